@@ -1,7 +1,8 @@
-"""Build the compiled half of gsfluent: `_C` (CPU, always), `_C_cuda` (when asked for or possible), `_core` (pybind11).
+"""Build the compiled half of gsfluent: `_C` (CPU), `_C_cuda` (when possible), `_core` (pybind11).
 
 Environment:
-    GSFLUENT_CUDA   auto (default: build CUDA when torch has CUDA and a toolkit is found) | 0 | 1 (cross build on CPU-only torch)
+    GSFLUENT_CUDA   auto (default: CUDA when torch has CUDA and a toolkit is found) | 0 |
+                    1 (also a cross build on CPU-only torch)
     GSFLUENT_ARCH   CUDA architectures, comma separated (default 90)
     GSFLUENT_MARCH  CPU architecture for -march (default x86-64-v3 on x86-64; empty elsewhere)
     DEBUG           1 builds with -O1 -g
@@ -19,7 +20,8 @@ from torch.utils import cpp_extension
 ROOT = Path(__file__).resolve().parent
 DEBUG = os.environ.get("DEBUG") == "1"
 
-# Stable ABI, oldest supported torch 2.11: one binary serves every later torch (docs/design/0001-stable-abi.md).
+# Stable ABI, oldest supported torch 2.11: one binary serves every later torch
+# (docs/design/0001-stable-abi.md).
 TORCH_TARGET = "-DTORCH_TARGET_VERSION=0x020b000000000000"
 
 
@@ -102,7 +104,7 @@ def cuda_extension() -> list:
                     *gencode,
                 ],
             },
-            # libtorch.so pulls in libtorch_cuda.so on the GPU machine; --as-needed would drop it here.
+            # libtorch.so pulls in libtorch_cuda.so on the GPU machine; --as-needed would drop it.
             extra_link_args=["-Wl,--no-as-needed", "-ltorch", "-Wl,--as-needed"],
             py_limited_api=True,
         )

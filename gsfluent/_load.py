@@ -1,4 +1,4 @@
-"""Load the compiled libraries: ``_C`` (schemas and CPU kernels) always, ``_C_cuda`` when torch has CUDA."""
+"""Load the compiled libraries: ``_C`` (schemas, CPU kernels), and ``_C_cuda`` if torch has CUDA."""
 
 from __future__ import annotations
 

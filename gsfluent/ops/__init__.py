@@ -1,4 +1,4 @@
-"""Functional operators: tensors in, tensors out, each with a CPU and a CUDA kernel and a float64 reference.
+"""Functional operators: tensors in, tensors out; a CPU and a CUDA kernel and a reference for each.
 
 Every operator is registered with the PyTorch dispatcher as ``torch.ops.gsfluent.<name>``.
 """

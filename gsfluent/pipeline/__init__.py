@@ -1,4 +1,4 @@
-"""Stages: each an ``nn.Module`` that takes containers and gives containers; chained by ``gsfluent run``."""
+"""Stages: each an ``nn.Module``, containers in, containers out; ``gsfluent run`` chains them."""
 
 from __future__ import annotations
 

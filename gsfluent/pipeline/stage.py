@@ -13,7 +13,8 @@ Progress = Callable[[int, int, str], None]
 class Stage(nn.Module):
     """Base class of the pipeline's stages.
 
-    A stage is constructed complete (all settings in ``__init__``), holds no scene data, and is called with containers.
+    A stage is constructed complete (all settings in ``__init__``), holds no scene data, and is
+    called with containers.
 
     Args:
         seed: Seed of everything random inside the stage.

@@ -1,1 +1,1 @@
-"""The definition of each operator in plain PyTorch, readable and slow; float64 unless the caller says otherwise."""
+"""The definition of each operator in plain PyTorch: readable, slow, float64 capable."""
