@@ -1,11 +1,13 @@
 """Materials: the numbers of one solid, named presets, and where each number comes from.
 
-A :class:`Material` is frozen; :meth:`Material.override` gives a changed copy. Presets live in groups
-(``materials.fruit.watermelon``, ``materials.glass``) and can be found by name with :func:`get`.
+A :class:`Material` is frozen; :meth:`Material.override` gives a changed copy. Presets live in
+groups (``materials.fruit.watermelon``, ``materials.glass``) and can be found by name with
+:func:`get`.
 
-Strength follows the non-associated Cam-Clay model of Wolper et al. 2019 (CD-MPM, section 4): the yield pressure is
-``p0 = kappa * sinh(hardening * max(-alpha, 0))`` and tension fails at ``cohesion * p0``. ``alpha`` is the log plastic
-volume ratio: negative is intact, zero and above is broken. The volumetric strain at which a material fails in tension is
+Strength follows the non-associated Cam-Clay model of Wolper et al. 2019 (CD-MPM, section 4): the
+yield pressure is ``p0 = kappa * sinh(hardening * max(-alpha, 0))`` and tension fails at
+``cohesion * p0``. ``alpha`` is the log plastic volume ratio: negative is intact, zero and above
+is broken. The volumetric strain at which a material fails in tension is
 :attr:`Material.failure_strain`; a body starts to break when it lands faster than about
 ``wave_speed * failure_strain``.
 """
@@ -64,7 +66,8 @@ class Material:
         alpha0: Log plastic volume ratio at the start; negative is intact.
         shear_damage: How much plastic shear counts as damage, eta; 0 is the plain model.
         parts: Default parts (for :meth:`gsfluent.Scene.add`), e.g. the rind of a melon.
-        sources: Field name -> where the number is from. A field that is not named was chosen by eye.
+        sources: Field name -> where the number is from. A field that is not named was chosen by
+            eye.
 
     Raises:
         InputError: An unknown law, a number outside its range, or a law that is not here yet.
@@ -87,19 +90,21 @@ class Material:
         """Check the law and every number."""
         if self.law in LATER_LAWS:
             raise InputError(
-                f"material {self.name!r}: law {self.law!r} is not in gsfluent yet; it arrives with a later issue",
+                f"material {self.name!r}: law {self.law!r} is not in gsfluent yet; "
+                "it arrives with a later issue",
                 mend="use 'elastic' or 'nacc'",
             )
         if self.law not in LAWS:
             raise InputError(
-                f"material {self.name!r}: unknown law {self.law!r}", mend=_nearest(self.law, [*LAWS, *LATER_LAWS])
+                f"material {self.name!r}: unknown law {self.law!r}",
+                mend=_nearest(self.law, [*LAWS, *LATER_LAWS]),
             )
         for field, (low, high, unit) in _RANGES.items():
             _check_number(self.name, field, getattr(self, field), low, high, unit)
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     def override(self, **changes: Any) -> Material:
-        """Return a copy with fields changed; an unknown field is an error that names the nearest one.
+        """Return a copy with fields changed; an unknown one is an error naming the nearest.
 
         Raises:
             InputError: An unknown field or a number outside its range.
@@ -108,18 +113,24 @@ class Material:
         for key in changes:
             if key in LATER_FIELDS:
                 raise InputError(
-                    f"material {self.name!r}: {key!r} belongs to a law that arrives with a later issue",
+                    f"material {self.name!r}: {key!r} belongs to a law that arrives with a "
+                    "later issue",
                     mend="use law 'elastic' or 'nacc', which do not read it",
                 )
             if key not in known:
-                raise InputError(f"material {self.name!r}: unknown parameter {key!r}", mend=_nearest(key, known))
+                raise InputError(
+                    f"material {self.name!r}: unknown parameter {key!r}", mend=_nearest(key, known)
+                )
         sources = {k: v for k, v in self.sources.items() if k not in changes}
         return dataclasses.replace(self, sources=sources, **changes)
 
     def source(self, field: str) -> str:
-        """Say where a number comes from: ``"measured: ..."``, ``"derived: ..."`` or ``"chosen by eye"``."""
+        """Say where a number is from: ``measured: ...``, ``derived: ...`` or ``chosen by eye``."""
         if field not in PARAMETERS:
-            raise InputError(f"material {self.name!r}: unknown parameter {field!r}", mend=_nearest(field, PARAMETERS))
+            raise InputError(
+                f"material {self.name!r}: unknown parameter {field!r}",
+                mend=_nearest(field, PARAMETERS),
+            )
         return self.sources.get(field, "chosen by eye")
 
     @property
@@ -130,7 +141,7 @@ class Material:
 
     @property
     def failure_strain(self) -> float:
-        """Volumetric strain at which tension fails (smallest over a field); infinite when elastic."""
+        """Smallest volumetric strain at which tension fails; infinite when elastic."""
         if self.law == "elastic":
             return math.inf
         alpha, xi, beta = (_tensor(v) for v in (self.alpha0, self.hardening, self.cohesion))
@@ -138,12 +149,14 @@ class Material:
         return float((0.5 * torch.log1p(2.0 * beta * ratio.clamp(max=0.495))).min())
 
     def parameters(self, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
-        """Return rows for :func:`gsfluent.ops.return_mapping`, shape [8] (or [..., 8] for fields), float64.
+        """Return rows for :func:`gsfluent.ops.return_mapping`, [8] or [..., 8], float64.
 
-        Columns: mu [Pa], kappa [Pa], M, cohesion, hardening, shear_damage, density [kg/m^3], reserved (0).
+        Columns: mu [Pa], kappa [Pa], M, cohesion, hardening, shear_damage, density [kg/m^3],
+            reserved (0).
 
         Args:
-            sample: Turns a parameter into its values at chosen points; default: the parameter as it is.
+            sample: Turns a parameter into its values at chosen points; default: the parameter as
+                it is.
         """
         at = sample or _tensor
         young, nu, density = at(self.young_modulus), at(self.poisson_ratio), at(self.density)
@@ -152,7 +165,9 @@ class Material:
         sine = torch.sin(torch.deg2rad(at(self.friction_angle)))
         slope = 6.0 * sine / (3.0 - sine)
         rest = [at(self.cohesion), at(self.hardening), at(self.shear_damage)]
-        columns = torch.broadcast_tensors(mu, kappa, slope, *rest, density, torch.zeros_like(density))
+        columns = torch.broadcast_tensors(
+            mu, kappa, slope, *rest, density, torch.zeros_like(density)
+        )
         return torch.stack(columns, dim=-1)
 
 
@@ -164,11 +179,14 @@ def _check_number(name: str, field: str, value: Any, low: float, high: float, un
     """Refuse a parameter that is not a finite number (or grid of numbers) in its range."""
     where = f"material {name!r}: {field}"
     if isinstance(value, bool) or not isinstance(value, int | float | Tensor):
-        raise InputError(f"{where} must be a number or a tensor, got {type(value).__name__}", mend=f"give {unit}")
+        raise InputError(
+            f"{where} must be a number or a tensor, got {type(value).__name__}", mend=f"give {unit}"
+        )
     data = _tensor(value)
     if data.ndim not in (0, 3):
         raise InputError(
-            f"{where} must be one number or a grid [X, Y, Z] over the solid's voxels, got shape {list(data.shape)}",
+            f"{where} must be one number or a grid [X, Y, Z] over the solid's voxels, "
+            f"got shape {list(data.shape)}",
             mend="sample the field on the solid's occupancy grid",
         )
     inside = torch.isfinite(data) & (data >= low) & (data <= high)
@@ -177,7 +195,10 @@ def _check_number(name: str, field: str, value: Any, low: float, high: float, un
     if not bool(inside.all()):
         worst = float(data[~inside].reshape(-1)[0])
         edge = "above" if field in _POSITIVE else "at least"
-        raise InputError(f"{where} must be {edge} {low:g} and at most {high:g} ({unit}), got {worst:g}", mend="mend the number")
+        raise InputError(
+            f"{where} must be {edge} {low:g} and at most {high:g} ({unit}), got {worst:g}",
+            mend="mend the number",
+        )
 
 
 def _nearest(word: str, known: Any) -> str:
@@ -186,17 +207,20 @@ def _nearest(word: str, known: Any) -> str:
     return f"{hint}known: {', '.join(sorted(known))}"
 
 
-# --- presets -----------------------------------------------------------------------------------------------------
-# Explicit time steps cost one wave transit per cell, so a solid at its true stiffness (glass: 5400 m/s) would need a
-# million steps per second. Stiff presets are therefore softened by a factor that `sources` states; strength is given
-# as a strain, so the landing speed at which they break is wave_speed * failure_strain of the softened solid.
+# --- presets ---
+# ----------------- Explicit time steps cost one wave transit per cell, so a solid at its true
+# stiffness (glass: 5400 m/s) would need a million steps per second. Stiff presets are therefore
+# softened by a factor that `sources` states; strength is given as a strain, so the landing speed
+# at which they break is wave_speed * failure_strain of the softened solid.
 
 _DENSITY = "measured: handbook density"
 _POISSON = "measured: handbook Poisson ratio"
 
 
 def _softened(true_young: float, factor: float, what: str) -> str:
-    return f"derived: handbook {true_young:g} Pa for {what}, softened {factor:g} times to keep the time step usable"
+    return (
+        f"derived: handbook {true_young:g} Pa for {what}, softened {factor:g} times for time steps"
+    )
 
 
 _RIND = {"name": "rind", "where": {"depth_below": 0.012}, "young_modulus": 8.0e5, "cohesion": 0.6}
@@ -206,55 +230,133 @@ _PRESETS: dict[str, Material] = {
     m.name: m
     for m in (
         Material(
-            "fruit.watermelon", 4e5, 0.35, 950.0, cohesion=0.1, hardening=10.0, alpha0=-0.08,
-            parts=(_RIND,), sources={"density": _DENSITY + ", a melon just floats"},
+            "fruit.watermelon",
+            4e5,
+            0.35,
+            950.0,
+            cohesion=0.1,
+            hardening=10.0,
+            alpha0=-0.08,
+            parts=(_RIND,),
+            sources={"density": _DENSITY + ", a melon just floats"},
         ),
         Material(
-            "fruit.apple", 1e6, 0.35, 840.0, cohesion=0.1, hardening=10.0, alpha0=-0.06,
+            "fruit.apple",
+            1e6,
+            0.35,
+            840.0,
+            cohesion=0.1,
+            hardening=10.0,
+            alpha0=-0.06,
             sources={
                 "density": _DENSITY + ", an apple floats with a sixth above water",
                 "young_modulus": _softened(3e6, 3, "apple flesh"),
             },
         ),
         Material(
-            "fruit.orange", 3e5, 0.4, 950.0, cohesion=0.2, hardening=8.0, alpha0=-0.08, parts=(_PEEL,),
+            "fruit.orange",
+            3e5,
+            0.4,
+            950.0,
+            cohesion=0.2,
+            hardening=8.0,
+            alpha0=-0.08,
+            parts=(_PEEL,),
             sources={"density": _DENSITY},
         ),
         Material("fruit.pumpkin", 6e5, 0.35, 800.0, cohesion=0.15, hardening=10.0, alpha0=-0.06),
         Material(
-            "glass", 7e7, 0.22, 2500.0, cohesion=0.05, hardening=10.0, alpha0=-0.03, friction_angle=60.0,
-            sources={"young_modulus": _softened(7e10, 1000, "soda-lime glass"), "density": _DENSITY,
-                     "poisson_ratio": _POISSON},
+            "glass",
+            7e7,
+            0.22,
+            2500.0,
+            cohesion=0.05,
+            hardening=10.0,
+            alpha0=-0.03,
+            friction_angle=60.0,
+            sources={
+                "young_modulus": _softened(7e10, 1000, "soda-lime glass"),
+                "density": _DENSITY,
+                "poisson_ratio": _POISSON,
+            },
         ),
         Material(
-            "ceramic", 6e7, 0.22, 2400.0, cohesion=0.06, hardening=10.0, alpha0=-0.03, friction_angle=60.0,
-            sources={"young_modulus": _softened(6e10, 1000, "porcelain"), "density": _DENSITY,
-                     "poisson_ratio": _POISSON},
+            "ceramic",
+            6e7,
+            0.22,
+            2400.0,
+            cohesion=0.06,
+            hardening=10.0,
+            alpha0=-0.03,
+            friction_angle=60.0,
+            sources={
+                "young_modulus": _softened(6e10, 1000, "porcelain"),
+                "density": _DENSITY,
+                "poisson_ratio": _POISSON,
+            },
         ),
         Material(
-            "bone", 1.7e7, 0.3, 1900.0, cohesion=0.2, hardening=10.0, alpha0=-0.04, friction_angle=50.0,
-            sources={"young_modulus": _softened(1.7e10, 1000, "cortical bone"), "density": _DENSITY,
-                     "poisson_ratio": _POISSON},
+            "bone",
+            1.7e7,
+            0.3,
+            1900.0,
+            cohesion=0.2,
+            hardening=10.0,
+            alpha0=-0.04,
+            friction_angle=50.0,
+            sources={
+                "young_modulus": _softened(1.7e10, 1000, "cortical bone"),
+                "density": _DENSITY,
+                "poisson_ratio": _POISSON,
+            },
         ),
         Material(
-            "chocolate", 1e7, 0.35, 1300.0, cohesion=0.08, hardening=10.0, alpha0=-0.03, friction_angle=50.0,
+            "chocolate",
+            1e7,
+            0.35,
+            1300.0,
+            cohesion=0.08,
+            hardening=10.0,
+            alpha0=-0.03,
+            friction_angle=50.0,
             sources={"density": _DENSITY},
         ),
-        Material("bread", 3e4, 0.1, 250.0, cohesion=0.5, hardening=3.0, alpha0=-0.15,
-                 sources={"density": _DENSITY + " of a white loaf"}),
-        Material("jelly", 3e4, 0.45, 1000.0, law="elastic", sources={"density": _DENSITY + " of water"}),
+        Material(
+            "bread",
+            3e4,
+            0.1,
+            250.0,
+            cohesion=0.5,
+            hardening=3.0,
+            alpha0=-0.15,
+            sources={"density": _DENSITY + " of a white loaf"},
+        ),
+        Material(
+            "jelly", 3e4, 0.45, 1000.0, law="elastic", sources={"density": _DENSITY + " of water"}
+        ),
         Material("plush", 2e4, 0.2, 150.0, law="elastic"),
         Material(
-            "rubber", 1e6, 0.45, 1100.0, law="elastic",
-            sources={"young_modulus": "measured: handbook, soft rubber 1 to 5 MPa", "density": _DENSITY,
-                     "poisson_ratio": "derived: rubber is 0.49 or above; 0.45 keeps the pressure wave slow"},
+            "rubber",
+            1e6,
+            0.45,
+            1100.0,
+            law="elastic",
+            sources={
+                "young_modulus": "measured: handbook, soft rubber 1 to 5 MPa",
+                "density": _DENSITY,
+                "poisson_ratio": "derived: rubber has 0.49 or above; 0.45 slows the pressure wave",
+            },
         ),
         Material("elastic", 1e5, 0.3, 1000.0, law="elastic"),
     )
 }
 
 fruit = SimpleNamespace(
-    **{name.split(".", 1)[1]: value for name, value in _PRESETS.items() if name.startswith("fruit.")}
+    **{
+        name.split(".", 1)[1]: value
+        for name, value in _PRESETS.items()
+        if name.startswith("fruit.")
+    }
 )
 glass = _PRESETS["glass"]
 ceramic = _PRESETS["ceramic"]

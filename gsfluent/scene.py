@@ -1,7 +1,7 @@
 """A scene: solids, what they are made of, where they are, how they move, and the floor.
 
-Coordinates are SI metres with +z up. A solid is brought from its own (world) coordinates into the scene by its
-``Frame``; events then place and move it.
+Coordinates are SI metres with +z up. A solid is brought from its own (world) coordinates into the
+scene by its ``Frame``; events then place and move it.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class Part:
 
     Args:
         name: Name for messages.
-        where: Conditions that must all hold: ``depth_below`` / ``depth_above`` [m under the surface], ``color_near``
-            ([r, g, b] in 0..1, with ``tolerance``, default 0.15), ``box`` ([[x, y, z], [x, y, z]]) and ``sphere``
-            ([x, y, z, radius]) in scene metres before any event moves the solid, ``region`` (number in
-            ``Solid.regions``).
+        where: Conditions that must all hold: ``depth_below`` / ``depth_above`` [m under the
+            surface], ``color_near`` ([r, g, b] in 0..1, with ``tolerance``, default 0.15),
+            ``box`` ([[x, y, z], [x, y, z]]) and ``sphere`` ([x, y, z, radius]) in scene metres
+            before any event moves the solid, ``region`` (number in ``Solid.regions``).
         overrides: Material parameters of the region; ``material`` starts from another preset.
     """
 
@@ -66,7 +66,11 @@ class Part:
         for key in where:
             _known(f"part {name!r}, where", key, _WHERE_KEYS)
         for key in rest:
-            _known(f"part {name!r}", key, [*materials.PARAMETERS, *materials.LATER_FIELDS, "material", "law"])
+            _known(
+                f"part {name!r}",
+                key,
+                [*materials.PARAMETERS, *materials.LATER_FIELDS, "material", "law"],
+            )
         return Part(name, dict(where), rest)
 
     def material(self, base: Material) -> Material:
@@ -91,8 +95,8 @@ class Body:
         velocity: Velocity of the centre of mass [m/s], [3].
         angular_velocity: Spin about the centre of mass [rad/s], [3].
         radius: Radius [m] when there is no solid.
-        start: Time [s] at which the body passes ``offset`` with ``velocity``; before that it is on its way, in free
-            flight.
+        start: Time [s] at which the body passes ``offset`` with ``velocity``; before that it is
+            on its way, in free flight.
     """
 
     name: str
@@ -173,11 +177,15 @@ class Scene:
             InputError: An empty solid, an unknown preset or parameter, or a name taken twice.
         """
         if not bool(solid.occupancy.any()):
-            raise InputError("scene.add: the solid holds no matter", mend="fill it first (gsfluent fill)")
+            raise InputError(
+                "scene.add: the solid holds no matter", mend="fill it first (gsfluent fill)"
+            )
         chosen = materials.get(material) if isinstance(material, str) else material
         regions = tuple(Part.parse(part) for part in (chosen.parts if parts is None else parts))
         for part in regions:
-            part.material(chosen)  # refuse bad parameters here, where the user can see which call is meant
+            part.material(
+                chosen
+            )  # refuse bad parameters here, where the user can see which call is meant
         body = Body(
             name=self._name(name, "object"),
             material=chosen,
@@ -191,7 +199,7 @@ class Scene:
         return body.name
 
     def drop(self, height: float, object: str | None = None) -> None:
-        """Put a solid so that its lowest point is ``height`` metres above the floor (z = 0 without a floor).
+        """Put a solid so that its lowest point is ``height`` metres above the floor (or z = 0).
 
         Args:
             height: Height [m], not negative.
@@ -209,7 +217,10 @@ class Scene:
             self.bodies[index] = dataclasses.replace(body, offset=(x, y, z + rise))
 
     def throw(
-        self, velocity: Sequence[float], spin: Sequence[float] = (0.0, 0.0, 0.0), object: str | None = None
+        self,
+        velocity: Sequence[float],
+        spin: Sequence[float] = (0.0, 0.0, 0.0),
+        object: str | None = None,
     ) -> None:
         """Give a solid a velocity [m/s] and a spin [rad/s] about its centre of mass at time 0."""
         for index in self._targets(object):
@@ -230,9 +241,10 @@ class Scene:
     ) -> str:
         """Fire a dense elastic ball, a body with its own velocity field.
 
-        Its density is what is asked for. Its stiffness is not that of steel: it is chosen so that its wave speed equals
-        that of the stiffest other body, so that the ball does not shorten the time step. It is still stiffer than its
-        target by the ratio of densities, and so hardly deforms.
+        Its density is what is asked for. Its stiffness is not that of steel: it is chosen so that
+        its wave speed equals that of the stiffest other body, so that the ball does not shorten
+        the time step. It is still stiffer than its target by the ratio of densities, and so
+        hardly deforms.
 
         Args:
             start: Position [m] at time ``at``, [3].
@@ -240,7 +252,8 @@ class Scene:
             speed: Speed at time ``at`` [m/s].
             radius: Radius [m].
             density: Density [kg/m^3].
-            at: Time [s] at which it passes ``start``; before that it is in free flight on its way there.
+            at: Time [s] at which it passes ``start``; before that it is in free flight on its way
+                there.
 
         Returns:
             The name of the new body.
@@ -254,17 +267,21 @@ class Scene:
         origin, target = _vector("bullet from", start), _vector("bullet toward", toward)
         distance = math.dist(origin, target)
         if distance == 0.0:
-            raise InputError("bullet: 'toward' must differ from 'from'", mend="aim at another point")
+            raise InputError(
+                "bullet: 'toward' must differ from 'from'", mend="aim at another point"
+            )
         speed = _number("bullet speed", speed, low=0.0)
         density = _number("bullet density", density, low=1.0)
         stiffest = max(
-            part.wave_speed for body in solids for part in [body.material, *(p.material(body.material) for p in body.parts)]
+            part.wave_speed
+            for body in solids
+            for part in [body.material, *(p.material(body.material) for p in body.parts)]
         )
         nu = 0.3
         young = density * stiffest**2 * (1 + nu) * (1 - 2 * nu) / (1 - nu)
         ball = Material(
             "bullet", young, nu, density, law="elastic",
-            sources={"young_modulus": "derived: wave speed of the stiffest target, so that the time step is kept"},
+            sources={"young_modulus": "derived: wave speed of the stiffest target"},
         )  # fmt: skip
         heading = [(b - a) / distance * speed for a, b in zip(origin, target, strict=True)]
         body = Body(
@@ -282,21 +299,29 @@ class Scene:
         """Apply one entry of a shot file's ``events``: ``drop``, ``throw`` or ``bullet``.
 
         Raises:
-            InputError: An unknown type or key, a missing key, or a type that arrives with a later issue.
+            InputError: An unknown type or key, a missing key, or a type that arrives with a later
+                issue.
         """
         rest = dict(event)
         kind = rest.pop("type", None)
         if kind in LATER_EVENTS:
             raise InputError(
-                f"event {kind!r} is not in gsfluent yet; it arrives with a later issue", mend="use drop, throw or bullet"
+                f"event {kind!r} is not in gsfluent yet; it arrives with a later issue",
+                mend="use drop, throw or bullet",
             )
         _known("event type", kind, _EVENT_KEYS)
         for key in rest:
             _known(f"event {kind!r}", key, _EVENT_KEYS[kind])
-        required = {"drop": ("height",), "throw": ("velocity",), "bullet": ("from", "toward", "speed")}[kind]
+        required = {
+            "drop": ("height",),
+            "throw": ("velocity",),
+            "bullet": ("from", "toward", "speed"),
+        }[kind]
         for key in required:
             if key not in rest:
-                raise InputError(f"event {kind!r}: {key!r} is missing", mend=f"required: {', '.join(required)}")
+                raise InputError(
+                    f"event {kind!r}: {key!r} is missing", mend=f"required: {', '.join(required)}"
+                )
         if kind == "drop":
             self.drop(**rest)
         elif kind == "throw":
@@ -311,7 +336,9 @@ class Scene:
                 if body.name == name:
                     return [index]
             names = [body.name for body in self.bodies]
-            raise InputError(f"event: no object is called {name!r}", mend=f"known: {', '.join(names) or 'none'}")
+            raise InputError(
+                f"event: no object is called {name!r}", mend=f"known: {', '.join(names) or 'none'}"
+            )
         found = [index for index, body in enumerate(self.bodies) if body.solid is not None]
         if not found:
             raise InputError("event: the scene has no solid", mend="scene.add(...) before events")
@@ -321,7 +348,9 @@ class Scene:
         taken = {body.name for body in self.bodies}
         if name is not None:
             if name in taken:
-                raise InputError(f"scene: two bodies are called {name!r}", mend="give each its own name")
+                raise InputError(
+                    f"scene: two bodies are called {name!r}", mend="give each its own name"
+                )
             return name
         number = 1
         while (free := stem if number == 1 else f"{stem}{number}") in taken:
@@ -341,7 +370,9 @@ def _number(name: str, value: Any, low: float = -math.inf, high: float = math.in
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{name} must be a finite number, got {value!r}", mend="give one number")
     if not low <= value <= high:
-        raise InputError(f"{name} must lie in [{low:g}, {high:g}], got {value:g}", mend="mend the number")
+        raise InputError(
+            f"{name} must lie in [{low:g}, {high:g}], got {value:g}", mend="mend the number"
+        )
     return float(value)
 
 

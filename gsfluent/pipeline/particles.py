@@ -1,7 +1,8 @@
 """From solids to material points: sampling, masses, material rows, seeded weakness.
 
-Gaussians are not material points: a grid cell wants 4 to 8 points whatever the number of splats, so points are sampled
-from the solid's voxels and the splats ride on them (:mod:`gsfluent.pipeline.carry`).
+Gaussians are not material points: a grid cell wants 4 to 8 points whatever the number of splats,
+so points are sampled from the solid's voxels and the splats ride on them
+(:mod:`gsfluent.pipeline.carry`).
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class Matter:
     Args:
         particles: The points at time 0; their positions are the rest positions.
         law: Law of each material row, int32 [M].
-        params: Parameters of each material row [M, 8] (columns of :func:`gsfluent.ops.return_mapping`).
+        params: Parameters of each material row [M, 8] (columns of
+            :func:`gsfluent.ops.return_mapping`).
         ranges: First and last + 1 row of each body's points.
         spacing: Mean distance between neighbouring points of each body [m].
         dx: Grid spacing [m].
@@ -56,13 +58,14 @@ class Matter:
 def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
     """Sample a solid's matter on a jittered lattice.
 
-    One point per lattice cell of edge ``spacing``, moved at random by up to a quarter of it along each axis (so that no
-    lattice plane is a preferred crack), kept where its voxel is occupied.
+    One point per lattice cell of edge ``spacing``, moved at random by up to a quarter of it along
+    each axis (so that no lattice plane is a preferred crack), kept where its voxel is occupied.
 
     Args:
         solid: The filled object.
         spacing: Distance between points [world units].
-        seed: Seed of the jitter, which is fixed in object space: the same solid gives the same points.
+        seed: Seed of the jitter, which is fixed in object space: the same solid gives the same
+            points.
 
     Returns:
         Points [N, 3] in world coordinates, float64, ordered along x, then y, then z.
@@ -78,7 +81,10 @@ def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     start = low + 0.5 * ((high - low) - counts * spacing)
     found = []
-    lattice = torch.stack(torch.meshgrid(torch.arange(int(counts[1])), torch.arange(int(counts[2])), indexing="ij"), -1)
+    lattice = torch.stack(
+        torch.meshgrid(torch.arange(int(counts[1])), torch.arange(int(counts[2])), indexing="ij"),
+        -1,
+    )
     for i in range(int(counts[0])):  # slab by slab: memory stays small for fine lattices
         cell = torch.cat([torch.full((*lattice.shape[:2], 1), i), lattice], dim=-1).reshape(-1, 3)
         jitter = torch.rand(cell.shape, generator=generator, dtype=torch.float64) - 0.5
@@ -87,7 +93,8 @@ def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
     result = torch.cat(found)
     if result.shape[0] == 0:
         raise InputError(
-            f"sampling: no material point falls inside the solid at spacing {spacing:.4g}", mend="use a finer quality"
+            f"sampling: no material point falls inside the solid at spacing {spacing:.4g}",
+            mend="use a finer quality",
         )
     return result
 
@@ -103,8 +110,8 @@ def build_matter(
 ) -> Matter:
     """Sample all bodies of a scene at :data:`POINTS_PER_CELL` points per cell of edge ``dx``.
 
-    The mass of a body is its density times its voxel volume; each point has the same share of the volume
-    (``V_object / N``), so surface cells are not over-weighted.
+    The mass of a body is its density times its voxel volume; each point has the same share of the
+    volume (``V_object / N``), so surface cells are not over-weighted.
 
     Args:
         scene: The scene; it must hold at least one body.
@@ -118,12 +125,15 @@ def build_matter(
         InputError: No body, too many points, or nothing inside a solid.
     """
     if not scene.bodies:
-        raise InputError("simulate: the scene is empty", mend="scene.add(solid, material=...) first")
+        raise InputError(
+            "simulate: the scene is empty", mend="scene.add(solid, material=...) first"
+        )
     step = dx / POINTS_PER_CELL ** (1 / 3)
     expected = sum(_volume(body) for body in scene.bodies) / step**3
     if expected > max_particles:
         raise InputError(
-            f"simulate: about {expected:.3g} material points at dx = {dx:.3g} m, more than {max_particles}",
+            f"simulate: about {expected:.3g} material points at dx = {dx:.3g} m, "
+            f"more than {max_particles}",
             mend="use a coarser quality or raise max_particles",
         )
     tables: list[Tensor] = []
@@ -136,7 +146,9 @@ def build_matter(
         points, volume = _sample_body(body, step, seed)
         count = points.shape[0]
         params, law, alpha = _parameters(body, points)
-        noise = torch.rand(count, generator=torch.Generator().manual_seed(seed + 7919 * (number + 1)))
+        noise = torch.rand(
+            count, generator=torch.Generator().manual_seed(seed + 7919 * (number + 1))
+        )
         alpha = torch.where(alpha < 0, alpha * (1 + jitter * (2 * noise - 1)), alpha)
         mass = params[:, 6] * (volume / count)
         position, velocity, affine = _start(body, scene, _placed(body, points), mass)
@@ -157,7 +169,9 @@ def build_matter(
         done += count
     everything = torch.cat([torch.cat(laws)[:, None].to(torch.float64), torch.cat(tables)], dim=1)
     unique, row = torch.unique(everything, dim=0, return_inverse=True)
-    particles = Particles.cat(groups).replace(material=row.to(torch.int32)).validated("simulate").to(device)
+    particles = (
+        Particles.cat(groups).replace(material=row.to(torch.int32)).validated("simulate").to(device)
+    )
     _log.info("%d material points, dx = %.4g m, %d material rows", done, dx, unique.shape[0])
     return Matter(
         particles=particles,
@@ -176,13 +190,15 @@ def body_frame(body: Body, scene: Scene) -> Frame:
 
 
 def grid_spacing(scene: Scene, cells: int) -> float:
-    """Grid spacing [m] that gives the largest solid (or ball) ``cells`` cells along its longest side."""
+    """Grid spacing [m] that gives the largest solid ``cells`` cells along its longest side."""
     extents = []
     for body in scene.bodies:
         low, high = body.bounds()
         extents.append((body.solid is not None, float((high - low).max())))
     if not extents:
-        raise InputError("simulate: the scene is empty", mend="scene.add(solid, material=...) first")
+        raise InputError(
+            "simulate: the scene is empty", mend="scene.add(solid, material=...) first"
+        )
     return max(extents)[1] / cells
 
 
@@ -198,7 +214,8 @@ def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
     volume = _volume(body)
     if body.solid is not None:
         return sample_points(body.solid, step / body.frame.scale, seed=seed), volume
-    # A ball is never coarser than four points across, so that even a bullet smaller than a cell has a shape.
+    # A ball is never coarser than four points across, so that even a bullet smaller than a cell
+    # has a shape.
     step = min(step, 0.5 * body.radius)
     side = math.ceil(body.radius / step)
     axis = (torch.arange(-side, side, dtype=torch.float64) + 0.5) * step
@@ -223,7 +240,7 @@ def _parameters(body: Body, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             if solid is None or value.shape != solid.occupancy.shape:
                 wanted = [] if solid is None else list(solid.occupancy.shape)
                 raise InputError(
-                    f"material {material.name!r}: a field must have the shape of the solid's voxels {wanted}, "
+                    f"material {material.name!r}: a field must have the shape of the voxels {wanted}, "
                     f"got {list(value.shape)}",
                     mend="sample the field on Solid.occupancy's grid",
                 )
@@ -236,7 +253,10 @@ def _parameters(body: Body, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     law = torch.zeros(count, dtype=torch.int32)
     alpha = torch.zeros(count, dtype=torch.float64)
     everywhere = torch.ones(count, dtype=torch.bool)
-    layers = [(body.material, everywhere), *((p.material(body.material), select(p, body, points)) for p in body.parts)]
+    layers = [
+        (body.material, everywhere),
+        *((p.material(body.material), select(p, body, points)) for p in body.parts),
+    ]
     for material, mask in layers:
         index = mask.nonzero()[:, 0]
         at = sampler(material, index)
@@ -254,7 +274,9 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
     """
     solid = body.solid
     if solid is None:
-        raise InputError(f"part {part.name!r}: a ball has no parts", mend="give the parts to a solid")
+        raise InputError(
+            f"part {part.name!r}: a ball has no parts", mend="give the parts to a solid"
+        )
     where = part.where
     mask = torch.ones(points.shape[0], dtype=torch.bool)
     on_device = points.to(solid.occupancy.device)
@@ -266,14 +288,18 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
     if "color_near" in where:
         if solid.color is None:
             raise InputError(
-                f"part {part.name!r}: 'color_near' needs a textured solid", mend="run the texture stage first"
+                f"part {part.name!r}: 'color_near' needs a textured solid",
+                mend="run the texture stage first",
             )
         wanted = torch.tensor(where["color_near"], dtype=torch.float64)
         color = solid.color_at(on_device).cpu().to(torch.float64)
         mask &= (color - wanted).norm(dim=1) <= float(where.get("tolerance", 0.15))
     if "region" in where:
         if solid.regions is None:
-            raise InputError(f"part {part.name!r}: the solid has no regions", mend="use depth_below or color_near")
+            raise InputError(
+                f"part {part.name!r}: the solid has no regions",
+                mend="use depth_below or color_near",
+            )
         voxel, _ = solid.voxel_index(on_device)
         mask &= (solid.regions[voxel[:, 0], voxel[:, 1], voxel[:, 2]] == int(where["region"])).cpu()
     at = body.frame.apply(points)
@@ -287,7 +313,7 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
 
 
 def _approach(body: Body, scene: Scene) -> tuple[Tensor, Tensor]:
-    """Shift of position and velocity at time 0 so that free flight passes ``offset`` with ``velocity`` at ``start``."""
+    """Shift and velocity at time 0 so that free flight passes ``offset`` at ``start``."""
     gravity = torch.tensor(scene.gravity, dtype=torch.float64)
     velocity = torch.tensor(body.velocity, dtype=torch.float64) - gravity * body.start
     shift = -(velocity * body.start + 0.5 * gravity * body.start**2)
@@ -295,7 +321,7 @@ def _approach(body: Body, scene: Scene) -> tuple[Tensor, Tensor]:
 
 
 def _start(body: Body, scene: Scene, placed: Tensor, mass: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return position [N, 3], velocity [N, 3] and the spin's velocity gradient [3, 3] at time 0, float64."""
+    """Return position [N, 3], velocity [N, 3] and velocity gradient [3, 3] at time 0."""
     shift, velocity = _approach(body, scene)
     center = (mass[:, None] * placed).sum(dim=0) / mass.sum()
     wx, wy, wz = body.angular_velocity

@@ -1,8 +1,8 @@
 """Free flight: a body that touches nothing moves as a rigid body, exactly, without a grid.
 
-Before its first contact a body has no strain, so gravity and spin are all there is. The centre of mass follows the
-parabola ``x0 + v0 t + g t^2 / 2`` in closed form; the orientation follows Euler's equations for a free rigid body with
-its angular momentum held fixed.
+Before its first contact a body has no strain, so gravity and spin are all there is. The centre of
+mass follows the parabola ``x0 + v0 t + g t^2 / 2`` in closed form; the orientation follows
+Euler's equations for a free rigid body with its angular momentum held fixed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from torch import Tensor
 from gsfluent.data import Particles
 
 _ANGLE_STEP = 0.02
-"""Largest turn per integration step of a tumbling body [rad]; the midpoint rule's error falls with its square."""
+"""Largest turn per integration step of a tumbling body [rad]; the midpoint rule's error falls
+with its square.
+"""
 
 
 class Flight:
@@ -28,7 +30,9 @@ class Flight:
     """
 
     def __init__(self, particles: Particles, gravity: Tensor, time: float) -> None:
-        position, velocity = (part.to("cpu", torch.float64) for part in (particles.position, particles.velocity))
+        position, velocity = (
+            part.to("cpu", torch.float64) for part in (particles.position, particles.velocity)
+        )
         mass = particles.mass.to("cpu", torch.float64)[:, None]
         self.particles = particles
         self.gravity = gravity
@@ -73,10 +77,13 @@ class Flight:
     def center_at(self, time: float) -> tuple[Tensor, Tensor]:
         """Return the centre of mass and its velocity at ``time``, float64 [3] each."""
         t = time - self.start
-        return self.center + t * self.velocity + 0.5 * t * t * self.gravity, self.velocity + t * self.gravity
+        return (
+            self.center + t * self.velocity + 0.5 * t * t * self.gravity,
+            self.velocity + t * self.gravity,
+        )
 
     def bounds_at(self, time: float) -> tuple[Tensor, Tensor]:
-        """Return a box that holds the body at ``time`` (tight without spin, that of the bounding ball with spin)."""
+        """Return a box that holds the body at ``time``; with spin, that of its bounding ball."""
         center, _ = self.center_at(time)
         if self.spins:
             return center - self.radius, center + self.radius
