@@ -371,19 +371,28 @@ def _parse_hollow(hollow: str | float) -> float | None:
 def _masked_views(
     capture: Capture | None, size: int = 400
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Masks with their undistorted cameras, for the views that have one."""
+    """Background pixels and undistorted cameras of the views that have a mask."""
+    from scipy import ndimage
+
     if capture is None:
         return []
     views = []
     for i in range(len(capture.cameras)):
-        _, mask, camera = capture.image(i, max_size=size)
-        if mask is None:
+        view = capture.view(i, max_size=size)
+        if view.mask is None:
             continue
+        ground = view.mask < 0.5
+        if view.valid is not None:
+            ground = ground & view.valid
+        # one pixel of tolerance: masks and poses are never better than that
+        ground_pixels = ndimage.binary_erosion(
+            ground.cpu().numpy(), np.ones((3, 3)), border_value=1
+        )
         views.append(
             (
-                (mask > 0.5).cpu().numpy(),
-                camera.viewmat.double().cpu().numpy(),
-                camera.K.double().cpu().numpy(),
+                ground_pixels,
+                view.camera.viewmat.double().cpu().numpy(),
+                view.camera.K.double().cpu().numpy(),
             )
         )
     return views

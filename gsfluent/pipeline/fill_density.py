@@ -16,8 +16,8 @@ from torch import Tensor
 
 __all__ = ["GridBox", "choose_grid", "density_field"]
 
-_RADII = (2, 3, 4, 6, 8, 12, 16, 24)  # half-widths [voxels] that splats are grouped into
-_CUTOFF = 3.0  # standard deviations; exp(-4.5) = 0.011 of the peak is dropped
+_RADII = (2, 3, 4, 6, 8, 12, 16, 20)  # half-widths [voxels] that splats are grouped into
+_CUTOFF = 2.5  # standard deviations; exp(-3.1) = 0.044 of the peak is dropped
 _MIN_SIGMA = 0.5  # voxels: a surface sampled about once per voxel stays closed
 _MAX_SIGMA = _RADII[-1] / _CUTOFF
 _CHUNK = 4_000_000  # kernel values per batch: 16 MB of float32, stays in cache-friendly territory

@@ -121,19 +121,31 @@ def trim_outer_flank(solid: np.ndarray, shell: np.ndarray, density: np.ndarray) 
     """Remove the outer half of the shell: the boundary then runs through the splat centres.
 
     A shell voxel belongs to the outer flank when the density still rises towards the inside of the
-    object. Sheets one or two voxels thick would lose both flanks; voxels left without any kept
-    neighbour are put back.
+    object. A sheet one or two voxels thick may be all flank: a voxel goes only when some voxel
+    behind it, within four steps inward, stays.
     """
     from scipy import ndimage
 
     blurred = ndimage.gaussian_filter(solid.astype(np.float32), 1.5)
-    inward = np.gradient(blurred)
-    slope = np.gradient(ndimage.gaussian_filter(density, 0.5))
-    rising = sum(a * b for a, b in zip(inward, slope, strict=True)) > 0
-    kept = solid & ~(shell & rising)
-    cross = ndimage.generate_binary_structure(3, 1)
-    lost = solid & ~kept & ~ndimage.binary_dilation(kept, cross, iterations=2)
-    return kept | lost
+    inward = np.stack(np.gradient(blurred))
+    inward /= np.maximum(np.linalg.norm(inward, axis=0), 1e-9)
+    slope = np.stack(np.gradient(ndimage.gaussian_filter(density, 0.5)))
+    rising = (inward * slope).sum(0) > 1e-3 * density
+    flank = solid & shell & rising
+    kept = solid & ~flank
+    index = np.argwhere(flank)
+    direction = inward[(slice(None), *index.T)].T
+    backed = np.zeros(len(index), bool)
+    for step in range(1, 5):
+        behind = np.rint(index + step * direction).astype(int)
+        backed |= kept[tuple(np.clip(behind, 0, np.array(solid.shape) - 1).T)]
+    loose = np.zeros(solid.shape, bool)
+    loose[tuple(index[backed].T)] = True
+    # only what can be peeled from outside: a second layer of splats below the skin is no boundary
+    loose &= ndimage.distance_transform_edt(solid) <= 3.0
+    peeled = ndimage.binary_propagation(~solid, mask=~solid | loose)
+    result: np.ndarray = ndimage.binary_fill_holes(~peeled)
+    return result
 
 
 def keep_components(solid: np.ndarray, *, relative: float = 0.1) -> tuple[np.ndarray, int]:
@@ -182,8 +194,8 @@ def visual_hull(box: GridBox, views: list[tuple[np.ndarray, np.ndarray, np.ndarr
 
     Args:
         box: The grid.
-        views: Per view ``(mask bool [H, W], viewmat [4, 4], K [3, 3])``; world to camera, OpenCV
-            axes, pixels.
+        views: Per view ``(ground bool [H, W], viewmat [4, 4], K [3, 3])``: pixels known to show
+            something else than the object; world to camera with OpenCV axes.
 
     Returns:
         Hull bool [X, Y, Z]. Voxels outside every image are kept.
@@ -195,8 +207,8 @@ def visual_hull(box: GridBox, views: list[tuple[np.ndarray, np.ndarray, np.ndarr
     points = box.centers(index).astype(np.float32)
     alive = np.arange(points.shape[0])
     votes = np.zeros(points.shape[0], dtype=np.uint8)
-    for mask, viewmat, intrinsics in views:
-        height, width = mask.shape
+    for ground, viewmat, intrinsics in views:
+        height, width = ground.shape
         camera = points[alive] @ viewmat[:3, :3].T.astype(np.float32) + viewmat[:3, 3].astype(
             np.float32
         )
@@ -208,6 +220,6 @@ def visual_hull(box: GridBox, views: list[tuple[np.ndarray, np.ndarray, np.ndarr
         seen = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         column = np.where(seen, u, 0).astype(np.int32)
         row = np.where(seen, v, 0).astype(np.int32)
-        votes[alive[seen & ~mask[row, column]]] += 1
+        votes[alive[seen & ground[row, column]]] += 1
         alive = alive[votes[alive] < needed]
     return (votes < needed).reshape(box.shape)

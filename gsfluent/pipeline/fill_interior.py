@@ -36,13 +36,13 @@ class SamplePoints(NamedTuple):
     Attributes:
         position: [M, 3] world units.
         depth: [M] distance below the surface, world units.
-        index: int64 [M, 3] voxel that holds the point; ``solid.color[tuple(index.T)]`` is its
+        voxel: int64 [M, 3] voxel that holds the point; ``solid.color[tuple(voxel.T)]`` is its
             colour.
     """
 
     position: Tensor
     depth: Tensor
-    index: Tensor
+    voxel: Tensor
 
 
 def jittered_lattice(
