@@ -21,7 +21,7 @@ from gsfluent.data import SURFACE, Gaussians
 from gsfluent.pipeline.particles import Matter, body_frame
 from gsfluent.scene import Body, Scene
 
-NEIGHBOURS = 6
+NEIGHBOURS = 12
 STRETCH = (0.6, 1.5)
 """Bounds of the stretch that splats show."""
 RIGID = 1e-3

@@ -1,8 +1,8 @@
 """Fragments: which material points still hang together.
 
-Points are linked to their neighbours at rest. A link is cut when one of its ends is broken (for good)
-or while it is stretched beyond twice its length at rest; fragments are the connected components of
-what remains.
+Points are linked to their neighbours at rest. A link is cut when one of its ends is broken (for
+good) or while it is stretched beyond twice its length at rest; fragments are the connected
+components of what remains.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Fragments:
         return float(self.mass_fractions[0]) if self.count else 0.0
 
 
-def rest_links(rest: Tensor, ranges: tuple[tuple[int, int], ...], spacing: tuple[float, ...]) -> Tensor:
+def rest_links(
+    rest: Tensor, ranges: tuple[tuple[int, int], ...], spacing: tuple[float, ...]
+) -> Tensor:
     """Link points of the same body that are close at rest.
 
     Args:
@@ -112,7 +114,9 @@ def find_fragments(
     length = (rest[a] - rest[b]).norm(dim=1)
     stretched = (position[a] - position[b]).norm(dim=1) > STRETCH_LIMIT * length
     kept = links[(~(broken[a] | broken[b] | stretched)).cpu()].cpu().numpy()
-    graph = coo_matrix((np.ones(len(kept), dtype=bool), (kept[:, 0], kept[:, 1])), shape=(count, count))
+    graph = coo_matrix(
+        (np.ones(len(kept), dtype=bool), (kept[:, 0], kept[:, 1])), shape=(count, count)
+    )
     number, component = connected_components(graph, directed=False)
     component = component.astype(np.int64)
     sizes = np.bincount(component, minlength=number)

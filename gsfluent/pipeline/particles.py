@@ -240,7 +240,8 @@ def _parameters(body: Body, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             if solid is None or value.shape != solid.occupancy.shape:
                 wanted = [] if solid is None else list(solid.occupancy.shape)
                 raise InputError(
-                    f"material {material.name!r}: a field must have the shape of the voxels {wanted}, "
+                    f"material {material.name!r}: a field must have the shape of the voxels "
+                    f"{wanted}, "
                     f"got {list(value.shape)}",
                     mend="sample the field on Solid.occupancy's grid",
                 )

@@ -132,9 +132,7 @@ class _CrackGraph:
             # Dense fillings count their spacing over the nearest eight, as on a lattice.
             spacing = max(spacing, float(torch.from_numpy(distance[:, min(8, k - 1)]).median()) / 2)
             near[rows, : k - 1] = rows[torch.from_numpy(which[:, 1:]).to(torch.int64)]
-            usable[rows, : k - 1] = (
-                torch.from_numpy(distance[:, 1:]) <= neighbour_radius * spacing
-            )
+            usable[rows, : k - 1] = torch.from_numpy(distance[:, 1:]) <= neighbour_radius * spacing
         device = carry.gaussians.device
         self._near, self._usable = near.to(device), usable.to(device)
         self.carry, self.radius = carry, radius

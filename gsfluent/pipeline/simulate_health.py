@@ -135,9 +135,7 @@ class Ledger:
         start: Figures at time 0.
     """
 
-    def __init__(
-        self, matter: Matter, gravity: tuple[float, float, float], start: Figures
-    ) -> None:
+    def __init__(self, matter: Matter, gravity: tuple[float, float, float], start: Figures) -> None:
         self.mass = float(matter.particles.mass.to(torch.float64).sum())
         self.start = torch.tensor(start.momentum, dtype=torch.float64)
         self.gravity = torch.tensor(gravity, dtype=torch.float64)

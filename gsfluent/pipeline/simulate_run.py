@@ -172,7 +172,8 @@ class Run:
         plastic, guarded, inverted, _ = _four(c.return_map)
         verdict = "failed" if self.failure else "healed" if self.watch.rollbacks else "clean"
         reason = self.failure or "; ".join(self.watch.reasons)
-        per_frame = {key: [f[key] for f in self.per_frame] for key in self.per_frame[:1] and self.per_frame[0]}
+        keys = self.per_frame[0] if self.per_frame else {}
+        per_frame = {key: [frame[key] for frame in self.per_frame] for key in keys}
         return {
             "verdict": verdict,
             "reason": reason,

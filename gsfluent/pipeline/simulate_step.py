@@ -31,7 +31,7 @@ WEAKENING = 0.02
 """Range of alpha past zero over which a broken point loses its cohesion for good."""
 
 
-class Unhealthy(Exception):  # noqa: N818  (a condition that the stage heals, not an error)
+class Unhealthy(Exception):
     """The state cannot be advanced: a number is not finite, or a point left the grid."""
 
 
@@ -140,7 +140,9 @@ class Stepper:
             stress=particles.position.new_zeros(particles.count, 6),
             time=0.0,
             step=0,
-            landed=(False,) * len(self.flights) if self.free_flight else (True,) * len(self.flights),
+            landed=(False,) * len(self.flights)
+            if self.free_flight
+            else (True,) * len(self.flights),
             impulse=torch.zeros(3, dtype=torch.float64, device=particles.device),
         )
         return self._land(state)
@@ -223,9 +225,8 @@ class Stepper:
                     touched.update(k for k in (i, j) if not state.landed[k])
         if not touched:
             return state
-        position = self.whole(state).particles
         state = state._replace(
-            particles=position,
+            particles=self.whole(state).particles,
             landed=tuple(now or i in touched for i, now in enumerate(state.landed)),
         )
         self.reset()
@@ -333,7 +334,7 @@ class Stepper:
             raise Unhealthy(str(error)) from error
         self._blocks, self._travelled = blocks, 0.0
         self.counters.block_builds += 1
-        self.counters.blocks_max = max(self.counters.blocks_max, blocks.count)
+        self.counters.blocks_max = max(self.counters.blocks_max, blocks.block_count)
         self._contact = sum(state.landed) > 1 and self._bodies_meet(active)
         return blocks
 
@@ -369,7 +370,7 @@ def _boxes_meet(a: tuple[Tensor, ...], b: tuple[Tensor, ...], pad: float) -> boo
 
 
 def _cells_meet(a: Tensor, b: Tensor, edge: float) -> bool:
-    """Tell whether points of ``a`` and ``b`` lie in the same or in neighbouring cubes of ``edge``."""
+    """Tell whether points of both lie in the same or in neighbouring cubes of ``edge``."""
     cells_a, cells_b = (torch.unique(torch.floor(p / edge).to(torch.int64), dim=0) for p in (a, b))
     if cells_a.shape[0] > cells_b.shape[0]:
         cells_a, cells_b = cells_b, cells_a
