@@ -86,6 +86,11 @@ class SimulationFrame:
         """The splats of :attr:`repaired`."""
         return self.repaired.gaussians
 
+    @property
+    def groups(self) -> Tensor:
+        """Sibling groups of :attr:`gaussians` for the rasterizer, int32; -1 for none."""
+        return self.repaired.groups
+
     @functools.cached_property
     def carried(self) -> Gaussians:
         """The splats without repair: one for one those of the solids."""

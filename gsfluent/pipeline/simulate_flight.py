@@ -27,9 +27,10 @@ class Flight:
         particles: The body's points, moving as a rigid body.
         gravity: Acceleration [m/s^2], float64 [3].
         time: Time of the given state [s].
+        dx: Grid spacing [m]; an APIC point turns like a blob with second moment dx^2 / 4.
     """
 
-    def __init__(self, particles: Particles, gravity: Tensor, time: float) -> None:
+    def __init__(self, particles: Particles, gravity: Tensor, time: float, dx: float) -> None:
         position, velocity = (
             part.to("cpu", torch.float64) for part in (particles.position, particles.velocity)
         )
@@ -44,6 +45,7 @@ class Flight:
         squared = (self.arm**2).sum(dim=1, keepdim=True)
         eye = torch.eye(3, dtype=torch.float64)
         self.inertia = (mass * squared).sum() * eye - (mass * self.arm).T @ self.arm
+        self.inertia += 0.5 * dx * dx * total * eye
         gradient = particles.affine[0].to("cpu", torch.float64)
         spin = torch.stack([gradient[2, 1], gradient[0, 2], gradient[1, 0]])
         self.momentum = self.inertia @ spin

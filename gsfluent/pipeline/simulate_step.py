@@ -111,10 +111,10 @@ class Stepper:
         if scene.floor is not None:
             plane = [0.0, 2.0, scene.floor_friction, 0.0, 0.0, scene.floor, 0.0, 0.0, 1.0]
             self._colliders = torch.tensor([plane + [0.0] * 7], device=device)
-        self.flights = [
-            Flight(matter.particles.select(torch.arange(a, b, device=device)), self._gravity, 0.0)
-            for a, b in matter.ranges
-        ]
+        self.flights = []
+        for a, b in matter.ranges:
+            points = matter.particles.select(torch.arange(a, b, device=device))
+            self.flights.append(Flight(points, self._gravity, 0.0, matter.dx))
         self.reset()
 
     def reset(self) -> None:
