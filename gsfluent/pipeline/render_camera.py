@@ -1,0 +1,192 @@
+"""Cameras of a video: an orbit that keeps the action in frame, a photograph's own pose, or a path from a file."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import Camera, Capture, Frame
+from gsfluent.errors import InputError
+from gsfluent.pipeline.light import look_along
+
+_FIELD_OF_VIEW = 32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
+_ELEVATION = 20.0
+_START = -60.0
+_SWEEP = 70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
+_SMOOTH_FRAMES = 5.0
+
+
+@dataclass(frozen=True)
+class Action:
+    """Where the matter is over time, as far as a camera operator cares.
+
+    Attributes:
+        center: Robust centre of the matter per frame [m], shape [F, 3].
+        radius: Distance from the centre that holds nine tenths of it, per frame [m], shape [F].
+    """
+
+    center: Tensor
+    radius: Tensor
+
+    @classmethod
+    def of(cls, positions: Sequence[Tensor]) -> Action:
+        """Measure the action from positions [N, 3] of each frame."""
+        center = torch.stack([p.median(dim=0).values.double().cpu() for p in positions])
+        radius = [
+            torch.quantile(_thin((p.double().cpu() - c).norm(dim=-1)), 0.9)
+            for p, c in zip(positions, center, strict=True)
+        ]
+        return cls(center, torch.stack(radius))
+
+
+def _thin(values: Tensor) -> Tensor:
+    """Every n-th value: a quantile needs thousands, not millions (and torch.quantile refuses 2^24)."""
+    return values[:: max(1, values.numel() // 20_000)]
+
+
+def pinhole(
+    viewmat: Tensor, size: tuple[int, int], *, field_of_view: float = _FIELD_OF_VIEW, name: str = ""
+) -> Camera:
+    """A centred pinhole camera whose shorter side spans ``field_of_view`` degrees."""
+    width, height = size
+    focal = 0.5 * min(width, height) / math.tan(math.radians(field_of_view) / 2.0)
+    intrinsics = torch.tensor(
+        [[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
+    return Camera(viewmat=viewmat.double(), K=intrinsics, width=width, height=height, name=name)
+
+
+def look_at(
+    target: Tensor, distance: float, azimuth: float, elevation: float, size: tuple[int, int]
+) -> Camera:
+    """A camera on a sphere around ``target`` [3] that looks at it; angles in degrees, +z up."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    outward = torch.tensor(
+        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)], dtype=torch.float64
+    )
+    return pinhole(look_along(target.double() + distance * outward, -outward), size)
+
+
+def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
+    """One camera per frame, slowly circling; it follows the matter smoothly and never zooms.
+
+    The distance is the one that shows nine tenths of the matter at its widest, but the whole object at least and
+    three times the object at most: a burst of crumbs must not shrink the subject to a dot.
+    """
+    count = action.center.shape[0]
+    first = float(action.radius[0])
+    shown = min(max(float(action.radius.amax()), 1.35 * first), 3.0 * first)
+    half = math.radians(_FIELD_OF_VIEW) / 2.0
+    distance = 1.2 * shown / math.sin(half)
+    centers = _smooth(action.center)
+    steps = [i / max(1, count - 1) for i in range(count)]
+    return [
+        look_at(centers[i], distance, _START + _SWEEP * step, _ELEVATION, size)
+        for i, step in enumerate(steps)
+    ]
+
+
+def _smooth(track: Tensor) -> Tensor:
+    """Gaussian smoothing along time with the ends held, shape [F, 3]."""
+    count = track.shape[0]
+    frames = torch.arange(count, dtype=track.dtype)
+    weight = torch.exp(-0.5 * ((frames[:, None] - frames[None, :]) / _SMOOTH_FRAMES) ** 2)
+    return (weight @ track) / weight.sum(dim=1, keepdim=True)
+
+
+def into_scene(camera: Camera, frame: Frame, size: tuple[int, int] | None = None) -> Camera:
+    """A capture's camera in the scene frame: same picture, metres for units.
+
+    With ``x_scene = s R x_world + t`` and camera ``x_cam = W x_world + w``, scaling the camera's own coordinates by s
+    leaves every pixel in place: ``W' = W R^T``, ``w' = s w - W R^T t``.
+    """
+    rotation = frame.rotation.double().cpu()
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = camera.viewmat[:3, :3].double().cpu() @ rotation.T
+    shift = frame.translation.double().cpu()
+    viewmat[:3, 3] = float(frame.scale) * camera.viewmat[:3, 3].double().cpu() - viewmat[:3, :3] @ shift
+    intrinsics = camera.K.double().cpu().clone()
+    width, height = camera.width, camera.height
+    if size is not None:
+        # keep the whole photograph in view; the principal point stays where it was relative to the centre
+        factor = min(size[0] / width, size[1] / height)
+        offset = (intrinsics[:2, 2] - torch.tensor([width / 2.0, height / 2.0], dtype=torch.float64)) * factor
+        intrinsics[:2] *= factor
+        intrinsics[0, 2], intrinsics[1, 2] = size[0] / 2.0 + offset[0], size[1] / 2.0 + offset[1]
+        width, height = size
+    return Camera(viewmat=viewmat, K=intrinsics, width=width, height=height, name=camera.name)
+
+
+def cameras_for(
+    choice: str | int,
+    action: Action,
+    size: tuple[int, int],
+    *,
+    capture: Capture | None = None,
+    frame: Frame | None = None,
+) -> list[Camera]:
+    """One camera per frame for ``output.camera``.
+
+    Args:
+        choice: ``orbit``, the index of a photograph, or a JSON file (see :func:`read_path`).
+        action: Where the matter is; its length is the number of frames.
+        size: (width, height) [px].
+        capture: The photographs, needed for an index.
+        frame: World to scene, needed for an index.
+
+    Raises:
+        InputError: No such photograph, or an unreadable file.
+    """
+    count = action.center.shape[0]
+    if str(choice) == "orbit":
+        return orbit(action, size)
+    try:
+        index = int(str(choice))
+    except ValueError:
+        return read_path(Path(str(choice)), count, size)
+    if capture is None or frame is None:
+        raise InputError(
+            f"output.camera: {index}", "a photograph's index needs a `capture:`; use `orbit` or a file"
+        )
+    if not -len(capture.cameras) <= index < len(capture.cameras):
+        raise InputError(
+            f"output.camera: {index}", f"the capture has photographs 0 to {len(capture.cameras) - 1}"
+        )
+    return [into_scene(capture.cameras[index], frame, size)] * count
+
+
+def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
+    """Cameras from JSON: ``{"fov": degrees, "frames": [{"eye": [x,y,z], "target": [x,y,z]}, ...]}``.
+
+    Scene frame, metres. One entry is a still camera; otherwise eyes and targets are interpolated over the video.
+
+    Raises:
+        InputError: The file is missing, is not such JSON, or an eye sits on its target.
+    """
+    mend = 'give {"fov": 32, "frames": [{"eye": [x, y, z], "target": [x, y, z]}, ...]} in metres'
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        keys = torch.tensor([[*f["eye"], *f["target"]] for f in data["frames"]], dtype=torch.float64)
+        field = float(data.get("fov", _FIELD_OF_VIEW))
+    except OSError as error:
+        raise InputError(f"output.camera: {path}: {error.strerror}", "give orbit, an index, or a file") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"output.camera: {path}: {error!r}", mend) from error
+    if keys.ndim != 2 or keys.shape[1] != 6 or not keys.isfinite().all() or not 1.0 <= field <= 150.0:
+        raise InputError(f"output.camera: {path}: fov {field}, frames {tuple(keys.shape)}", mend)
+    if bool(((keys[:, :3] - keys[:, 3:]).norm(dim=-1) == 0).any()):
+        raise InputError(f"output.camera: {path}: an eye equals its target", mend)
+    time = torch.linspace(0, keys.shape[0] - 1, count, dtype=torch.float64)
+    low = time.floor().long().clamp(max=max(0, keys.shape[0] - 2))
+    high = (low + 1).clamp(max=keys.shape[0] - 1)
+    part = (time - low)[:, None]
+    path_keys = keys[low] * (1.0 - part) + keys[high] * part
+    return [
+        pinhole(look_along(k[:3], k[3:] - k[:3]), size, field_of_view=field) for k in path_keys
+    ]
