@@ -1,0 +1,18 @@
+// Every operator schema, in reading order. Kernels are registered in csrc/cpu/*.cpp and
+// csrc/cuda/*_ops.cpp.
+#include "torch_api.h"
+
+STABLE_TORCH_LIBRARY(gsfluent, m) {
+  // --- mpm: sparse grid, particle-grid transfers, grid momentum update ---
+
+  // --- plasticity: constitutive update on strain e = b - I ---
+
+  // --- deform: polar decomposition, clamped deformation ---
+
+  // --- mvee: minimum-volume enclosing ellipsoids ---
+
+  // --- raster: Gaussian splatting ---
+
+  // --- build information ---
+  m.def("compiled_for(Tensor like) -> str");
+}

@@ -1,0 +1,48 @@
+"""The exceptions a user of gsfluent meets; every text says what, where and how to mend it."""
+
+from __future__ import annotations
+
+
+class GsfluentError(Exception):
+    """Base class of gsfluent's own errors."""
+
+    exit_code = 1
+
+
+class InputError(GsfluentError, ValueError):
+    """Something that came in is wrong: a file, a key, a tensor's contents.
+
+    Args:
+        what: What is wrong, naming the argument, key or file and what came.
+        mend: What the user can do about it (one sentence).
+    """
+
+    exit_code = 2
+
+    def __init__(self, what: str, mend: str = "") -> None:
+        self.what = what
+        self.mend = mend
+        super().__init__(f"{what}\n  mend: {mend}" if mend else what)
+
+
+class RunError(GsfluentError, RuntimeError):
+    """A stage failed while running.
+
+    Args:
+        what: What failed and where.
+        kept: What was kept on disk.
+        mend: How to resume or what to change.
+    """
+
+    exit_code = 1
+
+    def __init__(self, what: str, kept: str = "", mend: str = "") -> None:
+        self.what = what
+        self.kept = kept
+        self.mend = mend
+        lines = [what]
+        if kept:
+            lines.append(f"  kept: {kept}")
+        if mend:
+            lines.append(f"  mend: {mend}")
+        super().__init__("\n".join(lines))

@@ -1,0 +1,36 @@
+"""Functional operators: tensors in, tensors out; a CPU and a CUDA kernel and a reference for each.
+
+Every operator is registered with the PyTorch dispatcher as ``torch.ops.gsfluent.<name>``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from gsfluent import _load  # noqa: F401  (loads the compiled libraries)
+
+_PUBLIC: dict[str, str] = {
+    "Blocks": "gsfluent.ops.mpm",
+    "build_blocks": "gsfluent.ops.mpm",
+    "p2g": "gsfluent.ops.mpm",
+    "grid_update": "gsfluent.ops.mpm",
+    "g2p": "gsfluent.ops.mpm",
+    "return_mapping": "gsfluent.ops.plasticity",
+    "elastic_energy": "gsfluent.ops.plasticity",
+    "polar_clamped": "gsfluent.ops.deform",
+    "mvee": "gsfluent.ops.mvee",
+    "mvee_lens": "gsfluent.ops.mvee",
+    "Rendered": "gsfluent.ops.raster",
+    "rasterize": "gsfluent.ops.raster",
+}
+
+__all__ = list(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'gsfluent.ops' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value

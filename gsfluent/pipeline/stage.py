@@ -1,0 +1,33 @@
+"""What all stages share: an ``nn.Module`` with a name, a seed and an optional progress callback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import nn
+
+Progress = Callable[[int, int, str], None]
+"""``progress(done, total, note)``: called by a stage as it goes; ``None`` means nobody listens."""
+
+
+class Stage(nn.Module):
+    """Base class of the pipeline's stages.
+
+    A stage is constructed complete (all settings in ``__init__``), holds no scene data, and is
+    called with containers.
+
+    Args:
+        seed: Seed of everything random inside the stage.
+    """
+
+    name: str = "stage"
+
+    def __init__(self, *, seed: int = 0) -> None:
+        super().__init__()
+        self.seed = int(seed)
+
+
+def report_progress(progress: Progress | None, done: int, total: int, note: str = "") -> None:
+    """Call ``progress`` when there is one."""
+    if progress is not None:
+        progress(done, total, note)
