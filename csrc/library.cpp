@@ -8,6 +8,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- plasticity: constitutive update on strain e = b - I ---
 
   // --- deform: polar decomposition, clamped deformation ---
+  m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");
 
   // --- mvee: minimum-volume enclosing ellipsoids ---
 

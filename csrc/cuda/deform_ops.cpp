@@ -1,0 +1,22 @@
+// CUDA registration of the deformation ops.
+#include "cuda/launch_material.h"
+#include "cuda/stream.h"
+#include "host/deform.h"
+
+namespace gsf {
+namespace {
+
+struct DeformCuda {
+  template <typename T>
+  static void polar(const PolarArgs<T>& args, const Tensor& like) {
+    const CudaScope scope(like);
+    STD_CUDA_CHECK(cuda::polar(args, scope.stream()));
+  }
+};
+
+}  // namespace
+}  // namespace gsf
+
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
+  m.impl("polar_clamped", TORCH_BOX(&gsf::DeformOps<gsf::DeformCuda>::polar_clamped));
+}

@@ -1,0 +1,13 @@
+// Launchers of the material kernels: what *_ops.cpp may call. Torch-free.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "core/material_args.h"
+
+namespace gsf::cuda {
+
+template <typename T>
+cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream);
+
+}  // namespace gsf::cuda
