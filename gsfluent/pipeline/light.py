@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsfluent import ops
+from gsfluent import geometry, ops
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 
@@ -120,7 +120,8 @@ class ShadowMap:
         margin = 3.0 * float(gaussians.scales.amax(-1).mean())
         radius = float((means - center).norm(dim=-1).amax()) + margin + 1e-9
         distance = _LIGHT_DISTANCE * radius
-        viewmat = look_along(center + light.toward(means) * distance, -light.toward(means))
+        eye = center + light.toward(means) * distance
+        viewmat = geometry.look_at(eye, center, means.new_tensor([0.0, 0.0, 1.0])).to(means)
         focal = 0.5 * resolution * _LIGHT_DISTANCE / 1.02
         intrinsics = torch.tensor(
             [[focal, 0.0, resolution / 2], [0.0, focal, resolution / 2], [0.0, 0.0, 1.0]],
@@ -188,21 +189,6 @@ class ShadowMap:
         return 1.0 - sampled.flatten().clamp(0.0, 1.0)
 
 
-def look_along(eye: Tensor, forward: Tensor) -> Tensor:
-    """World-to-camera matrix [4, 4] (OpenCV axes) of a camera at ``eye`` [3] that looks along ``forward`` [3]."""
-    forward = forward / forward.norm()
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=eye.dtype, device=eye.device)
-    if abs(float(forward[2])) > 0.999:  # straight up or down: any horizontal axis will do
-        up = torch.tensor([0.0, 1.0, 0.0], dtype=eye.dtype, device=eye.device)
-    right = torch.linalg.cross(forward, up)
-    right = right / right.norm()
-    down = torch.linalg.cross(forward, right)
-    viewmat = torch.eye(4, dtype=eye.dtype, device=eye.device)
-    viewmat[:3, :3] = torch.stack([right, down, forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return viewmat
-
-
 def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
     """Blur an image [H, W] with a separable Gaussian of ``sigma`` pixels (zero outside the image)."""
     if sigma <= 0.0:
@@ -211,6 +197,7 @@ def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
     x = torch.arange(-reach, reach + 1, dtype=image.dtype, device=image.device)
     kernel = torch.exp(-0.5 * (x / sigma) ** 2)
     kernel = kernel / kernel.sum()
-    blurred = torch.nn.functional.conv2d(image[None, None], kernel[None, None, None, :], padding=(0, reach))
-    blurred = torch.nn.functional.conv2d(blurred, kernel[None, None, :, None], padding=(reach, 0))
+    conv2d = torch.nn.functional.conv2d
+    blurred = conv2d(image[None, None], kernel[None, None, None, :], padding=(0, reach))
+    blurred = conv2d(blurred, kernel[None, None, :, None], padding=(reach, 0))
     return blurred[0, 0]

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Capture, Frame
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import look_along
 
 _FIELD_OF_VIEW = 32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
 _ELEVATION = 20.0
@@ -50,18 +49,6 @@ def _thin(values: Tensor) -> Tensor:
     return values[:: max(1, values.numel() // 20_000)]
 
 
-def pinhole(
-    viewmat: Tensor, size: tuple[int, int], *, field_of_view: float = _FIELD_OF_VIEW, name: str = ""
-) -> Camera:
-    """A centred pinhole camera whose shorter side spans ``field_of_view`` degrees."""
-    width, height = size
-    focal = 0.5 * min(width, height) / math.tan(math.radians(field_of_view) / 2.0)
-    intrinsics = torch.tensor(
-        [[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )
-    return Camera(viewmat=viewmat.double(), K=intrinsics, width=width, height=height, name=name)
-
-
 def look_at(
     target: Tensor, distance: float, azimuth: float, elevation: float, size: tuple[int, int]
 ) -> Camera:
@@ -70,7 +57,15 @@ def look_at(
     outward = torch.tensor(
         [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)], dtype=torch.float64
     )
-    return pinhole(look_along(target.double() + distance * outward, -outward), size)
+    eye = target.double() + distance * outward
+    return Camera.look_at(eye, target, width=size[0], height=size[1], fov=_vertical_fov(size))
+
+
+def _vertical_fov(size: tuple[int, int]) -> float:
+    """Vertical angle [degrees] at which the shorter side spans the field of view."""
+    width, height = size
+    half = math.tan(math.radians(_FIELD_OF_VIEW) / 2.0)
+    return math.degrees(2.0 * math.atan(half * height / min(width, height)))
 
 
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
@@ -100,27 +95,15 @@ def _smooth(track: Tensor) -> Tensor:
     return (weight @ track) / weight.sum(dim=1, keepdim=True)
 
 
-def into_scene(camera: Camera, frame: Frame, size: tuple[int, int] | None = None) -> Camera:
-    """A capture's camera in the scene frame: same picture, metres for units.
-
-    With ``x_scene = s R x_world + t`` and camera ``x_cam = W x_world + w``, scaling the camera's own coordinates by s
-    leaves every pixel in place: ``W' = W R^T``, ``w' = s w - W R^T t``.
-    """
-    rotation = frame.rotation.double().cpu()
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = camera.viewmat[:3, :3].double().cpu() @ rotation.T
-    shift = frame.translation.double().cpu()
-    viewmat[:3, 3] = float(frame.scale) * camera.viewmat[:3, 3].double().cpu() - viewmat[:3, :3] @ shift
-    intrinsics = camera.K.double().cpu().clone()
-    width, height = camera.width, camera.height
-    if size is not None:
-        # keep the whole photograph in view; the principal point stays where it was relative to the centre
-        factor = min(size[0] / width, size[1] / height)
-        offset = (intrinsics[:2, 2] - torch.tensor([width / 2.0, height / 2.0], dtype=torch.float64)) * factor
-        intrinsics[:2] *= factor
-        intrinsics[0, 2], intrinsics[1, 2] = size[0] / 2.0 + offset[0], size[1] / 2.0 + offset[1]
-        width, height = size
-    return Camera(viewmat=viewmat, K=intrinsics, width=width, height=height, name=camera.name)
+def framed(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The whole view of ``camera``, centred in a picture of another size and aspect."""
+    width, height = size
+    factor = min(width / camera.width, height / camera.height)
+    intrinsics = camera.K.clone()
+    intrinsics[:2] *= factor
+    intrinsics[0, 2] += (width - factor * camera.width) / 2.0
+    intrinsics[1, 2] += (height - factor * camera.height) / 2.0
+    return camera.replace(K=intrinsics, width=width, height=height)
 
 
 def cameras_for(
@@ -158,11 +141,12 @@ def cameras_for(
         raise InputError(
             f"output.camera: {index}", f"the capture has photographs 0 to {len(capture.cameras) - 1}"
         )
-    return [into_scene(capture.cameras[index], frame, size)] * count
+    photograph = capture.view(index).camera  # undistorted
+    return [framed(photograph.transformed(frame), size)] * count
 
 
 def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
-    """Cameras from JSON: ``{"fov": degrees, "frames": [{"eye": [x,y,z], "target": [x,y,z]}, ...]}``.
+    """Cameras from JSON: ``{"fov": vertical degrees, "frames": [{"eye": [x,y,z], "target": [x,y,z]}, ...]}``.
 
     Scene frame, metres. One entry is a still camera; otherwise eyes and targets are interpolated over the video.
 
@@ -188,5 +172,5 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
     part = (time - low)[:, None]
     path_keys = keys[low] * (1.0 - part) + keys[high] * part
     return [
-        pinhole(look_along(k[:3], k[3:] - k[:3]), size, field_of_view=field) for k in path_keys
+        Camera.look_at(k[:3], k[3:], width=size[0], height=size[1], fov=field) for k in path_keys
     ]
