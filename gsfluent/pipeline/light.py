@@ -24,6 +24,8 @@ from gsfluent.errors import InputError
 # Distance of the light's camera in scene radii; at 40 the rays differ by 1.4 degrees from parallel.
 _LIGHT_DISTANCE = 40.0
 _DISPLAY_GAMMA = 2.2
+# Free border of the map, as a share of the scene's radius: the blurred shadow must fade out before the map ends.
+_BORDER = 1.3
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class ShadowMap:
         distance = _LIGHT_DISTANCE * radius
         eye = center + light.toward(means) * distance
         viewmat = geometry.look_at(eye, center, means.new_tensor([0.0, 0.0, 1.0])).to(means)
-        focal = 0.5 * resolution * _LIGHT_DISTANCE / 1.02
+        focal = 0.5 * resolution * _LIGHT_DISTANCE / _BORDER
         intrinsics = torch.tensor(
             [[focal, 0.0, resolution / 2], [0.0, focal, resolution / 2], [0.0, 0.0, 1.0]],
             dtype=means.dtype,
@@ -140,7 +142,7 @@ class ShadowMap:
             colors=torch.zeros_like(means[:, :1]),
             near=0.1 * radius,
         )
-        return cls(viewmat, focal, seen.depth, seen.alpha, 2.04 * radius / resolution)
+        return cls(viewmat, focal, seen.depth, seen.alpha, 2.0 * _BORDER * radius / resolution)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Texel coordinates [P, 2] (texel centres at +0.5) and depth [P] of scene points [P, 3]."""
@@ -159,17 +161,17 @@ class ShadowMap:
             Values in [0, 1], shape [P]; 1 outside the map.
         """
         texel, depth = self.project(points)
-        base = texel.floor().long()
         size = self.alpha.shape[0]
+        inside = ((texel >= 1.0) & (texel < size - 1.0)).all(dim=-1)
+        base = texel.long().clamp(1, size - 2)
+        first = base[:, 1] * size + base[:, 0]
+        flat_depth, flat_alpha = self.depth.flatten(), self.alpha.flatten()
+        limit = depth - bias
         blocked = torch.zeros_like(depth)
-        for dx in (-1, 0, 1):
-            for dy in (-1, 0, 1):
-                x, y = base[:, 0] + dx, base[:, 1] + dy
-                inside = (x >= 0) & (y >= 0) & (x < size) & (y < size)
-                index = y.clamp(0, size - 1) * size + x.clamp(0, size - 1)
-                nearer = self.depth.flatten()[index] < depth - bias
-                blocked += self.alpha.flatten()[index] * (inside & nearer)
-        return 1.0 - blocked / 9.0
+        for step in (-1 - size, -size, 1 - size, -1, 0, 1, size - 1, size, size + 1):
+            index = first + step
+            blocked += torch.where(flat_depth[index] < limit, flat_alpha[index], 0.0)
+        return torch.where(inside, 1.0 - blocked / 9.0, 1.0)
 
     def cast(self, points: Tensor, *, softness: float) -> Tensor:
         """Share of the light that reaches a receiver behind everything, such as the floor.

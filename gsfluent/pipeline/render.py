@@ -51,6 +51,8 @@ class Render(Stage):
         studio: Floor and backdrop; None composites over ``background``.
         background: Display colour behind the splats when there is no studio.
         antialiased: Antialiased splatting (opacity compensation for the pixel filter).
+        normal_cell: Grid spacing [m] of the normal estimate; found anew for each picture when None (a video fixes it
+            with :func:`gsfluent.pipeline.render_normals.occupancy_cell` of its first frame).
         seed: Unused; rendering has no randomness.
     """
 
@@ -64,6 +66,7 @@ class Render(Stage):
         studio: Studio | None = None,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         antialiased: bool = False,
+        normal_cell: float | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -72,6 +75,7 @@ class Render(Stage):
         self.studio = studio
         self.background = background
         self.antialiased = antialiased
+        self.normal_cell = normal_cell
 
     def forward(
         self, gaussians: Gaussians, camera: Camera | None = None, *, groups: Tensor | None = None
@@ -111,7 +115,7 @@ class Render(Stage):
             scales=gaussians.scales,
             sh=gaussians.sh,
             antialiased=self.antialiased,
-            normals=estimate_normals(gaussians) if self.light is not None else None,
+            normals=self._normals(gaussians),
             groups=groups,
         )
         alpha = seen.alpha[..., None]
@@ -145,6 +149,11 @@ class Render(Stage):
                 "render with the undistorted pinhole camera that Capture.image() returns",
             )
         return camera
+
+    def _normals(self, gaussians: Gaussians) -> Tensor | None:
+        if self.light is None:
+            return None
+        return estimate_normals(gaussians, cell=self.normal_cell)
 
     def _lit(
         self,

@@ -86,12 +86,14 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
     """
     means = gaussians.means
     outward = density_normals(means, occupancy_cell(means) if cell is None else cell)
-    axes = geometry.quaternion_to_matrix(gaussians.quats)
-    order = gaussians.scales.sort(dim=-1)
-    flat = order.values[:, 0] < _FLAT * order.values[:, 1]
-    shortest = torch.gather(axes, 2, order.indices[:, :1, None].expand(-1, 3, 1)).squeeze(-1)
-    agreement = (shortest * outward).sum(-1)
-    shortest = torch.where(agreement[:, None] < 0, -shortest, shortest)
+    scales = gaussians.scales
+    shortest_scale, index = scales.min(dim=-1)
+    middle_scale = scales.sum(-1) - shortest_scale - scales.amax(-1)
+    flat = (shortest_scale < _FLAT * middle_scale).nonzero()[:, 0]
+    axes = geometry.quaternion_to_matrix(gaussians.quats[flat])
+    shortest = torch.gather(axes, 2, index[flat, None, None].expand(-1, 3, 1)).squeeze(-1)
+    agreement = (shortest * outward[flat]).sum(-1)
     # an axis across the density gradient is a splat standing on edge (hair, seams): trust the density
-    trusted = flat & (agreement.abs() > 0.5)
-    return torch.where(trusted[:, None], shortest, outward)
+    trusted = agreement.abs() > 0.5
+    turned = shortest[trusted] * agreement[trusted].sign()[:, None]
+    return outward.index_copy(0, flat[trusted], turned)

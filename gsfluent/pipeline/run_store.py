@@ -23,6 +23,7 @@ from typing import Any
 import torch
 
 import gsfluent
+from gsfluent.errors import RunError
 from gsfluent.io import write_json
 
 _CHUNK = 1 << 20
@@ -141,7 +142,7 @@ class StageStore:
             # before still says "incomplete", which is all a later run needs
             try:
                 write_json(marker, _marker(result, complete=complete))
-            except OSError:
+            except (OSError, RunError):
                 if complete:
                     raise
         return result

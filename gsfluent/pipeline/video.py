@@ -1,13 +1,11 @@
-"""Images and video on disk, each written whole or not at all.
+"""Video on disk, written whole or not at all.
 
 H.264 through imageio-ffmpeg (a wheel that carries its own ffmpeg), because a browser plays H.264 with yuv420p and
-little else; PNG through Pillow. Both write beside the target and rename, so a full disk or Ctrl-C leaves no torso.
+little else.
 """
 
 from __future__ import annotations
 
-import errno
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, RunError
+from gsfluent.io import atomic_path
 
 # Constant rate factor of x264: 18 is the usual "visually lossless" setting, and splat noise punishes higher ones.
 _CRF = 18
@@ -27,26 +26,9 @@ def to_bytes(image: Tensor) -> np.ndarray:
     return np.ascontiguousarray(scaled.to(device="cpu", dtype=torch.uint8).numpy())
 
 
-def write_png(path: Path, image: Tensor | np.ndarray) -> Path:
-    """Write an image [H, W, 3] (float in [0, 1], or uint8) as PNG, atomically.
-
-    Raises:
-        OSError: The file cannot be written (no space, no permission); nothing is left behind.
-    """
-    from PIL import Image
-
-    pixels = to_bytes(image) if isinstance(image, Tensor) else image
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as stream:
-            Image.fromarray(pixels).save(stream, format="PNG")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-    return path
-
-
-def write_video(path: Path, frames: Iterable[np.ndarray], *, fps: float, size: tuple[int, int]) -> int:
+def write_video(
+    path: Path, frames: Iterable[np.ndarray], *, fps: float, size: tuple[int, int]
+) -> int:
     """Encode uint8 frames [H, W, 3] as H.264 (yuv420p, faststart), atomically.
 
     Args:
@@ -59,8 +41,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], *, fps: float, size: t
         The number of frames written.
 
     Raises:
-        InputError: An odd size, or a frame of another size.
-        OSError: The encoder could not write (disk full, no permission); nothing is left behind.
+        InputError: An odd size, no frame, or a frame of another size.
+        RunError: The encoder could not write (disk full, no permission); nothing is left behind.
     """
     import imageio_ffmpeg
 
@@ -69,41 +51,43 @@ def write_video(path: Path, frames: Iterable[np.ndarray], *, fps: float, size: t
         raise InputError(
             f"size: {width} x {height}", "give even numbers; H.264 with yuv420p has no odd ones"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".part.{path.name}")
-    writer = imageio_ffmpeg.write_frames(
-        str(part),
-        (width, height),
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        macro_block_size=1,
-        output_params=["-crf", str(_CRF), "-preset", "medium", "-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    )
     count = 0
-    try:
-        writer.send(None)
-        for frame in frames:
-            if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
-                raise InputError(
-                    f"video frame {count}: {frame.dtype} {frame.shape}",
-                    f"give uint8 ({height}, {width}, 3)",
-                )
-            writer.send(frame)
-            count += 1
-        writer.close()
+    with atomic_path(path) as part:
+        writer = imageio_ffmpeg.write_frames(
+            str(part),
+            (width, height),
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=1,
+            output_params=["-crf", str(_CRF), "-preset", "medium", "-movflags", "+faststart"],
+            ffmpeg_log_level="error",
+        )
+        try:
+            writer.send(None)
+            for frame in frames:
+                if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
+                    raise InputError(
+                        f"video frame {count}: {frame.dtype} {frame.shape}",
+                        f"give uint8 ({height}, {width}, 3)",
+                    )
+                writer.send(frame)
+                count += 1
+        except OSError as error:
+            raise _encoder_stopped(path) from error
+        finally:
+            writer.close()
         if count == 0:
             raise InputError("video: no frame at all", "give at least one image")
         # ffmpeg can end without an exception and without a file when the disk is full
         if not part.is_file() or part.stat().st_size == 0:
-            raise OSError(errno.ENOSPC, "the encoder wrote nothing; is the disk full?", str(path))
-        os.replace(part, path)
-    except OSError as error:
-        if error.errno in (errno.EPIPE, None):
-            raise OSError(errno.ENOSPC, f"the encoder stopped ({error}); is the disk full?", str(path)) from error
-        raise
-    finally:
-        writer.close()
-        part.unlink(missing_ok=True)
+            raise _encoder_stopped(path)
     return count
+
+
+def _encoder_stopped(path: Path) -> RunError:
+    return RunError(
+        f"{path}: the video encoder stopped; is the disk full?",
+        "the simulated frames",
+        "free some space and run the same command again",
+    )
