@@ -1,8 +1,9 @@
 """Rotations, covariances, spherical harmonics and cameras as plain tensor functions.
 
-Conventions (those of every 3DGS program): quaternions are ``wxyz``; covariances are packed ``xx, yy, zz, xy, xz, yz``;
-real spherical harmonics carry the Condon-Shortley sign, so degree 1 reads ``-y, z, -x`` times 0.4886; cameras look
-along +z with +y down (OpenCV). All functions accept leading batch dimensions and are differentiable.
+Conventions (those of every 3DGS program): quaternions are ``wxyz``; covariances are packed ``xx,
+yy, zz, xy, xz, yz``; real spherical harmonics carry the Condon-Shortley sign, so degree 1 reads
+``-y, z, -x`` times 0.4886; cameras look along +z with +y down (OpenCV). All functions accept
+leading batch dimensions and are differentiable.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ def quaternion_to_matrix(quats: Tensor) -> Tensor:
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     """Quaternions [..., 4] (``wxyz``, w >= 0) of rotation matrices [..., 3, 3].
 
-    The four squared components follow from the diagonal; dividing by the largest of them keeps every case well
-    conditioned (Shepperd 1978).
+    The four squared components follow from the diagonal; dividing by the largest of them keeps
+    every case well conditioned (Shepperd 1978).
     """
     m = matrix
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -95,7 +96,7 @@ def unpack_symmetric(packed: Tensor) -> Tensor:
 
 
 def covariance(quats: Tensor, scales: Tensor) -> Tensor:
-    """Packed covariances [..., 6] = R diag(scales^2) R^T of quaternions [..., 4] and standard deviations [..., 3]."""
+    """Packed covariances R diag(scales^2) R^T [..., 6] of quaternions and standard deviations."""
     root = quaternion_to_matrix(quats) * scales[..., None, :]
     return pack_symmetric(root @ root.mT)
 
@@ -103,7 +104,8 @@ def covariance(quats: Tensor, scales: Tensor) -> Tensor:
 def covariance_to_quats_scales(packed: Tensor) -> tuple[Tensor, Tensor]:
     """Quaternions [..., 4] and standard deviations [..., 3] of packed covariances [..., 6].
 
-    Eigenvalues are floored at 1e-12 of the largest, so a flattened covariance gives a thin splat and not NaN.
+    Eigenvalues are floored at 1e-12 of the largest, so a flattened covariance gives a thin splat
+    and not NaN.
     """
     values, vectors = torch.linalg.eigh(unpack_symmetric(packed))
     largest = values[..., -1:].clamp_min(torch.finfo(packed.dtype).tiny)
@@ -130,9 +132,10 @@ def sh_degree(coefficients: int) -> int:
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit directions [..., 3] up to ``degree``: [..., (degree + 1)^2].
 
-    Ordered by degree l, then m = -l..l, with the Condon-Shortley sign. ``P_l^m`` (without its (1-z^2)^(m/2) factor) comes
-    from the three-term recurrence ``(l-m) P_l^m = (2l-1) z P_{l-1}^m - (l+m-1) P_{l-2}^m``; the factor is carried by
-    ``(x + i y)^m``, so the result is a polynomial with no special case at the poles.
+    Ordered by degree l, then m = -l..l, with the Condon-Shortley sign. ``P_l^m`` (without its
+    (1-z^2)^(m/2) factor) comes from the three-term recurrence ``(l-m) P_l^m = (2l-1) z P_{l-1}^m -
+    (l+m-1) P_{l-2}^m``; the factor is carried by ``(x + i y)^m``, so the result is a polynomial
+    with no special case at the poles.
     """
     x, y, z = directions.unbind(-1)
     columns: dict[tuple[int, int], Tensor] = {}
@@ -186,7 +189,7 @@ def sh0_to_rgb(sh0: Tensor) -> Tensor:
 
 @functools.cache
 def _sh_samples(degree: int) -> tuple[Tensor, Tensor]:
-    """Well spread directions [M, 3] and the least-squares inverse [2 degree + 1, M] of the degree's basis on them."""
+    """Well spread directions [M, 3] and the inverse [2 degree + 1, M] of the basis on them."""
     count = 4 * (2 * degree + 1)
     index = torch.arange(count, dtype=torch.float64) + 0.5
     height = 1 - 2 * index / count
@@ -200,8 +203,9 @@ def _sh_samples(degree: int) -> tuple[Tensor, Tensor]:
 def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     """Rotate spherical-harmonic colours with the object.
 
-    The rotated function is ``f'(R d) = f(d)``. Each degree is closed under rotation, so its coefficients transform by a
-    (2l+1) x (2l+1) matrix, found exactly (to round-off) by sampling the basis at more than 2l+1 fixed directions.
+    The rotated function is ``f'(R d) = f(d)``. Each degree is closed under rotation, so its
+    coefficients transform by a (2l+1) x (2l+1) matrix, found exactly (to round-off) by sampling the
+    basis at more than 2l+1 fixed directions.
 
     Args:
         sh: Coefficients [N, K, 3], K = (degree + 1)^2.
@@ -222,7 +226,7 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """World-to-camera matrix [4, 4] (OpenCV axes) of a camera at ``eye`` looking at ``target``, all [3].
+    """World-to-camera matrix [4, 4] (OpenCV axes) of a camera at ``eye`` facing ``target``, [3].
 
     Raises:
         ValueError: Eye and target coincide.
@@ -248,7 +252,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def rotation_between(source: Tensor, target: Tensor) -> Tensor:
-    """Smallest rotation [3, 3] (float64) that carries direction ``source`` [3] onto ``target`` [3]."""
+    """Smallest rotation [3, 3] (float64) that carries direction ``source`` onto ``target``."""
     a, b = (functional.normalize(part.to(torch.float64), dim=0) for part in (source, target))
     if float(a @ b) < -1 + 1e-12:  # opposite: half a turn about any perpendicular axis
         axis = functional.normalize(

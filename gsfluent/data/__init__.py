@@ -1,4 +1,4 @@
-"""Containers: what flows between the stages. They hold tensors and check shapes; they compute nothing."""
+"""Containers: what flows between the stages. They hold tensors and check their shapes."""
 
 from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture, View

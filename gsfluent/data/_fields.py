@@ -1,14 +1,14 @@
 """Declared shapes for tensor containers, checked once on construction.
 
 A container is a frozen dataclass whose tensor fields are annotated
-``Annotated[Tensor, Shape("N", 3, unit="m")]``. Letters name sizes that must agree between the fields of one
-container, so a row of one field and the same row of another are always the same particle or splat.
+``Annotated[Tensor, Shape("N", 3, unit="m")]``. Letters name sizes that must agree between the
+fields of one container, so a row of one field and the same row of another are always the same
+particle or splat.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -47,9 +47,13 @@ def shape(*sizes: int | str, kind: str = "float", unit: str = "") -> Shape:
     return Shape(sizes, kind, unit)
 
 
-@functools.cache
+_FIELDS: dict[type, dict[str, tuple[Shape, bool]]] = {}
+
+
 def tensor_fields(cls: type) -> dict[str, tuple[Shape, bool]]:
     """Return name -> (shape, may be None) for the annotated tensor fields of a container class."""
+    if cls in _FIELDS:
+        return _FIELDS[cls]
     found: dict[str, tuple[Shape, bool]] = {}
     for name, hint in get_type_hints(cls, include_extras=True).items():
         optional = False
@@ -61,6 +65,7 @@ def tensor_fields(cls: type) -> dict[str, tuple[Shape, bool]]:
                 for extra in get_args(part)[1:]:
                     if isinstance(extra, Shape):
                         found[name] = (extra, optional)
+    _FIELDS[cls] = found
     return found
 
 
@@ -85,18 +90,18 @@ class TensorContainer:
                     f"{owner}: {name} must be a torch.Tensor, got {type(value).__name__}"
                 )
             if value.dtype not in _KINDS[wanted.kind]:
+                got = str(value.dtype).removeprefix("torch.")
                 names = " or ".join(
                     str(kind).removeprefix("torch.") for kind in _KINDS[wanted.kind]
                 )
-                raise TypeError(
-                    f"{owner}: {name} must be {names}, got {str(value.dtype).removeprefix('torch.')}"
-                )
+                raise TypeError(f"{owner}: {name} must be {names}, got {got}")
             _check_sizes(owner, name, value, wanted, sizes)
             if device is None:
                 device = (value.device, name)
             elif value.device != device[0]:
                 raise ValueError(
-                    f"{owner}: {name} must be on {device[0]} like {device[1]}, got {value.device}; move it with .to(device)"
+                    f"{owner}: {name} must be on {device[0]} like {device[1]}, got {value.device}; "
+                    "move it with .to(device)"
                 )
             if wanted.kind == "float":
                 if dtype is None:
@@ -118,7 +123,7 @@ class TensorContainer:
     def to(
         self: _Self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> _Self:
-        """Return a copy on ``device``; ``dtype`` (float32 or float64) applies to the float fields only."""
+        """Return a copy on ``device``; ``dtype`` applies to the float fields only."""
 
         def move(value: Tensor) -> Tensor:
             return value.to(device=device, dtype=dtype if value.is_floating_point() else None)

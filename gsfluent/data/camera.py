@@ -51,7 +51,7 @@ class Camera:
                 )
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(
-                    f"Camera: {label} of {self.name or 'camera'} must be finite, got NaN or infinity"
+                    f"Camera: {label} of {self.name!r} must be finite, got NaN or infinity"
                 )
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera: size must be positive, got {self.width} x {self.height}")
@@ -75,7 +75,7 @@ class Camera:
         up: Sequence[float] | Tensor = (0.0, 0.0, 1.0),
         name: str = "",
     ) -> Camera:
-        """Make a pinhole camera at ``eye`` [3] facing ``target`` [3]; ``fov`` is vertical, in degrees."""
+        """Make a pinhole camera at ``eye`` facing ``target``; ``fov`` is vertical [degrees]."""
         points = [torch.as_tensor(part, dtype=torch.float64) for part in (eye, target, up)]
         focal = 0.5 * height / math.tan(math.radians(fov) / 2)
         intrinsics = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
@@ -100,10 +100,10 @@ class Camera:
         return -self.viewmat[1, :3]
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project world points [N, 3] to pixels [N, 2] and camera depth [N], lens distortion included.
+        """Project world points [N, 3] to pixels [N, 2] and depths [N], lens distortion included.
 
-        Points behind the camera get a negative depth; their pixels mean nothing. Radial and tangential model:
-        OpenCV, "Camera Calibration and 3D Reconstruction".
+        Points behind the camera get a negative depth; their pixels mean nothing. Radial and
+        tangential model: OpenCV, "Camera Calibration and 3D Reconstruction".
         """
         local = points.to(self.viewmat) @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         depth = local[:, 2]
@@ -124,7 +124,7 @@ class Camera:
         return pixels[:, :2], depth
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the camera of the same view at another image size (each axis scaled on its own)."""
+        """Return the camera of the same view at another image size; each axis scales on its own."""
         stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
         return self.replace(K=self.K * stretch[:, None], width=int(width), height=int(height))
 
@@ -133,7 +133,7 @@ class Camera:
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
     def transformed(self, frame: Frame) -> Camera:
-        """Return the same view of the world moved by ``frame``; depths are multiplied by ``frame.scale``."""
+        """Return the same view of the world moved by ``frame``; depths grow by ``frame.scale``."""
         viewmat = self.viewmat.clone()
         rotation = self.viewmat[:3, :3] @ frame.rotation.T.to(self.viewmat)
         viewmat[:3, :3] = rotation

@@ -18,8 +18,10 @@ class View(NamedTuple):
 
     Attributes:
         image: sRGB values as photographed, float32 [H, W, 3] in 0..1.
-        mask: Share of each pixel that shows the object, float32 [H, W] in 0..1; None when the capture has no masks.
-        valid: Pixels that the photograph covers after undistortion, bool [H, W]; None when all of them.
+        mask: Share of each pixel that shows the object, float32 [H, W] in 0..1; None when the
+            capture has no masks.
+        valid: Pixels that the photograph covers after undistortion, bool [H, W]; None when all of
+            them.
         camera: Pinhole camera of this image at this size.
     """
 
@@ -65,11 +67,11 @@ class Capture:
 
     @property
     def has_masks(self) -> bool:
-        """Whether any photograph comes with a separate mask file (an alpha channel shows only on reading)."""
+        """Whether any photograph has a mask file (an alpha channel shows only on reading)."""
         return any(camera.mask_path is not None for camera in self.cameras)
 
     def split(self, every: int = 8) -> tuple[Capture, Capture | None]:
-        """Hold out every ``every``-th photograph: (train, held out); None when there are too few to hold out any.
+        """Hold out every ``every``-th photograph: (train, held out or None when there are too few).
 
         Raises:
             ValueError: ``every`` is below 2.
@@ -93,7 +95,7 @@ class Capture:
     def image(
         self, index: int, max_size: int | None = None
     ) -> tuple[Tensor, Tensor | None, Camera]:
-        """Read photograph ``index`` as (image [H, W, 3], mask [H, W] or None, pinhole camera); see :meth:`view`."""
+        """Read a photograph: (image [H, W, 3], mask [H, W] or None, camera); see :meth:`view`."""
         view = self.view(index, max_size)
         return view.image, view.mask, view.camera
 

@@ -20,7 +20,8 @@ class Frame:
         scale: Target units per source unit, positive.
 
     Raises:
-        ValueError: The rotation is not orthogonal with determinant one, or the scale is not positive and finite.
+        ValueError: The rotation is not orthogonal with determinant one, or the scale is not
+            positive and finite.
     """
 
     rotation: Tensor

@@ -26,10 +26,12 @@ class Gaussians(TensorContainer):
     Args:
         means: Centres [N, 3], length units of the frame.
         quats: Orientations [N, 4], ``wxyz``; need not be normalised.
-        scales: Standard deviations along the local axes [N, 3], length units, positive (not logarithms).
+        scales: Standard deviations along the local axes [N, 3], length units, positive (not
+            logarithms).
         opacities: Peak opacities [N] in 0..1 (not logits).
         sh: Spherical-harmonic colours [N, K, 3], K = (degree + 1)^2.
-        labels: ``SURFACE``, ``INTERIOR``, ``TRANSITION`` or ``BACKGROUND`` per splat, int32 [N], or None.
+        labels: ``SURFACE``, ``INTERIOR``, ``TRANSITION`` or ``BACKGROUND`` per splat, int32 [N], or
+            None.
         normals: Unit surface normals [N, 3], or None.
 
     Raises:
@@ -127,7 +129,7 @@ class Gaussians(TensorContainer):
         )
 
     def with_colors(self, colors: Tensor) -> Gaussians:
-        """Return a copy whose colour is ``colors`` [N, 3] from every direction; the SH degree is kept."""
+        """Return a copy coloured ``colors`` [N, 3] from every direction; the SH degree is kept."""
         sh = torch.zeros_like(self.sh)
         sh[:, 0] = geometry.rgb_to_sh0(colors)
         return self.replace(sh=sh)
@@ -150,7 +152,7 @@ class Gaussians(TensorContainer):
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join rows. SH is padded to the highest degree; labels missing in one part only become ``SURFACE``.
+        """Join rows. SH is padded to the highest degree; missing labels are ``SURFACE``.
 
         Raises:
             ValueError: ``parts`` is empty.
@@ -179,7 +181,7 @@ class Gaussians(TensorContainer):
         )
 
     def transformed(self, frame: Frame) -> Gaussians:
-        """Return the splats in another frame: centres, orientations, sizes, normals and SH colours move together."""
+        """Return the splats in another frame: means, axes, sizes, normals and SH together."""
         turn = geometry.matrix_to_quaternion(frame.rotation).to(self.means)
         normals = None if self.normals is None else frame.apply_vector(self.normals)
         return self.replace(
@@ -197,7 +199,8 @@ class Gaussians(TensorContainer):
             source: What to call the input in the message, usually its file name.
 
         Raises:
-            InputError: No rows; NaN or infinite values; a scale that is not positive; an opacity outside 0..1.
+            InputError: No rows; NaN or infinite values; a scale that is not positive; an opacity
+                outside 0..1.
         """
         if self.count == 0:
             raise InputError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -22,12 +22,14 @@ class Particles(TensorContainer):
         velocity: Velocities v [m/s], [N, 3].
         affine: APIC matrices C [1/s], [N, 3, 3].
         strain: Elastic strain e = b - I, [N, 6] in the order ``xx, yy, zz, xy, xz, yz``.
-        alpha: Log plastic volume ratio [N]; negative is intact, growing towards 0 and above is softened.
+        alpha: Log plastic volume ratio [N]; negative is intact, growing towards 0 and above is
+            softened.
         mass: Masses [kg], [N].
         volume: Initial volumes [m^3], [N].
         body: Velocity field (contact body) of each point, int32 [N].
         material: Row of the material table of each point, int32 [N].
-        deformation: Total deformation gradient F since the start, [N, 3, 3]; None when nobody draws it.
+        deformation: Total deformation gradient F since the start, [N, 3, 3]; None when nobody draws
+            it.
     """
 
     position: Annotated[Tensor, shape("N", 3, unit="m")]
@@ -66,7 +68,7 @@ class Particles(TensorContainer):
             deformation: Whether to carry the total deformation gradient.
         """
         count = position.shape[0]
-        like = {"dtype": position.dtype, "device": position.device}
+        like: dict[str, Any] = {"dtype": position.dtype, "device": position.device}
 
         def column(value: Tensor | int) -> Tensor:
             whole = torch.as_tensor(value, dtype=torch.int32, device=position.device)
@@ -128,7 +130,7 @@ class Particles(TensorContainer):
         return Particles(**joined, deformation=torch.cat(carried) if carried else None)
 
     def validated(self, source: str = "Particles") -> Particles:
-        """Return self after checking that there are rows, all finite, with positive mass and volume.
+        """Return self after checking for rows that are finite and have positive mass and volume.
 
         Raises:
             InputError: Otherwise, with the number of bad rows and the first of them.

@@ -21,8 +21,9 @@ from gsfluent.errors import InputError
 class Solid(TensorContainer):
     """Splats with labels and the voxels inside them, all in the world frame of the input.
 
-    The centre of voxel (i, j, k) is ``origin + (i + 0.5, j + 0.5, k + 0.5) * voxel``. The grid stays axis-aligned in its
-    own frame for good: moving the solid only changes ``frame`` (world -> scene), which consumers apply.
+    The centre of voxel (i, j, k) is ``origin + (i + 0.5, j + 0.5, k + 0.5) * voxel``. The grid
+    stays axis-aligned in its own frame for good: moving the solid only changes ``frame`` (world ->
+    scene), which consumers apply.
 
     Args:
         gaussians: Surface and interior splats, labels set.
@@ -67,13 +68,13 @@ class Solid(TensorContainer):
         return moved.replace(gaussians=self.gaussians.to(device, dtype))
 
     def voxel_centers(self, index: Tensor | None = None) -> Tensor:
-        """Return centres [M, 3] of voxels ``index`` [M, 3]; of the occupied ones by default. World units."""
+        """Return centres [M, 3] of voxels ``index`` [M, 3] (default: the occupied), world units."""
         if index is None:
             index = self.occupancy.nonzero()
         return self.origin + (index.to(self.origin) + 0.5) * self.voxel
 
     def voxel_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Find the voxels of world points [N, 3]: (index int64 [N, 3], inside the grid bool [N])."""
+        """Find the voxels of world points [N, 3]: (index [N, 3], inside the grid bool [N])."""
         size = torch.tensor(self.occupancy.shape, device=points.device)
         index = ((points - self.origin.to(points)) / self.voxel).floor().to(torch.int64)
         inside = ((index >= 0) & (index < size)).all(dim=1)
@@ -85,13 +86,13 @@ class Solid(TensorContainer):
         return inside & self.occupancy[index[:, 0], index[:, 1], index[:, 2]]
 
     def depth_at(self, points: Tensor) -> Tensor:
-        """Depth below the surface [N] at world points [N, 3], trilinear between voxel centres; 0 off the grid."""
+        """Depth below the surface [N] at world points [N, 3], trilinear; 0 off the grid."""
         return _trilinear(self.depth[..., None], (points - self.origin.to(points)) / self.voxel)[
             :, 0
         ]
 
     def color_at(self, points: Tensor) -> Tensor:
-        """Colour [N, 3] of the voxel that holds each world point [N, 3] (nearest voxel for points off the grid).
+        """Colour [N, 3] of the voxel that holds each world point [N, 3]; nearest off the grid.
 
         Raises:
             ValueError: The solid has no colours yet.
@@ -104,11 +105,11 @@ class Solid(TensorContainer):
         return self.color[index[:, 0], index[:, 1], index[:, 2]]
 
     def transformed(self, frame: Frame) -> Solid:
-        """Return the same solid placed by ``frame`` after its present frame; tensors stay in the world frame."""
+        """Return the solid placed by ``frame`` after its present frame; tensors stay."""
         return self.replace(frame=frame if self.frame is None else frame.compose(self.frame))
 
     def save(self, path: str | Path) -> None:
-        """Write the splats to ``path`` (.ply) and the volume beside it as ``<name>.volume.npz``, each atomically."""
+        """Write the splats to ``path`` (.ply) and the volume to ``<name>.volume.npz`` beside it."""
         import numpy as np
 
         from gsfluent.io.atomic import atomic_path
@@ -186,7 +187,7 @@ def volume_path(path: str | Path) -> Path:
 
 
 def _trilinear(grid: Tensor, position: Tensor) -> Tensor:
-    """Sample a grid [X, Y, Z, C] with voxel centres at +0.5 at grid positions [N, 3]; zero outside."""
+    """Sample a grid [X, Y, Z, C], voxel centres at +0.5, at grid positions [N, 3]; 0 outside."""
     size = torch.tensor(grid.shape[:3], device=position.device)
     base = (position - 0.5).floor()
     fraction = position - 0.5 - base

@@ -17,9 +17,9 @@ from gsfluent.errors import RunError
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path``; rename it onto ``path`` when the block ends well.
 
-    The temporary keeps the suffix (writers that look at it work) and lies in the same directory, so the rename is one
-    step of the file system. When the block fails, Ctrl-C included, the temporary is removed and an older ``path`` stays as
-    it was.
+    The temporary keeps the suffix (writers that look at it work) and lies in the same directory, so
+    the rename is one step of the file system. When the block fails, Ctrl-C included, the temporary
+    is removed and an older ``path`` stays as it was.
 
     Raises:
         RunError: The disk is full or the folder cannot be written.

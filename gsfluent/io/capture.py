@@ -14,10 +14,10 @@ _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 
 def load_capture(path: str | Path) -> Capture:
-    """Read a capture: a folder with a COLMAP model (binary or text) or a ``transforms.json``, or that file itself.
+    """Read a capture: a folder with a COLMAP model or a ``transforms.json``, or that file itself.
 
-    A COLMAP model (``sparse/0`` and the usual other places) is preferred when both are there. Photographs are only
-    located, not decoded; :meth:`Capture.view` reads them.
+    A COLMAP model (``sparse/0`` and the usual other places) is preferred when both are there.
+    Photographs are only located, not decoded; :meth:`Capture.view` reads them.
 
     Args:
         path: Folder or ``.json`` file.
@@ -26,7 +26,8 @@ def load_capture(path: str | Path) -> Capture:
         The capture, cameras in the order of their image names.
 
     Raises:
-        InputError: Nothing usable there, a damaged model, an unsupported lens, a pose or image missing.
+        InputError: Nothing usable there, a damaged model, an unsupported lens, a pose or image
+            missing.
     """
     path = Path(path)
     if not path.exists():
@@ -63,8 +64,8 @@ def _nothing_found(path: Path) -> InputError:
     )
     if images:
         return InputError(
-            f"{path}: {images} images but no camera poses (no sparse/0 and no transforms.json)",
-            "pose them first, for example with `colmap automatic_reconstructor`, into sparse/0 beside images/",
+            f"{path}: {images} images but no poses (no sparse/0 and no transforms.json)",
+            "pose them first, for example with `colmap automatic_reconstructor`, into sparse/0",
         )
     return InputError(
         f"{path}: no COLMAP model and no transforms.json here", "pass the folder that holds them"

@@ -1,7 +1,7 @@
-"""COLMAP sparse models, binary and text: cameras, images, points3D (rigs and frames are not needed).
+"""COLMAP sparse models, binary and text: cameras, images, points3D.
 
-Formats: COLMAP documentation, "Output Format". Poses are world-to-camera, the pixel origin is the corner of the first
-pixel; both as gsfluent has them.
+Formats: COLMAP documentation, "Output Format". Poses are world-to-camera, the pixel origin is the
+corner of the first pixel; both as gsfluent has them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
 from gsfluent.io.images import IMAGE_SUFFIXES
 
-# model name -> (COLMAP id, parameter count, places of fx, fy, cx, cy, places of the OpenCV coefficients; None is 0)
+# name -> (COLMAP id, parameter count, places of fx fy cx cy, of the OpenCV coefficients or None)
+_Lens = tuple[int, int, torch.Tensor, tuple[float, ...]]  # width, height, K, OpenCV coefficients
 _Layout = tuple[int, int, tuple[int, int, int, int], tuple[int | None, ...]]
 _MODELS: dict[str, _Layout] = {
     "SIMPLE_PINHOLE": (0, 3, (0, 0, 1, 2), ()),
@@ -77,7 +78,7 @@ class _Bytes:
 
 
 def find_model(root: Path) -> Path | None:
-    """Return the folder below ``root`` with cameras and images of a COLMAP model, the one with most images, or None."""
+    """Return the folder below ``root`` with the largest COLMAP model, or None."""
     folders = [root / place for place in _PLACES]
     if (root / "sparse").is_dir():
         folders += sorted(folder for folder in (root / "sparse").iterdir() if folder.is_dir())
@@ -94,7 +95,8 @@ def read_model(model: Path, root: Path) -> Capture:
     """Read the COLMAP model in folder ``model`` with the photographs below ``root``.
 
     Raises:
-        InputError: A damaged file, an unsupported lens model, no registered image, or a photograph that is not there.
+        InputError: A damaged file, an unsupported lens model, no registered image, or a photograph
+            that is not there.
     """
     binary = (model / "images.bin").is_file()
     suffix = ".bin" if binary else ".txt"
@@ -145,7 +147,7 @@ def read_model(model: Path, root: Path) -> Capture:
 
 
 def find_mask(root: Path, name: str) -> Path | None:
-    """Return the mask that belongs to image ``name``: ``masks/`` with the same name, the name + .png, or the stem."""
+    """Return the mask of image ``name``: in ``masks/``, same name, name + .png, or same stem."""
     relative = Path(name)
     for folder in (root / "masks", root / "mask"):
         if folder.is_dir():
@@ -163,7 +165,7 @@ def find_mask(root: Path, name: str) -> Path | None:
 
 
 def _image_folder(root: Path, names: list[str]) -> Path:
-    """Return the folder that holds all named images; the error names what is missing in the most complete one."""
+    """Return the folder that holds all named images."""
     best: tuple[int, Path, list[str]] | None = None
     for place in _IMAGE_FOLDERS:
         folder = root / place
@@ -185,7 +187,7 @@ def _damaged(path: Path, why: str) -> InputError:
     )
 
 
-def _lens(path: Path, model: str, width: float, height: float, params: tuple[float, ...]) -> tuple:  # type: ignore[type-arg]
+def _lens(path: Path, model: str, width: float, height: float, params: tuple[float, ...]) -> _Lens:
     """Turn COLMAP parameters into (width, height, K, OpenCV coefficients)."""
     layout = _MODELS.get(model)
     if layout is None:
@@ -225,7 +227,7 @@ def _pose(
     return viewmat
 
 
-def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple]]:  # type: ignore[type-arg]
+def _binary_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
     data = _Bytes(path)
     names = {layout[0]: name for name, layout in _MODELS.items()}
     for _ in range(data.count()):
@@ -270,7 +272,7 @@ def _numbers(
         raise _damaged(path, f"{' '.join(words)[:60]!r} are not numbers") from error
 
 
-def _text_cameras(path: Path) -> Iterator[tuple[int, tuple]]:  # type: ignore[type-arg]
+def _text_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
     for words in _lines(path):
         if words:
             if len(words) < 5:

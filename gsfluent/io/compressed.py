@@ -1,8 +1,8 @@
 """SuperSplat's compressed ``.ply``: 16 bytes per splat, quantised within chunks of 256.
 
-Position and log scale: 11 + 10 + 11 bits between the chunk's limits; rotation: which of ``w, x, y, z`` is largest (2 bits) and
-the other three in 10 bits each; colour and opacity: 8 bits each; SH rest: one byte per coefficient over -4..4.
-Layout: PlayCanvas "compressed PLY" description.
+Position and log scale: 11 + 10 + 11 bits between the chunk's limits; rotation: which of ``w, x, y,
+z`` is largest (2 bits) and the other three in 10 bits each; colour and opacity: 8 bits each; SH
+rest: one byte per coefficient over -4..4. Layout: PlayCanvas "compressed PLY" description.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _unpack_rotation(packed: NDArray[Any]) -> NDArray[Any]:
 
 
 def _rest(path: Path, rows: NDArray[Any]) -> NDArray[Any]:
-    """SH rest [N, K - 1, 3]; 0 and 255 stand for the ends of the range, all others for the middle of their step."""
+    """SH rest [N, K - 1, 3]; 0 and 255 are the ends of the range, others the middle of a step."""
     count = sum(1 for name in rows.dtype.names or () if name.startswith("f_rest_"))
     if count not in (9, 24, 45):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Photographs and masks: read lazily, resized, undistorted to a pinhole, with errors that name the file."""
+"""Photographs and masks: resized, undistorted to a pinhole, with errors that name the file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsfluent.io.atomic import atomic_path
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
 _ASPECT_TOLERANCE = 0.01
-"""Relative difference of aspect ratio up to which an image counts as a resized copy of what its camera describes."""
+"""Relative difference of aspect up to which an image counts as a resized copy."""
 
 _ZOOM_LIMIT = 2.0
 """Most that undistortion may magnify to avoid pixels that no photograph covers."""
@@ -34,8 +34,9 @@ def read_array(path: str | Path) -> NDArray[np.float32]:
 
     path = Path(path)
     try:
-        with Image.open(path) as image:
-            image.load()
+        with Image.open(path) as opened:
+            opened.load()
+            image: Image.Image = opened
             if image.mode.startswith("I") or image.mode == "F":
                 deep = np.asarray(image, dtype=np.float32)
                 top = 65535.0 if image.mode.startswith("I") else 1.0
@@ -119,9 +120,9 @@ def save_image(image: Tensor, path: str | Path) -> None:
 def load_view(camera: Camera, max_size: int | None = None) -> View:
     """Read the photograph (and mask) of a camera as a pinhole view.
 
-    The image is resized so that its longer side is at most ``max_size``, then undistorted. Lens distortion is removed
-    about the same principal point, magnified just enough that every pixel is covered by the photograph; what a strong lens
-    still leaves uncovered is told by ``valid``.
+    The image is resized so that its longer side is at most ``max_size``, then undistorted. Lens
+    distortion is removed about the same principal point, magnified just enough that every pixel is
+    covered by the photograph; what a strong lens still leaves uncovered is told by ``valid``.
 
     Args:
         camera: Posed camera with ``image_path``.
@@ -209,14 +210,15 @@ def _fitted(camera: Camera, width: int, height: int) -> Camera:
         return camera
     if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT_TOLERANCE:
         raise InputError(
-            f"{camera.image_path}: the image is {width} x {height}, its camera describes {camera.width} x {camera.height}",
-            "use the images that the poses were computed on, or resized copies of them (not cropped or turned)",
+            f"{camera.image_path}: the image is {width} x {height}, but its camera describes "
+            f"{camera.width} x {camera.height}",
+            "use the images that were posed, or resized copies of them (not cropped or turned)",
         )
     return camera.resized(width, height)
 
 
 def _read_mask(path: Path) -> NDArray[np.float32]:
-    """Read a mask: its alpha channel if that says anything, else its first channel; white is the object."""
+    """Read a mask: its alpha channel if that says anything, else its first; white is object."""
     values = read_array(path)
     if values.shape[2] == 4 and values[..., 3].min() < 1:
         return values[..., 3]
@@ -237,7 +239,7 @@ def _resize(values: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 def _remap(
     values: NDArray[Any], camera: Camera, pinhole: Camera
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Resample from the distorted to the pinhole image; also tell which pixels the source covers."""
+    """Resample to the pinhole image; also tell which pixels the photograph covers."""
     import cv2
 
     def opencv(intrinsics: Tensor) -> NDArray[np.float64]:

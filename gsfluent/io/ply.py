@@ -35,7 +35,7 @@ _NAMES = {
 }
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
-"""A header longer than this is not a PLY header; stops a search for ``end_header`` in some other large file."""
+"""A longer header is no PLY header; stops the search for its end in some other large file."""
 
 
 @dataclasses.dataclass
@@ -162,7 +162,8 @@ def _scalar_dtype(element: _Element, order: str) -> np.dtype[Any]:
 
 def _truncated(path: Path, element: _Element, got: int) -> InputError:
     return InputError(
-        f"{path}: the file ends inside element {element.name}: the header promises {element.count} rows, got {got}",
+        f"{path}: the file ends inside element {element.name}: it promises {element.count} rows, "
+        f"got {got}",
         "the file is truncated; copy or export it again",
     )
 

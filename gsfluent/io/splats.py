@@ -1,7 +1,8 @@
 """Gaussians in INRIA-layout 3DGS ``.ply`` files.
 
-Stored: log scales, logit opacities, quaternions ``wxyz``, ``f_dc`` and ``f_rest`` with the rest channel-major (all red, all
-green, all blue). Kerbl et al. 2023, reference implementation's ``save_ply``.
+Stored: log scales, logit opacities, quaternions ``wxyz``, ``f_dc`` and ``f_rest`` with the rest
+channel-major (all red, all green, all blue). Kerbl et al. 2023, reference implementation's
+``save_ply``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from gsfluent.io.ply import read_ply, write_ply
 logger = logging.getLogger(__name__)
 
 _LOGIT_LIMIT = 20.0
-"""Stored opacities are cut here: sigmoid(20) is 1 in float32, so an opacity of 1 survives a round trip."""
+"""Stored opacities are cut here: sigmoid(20) is 1 in float32, so opaque stays opaque."""
 
 _REQUIRED = (
     "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
@@ -32,11 +33,11 @@ _REQUIRED = (
 
 
 def load_splats(path: str | Path) -> Gaussians:
-    """Read a 3DGS ``.ply`` (INRIA layout, or SuperSplat's compressed layout) as float32 Gaussians on the CPU.
+    """Read a 3DGS ``.ply`` (INRIA or SuperSplat's compressed layout) as float32 on the CPU.
 
-    Quaternions are normalised (trained files hold any length), opacities pass a sigmoid (some exporters write 400 for
-    opaque) and scales an exponential. ``nx, ny, nz`` become normals unless all are zero; our own column ``label`` becomes
-    labels; every other property is ignored.
+    Quaternions are normalised (trained files hold any length), opacities pass a sigmoid (some
+    exporters write 400 for opaque) and scales an exponential. ``nx, ny, nz`` become normals unless
+    all are zero; our own column ``label`` becomes labels; every other property is ignored.
 
     Args:
         path: The file.
@@ -85,8 +86,8 @@ def load_splats(path: str | Path) -> Gaussians:
 def save_splats(gaussians: Gaussians, path: str | Path) -> None:
     """Write Gaussians as an INRIA-layout 3DGS ``.ply`` that other viewers open, atomically.
 
-    ``nx, ny, nz`` hold the normals (zero without); labels, when present, go into one extra float property ``label`` at the
-    end, which viewers that look properties up by name ignore.
+    ``nx, ny, nz`` hold the normals (zero without); labels, when present, go into one extra float
+    property ``label`` at the end, which viewers that look properties up by name ignore.
 
     Args:
         gaussians: What to write; the values are checked first.

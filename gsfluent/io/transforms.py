@@ -1,6 +1,7 @@
 """``transforms.json`` as nerfstudio, instant-ngp and the NeRF synthetic scenes write it.
 
-Poses there are camera-to-world with OpenGL axes (+y up, looking along -z); they are turned to OpenCV here and nowhere else.
+Poses there are camera-to-world with OpenGL axes (+y up, looking along -z); they are turned to
+OpenCV here and nowhere else.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ _RIGID_TOLERANCE = 1e-3
 def read_transforms(path: Path) -> Capture:
     """Read a ``transforms.json``.
 
-    Understood: intrinsics for the whole file or per frame (``fl_x``/``fl_y``, ``camera_angle_x``/``_y``, ``cx``, ``cy``, ``w``, ``h``, ``k1``..``k3``, ``p1``,
-    ``p2``), image paths without extension, ``mask_path``, ``masks/``, ``ply_file_path``.
+    Understood: intrinsics for the whole file or per frame (``fl_x``/``fl_y``,
+    ``camera_angle_x``/``_y``, ``cx``, ``cy``, ``w``, ``h``, ``k1``..``k3``, ``p1``, ``p2``), image
+    paths without extension, ``mask_path``, ``masks/``, ``ply_file_path``.
 
     Raises:
         InputError: Not JSON, no frames, a frame without pose or image, an unsupported lens.
@@ -184,7 +186,7 @@ def _distortion(where: str, settings: dict[str, Any]) -> tuple[float, ...]:
 
 
 def _find_image(root: Path, name: str) -> Path | None:
-    """Return the image a frame names, trying the usual extensions when it has none; None when there is no such file."""
+    """Return the image a frame names, trying the usual extensions; None when there is none."""
     plain = Path(os.path.normpath(root / name))
     if plain.is_file():
         return plain
