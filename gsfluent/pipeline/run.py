@@ -62,12 +62,11 @@ def run_shot(
     out.mkdir(parents=True, exist_ok=True)
     device = torch.device(device)
     store = StageStore(out / "stages", force=force)
-    record = RunRecord(out / "run.json", shot.to_dict(), device, seed)
+    record = RunRecord(out / "run.json", shot.resolved(), device, seed)
     context = RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
     start = time.perf_counter()
     try:
-        if shot.capture is not None:
-            reconstruct_stage(context)
+        reconstruct_stage(context)
         isolate_stage(context)
         fill_stage(context)
         texture_stage(context)

@@ -29,6 +29,7 @@ class RunContext:
         reporter: Progress.
         capture: The photographs, when the shot has any.
         frame: World to scene; set by the isolate stage.
+        source_key: Fingerprint of the last stage, which the next one builds on.
     """
 
     shot: Shot
@@ -40,6 +41,7 @@ class RunContext:
     reporter: Reporter
     capture: Capture | None = None
     frame: Frame = field(default_factory=Frame.identity)
+    source_key: str = ""
 
     def key(self, *parts: Any) -> list[Any]:
         """Fingerprint parts every stage shares."""
