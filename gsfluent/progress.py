@@ -1,8 +1,8 @@
 """Progress of long work: a bar on a terminal, plain log lines anywhere else.
 
-Every stage takes ``progress: Callable[[int, int, str], None]``, called with (done, total, what is being done). The
-stages know nothing of terminals; :func:`reporter` decides once which of the two forms the caller sees. Both write to
-stderr, so that stdout stays free for ``--json``.
+Every stage takes ``progress: Callable[[int, int, str], None]``, called with (done, total, what is
+being done). The stages know nothing of terminals; :func:`reporter` decides once which of the two
+forms the caller sees. Both write to stderr, so that stdout stays free for ``--json``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ _SECONDS_BETWEEN_LINES = 5.0
 class Reporter(Protocol):
     """Hands out one progress callback per task."""
 
-    def task(self, name: str) -> Progress: ...
+    def task(self, name: str) -> Progress:
+        """Return the callback for one task called ``name``."""
+        ...
 
 
 class LineReporter:
@@ -80,7 +82,9 @@ class BarReporter:
         bar = self.bars.add_task("", name=name, total=None)
 
         def report(done: int, total: int, text: str) -> None:
-            self.bars.update(bar, completed=done, total=total if total > 0 else None, description=text)
+            self.bars.update(
+                bar, completed=done, total=total if total > 0 else None, description=text
+            )
 
         return report
 
@@ -98,4 +102,3 @@ def reporter(*, quiet: bool = False) -> Iterator[Reporter]:
     bars = BarReporter()
     with bars.bars:
         yield bars
-

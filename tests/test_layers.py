@@ -1,4 +1,4 @@
-"""The shape of the house: who may import whom, how long a file may be, what must not stand in the source."""
+"""The shape of the house: who may import whom, how long a file may be, what may not be in it."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def test_only_ops_call_the_dispatcher() -> None:
     calls = [
         str(p.relative_to(ROOT))
         for p in SOURCES
-        if layer(p) not in ("ops", "_load") and "torch.ops.gsfluent" in p.read_text(encoding="utf-8")
+        if layer(p) not in ("ops", "_load")
+        and "torch.ops.gsfluent" in p.read_text(encoding="utf-8")
     ]
     assert calls == []
 
@@ -85,9 +86,7 @@ def test_kernels_and_core_do_not_know_torch(path: Path) -> None:
     assert [name for name in included if "torch" in name or "ATen" in name or "c10" in name] == []
 
 
-@pytest.mark.parametrize(
-    "path", [p for p in CSRC if p.parent.name == "core"], ids=lambda p: p.name
-)
+@pytest.mark.parametrize("path", [p for p in CSRC if p.parent.name == "core"], ids=lambda p: p.name)
 def test_core_has_no_containers_and_includes_only_core(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert re.findall(r"std::(vector|map|string|unordered_map)\b", text) == []
@@ -128,7 +127,16 @@ def test_library_does_not_print() -> None:
 
 
 def test_heavy_libraries_are_imported_late() -> None:
-    heavy = ("diffusers", "transformers", "accelerate", "cv2", "trimesh", "scipy", "imageio_ffmpeg", "PIL")
+    heavy = (
+        "diffusers",
+        "transformers",
+        "accelerate",
+        "cv2",
+        "trimesh",
+        "scipy",
+        "imageio_ffmpeg",
+        "PIL",
+    )
     found = []
     for path in SOURCES:
         for node in ast.parse(path.read_text(encoding="utf-8")).body:

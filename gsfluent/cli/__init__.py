@@ -1,7 +1,8 @@
 """The command line: ``gsfluent VERB``, one dataclass per verb, read by tyro.
 
-Contract (interface.md section 1): exit 0 on success, 2 on bad input, 1 on a failure while running, 130 after Ctrl-C;
-``--json`` puts exactly one object on stdout and everything else on stderr; no traceback unless ``GSFLUENT_DEBUG=1``.
+Contract (interface.md section 1): exit 0 on success, 2 on bad input, 1 on a failure while running,
+130 after Ctrl-C; ``--json`` puts exactly one object on stdout and everything else on stderr; no
+traceback unless ``GSFLUENT_DEBUG=1``.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from typing import Any
 from gsfluent.errors import GsfluentError, InputError, RunError
 
 # errno of things a user can mend by naming another path
-_USER_ERRNO = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.EROFS)
+_USER_ERRNO = (
+    errno.ENOENT,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.EROFS,
+)
 _INTERRUPTED = 130
 
 _log = logging.getLogger("gsfluent")
@@ -39,7 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # tyro has printed help (0) or what is wrong (2)
         code = stop.code if isinstance(stop.code, int) else 2
         if code and as_json:
-            _print_json({"error": {"kind": "InputError", "message": "see stderr"}, "exit_code": code})
+            _print_json(
+                {"error": {"kind": "InputError", "message": "see stderr"}, "exit_code": code}
+            )
         return code
     _configure_logging()
     _treat_termination_as_interrupt()
@@ -55,7 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(as_json, type(error).__name__, *_explain_os_error(error))
     except Exception as error:
         _show_traceback()
-        text = f"unexpected {type(error).__name__}: {error}\n  mend: see the traceback with GSFLUENT_DEBUG=1"
+        text = f"unexpected {type(error).__name__}: {error}"
+        text += "\n  mend: GSFLUENT_DEBUG=1 shows the traceback; please report it"
         return _fail(as_json, type(error).__name__, text, 1)
     if as_json:
         _print_json(result)
@@ -115,7 +127,7 @@ def _configure_logging() -> None:
 
 
 def _treat_termination_as_interrupt() -> None:
-    """Let SIGTERM unwind like Ctrl-C, so that a batch system's kill leaves the same resumable state."""
+    """Let SIGTERM unwind like Ctrl-C: a batch system's kill leaves the same resumable state."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")

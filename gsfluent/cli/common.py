@@ -69,7 +69,9 @@ def choose_device(name: str, *, seed: int = 0) -> Any:
         raise InputError(f"--device {name}", "give auto, cpu, cuda or cuda:0, cuda:1, ...")
     if device.type == "cuda":
         if torch.version.cuda is None:
-            raise InputError(f"--device {name}: this torch has no CUDA", "install a CUDA torch, or use cpu")
+            raise InputError(
+                f"--device {name}: this torch has no CUDA", "install a CUDA torch, or use cpu"
+            )
         if not HAS_CUDA_KERNELS:
             mend = "reinstall with GSFLUENT_CUDA=1, or use cpu"
             raise InputError(f"--device {name}: gsfluent was built without its CUDA kernels", mend)
@@ -105,7 +107,9 @@ def parse_size(text: str) -> tuple[int, int]:
     except ValueError:
         raise InputError(f"--size {text}", "give WIDTHxHEIGHT, for example 1280x720") from None
     if width < 16 or height < 16 or width % 2 or height % 2:
-        raise InputError(f"--size {text}", "give even numbers of at least 16 (video needs even sides)")
+        raise InputError(
+            f"--size {text}", "give even numbers of at least 16 (video needs even sides)"
+        )
     return width, height
 
 

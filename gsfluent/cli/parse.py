@@ -59,7 +59,7 @@ def parse(arguments: Sequence[str]) -> Verb:
         sys.stdout.write(f"gsfluent {__version__}\n")
         raise SystemExit(0)
     # only help, a missing verb and a misspelt one come here; one line per verb is enough
-    choices: Any = Union[
+    choices: Any = Union[  # noqa: UP007 - there is no other spelling for a computed union
         tuple(
             Annotated[
                 kind,

@@ -15,7 +15,7 @@ from gsfluent.cli.common import Out, Verb, existing
 class Doctor(Verb):
     """Say what is installed, which ops are compiled for what, and test each op for a second.
 
-    examples:
+    Examples:
       gsfluent doctor                   # a table; exit 1 when an op gives a wrong answer
       gsfluent doctor --json            # the same for a program
       gsfluent doctor --device cpu      # leave the GPU alone
@@ -30,12 +30,12 @@ class Doctor(Verb):
 
 @dataclass(kw_only=True)
 class Inspect(Verb):
-    """Say what is in a capture or a splat: size, up axis, floor, floaters, thin parts; draw one PNG.
+    """Say what is in a capture or a splat (size, up axis, floor, floaters) and draw one PNG.
 
-    examples:
+    Examples:
       gsfluent inspect captures/apple                    # a folder of posed photographs
       gsfluent inspect melon.ply -o melon.png            # a trained splat
-      gsfluent inspect melon.ply --size 0.25             # its largest extent is 25 cm: what scale is that?
+      gsfluent inspect melon.ply --size 0.25             # its largest extent is 25 cm
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
@@ -55,9 +55,9 @@ class Inspect(Verb):
 
 @dataclass(kw_only=True)
 class Plan(Verb):
-    """Say what a shot will cost, without simulating: grid, time step, particles, memory, time, warnings.
+    """Say what a shot will cost without simulating: grid, steps, particles, memory, time.
 
-    examples:
+    Examples:
       gsfluent plan shot.yaml           # before an hour is spent
       gsfluent plan shot.yaml --json
     """

@@ -13,13 +13,13 @@ from gsfluent.cli.common import Out, Verb, existing, parse_size, parse_vector
 
 @dataclass(kw_only=True)
 class Run(Verb):
-    """Do everything a shot asks for, in order: reconstruct, fill, texture, simulate, render, export.
+    """Do all a shot asks for, in order: reconstruct, fill, texture, simulate, render, export.
 
-    examples:
-      gsfluent run shot.yaml -o out                # photographs or a splat in, video.mp4 and run.json out
-      gsfluent run shot.yaml -o out                # again: finished stages are not redone, a cut-short one goes on
-      gsfluent run shot.yaml -o out --force        # redo everything
-      gsfluent run shot.yaml -o out --json         # run.json on stdout
+    Examples:
+      gsfluent run shot.yaml -o out            # leaves out/video.mp4, out/run.json and more
+      gsfluent run shot.yaml -o out            # again: only what changed or was cut short
+      gsfluent run shot.yaml -o out --force    # redo everything
+      gsfluent run shot.yaml -o out --json     # run.json on stdout
 
     The smallest useful shot.yaml:
       capture: captures/apple
@@ -50,15 +50,15 @@ class Run(Verb):
 
 @dataclass(kw_only=True)
 class Demo(Verb):
-    """Run the built-in scene: a melon is photographed, rebuilt, filled, dropped and broken. No download.
+    """Run the built-in scene: a melon is photographed, rebuilt, filled, dropped and broken.
 
-    examples:
+    Examples:
       gsfluent demo                            # into demo_out/, a few minutes on two cores
       gsfluent demo watermelon -o out          # the same by name
       gsfluent demo --size preview             # small and quick, for a check
 
-    gsfluent draws the photographs itself from an object whose inside it knows, so run.json can say how far the
-    reconstructed inside is from the truth.
+    Nothing is downloaded: gsfluent draws the photographs itself from an object whose inside it
+    knows, so run.json can say how far the reconstructed inside is from the truth.
     """
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "watermelon"
@@ -92,13 +92,13 @@ class Demo(Verb):
 class Render(Verb):
     """Render a finished simulation again: another camera, light or size.
 
-    examples:
-      gsfluent render out                                       # as the shot says, to out/render.mp4
-      gsfluent render out --size 1920x1080 -o big.mp4
+    Examples:
+      gsfluent render out                                       # as the shot says, to
+      out/render.mp4 gsfluent render out --size 1920x1080 -o big.mp4
       gsfluent render out --camera 3                            # from the pose of photograph 3
-      gsfluent render out --camera path.json                    # {"frames": [{"eye": [..], "target": [..]}]}
-      gsfluent render out --light=-1,-1,3 --ambient 0.3         # harder light from the left
-      gsfluent render out --frame 20 -o still.png               # one picture
+      gsfluent render out --camera path.json                    # {"frames": [{"eye": [..],
+      "target": [..]}]} gsfluent render out --light=-1,-1,3 --ambient 0.3         # harder light
+      from the left gsfluent render out --frame 20 -o still.png               # one picture
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
@@ -142,10 +142,10 @@ class Render(Verb):
 class Export(Verb):
     """Write a finished simulation in other programs' formats.
 
-    examples:
-      gsfluent export out --to ply-seq              # frames/frame_0001.ply ..., standard 3DGS, any splat viewer
-      gsfluent export out --to vtk                  # particles/particles_0001.vtk ..., ParaView
-      gsfluent export out --to ply-seq,mp4,vtk
+    Examples:
+      gsfluent export out --to ply-seq              # frames/frame_0001.ply ..., standard 3DGS, any
+      splat viewer gsfluent export out --to vtk                  # particles/particles_0001.vtk ...,
+      ParaView gsfluent export out --to ply-seq,mp4,vtk
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]

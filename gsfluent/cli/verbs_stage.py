@@ -23,14 +23,15 @@ def _ply(path: Path) -> Path:
 class Reconstruct(Verb):
     """Fit Gaussians to posed photographs.
 
-    examples:
+    Examples:
       gsfluent reconstruct captures/apple -o apple.ply
       gsfluent reconstruct captures/apple -o apple.ply --iterations 7000 --max-gaussians 300000
       gsfluent reconstruct captures/apple -o apple.ply --image-size 400        # quick look
       gsfluent reconstruct captures/apple -o room.ply --keep-background
 
-    CAPTURE is a COLMAP model (text or binary) with its images, or a folder with transforms.json; masks are used
-    when there are any. Every eighth photograph is held out; its PSNR stands in reconstruct.json beside the .ply.
+    CAPTURE is a COLMAP model (text or binary) with its images, or a folder with transforms.json;
+    masks are used when there are any. Every eighth photograph is held out; its PSNR stands in
+    reconstruct.json beside the .ply.
     """
 
     capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
@@ -79,10 +80,10 @@ class Reconstruct(Verb):
 class Fill(Verb):
     """Turn a shell of surface Gaussians into a solid with interior Gaussians.
 
-    examples:
+    Examples:
       gsfluent fill melon.ply -o solid.ply
-      gsfluent fill melon.ply -o solid.ply --capture captures/melon     # refine against the photographs
-      gsfluent fill cup.ply -o cup_solid.ply --hollow auto
+      gsfluent fill melon.ply -o solid.ply --capture captures/melon     # refine against the
+      photographs gsfluent fill cup.ply -o cup_solid.ply --hollow auto
 
     Writes solid.ply (opens in any splat viewer) and solid.volume.npz (the voxels) beside it.
     """
@@ -123,10 +124,11 @@ class Fill(Verb):
 class Texture(Verb):
     """Give the inside of a solid its colours.
 
-    examples:
-      gsfluent texture solid.ply -o textured.ply                                       # by default from the skin
-      gsfluent texture solid.ply -o textured.ply --method exemplar --exemplar cut.jpg    # from a photo of a cut
-      gsfluent texture solid.ply -o textured.ply --method diffusion --model PATH --prompt "watermelon flesh"
+    Examples:
+      gsfluent texture solid.ply -o textured.ply                                       # by default
+      from the skin gsfluent texture solid.ply -o textured.ply --method exemplar --exemplar cut.jpg
+        # from a photo of a cut gsfluent texture solid.ply -o textured.ply --method diffusion
+        # --model PATH --prompt "watermelon flesh"
 
     Writes textured.ply with its volume, and textured.cuts.png with three cut views.
     """

@@ -1,7 +1,8 @@
-"""What works on this machine: versions, compiled ops, memory, GPUs, and a small exact test of every op.
+"""What works on this machine: versions, compiled ops, memory, GPUs, a small test of every op.
 
-Each test has an answer known without a second implementation (mass is conserved, a rest state stays at rest, one opaque
-splat shows its own colour), so a wrong build, not only a missing one, is found in about a second.
+Each test has an answer known without a second implementation (mass is conserved, a rest state stays
+at rest, one opaque splat shows its own colour), so a wrong build, not only a missing one, is found
+in about a second.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from torch import Tensor
 import gsfluent
 from gsfluent import ops
 from gsfluent._load import HAS_CUDA_KERNELS
-
 
 _LIBRARIES = (
     "numpy",
@@ -122,7 +122,8 @@ def _test_p2g(device: torch.device) -> float:
     momentum = (mass[:, None] * velocity).sum(0)
     scale = float(mass.sum())
     return max(
-        abs(float(total[3] - mass.sum())) / scale, float((total[:3] - momentum).abs().amax()) / scale
+        abs(float(total[3] - mass.sum())) / scale,
+        float((total[:3] - momentum).abs().amax()) / scale,
     )
 
 
@@ -155,7 +156,8 @@ def _test_return_mapping(device: torch.device) -> float:
     alpha = torch.full((2,), -0.04, device=device)
     _, after, stress, _ = ops.return_mapping(strain, alpha, increment, law=law, params=params)
     rest = float(stress[0].abs().amax()) / mu
-    # second order in the shear: the relative error of the linear answer is of the order of the shear itself
+    # second order in the shear: the relative error of the linear answer is of the order of the
+    # shear itself
     linear = abs(float(stress[1, 3]) / (2.0 * mu * shear) - 1.0)
     return max(rest, linear * 0.1, float((after - alpha).abs().amax()))
 
@@ -175,7 +177,11 @@ def _test_rasterize(device: torch.device) -> float:
         scales=torch.full((1, 3), 50.0, device=device),
         colors=color,
     )
-    errors = (seen.image[16, 16] - 0.9 * color[0], seen.alpha[16, 16] - 0.9, seen.depth[16, 16] - 2.0)
+    errors = (
+        seen.image[16, 16] - 0.9 * color[0],
+        seen.alpha[16, 16] - 0.9,
+        seen.depth[16, 16] - 2.0,
+    )
     # the pixel centre is half a pixel off the splat's, 1e-8 of its width
     return max(float(e.abs().amax()) for e in errors)
 

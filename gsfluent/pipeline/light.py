@@ -1,13 +1,14 @@
-"""One directional light: Blinn-Phong on linear radiance, with a shadow map made by our own rasterizer.
+"""One directional light: Blinn-Phong on linear radiance, with a shadow map made by our own
+rasterizer.
 
 equations.md section 16: ``L = c_0 (I_a + T I_L (D + S))`` with ``D = max(0, n.l)``,
-``S = k_s max(0, n.h)^{n_s}`` and ``h = (l + v) / |l + v|``. The captured colour ``c_0`` already holds the light of
-the photographs, so the default is mild: a surface that faces the light keeps its colour, the far side loses about
-a fifth of its display value.
+``S = k_s max(0, n.h)^{n_s}`` and ``h = (l + v) / |l + v|``. The captured colour ``c_0`` already
+holds the light of the photographs, so the default is mild: a surface that faces the light keeps its
+colour, the far side loses about a fifth of its display value.
 
-The shadow transmittance ``T`` comes from a depth-and-opacity image seen from the light (the derived alternative to
-counting neighbours in a cone, which is quadratic). The light is directional; a perspective camera far away stands in
-for the orthographic one.
+The shadow transmittance ``T`` comes from a depth-and-opacity image seen from the light (the derived
+alternative to counting neighbours in a cone, which is quadratic). The light is directional; a
+perspective camera far away stands in for the orthographic one.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from gsfluent.errors import InputError
 # Distance of the light's camera in scene radii; at 40 the rays differ by 1.4 degrees from parallel.
 _LIGHT_DISTANCE = 40.0
 _DISPLAY_GAMMA = 2.2
-# Free border of the map, as a share of the scene's radius: the blurred shadow must fade out before the map ends.
+# Free border of the map, as a share of the scene's radius: the blurred shadow must fade out before
+# the map ends.
 _BORDER = 1.3
 
 
@@ -155,7 +157,8 @@ class ShadowMap:
 
         Args:
             points: Scene points [m], shape [P, 3].
-            bias: Depth [m] by which an occluder must be nearer to the light; about the thickness of a splat.
+            bias: Depth [m] by which an occluder must be nearer to the light; about the thickness of
+                a splat.
 
         Returns:
             Values in [0, 1], shape [P]; 1 outside the map.
@@ -176,7 +179,8 @@ class ShadowMap:
     def cast(self, points: Tensor, *, softness: float) -> Tensor:
         """Share of the light that reaches a receiver behind everything, such as the floor.
 
-        No depth test is needed there, so the opacity itself is blurred: a smooth penumbra without acne.
+        No depth test is needed there, so the opacity itself is blurred: a smooth penumbra without
+        acne.
 
         Args:
             points: Scene points on the receiver [m], shape [P, 3].
@@ -192,7 +196,7 @@ class ShadowMap:
 
 
 def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
-    """Blur an image [H, W] with a separable Gaussian of ``sigma`` pixels (zero outside the image)."""
+    """Blur an image [H, W] with a Gaussian of ``sigma`` pixels (zero outside the image)."""
     if sigma <= 0.0:
         return image
     reach = max(1, min(int(3.0 * sigma + 0.5), max(image.shape)))

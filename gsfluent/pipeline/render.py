@@ -1,8 +1,10 @@
-"""The Render stage: Gaussians, a camera and a light in; an image with shadows, a floor and a backdrop out.
+"""The Render stage: Gaussians, a camera and a light in; an image with shadows, a floor and a
+backdrop out.
 
-Shading is deferred: one pass of the rasterizer gives colour, opacity, depth and blended normals per pixel, a second
-one from the light gives its shadow map, and Blinn-Phong then runs once per pixel instead of once per splat. Siblings
-that repair created are composited nearest-only through ``groups`` (equations.md section 14).
+Shading is deferred: one pass of the rasterizer gives colour, opacity, depth and blended normals per
+pixel, a second one from the light gives its shadow map, and Blinn-Phong then runs once per pixel
+instead of once per splat. Siblings that repair created are composited nearest-only through
+``groups`` (equations.md section 14).
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_normals import estimate_normals
 from gsfluent.pipeline.stage import Stage
 
-# Shadows start this many mean splat sizes behind the occluder, or a lit surface would shadow itself.
+# Shadows start this many mean splat sizes behind the occluder, or a lit surface would shadow
+# itself.
 _BIAS_IN_SPLATS = 4.0
 _ALPHA_FLOOR = 1e-4
 
@@ -51,8 +54,9 @@ class Render(Stage):
         studio: Floor and backdrop; None composites over ``background``.
         background: Display colour behind the splats when there is no studio.
         antialiased: Antialiased splatting (opacity compensation for the pixel filter).
-        normal_cell: Grid spacing [m] of the normal estimate; found anew for each picture when None (a video fixes it
-            with :func:`gsfluent.pipeline.render_normals.occupancy_cell` of its first frame).
+        normal_cell: Grid spacing [m] of the normal estimate; found anew for each picture when None
+            (a video fixes it with :func:`gsfluent.pipeline.render_normals.occupancy_cell` of its
+            first frame).
         seed: Unused; rendering has no randomness.
     """
 
@@ -129,7 +133,9 @@ class Render(Stage):
             radiance = albedo
         else:
             normal = torch.nn.functional.normalize(seen.normal, dim=-1)
-            radiance = self._lit(albedo, normal, seen.alpha, seen.depth, eye, rays, viewmat, shadow, gaussians)
+            radiance = self._lit(
+                albedo, normal, seen.alpha, seen.depth, eye, rays, viewmat, shadow, gaussians
+            )
         if self.studio is not None:
             behind = self.studio.shade(eye, rays, light or Light(shadow=False), shadow, gaussians)
             background = to_display(behind)
@@ -182,7 +188,9 @@ class Render(Stage):
         if shadow is not None:
             bias = _BIAS_IN_SPLATS * float(gaussians.scales.mean()) + shadow.texel
             arrives = shadow.transmittance(points + 0.5 * bias * surface, bias=0.5 * bias)
-        radiance[covered] = albedo[covered] * blinn_phong(light, surface, toward_eye, arrives)[:, None]
+        radiance[covered] = (
+            albedo[covered] * blinn_phong(light, surface, toward_eye, arrives)[:, None]
+        )
         return radiance
 
 
@@ -193,6 +201,11 @@ def pixel_rays(viewmat: Tensor, intrinsics: Tensor, width: int, height: int) -> 
     u = (x - intrinsics[0, 2]) / intrinsics[0, 0]
     v = (y - intrinsics[1, 2]) / intrinsics[1, 1]
     local = torch.stack(
-        [u.expand(height, width), v[:, None].expand(height, width), torch.ones(height, width).to(u)], -1
+        [
+            u.expand(height, width),
+            v[:, None].expand(height, width),
+            torch.ones(height, width).to(u),
+        ],
+        -1,
     )
     return torch.nn.functional.normalize(local @ viewmat[:3, :3], dim=-1)

@@ -1,4 +1,4 @@
-"""Cameras of a video: an orbit that keeps the action in frame, a photograph's own pose, or a path from a file."""
+"""Cameras of a video: an orbit that follows the action, a photograph's pose, or a path file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,14 @@ from torch import Tensor
 from gsfluent.data import Camera, Capture, Frame
 from gsfluent.errors import InputError
 
-_FIELD_OF_VIEW = 32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
+_FIELD_OF_VIEW = (
+    32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
+)
 _ELEVATION = 20.0
 _START = -60.0
-_SWEEP = 70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
+_SWEEP = (
+    70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
+)
 _SMOOTH_FRAMES = 5.0
 
 
@@ -45,7 +49,7 @@ class Action:
 
 
 def _thin(values: Tensor) -> Tensor:
-    """Every n-th value: a quantile needs thousands, not millions (and torch.quantile refuses 2^24)."""
+    """Every n-th value: a quantile needs thousands (and torch.quantile refuses 2^24)."""
     return values[:: max(1, values.numel() // 20_000)]
 
 
@@ -71,8 +75,9 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     """One camera per frame, slowly circling; it follows the matter smoothly and never zooms.
 
-    The distance is the one that shows nine tenths of the matter at its widest, but the whole object at least and
-    three times the object at most: a burst of crumbs must not shrink the subject to a dot.
+    The distance is the one that shows nine tenths of the matter at its widest, but the whole object
+    at least and three times the object at most: a burst of crumbs must not shrink the subject to a
+    dot.
     """
     count = action.center.shape[0]
     first = float(action.radius[0])
@@ -135,20 +140,24 @@ def cameras_for(
         return read_path(Path(str(choice)), count, size)
     if capture is None or frame is None:
         raise InputError(
-            f"output.camera: {index}", "a photograph's index needs a `capture:`; use `orbit` or a file"
+            f"output.camera: {index}",
+            "a photograph's index needs a `capture:`; use `orbit` or a file",
         )
     if not -len(capture.cameras) <= index < len(capture.cameras):
         raise InputError(
-            f"output.camera: {index}", f"the capture has photographs 0 to {len(capture.cameras) - 1}"
+            f"output.camera: {index}",
+            f"the capture has photographs 0 to {len(capture.cameras) - 1}",
         )
     photograph = capture.view(index).camera  # undistorted
     return [framed(photograph.transformed(frame), size)] * count
 
 
 def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
-    """Cameras from JSON: ``{"fov": vertical degrees, "frames": [{"eye": [x,y,z], "target": [x,y,z]}, ...]}``.
+    """Cameras from JSON: ``{"fov": vertical degrees, "frames": [{"eye": [x,y,z], "target":
+    [x,y,z]}, ...]}``.
 
-    Scene frame, metres. One entry is a still camera; otherwise eyes and targets are interpolated over the video.
+    Scene frame, metres. One entry is a still camera; otherwise eyes and targets are interpolated
+    over the video.
 
     Raises:
         InputError: The file is missing, is not such JSON, or an eye sits on its target.
@@ -156,13 +165,22 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
     mend = 'give {"fov": 32, "frames": [{"eye": [x, y, z], "target": [x, y, z]}, ...]} in metres'
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        keys = torch.tensor([[*f["eye"], *f["target"]] for f in data["frames"]], dtype=torch.float64)
+        keys = torch.tensor(
+            [[*f["eye"], *f["target"]] for f in data["frames"]], dtype=torch.float64
+        )
         field = float(data.get("fov", _FIELD_OF_VIEW))
     except OSError as error:
-        raise InputError(f"output.camera: {path}: {error.strerror}", "give orbit, an index, or a file") from error
+        raise InputError(
+            f"output.camera: {path}: {error.strerror}", "give orbit, an index, or a file"
+        ) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"output.camera: {path}: {error!r}", mend) from error
-    if keys.ndim != 2 or keys.shape[1] != 6 or not keys.isfinite().all() or not 1.0 <= field <= 150.0:
+    if (
+        keys.ndim != 2
+        or keys.shape[1] != 6
+        or not keys.isfinite().all()
+        or not 1.0 <= field <= 150.0
+    ):
         raise InputError(f"output.camera: {path}: fov {field}, frames {tuple(keys.shape)}", mend)
     if bool(((keys[:, :3] - keys[:, 3:]).norm(dim=-1) == 0).any()):
         raise InputError(f"output.camera: {path}: an eye equals its target", mend)

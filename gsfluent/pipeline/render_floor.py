@@ -1,8 +1,10 @@
-"""The studio behind the splats: an analytic floor that takes shadows, fading into a neutral backdrop.
+"""The studio behind the splats: an analytic floor that takes shadows, fading into a neutral
+backdrop.
 
-A ground plane needs no Gaussians: each pixel's ray meets ``z = height`` in closed form, so the floor is sharp at any
-size, never punches through the object, and costs one pass over the pixels. Far away it dissolves into the backdrop,
-whose grey rises with the ray, so that no horizon line cuts the picture.
+A ground plane needs no Gaussians: each pixel's ray meets ``z = height`` in closed form, so the
+floor is sharp at any size, never punches through the object, and costs one pass over the pixels.
+Far away it dissolves into the backdrop, whose grey rises with the ray, so that no horizon line cuts
+the picture.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from torch import Tensor
 from gsfluent.data import Gaussians
 from gsfluent.pipeline.light import Light, ShadowMap, gaussian_blur
 
-# Linear radiance of the floor's paint and of the backdrop at and above the horizon: a light neutral studio grey.
+# Linear radiance of the floor's paint and of the backdrop at and above the horizon: a light neutral
+# studio grey.
 _FLOOR = (0.46, 0.46, 0.47)
 _HORIZON = (0.50, 0.50, 0.51)
 _ZENITH = (0.27, 0.28, 0.30)
@@ -79,7 +82,9 @@ class Studio:
         ambient = 1.0 - _CONTACT_STRENGTH * self.contact(gaussians, points)
         irradiance = light.ambient * ambient + light.intensity * arrives * toward[2].clamp(min=0.0)
         # relative to an open floor, so that the paint keeps its grey under any light
-        irradiance = irradiance / (light.ambient + light.intensity * float(toward[2].clamp(min=0.0)))
+        irradiance = irradiance / (
+            light.ambient + light.intensity * float(toward[2].clamp(min=0.0))
+        )
         paint = points.new_tensor(_FLOOR) * irradiance[:, None]
         away = (points[:, :2] - points.new_tensor(self.center)).norm(dim=-1) / (6.0 * self.radius)
         keep = torch.exp(-(away**2))[:, None]
@@ -89,7 +94,8 @@ class Studio:
     def contact(self, gaussians: Gaussians, points: Tensor) -> Tensor:
         """Share of the sky hidden from floor points [P, 3] by matter close above them, in [0, 1].
 
-        The footprint of the splats, each counted less the higher it hangs, blurred by about that height.
+        The footprint of the splats, each counted less the higher it hangs, blurred by about that
+        height.
         """
         means = gaussians.means
         reach = 0.25 * self.radius

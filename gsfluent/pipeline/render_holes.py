@@ -1,8 +1,9 @@
 """How much background shows through the object: the fraction of holes in its silhouette.
 
-When a body breaks, the Gaussians that rode on it part and the far side shines through. The silhouette against which
-this is counted comes from the matter itself, the material points drawn as solid balls that touch their neighbours, so
-a true gap between fragments is not a hole but a see-through fragment is.
+When a body breaks, the Gaussians that rode on it part and the far side shines through. The
+silhouette against which this is counted comes from the matter itself, the material points drawn as
+solid balls that touch their neighbours, so a true gap between fragments is not a hole but a
+see-through fragment is.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
 
-# Balls of this many standard deviations per particle spacing overlap enough to close the silhouette of a packing.
+# Balls of this many standard deviations per particle spacing overlap enough to close the silhouette
+# of a packing.
 _SIGMA_IN_SPACINGS = 0.45
 _SOLID = 0.9
 _HOLE = 0.5

@@ -1,8 +1,9 @@
 """Normals of Gaussians in any state, whole or broken, from where matter is now.
 
-The outward normal is minus the gradient of the blurred occupancy of space. It exists on the skin, on crack faces and
-on debris alike, needs no memory of the rest state and, unlike a plane fitted to neighbours (PCA), it has a side.
-Flat Gaussians know their plane better than any neighbourhood does: they use their shortest axis, turned outward.
+The outward normal is minus the gradient of the blurred occupancy of space. It exists on the skin,
+on crack faces and on debris alike, needs no memory of the rest state and, unlike a plane fitted to
+neighbours (PCA), it has a side. Flat Gaussians know their plane better than any neighbourhood does:
+they use their shortest axis, turned outward.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Gaussians
 
-# Gaussians per occupied cell wanted in the occupancy grid: fewer leaves pinholes, more rounds edges away.
+# Gaussians per occupied cell wanted in the occupancy grid: fewer leaves pinholes, more rounds edges
+# away.
 _PER_CELL = 3.0
 _MAX_CELLS = 4_000_000
 # A Gaussian is called flat when its shortest axis is below this share of the middle one.
@@ -46,8 +48,8 @@ def occupancy_cell(means: Tensor) -> float:
 def density_normals(means: Tensor, cell: float) -> Tensor:
     """Outward unit normals [N, 3]: minus the gradient of the blurred occupancy at each point.
 
-    Occupancy saturates at one per cell; otherwise the crowded skin of a reconstruction would be a ridge whose inner
-    half points inward.
+    Occupancy saturates at one per cell; otherwise the crowded skin of a reconstruction would be a
+    ridge whose inner half points inward.
 
     Args:
         means: Positions, shape [N, 3].
@@ -93,7 +95,8 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
     axes = geometry.quaternion_to_matrix(gaussians.quats[flat])
     shortest = torch.gather(axes, 2, index[flat, None, None].expand(-1, 3, 1)).squeeze(-1)
     agreement = (shortest * outward[flat]).sum(-1)
-    # an axis across the density gradient is a splat standing on edge (hair, seams): trust the density
+    # an axis across the density gradient is a splat standing on edge (hair, seams): trust the
+    # density
     trusted = agreement.abs() > 0.5
     turned = shortest[trusted] * agreement[trusted].sign()[:, None]
     return outward.index_copy(0, flat[trusted], turned)

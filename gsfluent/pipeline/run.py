@@ -1,7 +1,8 @@
 """Everything a shot asks for, in order, resumable: the orchestrator behind ``gsfluent run``.
 
-Each stage is looked up by the fingerprint of what goes into it and only done when that changed. Whatever happens,
-``run.json`` says so: it is written when the run ends, when it fails, and when it is interrupted.
+Each stage is looked up by the fingerprint of what goes into it and only done when that changed.
+Whatever happens, ``run.json`` says so: it is written when the run ends, when it fails, and when it
+is interrupted.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ import torch
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
 from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_prepare import isolate_stage, reconstruct_stage, fill_stage, texture_stage
+from gsfluent.pipeline.run_prepare import (
+    fill_stage,
+    isolate_stage,
+    reconstruct_stage,
+    texture_stage,
+)
 from gsfluent.pipeline.run_record import RunRecord
 from gsfluent.pipeline.run_show import export_stage, render_stage
 from gsfluent.pipeline.run_simulate import simulate_stage
@@ -89,15 +95,21 @@ def run_shot(
         ) from error
     values = record.finish(store.results)
     _log.info(
-        "%s in %.1f s: %s (%s)", out, time.perf_counter() - start, values["verdict"], values["reason"]
+        "%s in %.1f s: %s (%s)",
+        out,
+        time.perf_counter() - start,
+        values["verdict"],
+        values["reason"],
     )
     if values["verdict"] == "failed":
-        raise RunError(values["reason"], _kept(out, store), "try solve.quality: hero, or softer material")
+        raise RunError(
+            values["reason"], _kept(out, store), "try solve.quality: hero, or softer material"
+        )
     return values
 
 
 def _record_failure(record: RunRecord, error: BaseException, store: StageStore) -> None:
-    """Write run.json; when even that is impossible (full disk) the error itself still reaches the user."""
+    """Write run.json; where even that is impossible (full disk) the error still reaches the user."""
     with suppress(RunError, OSError):
         record.fail(error, store.results)
 

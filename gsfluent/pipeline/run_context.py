@@ -17,7 +17,8 @@ from gsfluent.progress import Reporter
 
 @dataclass
 class RunContext:
-    """Settings of a run and what its stages hand on: file names, not tensors, so that any stage may be skipped.
+    """Settings of a run and what its stages hand on: file names, not tensors, so that any stage may
+    be skipped.
 
     Attributes:
         shot: What to do.

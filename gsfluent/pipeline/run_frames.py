@@ -1,7 +1,8 @@
 """Simulated frames on disk: what rendering and exporting need, without the solver's state.
 
-One uncompressed ``.npz`` per frame, about 50 bytes a Gaussian plus 6 a colour coefficient. Centres and sizes keep full
-precision, since pictures and exports hang on them; what only tints a picture is stored in half precision.
+One uncompressed ``.npz`` per frame, about 50 bytes a Gaussian plus 6 a colour coefficient. Centres
+and sizes keep full precision, since pictures and exports hang on them; what only tints a picture is
+stored in half precision.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class SavedFrame:
         time: Simulated time [s].
         gaussians: Scene frame, repaired.
         groups: Siblings for nearest-only compositing, int32 [N], -1 for none.
-        before: Gaussians before repair (same frame), or None when repair changed nothing.
+        carried: How many of them came from the solids; the rest, at the end, are transition splats
+            of the repair.
         positions: Material points [m], [P, 3].
         volumes: Their volumes [m^3], [P].
         damage: 0 intact to 1 broken, [P].
@@ -44,7 +46,7 @@ class SavedFrame:
     time: float
     gaussians: Gaussians
     groups: Tensor
-    before: Gaussians | None
+    carried: int
     positions: Tensor
     volumes: Tensor
     damage: Tensor
@@ -58,7 +60,7 @@ class SavedFrame:
             self.time,
             self.gaussians.to(device),
             self.groups.to(device),
-            None if self.before is None else self.before.to(device),
+            self.carried,
             self.positions.to(device),
             self.volumes.to(device),
             self.damage.to(device),
@@ -79,15 +81,18 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
         RunError: The disk is full.
     """
     arrays: dict[str, np.ndarray] = {}
-    for prefix, gaussians in (("", frame.gaussians), ("before_", frame.before)):
-        if gaussians is not None:
-            for name in ("means", "quats", "scales", "opacities", "sh"):
-                arrays[prefix + name] = _packed(name, getattr(gaussians, name))
-            if gaussians.labels is not None:
-                arrays[prefix + "labels"] = gaussians.labels.cpu().numpy().astype(np.int8)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        arrays[name] = _packed(name, getattr(frame.gaussians, name))
+    if frame.gaussians.labels is not None:
+        arrays["labels"] = frame.gaussians.labels.cpu().numpy().astype(np.int8)
     for name in ("groups", "positions", "volumes", "damage", "fragments"):
         arrays[name] = _packed(name, getattr(frame, name))
-    head = {"index": frame.index, "time": frame.time, "facts": frame.facts}
+    head = {
+        "index": frame.index,
+        "time": frame.time,
+        "carried": frame.carried,
+        "facts": frame.facts,
+    }
     arrays["head"] = np.array(json.dumps(head))
     path = frame_path(folder, frame.index)
     with atomic_path(path) as part, part.open("wb") as stream:
@@ -109,9 +114,9 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
         return SavedFrame(
             head["index"],
             head["time"],
-            _gaussians(arrays, ""),
+            _gaussians(arrays),
             _tensor(arrays["groups"]),
-            _gaussians(arrays, "before_") if "before_means" in arrays else None,
+            head["carried"],
             _tensor(arrays["positions"]),
             _tensor(arrays["volumes"]),
             _tensor(arrays["damage"]),
@@ -143,9 +148,9 @@ def _tensor(array: np.ndarray) -> Tensor:
     return value.float() if value.dtype == torch.float16 else value
 
 
-def _gaussians(arrays: dict[str, np.ndarray], prefix: str) -> Gaussians:
-    labels = arrays.get(prefix + "labels")
+def _gaussians(arrays: dict[str, np.ndarray]) -> Gaussians:
+    labels = arrays.get("labels")
     return Gaussians(
-        *(_tensor(arrays[prefix + n]) for n in ("means", "quats", "scales", "opacities", "sh")),
+        *(_tensor(arrays[name]) for name in ("means", "quats", "scales", "opacities", "sh")),
         labels=None if labels is None else torch.from_numpy(labels.astype(np.int32)),
     )

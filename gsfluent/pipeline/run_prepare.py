@@ -15,12 +15,11 @@ from gsfluent.data import Frame, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, write_json
 from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.orient import make_frame, orient
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_store import content_digest, fingerprint
+from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
 from gsfluent.pipeline.texture import Texture
 
 _log = logging.getLogger(__name__)
@@ -173,14 +172,14 @@ def texture_stage(context: RunContext) -> None:
 
     result = context.store.run("texture", key, work)
     first = next(iter(shot.objects))
-    _copy(result.folder / f"{first}.png", context.out / "interior.png")
+    publish(result.folder / f"{first}.png", context.out / "interior.png")
     context.record.values["texture"] = dict(result.report)
     context.record.values["outputs"]["interior"] = "interior.png"
     context.source_key = result.fingerprint
 
 
 def _merged(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """One report: the object's own when there is one, counts and volumes summed when there are more."""
+    """One report: the object's own, or counts and volumes summed when there are more objects."""
     if len(reports) == 1:
         return reports[0]
     total: dict[str, Any] = dict(reports[0])
@@ -189,11 +188,3 @@ def _merged(reports: list[dict[str, Any]]) -> dict[str, Any]:
             total[key] = sum(report[key] for report in reports)
     total["objects"] = reports
     return total
-
-
-def _copy(source: Path, target: Path) -> None:
-    from gsfluent.io import atomic_path
-
-    with atomic_path(target) as part:
-        part.write_bytes(source.read_bytes())
-

@@ -1,4 +1,4 @@
-"""``run.json``: the verdict of a run and every figure its stages know, written atomically, also on failure."""
+"""``run.json``: verdict and every figure the stages know, written atomically, also on failure."""
 
 from __future__ import annotations
 

@@ -1,15 +1,17 @@
 """Finished stages on disk, each with a fingerprint of everything it depends on.
 
-A stage's folder holds its results and ``stage.json``. The fingerprint covers gsfluent's version, the part of the shot
-the stage reads, the content of its input files and the fingerprint of the stage before it, so a changed texture
-exemplar redoes the texture and what follows, and leaves the reconstruction alone. A folder whose work was cut short
-stays, marked incomplete, and is handed back to the stage, which may go on from there.
+A stage's folder holds its results and ``stage.json``. The fingerprint covers gsfluent's version,
+the part of the shot the stage reads, the content of its input files and the fingerprint of the
+stage before it, so a changed texture exemplar redoes the texture and what follows, and leaves the
+reconstruction alone. A folder whose work was cut short stays, marked incomplete, and is handed back
+to the stage, which may go on from there.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import resource
 import shutil
 import sys
@@ -24,7 +26,7 @@ import torch
 
 import gsfluent
 from gsfluent.errors import RunError
-from gsfluent.io import write_json
+from gsfluent.io import atomic_path, write_json
 
 _CHUNK = 1 << 20
 
@@ -100,13 +102,14 @@ class StageStore:
         self.results: list[StageResult] = []
 
     def run(self, name: str, key: str, work: Callable[[Path], dict[str, Any]]) -> StageResult:
-        """Return the finished result of stage ``name``, doing ``work(folder)`` only when it must be done.
+        """Return the finished result of stage ``name``, doing ``work(folder)`` only when it must be
+        done.
 
         Args:
             name: Folder name under the root.
             key: Fingerprint of the inputs.
-            work: Writes its files into the folder and returns the report. The folder may hold what an earlier try
-                with the same fingerprint left.
+            work: Writes its files into the folder and returns the report. The folder may hold what
+                an earlier try with the same fingerprint left.
         """
         folder = self.root / name
         marker = folder / "stage.json"
@@ -138,8 +141,8 @@ class StageStore:
                 result.report = work(folder)
             complete = True
         finally:
-            # on failure this keeps the time already spent; when even that cannot be written, the marker from
-            # before still says "incomplete", which is all a later run needs
+            # on failure this keeps the time already spent; when even that cannot be written, the
+            # marker from before still says "incomplete", which is all a later run needs
             try:
                 write_json(marker, _marker(result, complete=complete))
             except (OSError, RunError):
@@ -166,7 +169,7 @@ def measured(result: StageResult) -> Iterator[None]:
 
 
 def _reset_peak_memory() -> None:
-    """Start a new high-water mark where the kernel allows it (Linux); elsewhere it counts from process start."""
+    """Start a new high-water mark where the kernel can (Linux); else it counts from the start."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
@@ -191,9 +194,18 @@ def _marker(result: StageResult, *, complete: bool) -> dict[str, Any]:
 
 
 def _read_marker(path: Path) -> dict[str, Any]:
-    """The marker, or nothing when there is none or it cannot be read (then the stage is simply redone)."""
+    """The marker, or nothing when it is missing or unreadable (then the stage is redone)."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+def publish(source: Path, target: Path) -> None:
+    """Show a stage's result in the result folder: a hard link where possible, else a copy."""
+    with atomic_path(target) as part:
+        try:
+            os.link(source, part)
+        except OSError:
+            shutil.copyfile(source, part)

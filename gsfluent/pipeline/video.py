@@ -1,7 +1,7 @@
 """Video on disk, written whole or not at all.
 
-H.264 through imageio-ffmpeg (a wheel that carries its own ffmpeg), because a browser plays H.264 with yuv420p and
-little else.
+H.264 through imageio-ffmpeg (a wheel that carries its own ffmpeg), because a browser plays H.264
+with yuv420p and little else.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from torch import Tensor
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import atomic_path
 
-# Constant rate factor of x264: 18 is the usual "visually lossless" setting, and splat noise punishes higher ones.
+# Constant rate factor of x264: 18 is the usual "visually lossless" setting, and splat noise
+# punishes higher ones.
 _CRF = 18
 
 
