@@ -53,7 +53,7 @@ class Reconstruct(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Reconstruct and write."""
-        from gsfluent.pipeline.single import reconstruct_to
+        from gsfluent.pipeline.run_single import reconstruct_to
 
         existing(self.capture, "CAPTURE", folder=True)
         given = {
@@ -103,7 +103,7 @@ class Fill(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Fill and write."""
-        from gsfluent.pipeline.single import fill_to
+        from gsfluent.pipeline.run_single import fill_to
 
         existing(self.model, "model.ply", folder=False)
         given = {"resolution": self.resolution, "method": self.method, "hollow": self.hollow}
@@ -150,7 +150,7 @@ class Texture(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Texture and write."""
-        from gsfluent.pipeline.single import texture_to
+        from gsfluent.pipeline.run_single import texture_to
 
         existing(self.solid, "solid.ply", folder=False)
         method = self.method or ("exemplar" if self.exemplar else None)

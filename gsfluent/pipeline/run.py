@@ -28,7 +28,7 @@ from gsfluent.pipeline.run_prepare import (
 from gsfluent.pipeline.run_record import RunRecord
 from gsfluent.pipeline.run_show import export_stage, render_stage
 from gsfluent.pipeline.run_simulate import simulate_stage
-from gsfluent.pipeline.run_store import StageStore
+from gsfluent.pipeline.run_store import StageResult, StageStore
 from gsfluent.progress import LineReporter, Reporter
 
 _log = logging.getLogger(__name__)
@@ -44,6 +44,7 @@ def run_shot(
     seed: int = 0,
     force: bool = False,
     reporter: Reporter | None = None,
+    before: StageResult | None = None,
     after: AfterRun | None = None,
 ) -> dict[str, Any]:
     """Run a shot into a folder.
@@ -55,6 +56,7 @@ def run_shot(
         seed: Seed of everything random.
         force: Redo finished stages.
         reporter: Receives progress; log lines by default.
+        before: A stage done already, to stand first in ``run.json``.
         after: Called when all stages are done; what it returns is added to ``run.json``.
 
     Returns:
@@ -68,6 +70,8 @@ def run_shot(
     out.mkdir(parents=True, exist_ok=True)
     device = torch.device(device)
     store = StageStore(out / "stages", force=force)
+    if before is not None:
+        store.results.append(before)
     record = RunRecord(out / "run.json", shot.resolved(), device, seed)
     context = RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
     start = time.perf_counter()

@@ -12,7 +12,7 @@ from gsfluent.errors import GsfluentError
 from gsfluent.io import write_json
 from gsfluent.pipeline.run_store import StageResult
 
-CLEAN, HEALED, FAILED = "clean", "healed", "failed"
+CLEAN, FAILED = "clean", "failed"
 
 
 class RunRecord:
@@ -46,14 +46,8 @@ class RunRecord:
     def finish(self, stages: list[StageResult]) -> dict[str, Any]:
         """Set the verdict of a run that went through and write the file."""
         simulation = self.values["simulation"] or {}
-        rollbacks = int(simulation.get("rollbacks", 0))
-        non_finite = sum(simulation.get("per_frame", {}).get("non_finite", []))
-        if non_finite:
-            verdict, reason = FAILED, f"{non_finite} non-finite particle values in the simulation"
-        elif rollbacks:
-            verdict, reason = HEALED, f"{rollbacks} time steps were taken back and repeated smaller"
-        else:
-            verdict, reason = CLEAN, "every stage finished, nothing had to be repaired"
+        verdict = simulation.get("verdict", CLEAN)
+        reason = simulation.get("reason") or "every stage finished, nothing had to be healed"
         return self._write(verdict, reason, stages)
 
     def fail(self, error: BaseException, stages: list[StageResult]) -> dict[str, Any]:

@@ -76,8 +76,7 @@ def simulate_stage(context: RunContext) -> None:
         for frame in frames:
             save_frame(folder, saved(frame))
             # after the frame: a state on disk always has its picture
-            stage.save(state)
-        state.unlink(missing_ok=True)
+            stage.save_state(state)
         return stage.report()
 
     result = context.store.run("simulate", key, work)

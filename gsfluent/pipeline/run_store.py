@@ -139,7 +139,8 @@ class StageStore:
         try:
             with measured(result):
                 result.report = work(folder)
-            complete = True
+            # a stage that gave up is asked again next time
+            complete = result.report.get("verdict") != "failed"
         finally:
             # on failure this keeps the time already spent; when even that cannot be written, the
             # marker from before still says "incomplete", which is all a later run needs
