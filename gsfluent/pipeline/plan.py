@@ -107,19 +107,10 @@ def _stand_in(shot: Shot, warnings: list[str]) -> tuple[Solid, Frame, str]:
     from gsfluent.pipeline.inspect import inspect
 
     report = inspect(shot.capture, None, size=shot.size)
-    box = [float(x) for x in _box_size(report["box"])]
+    box = [float(x) for x in report["box"]["size"]]
     if shot.scale is not None:
-        box = [x * shot.scale / float(report["scale"]) for x in box]
+        box = [x * shot.scale / float(report["scale"]["metres_per_unit"]) for x in box]
     return _ellipsoid(box), Frame.identity(), "an ellipsoid in the box of the sparse points"
-
-
-def _box_size(box: Any) -> Any:
-    """Extents of a box given as size or as two corners."""
-    if isinstance(box, dict):
-        box = box.get("size") or [b - a for a, b in zip(box["low"], box["high"], strict=True)]
-    if len(box) == 2:
-        return [b - a for a, b in zip(box[0], box[1], strict=True)]
-    return box
 
 
 def _ellipsoid(size: list[float]) -> Solid:

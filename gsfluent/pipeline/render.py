@@ -1,5 +1,4 @@
-"""The Render stage: Gaussians, a camera and a light in; an image with shadows, a floor and a
-backdrop out.
+"""The Render stage: Gaussians, a camera and a light in; a picture with shadows and a floor out.
 
 Shading is deferred: one pass of the rasterizer gives colour, opacity, depth and blended normals per
 pixel, a second one from the light gives its shadow map, and Blinn-Phong then runs once per pixel

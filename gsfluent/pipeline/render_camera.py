@@ -23,6 +23,7 @@ _SWEEP = (
     70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
 )
 _SMOOTH_FRAMES = 5.0
+_ROOM = 1.2  # free space around the matter, as a factor on its radius
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 
 
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
-    """One camera per frame, slowly circling; it follows the matter smoothly and never zooms.
+    """One camera per frame, slowly circling; it follows the matter softly and never zooms.
 
     The distance is the one that shows nine tenths of the matter at its widest, but the whole object
     at least and three times the object at most: a burst of crumbs must not shrink the subject to a
@@ -81,10 +82,9 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     """
     count = action.center.shape[0]
     first = float(action.radius[0])
-    shown = min(max(float(action.radius.amax()), 1.35 * first), 3.0 * first)
-    half = math.radians(_FIELD_OF_VIEW) / 2.0
-    distance = 1.2 * shown / math.sin(half)
-    centers = _smooth(action.center)
+    shown = _ROOM * min(max(float(action.radius.amax()), 1.35 * first), 3.0 * first)
+    distance = shown / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
+    centers = _follow(action, shown)
     steps = [i / max(1, count - 1) for i in range(count)]
     return [
         look_at(centers[i], distance, _START + _SWEEP * step, _ELEVATION, size)
@@ -92,11 +92,20 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     ]
 
 
-def _smooth(track: Tensor) -> Tensor:
-    """Gaussian smoothing along time with the ends held, shape [F, 3]."""
-    count = track.shape[0]
-    frames = torch.arange(count, dtype=track.dtype)
-    weight = torch.exp(-0.5 * ((frames[:, None] - frames[None, :]) / _SMOOTH_FRAMES) ** 2)
+def _follow(action: Action, shown: float) -> Tensor:
+    """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
+    smooth = _smooth(action.center, _SMOOTH_FRAMES)
+    lag = smooth - action.center
+    room = (shown - _ROOM * action.radius).clamp(min=0.1 * shown)
+    length = lag.norm(dim=1).clamp(min=1e-12)
+    held = action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
+    return _smooth(held, 0.5)
+
+
+def _smooth(track: Tensor, sigma: float) -> Tensor:
+    """Gaussian smoothing over ``sigma`` frames with the ends held, shape [F, 3]."""
+    frames = torch.arange(track.shape[0], dtype=track.dtype)
+    weight = torch.exp(-0.5 * ((frames[:, None] - frames[None, :]) / sigma) ** 2)
     return (weight @ track) / weight.sum(dim=1, keepdim=True)
 
 
@@ -153,11 +162,10 @@ def cameras_for(
 
 
 def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
-    """Cameras from JSON: ``{"fov": vertical degrees, "frames": [{"eye": [x,y,z], "target":
-    [x,y,z]}, ...]}``.
+    """Cameras from JSON: ``{"fov": 32, "frames": [{"eye": [x,y,z], "target": [x,y,z]}, ...]}``.
 
-    Scene frame, metres. One entry is a still camera; otherwise eyes and targets are interpolated
-    over the video.
+    Scene frame, metres; ``fov`` is vertical, in degrees. One entry is a still camera; otherwise
+    eyes and targets are interpolated over the video.
 
     Raises:
         InputError: The file is missing, is not such JSON, or an eye sits on its target.

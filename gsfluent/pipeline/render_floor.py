@@ -1,5 +1,4 @@
-"""The studio behind the splats: an analytic floor that takes shadows, fading into a neutral
-backdrop.
+"""The studio behind the splats: an analytic floor that takes shadows, and a neutral backdrop.
 
 A ground plane needs no Gaussians: each pixel's ray meets ``z = height`` in closed form, so the
 floor is sharp at any size, never punches through the object, and costs one pass over the pixels.
@@ -102,15 +101,16 @@ class Studio:
         lift = (means[:, 2] - self.height).clamp(min=0.0)
         weight = gaussians.opacities * torch.exp(-lift / reach)
         half = float((means[:, :2] - means.new_tensor(self.center)).abs().amax()) + 3.0 * reach
-        cell = 2.0 * half / _FOOTPRINT_TEXELS
+        # texels no finer than the splats, or the floor would see between them
+        texels = int(half / max(1.5 * float(gaussians.scales.mean()), half / _FOOTPRINT_TEXELS))
+        texels = max(texels, 8)
+        cell = 2.0 * half / texels
         index = ((means[:, :2] - means.new_tensor(self.center) + half) / cell).long()
-        index = index.clamp(0, _FOOTPRINT_TEXELS - 1)
-        footprint = torch.zeros(_FOOTPRINT_TEXELS**2, dtype=means.dtype, device=means.device)
+        index = index.clamp(0, texels - 1)
+        footprint = torch.zeros(texels**2, dtype=means.dtype, device=means.device)
         # the nearest splat above a texel hides it; more of them hide it no further
-        footprint.scatter_reduce_(0, index[:, 1] * _FOOTPRINT_TEXELS + index[:, 0], weight, "amax")
-        blurred = gaussian_blur(
-            footprint.reshape(_FOOTPRINT_TEXELS, _FOOTPRINT_TEXELS), 0.35 * reach / cell
-        )
+        footprint.scatter_reduce_(0, index[:, 1] * texels + index[:, 0], weight, "amax")
+        blurred = gaussian_blur(footprint.reshape(texels, texels), 0.35 * reach / cell)
         grid = ((points[:, :2] - points.new_tensor(self.center)) / half)[None, None]
         sampled = torch.nn.functional.grid_sample(
             blurred[None, None], grid, mode="bilinear", padding_mode="zeros", align_corners=False

@@ -113,7 +113,7 @@ def run_shot(
 
 
 def _record_failure(record: RunRecord, error: BaseException, store: StageStore) -> None:
-    """Write run.json; where even that is impossible (full disk) the error still reaches the user."""
+    """Write run.json; where even that cannot be (full disk) the error still reaches the user."""
     with suppress(RunError, OSError):
         record.fail(error, store.results)
 

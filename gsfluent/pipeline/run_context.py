@@ -17,8 +17,9 @@ from gsfluent.progress import Reporter
 
 @dataclass
 class RunContext:
-    """Settings of a run and what its stages hand on: file names, not tensors, so that any stage may
-    be skipped.
+    """Settings of a run and what its stages hand on.
+
+    They hand on files and fingerprints, not tensors, so that any of them may be skipped.
 
     Attributes:
         shot: What to do.

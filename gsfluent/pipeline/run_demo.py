@@ -1,4 +1,4 @@
-"""The built-in scenes: photographs that gsfluent draws itself, of an object whose inside it knows."""
+"""The built-in scenes: photographs drawn by gsfluent of an object whose inside it knows."""
 
 from __future__ import annotations
 

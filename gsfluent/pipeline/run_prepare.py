@@ -8,11 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from gsfluent.config import Select
-from gsfluent.data import Frame, Gaussians, Solid
-from gsfluent.errors import InputError
+from gsfluent.data import Frame, Solid
 from gsfluent.io import load, load_capture, write_json
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.orient import make_frame, orient
@@ -20,11 +17,10 @@ from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
+from gsfluent.pipeline.select import select_mask
 from gsfluent.pipeline.texture import Texture
 
 _log = logging.getLogger(__name__)
-
-_COLOR_TOLERANCE = 0.15
 
 
 def reconstruct_stage(context: RunContext) -> None:
@@ -38,10 +34,13 @@ def reconstruct_stage(context: RunContext) -> None:
     capture = context.capture
 
     def work(folder: Path) -> dict[str, Any]:
-        stage = Reconstruct(**shot.reconstruct.given(), seed=context.seed)
-        gaussians, report = stage(
-            capture, progress=context.reporter.task("reconstruct"), device=context.device
+        stage = Reconstruct(
+            **shot.reconstruct.given(),
+            checkpoint=folder / "training.pt",
+            device=context.device,
+            seed=context.seed,
         )
+        gaussians, report = stage(capture, progress=context.reporter.task("reconstruct"))
         gaussians.save(folder / "model.ply")
         return dict(report)
 
@@ -63,7 +62,7 @@ def isolate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load(source).validated(source.name)
-        whole = isolate(gaussians, context.capture, seed=context.seed)
+        whole = Isolate(seed=context.seed)(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
         whole.save(folder / "object.ply")
@@ -101,7 +100,7 @@ def fill_stage(context: RunContext) -> None:
         taken = torch.zeros(everything.count, dtype=torch.bool)
         reports = []
         for name, settings in shot.objects.items():
-            mask = select_splats(everything, settings.select, frame, name) & ~taken
+            mask = select_mask(everything, settings.select, frame) & ~taken
             taken |= mask
             down = -frame.rotation[2]
             stage = Fill(**options, down=tuple(down.tolist()), seed=context.seed)
@@ -117,39 +116,6 @@ def fill_stage(context: RunContext) -> None:
     result = context.store.run("fill", key, work)
     context.record.values["fill"] = dict(result.report)
     context.source_key = result.fingerprint
-
-
-def select_splats(gaussians: Gaussians, select: Select, frame: Frame, name: str) -> Tensor:
-    """Mask [N] of the splats that belong to an object.
-
-    Raises:
-        InputError: Nothing is selected, or the label file does not fit.
-    """
-    mask = torch.ones(gaussians.count, dtype=torch.bool)
-    at = frame.apply(gaussians.means.double())
-    if select.box is not None:
-        low, high = torch.tensor(select.box, dtype=torch.float64)
-        mask &= ((at >= low) & (at <= high)).all(dim=1)
-    if select.sphere is not None:
-        sphere = torch.tensor(select.sphere, dtype=torch.float64)
-        mask &= (at - sphere[:3]).norm(dim=1) <= sphere[3]
-    if select.color_near is not None:
-        wanted = torch.tensor(select.color_near)
-        tolerance = _COLOR_TOLERANCE if select.tolerance is None else select.tolerance
-        mask &= (gaussians.colors() - wanted).norm(dim=1) <= tolerance
-    if select.labels is not None:
-        import numpy as np
-
-        labels = np.load(select.labels, allow_pickle=False)
-        if labels.shape != (gaussians.count,):
-            raise InputError(
-                f"objects.{name}.select.labels: {labels.shape} numbers for {gaussians.count} splats",
-                "give one number per splat of stages/isolate/object.ply",
-            )
-        mask &= torch.from_numpy(labels == (1 if select.label is None else select.label))
-    if not bool(mask.any()):
-        raise InputError(f"objects.{name}.select: no splat is selected", "widen the selection")
-    return mask
 
 
 def texture_stage(context: RunContext) -> None:

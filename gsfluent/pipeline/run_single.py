@@ -47,8 +47,8 @@ def reconstruct_to(
         RunError: The disk is full.
     """
     photographs = load_capture(capture)
-    stage = Reconstruct(**options, seed=seed)
-    gaussians, report = stage(photographs, progress=progress, device=device)
+    stage = Reconstruct(**options, device=device, seed=seed)
+    gaussians, report = stage(photographs, progress=progress)
     if not keep_background:
         gaussians = Isolate(seed=seed)(gaussians, photographs)
     gaussians.save(out)

@@ -102,8 +102,7 @@ class StageStore:
         self.results: list[StageResult] = []
 
     def run(self, name: str, key: str, work: Callable[[Path], dict[str, Any]]) -> StageResult:
-        """Return the finished result of stage ``name``, doing ``work(folder)`` only when it must be
-        done.
+        """Return the result of stage ``name``, doing ``work(folder)`` only when it must be done.
 
         Args:
             name: Folder name under the root.
