@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsfluent.data import Capture, Frame, Gaussians
+from gsfluent.data import Capture, Frame
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture, load_splats, save_image
 from gsfluent.pipeline.inspect_picture import Picture, draw
-from gsfluent.pipeline.inspect_shape import Clusters, cluster, thin_parts
+from gsfluent.pipeline.inspect_shape import cluster, lone_points, robust_box, thin_parts
 from gsfluent.pipeline.orient import (
     DEFAULT_SIZE,
     Orientation,
     near_points,
     orient,
-    robust_box,
     upright_rotation,
 )
 
@@ -48,18 +48,36 @@ def inspect(
         device: Not needed by the look itself; accepted so that every verb takes it.
 
     Returns:
-        The report (JSON values): ``kind``, counts, ``up``, ``floor``, ``box`` in metres, ``scale``, ``pieces``, ``floaters``, ``thin``,
-        ``warnings``, and a ``shot`` to begin with.
+        The report (JSON values): ``kind``, counts, ``up``, ``floor``, ``box`` in metres, ``scale``,
+        ``pieces``, ``floaters``, ``thin``, ``warnings``, and a ``shot`` to begin with.
 
     Raises:
         InputError: The input cannot be read, or ``size`` is not positive.
     """
     if size is not None and not size > 0:
-        raise InputError(f"size must be above 0 metres, got {size}", "give the largest extent in metres")
+        raise InputError(
+            f"size must be above 0 metres, got {size}", "give the largest extent in metres"
+        )
     path = Path(input)
     if path.is_file() and path.suffix.lower() == ".ply":
         return _inspect_splats(path, out, size)
     return _inspect_capture(path, out, size)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """Points of the object in world coordinates, with what stands off it."""
+
+    points: Array
+    colors: Array
+    radii: Array
+    floaters: NDArray[np.bool_]
+    pieces: list[float]  # shares of the points; empty when the cloud is too sparse to tell
+
+
+def _shares(index: NDArray[np.int64], pieces: int) -> list[float]:
+    counts = np.bincount(index)[:pieces]
+    return [round(float(count / len(index)), 4) for count in counts]
 
 
 def _inspect_splats(path: Path, out: str | Path | None, size: float | None) -> dict[str, Any]:
@@ -79,9 +97,11 @@ def _inspect_splats(path: Path, out: str | Path | None, size: float | None) -> d
         "sh_degree": gaussians.sh_degree,
         "anisotropy": float((gaussians.scales.amax(dim=1) / gaussians.scales.amin(dim=1)).median()),
     }
-    thin = thin_parts(points[~groups.floaters], 2 * radii[~groups.floaters])
+    reach = opaque.scales.amax(dim=1).double().numpy()
+    thin = thin_parts(points[~groups.floaters], reach[~groups.floaters])
     colors = opaque.colors().double().numpy()
-    return _finish(facts, points, colors, radii, groups, stance, thin, None, size, out)
+    found = _Found(points, colors, radii, groups.floaters, _shares(groups.index, groups.pieces))
+    return _finish(facts, found, stance, thin, None, size, out)
 
 
 def _inspect_capture(path: Path, out: str | Path | None, size: float | None) -> dict[str, Any]:
@@ -103,13 +123,12 @@ def _inspect_capture(path: Path, out: str | Path | None, size: float | None) -> 
         )
     stance = orient(None, capture)
     points, colors = _object_of(capture, stance)
-    groups = cluster(points, cells=16)
-    radii = np.zeros(len(points))
-    return _finish(facts, points, colors, radii, groups, stance, None, capture, size, out)
+    found = _Found(points, colors, np.zeros(len(points)), lone_points(points), [])
+    return _finish(facts, found, stance, None, capture, size, out)
 
 
 def _object_of(capture: Capture, stance: Orientation) -> tuple[Array, Array]:
-    """Sparse points of the object: near what the cameras look at, above the floor, seen by most views."""
+    """Sparse points of the object: near the cameras' focus, above the floor, seen by most."""
     points = capture.points.double().numpy()
     colors = capture.point_colors.double().numpy()
     near = near_points(capture, stance.focus)
@@ -120,15 +139,20 @@ def _object_of(capture: Capture, stance: Orientation) -> tuple[Array, Array]:
     seen = np.zeros(len(points))
     for camera in capture.cameras:
         pixels, depth = camera.project(capture.points)
-        inside = (pixels >= 0).all(dim=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        inside = (
+            (pixels >= 0).all(dim=1)
+            & (pixels[:, 0] < camera.width)
+            & (pixels[:, 1] < camera.height)
+        )
         seen += (inside & (depth > 0)).numpy()
     keep &= seen >= 0.6 * len(capture)
-    if keep.sum() < 20:
-        return near, np.full((len(near), 3), 0.5)
-    groups = cluster(points[keep], cells=16)
     index = np.flatnonzero(keep)
-    main = index[groups.index == 0]
-    # The sparse cloud of one object falls apart; what lies within its size of the main cluster belongs to it.
+    index = index[~lone_points(points[index])]
+    if len(index) < 20:
+        return near, np.full((len(near), 3), 0.5)
+    main = index[cluster(points[index], cells=16).index == 0]
+    index = np.flatnonzero(keep)
+    # The sparse cloud of one object falls apart; what is close to the main cluster belongs to it.
     low, high = robust_box(points[main])
     half = (high - low) / 2
     close = (np.abs(points[index] - (low + high) / 2) <= 1.5 * half).all(axis=1)
@@ -138,10 +162,7 @@ def _object_of(capture: Capture, stance: Orientation) -> tuple[Array, Array]:
 
 def _finish(
     facts: dict[str, Any],
-    points: Array,
-    colors: Array,
-    radii: Array,
-    groups: Clusters,
+    found: _Found,
     stance: Orientation,
     thin: dict[str, Any] | None,
     capture: Capture | None,
@@ -150,29 +171,36 @@ def _finish(
 ) -> dict[str, Any]:
     """Turn everything to scene metres, complete the report, draw."""
     rotation = upright_rotation(stance.up, None if capture is None else capture.cameras)
-    solid = points[~groups.floaters] @ rotation.T
+    solid = found.points[~found.floaters] @ rotation.T
     low, high = robust_box(solid)
     extent = float((high - low).max())
     if not extent > 0:
         raise InputError(f"{facts['input']}: everything lies in one point", "check the file")
     scale = (size or DEFAULT_SIZE) / extent
-    ground = stance.floor if stance.floor_from == "support plane" else low[2]
+    if stance.floor_from == "support plane":
+        low[2] = stance.floor  # what stands on the plane reaches down to it, seen or not
+    ground = low[2]
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, ground])
     frame = Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
-    low, high = (frame.apply(torch.from_numpy(corner)).numpy() for corner in (low @ rotation, high @ rotation))
+    low, high = (
+        frame.apply(torch.from_numpy(corner)).numpy()
+        for corner in (low @ rotation, high @ rotation)
+    )
     report = dict(facts)
     report["up"] = {"axis": stance.up.round(4).tolist(), "from": stance.up_from}
     report["floor"] = {"height": 0.0, "world": float(ground), "from": stance.floor_from}
     report["scale"] = {
         "metres_per_unit": scale,
-        "from": f"largest extent {size:g} m" if size else f"assumed largest extent {DEFAULT_SIZE:g} m",
+        "from": f"largest extent {size:g} m"
+        if size
+        else f"assumed largest extent {DEFAULT_SIZE:g} m",
     }
     report["box"] = {"low": low.tolist(), "high": high.tolist(), "size": (high - low).tolist()}
     report["world_extent"] = extent
-    counts = np.bincount(groups.index)
-    report["pieces"] = [round(float(count / len(points)), 4) for count in counts[: groups.pieces]]
-    loose = int(groups.floaters.sum())
-    report["floaters"] = {"count": loose, "share": loose / len(points)}
+    if found.pieces:
+        report["pieces"] = found.pieces
+    loose = int(found.floaters.sum())
+    report["floaters"] = {"count": loose, "share": loose / len(found.points)}
     if thin is not None:
         report["thin"] = _thin_in_metres(thin, frame)
     report["warnings"] = _warnings(report, capture, size)
@@ -182,11 +210,20 @@ def _finish(
         "up": stance.up.round(4).tolist(),
     }
     if out is not None:
-        placed = frame.apply(torch.from_numpy(points)).numpy()
+        placed = frame.apply(torch.from_numpy(found.points)).numpy()
         photograph = None if capture is None else (_telling_view(capture), frame)
         cameras = np.zeros((0, 3)) if capture is None else frame.apply(capture.centers()).numpy()
         picture = Picture(
-            placed, colors, radii * scale, groups.floaters, low, high, 0.0, cameras, _lines(report), photograph
+            placed,
+            found.colors,
+            found.radii * scale,
+            found.floaters,
+            low,
+            high,
+            0.0,
+            cameras,
+            _lines(report),
+            photograph,
         )
         save_image(draw(picture), out)
         report["picture"] = str(out)
@@ -195,7 +232,9 @@ def _finish(
 
 def _telling_view(capture: Capture) -> Any:
     """Read the photograph taken from the middle height, so that box and floor can be told apart."""
-    heights = capture.centers() @ torch.stack([camera.up() for camera in capture.cameras]).mean(dim=0)
+    heights = capture.centers() @ torch.stack([camera.up() for camera in capture.cameras]).mean(
+        dim=0
+    )
     index = int(heights.argsort()[len(capture) // 2])
     return capture.view(index, _PHOTO_SIZE)
 
@@ -214,16 +253,22 @@ def _warnings(report: dict[str, Any], capture: Capture | None, size: float | Non
     if size is None:
         found.append(f"the size is a guess ({DEFAULT_SIZE:g} m); set size or scale in the shot")
     if report["up"]["from"] == "convention":
-        found.append("a splat does not tell which way is up; -y is assumed, set up in the shot if the picture is wrong")
+        found.append(
+            "a splat does not tell which way is up; -y is assumed: set up if the picture is wrong"
+        )
     if report["floaters"]["share"] > 0.02:
-        found.append(f"{100 * report['floaters']['share']:.0f} % of the points float off the object")
-    if len(report["pieces"]) > 1:
+        found.append(
+            f"{100 * report['floaters']['share']:.0f} % of the points float off the object"
+        )
+    if len(report.get("pieces", [])) > 1:
         found.append(f"{len(report['pieces'])} separate pieces")
     thin = report.get("thin")
-    if thin is not None and not thin["closed"]:
-        found.append("the surface does not close: filling may leak")
+    if thin is not None and thin["share"] > 0.5:
+        found.append("thin nearly everywhere: an open shell, or a sheet")
     elif thin is not None and thin["share"] > 0.05:
-        found.append(f"{100 * thin['share']:.0f} % of the solid is thinner than {1000 * thin['limit']:.0f} mm")
+        found.append(
+            f"{100 * thin['share']:.0f} % of it is thinner than {1000 * thin['limit']:.0f} mm"
+        )
     if capture is not None and report["masks"] == 0:
         found.append("no masks: the background is removed by geometry")
     return found
@@ -240,9 +285,10 @@ def _lines(report: dict[str, Any]) -> list[str]:
     )
     return [
         f"{Path(report['input']).name}: {what}",
-        f"box {wide:.1f} x {deep:.1f} x {tall:.1f} cm; 1 unit = {report['scale']['metres_per_unit']:.4g} m "
+        f"box {wide:.1f} x {deep:.1f} x {tall:.1f} cm; "
+        f"1 unit = {report['scale']['metres_per_unit']:.4g} m "
         f"({report['scale']['from']})",
         f"up [{axis}] from {report['up']['from']}; floor from {report['floor']['from']}; "
-        f"{report['floaters']['count']} floaters (magenta), {len(report['pieces'])} piece(s)",
+        f"{report['floaters']['count']} floaters (magenta)",
         *(f"! {warning}" for warning in report["warnings"]),
     ]

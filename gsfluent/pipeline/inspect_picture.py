@@ -1,4 +1,4 @@
-"""The picture of ``gsfluent inspect``: three views to scale with box, axes and floor, and a fourth as photographed."""
+"""The picture of ``gsfluent inspect``: three views to scale with box, axes and floor, and a photo."""
 
 from __future__ import annotations
 
@@ -111,7 +111,10 @@ def _oblique_view(picture: Picture) -> Any:
 
     def project(points: Array) -> Array:
         local = (points - middle) @ np.stack([right, upward, ahead], axis=1)
-        return np.stack([_PANEL / 2 + local[:, 0] * scale, _PANEL / 2 - local[:, 1] * scale, local[:, 2]], axis=1)
+        return np.stack(
+            [_PANEL / 2 + local[:, 0] * scale, _PANEL / 2 - local[:, 1] * scale, local[:, 2]],
+            axis=1,
+        )
 
     image = _splat(picture, project, scale)
     pen = _pen(image)
@@ -133,7 +136,9 @@ def _photo_view(picture: Picture) -> Any:
     size = (round(pixels.shape[1] * factor), round(pixels.shape[0] * factor))
     image = Image.new("RGB", (_PANEL, _PANEL), _PAPER)
     corner = np.array([(_PANEL - size[0]) / 2, (_PANEL - size[1]) / 2])
-    image.paste(Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS), tuple(corner.astype(int)))
+    image.paste(
+        Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS), tuple(corner.astype(int))
+    )
     back = frame.inverse()
 
     def project(points: Array) -> Array:
@@ -144,7 +149,13 @@ def _photo_view(picture: Picture) -> Any:
     _floor_square(pen, picture, project)
     _outline(pen, picture, project)
     _triad(pen, picture, project)
-    pen.text((12, 8), f"photograph {view.camera.name}", fill=(255, 255, 255), stroke_width=2, stroke_fill=_INK)
+    pen.text(
+        (12, 8),
+        f"photograph {view.camera.name}",
+        fill=(255, 255, 255),
+        stroke_width=2,
+        stroke_fill=_INK,
+    )
     return image
 
 
@@ -183,7 +194,9 @@ def _splat(picture: Picture, project: Project, scale: float) -> Any:
     return image
 
 
-def _segments(pen: Any, project: Project, start: Array, end: Array, color: tuple[int, int, int], width: int) -> None:
+def _segments(
+    pen: Any, project: Project, start: Array, end: Array, color: tuple[int, int, int], width: int
+) -> None:
     """Draw lines between rows of ``start`` and ``end`` that are in front of the viewer."""
     first, second = project(start), project(end)
     for a, b in zip(first, second, strict=True):
@@ -201,7 +214,10 @@ def _outline(pen: Any, picture: Picture, project: Project) -> None:
 
 def _floor_square(pen: Any, picture: Picture, project: Project) -> None:
     """A grid on the floor around the object."""
-    middle, half = (picture.low + picture.high) / 2, 0.75 * float((picture.high - picture.low).max())
+    middle, half = (
+        (picture.low + picture.high) / 2,
+        0.75 * float((picture.high - picture.low).max()),
+    )
     ticks = np.linspace(-half, half, 7)
     ends = []
     for tick in ticks:

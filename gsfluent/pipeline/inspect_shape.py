@@ -8,18 +8,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.pipeline.orient import robust_box
-
 Array = NDArray[np.float64]
 
 _PIECE_SHARE = 0.01
-"""A separate cluster with a smaller share of the points is a floater, a larger one a piece of the object."""
+"""A separate cluster with a smaller share of the points is a floater, a larger one a piece."""
 
-_THIN = 0.03
+_THIN = 0.04
 """Matter within this share of the largest extent from both sides (radius) is called thin."""
 
-_GRID = 72
+_GRID = 48
 """Voxels along the longest side when looking for thin parts."""
+
+
+def robust_box(points: Array) -> tuple[Array, Array]:
+    """Box of points [N, 3] less 2 per thousand on each side: one floater must not set the scale."""
+    if len(points) < 100:
+        return points.min(axis=0), points.max(axis=0)
+    return np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,26 +74,37 @@ def cluster(points: Array, cells: int = 48) -> Clusters:
     return Clusters(rank[of_point].astype(np.int64), pieces, cell)
 
 
+def lone_points(points: Array, neighbours: int = 8, factor: float = 2.5) -> NDArray[np.bool_]:
+    """Points of a noisy cloud whose neighbours are ``factor`` times the usual distance off [N]."""
+    from scipy.spatial import cKDTree
+
+    if len(points) <= neighbours:
+        return np.zeros(len(points), dtype=bool)
+    distance = cKDTree(points).query(points, k=neighbours + 1)[0][:, -1]
+    return np.asarray(distance > factor * np.median(distance))
+
+
 def thin_parts(points: Array, radii: Array) -> dict[str, Any]:
     """Find where the solid behind a surface of splats is thin.
 
-    The splats are rasterised into voxels, closed, and filled; what an opening with a ball of 3 % of the largest extent removes
-    is thin. Voxels of a shell that does not close are thin everywhere, which ``closed`` tells.
+    The splats are rasterised into voxels, closed, and filled; what an opening with a ball of 4 % of
+    the largest extent removes is thin. A shell that does not close is thin everywhere.
 
     Args:
         points: Surface points [N, 3].
         radii: Their radii [N], same unit.
 
     Returns:
-        ``closed`` (whether filling found an inside), ``share`` of the volume that is thin, ``limit`` (thickness below which
-        matter counts as thin) and ``parts`` (centre and length of the largest thin pieces), in the unit of the points.
+        ``share`` of the volume that is thin, ``limit`` (thickness below which
+        matter counts as thin) and ``parts`` (centre and length of the largest thin pieces), in the
+        unit of the points.
     """
     from scipy import ndimage
 
     low, high = robust_box(points)
     step = float((high - low).max()) / _GRID
     if not step > 0:
-        return {"closed": False, "share": 1.0, "limit": 0.0, "parts": []}
+        return {"share": 1.0, "limit": 0.0, "parts": []}
     margin = 4
     size = np.ceil((high - low) / step).astype(int) + 2 * margin
     inside = ((points >= low) & (points <= high)).all(axis=1)
@@ -115,7 +131,6 @@ def thin_parts(points: Array, radii: Array) -> dict[str, Any]:
         center = low + (where.mean(axis=0) - margin + 0.5) * step
         parts.append({"center": center.tolist(), "extent": extent.tolist()})
     return {
-        "closed": bool(solid.sum() > 1.2 * shell.sum()),
         "share": float(thin.sum() / max(1, solid.sum())),
         "limit": 2 * _THIN * _GRID * step,
         "parts": parts,

@@ -1,4 +1,4 @@
-"""Which way is up, where the floor is, how large a unit is: from world coordinates to scene metres."""
+"""Which way is up, where the floor is, how large a unit is: from the world to scene metres."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.pipeline.inspect_shape import cluster, robust_box
 
 if TYPE_CHECKING:
     from gsfluent.config import Shot
@@ -23,7 +24,7 @@ DEFAULT_SIZE = 0.2
 """Largest extent [m] assumed for an object of unknown size: what fits in two hands."""
 
 _SPLAT_UP = (0.0, -1.0, 0.0)
-"""Up of a splat without cameras: trainers keep COLMAP's axes, where the first camera's y points down."""
+"""Up of a splat without cameras: trainers keep COLMAP's axes, where y points down."""
 
 _LEVEL = 0.05
 """Mean squared sine of the cameras' roll below which they count as held level."""
@@ -41,7 +42,8 @@ class Orientation:
 
     Attributes:
         up: Unit up axis [3], world.
-        up_from: What it was taken from: ``given``, ``support plane``, ``cameras`` or ``convention``.
+        up_from: What it was taken from: ``given``, ``support plane``, ``cameras`` or
+            ``convention``.
         floor: Coordinate of the floor along ``up``, world units.
         floor_from: ``given``, ``support plane`` or ``lowest point``.
         focus: Point that the cameras look at [3], or the centre of the splats.
@@ -59,9 +61,9 @@ def orient(
 ) -> Orientation:
     """Find the up axis and the floor.
 
-    Up: as given; else the normal of the plane that carries the object, if the sparse points show one near what the
-    cameras suggest; else the axis that level cameras turn about; else, for a bare splat, -y. Floor: that plane, else the
-    lowest point of the object.
+    Up: as given; else the normal of the plane that carries the object, if the sparse points show
+    one near what the cameras suggest; else the axis that level cameras turn about; else, for a bare
+    splat, -y. Floor: that plane, else the lowest point of the object.
 
     Args:
         gaussians: The object's splats, or None when there is only a capture.
@@ -90,7 +92,9 @@ def orient(
             plane = None  # a slanted surface is no floor for the up axis the user gave
     if plane is not None:
         return Orientation(axis, source, float(plane[1]), "support plane", focus)
-    return Orientation(axis, source, float(np.quantile(points @ axis, 0.002)), "lowest point", focus)
+    return Orientation(
+        axis, source, float(np.quantile(points @ axis, 0.002)), "lowest point", focus
+    )
 
 
 def make_frame(
@@ -98,8 +102,8 @@ def make_frame(
 ) -> Frame:
     """Return the transform from world coordinates to scene metres.
 
-    The scene has +z up. The object's centre stands on the z axis; its lowest point lies at z = 0, unless the shot gives
-    a floor height, which then becomes z = 0.
+    The scene has +z up. The object's centre stands on the z axis; its lowest point lies at z = 0,
+    unless the shot gives a floor height, which then becomes z = 0.
 
     Args:
         gaussians: The object's splats (background removed), world coordinates.
@@ -112,11 +116,14 @@ def make_frame(
     gaussians.validated("make_frame")
     stance = orient(gaussians, capture, "auto" if shot is None else shot.up)
     rotation = upright_rotation(stance.up, None if capture is None else capture.cameras)
-    points = _object_points(gaussians, None) @ rotation.T
+    points = _object_points(gaussians, None)
+    points = points[~cluster(points).floaters] @ rotation.T
     low, high = robust_box(points)
     extent = float((high - low).max())
     if not extent > 0:
-        raise InputError("make_frame: all splats lie in one point", "check the splat file or the selection")
+        raise InputError(
+            "make_frame: all splats lie in one point", "check the splat file or the selection"
+        )
     scale = DEFAULT_SIZE / extent
     if shot is not None and shot.scale is not None:
         scale = shot.scale
@@ -130,11 +137,13 @@ def make_frame(
 
 
 def upright_rotation(up: Array, cameras: list[Camera] | None = None) -> Array:
-    """Rotation [3, 3] that carries ``up`` onto +z, with the first camera (if any) on the -y side, facing +y.
+    """Rotation [3, 3] that carries ``up`` onto +z and faces the first camera (if any) along +y.
 
     So the front view of a scene is the view of the first photograph.
     """
-    rotation = geometry.rotation_between(torch.from_numpy(up), torch.tensor([0.0, 0.0, 1.0])).numpy()
+    rotation = geometry.rotation_between(
+        torch.from_numpy(up), torch.tensor([0.0, 0.0, 1.0])
+    ).numpy()
     if cameras:
         ahead = rotation @ cameras[0].forward().numpy()
         length = float(np.hypot(ahead[0], ahead[1]))
@@ -144,18 +153,11 @@ def upright_rotation(up: Array, cameras: list[Camera] | None = None) -> Array:
     return np.asarray(rotation)
 
 
-def robust_box(points: Array) -> tuple[Array, Array]:
-    """Box of points [N, 3] without the outermost 2 per thousand on each side: one floater must not set the scale."""
-    if len(points) < 100:
-        return points.min(axis=0), points.max(axis=0)
-    return np.quantile(points, 0.002, axis=0), np.quantile(points, 0.998, axis=0)
-
-
 def camera_up(cameras: list[Camera]) -> Array:
-    """Up axis from cameras: the axis perpendicular to all their horizontal (x) axes, if they were held level.
+    """Up axis from cameras: perpendicular to all their horizontal axes, if they were held level.
 
-    With level cameras from several sides that axis is sharp: the eigenvector of sum(x x^T) with the smallest eigenvalue.
-    Otherwise the mean of the image-up directions is taken.
+    With level cameras from several sides that axis is sharp: the eigenvector of sum(x x^T) with the
+    smallest eigenvalue. Otherwise the mean of the image-up directions is taken.
     """
     mean = torch.stack([camera.up() for camera in cameras]).to(torch.float64).mean(dim=0).numpy()
     across = torch.stack([camera.viewmat[0, :3] for camera in cameras]).to(torch.float64).numpy()
@@ -171,7 +173,7 @@ def camera_up(cameras: list[Camera]) -> Array:
 
 
 def look_at_point(cameras: list[Camera]) -> Array:
-    """Point nearest to all optical axes, least squares [3]; one metre-unit ahead for parallel cameras."""
+    """Point nearest to all optical axes, least squares [3]; one unit ahead for parallel cameras."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for camera in cameras:
         axis = camera.forward().to(torch.float64).numpy()
@@ -184,7 +186,7 @@ def look_at_point(cameras: list[Camera]) -> Array:
 
 
 def support_plane(capture: Capture, up: Array, focus: Array) -> tuple[Array, float] | None:
-    """Find the plane the object stands on among the sparse points: (unit normal [3], offset along it), or None.
+    """Find the plane the object stands on: (unit normal [3], offset along it), or None.
 
     RANSAC over triples of points near the object. A plane counts when its normal is within 30
     degrees of ``up``, at least 15 % of the points lie on it, hardly any below it, and the cameras
@@ -225,7 +227,7 @@ def support_plane(capture: Capture, up: Array, focus: Array) -> tuple[Array, flo
 
 
 def near_points(capture: Capture, focus: Array) -> Array:
-    """Sparse points nearer to ``focus`` than half the cameras' distance [M, 3]: the object and its surroundings."""
+    """Sparse points nearer to ``focus`` than half the cameras' distance [M, 3]."""
     points = np.asarray(capture.points.to(torch.float64).numpy())
     distance = np.linalg.norm(points - focus, axis=1)
     reach = float(np.median(np.linalg.norm(capture.centers().numpy() - focus, axis=1)))
@@ -254,5 +256,8 @@ def _object_points(gaussians: Gaussians | None, capture: Capture | None) -> Arra
             opaque = gaussians.means
         return np.asarray(opaque.detach().to("cpu", torch.float64).numpy())
     if capture is None or len(capture.points) == 0:
-        raise InputError("orient: neither splats nor sparse points are there", "give splats, or a capture with points3D")
+        raise InputError(
+            "orient: neither splats nor sparse points are there",
+            "give splats, or a capture with points3D",
+        )
     return near_points(capture, look_at_point(capture.cameras))
