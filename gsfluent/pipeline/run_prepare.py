@@ -12,6 +12,7 @@ import torch
 from gsfluent.data import Frame, Solid
 from gsfluent.io import load, load_capture, write_json
 from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.orient import make_frame, orient
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.render_cuts import save_cut_views

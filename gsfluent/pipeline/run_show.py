@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from collections.abc import Iterator
@@ -177,7 +178,7 @@ def poster_frame(fragments: list[int], fps: float) -> int:
 
     Without any break it is the middle of the video.
     """
-    jumps = [b - a for a, b in zip(fragments, fragments[1:], strict=False)]
+    jumps = [b - a for a, b in itertools.pairwise(fragments)]
     if not jumps or max(jumps) <= 0:
         return len(fragments) // 2
     return min(len(fragments) - 1, jumps.index(max(jumps)) + 1 + round(_POSTER_DELAY * fps))
