@@ -4,6 +4,28 @@
 
 STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- mpm: sparse grid, particle-grid transfers, grid momentum update ---
+  m.def(
+      "build_blocks(Tensor position, float dx, int margin, int max_table) -> "
+      "(Tensor table, Tensor coords, Tensor order, Tensor start, Tensor info)");
+  m.def(
+      "p2g(Tensor position, Tensor velocity, Tensor affine, Tensor mass, Tensor? stress, "
+      "Tensor? volume, Tensor? body, Tensor table, Tensor coords, Tensor order, Tensor start, "
+      "int[3] origin, int margin, float dx, float dt, int fields, bool contact) -> "
+      "(Tensor grid, Tensor moments, Tensor skipped)");
+  m.def(
+      "p2g_adjoint(Tensor grid, Tensor position, Tensor? body, Tensor table, Tensor coords, "
+      "Tensor order, Tensor start, int[3] origin, int margin, float dx) -> "
+      "(Tensor value, Tensor first)");
+  m.def(
+      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor coords, float dx, "
+      "float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
+      "float restitution, float contact_gap) -> "
+      "(Tensor velocity, Tensor impulse, Tensor contact_nodes)");
+  m.def(
+      "g2p(Tensor velocity_grid, Tensor position, Tensor? velocity, Tensor? deformation, "
+      "Tensor? body, Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, "
+      "int margin, float dx, float dt) -> (Tensor position, Tensor velocity, Tensor affine, "
+      "Tensor deformation, Tensor skipped)");
 
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(
@@ -17,6 +39,24 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- mvee: minimum-volume enclosing ellipsoids ---
 
   // --- raster: Gaussian splatting ---
+  // Returns image, alpha, depth, normal, contribution, radii, then what the adjoint needs: splats,
+  // order, tile_start, instances.
+  m.def(
+      "rasterize(Tensor means, Tensor opacities, Tensor viewmat, Tensor K, Tensor? quats, "
+      "Tensor? scales, Tensor? covars, Tensor? sh, Tensor? colors, Tensor? background, "
+      "Tensor? normals, Tensor? groups, Tensor? means2d_offset, int width, int height, "
+      "bool antialiased, bool contribution, float near, float far) -> "
+      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  // Gradients of means, opacities, quats, scales, covars, sh, colors, background, normals,
+  // means2d_offset.
+  m.def(
+      "rasterize_backward(Tensor? grad_image, Tensor? grad_alpha, Tensor? grad_depth, "
+      "Tensor? grad_normal, Tensor image, Tensor alpha, Tensor depth, Tensor normal, "
+      "Tensor splats, Tensor order, Tensor tile_start, Tensor instances, Tensor means, "
+      "Tensor opacities, Tensor viewmat, Tensor K, Tensor? quats, Tensor? scales, Tensor? covars, "
+      "Tensor? sh, Tensor? colors, Tensor? background, Tensor? normals, Tensor? groups, "
+      "Tensor? means2d_offset, int width, int height, bool antialiased, float near, float far) -> "
+      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
 
   // --- build information ---
   m.def("compiled_for(Tensor like) -> str");

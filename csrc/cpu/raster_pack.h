@@ -1,0 +1,134 @@
+// A register of 8 floats or 4 doubles as the compiler's vector type, with the few functions the
+// blend loop needs. GCC and clang compile it to AVX, NEON or scalar code.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#ifdef __AVX__
+#include <immintrin.h>
+#endif
+
+namespace gsf {
+
+template <typename T>
+struct PackOf;
+template <>
+struct PackOf<float> {
+  using Type = float __attribute__((vector_size(32)));
+  using Mask = int32_t __attribute__((vector_size(32)));
+  static constexpr int kLanes = 8;
+};
+template <>
+struct PackOf<double> {
+  using Type = double __attribute__((vector_size(32)));
+  using Mask = int64_t __attribute__((vector_size(32)));
+  static constexpr int kLanes = 4;
+};
+template <typename T>
+using Pack = typename PackOf<T>::Type;
+template <typename T>
+using PackMask = typename PackOf<T>::Mask;
+
+template <typename T>
+inline Pack<T> splat_pack(T x) {
+  return Pack<T>{} + x;
+}
+
+template <typename T>
+inline Pack<T> load_pack(const T* p) {
+  Pack<T> v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+
+template <typename V, typename T>
+inline void store_pack(T* p, const V& v) {
+  static_assert(sizeof v == 32);
+  std::memcpy(p, &v, sizeof v);
+}
+
+// Sign bit of every lane; for a comparison result, the lanes where it holds.
+inline unsigned lane_bits(PackMask<float> m) {
+#ifdef __AVX__
+  return static_cast<unsigned>(_mm256_movemask_ps(reinterpret_cast<__m256>(m)));
+#else
+  unsigned bits = 0;
+  for (int i = 0; i < 8; ++i) bits |= static_cast<unsigned>(m[i] < 0) << i;
+  return bits;
+#endif
+}
+inline unsigned lane_bits(PackMask<double> m) {
+#ifdef __AVX__
+  return static_cast<unsigned>(_mm256_movemask_pd(reinterpret_cast<__m256d>(m)));
+#else
+  unsigned bits = 0;
+  for (int i = 0; i < 4; ++i) bits |= static_cast<unsigned>(m[i] < 0) << i;
+  return bits;
+#endif
+}
+
+template <typename T>
+inline Pack<T> pack_max(Pack<T> a, Pack<T> b) {
+  return a > b ? a : b;
+}
+template <typename T>
+inline Pack<T> pack_min(Pack<T> a, Pack<T> b) {
+  return a < b ? a : b;
+}
+template <typename T>
+inline Pack<T> pack_sqrt(Pack<T> a) {
+  for (int i = 0; i < PackOf<T>::kLanes; ++i) a[i] = std::sqrt(a[i]);
+  return a;
+}
+#ifdef __AVX__
+template <>
+inline Pack<float> pack_sqrt<float>(Pack<float> a) {
+  return _mm256_sqrt_ps(a);
+}
+template <>
+inline Pack<double> pack_sqrt<double>(Pack<double> a) {
+  return _mm256_sqrt_pd(a);
+}
+#endif
+
+template <typename T>
+inline T pack_sum(Pack<T> a) {
+  T s = T(0);
+  for (int i = 0; i < PackOf<T>::kLanes; ++i) s += a[i];
+  return s;
+}
+template <>
+inline float pack_sum<float>(Pack<float> a) {
+  const float s0 = a[0] + a[4], s1 = a[1] + a[5], s2 = a[2] + a[6], s3 = a[3] + a[7];
+  return (s0 + s2) + (s1 + s3);
+}
+
+// exp(-x) for 0 <= x <= 80. Relative error below 2e-7: 2^n times the degree-6 Taylor polynomial of
+// 2^f, |f| <= 1/2 (remainder (ln 2 / 2)^7 / 7! = 1.2e-7).
+inline Pack<float> exp_negative(Pack<float> x) {
+  const Pack<float> y = x * -1.44269504088896341f;
+  // Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low mantissa bits.
+  const float magic = 12582912.0f;
+  const Pack<float> shifted = y + magic;
+  const Pack<float> f = y - (shifted - magic);
+  Pack<float> p = 1.5403530393381609e-4f * f + 1.3333558146428443e-3f;
+  p = p * f + 9.6181291076284772e-3f;
+  p = p * f + 5.5504108664821580e-2f;
+  p = p * f + 2.4022650695910071e-1f;
+  p = p * f + 6.9314718055994531e-1f;
+  p = p * f + 1.0f;
+  PackMask<float> n;
+  std::memcpy(&n, &shifted, sizeof n);
+  n = (n << 23) + 0x3f800000;
+  Pack<float> scale;
+  std::memcpy(&scale, &n, sizeof scale);
+  return p * scale;
+}
+inline Pack<double> exp_negative(Pack<double> x) {
+  for (int i = 0; i < 4; ++i) x[i] = std::exp(-x[i]);
+  return x;
+}
+
+}  // namespace gsf

@@ -1,0 +1,275 @@
+"""Objects of a shot: which splats, what material, which parts differ."""
+
+# ruff: noqa: RUF009 - key() makes a dataclass field, not a shared default
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gsfluent.config.read import (
+    Place,
+    Reader,
+    existing_path,
+    given,
+    key,
+    mapping,
+    number,
+    plain,
+    refuse_unknown,
+    section,
+    text,
+    vector,
+    whole,
+)
+from gsfluent.errors import InputError
+
+Vector = tuple[float, float, float]
+
+
+def read_box(value: Any, place: Place) -> tuple[tuple[float, ...], ...]:
+    """Read two corners, the lower one first."""
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise place.error("be two corners [[x, y, z], [x, y, z]]", value)
+    low, high = (vector(3)(corner, place.inside(str(index))) for index, corner in enumerate(value))
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise place.error("have its first corner below its second in x, y and z", value)
+    return low, high
+
+
+def read_sphere(value: Any, place: Place) -> tuple[float, ...]:
+    """Read x, y, z and a positive radius."""
+    numbers: tuple[float, ...] = vector(4)(value, place)
+    if not numbers[3] > 0:
+        raise place.error("have a positive radius", value)
+    return numbers
+
+
+@dataclasses.dataclass(frozen=True)
+class Where:
+    """``where:`` - which matter a part is made of; all conditions given must hold."""
+
+    depth_below: float | None = key(
+        number(above=0.0), default=None, doc="Closer to the surface than this [m].", example="0.012"
+    )
+    depth_above: float | None = key(
+        number(0.0), default=None, doc="Deeper than this [m].", example="0.012"
+    )
+    color_near: Vector | None = key(
+        vector(3, 0.0, 1.0),
+        default=None,
+        doc="Coloured like this, RGB in 0..1.",
+        example="[0.1, 0.07, 0.05]",
+    )
+    tolerance: float | None = key(
+        number(0.0, 2.0),
+        default=None,
+        doc="Largest RGB distance from color_near (0.15 if absent).",
+        example="0.15",
+    )
+    box: tuple[Vector, Vector] | None = key(
+        read_box, default=None, doc="Inside this box, scene metres: two corners.",
+        example="[[-0.1, -0.1, 0], [0.1, 0.1, 0.05]]",
+    )  # fmt: skip
+    sphere: tuple[float, ...] | None = key(
+        read_sphere, default=None, doc="Inside this sphere, scene metres: x, y, z, radius.",
+        example="[0, 0, 0.1, 0.05]",
+    )  # fmt: skip
+    region: int | None = key(
+        whole(0, 2**31 - 1), default=None, doc="Part number in the solid's voxels.", example="1"
+    )
+
+    def given(self) -> dict[str, Any]:
+        """Return the conditions that are set."""
+        return given(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One entry of ``parts:`` - a region with parameters of its own."""
+
+    name: str
+    where: Where
+    overrides: Mapping[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the form that :meth:`gsfluent.Scene.add` takes."""
+        return {"name": self.name, "where": self.where.given(), **self.overrides}
+
+
+@dataclasses.dataclass(frozen=True)
+class Select:
+    """``select:`` - which splats belong to an object; ``all`` when nothing is set. Scene metres."""
+
+    box: tuple[Vector, Vector] | None = key(
+        read_box, default=None, doc="Centres inside this box [m].",
+        example="[[-0.1, -0.1, 0], [0.1, 0.1, 0.2]]",
+    )  # fmt: skip
+    sphere: tuple[float, ...] | None = key(
+        read_sphere, default=None, doc="Centres inside this sphere [m]: x, y, z, radius.",
+        example="[0, 0, 0.1, 0.15]",
+    )  # fmt: skip
+    color_near: Vector | None = key(
+        vector(3, 0.0, 1.0),
+        default=None,
+        doc="Coloured like this, RGB in 0..1.",
+        example="[0.6, 0.1, 0.1]",
+    )
+    tolerance: float | None = key(
+        number(0.0, 2.0),
+        default=None,
+        doc="Largest RGB distance from color_near (0.15 if absent).",
+        example="0.2",
+    )
+    labels: Path | None = key(
+        existing_path,
+        default=None,
+        doc="NumPy file with one number per splat; picks label.",
+        example="labels.npy",
+    )
+    label: int | None = key(
+        whole(-(2**31), 2**31 - 1),
+        default=None,
+        doc="Number in the label file (1 if absent).",
+        example="1",
+    )
+
+    @property
+    def everything(self) -> bool:
+        """Whether nothing is left out."""
+        return not given(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectSettings:
+    """One entry of ``objects:`` - what it is made of."""
+
+    name: str
+    select: Select = dataclasses.field(default_factory=Select)
+    material: str = "fruit.watermelon"
+    overrides: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    parts: tuple[Part, ...] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for run.json."""
+        parts = None if self.parts is None else [plain(part.to_dict()) for part in self.parts]
+        select = "all" if self.select.everything else plain(given(self.select))
+        return {
+            "select": select,
+            "material": self.material,
+            **plain(self.overrides),
+            "parts": parts,
+        }
+
+
+def read_objects(value: Any, place: Place) -> dict[str, ObjectSettings]:
+    """Read the objects by name."""
+    return {
+        name: _object(name, item, place.inside(name))
+        for name, item in mapping(value, place).items()
+    }
+
+
+def _object(name: str, value: Any, place: Place) -> ObjectSettings:
+    settings = mapping(value, place)
+    _refuse_parameters(settings, ("select", "material", "parts"), place)
+    material = text(settings.pop("material", "fruit.watermelon"), place.inside("material"))
+    select = _select(settings.pop("select", "all"), place.inside("select"))
+    parts = settings.pop("parts", None)
+    overrides = _parameters(material, settings, place)
+    return ObjectSettings(
+        name,
+        select,
+        material,
+        overrides,
+        None if parts is None else _parts(material, overrides, parts, place.inside("parts")),
+    )
+
+
+def _select(value: Any, place: Place) -> Select:
+    if value == "all":
+        return Select()
+    if isinstance(value, str):
+        raise place.error("be all, or a section with box, sphere, color_near or labels", value)
+    select = section(Select, value, place)
+    _needs(select.tolerance, select.color_near, "tolerance", "color_near", place)
+    _needs(select.label, select.labels, "label", "labels", place)
+    if select.everything:
+        raise place.error("name a condition", value, "write select: all")
+    return select
+
+
+def _needs(inner: Any, outer: Any, name: str, other: str, place: Place) -> None:
+    if inner is not None and outer is None:
+        raise InputError(
+            f"{place.inside(name).path} does nothing without {other}",
+            f"add {other} or remove {name}",
+        )
+
+
+def _parts(material: str, base: Mapping[str, Any], value: Any, place: Place) -> tuple[Part, ...]:
+    if not isinstance(value, list | tuple):
+        raise place.error("be a list of parts", value)
+    parts = []
+    for index, item in enumerate(value):
+        where = Place(f"{place.path}[{index}]", place.folder)
+        settings = mapping(item, where)
+        name = text(settings.pop("name", f"part{index + 1}"), where.inside("name"))
+        where = Place(f"{place.path}.{name}", place.folder)
+        _refuse_parameters(settings, ("where", "material"), where)
+        chosen = section(Where, settings.pop("where", None), where.inside("where"))
+        _needs(
+            chosen.tolerance, chosen.color_near, "tolerance", "color_near", where.inside("where")
+        )
+        if not chosen.given():
+            raise InputError(
+                f"{where.path}.where must name a condition",
+                "for example where: {depth_below: 0.01}",
+            )
+        own = settings.pop("material", None)
+        if own is None:
+            overrides = _parameters(material, settings, where, base)
+        else:
+            overrides = {
+                "material": text(own, where.inside("material")),
+                **_parameters(own, settings, where),
+            }
+        if not overrides:
+            raise InputError(
+                f"{where.path} changes no parameter",
+                "add one, for example cohesion: 2.0, or remove the part",
+            )
+        parts.append(Part(name, chosen, overrides))
+    return tuple(parts)
+
+
+def _refuse_parameters(settings: Mapping[str, Any], extra: tuple[str, ...], place: Place) -> None:
+    from gsfluent import materials
+
+    later = dict.fromkeys(materials.LATER_FIELDS, "the law that reads it")
+    refuse_unknown(settings, [*extra, "law", *materials.PARAMETERS], place, later)
+
+
+def _parameters(
+    material: str, settings: Mapping[str, Any], place: Place, base: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Read material parameters and try them on the preset, so that a bad number is refused here."""
+    from gsfluent import materials
+
+    parameter: Reader = number()
+    read = {
+        name: (text if name == "law" else parameter)(value, place.inside(name))
+        for name, value in settings.items()
+    }
+    try:
+        preset = materials.get(material).override(**dict(base or {}))
+    except InputError as error:
+        raise InputError(f"{place.inside('material').path}: {error.what}", error.mend) from error
+    for name, value in read.items():
+        try:
+            preset.override(**{name: value})
+        except InputError as error:
+            raise InputError(f"{place.inside(name).path}: {error.what}", error.mend) from error
+    return read

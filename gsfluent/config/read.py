@@ -1,0 +1,270 @@
+"""Readers that turn YAML values into typed settings; errors name the full path of a key."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gsfluent.errors import InputError
+
+_Section = TypeVar("_Section")
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where in the shot a value stands, and the folder that relative file names start from."""
+
+    path: str
+    folder: Path
+
+    def inside(self, key: str) -> Place:
+        """Return the place of a key of this section."""
+        return Place(f"{self.path}.{key}" if self.path else key, self.folder)
+
+    def error(self, wanted: str, got: Any, mend: str = "") -> InputError:
+        """Make the error ``{path} must {wanted}, got {got}``."""
+        return InputError(
+            f"{self.path} must {wanted}, got {got!r}", mend or "correct the shot file"
+        )
+
+
+Reader = Callable[[Any, Place], Any]
+
+
+def key(
+    read: Reader, *, doc: str, example: str, default: Any = dataclasses.MISSING, name: str = ""
+) -> Any:
+    """Declare a setting as a dataclass field.
+
+    Args:
+        read: Turns the YAML value into the field's value.
+        doc: One sentence for docs/shot.md, with the unit.
+        example: A YAML value, read by the documentation's test.
+        default: Value when the key is absent; without one the key is required.
+        name: Key in the file when it is not a legal field name (``from``).
+    """
+    facts = {"read": read, "doc": doc, "example": example, "name": name}
+    if default is not dataclasses.MISSING and default.__class__.__hash__ is None:
+        return dataclasses.field(default_factory=lambda: dict(default), metadata=facts)
+    return dataclasses.field(default=default, metadata=facts)
+
+
+def key_name(field: dataclasses.Field[Any]) -> str:
+    """Name of a field in the shot file."""
+    return field.metadata["name"] or field.name
+
+
+def nearest(word: Any, known: Iterable[str]) -> str:
+    """Suggest the nearest known word, then list them all."""
+    words = list(known)
+    close = difflib.get_close_matches(str(word), words, n=1, cutoff=0.4)
+    return (f"did you mean {close[0]!r}? " if close else "") + f"known: {', '.join(words)}"
+
+
+def mapping(value: Any, place: Place) -> dict[str, Any]:
+    """Read a section as a mapping with text keys; an empty section is an empty mapping."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise place.error("be a section of keys", value)
+    for name in value:
+        if not isinstance(name, str):
+            raise place.error("have text keys", name)
+    return dict(value)
+
+
+def section(cls: type[_Section], value: Any, place: Place) -> _Section:
+    """Read a mapping into the dataclass ``cls`` whose fields were declared with :func:`key`.
+
+    A class attribute ``LATER`` (key -> what it belongs to) names keys that a later issue brings.
+
+    Raises:
+        InputError: An unknown, later or missing key, or a value that its reader refuses.
+    """
+    given = mapping(value, place)
+    fields = {key_name(field): field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    refuse_unknown(given, fields, place, getattr(cls, "LATER", {}))
+    values = {}
+    for name, field in fields.items():
+        if name in given:
+            values[field.name] = field.metadata["read"](given[name], place.inside(name))
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            mend = f"add it, for example {name}: {field.metadata['example']}"
+            raise InputError(f"{place.inside(name).path} is missing", mend)
+    return cls(**values)
+
+
+def refuse_unknown(
+    given: Iterable[str], known: Iterable[str], place: Place, later: Mapping[str, str] | None = None
+) -> None:
+    """Raise for the first key that is not known, or that a later issue brings."""
+    known = list(known)
+    for name in given:
+        if later and name in later:
+            where = place.inside(name).path
+            raise InputError(f"{where}: {later[name]} arrives with a later issue", "remove the key")
+        if name not in known:
+            raise InputError(f"{place.inside(name).path}: unknown key", nearest(name, known))
+
+
+def number(low: float = -math.inf, high: float = math.inf, *, above: float | None = None) -> Reader:
+    """Reader of a finite number in ``low..high``, or strictly above ``above``."""
+
+    def read(value: Any, place: Place) -> float:
+        if isinstance(value, str):  # YAML 1.1 reads 1e6 as text
+            try:
+                value = float(value)
+            except ValueError:
+                raise place.error("be a number", value) from None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise place.error("be a number", value)
+        if not math.isfinite(value) or not low <= value <= high:
+            raise place.error(f"lie in {low:g}..{high:g}", value)
+        if above is not None and not value > above:
+            raise place.error(f"be above {above:g}", value)
+        return float(value)
+
+    return read
+
+
+def whole(low: int, high: int) -> Reader:
+    """Reader of a whole number in ``low..high``."""
+
+    def read(value: Any, place: Place) -> int:
+        exact = number(low, high)(value, place)
+        if exact != int(exact):
+            raise place.error("be a whole number", value)
+        return int(exact)
+
+    return read
+
+
+def text(value: Any, place: Place) -> str:
+    """Read text that is not empty."""
+    if not isinstance(value, str) or not value.strip():
+        raise place.error("be text", value)
+    return value
+
+
+def flag(value: Any, place: Place) -> bool:
+    """Read true or false."""
+    if not isinstance(value, bool):
+        raise place.error("be true or false", value)
+    return value
+
+
+def choice(*known: str, later: Iterable[str] = ()) -> Reader:
+    """Reader of one of ``known``; words in ``later`` are refused as coming with a later issue."""
+
+    def read(value: Any, place: Place) -> str:
+        value = {True: "yes", False: "no", None: "none"}.get(value, value) if not value else value
+        if value in later:
+            raise InputError(
+                f"{place.path}: {value} arrives with a later issue", nearest("", known)
+            )
+        if value not in known:
+            raise place.error(f"be one of {', '.join(known)}", value, nearest(value, known))
+        return str(value)
+
+    return read
+
+
+def vector(count: int, low: float = -math.inf, high: float = math.inf) -> Reader:
+    """Reader of ``count`` numbers as a tuple."""
+
+    def read(value: Any, place: Place) -> tuple[float, ...]:
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise place.error(f"be {count} numbers in brackets", value)
+        one = number(low, high)
+        return tuple(one(part, place.inside(str(index))) for index, part in enumerate(value))
+
+    return read
+
+
+def several(read_one: Reader) -> Reader:
+    """Reader of a list as a tuple; one value alone counts as a list of one."""
+
+    def read(value: Any, place: Place) -> tuple[Any, ...]:
+        items = value if isinstance(value, list | tuple) else [value]
+        return tuple(
+            read_one(item, Place(f"{place.path}[{i}]", place.folder))
+            for i, item in enumerate(items)
+        )
+
+    return read
+
+
+def either(words: Reader, other: Reader) -> Reader:
+    """Reader that lets text that is no number go to ``words`` and everything else to ``other``."""
+
+    def read(value: Any, place: Place) -> Any:
+        if isinstance(value, str) and not _is_number(value):
+            return words(value, place)
+        return other(value, place)
+
+    return read
+
+
+def existing_path(value: Any, place: Place) -> Path:
+    """Read a path relative to the shot file, which must exist."""
+    path = (place.folder / Path(text(value, place)).expanduser()).resolve()
+    if not path.exists():
+        raise InputError(
+            f"{place.path}: {path} does not exist",
+            "check the path; it starts from the shot file's folder",
+        )
+    return path
+
+
+def nested(cls: type[Any]) -> Reader:
+    """Reader of a section as the dataclass ``cls``."""
+    return lambda value, place: section(cls, value, place)
+
+
+def plain(value: Any) -> Any:
+    """Turn settings back into what JSON and YAML hold, keys as in the file."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        shown = {
+            key_name(field): field
+            for field in dataclasses.fields(value)
+            if "read" in field.metadata
+        }
+        return {name: plain(getattr(value, field.name)) for name, field in shown.items()}
+    if isinstance(value, Mapping):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def given(settings: Any) -> dict[str, Any]:
+    """Return the fields of a section that are set (not None), by field name."""
+    pairs = ((field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings))
+    return {name: value for name, value in pairs if value is not None}
+
+
+def without_none(value: Any) -> Any:
+    """Drop keys whose value is None, at every depth."""
+    if isinstance(value, dict):
+        return {name: without_none(item) for name, item in value.items() if item is not None}
+    return [without_none(item) for item in value] if isinstance(value, list) else value
+
+
+def read_direction(value: Any, place: Place) -> tuple[float, ...]:
+    """Read a direction [x, y, z] that is not zero."""
+    numbers: tuple[float, ...] = vector(3)(value, place)
+    if not any(numbers):
+        raise place.error("not be zero", value)
+    return numbers
+
+
+def _is_number(value: str) -> bool:
+    try:
+        float(value)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,220 @@
+"""Sections of a shot that set how a stage works."""
+
+# ruff: noqa: RUF009 - key() makes a dataclass field, not a shared default
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, ClassVar
+
+from gsfluent.config.read import (
+    Place,
+    choice,
+    either,
+    existing_path,
+    flag,
+    given,
+    key,
+    nested,
+    number,
+    read_direction,
+    several,
+    text,
+    whole,
+)
+
+Vector = tuple[float, float, float]
+
+
+def _size(value: Any, place: Place) -> tuple[int, ...]:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise place.error("be [width, height]", value)
+    sides = tuple(
+        whole(16, 16384)(side, place.inside(str(index))) for index, side in enumerate(value)
+    )
+    if any(side % 2 for side in sides):
+        raise place.error("be even numbers (video)", value)
+    return sides
+
+
+def _camera(value: Any, place: Place) -> str | int | Path:
+    if value == "orbit":
+        return "orbit"
+    if isinstance(value, str):
+        return existing_path(value, place)
+    index: int = whole(0, 10**9)(value, place)
+    return index
+
+
+@dataclasses.dataclass(frozen=True)
+class ReconstructSettings:
+    """``reconstruct:`` - photographs to splats. None leaves the choice to the stage."""
+
+    iterations: int | None = key(
+        whole(1, 1_000_000), default=None, doc="Optimisation steps.", example="7000"
+    )
+    max_gaussians: int | None = key(
+        whole(100, 100_000_000),
+        default=None,
+        doc="Upper limit of the number of splats.",
+        example="300000",
+    )
+    kernel: str | None = key(
+        choice("isotropic", "anisotropic"),
+        default=None,
+        doc="Shape of the splats.",
+        example="anisotropic",
+    )
+    scale_regularization: float | None = key(
+        number(0.0, 1e6), default=None, doc="Weight of the penalty on large splats.", example="1.0"
+    )
+    image_size: int | None = key(
+        whole(16, 16384),
+        default=None,
+        doc="Longest side of the photographs while fitting [pixels].",
+        example="800",
+    )
+
+    def given(self) -> dict[str, Any]:
+        """Return the settings that are set, as keyword arguments of the stage."""
+        return given(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class FillSettings:
+    """``fill:`` - a shell of splats to a solid."""
+
+    method: str = key(
+        choice("auto", "vote", "hull"), default="auto",
+        doc="How the inside is found: by rays, by masks, or both.",
+        example="auto",
+    )  # fmt: skip
+    hollow: str | float = key(
+        either(choice("auto", "none"), number(above=0.0)),
+        default="auto",
+        doc="Whether the object is hollow: auto, none, or a wall thickness [m].",
+        example="auto",
+    )
+    resolution: int | None = key(
+        whole(8, 512), default=None, doc="Voxels along the longest side.", example="96"
+    )
+
+    def given(self, scale: float = 1.0) -> dict[str, Any]:
+        """Return the settings that are set, as keyword arguments of the stage.
+
+        Args:
+            scale: Metres per world unit: the stage works in world units, the shot file in metres.
+        """
+        values = given(self)
+        if not isinstance(self.hollow, str):
+            values["hollow"] = self.hollow / scale
+        return values
+
+
+@dataclasses.dataclass(frozen=True)
+class TextureSettings:
+    """``texture:`` - colours for the inside."""
+
+    method: str | None = key(
+        choice("exemplar", "diffusion", "color_copy", "procedural", "profile"),
+        default=None,
+        doc="How the inside gets its colours; by default from the exemplar if there is one.",
+        example="exemplar",
+    )
+    exemplar: Path | None = key(
+        existing_path,
+        default=None,
+        doc="Photograph of a cut through such an object.",
+        example="cut.jpg",
+    )
+    prompt: str | None = key(
+        text,
+        default=None,
+        doc="What the inside looks like, for diffusion.",
+        example="ripe watermelon flesh",
+    )
+    model: str | None = key(
+        text,
+        default=None,
+        doc="Folder or hub id of a diffusers inpainting model.",
+        example="models/sdxl-inpainting",
+    )
+
+    def given(self) -> dict[str, Any]:
+        """Return the settings that are set, as keyword arguments of the stage."""
+        return given(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class SolveSettings:
+    """``solve:`` - how accurately."""
+
+    LATER: ClassVar[dict[str, str]] = {
+        "error": "choosing the setting by an error bound",
+        "seconds_per_frame": "choosing the setting by a time budget",
+        "deterministic": "choosing the order of sums on the GPU",
+    }
+    quality: str = key(
+        choice("preview", "shot", "hero"),
+        default="shot",
+        doc="Size of the cells of the grid.",
+        example="preview",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyLight:
+    """``light.key:`` - the directional light."""
+
+    direction: Vector = key(
+        read_direction, default=(1.0, -1.0, 2.0),
+        doc="From the scene towards the light; +z is up.", example="[1, -1, 2]",
+    )  # fmt: skip
+    shadow: bool = key(
+        flag, default=True, doc="Whether the object shadows itself and the floor.", example="true"
+    )
+    intensity: float | None = key(number(0.0, 1e3), default=None, doc="Strength.", example="0.6")
+
+
+@dataclasses.dataclass(frozen=True)
+class LightSettings:
+    """``light:``."""
+
+    ambient: float | None = key(
+        number(0.0, 1e3), default=None, doc="Light from everywhere.", example="0.4"
+    )
+    specular: float | None = key(
+        number(0.0, 1e3), default=None, doc="Strength of highlights.", example="0.2"
+    )
+    # Last, because from here on ``key`` names this field.
+    key: KeyLight = key(
+        nested(KeyLight),
+        default=KeyLight(),
+        doc="The directional light.",
+        example="{direction: [1, -1, 2]}",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class OutputSettings:
+    """``output:`` - what is made of the simulation."""
+
+    fps: float = key(number(1.0, 1000.0), default=30.0, doc="Frames per second.", example="30")
+    seconds: float = key(
+        number(0.0, 3600.0, above=0.0), default=2.0, doc="Simulated time [s].", example="2"
+    )
+    size: tuple[int, int] = key(
+        _size, default=(1280, 720), doc="Width and height of the video [pixels].",
+        example="[1280, 720]",
+    )  # fmt: skip
+    camera: str | int | Path = key(
+        _camera, default="orbit",
+        doc="orbit, the number of a photograph (0 is the first), or a JSON file with a path.",
+        example="orbit",
+    )  # fmt: skip
+    what: tuple[str, ...] = key(
+        several(choice("mp4", "ply-seq", "vtk", later=("usd", "png-seq", "spz", "gltf"))),
+        default=("mp4",),
+        doc="What to write.", example="[mp4, ply-seq]",
+    )  # fmt: skip

@@ -1,0 +1,200 @@
+"""The whole shot."""
+
+# ruff: noqa: RUF009 - key() makes a dataclass field, not a shared default
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gsfluent.config.events import Event, event_dict, read_events
+from gsfluent.config.objects import ObjectSettings, read_objects
+from gsfluent.config.read import (
+    Place,
+    choice,
+    either,
+    existing_path,
+    key,
+    nearest,
+    nested,
+    number,
+    plain,
+    read_direction,
+    section,
+    without_none,
+)
+from gsfluent.config.settings import (
+    FillSettings,
+    LightSettings,
+    OutputSettings,
+    ReconstructSettings,
+    SolveSettings,
+    TextureSettings,
+    Vector,
+)
+from gsfluent.errors import InputError
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def _up(value: Any, place: Place) -> str | tuple[float, ...]:
+    if not isinstance(value, str):
+        return read_direction(value, place)
+    if value == "auto":
+        return value
+    axis = value.lstrip("+-")
+    if axis not in _AXES or value[:-1] not in ("", "+", "-"):
+        raise place.error("be auto, +x, -x, +y, -y, +z, -z or [x, y, z]", value)
+    sign = -1.0 if value.startswith("-") else 1.0
+    return tuple(sign * part + 0.0 for part in _AXES[axis])
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """One shot: what is read, what happens to it, what is written. Paths are absolute."""
+
+    capture: Path | None = key(
+        existing_path, default=None,
+        doc="Folder with a COLMAP model or transforms.json (this or splats).",
+        example="captures/apple",
+    )  # fmt: skip
+    splats: Path | None = key(
+        existing_path,
+        default=None,
+        doc="Trained 3DGS .ply (this or capture).",
+        example="melon.ply",
+    )
+    scale: float | None = key(
+        number(above=0.0),
+        default=None,
+        doc="Metres per world unit; from size when absent.",
+        example="0.08",
+    )
+    size: float | None = key(
+        number(above=0.0),
+        default=None,
+        doc="Largest extent of the object [m], instead of scale.",
+        example="0.08",
+    )
+    up: str | Vector = key(
+        _up, default="auto", doc="Up axis of the input: auto, +x to -z, or [x, y, z].",
+        example="-y",
+    )  # fmt: skip
+    floor: str | float = key(
+        either(choice("auto", "none"), number()), default="auto",
+        doc="Floor: auto, none, or its height along up: input coordinate times scale [m].",
+        example="auto",
+    )  # fmt: skip
+    reconstruct: ReconstructSettings = key(
+        nested(ReconstructSettings),
+        default=ReconstructSettings(),
+        doc="Photographs to splats.",
+        example="{iterations: 7000}",
+    )
+    fill: FillSettings = key(
+        nested(FillSettings),
+        default=FillSettings(),
+        doc="Splats to a solid.",
+        example="{hollow: none}",
+    )
+    texture: TextureSettings = key(
+        nested(TextureSettings),
+        default=TextureSettings(),
+        doc="Colours for the inside.",
+        example="{method: color_copy}",
+    )
+    objects: Mapping[str, ObjectSettings] = key(
+        read_objects, default={},
+        doc="What the objects are made of, by name; one object named `object` when absent.",
+        example="{melon: {material: fruit.watermelon}}",
+    )  # fmt: skip
+    events: tuple[Event, ...] = key(
+        read_events, default=(), doc="What happens.", example="[{type: drop, height: 1.0}]"
+    )
+    solve: SolveSettings = key(
+        nested(SolveSettings),
+        default=SolveSettings(),
+        doc="How accurately.",
+        example="{quality: preview}",
+    )
+    light: LightSettings = key(
+        nested(LightSettings), default=LightSettings(), doc="The light.", example="{ambient: 0.4}"
+    )
+    output: OutputSettings = key(
+        nested(OutputSettings),
+        default=OutputSettings(),
+        doc="What is written.",
+        example="{seconds: 2}",
+    )
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any], folder: str | Path = ".") -> Shot:
+        """Read a shot from plain values.
+
+        Args:
+            values: Keys and values as in a shot file.
+            folder: Where relative paths start.
+
+        Raises:
+            InputError: An unknown, missing or later key, or a value out of range; the message names
+                its path.
+        """
+        shot = section(Shot, values, Place("", Path(folder)))
+        if (shot.capture is None) == (shot.splats is None):
+            got = "neither" if shot.capture is None else "both"
+            raise InputError(
+                f"the shot must have either 'capture' or 'splats', got {got}", "name one input"
+            )
+        if shot.scale is not None and shot.size is not None:
+            raise InputError(
+                "'scale' and 'size' both set the size of the object", "keep one of them"
+            )
+        if shot.texture.exemplar is None and shot.texture.method == "exemplar":
+            raise InputError(
+                "texture.exemplar is missing",
+                "name a photograph of a cut, or choose another method",
+            )
+        if shot.splats is not None and shot.reconstruct != ReconstructSettings():
+            raise InputError(
+                "reconstruct: does nothing when splats are given", "remove the section"
+            )
+        if not shot.objects:
+            shot = dataclasses.replace(shot, objects={"object": ObjectSettings("object")})
+        for index, event in enumerate(shot.events):
+            name = getattr(event, "object", None)
+            if name is not None and name not in shot.objects:
+                raise InputError(
+                    f"events[{index}].object: no object is called {name!r}",
+                    nearest(name, shot.objects),
+                )
+        return shot
+
+    def resolved(self) -> dict[str, Any]:
+        """Return every setting as plain values, defaults filled in; reads back as the same."""
+        values: dict[str, Any] = plain(self)
+        values["objects"] = {name: item.to_dict() for name, item in self.objects.items()}
+        values["events"] = [event_dict(event) for event in self.events]
+        return without_none(values)
+
+
+def load_shot(path: str | Path) -> Shot:
+    """Read a shot file; relative paths in it start from its own folder.
+
+    Raises:
+        InputError: Missing file, invalid YAML, or anything :meth:`Shot.from_dict` refuses.
+    """
+    from gsfluent.config.yaml_file import read_yaml
+
+    path = Path(path)
+    values = read_yaml(path)
+    if not isinstance(values, Mapping):
+        raise InputError(
+            f"{path}: must be a YAML mapping, got {type(values).__name__}",
+            "see docs/shot.md",
+        )
+    try:
+        return Shot.from_dict(values, path.resolve().parent)
+    except InputError as error:
+        raise InputError(f"{path}: {error.what}", error.mend) from error

@@ -1,0 +1,113 @@
+"""A set of posed photographs with the sparse points that posing them left behind."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent.data.camera import Camera
+from gsfluent.data.frame import Frame
+
+
+class View(NamedTuple):
+    """One photograph made ready for a pinhole renderer.
+
+    Attributes:
+        image: sRGB values as photographed, float32 [H, W, 3] in 0..1.
+        mask: Share of each pixel that shows the object, float32 [H, W] in 0..1; None when the
+            capture has no masks.
+        valid: Pixels that the photograph covers after undistortion, bool [H, W]; None when all of
+            them.
+        camera: Pinhole camera of this image at this size.
+    """
+
+    image: Tensor
+    mask: Tensor | None
+    valid: Tensor | None
+    camera: Camera
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Capture:
+    """Posed photographs of one thing.
+
+    Args:
+        cameras: Posed cameras, ordered by image name.
+        points: Sparse points [P, 3], float64, world units; P may be 0.
+        point_colors: Their colours [P, 3], float32 in 0..1.
+        root: Folder the capture was read from.
+    """
+
+    cameras: list[Camera]
+    points: Tensor
+    point_colors: Tensor
+    root: Path
+
+    def __post_init__(self) -> None:
+        """Check shapes."""
+        if not self.cameras:
+            raise ValueError("Capture: cameras must hold at least one camera, got none")
+        if (
+            self.points.dim() != 2
+            or self.points.shape[1] != 3
+            or self.point_colors.shape != self.points.shape
+        ):
+            got = f"{list(self.points.shape)} and {list(self.point_colors.shape)}"
+            raise ValueError(
+                f"Capture: points and point_colors must both have shape [P, 3], got {got}"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of photographs."""
+        return len(self.cameras)
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether any photograph has a mask file (an alpha channel shows only on reading)."""
+        return any(camera.mask_path is not None for camera in self.cameras)
+
+    def split(self, every: int = 8) -> tuple[Capture, Capture | None]:
+        """Hold out every ``every``-th photograph: (train, held out or None when there are too few).
+
+        Raises:
+            ValueError: ``every`` is below 2.
+        """
+        if every < 2:
+            raise ValueError(f"Capture.split: every must be at least 2, got {every}")
+        held = [camera for index, camera in enumerate(self.cameras) if index % every == every - 1]
+        train = [camera for index, camera in enumerate(self.cameras) if index % every != every - 1]
+        return self.replace(cameras=train), self.replace(cameras=held) if held else None
+
+    def view(self, index: int, max_size: int | None = None) -> View:
+        """Read photograph ``index``, undistorted, with its longer side at most ``max_size`` pixels.
+
+        Raises:
+            InputError: The file is missing, truncated, or not an image.
+        """
+        from gsfluent.io.images import load_view
+
+        return load_view(self.cameras[index], max_size)
+
+    def image(
+        self, index: int, max_size: int | None = None
+    ) -> tuple[Tensor, Tensor | None, Camera]:
+        """Read a photograph: (image [H, W, 3], mask [H, W] or None, camera); see :meth:`view`."""
+        view = self.view(index, max_size)
+        return view.image, view.mask, view.camera
+
+    def centers(self) -> Tensor:
+        """Return the camera positions [C, 3], float64."""
+        return torch.stack([camera.center() for camera in self.cameras])
+
+    def transformed(self, frame: Frame) -> Capture:
+        """Return the capture in another frame."""
+        cameras = [camera.transformed(frame) for camera in self.cameras]
+        return self.replace(cameras=cameras, points=frame.apply(self.points))
+
+    def replace(self, **changes: object) -> Capture:
+        """Return a copy with the named fields replaced."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,22 @@
+"""Files in and out: splats, captures, images. Nothing here keeps state."""
+
+from gsfluent.io.atomic import atomic_path, write_json
+from gsfluent.io.capture import load_capture
+from gsfluent.io.images import load_image, save_image
+from gsfluent.io.ply import read_ply, write_ply
+from gsfluent.io.splats import load_splats, save_splats
+
+load = load_splats
+
+__all__ = [
+    "atomic_path",
+    "load",
+    "load_capture",
+    "load_image",
+    "load_splats",
+    "read_ply",
+    "save_image",
+    "save_splats",
+    "write_json",
+    "write_ply",
+]

@@ -1,0 +1,72 @@
+"""Find out what kind of capture a folder holds and read it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsfluent.data.capture import Capture
+from gsfluent.errors import InputError
+from gsfluent.io.colmap import find_model, read_model
+from gsfluent.io.images import IMAGE_SUFFIXES
+from gsfluent.io.transforms import read_transforms
+
+_TRANSFORMS = ("transforms.json", "transforms_train.json")
+
+
+def load_capture(path: str | Path) -> Capture:
+    """Read a capture: a folder with a COLMAP model or a ``transforms.json``, or that file itself.
+
+    A COLMAP model (``sparse/0`` and the usual other places) is preferred when both are there.
+    Photographs are only located, not decoded; :meth:`Capture.view` reads them.
+
+    Args:
+        path: Folder or ``.json`` file.
+
+    Returns:
+        The capture, cameras in the order of their image names.
+
+    Raises:
+        InputError: Nothing usable there, a damaged model, an unsupported lens, a pose or image
+            missing.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such capture", "check the path")
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise InputError(
+                f"{path}: a capture must be a folder or a transforms.json",
+                "pass the folder of the capture",
+            )
+        return read_transforms(path)
+    model = find_model(path)
+    if model is not None:
+        return read_model(model, path)
+    for name in _TRANSFORMS:
+        if (path / name).is_file():
+            return read_transforms(path / name)
+    raise _nothing_found(path)
+
+
+def _nothing_found(path: Path) -> InputError:
+    """Explain what a folder without poses does hold."""
+    if not any(path.iterdir()):
+        return InputError(
+            f"{path}: the capture folder is empty",
+            "put images/ and sparse/0 or transforms.json there",
+        )
+    folders = [folder for folder in (path / "images", path) if folder.is_dir()]
+    images = sum(
+        1
+        for folder in folders
+        for file in folder.iterdir()
+        if file.suffix.lower() in IMAGE_SUFFIXES
+    )
+    if images:
+        return InputError(
+            f"{path}: {images} images but no poses (no sparse/0 and no transforms.json)",
+            "pose them first, for example with `colmap automatic_reconstructor`, into sparse/0",
+        )
+    return InputError(
+        f"{path}: no COLMAP model and no transforms.json here", "pass the folder that holds them"
+    )

@@ -1,0 +1,111 @@
+"""SuperSplat's compressed ``.ply``: 16 bytes per splat, quantised within chunks of 256.
+
+Position and log scale: 11 + 10 + 11 bits between the chunk's limits; rotation: which of ``w, x, y,
+z`` is largest (2 bits) and the other three in 10 bits each; colour and opacity: 8 bits each; SH
+rest: one byte per coefficient over -4..4. Layout: PlayCanvas "compressed PLY" description.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsfluent import geometry
+from gsfluent.data.gaussians import Gaussians
+from gsfluent.errors import InputError
+
+_CHUNK = 256
+_LIMITS = ("x", "y", "z", "scale_x", "scale_y", "scale_z")
+
+
+def is_compressed(data: dict[str, NDArray[Any]]) -> bool:
+    """Tell whether PLY elements hold SuperSplat's compressed layout."""
+    vertex = data.get("vertex")
+    return (
+        "chunk" in data and vertex is not None and "packed_position" in (vertex.dtype.names or ())
+    )
+
+
+def decode_compressed(path: Path, data: dict[str, NDArray[Any]]) -> Gaussians:
+    """Decode the elements ``chunk``, ``vertex`` and, if present, ``sh``.
+
+    Raises:
+        InputError: Properties or rows are missing.
+    """
+    chunk, vertex, rest = data["chunk"], data["vertex"], data.get("sh")
+    count = len(vertex)
+    needed = [f"{side}_{name}" for side in ("min", "max") for name in _LIMITS]
+    absent = [name for name in needed if name not in (chunk.dtype.names or ())]
+    packed = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+    absent += [name for name in packed if name not in (vertex.dtype.names or ())]
+    if absent or len(chunk) * _CHUNK < count or (rest is not None and len(rest) != count):
+        got = (
+            f"missing {', '.join(absent)}" if absent else f"{len(chunk)} chunks for {count} splats"
+        )
+        raise InputError(f"{path}: the compressed splat is incomplete ({got})", "export it again")
+    limits = chunk[np.arange(count) // _CHUNK]
+    position = _unpack_111011(vertex["packed_position"])
+    scale = _unpack_111011(vertex["packed_scale"])
+    color = np.stack(
+        [(vertex["packed_color"] >> shift & 255) / 255.0 for shift in (24, 16, 8, 0)], axis=1
+    )
+    rgb = color[:, :3]
+    if "min_r" in (chunk.dtype.names or ()):
+        rgb = _between(limits, ("r", "g", "b"), rgb)
+    sh = ((rgb - 0.5) / geometry.SH0)[:, None]
+    if rest is not None:
+        sh = np.concatenate([sh, _rest(path, rest)], axis=1)
+    return Gaussians(
+        means=_tensor(_between(limits, ("x", "y", "z"), position)),
+        quats=_tensor(_unpack_rotation(vertex["packed_rotation"])),
+        scales=_tensor(np.exp(_between(limits, ("scale_x", "scale_y", "scale_z"), scale))),
+        opacities=_tensor(color[:, 3]),
+        sh=_tensor(sh),
+    )
+
+
+def _tensor(values: NDArray[Any]) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def _between(limits: NDArray[Any], names: tuple[str, ...], fraction: NDArray[Any]) -> NDArray[Any]:
+    """Map fractions 0..1 [N, 3] between each row's limits."""
+    low = np.stack([limits[f"min_{name}"].astype(np.float64) for name in names], axis=1)
+    high = np.stack([limits[f"max_{name}"].astype(np.float64) for name in names], axis=1)
+    return low + fraction * (high - low)
+
+
+def _unpack_111011(packed: NDArray[Any]) -> NDArray[Any]:
+    return np.stack(
+        [(packed >> 21) / 2047.0, (packed >> 11 & 1023) / 1023.0, (packed & 2047) / 2047.0], axis=1
+    )
+
+
+def _unpack_rotation(packed: NDArray[Any]) -> NDArray[Any]:
+    """Quaternions ``wxyz`` whose largest component was left out."""
+    small = np.stack([(packed >> shift & 1023) / 1023.0 for shift in (20, 10, 0)], axis=1)
+    small = (small - 0.5) * np.sqrt(2.0)
+    largest = (packed >> 30).astype(np.int64)
+    quats = np.zeros((len(packed), 4))
+    places = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    np.put_along_axis(quats, places, small, axis=1)
+    missing = np.sqrt(np.clip(1.0 - (small**2).sum(axis=1), 0.0, None))
+    np.put_along_axis(quats, largest[:, None], missing[:, None], axis=1)
+    return quats
+
+
+def _rest(path: Path, rows: NDArray[Any]) -> NDArray[Any]:
+    """SH rest [N, K - 1, 3]; 0 and 255 are the ends of the range, others the middle of a step."""
+    count = sum(1 for name in rows.dtype.names or () if name.startswith("f_rest_"))
+    if count not in (9, 24, 45):
+        raise InputError(
+            f"{path}: element sh must have 9, 24 or 45 properties, got {count}", "export it again"
+        )
+    level = np.stack([rows[f"f_rest_{index}"].astype(np.float64) for index in range(count)], axis=1)
+    fraction = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
+    values = (fraction - 0.5) * 8
+    return values.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)

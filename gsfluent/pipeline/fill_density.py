@@ -1,0 +1,180 @@
+"""Opacity density of a splat cloud on a voxel grid.
+
+``d(x) = sum_p alpha_p exp(-1/2 (x - x_p)^T A_p^-1 (x - x_p))`` (GaussianFluent, Eq. 2) evaluated
+with the exact anisotropic covariance of every splat. What makes it safe for real files: standard
+deviations are clamped to a range given in voxels, so a needle of size 1e-15 cannot slip between
+voxels or divide by zero, and a splat as large as the room costs a bounded number of voxels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["GridBox", "choose_grid", "density_field"]
+
+_RADII = (2, 3, 4, 6, 8, 12, 16, 20)  # half-widths [voxels] that splats are grouped into
+_CUTOFF = 2.5  # standard deviations; exp(-3.1) = 0.044 of the peak is dropped
+_MIN_SIGMA = 0.5  # voxels: a surface sampled about once per voxel stays closed
+_MAX_SIGMA = _RADII[-1] / _CUTOFF
+_CHUNK = 4_000_000  # kernel values per batch: 16 MB of float32, stays in cache-friendly territory
+
+
+@dataclass(frozen=True)
+class GridBox:
+    """An axis-aligned voxel grid; voxel ``i`` is centred on ``origin + (i + 0.5) * voxel``."""
+
+    origin: tuple[float, float, float]
+    voxel: float
+    shape: tuple[int, int, int]
+
+    def centers(self, index: np.ndarray) -> np.ndarray:
+        """World positions [M, 3] of voxel indices [M, 3]."""
+        return np.asarray(self.origin) + (index + 0.5) * self.voxel
+
+
+def choose_grid(means: Tensor, opacities: Tensor, resolution: int) -> tuple[GridBox, int]:
+    """Grid around the splats that matter.
+
+    A few stray splats far away ("floaters") must not blow the box up: when the box of all visible
+    splats is more than 1.5 times the box of the central 99 % along some axis, that axis falls back
+    to the central 99 % widened by a quarter.
+
+    Args:
+        means: Splat centres [N, 3], world units.
+        opacities: [N] in 0..1.
+        resolution: Voxels along the longest side of the object (the grid adds a rim of three
+            voxels).
+
+    Returns:
+        The grid and the number of visible splats that lie outside it.
+    """
+    visible = means[opacities > 0.05]
+    if visible.shape[0] < 8:
+        visible = means
+    points = visible.detach().double().cpu().numpy()
+    low, high = points.min(0), points.max(0)
+    inner_low, inner_high = np.quantile(points, [0.005, 0.995], axis=0)
+    inner = np.maximum(inner_high - inner_low, 1e-12)
+    stray = (high - low) > 1.5 * inner + 1e-9
+    low = np.where(stray, np.maximum(low, inner_low - 0.25 * inner), low)
+    high = np.where(stray, np.minimum(high, inner_high + 0.25 * inner), high)
+    extent = float((high - low).max())
+    voxel = max(extent, 1e-9) / max(resolution - 1, 1)
+    rim = 3
+    shape = np.ceil((high - low) / voxel).astype(int) + 1 + 2 * rim
+    middle = 0.5 * (low + high)
+    origin = middle - 0.5 * shape * voxel
+    outside = int((((points < origin) | (points > origin + shape * voxel)).any(1)).sum())
+    box = GridBox(
+        (float(origin[0]), float(origin[1]), float(origin[2])),
+        voxel,
+        (int(shape[0]), int(shape[1]), int(shape[2])),
+    )
+    return box, outside
+
+
+def density_field(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    box: GridBox,
+) -> Tensor:
+    """Sum of opacity-weighted Gaussians at every voxel centre.
+
+    Splats are grouped by the voxel half-widths of their box; within a group the quadratic form of
+    all splats at all offsets is one matrix product, because ``(o - f)^T P (o - f)`` is linear in
+    ten monomials of the offset ``o``.
+
+    Args:
+        means: [N, 3] world units.
+        quats: [N, 4] wxyz, any non-zero norm.
+        scales: [N, 3] standard deviations, world units, > 0.
+        opacities: [N] in 0..1.
+        box: Target grid.
+
+    Returns:
+        Density float32 [X, Y, Z], dimensionless.
+    """
+    pad = _RADII[-1]
+    shape = tuple(s + 2 * pad for s in box.shape)
+    field = torch.zeros(shape[0] * shape[1] * shape[2], dtype=torch.float32)
+    position = (
+        means.detach().cpu().double() - torch.tensor(box.origin, dtype=torch.float64)
+    ) / box.voxel - 0.5
+    limit = torch.tensor(box.shape, dtype=torch.float64) - 0.5
+    keep = ((position > -0.5) & (position < limit)).all(1) & (opacities.detach().cpu() > 1e-3)
+    position = position[keep]
+    if position.shape[0] == 0:
+        return field.view(shape)[pad:-pad, pad:-pad, pad:-pad].clone()
+    sigma = (scales.detach().cpu().double()[keep] / box.voxel).clamp(_MIN_SIGMA, _MAX_SIGMA)
+    rotation = _rotation(quats.detach().cpu().double()[keep])
+    alpha = opacities.detach().cpu().float()[keep]
+    precision = torch.einsum("nij,nj,nkj->nik", rotation, sigma**-2, rotation)
+    reach = _CUTOFF * torch.einsum("nij,nj->ni", rotation**2, sigma**2).sqrt()
+
+    radii = torch.tensor(_RADII, dtype=torch.float64)
+    bucket = torch.bucketize(reach, radii).clamp_(max=len(_RADII) - 1)
+    key = (bucket[:, 0] * len(_RADII) + bucket[:, 1]) * len(_RADII) + bucket[:, 2]
+    base = position.round().long()
+    fraction = position - base
+    flat_base = ((base[:, 0] + pad) * shape[1] + base[:, 1] + pad) * shape[2] + base[:, 2] + pad
+    coefficients = _quadratic_coefficients(precision, fraction).float()
+
+    for value in key.unique().tolist():
+        members = (key == value).nonzero()[:, 0]
+        size = len(_RADII)
+        half = [_RADII[value // size // size], _RADII[value // size % size], _RADII[value % size]]
+        offset = torch.cartesian_prod(*(torch.arange(-h, h + 1) for h in half))
+        flat_offset = (offset[:, 0] * shape[1] + offset[:, 1]) * shape[2] + offset[:, 2]
+        monomials = _monomials(offset.float())
+        step = max(1, _CHUNK // offset.shape[0])
+        for start in range(0, members.shape[0], step):
+            part = members[start : start + step]
+            weight = (coefficients[part] @ monomials.T).clamp_(min=0.0).mul_(-0.5).exp_()
+            weight *= alpha[part, None]
+            index = flat_base[part, None] + flat_offset[None]
+            field.index_add_(0, index.reshape(-1), weight.reshape(-1))
+    return field.view(shape)[pad:-pad, pad:-pad, pad:-pad].clone()
+
+
+def _rotation(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of wxyz quaternions; a zero quaternion counts as no rotation."""
+    norm = quats.norm(dim=1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    q = torch.where(norm > 1e-12, quats / norm.clamp(min=1e-12), identity)
+    w, x, y, z = q.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, dim=1).view(-1, 3, 3)
+
+
+def _quadratic_coefficients(precision: Tensor, fraction: Tensor) -> Tensor:
+    """Coefficients [N, 10] of ``(o - f)^T P (o - f)`` in the monomials of :func:`_monomials`."""
+    linear = torch.einsum("nij,nj->ni", precision, fraction)
+    constant = torch.einsum("ni,ni->n", linear, fraction)
+    p = precision
+    columns = [p[:, 0, 0], p[:, 1, 1], p[:, 2, 2], 2 * p[:, 0, 1], 2 * p[:, 0, 2], 2 * p[:, 1, 2]]
+    columns += [-2 * linear[:, 0], -2 * linear[:, 1], -2 * linear[:, 2], constant]
+    return torch.stack(columns, dim=1)
+
+
+def _monomials(offset: Tensor) -> Tensor:
+    """Monomials [M, 10] xx, yy, zz, xy, xz, yz, x, y, z, 1 of integer offsets [M, 3]."""
+    x, y, z = offset.unbind(1)
+    return torch.stack(
+        [x * x, y * y, z * z, x * y, x * z, y * z, x, y, z, torch.ones_like(x)], dim=1
+    )

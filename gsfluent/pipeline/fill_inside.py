@@ -1,0 +1,225 @@
+"""Which voxels are inside: ray vote, visual hull, surface trimming, leak report.
+
+A bare flood fill from outside is never used to decide: one missing splat and the whole object is
+"outside" (measured IoU 0.13-0.38, against 0.75-0.85 for votes; docs/interior.md). It is used only
+to *report* leaks.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+
+from .fill_density import GridBox
+
+__all__ = [
+    "DIRECTIONS",
+    "Vote",
+    "cast_votes",
+    "count_leaks",
+    "keep_components",
+    "trim_outer_flank",
+    "visual_hull",
+]
+
+logger = logging.getLogger(__name__)
+
+DIRECTIONS = np.array(
+    [d for d in itertools.product((-1, 0, 1), repeat=3) if any(d)], dtype=int
+)  # 26
+
+
+@dataclass(frozen=True)
+class Vote:
+    """Result of :func:`cast_votes`.
+
+    Attributes:
+        score: Fraction of the counted directions that hit the surface, float32 [X, Y, Z].
+        open_side: Unit vector of the side that was left out because nothing was seen there, or
+            None.
+        open_fraction: Fraction of the inner voxels that look out through that side.
+    """
+
+    score: np.ndarray
+    open_side: tuple[float, float, float] | None
+    open_fraction: float
+
+
+def _blocked(hit: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """True where some ``hit[x + k * direction]``, k >= 1, is set: one sweep from the far end."""
+    flips = tuple(i for i in range(3) if direction[i] < 0)
+    lead = int(np.flatnonzero(direction)[0])
+    order = [lead] + [i for i in range(3) if i != lead]
+    source = np.flip(hit, flips).transpose(order)
+    shift = np.abs(direction)[order]
+    out = np.zeros(source.shape, dtype=bool)
+    _, ny, nz = source.shape
+    for i in range(source.shape[0] - 2, -1, -1):
+        ahead = source[i + 1] | out[i + 1]
+        out[i, : ny - shift[1], : nz - shift[2]] = ahead[shift[1] :, shift[2] :]
+    return np.flip(out.transpose(np.argsort(order)), flips)
+
+
+def cast_votes(
+    shell: np.ndarray,
+    *,
+    rays: int = 26,
+    down: np.ndarray | None = None,
+    close_open_side: bool = True,
+) -> Vote:
+    """Let every voxel look for the surface along 6 or 26 lattice directions.
+
+    Things photographed on a table have no underside. When most inner voxels look out through one
+    side and hardly any through the others, that side is left out of the vote, which closes the hole
+    flat at its rim.
+
+    Args:
+        shell: Surface voxels, bool [X, Y, Z].
+        rays: 6 (axes) or 26 (axes and diagonals; narrower crevices stay open).
+        down: Known downward direction [3]; None finds the open side by itself.
+        close_open_side: False never leaves a side out.
+
+    Returns:
+        The vote; a voxel is inside when its score is high.
+    """
+    axes = np.abs(DIRECTIONS).sum(1) == 1
+    chosen = DIRECTIONS[axes] if rays == 6 else DIRECTIONS
+    flags = np.stack([_blocked(shell, d) for d in chosen])
+    unit = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+    count = flags.sum(0, dtype=np.uint8)
+    plain = count.astype(np.float32) / len(chosen)
+    if not close_open_side:
+        return Vote(plain, None, 0.0)
+    # inner voxels: most directions are blocked, up to one open half-space of directions
+    inner = (plain >= 0.6) & ~shell
+    total = int(inner.sum())
+    if total == 0:
+        return Vote(plain, None, 0.0)
+    free = 1.0 - flags[:, inner].mean(1)
+    if down is not None:
+        side = np.asarray(down, dtype=float) / max(float(np.linalg.norm(down)), 1e-12)
+        weight = np.clip(unit @ side, 0.0, None) ** 2
+        fraction = float((free * weight).sum() / weight.sum())
+        if fraction < 0.03:
+            return Vote(plain, None, fraction)
+    else:
+        principal = np.flatnonzero(np.abs(chosen).sum(1) == 1)
+        order = principal[np.argsort(free[principal])[::-1]]
+        fraction = float(free[order[0]])
+        if fraction < 0.05 or free[order[1]] > 0.6 * fraction:
+            return Vote(plain, None, fraction)
+        side = unit[order[0]]
+    counted = unit @ side < 0.5
+    score = flags[counted].mean(0, dtype=np.float32)
+    return Vote(score, (float(side[0]), float(side[1]), float(side[2])), fraction)
+
+
+def trim_outer_flank(solid: np.ndarray, shell: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Remove the outer half of the shell: the boundary then runs through the splat centres.
+
+    A shell voxel belongs to the outer flank when the density still rises towards the inside of the
+    object. A sheet one or two voxels thick may be all flank: a voxel goes only when some voxel
+    behind it, within four steps inward, stays.
+    """
+    from scipy import ndimage
+
+    blurred = ndimage.gaussian_filter(solid.astype(np.float32), 1.5)
+    inward = np.stack(np.gradient(blurred))
+    inward /= np.maximum(np.linalg.norm(inward, axis=0), 1e-9)
+    slope = np.stack(np.gradient(ndimage.gaussian_filter(density, 0.5)))
+    rising = (inward * slope).sum(0) > 1e-3 * density
+    flank = solid & shell & rising
+    kept = solid & ~flank
+    index = np.argwhere(flank)
+    direction = inward[(slice(None), *index.T)].T
+    backed = np.zeros(len(index), bool)
+    for step in range(1, 5):
+        behind = np.rint(index + step * direction).astype(int)
+        backed |= kept[tuple(np.clip(behind, 0, np.array(solid.shape) - 1).T)]
+    loose = np.zeros(solid.shape, bool)
+    loose[tuple(index[backed].T)] = True
+    # only what can be peeled from outside: a second layer of splats below the skin is no boundary
+    loose &= ndimage.distance_transform_edt(solid) <= 3.0
+    peeled = ndimage.binary_propagation(~solid, mask=~solid | loose)
+    result: np.ndarray = ndimage.binary_fill_holes(~peeled)
+    return result
+
+
+def keep_components(solid: np.ndarray, *, relative: float = 0.1) -> tuple[np.ndarray, int]:
+    """Keep the largest 26-connected component and those of ``relative`` its size."""
+    from scipy import ndimage
+
+    labels, count = ndimage.label(solid, structure=np.ones((3, 3, 3)))
+    if count <= 1:
+        return solid, 0
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    wanted = sizes >= relative * sizes.max()
+    return wanted[labels], int(count - wanted.sum())
+
+
+def count_leaks(shell: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
+    """Openings through which a flood from outside would enter the object.
+
+    Args:
+        shell: Surface voxels that hold water back, bool [X, Y, Z].
+        inside: Voxels decided to be inside.
+
+    Returns:
+        Number of separate openings, and number of inner voxels that the flood would reach.
+    """
+    from scipy import ndimage
+
+    cross = ndimage.generate_binary_structure(3, 1)
+    open_space = np.pad(~shell, 1, constant_values=True)
+    labels, _ = ndimage.label(open_space, structure=cross)
+    flooded = (labels == labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
+    wet = flooded & inside & ~shell
+    if not wet.any():
+        return 0, 0
+    # an opening: wet inner voxels that touch open space outside the object
+    mouth = wet & ndimage.binary_dilation(~inside & ~shell, cross)
+    _, openings = ndimage.label(mouth, structure=np.ones((3, 3, 3)))
+    return int(openings), int(wet.sum())
+
+
+def visual_hull(box: GridBox, views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Voxels whose centre falls inside the mask of (nearly) every view that sees it.
+
+    One stray mask must not cut the object in two: from eight views on, two views have to agree
+    before a voxel goes.
+
+    Args:
+        box: The grid.
+        views: Per view ``(ground bool [H, W], viewmat [4, 4], K [3, 3])``: pixels known to show
+            something else than the object; world to camera with OpenCV axes.
+
+    Returns:
+        Hull bool [X, Y, Z]. Voxels outside every image are kept.
+    """
+    needed = 2 if len(views) >= 8 else 1
+    index = np.stack(np.meshgrid(*(np.arange(s) for s in box.shape), indexing="ij"), -1).reshape(
+        -1, 3
+    )
+    points = box.centers(index).astype(np.float32)
+    alive = np.arange(points.shape[0])
+    votes = np.zeros(points.shape[0], dtype=np.uint8)
+    for ground, viewmat, intrinsics in views:
+        height, width = ground.shape
+        camera = points[alive] @ viewmat[:3, :3].T.astype(np.float32) + viewmat[:3, 3].astype(
+            np.float32
+        )
+        z = camera[:, 2]
+        front = z > 1e-6
+        pixel = camera @ intrinsics.T.astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = pixel[:, 0] / z, pixel[:, 1] / z
+        seen = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        column = np.where(seen, u, 0).astype(np.int32)
+        row = np.where(seen, v, 0).astype(np.int32)
+        votes[alive[seen & ground[row, column]]] += 1
+        alive = alive[votes[alive] < needed]
+    return (votes < needed).reshape(box.shape)

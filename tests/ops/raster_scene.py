@@ -1,0 +1,58 @@
+"""Scenes shared by the rasterizer's tests: built from a seed, small enough for the reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+WIDTH, HEIGHT = 50, 38  # neither is a multiple of the tile
+
+
+def camera() -> tuple[Tensor, Tensor]:
+    """A camera at the origin looking along +z with a slight turn; viewmat and K in float64."""
+    angle = torch.tensor(0.1, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 0] = viewmat[2, 2] = angle.cos()
+    viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
+    viewmat[:3, 3] = torch.tensor([-0.2, 0.05, 0.3])
+    K = torch.tensor([[60.0, 0, 26.0], [0, 62.0, 18.0], [0, 0, 1]], dtype=torch.float64)
+    return viewmat, K
+
+
+def scene(count: int, *, degree: int = 3, seed: int = 1) -> dict[str, Tensor]:
+    """Random float64 Gaussians in front of :func:`camera`, with all optional inputs but groups."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    means = normal(count, 3) * 0.5
+    means[:, 2] += 3.0
+    return {
+        "means": means,
+        "opacities": 0.05 + 0.95 * uniform(count),
+        "quats": normal(count, 4),
+        "scales": 0.02 + 0.2 * uniform(count, 3),
+        "sh": 0.3 * normal(count, (degree + 1) ** 2, 3),
+        "background": uniform(3),
+        "normals": normal(count, 3),
+        "means2d_offset": 0.5 * normal(count, 2),
+    }
+
+
+def render(op: Any, inputs: dict[str, Tensor], **options: Any) -> Any:
+    """Call `op` (the operator or the reference) on a scene."""
+    viewmat, K = camera()
+    rest = {k: v for k, v in inputs.items() if k not in ("means", "opacities")}
+    return op(inputs["means"], inputs["opacities"], viewmat, K, WIDTH, HEIGHT, **rest, **options)
+
+
+def relative_error(value: Tensor, expected: Tensor) -> float:
+    """Largest difference over the largest expected magnitude."""
+    scale = expected.abs().max().clamp(min=1e-30)
+    return ((value.double() - expected.double()).abs().max() / scale).item()
