@@ -1,0 +1,144 @@
+// One plain struct per MPM kernel: pointers, sizes, scalars. Shared by the CPU and the CUDA back
+// end.
+#pragma once
+
+#include "core/contact.h"
+
+namespace gsf {
+
+// Blocks per ordered partial sum of collider impulses; fixed, so that sums do not depend on the
+// machine.
+constexpr int64_t kChunkBlocks = 16;
+GSF_HOST_DEVICE int64_t grid_update_chunks(int64_t blocks) {
+  return (blocks + kChunkBlocks - 1) / kChunkBlocks;
+}
+
+template <typename T>
+struct P2GArgs {
+  BlockView blocks;
+  const T* position;    // [N, 3] m
+  const T* velocity;    // [N, 3] m/s
+  const T* affine;      // [N, 3, 3] 1/s
+  const T* mass;        // [N] kg
+  const T* stress;      // [N, 6] Kirchhoff stress, Pa, or null
+  const T* volume;      // [N] initial volume, m^3, or null (with stress)
+  const int32_t* body;  // [N] field of each particle, or null (all 0)
+  T dx, dt;
+  int32_t fields;
+  T* grid;           // [fields, count, 64, 4] momentum and mass, zeroed
+  T* moments;        // [fields, count, 64, 6] mass gradient, first moment, zeroed; or null
+  int64_t* skipped;  // [] particles given to no node, zeroed
+};
+
+// Gather of velocities (g2p) or of four plain channels (adjoint of p2g), told apart by `channels`.
+template <typename T>
+struct GatherArgs {
+  BlockView blocks;
+  const T* grid;  // [fields, count, 64, channels]
+  const T* position;
+  const int32_t* body;
+  T dx, dt;
+  int32_t fields;
+  int64_t* skipped;
+  // g2p (channels = 3)
+  const T* velocity;     // [N, 3] kept by skipped particles, or null
+  const T* deformation;  // [N, 3, 3] or null
+  T* position_out;
+  T* velocity_out;
+  T* affine_out;
+  T* deformation_out;  // or null
+  // adjoint (channels = 4)
+  T* value_out;  // [N, 4] sum w g
+  T* first_out;  // [N, 3, 3] sum w g (x_i - x_p)^T
+};
+
+template <typename T>
+struct GridUpdateArgs {
+  const int32_t* coords;  // [count, 3]
+  int64_t count;
+  int32_t fields;
+  const T* grid;       // [fields, count, 64, 4]
+  const T* moments;    // [fields, count, 64, 6] or null
+  const T* colliders;  // [collider_count, 16] or null
+  int64_t collider_count;
+  T dx, dt;
+  T gravity[3];
+  ContactLaw law;
+  T* velocity;             // [fields, count, 64, 3]
+  double* partial;         // [chunks, collider_count, 3] scratch
+  double* impulse;         // [collider_count, 3]
+  int64_t* contact_nodes;  // [] zeroed
+
+  GSF_HOST_DEVICE const T* node(int32_t field, int64_t node) const {
+    return grid + 4 * (int64_t(field) * count * kBlockNodes + node);
+  }
+  GSF_HOST_DEVICE T* out(int32_t field, int64_t node) const {
+    return velocity + 3 * (int64_t(field) * count * kBlockNodes + node);
+  }
+};
+
+// Momentum to velocity with gravity, then contact between every pair of fields (Gauss-Seidel);
+// returns whether any touched.
+template <typename T>
+GSF_HOST_DEVICE bool update_node(const GridUpdateArgs<T>& a, int64_t node) {
+  int present = 0;
+  for (int32_t f = 0; f < a.fields; ++f) {
+    const T* g = a.node(f, node);
+    T* v = a.out(f, node);
+    const bool heavy = g[3] > mass_floor<T>();
+    for (int i = 0; i < 3; ++i) v[i] = heavy ? g[i] / g[3] + a.dt * a.gravity[i] : T(0);
+    present += heavy ? 1 : 0;
+  }
+  if (a.moments == nullptr || present < 2) return false;
+  bool touched = false;
+  for (int32_t fa = 0; fa < a.fields; ++fa) {
+    const T mass_a = a.node(fa, node)[3];
+    if (!(mass_a > mass_floor<T>())) continue;
+    for (int32_t fb = fa + 1; fb < a.fields; ++fb) {
+      const T mass_b = a.node(fb, node)[3];
+      if (!(mass_b > mass_floor<T>())) continue;
+      T* pa = a.out(fa, node);
+      T* pb = a.out(fb, node);
+      Vec3<T> va{pa[0], pa[1], pa[2]}, vb{pb[0], pb[1], pb[2]};
+      const T* ma = a.moments + 6 * (int64_t(fa) * a.count * kBlockNodes + node);
+      const T* mb = a.moments + 6 * (int64_t(fb) * a.count * kBlockNodes + node);
+      if (!contact_pair(mass_a, mass_b, ma, mb, a.dx, a.law, va, vb)) continue;
+      touched = true;
+      for (int i = 0; i < 3; ++i) {
+        pa[i] = va[i];
+        pb[i] = vb[i];
+      }
+    }
+  }
+  return touched;
+}
+
+// Applies collider `c` to every field at one node and adds the impulse given to the bodies [N s],
+// in double.
+template <typename T>
+GSF_HOST_DEVICE void collide_node(const GridUpdateArgs<T>& a, int64_t c, int64_t node,
+                                  double* impulse) {
+  const T* row = a.colliders + c * kColliderColumns;
+  const int32_t* block = a.coords + 3 * (node / kBlockNodes);
+  const int32_t local = static_cast<int32_t>(node % kBlockNodes);
+  const Vec3<T> x{(T(block[0]) * kBlockEdge + T(local / 16)) * a.dx,
+                  (T(block[1]) * kBlockEdge + T(local / 4 % 4)) * a.dx,
+                  (T(block[2]) * kBlockEdge + T(local % 4)) * a.dx};
+  Vec3<T> normal;
+  bool valid;
+  const bool inside = collider_normal(row, x, a.dx, normal, valid);
+  if (!valid) impulse[0] = impulse[1] = impulse[2] = double(NAN);
+  if (!inside) return;
+  for (int32_t f = 0; f < a.fields; ++f) {
+    const T mass = a.node(f, node)[3];
+    if (!(mass > mass_floor<T>())) continue;
+    T* p = a.out(f, node);
+    const Vec3<T> after = collide(row, normal, Vec3<T>{p[0], p[1], p[2]});
+    for (int i = 0; i < 3; ++i) {
+      impulse[i] += double(mass) * (double(after[i]) - double(p[i]));
+      p[i] = after[i];
+    }
+  }
+}
+
+}  // namespace gsf

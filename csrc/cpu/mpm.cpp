@@ -1,0 +1,389 @@
+// CPU kernels of the MPM transfers. Blocks of one colour in parallel, each into its own tile: every
+// node receives its sums in an order that does not depend on the number of threads.
+#include "host/mpm.h"
+
+#include <algorithm>
+#include <atomic>
+#include <numeric>
+
+#include "cpu/mpm_tile.h"
+
+namespace gsf {
+namespace cpu {
+namespace {
+
+constexpr int64_t kBlockGrain = 4;
+constexpr int64_t kAhead = 8;  // particles; they are read through `order`, in any memory order
+
+inline void fetch(const void* p) { __builtin_prefetch(p); }
+
+template <typename T>
+void fetch_particle(const P2GArgs<T>& a, int64_t r, int64_t end) {
+  if (r >= end) return;
+  const int64_t p = a.blocks.order[r];  // a prefetch of a wrong address does nothing
+  fetch(a.position + 3 * p);
+  fetch(a.velocity + 3 * p);
+  fetch(a.affine + 9 * p);
+  fetch(a.affine + 9 * p + 8);
+  fetch(a.mass + p);
+  if (a.stress == nullptr) return;
+  fetch(a.stress + 6 * p);
+  fetch(a.volume + p);
+}
+
+template <typename T>
+void fetch_particle(const GatherArgs<T>& a, int64_t r, int64_t end) {
+  if (r >= end) return;
+  const int64_t p = a.blocks.order[r];
+  fetch(a.position + 3 * p);
+  if (a.deformation != nullptr) fetch(a.deformation + 9 * p);
+  if (a.position_out == nullptr) return;
+  __builtin_prefetch(a.position_out + 3 * p, 1);
+  __builtin_prefetch(a.velocity_out + 3 * p, 1);
+  __builtin_prefetch(a.affine_out + 9 * p, 1);
+}
+
+template <typename T>
+ParticleMomentum<T> momentum_of(const P2GArgs<T>& a, const Stencil<T>& s, int64_t p) {
+  const T* stress = a.stress != nullptr ? a.stress + 6 * p : nullptr;
+  const T volume = a.stress != nullptr ? a.volume[p] : T(0);
+  return particle_momentum(s, a.mass[p], a.velocity + 3 * p, a.affine + 9 * p, stress, volume, a.dx,
+                           a.dt);
+}
+
+template <typename T>
+void scatter_momentum(const ParticleMomentum<T>& q, const Stencil<T>& s, Lanes<T>* node,
+                      int32_t edge) {
+  const Lanes<T> q0{q.constant.x, q.constant.y, q.constant.z, q.mass};
+  const Lanes<T> qx{q.slope(0, 0), q.slope(1, 0), q.slope(2, 0), T(0)};
+  const Lanes<T> qy{q.slope(0, 1), q.slope(1, 1), q.slope(2, 1), T(0)};
+  const Lanes<T> qz{q.slope(0, 2), q.slope(1, 2), q.slope(2, 2), T(0)};
+  Lanes<T> px = q0;
+  for (int i = 0; i < 3; ++i, px += qx, node += edge * edge) {
+    Lanes<T> pxy = px;
+    for (int j = 0; j < 3; ++j, pxy += qy) {
+      const T w = s.w[0][i] * s.w[1][j];
+      Lanes<T>* n = node + j * edge;
+      const Lanes<T> a = w * pxy, b = w * qz;
+      n[0] += s.w[2][0] * a;
+      n[1] += s.w[2][1] * (a + b);
+      n[2] += s.w[2][2] * (a + b + b);
+    }
+  }
+}
+
+// Mass gradient sum m dw/dx_p and first moment sum w m (x_p - x_node), two lanes-of-four per node.
+template <typename T>
+void scatter_moments(const Stencil<T>& s, T mass, T dx, Lanes<T>* node, int32_t edge) {
+  const T per_dx = mass / dx;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      const T w = s.w[0][i] * s.w[1][j];
+      const Lanes<T> lateral{per_dx * s.slope(0, i) * s.w[1][j], per_dx * s.w[0][i] * s.slope(1, j),
+                             T(0), T(0)};
+      const Lanes<T> vertical{T(0), T(0), per_dx * w, T(0)};
+      Lanes<T>* n = node + 2 * (i * edge + j) * edge;
+      for (int k = 0; k < 3; ++k) {
+        const T m = mass * w * s.w[2][k] * dx;
+        const Lanes<T> offset{s.f[0] - T(i), s.f[1] - T(j), s.f[2] - T(k), T(0)};
+        n[2 * k] += s.w[2][k] * lateral + s.slope(2, k) * vertical;
+        n[2 * k + 1] += m * offset;
+      }
+    }
+}
+
+// One particle straight to the grid, for those that left their block's window; called from one
+// thread only.
+template <typename T>
+bool scatter_stray(const P2GArgs<T>& a, int64_t p) {
+  const int32_t field = a.body != nullptr ? a.body[p] : 0;
+  if (field < 0 || field >= a.fields) return false;
+  Stencil<T> s;
+  StencilBlocks at;
+  if (!make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s)) return false;
+  if (!at.find(a.blocks, s)) return false;
+  Lanes<T> tile[27] = {};
+  Lanes<T> moment[54] = {};
+  scatter_momentum(momentum_of(a, s, p), s, tile, 3);
+  if (a.moments != nullptr) scatter_moments(s, a.mass[p], a.dx, moment, 3);
+  const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
+  for (int n = 0; n < 27; ++n) {
+    const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
+    for (int c = 0; c < 4; ++c) a.grid[4 * node + c] += tile[n][c];
+    if (a.moments == nullptr) continue;
+    for (int c = 0; c < 6; ++c) a.moments[6 * node + c] += moment[2 * n + c / 3][c % 3];
+  }
+  return true;
+}
+
+// Scatters the particles of one block; returns how many it could not place in the block's window.
+template <typename T>
+int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& tile,
+                  std::vector<Lanes<T>>& moment) {
+  const BlockView& view = a.blocks;
+  const OrderRange range(view, block);
+  if (range.begin == range.end) return 0;
+  const Window window(view, block);
+  if (!window.sound()) return static_cast<int32_t>(range.end - range.begin);
+  const NodeRange nodes = view.node_range();
+  const T inv_dx = T(1) / a.dx;
+  const int32_t edge = window.edge();
+  int64_t placed = 0;
+  for (uint64_t left = fields_in(view, range, a.body, a.fields); left != 0; left &= left - 1) {
+    const int32_t field = __builtin_ctzll(left);
+    tile.assign(window.nodes(), Lanes<T>{});
+    if (a.moments != nullptr) moment.assign(2 * window.nodes(), Lanes<T>{});
+    for (int64_t r = range.begin; r < range.end; ++r) {
+      fetch_particle(a, r + kAhead, range.end);
+      const int64_t p = view.order[r];
+      if (p < 0 || p >= view.particles) continue;
+      if (a.body != nullptr && a.body[p] != field) continue;
+      Stencil<T> s;
+      if (!make_stencil(a.position + 3 * p, inv_dx, nodes, s)) continue;
+      const int32_t o = window.offset(s);
+      if (o < 0) continue;
+      ++placed;
+      scatter_momentum(momentum_of(a, s, p), s, tile.data() + o, edge);
+      if (a.moments != nullptr) scatter_moments(s, a.mass[p], a.dx, moment.data() + 2 * o, edge);
+    }
+    const int64_t base = int64_t(field) * view.count * kBlockNodes;
+    window.for_each_run([&](int32_t t, int64_t node, int32_t run) {
+      T* out = a.grid + 4 * (base + node);
+      for (int32_t n = 0; n < run; ++n)
+        for (int c = 0; c < 4; ++c) out[4 * n + c] += tile[t + n][c];
+      if (a.moments == nullptr) return;
+      T* mom = a.moments + 6 * (base + node);
+      for (int32_t n = 0; n < run; ++n)
+        for (int c = 0; c < 6; ++c) mom[6 * n + c] += moment[2 * (t + n) + c / 3][c % 3];
+    });
+  }
+  return static_cast<int32_t>(range.end - range.begin - placed);
+}
+
+template <typename T>
+void p2g(const P2GArgs<T>& a) {
+  const BlockView& view = a.blocks;
+  const int32_t stride = color_stride(view.margin);
+  const int32_t colors = stride * stride * stride;
+  // Blocks listed by colour, in block order within a colour.
+  std::vector<std::vector<int32_t>> list(colors);
+  for (int64_t b = 0; b < view.count; ++b) {
+    if (view.start[b] == view.start[b + 1]) continue;
+    int32_t color = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const int32_t c = view.coords[3 * b + axis] % stride;
+      color = color * stride + (c < 0 ? c + stride : c);
+    }
+    list[color].push_back(static_cast<int32_t>(b));
+  }
+  std::vector<int32_t> unplaced(view.count, 0);
+  for (const std::vector<int32_t>& blocks : list)
+    parallel_for(static_cast<int64_t>(blocks.size()), kBlockGrain, [&](int64_t begin, int64_t end) {
+      std::vector<Lanes<T>> tile, moment;
+      for (int64_t i = begin; i < end; ++i)
+        unplaced[blocks[i]] = p2g_block(a, blocks[i], tile, moment);
+    });
+  // Strays are few: one thread, block order.
+  for (int64_t b = 0; b < view.count; ++b) {
+    if (unplaced[b] == 0) continue;
+    const OrderRange range(view, b);
+    const Window window(view, b);
+    for (int64_t r = range.begin; r < range.end; ++r) {
+      const int64_t p = view.order[r];
+      if (p < 0 || p >= view.particles) {
+        ++*a.skipped;
+        continue;
+      }
+      Stencil<T> s;
+      const int32_t field = a.body != nullptr ? a.body[p] : 0;
+      const bool placed = window.sound() && field >= 0 && field < a.fields &&
+                          make_stencil(a.position + 3 * p, T(1) / a.dx, view.node_range(), s) &&
+                          window.offset(s) >= 0;
+      if (!placed && !scatter_stray(a, p)) ++*a.skipped;
+    }
+  }
+}
+
+// sum w g and sum w g (x_i - x_p)^T over a tile or over 27 loose nodes.
+template <typename T>
+Gathered<T> gather(const Stencil<T>& s, T dx, const Lanes<T>* node, int32_t edge) {
+  Lanes<T> sum{}, sx{}, sy{}, sz{};
+  for (int i = 0; i < 3; ++i) {
+    Lanes<T> plane{};
+    for (int j = 0; j < 3; ++j) {
+      const Lanes<T>* n = node + (i * edge + j) * edge;
+      const Lanes<T> b = s.w[2][1] * n[1], c = s.w[2][2] * n[2];
+      const Lanes<T> row = s.w[2][0] * n[0] + b + c;
+      const T w = s.w[1][j];
+      plane += w * row;
+      sy += (s.w[0][i] * w * (T(j) - s.f[1])) * row;
+      sz += (s.w[0][i] * w) * (b + c + c);
+    }
+    sum += s.w[0][i] * plane;
+    sx += (s.w[0][i] * (T(i) - s.f[0])) * plane;
+  }
+  sz -= s.f[2] * sum;
+  Gathered<T> g;
+  for (int c = 0; c < 4; ++c) g.value[c] = sum[c];
+  for (int c = 0; c < 3; ++c) {
+    g.first(c, 0) = dx * sx[c];
+    g.first(c, 1) = dx * sy[c];
+    g.first(c, 2) = dx * sz[c];
+  }
+  return g;
+}
+
+template <typename T>
+struct VelocityGather {
+  static constexpr int kChannels = 3;
+  static void store(const GatherArgs<T>& a, int64_t p, const Gathered<T>& g) {
+    finish_g2p(g, a.dx, a.dt, a.position + 3 * p, a.deformation ? a.deformation + 9 * p : nullptr,
+               a.position_out + 3 * p, a.velocity_out + 3 * p, a.affine_out + 9 * p,
+               a.deformation_out ? a.deformation_out + 9 * p : nullptr);
+  }
+  static void skip(const GatherArgs<T>& a, int64_t p) {
+    skip_g2p(a.dt, a.position + 3 * p, a.velocity ? a.velocity + 3 * p : nullptr,
+             a.deformation ? a.deformation + 9 * p : nullptr, a.position_out + 3 * p,
+             a.velocity_out + 3 * p, a.affine_out + 9 * p,
+             a.deformation_out ? a.deformation_out + 9 * p : nullptr);
+  }
+};
+
+template <typename T>
+struct AdjointGather {
+  static constexpr int kChannels = 4;
+  static void store(const GatherArgs<T>& a, int64_t p, const Gathered<T>& g) {
+    for (int c = 0; c < 4; ++c) a.value_out[4 * p + c] = g.value[c];
+    store_mat3(a.first_out + 9 * p, g.first);
+  }
+  static void skip(const GatherArgs<T>& a, int64_t p) { store(a, p, Gathered<T>{}); }
+};
+
+template <typename T, typename Kind>
+bool gather_stray(const GatherArgs<T>& a, int64_t p) {
+  const int32_t field = a.body != nullptr ? a.body[p] : 0;
+  if (field < 0 || field >= a.fields) return false;
+  Stencil<T> s;
+  StencilBlocks at;
+  if (!make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s)) return false;
+  if (!at.find(a.blocks, s)) return false;
+  Lanes<T> tile[27] = {};
+  const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
+  for (int n = 0; n < 27; ++n) {
+    const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
+    for (int c = 0; c < Kind::kChannels; ++c) tile[n][c] = a.grid[Kind::kChannels * node + c];
+  }
+  Kind::store(a, p, gather(s, a.dx, tile, 3));
+  return true;
+}
+
+template <typename T, typename Kind>
+int64_t gather_block(const GatherArgs<T>& a, int64_t block, std::vector<Lanes<T>>& tile) {
+  constexpr int kChannels = Kind::kChannels;
+  const BlockView& view = a.blocks;
+  const OrderRange range(view, block);
+  if (range.begin == range.end) return 0;
+  const Window window(view, block);
+  const NodeRange nodes = view.node_range();
+  const T inv_dx = T(1) / a.dx;
+  const int32_t edge = window.edge();
+  int64_t skipped = 0;
+  const uint64_t present = fields_in(view, range, a.body, a.fields);
+  for (uint64_t left = present; left != 0; left &= left - 1) {
+    const int32_t field = __builtin_ctzll(left);
+    const T* grid = a.grid + kChannels * int64_t(field) * view.count * kBlockNodes;
+    tile.assign(window.nodes(), Lanes<T>{});
+    window.for_each_run([&](int32_t t, int64_t node, int32_t run) {
+      const T* in = grid + kChannels * node;
+      for (int32_t n = 0; n < run; ++n)
+        for (int c = 0; c < kChannels; ++c) tile[t + n][c] = in[kChannels * n + c];
+    });
+    for (int64_t r = range.begin; r < range.end; ++r) {
+      fetch_particle(a, r + kAhead, range.end);
+      const int64_t p = view.order[r];
+      if (p < 0 || p >= view.particles) continue;
+      if (a.body != nullptr && a.body[p] != field) continue;
+      Stencil<T> s;
+      const bool inside = make_stencil(a.position + 3 * p, inv_dx, nodes, s);
+      const int32_t o = inside ? window.offset(s) : -1;
+      if (o >= 0) {
+        Kind::store(a, p, gather(s, a.dx, tile.data() + o, edge));
+      } else if (!gather_stray<T, Kind>(a, p)) {
+        Kind::skip(a, p);
+        ++skipped;
+      }
+    }
+  }
+  // Particles whose body is no field, and order entries that are no particle.
+  for (int64_t r = range.begin; r < range.end; ++r) {
+    const int64_t p = view.order[r];
+    const bool real = p >= 0 && p < view.particles;
+    const int32_t field = real && a.body != nullptr ? a.body[p] : 0;
+    if (real && field >= 0 && field < a.fields) continue;
+    if (real) Kind::skip(a, p);
+    ++skipped;
+  }
+  return skipped;
+}
+
+template <typename T, typename Kind>
+void gather_all(const GatherArgs<T>& a) {
+  std::atomic<int64_t> skipped{0};
+  parallel_for(a.blocks.count, kBlockGrain, [&](int64_t begin, int64_t end) {
+    std::vector<Lanes<T>> tile;
+    int64_t mine = 0;
+    for (int64_t b = begin; b < end; ++b) mine += gather_block<T, Kind>(a, b, tile);
+    skipped += mine;
+  });
+  *a.skipped += skipped;
+}
+
+template <typename T>
+void grid_update(const GridUpdateArgs<T>& a) {
+  const int64_t chunks = grid_update_chunks(a.count);
+  std::vector<int64_t> touched(chunks, 0);
+  parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
+    for (int64_t chunk = begin; chunk < end; ++chunk) {
+      double* partial = a.partial + 3 * chunk * a.collider_count;
+      std::fill(partial, partial + 3 * a.collider_count, 0.0);
+      const int64_t first = chunk * kChunkBlocks * kBlockNodes;
+      const int64_t last = std::min(first + kChunkBlocks * kBlockNodes, a.count * kBlockNodes);
+      for (int64_t node = first; node < last; ++node) touched[chunk] += update_node(a, node);
+      for (int64_t c = 0; c < a.collider_count; ++c)
+        for (int64_t node = first; node < last; ++node) collide_node(a, c, node, partial + 3 * c);
+    }
+  });
+  // Ordered sums: the same for any number of threads.
+  for (int64_t chunk = 0; chunk < chunks; ++chunk)
+    for (int64_t i = 0; i < 3 * a.collider_count; ++i)
+      a.impulse[i] += a.partial[3 * chunk * a.collider_count + i];
+  *a.contact_nodes = std::accumulate(touched.begin(), touched.end(), int64_t(0));
+}
+
+struct Cpu {
+  struct Scope {
+    explicit Scope(const Tensor&) {}
+  };
+  template <typename T>
+  static void p2g(const P2GArgs<T>& a, const Scope&) {
+    cpu::p2g(a);
+  }
+  template <typename T>
+  static void g2p(const GatherArgs<T>& a, const Scope&) {
+    gather_all<T, VelocityGather<T>>(a);
+  }
+  template <typename T>
+  static void p2g_adjoint(const GatherArgs<T>& a, const Scope&) {
+    gather_all<T, AdjointGather<T>>(a);
+  }
+  template <typename T>
+  static void grid_update(const GridUpdateArgs<T>& a, const Scope&) {
+    cpu::grid_update(a);
+  }
+};
+
+}  // namespace
+}  // namespace cpu
+}  // namespace gsf
+
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) { gsf::MpmOps<gsf::cpu::Cpu>::register_all(m); }

@@ -1,0 +1,332 @@
+"""Material point method on a sparse grid: build_blocks, p2g, grid_update, g2p.
+
+MLS-MPM with quadratic B-splines and APIC transfer (Jiang et al. 2015; Hu et al. 2018). The formulas
+with their sources are in ``docs/mpm.md``. Sparse grid: :mod:`gsfluent.ops.blocks`; shape functions
+and gradients: :mod:`gsfluent.ops._mpm_grad`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, overload
+
+import torch
+from torch import Tensor
+
+from gsfluent._check import check_tensor
+from gsfluent.ops import _mpm_grad  # noqa: F401  (registers shape functions and gradients)
+from gsfluent.ops.blocks import Blocks, build_blocks, check_blocks, check_dx, check_order
+
+__all__ = ["Blocks", "build_blocks", "g2p", "grid_update", "p2g"]
+
+MAX_FIELDS = 64
+COLLIDER_COLUMNS = 16
+
+
+def _check_dt(op: str, dt: float) -> float:
+    if not abs(float(dt)) < float("inf"):
+        raise ValueError(f"{op}: dt must be a finite number, got {dt}")
+    return float(dt)
+
+
+def _check_body(op: str, body: Tensor | None, count: int, like: Tensor) -> None:
+    if body is not None:
+        check_tensor(op, "body", body, shape=(count,), dtype=torch.int32, like=like)
+
+
+def p2g(
+    position: Tensor,
+    velocity: Tensor,
+    affine: Tensor,
+    mass: Tensor,
+    *,
+    dx: float,
+    blocks: Blocks,
+    dt: float = 0.0,
+    stress: Tensor | None = None,
+    volume: Tensor | None = None,
+    body: Tensor | None = None,
+    fields: int = 1,
+    contact: bool = False,
+) -> tuple[Tensor, Tensor | None]:
+    """Scatter particle mass and momentum (with the stress impulse) to the grid.
+
+    ``m_i = sum w m_p`` and ``(m v)_i = sum w [m_p (v_p + C_p d) - dt V_p (4 / dx^2) tau_p d]`` with
+    ``d = x_i - x_p``: fused MLS-MPM, the weight applied once.
+
+    Args:
+        position: Positions [m], shape [N, 3].
+        velocity: Velocities [m/s], shape [N, 3].
+        affine: APIC matrices C [1/s], shape [N, 3, 3].
+        mass: Masses [kg], shape [N].
+        dx: Node spacing [m].
+        blocks: From :func:`build_blocks` for these particles.
+        dt: Time step of the stress impulse [s].
+        stress: Kirchhoff stress tau [Pa] as xx, yy, zz, xy, xz, yz, shape [N, 6].
+        volume: Initial volumes [m^3], shape [N]; required with ``stress``.
+        body: Field of each particle in [0, fields), int32 [N]; None puts all into field 0.
+        fields: Number of separate velocity fields K, 1 to 64.
+        contact: Also accumulate what :func:`grid_update` needs for contact between fields.
+
+    Returns:
+        ``grid`` [K, B, 64, 4]: momentum [kg m/s] and mass [kg] per node; ``moments``
+        [K, B, 64, 6] or None: mass gradient ``sum m dw/dx_p`` [kg/m] (points out of the body) and
+        first moment ``sum w m (x_p - x_i)`` [kg m].
+
+    Raises:
+        TypeError: Wrong type or dtype.
+        ValueError: Wrong shape, device or range; blocks built for another particle count.
+        NotImplementedError: A gradient with respect to ``position`` or through ``moments``.
+
+    A particle that is not finite, not covered by ``blocks`` or not in a field gives nothing;
+    :func:`g2p` counts the same particles. Gradient: ``velocity``, ``affine``, ``mass``, ``stress``,
+    ``volume``. Determinism: on the CPU the result does not depend on the number of threads; on CUDA
+    sums are reordered by atomics. Source: Jiang et al. 2015; Hu et al. 2018; docs/mpm.md.
+    """
+    op = "p2g"
+    check_tensor(op, "position", position, shape=(None, 3))
+    n = position.shape[0]
+    check_tensor(op, "velocity", velocity, shape=(n, 3), like=position)
+    check_tensor(op, "affine", affine, shape=(n, 3, 3), like=position)
+    check_tensor(op, "mass", mass, shape=(n,), like=position)
+    if (stress is None) != (volume is None):
+        raise ValueError(f"{op}: stress and volume must be given together")
+    if stress is not None:
+        check_tensor(op, "stress", stress, shape=(n, 6), like=position)
+        check_tensor(op, "volume", volume, shape=(n,), like=position)
+    _check_body(op, body, n, position)
+    if not 1 <= fields <= MAX_FIELDS:
+        raise ValueError(f"{op}: fields must be 1 to {MAX_FIELDS}, got {fields}")
+    check_blocks(op, blocks, position)
+    check_order(op, blocks, n)
+    grid, moments, _ = torch.ops.gsfluent.p2g(
+        position,
+        velocity,
+        affine,
+        mass,
+        stress,
+        volume,
+        body,
+        blocks.table,
+        blocks.coords,
+        blocks.order,
+        blocks.start,
+        blocks.origin,
+        blocks.margin,
+        check_dx(op, dx),
+        _check_dt(op, dt),
+        fields,
+        contact,
+    )
+    return grid, moments if contact else None
+
+
+def grid_update(
+    grid: Tensor,
+    *,
+    dx: float,
+    dt: float,
+    blocks: Blocks,
+    gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    colliders: Tensor | None = None,
+    moments: Tensor | None = None,
+    friction: float = 0.3,
+    restitution: float = 0.0,
+    contact_gap: float = 1.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Turn nodal momentum into velocity: gravity, contact between fields, rigid colliders.
+
+    Contact between every pair of fields that meet at a node uses the corrected Collision-MPM
+    impulse: normal from the difference of unit mass gradients, active only while the centroids of
+    the two masses overlap within ``contact_gap * dx`` and the bodies approach, Coulomb friction.
+    Momentum is exchanged exactly. Colliders act afterwards, in row order.
+
+    Args:
+        grid: Momentum and mass from :func:`p2g`, shape [K, B, 64, 4].
+        dx: Node spacing [m].
+        dt: Time step [s].
+        blocks: The blocks of ``grid``.
+        gravity: Acceleration [m/s^2], three numbers.
+        colliders: Rows ``[type, mode, friction, px, py, pz, nx, ny, nz, radius, vx, vy, vz,
+            restitution, 0, 0]``, shape [M, 16]: type 0 plane through p with normal n out of the
+            collider, 1 sphere of ``radius`` around p; mode 0 sticky, 1 slip (no normal motion),
+            2 separate (may leave; Coulomb friction and restitution on approach); v its velocity.
+        moments: From :func:`p2g` with ``contact=True``; None switches contact off.
+        friction: Coulomb coefficient between fields, >= 0.
+        restitution: Of contact between fields, in [0, 1].
+        contact_gap: Centroid separation [dx] below which fields touch; 1.0 to 1.1 is right for
+            8 particles per cell.
+
+    Returns:
+        ``velocity`` [K, B, 64, 3] in m/s, zero at nodes without mass; ``impulse`` float64 [M, 3]
+        given to the bodies by each collider [N s]; ``contact_nodes`` int64 [], nodes where fields
+        touched.
+
+    Raises:
+        TypeError: Wrong type or dtype.
+        ValueError: Wrong shape, device or range; on the CPU also a collider row of unknown type or
+            mode or without normal (on CUDA such a row does nothing and its impulse is NaN).
+        NotImplementedError: A gradient through contact or colliders.
+
+    Gradient: ``grid`` when there is neither contact nor a collider. Determinism: independent of
+    thread count on the CPU and of scheduling on CUDA.
+    Source: Bardenhagen et al. 2001; the corrected force of docs/mpm.md.
+    """
+    op = "grid_update"
+    check_tensor(op, "grid", grid, shape=(None, None, 64, 4))
+    check_blocks(op, blocks, grid)
+    fields, count = grid.shape[:2]
+    if not 1 <= fields <= MAX_FIELDS:
+        raise ValueError(f"{op}: grid must have 1 to {MAX_FIELDS} fields, got {fields}")
+    check_tensor(op, "grid", grid, shape=(fields, blocks.block_count, 64, 4))
+    if moments is not None:
+        check_tensor(op, "moments", moments, shape=(fields, count, 64, 6), like=grid)
+    if colliders is not None:
+        check_tensor(op, "colliders", colliders, shape=(None, COLLIDER_COLUMNS), like=grid)
+        if colliders.device.type == "cpu":
+            _check_colliders(op, colliders)
+    if len(gravity) != 3:
+        raise ValueError(f"{op}: gravity must have three numbers, got {len(gravity)}")
+    if not friction >= 0.0:
+        raise ValueError(f"{op}: friction must be >= 0, got {friction}")
+    if not 0.0 <= restitution <= 1.0:
+        raise ValueError(
+            f"{op}: restitution must be in [0, 1] (more creates energy), got {restitution}"
+        )
+    velocity, impulse, contact_nodes = torch.ops.gsfluent.grid_update(
+        grid,
+        moments,
+        colliders,
+        blocks.coords,
+        check_dx(op, dx),
+        _check_dt(op, dt),
+        *(float(g) for g in gravity),
+        float(friction),
+        float(restitution),
+        float(contact_gap),
+    )
+    return velocity, impulse, contact_nodes
+
+
+def _check_colliders(op: str, rows: Tensor) -> None:
+    kind, mode = rows[:, 0], rows[:, 1]
+    wrong = ~(((kind == 0) | (kind == 1)) & ((mode == 0) | (mode == 1) | (mode == 2)))
+    wrong |= (kind == 0) & ~(rows[:, 6:9].norm(dim=1) > 0)
+    wrong |= (kind == 1) & ~(rows[:, 9] > 0)
+    wrong |= ~torch.isfinite(rows).all(dim=1) | (rows[:, 2] < 0)
+    wrong |= (rows[:, 13] < 0) | (rows[:, 13] > 1)
+    if bool(wrong.any()):
+        i = int(wrong.nonzero()[0])
+        raise ValueError(
+            f"{op}: colliders row {i} must be finite, with type 0 (plane, normal not zero) or 1 "
+            "(sphere, radius > 0), mode 0, 1 or 2, friction >= 0 and restitution in [0, 1], "
+            f"got {[round(v, 6) for v in rows[i].tolist()]}"
+        )
+
+
+@overload
+def g2p(
+    velocity_grid: Tensor,
+    position: Tensor,
+    *,
+    dx: float,
+    dt: float,
+    blocks: Blocks,
+    body: Tensor | None = ...,
+    deformation: Tensor | None = ...,
+    velocity: Tensor | None = ...,
+    return_skipped: Literal[False] = ...,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]: ...
+
+
+@overload
+def g2p(
+    velocity_grid: Tensor,
+    position: Tensor,
+    *,
+    dx: float,
+    dt: float,
+    blocks: Blocks,
+    body: Tensor | None = ...,
+    deformation: Tensor | None = ...,
+    velocity: Tensor | None = ...,
+    return_skipped: Literal[True],
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]: ...
+
+
+def g2p(
+    velocity_grid: Tensor,
+    position: Tensor,
+    *,
+    dx: float,
+    dt: float,
+    blocks: Blocks,
+    body: Tensor | None = None,
+    deformation: Tensor | None = None,
+    velocity: Tensor | None = None,
+    return_skipped: bool = False,
+) -> tuple[Tensor | None, ...]:
+    """Gather grid velocity to the particles and move them.
+
+    ``v' = sum w v_i``, ``C' = (4 / dx^2) sum w v_i (x_i - x_p)^T``, ``x' = x + dt v'``,
+    ``F' = (I + dt C') F``.
+
+    Args:
+        velocity_grid: Node velocities from :func:`grid_update` [m/s], shape [K, B, 64, 3].
+        position: Positions at the time of :func:`p2g` [m], shape [N, 3].
+        dx: Node spacing [m].
+        dt: Time step [s].
+        blocks: The blocks used in :func:`p2g`.
+        body: Field of each particle, int32 [N]; None reads field 0.
+        deformation: Deformation gradients F, shape [N, 3, 3].
+        velocity: Velocities before the step [m/s], shape [N, 3]. Particles the blocks do not cover
+            fly on with it; without it they stop.
+        return_skipped: Also return how many particles were skipped.
+
+    Returns:
+        ``position'`` [N, 3], ``velocity'`` [N, 3], ``affine'`` [N, 3, 3], ``deformation'``
+        [N, 3, 3] or None; with ``return_skipped`` also an int64 [] tensor: particles that are not
+        finite, not covered by ``blocks`` or not in a field. Those keep F and lose C. When it is not
+        zero, call :func:`build_blocks` again (it names particles that are not finite).
+
+    Raises:
+        TypeError: Wrong type or dtype.
+        ValueError: Wrong shape, device or range; blocks built for another particle count.
+        NotImplementedError: A gradient with respect to ``position``.
+
+    Gradient: ``velocity_grid``, ``deformation``, ``velocity``. Deterministic on CPU and CUDA.
+    Source: Jiang et al. 2015; Hu et al. 2018; docs/mpm.md.
+    """
+    op = "g2p"
+    check_tensor(op, "position", position, shape=(None, 3))
+    n = position.shape[0]
+    check_blocks(op, blocks, position)
+    check_order(op, blocks, n)
+    shape = (None, blocks.block_count, 64, 3)
+    check_tensor(op, "velocity_grid", velocity_grid, shape=shape, like=position)
+    if not 1 <= velocity_grid.shape[0] <= MAX_FIELDS:
+        raise ValueError(
+            f"{op}: velocity_grid must have 1 to {MAX_FIELDS} fields, got {velocity_grid.shape[0]}"
+        )
+    _check_body(op, body, n, position)
+    if deformation is not None:
+        check_tensor(op, "deformation", deformation, shape=(n, 3, 3), like=position)
+    if velocity is not None:
+        check_tensor(op, "velocity", velocity, shape=(n, 3), like=position)
+    x, v, c, f, skipped = torch.ops.gsfluent.g2p(
+        velocity_grid,
+        position,
+        velocity,
+        deformation,
+        body,
+        blocks.table,
+        blocks.coords,
+        blocks.order,
+        blocks.start,
+        blocks.origin,
+        blocks.margin,
+        check_dx(op, dx),
+        _check_dt(op, dt),
+    )
+    moved = (x, v, c, f if deformation is not None else None)
+    return (*moved, skipped) if return_skipped else moved
