@@ -1,0 +1,74 @@
+"""Held-out quality of a reconstruction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from gsfluent import ops
+from gsfluent.data import Camera, Capture, Gaussians
+from gsfluent.metrics import psnr, ssim
+
+
+@torch.no_grad()
+def render_view(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Render Gaussians as a camera sees them, before black: image [H, W, 3] and alpha [H, W]."""
+    result = ops.rasterize(
+        gaussians.means,
+        gaussians.opacities,
+        camera.viewmat.to(gaussians.means),
+        camera.K.to(gaussians.means),
+        camera.width,
+        camera.height,
+        quats=gaussians.quats,
+        scales=gaussians.scales,
+        sh=gaussians.sh,
+        near=1e-4,
+    )
+    return result.image, result.alpha
+
+
+def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> dict[str, Any]:
+    """PSNR and SSIM on photographs that were not trained on.
+
+    With masks the whole image is compared before white (object times mask plus white), and
+    ``psnr_inside`` looks only at pixels inside the mask. Without masks the whole photograph is
+    compared.
+
+    Args:
+        gaussians: What to judge.
+        held_out: Photographs to judge by, or None.
+        max_size: Longer side of the images [px].
+
+    Returns:
+        ``psnr``, ``ssim`` (means over the images, None without any), ``psnr_inside`` (None without
+        masks), ``psnr_region`` ("whole image before white" or "whole image"), ``psnr_views``.
+    """
+    if held_out is None:
+        return {"psnr": None, "ssim": None, "psnr_inside": None, "psnr_region": "none held out"}
+    whole, inside, similar, masked = [], [], [], False
+    for index in range(len(held_out)):
+        view = held_out.view(index, max_size)
+        image, alpha = render_view(gaussians, view.camera)
+        image, alpha = image.cpu(), alpha.cpu()
+        target = view.image
+        if view.mask is not None:
+            masked = True
+            mask = view.mask[..., None]
+            target = target * mask + (1.0 - mask)
+            image = image + (1.0 - alpha[..., None])
+        image = image.clamp(0.0, 1.0)
+        valid = None if view.valid is None else view.valid.float()
+        whole.append(psnr(image, target, valid))
+        similar.append(float(ssim(image, target)))
+        if view.mask is not None and float((view.mask > 0.5).sum()) > 0:
+            region = (view.mask > 0.5).float() * (1.0 if valid is None else valid)
+            inside.append(psnr(image, target, region))
+    return {
+        "psnr": round(sum(whole) / len(whole), 3),
+        "ssim": round(sum(similar) / len(similar), 4),
+        "psnr_inside": round(sum(inside) / len(inside), 3) if inside else None,
+        "psnr_region": "whole image before white" if masked else "whole image",
+        "psnr_views": [round(value, 2) for value in whole],
+    }

@@ -1,0 +1,313 @@
+"""Where reconstruction starts from: the visual hull of the masks, or the sparse points of the capture."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from gsfluent.data import Capture, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.geometry import matrix_to_quaternion
+from gsfluent.pipeline.reconstruct_views import TrainView
+
+_log = logging.getLogger(__name__)
+
+_COARSE = 40  # cells per side of the first hull
+_FLATNESS = 0.35  # thickness of a starting disc over its radius
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Voxels that every mask allows to be object.
+
+    Attributes:
+        occupancy: bool [X, Y, Z].
+        origin: Corner of voxel (0, 0, 0), float32 [3].
+        voxel: Edge length, world units.
+    """
+
+    occupancy: Tensor
+    origin: Tensor
+    voxel: float
+
+    def centers(self, index: Tensor) -> Tensor:
+        """Centres of voxels ``index`` [M, 3]."""
+        return self.origin + (index + 0.5) * self.voxel
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper corner of the occupied voxels, [3] each."""
+        index = self.occupancy.nonzero()
+        return (
+            self.origin + index.amin(0) * self.voxel,
+            self.origin + (index.amax(0) + 1) * self.voxel,
+        )
+
+    def contains(self, points: Tensor, slack: int = 0) -> Tensor:
+        """Which points [N, 3] lie in the hull grown by ``slack`` voxels, bool [N]."""
+        grown = _dilated(self.occupancy, slack)
+        index = ((points - self.origin) / self.voxel).floor().long()
+        size = torch.tensor(grown.shape, device=points.device)
+        on = ((index >= 0) & (index < size)).all(1)
+        index = torch.minimum(index.clamp_min(0), size - 1)
+        return on & grown[index[:, 0], index[:, 1], index[:, 2]]
+
+
+def focus_point(viewmats: Tensor) -> Tensor:
+    """Point nearest to all optical axes in the least-squares sense, [3], from viewmats [C, 4, 4].
+
+    A weak pull towards the mean camera keeps parallel axes solvable.
+    """
+    viewmats = viewmats.double()
+    axis = viewmats[:, 2, :3]
+    center = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])[..., 0]
+    project = (
+        torch.eye(3, dtype=torch.float64, device=axis.device) - axis[:, :, None] * axis[:, None]
+    )
+    pull = 1e-6 * torch.eye(3, dtype=torch.float64, device=axis.device)
+    right = (project @ center[..., None]).mean(0) + pull @ center.mean(0)[:, None]
+    return torch.linalg.solve(project.mean(0) + pull, right)[:, 0]
+
+
+def visual_hull(views: list[TrainView], resolution: int = 96) -> Hull:
+    """Carve the space that every mask leaves, coarse to fine (Laurentini 1994).
+
+    A voxel stays when its projection touches the mask in every view that sees it; at the coarse
+    level the masks are grown by a voxel's footprint so that thin parts survive.
+
+    Args:
+        views: Masked views.
+        resolution: Voxels along the longest side of the object.
+
+    Raises:
+        InputError: Nothing is left, so masks and poses contradict each other.
+    """
+    viewmats = torch.stack([view.viewmat for view in views])
+    middle = focus_point(viewmats).float()
+    half = _reach(views, middle)
+    hull = _carve(views, middle - half, 2.0 * half / _COARSE, (_COARSE,) * 3)
+    if not bool(hull.occupancy.any()):
+        raise InputError(
+            "reconstruct: the masks of the views have no common object",
+            "check that masks are white on the object and that the poses belong to the images",
+        )
+    lower, upper = hull.bounds()
+    voxel = float((upper - lower).max()) / resolution
+    shape = [int(n) + 2 for n in ((upper - lower) / voxel).ceil()]
+    fine = _carve(views, lower - voxel, voxel, (shape[0], shape[1], shape[2]))
+    return fine if bool(fine.occupancy.any()) else hull
+
+
+def _reach(views: list[TrainView], middle: Tensor) -> float:
+    """Half side of a cube around ``middle`` that holds the object: the widest mask, seen from afar."""
+    reach = []
+    for view in views:
+        assert view.mask is not None  # callers pass masked views
+        depth = float((view.viewmat[:3, :3] @ middle + view.viewmat[:3, 3])[2])
+        spot = view.viewmat[:3, :3] @ middle + view.viewmat[:3, 3]
+        pixel = (view.K @ (spot / spot[2]))[:2]
+        row, column = (view.mask > 0.5).nonzero().unbind(1)
+        if depth <= 0 or len(row) == 0:
+            continue
+        far = torch.stack([(column - pixel[0]) / view.K[0, 0], (row - pixel[1]) / view.K[1, 1]])
+        reach.append(float(far.norm(dim=0).max()) * depth)
+    if not reach:
+        raise InputError(
+            "reconstruct: no camera looks at the masked object", "check poses and masks"
+        )
+    return 1.3 * max(reach)
+
+
+def _carve(
+    views: list[TrainView], lower: Tensor, voxel: float, shape: tuple[int, int, int]
+) -> Hull:
+    device = views[0].color.device
+    axes = [torch.arange(n, device=device, dtype=torch.float32) + 0.5 for n in shape]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    points = lower.to(device) + grid * voxel
+    alive = torch.arange(len(points), device=device)
+    for view in views:
+        assert view.mask is not None
+        local = points[alive] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        depth = local[:, 2]
+        pixel = local @ view.K.T
+        pixel = pixel[:, :2] / depth.clamp_min(1e-6)[:, None]
+        footprint = 0.5 * voxel * float(view.K[0, 0]) / max(float(depth.median()), 1e-6)
+        grow = max(1, math.ceil(footprint))
+        grown = functional.max_pool2d(view.mask[None, None], 2 * grow + 1, 1, grow)[0, 0]
+        width, height = view.size
+        column, row = pixel.floor().long().unbind(1)
+        on = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        keep = grown[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5
+        # Off the crop means off the mask, unless the mask touches the edge of the photograph.
+        keep = torch.where(on, keep, torch.full_like(keep, _touches_edge(view.mask)) | (depth <= 0))
+        alive = alive[keep]
+    occupancy = torch.zeros(len(points), dtype=torch.bool, device=device)
+    occupancy[alive] = True
+    return Hull(occupancy.view(shape), lower.to(device), voxel)
+
+
+def _touches_edge(mask: Tensor) -> bool:
+    edge = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    return bool((edge > 0.5).any())
+
+
+def _dilated(occupancy: Tensor, cells: int) -> Tensor:
+    if cells == 0:
+        return occupancy
+    grown = functional.max_pool3d(occupancy[None, None].float(), 2 * cells + 1, 1, cells)
+    return grown[0, 0] > 0.5
+
+
+def hull_gaussians(
+    hull: Hull, views: list[TrainView], count: int, degree: int, generator: torch.Generator
+) -> Gaussians:
+    """Flat Gaussians on the surface of the hull, coloured by the views that face them.
+
+    Args:
+        hull: The hull.
+        views: Views to take colours from.
+        count: How many.
+        degree: SH degree of the result.
+        generator: Draws the cells (CPU).
+
+    Returns:
+        ``count`` Gaussians: discs along the surface, opacity 0.6.
+    """
+    solid = functional.pad(hull.occupancy[None, None].float(), (1,) * 6)[0, 0]
+    neighbours = functional.avg_pool3d(solid[None, None], 3, 1)[0, 0]
+    cells = (hull.occupancy & (neighbours < 0.999)).nonzero()
+    pick = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
+    jitter = (torch.rand(count, 3, generator=generator) - 0.5).to(cells.device)
+    means = hull.centers(cells[pick] + jitter)
+    normal = _outward(hull)[tuple(cells[pick].T)]
+    # About 1.5 boundary cells meet each voxel-sized patch of a smooth surface.
+    area = len(cells) * hull.voxel**2 / 1.5
+    radius = math.sqrt(area / count)
+    scales = means.new_tensor([radius, radius, radius * _FLATNESS]).expand(count, 3).contiguous()
+    color = _facing_colors(means, normal, views)
+    gaussians = Gaussians.from_colors(
+        means, scales * 0.8, color, opacities=0.6, quats=_quats_of(normal)
+    )
+    return gaussians.with_sh_degree(degree)
+
+
+def _outward(hull: Hull) -> Tensor:
+    """Outward normals from the blurred occupancy, [X, Y, Z, 3]."""
+    soft = hull.occupancy[None, None].float()
+    for _ in range(3):
+        soft = functional.avg_pool3d(soft, 3, 1, 1)
+    field = soft[0, 0]
+    slopes = torch.gradient(field)
+    return -functional.normalize(torch.stack(list(slopes), -1), dim=-1)
+
+
+def _quats_of(normal: Tensor) -> Tensor:
+    """Quaternions whose z axis is ``normal``, [N, 4]."""
+    helper = torch.zeros_like(normal)
+    helper.scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
+    first = functional.normalize(torch.linalg.cross(helper, normal), dim=1)
+    second = torch.linalg.cross(normal, first)
+    return matrix_to_quaternion(torch.stack([first, second, normal], -1)).to(normal)
+
+
+def _facing_colors(points: Tensor, normal: Tensor, views: list[TrainView]) -> Tensor:
+    """Mean colour seen at surface points [N, 3] by the views that face them, weighted by cos^4."""
+    total, weight = torch.zeros_like(points), points.new_full((len(points), 1), 1e-6)
+    mean = torch.stack([view.color.mean((0, 1)) for view in views]).mean(0)
+    total += 1e-6 * mean
+    for view in views:
+        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        facing = (functional.normalize(eye - points, dim=1) * normal).sum(1).clamp_min(0.0)
+        pixel = local @ view.K.T
+        pixel = pixel[:, :2] / pixel[:, 2:].clamp_min(1e-6)
+        width, height = view.size
+        column, row = pixel.floor().long().unbind(1)
+        on = (local[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+        trust = on.float() * facing**4
+        if view.mask is not None:
+            trust = trust * (view.mask[row, column] > 0.98)
+        total += trust[:, None] * view.color[row, column]
+        weight += trust[:, None]
+    return (total / weight).clamp(0.0, 1.0)
+
+
+def point_gaussians(
+    capture: Capture, views: list[TrainView], count: int, degree: int, generator: torch.Generator
+) -> tuple[Gaussians, float]:
+    """Round Gaussians at the sparse points, filtered to the scene, and a far shell behind it.
+
+    Points farther from the focus than eight times the median camera distance, and points whose
+    neighbours are ten times farther than usual, are dropped as triangulation errors.
+
+    Returns:
+        The Gaussians (about ``count`` at most) and the scene's extent [world units]: the median
+        distance of the cameras from what they look at.
+
+    Raises:
+        InputError: Too few points are left.
+    """
+    from scipy.spatial import cKDTree
+
+    device = views[0].color.device
+    viewmats = torch.stack([view.viewmat for view in views]).cpu()
+    middle = focus_point(viewmats)
+    centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])[..., 0]
+    extent = float((centers.double() - middle).norm(dim=1).median())
+    near = (capture.points.cpu().double() - middle).norm(dim=1) < 8.0 * extent
+    points, colors = capture.points.cpu()[near].float(), capture.point_colors.cpu()[near].float()
+    spacing = torch.empty(0)
+    if len(points) >= 8:
+        distance, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)
+        spacing = torch.from_numpy(distance[:, 1:].mean(1)).float()
+        kept = (spacing < 10.0 * spacing.median()) & (spacing > 0)
+        points, colors, spacing = points[kept], colors[kept], spacing[kept]
+    if len(points) < 50:
+        raise InputError(
+            f"reconstruct: there are no masks, and only {len(points)} usable sparse points",
+            "give masks (masks/ or an alpha channel), or a COLMAP model with its points",
+        )
+    if len(points) > count:
+        pick = torch.randperm(len(points), generator=generator)[:count]
+        spacing = spacing[pick] * math.sqrt(len(points) / count)
+        points, colors = points[pick], colors[pick]
+    shell, shell_color, shell_size = _far_shell(views, middle.float(), extent, generator)
+    means = torch.cat([points, shell]).to(device)
+    scales = torch.cat([spacing.clamp_max(0.1 * extent) * 0.7, shell_size]).to(device)
+    gaussians = Gaussians.from_colors(
+        means, scales, torch.cat([colors, shell_color]).to(device), opacities=0.3
+    )
+    return gaussians.with_sh_degree(degree), extent
+
+
+def _far_shell(
+    views: list[TrainView], middle: Tensor, extent: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Large soft Gaussians on a sphere around the scene, coloured by the photographs that see them.
+
+    Where structure from motion found nothing (a plain wall), something has to carry the background.
+    """
+    count, radius = 1200, 4.0 * extent
+    direction = torch.randn(count, 3, generator=generator)
+    direction = functional.normalize(direction, dim=1)
+    points = middle + radius * direction
+    device = views[0].color.device
+    seen = torch.zeros(count, dtype=torch.bool, device=device)
+    placed = points.to(device)
+    for view in views:
+        local = placed @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        pixel = local @ view.K.T
+        pixel = pixel[:, :2] / pixel[:, 2:].clamp_min(1e-6)
+        width, height = view.size
+        inside = (pixel >= 0) & (pixel < pixel.new_tensor([width, height]))
+        seen |= inside.all(1) & (local[:, 2] > 0)
+    color = _facing_colors(placed, -direction.to(device), views).cpu()
+    kept = seen.cpu()
+    size = torch.full((count,), radius * math.sqrt(4.0 * math.pi / count) * 0.6)
+    return points[kept], color[kept], size[kept]

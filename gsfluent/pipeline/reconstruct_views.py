@@ -1,0 +1,159 @@
+"""Photographs made ready for training: read once, cropped to the object, kept at two sizes."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import Camera, Capture
+from gsfluent.errors import InputError
+from gsfluent.metrics import SsimTarget
+
+_log = logging.getLogger(__name__)
+
+_MARGIN = 12  # pixels kept around a mask; more than half an SSIM window
+_SMALLEST = 24  # pixels; a side of a crop is never shorter
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One photograph, or the part of it that shows the object.
+
+    Attributes:
+        color: Colour times mask (times validity), float32 [H, W, 3].
+        mask: Coverage of the object in [0, 1], [H, W]; None without masks.
+        valid: 1 where the photograph covers the pixel, [H, W]; None when everywhere.
+        viewmat: World to camera [4, 4], float32.
+        K: Intrinsics of this crop [3, 3], float32.
+        target: ``color`` prepared for SSIM, before a black background.
+        full_width: Width of the uncropped photograph at this size [px].
+    """
+
+    color: Tensor
+    mask: Tensor | None
+    valid: Tensor | None
+    viewmat: Tensor
+    K: Tensor
+    target: SsimTarget
+    full_width: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return int(self.color.shape[1]), int(self.color.shape[0])
+
+
+def read_views(
+    capture: Capture, max_size: int, device: torch.device, *, crop: bool
+) -> list[TrainView]:
+    """Read every photograph of a capture.
+
+    Args:
+        capture: Posed photographs.
+        max_size: Longer side of the images [px].
+        device: Where the tensors go.
+        crop: Keep only the surroundings of the mask (where there is one).
+
+    Raises:
+        InputError: All photographs are black, all masks are empty, or only some images have masks.
+    """
+    views, masked, brightest, covered = [], 0, 0.0, 0.0
+    for index in range(len(capture)):
+        view = capture.view(index, max_size)
+        brightest = max(brightest, float(view.image.max()))
+        masked += view.mask is not None
+        if view.mask is not None:
+            covered = max(covered, float(view.mask.max()))
+        views.append(view)
+    if brightest < 2.0 / 255.0:
+        raise InputError(
+            f"reconstruct: all {len(views)} photographs of {capture.root} are black",
+            "check the exposure, or that the image files are the right ones",
+        )
+    if masked not in (0, len(views)):
+        raise InputError(
+            f"reconstruct: {masked} of {len(views)} photographs have masks",
+            "give a mask for every photograph, or none",
+        )
+    if masked and covered < 0.5:
+        raise InputError(
+            "reconstruct: every mask is empty", "masks are white (or opaque) where the object is"
+        )
+    prepared = []
+    for view in views:
+        box = (0, 0, view.camera.width, view.camera.height)
+        if crop and view.mask is not None:
+            found = _mask_box(view.mask)
+            if found is None:
+                _log.info("skipping %s: its mask is empty", view.camera.name)
+                continue
+            box = found
+        prepared.append(_prepare(view.image, view.mask, view.valid, view.camera, box, device))
+    return prepared
+
+
+def _mask_box(mask: Tensor) -> tuple[int, int, int, int] | None:
+    """Box (left, top, right, bottom) around the mask with a margin, None when it is empty."""
+    rows = (mask > 0.02).any(1).nonzero()[:, 0]
+    columns = (mask > 0.02).any(0).nonzero()[:, 0]
+    if len(rows) == 0:
+        return None
+    box = []
+    for line, size in ((columns, mask.shape[1]), (rows, mask.shape[0])):
+        low, high = int(line[0]) - _MARGIN, int(line[-1]) + 1 + _MARGIN
+        short = max(0, _SMALLEST - (high - low))
+        low, high = max(0, low - short), min(size, high + short)
+        box.append((low, high))
+    return box[0][0], box[1][0], box[0][1], box[1][1]
+
+
+def _prepare(
+    image: Tensor,
+    mask: Tensor | None,
+    valid: Tensor | None,
+    camera: Camera,
+    box: tuple[int, int, int, int],
+    device: torch.device,
+) -> TrainView:
+    left, top, right, bottom = box
+    color = image[top:bottom, left:right]
+    cut_mask = None if mask is None else mask[top:bottom, left:right].contiguous().to(device)
+    cut_valid = None if valid is None else valid[top:bottom, left:right].float().to(device)
+    color = color.to(device)
+    if cut_mask is not None:
+        color = color * cut_mask[..., None]
+    if cut_valid is not None:
+        color = color * cut_valid[..., None]
+    K = camera.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    return TrainView(
+        color.contiguous(),
+        cut_mask,
+        cut_valid,
+        camera.viewmat.to(device, torch.float32),
+        K.to(device, torch.float32),
+        SsimTarget.of(color),
+        camera.width,
+    )
+
+
+def halved(view: TrainView) -> TrainView:
+    """The same view at half the size (2 x 2 means of premultiplied colour; an odd last line is cut)."""
+    height, width = (side // 2 * 2 for side in view.color.shape[:2])
+
+    def half(value: Tensor) -> Tensor:
+        value = value[:height, :width].reshape(height // 2, 2, width // 2, 2, -1)
+        return value.mean(dim=(1, 3))
+
+    color = half(view.color)
+    K = view.K.clone()
+    K[:2] *= 0.5
+    mask = None if view.mask is None else half(view.mask[..., None])[..., 0]
+    valid = None if view.valid is None else half(view.valid[..., None])[..., 0]
+    return TrainView(
+        color, mask, valid, view.viewmat, K, SsimTarget.of(color), view.full_width // 2
+    )
