@@ -73,7 +73,14 @@ struct StencilBlocks {
   template <typename T>
   GSF_HOST_DEVICE int64_t node(const Stencil<T>& s, int i, int j, int k) const {
     const int32_t x = s.base[0] + i, y = s.base[1] + j, z = s.base[2] + k;
-    const int32_t b = block[block_of(x) != lo[0]][block_of(y) != lo[1]][block_of(z) != lo[2]];
+    // Selects instead of an index: the array stays in registers on the device.
+    const bool far_x = block_of(x) != lo[0], far_y = block_of(y) != lo[1],
+               far_z = block_of(z) != lo[2];
+    const int32_t near_near = far_x ? block[1][0][0] : block[0][0][0];
+    const int32_t near_far = far_x ? block[1][0][1] : block[0][0][1];
+    const int32_t far_near = far_x ? block[1][1][0] : block[0][1][0];
+    const int32_t far_far = far_x ? block[1][1][1] : block[0][1][1];
+    const int32_t b = far_y ? (far_z ? far_far : far_near) : (far_z ? near_far : near_near);
     return int64_t(b) * kBlockNodes + local_index(local_of(x), local_of(y), local_of(z));
   }
 };

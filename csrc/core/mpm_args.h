@@ -6,6 +6,13 @@
 
 namespace gsf {
 
+// Blocks per ordered partial sum of collider impulses; fixed, so that sums do not depend on the
+// machine.
+constexpr int64_t kChunkBlocks = 16;
+GSF_HOST_DEVICE int64_t grid_update_chunks(int64_t blocks) {
+  return (blocks + kChunkBlocks - 1) / kChunkBlocks;
+}
+
 template <typename T>
 struct P2GArgs {
   BlockView blocks;

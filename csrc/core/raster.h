@@ -51,7 +51,8 @@ struct RasterArgs {
   T near, far;
 
   T* splats;            // [N, stride]; row order is the backend's own
-  int32_t* order;       // [N] row of `splats` -> Gaussian, -1 beyond the visible ones
+  int32_t* order;       // [N] Gaussians by depth; on the CPU, row r of `splats` is Gaussian
+                        // order[r], and -1 stands beyond the visible ones
   int32_t* tile_start;  // [tiles + 1] ranges of `instances`
   int32_t* instances;   // [I] rows of `splats`, by tile, front to back
   int64_t instance_count;
@@ -61,7 +62,6 @@ struct RasterArgs {
   T* depth;         // [H, W]
   T* normal;        // [H, W, 3] or null
   T* contribution;  // [N] or null
-  void* scratch;
 };
 
 template <typename T>
@@ -81,7 +81,6 @@ struct RasterGradArgs {
   T* grad_normals;
   T* grad_background;
   T* grad_offset;
-  void* scratch;
 };
 
 template <typename T>

@@ -41,6 +41,7 @@ inline void sort_by_key(std::vector<uint64_t>& items) {
 template <typename T>
 int64_t project_and_sort(const RasterArgs<T>& a) {
   constexpr uint32_t kCulled = 0xffffffffu;
+  constexpr int64_t kAhead = 8;  // rows asked for before they are copied
   const SplatCamera<T> camera = raster_camera(a);
   // Uninitialised on purpose: rows of culled splats are never read.
   std::unique_ptr<T[]> rows(new T[static_cast<size_t>(a.count) * a.stride]);
@@ -64,6 +65,8 @@ int64_t project_and_sort(const RasterArgs<T>& a) {
   const int used = kFeatures + a.features;
   parallel_for(a.count, 2048, [&](int64_t begin, int64_t end) {
     for (int64_t r = begin; r < end; ++r) {
+      if (r + kAhead < visible)
+        __builtin_prefetch(rows.get() + (items[r + kAhead] & 0xffffffffu) * a.stride);
       const int64_t i = r < visible ? static_cast<int64_t>(items[r] & 0xffffffffu) : -1;
       a.order[r] = static_cast<int32_t>(i);
       if (i >= 0) std::copy_n(rows.get() + i * a.stride, used, a.splats + r * a.stride);
@@ -129,6 +132,18 @@ class TileLists {
 template <typename T>
 int64_t visible_count(const RasterArgs<T>& a) {
   return std::find_if(a.order, a.order + a.count, [](int32_t i) { return i < 0; }) - a.order;
+}
+
+// True when the lists the adjoint is handed back can be walked without leaving their arrays.
+template <typename T>
+bool lists_are_sound(const RasterArgs<T>& a, int64_t visible) {
+  const int64_t tiles = int64_t(a.tiles_x) * a.tiles_y;
+  bool sound = a.tile_start[0] == 0 && a.tile_start[tiles] == a.instance_count;
+  for (int64_t t = 0; t < tiles; ++t) sound &= a.tile_start[t] <= a.tile_start[t + 1];
+  for (int64_t r = 0; r < visible; ++r) sound &= a.order[r] < a.count;
+  for (int64_t e = 0; e < a.instance_count; ++e)
+    sound &= static_cast<uint32_t>(a.instances[e]) < static_cast<uint64_t>(visible);
+  return sound;
 }
 
 // first_slot[r]: instances of the ranks before r; one more entry holds their total.

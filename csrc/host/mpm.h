@@ -7,13 +7,6 @@
 
 namespace gsf {
 
-// Blocks per ordered partial sum of collider impulses; fixed, so that sums do not depend on the
-// machine.
-constexpr int64_t kChunkBlocks = 16;
-inline int64_t grid_update_chunks(int64_t blocks) {
-  return (blocks + kChunkBlocks - 1) / kChunkBlocks;
-}
-
 template <class Backend>
 struct MpmOps {
   using Ints = std::vector<int64_t>;

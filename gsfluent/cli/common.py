@@ -1,0 +1,126 @@
+"""What every verb has: ``--json``, ``--device``, ``--seed``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from gsfluent.errors import InputError
+from gsfluent.pipeline.stage import Progress
+
+Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+
+
+@dataclass(kw_only=True)
+class Verb:
+    """Base of the verbs."""
+
+    json: bool = False
+    """One JSON object on stdout, logs on stderr."""
+    device: Annotated[str, tyro.conf.arg(metavar="auto|cpu|cuda[:i]")] = "auto"
+    """Where the heavy work runs."""
+    seed: int = 0
+    """Seed of everything random."""
+
+    def execute(self) -> dict[str, Any]:
+        """Do the work and return what ``--json`` prints."""
+        raise NotImplementedError
+
+    def torch_device(self) -> Any:
+        """The chosen device, with the generators seeded.
+
+        Raises:
+            InputError: No such device here.
+        """
+        return choose_device(self.device, seed=self.seed)
+
+    @contextmanager
+    def progress(self, name: str) -> Iterator[Progress]:
+        """One progress callback, drawn as this process and ``--json`` allow."""
+        from gsfluent.progress import reporter
+
+        with reporter(quiet=self.json) as report:
+            yield report.task(name)
+
+
+def choose_device(name: str, *, seed: int = 0) -> Any:
+    """Turn ``auto|cpu|cuda[:i]`` into a torch device.
+
+    Raises:
+        InputError: Not such a name, or a device this machine or install does not have.
+    """
+    import torch
+
+    from gsfluent._load import HAS_CUDA_KERNELS, has_cuda
+
+    torch.manual_seed(seed)
+    if name == "auto":
+        return torch.device("cuda" if has_cuda() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise InputError(f"--device {name}", "give auto, cpu, cuda or cuda:0, cuda:1, ...")
+    if device.type == "cuda":
+        if torch.version.cuda is None:
+            raise InputError(
+                f"--device {name}: this torch has no CUDA", "install a CUDA torch, or use cpu"
+            )
+        if not HAS_CUDA_KERNELS:
+            mend = "reinstall with GSFLUENT_CUDA=1, or use cpu"
+            raise InputError(f"--device {name}: gsfluent was built without its CUDA kernels", mend)
+        count = torch.cuda.device_count()
+        if count == 0 or (device.index or 0) >= count:
+            raise InputError(f"--device {name}: torch sees {count} GPUs", "use auto or cpu")
+    return device
+
+
+def existing(path: Path, argument: str, *, folder: bool | None = None) -> Path:
+    """Return ``path`` when it is there and of the right kind.
+
+    Raises:
+        InputError: Missing, or a file for a folder, or the other way round.
+    """
+    if not path.exists():
+        raise InputError(f"{argument}: {path} does not exist", "check the path")
+    if folder is not None and path.is_dir() != folder:
+        kind = "folder" if folder else "file"
+        raise InputError(f"{argument}: {path} is not a {kind}", f"give a {kind}")
+    return path
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """``1280x720`` to (1280, 720), both even.
+
+    Raises:
+        InputError: Not two positive even numbers.
+    """
+    parts = text.lower().replace(",", "x").split("x")
+    try:
+        width, height = (int(p) for p in parts)
+    except ValueError:
+        raise InputError(f"--size {text}", "give WIDTHxHEIGHT, for example 1280x720") from None
+    if width < 16 or height < 16 or width % 2 or height % 2:
+        raise InputError(
+            f"--size {text}", "give even numbers of at least 16 (video needs even sides)"
+        )
+    return width, height
+
+
+def parse_vector(text: str, argument: str) -> tuple[float, float, float]:
+    """``1,-1,2`` to three numbers.
+
+    Raises:
+        InputError: Not three finite numbers.
+    """
+    try:
+        x, y, z = (float(p) for p in text.strip("[]() ").split(","))
+    except ValueError:
+        raise InputError(f"{argument} {text}", "give three numbers, for example 1,-1,2") from None
+    return x, y, z

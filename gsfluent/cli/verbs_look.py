@@ -1,0 +1,74 @@
+"""Verbs that look and change nothing: doctor, inspect, plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from gsfluent.cli.common import Out, Verb, existing
+
+
+@dataclass(kw_only=True)
+class Doctor(Verb):
+    """Say what is installed, which ops are compiled for what, and test each op for a second.
+
+    Examples:
+      gsfluent doctor                   # a table; exit 1 when an op gives a wrong answer
+      gsfluent doctor --json            # the same for a program
+      gsfluent doctor --device cpu      # leave the GPU alone
+    """
+
+    def execute(self) -> dict[str, Any]:
+        """Examine the machine."""
+        from gsfluent.pipeline.doctor import examine
+
+        return examine(self.torch_device(), every_device=self.device == "auto")
+
+
+@dataclass(kw_only=True)
+class Inspect(Verb):
+    """Say what is in a capture or a splat (size, up axis, floor, floaters) and draw one PNG.
+
+    Examples:
+      gsfluent inspect captures/apple                    # a folder of posed photographs
+      gsfluent inspect melon.ply -o melon.png            # a trained splat
+      gsfluent inspect melon.ply --size 0.25             # its largest extent is 25 cm
+    """
+
+    input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """Capture folder or splat .ply."""
+    out: Out = Path("inspect.png")
+    """Where the picture goes."""
+    size: float | None = None
+    """Largest extent of the object in metres, if known."""
+
+    def execute(self) -> dict[str, Any]:
+        """Inspect the input and draw the picture."""
+        from gsfluent.pipeline.inspect import inspect
+
+        existing(self.input, "INPUT")
+        return inspect(self.input, out=self.out, size=self.size, device=self.torch_device())
+
+
+@dataclass(kw_only=True)
+class Plan(Verb):
+    """Say what a shot will cost without simulating: grid, steps, particles, memory, time.
+
+    Examples:
+      gsfluent plan shot.yaml           # before an hour is spent
+      gsfluent plan shot.yaml --json
+    """
+
+    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
+    """The shot file."""
+
+    def execute(self) -> dict[str, Any]:
+        """Plan the shot."""
+        from gsfluent.config import load_shot
+        from gsfluent.pipeline.plan import plan_shot
+
+        shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        return plan_shot(shot, device=self.torch_device(), seed=self.seed)

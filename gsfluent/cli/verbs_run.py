@@ -1,0 +1,164 @@
+"""Verbs around a whole shot: run, demo, render, export."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from gsfluent.cli.common import Out, Verb, existing, parse_size, parse_vector
+
+
+@dataclass(kw_only=True)
+class Run(Verb):
+    """Do all a shot asks for, in order: reconstruct, fill, texture, simulate, render, export.
+
+    Examples:
+      gsfluent run shot.yaml -o out            # leaves out/video.mp4, out/run.json and more
+      gsfluent run shot.yaml -o out            # again: only what changed or was cut short
+      gsfluent run shot.yaml -o out --force    # redo everything
+      gsfluent run shot.yaml -o out --json     # run.json on stdout
+
+    The smallest useful shot.yaml:
+      capture: captures/apple
+      events:
+        - {type: drop, height: 1.0}
+    """
+
+    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
+    """The shot file."""
+    out: Out
+    """Folder for the results; made when missing."""
+    force: bool = False
+    """Redo every stage."""
+
+    def execute(self) -> dict[str, Any]:
+        """Run the shot."""
+        from gsfluent.config import load_shot
+        from gsfluent.pipeline.run import run_shot
+        from gsfluent.progress import reporter
+
+        shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        device = self.torch_device()
+        with reporter(quiet=self.json) as report:
+            return run_shot(
+                shot, self.out, device=device, seed=self.seed, force=self.force, reporter=report
+            )
+
+
+@dataclass(kw_only=True)
+class Demo(Verb):
+    """Run the built-in scene: a melon is photographed, rebuilt, filled, dropped and broken.
+
+    Examples:
+      gsfluent demo                            # into demo_out/, a few minutes on two cores
+      gsfluent demo watermelon -o out          # the same by name
+      gsfluent demo --size preview             # small and quick, for a check
+
+    Nothing is downloaded: gsfluent draws the photographs itself from an object whose inside it
+    knows, so run.json can say how far the reconstructed inside is from the truth.
+    """
+
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "watermelon"
+    """Which scene."""
+    out: Out = Path("demo_out")
+    """Folder for the results."""
+    size: Literal["full", "preview"] = "full"
+    """full, or a small quick one."""
+    force: bool = False
+    """Redo every stage."""
+
+    def execute(self) -> dict[str, Any]:
+        """Run the demo."""
+        from gsfluent.pipeline.run_demo import run_demo
+        from gsfluent.progress import reporter
+
+        device = self.torch_device()
+        with reporter(quiet=self.json) as report:
+            return run_demo(
+                self.name,
+                self.out,
+                size=self.size,
+                device=device,
+                seed=self.seed,
+                force=self.force,
+                reporter=report,
+            )
+
+
+@dataclass(kw_only=True)
+class Render(Verb):
+    """Render a finished simulation again: another camera, light or size.
+
+    Examples:
+      gsfluent render out                                       # as the shot says, to
+      out/render.mp4 gsfluent render out --size 1920x1080 -o big.mp4
+      gsfluent render out --camera 3                            # from the pose of photograph 3
+      gsfluent render out --camera path.json                    # {"frames": [{"eye": [..],
+      "target": [..]}]} gsfluent render out --light=-1,-1,3 --ambient 0.3         # harder light
+      from the left gsfluent render out --frame 20 -o still.png               # one picture
+    """
+
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder that `gsfluent run` wrote."""
+    to: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Where the video (.mp4) or picture (.png) goes."""
+    camera: str | None = None
+    """orbit, the index of a photograph, or a JSON file."""
+    size: str | None = None
+    """Such as 1280x720."""
+    light: str | None = None
+    """Direction toward the light, such as 1,-1,2."""
+    ambient: float | None = None
+    """Ambient light."""
+    specular: float | None = None
+    """Strength of highlights."""
+    frame: int | None = None
+    """Render this frame only (0 is the first)."""
+
+    def execute(self) -> dict[str, Any]:
+        """Render."""
+        from gsfluent.pipeline.run_show import render_again
+
+        existing(self.out, "OUT", folder=True)
+        with self.progress("render") as progress:
+            return render_again(
+                self.out,
+                to=self.to,
+                camera=self.camera,
+                size=parse_size(self.size) if self.size else None,
+                direction=parse_vector(self.light, "--light") if self.light else None,
+                ambient=self.ambient,
+                specular=self.specular,
+                frame=self.frame,
+                device=self.torch_device(),
+                progress=progress,
+            )
+
+
+@dataclass(kw_only=True)
+class Export(Verb):
+    """Write a finished simulation in other programs' formats.
+
+    Examples:
+      gsfluent export out --to ply-seq              # frames/frame_0001.ply ..., standard 3DGS, any
+      splat viewer gsfluent export out --to vtk                  # particles/particles_0001.vtk ...,
+      ParaView gsfluent export out --to ply-seq,mp4,vtk
+    """
+
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder that `gsfluent run` wrote."""
+    to: str
+    """Comma-separated: mp4, ply-seq, vtk."""
+
+    def execute(self) -> dict[str, Any]:
+        """Export."""
+        from gsfluent.pipeline.export import export
+
+        existing(self.out, "OUT", folder=True)
+        with self.progress("export") as progress:
+            return export(
+                self.out, self.to.split(","), device=self.torch_device(), progress=progress
+            )

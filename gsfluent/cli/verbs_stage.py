@@ -1,0 +1,173 @@
+"""Verbs that run one stage on files: reconstruct, fill, texture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from gsfluent.cli.common import Out, Verb, existing
+from gsfluent.errors import InputError
+
+
+def _ply(path: Path) -> Path:
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"-o {path}", "name a .ply file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+@dataclass(kw_only=True)
+class Reconstruct(Verb):
+    """Fit Gaussians to posed photographs.
+
+    Examples:
+      gsfluent reconstruct captures/apple -o apple.ply
+      gsfluent reconstruct captures/apple -o apple.ply --iterations 7000 --max-gaussians 300000
+      gsfluent reconstruct captures/apple -o apple.ply --image-size 400        # quick look
+      gsfluent reconstruct captures/apple -o room.ply --keep-background
+
+    CAPTURE is a COLMAP model (text or binary) with its images, or a folder with transforms.json;
+    masks are used when there are any. Every eighth photograph is held out; its PSNR stands in
+    reconstruct.json beside the .ply.
+    """
+
+    capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
+    """Folder with posed photographs."""
+    out: Out
+    """The .ply to write, standard 3DGS layout."""
+    iterations: int | None = None
+    """Optimisation steps."""
+    max_gaussians: int | None = None
+    """Upper limit of the number of Gaussians."""
+    kernel: Literal["anisotropic", "isotropic"] | None = None
+    """Shape of the Gaussians."""
+    scale_regularization: float | None = None
+    """Weight of the penalty on large Gaussians."""
+    image_size: int | None = None
+    """Longest side of the photographs in pixels while fitting."""
+    keep_background: bool = False
+    """Keep what does not belong to the object."""
+
+    def execute(self) -> dict[str, Any]:
+        """Reconstruct and write."""
+        from gsfluent.pipeline.run_single import reconstruct_to
+
+        existing(self.capture, "CAPTURE", folder=True)
+        given = {
+            "iterations": self.iterations,
+            "max_gaussians": self.max_gaussians,
+            "kernel": self.kernel,
+            "scale_regularization": self.scale_regularization,
+            "image_size": self.image_size,
+        }
+        options = {name: value for name, value in given.items() if value is not None}
+        with self.progress("reconstruct") as progress:
+            return reconstruct_to(
+                self.capture,
+                _ply(self.out),
+                device=self.torch_device(),
+                seed=self.seed,
+                keep_background=self.keep_background,
+                progress=progress,
+                **options,
+            )
+
+
+@dataclass(kw_only=True)
+class Fill(Verb):
+    """Turn a shell of surface Gaussians into a solid with interior Gaussians.
+
+    Examples:
+      gsfluent fill melon.ply -o solid.ply
+      gsfluent fill melon.ply -o solid.ply --capture captures/melon     # refine against the
+      photographs gsfluent fill cup.ply -o cup_solid.ply --hollow auto
+
+    Writes solid.ply (opens in any splat viewer) and solid.volume.npz (the voxels) beside it.
+    """
+
+    model: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="model.ply")]
+    """Splat to fill."""
+    out: Out
+    """The .ply to write."""
+    capture: Path | None = None
+    """Photographs that the splat was made from."""
+    resolution: int | None = None
+    """Voxels along the longest side of the density field."""
+    method: str | None = None
+    """How the inside is found; auto decides."""
+    hollow: str | None = None
+    """Whether the object is hollow: auto, none, or a wall thickness."""
+
+    def execute(self) -> dict[str, Any]:
+        """Fill and write."""
+        from gsfluent.pipeline.run_single import fill_to
+
+        existing(self.model, "model.ply", folder=False)
+        given = {"resolution": self.resolution, "method": self.method, "hollow": self.hollow}
+        options = {name: value for name, value in given.items() if value is not None}
+        with self.progress("fill") as progress:
+            return fill_to(
+                self.model,
+                _ply(self.out),
+                capture=self.capture,
+                device=self.torch_device(),
+                seed=self.seed,
+                progress=progress,
+                **options,
+            )
+
+
+@dataclass(kw_only=True)
+class Texture(Verb):
+    """Give the inside of a solid its colours.
+
+    Examples:
+      gsfluent texture solid.ply -o textured.ply                                       # by default
+      from the skin gsfluent texture solid.ply -o textured.ply --method exemplar --exemplar cut.jpg
+        # from a photo of a cut gsfluent texture solid.ply -o textured.ply --method diffusion
+        # --model PATH --prompt "watermelon flesh"
+
+    Writes textured.ply with its volume, and textured.cuts.png with three cut views.
+    """
+
+    solid: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="solid.ply")]
+    """Solid written by `gsfluent fill`."""
+    out: Out
+    """The .ply to write."""
+    method: str | None = None
+    """exemplar, diffusion, color_copy or procedural."""
+    exemplar: Path | None = None
+    """Photograph of a cut through such an object."""
+    prompt: str | None = None
+    """What the inside looks like, for diffusion."""
+    model: str | None = None
+    """Path or hub id of a diffusers SD-XL inpainting model."""
+    capture: Path | None = None
+    """Photographs that the splat was made from."""
+
+    def execute(self) -> dict[str, Any]:
+        """Texture and write."""
+        from gsfluent.pipeline.run_single import texture_to
+
+        existing(self.solid, "solid.ply", folder=False)
+        method = self.method or ("exemplar" if self.exemplar else None)
+        given = {
+            "method": method,
+            "exemplar": self.exemplar,
+            "prompt": self.prompt,
+            "model": self.model,
+        }
+        options = {name: value for name, value in given.items() if value is not None}
+        with self.progress("texture") as progress:
+            return texture_to(
+                self.solid,
+                _ply(self.out),
+                capture=self.capture,
+                device=self.torch_device(),
+                seed=self.seed,
+                progress=progress,
+                **options,
+            )

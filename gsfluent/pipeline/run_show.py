@@ -1,0 +1,283 @@
+"""From simulated frames to pictures: render and export stages, and ``gsfluent render``."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsfluent.config import Shot
+from gsfluent.data import Camera, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.io import load_capture, save_image
+from gsfluent.pipeline.export import write_exports
+from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.render import Render
+from gsfluent.pipeline.render_camera import Action, cameras_for
+from gsfluent.pipeline.render_floor import Studio
+from gsfluent.pipeline.render_holes import hole_fraction
+from gsfluent.pipeline.render_normals import occupancy_cell
+from gsfluent.pipeline.run_context import RunContext
+from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame
+from gsfluent.pipeline.run_prepare import read_frame
+from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
+from gsfluent.pipeline.stage import Progress, report_progress
+from gsfluent.pipeline.video import to_bytes, write_video
+
+# The pieces need a moment to part before a picture of them tells anything.
+_POSTER_DELAY = 0.2
+
+
+def light_of(shot: Shot) -> Light:
+    """The shot's light; what it leaves out keeps the default."""
+    given = {
+        "direction": shot.light.key.direction,
+        "shadow": shot.light.key.shadow,
+        "intensity": shot.light.key.intensity,
+        "ambient": shot.light.ambient,
+        "specular": shot.light.specular,
+    }
+    return Light(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
+
+
+class Film:
+    """Cameras, light and studio of one video over the frames of a simulation.
+
+    Args:
+        folder: ``OUT/stages/simulate``.
+        cameras: One per frame; made by :meth:`of`.
+        render: The render stage.
+        device: Where to render.
+    """
+
+    def __init__(
+        self, folder: Path, cameras: list[Camera], render: Render, device: torch.device
+    ) -> None:
+        self.folder, self.cameras, self.render, self.device = folder, cameras, render, device
+
+    @classmethod
+    def of(cls, out: Path, shot: Shot, light: Light, device: torch.device) -> Film:
+        """Set up the film of a finished simulation.
+
+        Raises:
+            InputError: There is none, or the camera cannot be.
+        """
+        folder = out / "stages" / "simulate"
+        count = count_frames(folder)
+        if count == 0:
+            raise InputError(f"{out}: no simulated frames", "run the shot first: gsfluent run")
+        first = load_frame(folder, 0)
+        positions = [first.positions]
+        positions += [load_frame(folder, index).positions for index in range(1, count)]
+        action = Action.of(positions)
+        floor = None if shot.floor == "none" else 0.0
+        studio = None
+        if floor is not None:
+            x, y = action.center[:, :2].mean(dim=0).tolist()
+            studio = Studio(floor, (x, y), 1.3 * float(action.radius.amax()))
+        needs_capture = shot.capture is not None and isinstance(shot.output.camera, int)
+        cameras = cameras_for(
+            str(shot.output.camera),
+            action,
+            shot.output.size,
+            capture=load_capture(shot.capture) if needs_capture and shot.capture else None,
+            frame=read_frame(out / "stages" / "isolate") if needs_capture else None,
+        )
+        render = Render(
+            light=light, studio=studio, normal_cell=occupancy_cell(first.gaussians.means)
+        )
+        return cls(folder, cameras, render, device)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.cameras)
+
+    def frame(self, index: int) -> SavedFrame:
+        """Frame ``index`` on the film's device."""
+        return load_frame(self.folder, index).to(self.device)
+
+    def picture(self, frame: SavedFrame) -> torch.Tensor:
+        """The picture [H, W, 3] of a frame."""
+        camera = self.cameras[frame.index]
+        return self.render(frame.gaussians, camera, groups=frame.groups)
+
+
+def render_stage(context: RunContext) -> None:
+    """``video.mp4`` and ``poster.png``, and how many holes the repair closed."""
+    shot = context.shot
+    light = light_of(shot)
+    output = [list(shot.output.size), str(shot.output.camera), shot.output.fps]
+    path = shot.output.camera
+    camera_key = content_digest(path) if isinstance(path, Path) else None
+    key = fingerprint("render", context.key(context.source_key, repr(light), output, camera_key))
+
+    def work(folder: Path) -> dict[str, Any]:
+        film = Film.of(context.out, shot, light, context.device)
+        report: dict[str, Any] = {
+            "frames": len(film),
+            "hole_fraction_before": [],
+            "hole_fraction": [],
+            "transition_gaussians": [],
+        }
+        counts: list[int] = []
+        drawing = 0.0
+        progress = context.reporter.task("render")
+
+        def pictures() -> Iterator[np.ndarray]:
+            nonlocal drawing
+            for index in range(len(film)):
+                frame = film.frame(index)
+                start = time.perf_counter()
+                picture = to_bytes(film.picture(frame))
+                drawing += time.perf_counter() - start
+                _count_holes(report, frame, film.cameras[index])
+                counts.append(int(frame.facts.get("fragments", 1)))
+                report_progress(progress, index + 1, len(film), "")
+                yield picture
+
+        write_video(folder / "video.mp4", pictures(), fps=shot.output.fps, size=shot.output.size)
+        report["seconds_per_frame"] = drawing / len(film)
+        report["poster_frame"] = poster_frame(counts, shot.output.fps)
+        best = film.frame(report["poster_frame"])
+        save_image(film.picture(best).cpu(), folder / "poster.png")
+        return report
+
+    result = context.store.run("render", key, work)
+    for name in ("video.mp4", "poster.png"):
+        publish(result.folder / name, context.out / name)
+        context.record.values["outputs"][name.split(".")[0]] = name
+    context.record.values["render"] = dict(result.report)
+
+
+def _count_holes(report: dict[str, Any], frame: SavedFrame, camera: Camera) -> None:
+    """Append the frame's hole fractions and number of transition splats."""
+    gaussians, matter = frame.gaussians, (frame.positions, frame.volumes)
+    added = gaussians.count - frame.carried
+    whole = hole_fraction(gaussians, *matter, camera, groups=frame.groups)
+    before = whole
+    if added:
+        before = hole_fraction(_first(gaussians, frame.carried), *matter, camera)
+    report["hole_fraction_before"].append(round(before, 6))
+    report["hole_fraction"].append(round(whole, 6))
+    report["transition_gaussians"].append(added)
+
+
+def _first(gaussians: Gaussians, count: int) -> Gaussians:
+    return gaussians.map(lambda value: value[:count])
+
+
+def poster_frame(fragments: list[int], fps: float) -> int:
+    """The most telling frame: shortly after the largest jump in the number of fragments.
+
+    Without any break it is the middle of the video.
+    """
+    jumps = [b - a for a, b in itertools.pairwise(fragments)]
+    if not jumps or max(jumps) <= 0:
+        return len(fragments) // 2
+    return min(len(fragments) - 1, jumps.index(max(jumps)) + 1 + round(_POSTER_DELAY * fps))
+
+
+def export_stage(context: RunContext) -> None:
+    """What ``output.what`` asks for beside the video."""
+    wanted = [kind for kind in context.shot.output.what if kind != "mp4"]
+    if not wanted:
+        return
+    key = fingerprint("export", context.key(context.source_key, wanted))
+
+    def work(folder: Path) -> dict[str, Any]:
+        return write_exports(context.out, wanted, progress=context.reporter.task("export"))
+
+    result = context.store.run("export", key, work)
+    context.record.values["outputs"] |= result.report
+
+
+def render_again(
+    out: Path,
+    *,
+    device: torch.device,
+    to: Path | None = None,
+    camera: str | None = None,
+    size: tuple[int, int] | None = None,
+    direction: tuple[float, float, float] | None = None,
+    ambient: float | None = None,
+    specular: float | None = None,
+    frame: int | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Render a finished simulation with another camera, light or size.
+
+    Args:
+        out: Folder of the run.
+        device: Where to render.
+        to: Video (.mp4) or picture (.png); ``render.mp4`` or ``render.png`` in ``out`` by default.
+        camera: ``orbit``, a photograph's index, or a JSON file; the shot's own by default.
+        size: (width, height) [px].
+        direction: Toward the light.
+        ambient: Ambient light.
+        specular: Strength of highlights.
+        frame: Only this frame.
+        progress: Called per frame.
+
+    Returns:
+        ``output``, ``frames`` and ``seconds_per_frame``.
+
+    Raises:
+        InputError: Not a finished run, or an argument out of range.
+    """
+    shot = shot_of(out)
+    output = shot.output
+    if camera is not None:
+        index = camera.lstrip("-").isdigit()
+        output = replace(output, camera=int(camera) if index else camera)
+    if size is not None:
+        output = replace(output, size=size)
+    shot = replace(shot, output=output)
+    light = light_of(shot)
+    changes = {"direction": direction, "ambient": ambient, "specular": specular}
+    light = replace(light, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
+    film = Film.of(out, shot, light, device)
+    target = to or out / ("render.mp4" if frame is None else "render.png")
+    start = time.perf_counter()
+    if frame is not None:
+        if not 0 <= frame < len(film):
+            raise InputError(f"--frame {frame}", f"the run has frames 0 to {len(film) - 1}")
+        save_image(film.picture(film.frame(frame)).cpu(), target)
+        return {
+            "output": str(target),
+            "frames": 1,
+            "seconds_per_frame": time.perf_counter() - start,
+        }
+    if target.suffix.lower() != ".mp4":
+        raise InputError(f"-o {target}", "name a .mp4 file, or give --frame N for one .png")
+
+    def pictures() -> Iterator[np.ndarray]:
+        for index in range(len(film)):
+            yield to_bytes(film.picture(film.frame(index)))
+            report_progress(progress, index + 1, len(film), "")
+
+    count = write_video(target, pictures(), fps=shot.output.fps, size=shot.output.size)
+    seconds = (time.perf_counter() - start) / count
+    return {"output": str(target), "frames": count, "seconds_per_frame": seconds}
+
+
+def shot_of(out: Path) -> Shot:
+    """The resolved shot of a run, from its ``run.json``.
+
+    Raises:
+        InputError: There is none.
+    """
+    path = out / "run.json"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["shot"]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: not the record of a run ({error})", "run the shot first"
+        ) from error
+    return Shot.from_dict(values, out)

@@ -1,0 +1,109 @@
+"""The simulation stage of a run: one file per finished frame, taken up again where it stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent import materials
+from gsfluent.config import Shot, event_dict
+from gsfluent.data import Frame, Solid
+from gsfluent.pipeline.run_context import RunContext
+from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
+from gsfluent.pipeline.run_store import fingerprint
+from gsfluent.pipeline.simulate import Simulate, SimulationFrame
+from gsfluent.scene import Scene
+
+_STATE = "state.pt"
+
+
+def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
+    """The scene of a shot: its solids with their materials, the floor, and the events.
+
+    Args:
+        shot: The shot.
+        solids: Solid of each object by name.
+        frame: World to scene.
+
+    Raises:
+        InputError: A material, part or event that cannot be.
+    """
+    scene = Scene(floor=None if shot.floor == "none" else 0.0)
+    for name, settings in shot.objects.items():
+        material = materials.get(settings.material).override(**dict(settings.overrides))
+        parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
+        scene.add(solids[name], material, frame=frame, parts=parts, name=name)
+    for event in shot.events:
+        scene.add_event(event_dict(event))
+    return scene
+
+
+def load_solids(context: RunContext) -> dict[str, Solid]:
+    """The textured solids of the run's objects, by name."""
+    folder = context.store.root / "texture"
+    return {name: Solid.load(folder / f"{name}.ply") for name in context.shot.objects}
+
+
+def simulate_stage(context: RunContext) -> None:
+    """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
+    shot = context.shot
+    objects = {name: settings.to_dict() for name, settings in shot.objects.items()}
+    events = [event_dict(event) for event in shot.events]
+    settings = [
+        objects,
+        events,
+        shot.floor,
+        shot.solve.quality,
+        shot.output.fps,
+        shot.output.seconds,
+    ]
+    key = fingerprint("simulate", context.key(context.source_key, settings))
+
+    def work(folder: Path) -> dict[str, Any]:
+        scene = build_scene(shot, load_solids(context), context.frame)
+        stage = Simulate(quality=shot.solve.quality, seed=context.seed, device=context.device)
+        state = folder / _STATE
+        resume = state if state.is_file() and count_frames(folder) > 0 else None
+        frames = stage(
+            scene,
+            fps=shot.output.fps,
+            seconds=shot.output.seconds,
+            progress=context.reporter.task("simulate"),
+            resume=resume,
+        )
+        for frame in frames:
+            save_frame(folder, saved(frame))
+            # after the frame: a state on disk always has its picture
+            stage.save_state(state)
+        return stage.report()
+
+    result = context.store.run("simulate", key, work)
+    report = dict(result.report)
+    fill = context.record.values["fill"]
+    # the number of material points is known only once the grid is
+    for name in ("particles", "particles_per_cell"):
+        if name in report and name not in fill:
+            fill[name] = report[name]
+    context.record.values["simulation"] = report
+    context.source_key = result.fingerprint
+
+
+def saved(frame: SimulationFrame) -> SavedFrame:
+    """What of a simulated frame goes to disk."""
+    gaussians, groups = frame.gaussians, frame.groups
+    if groups is None:
+        groups = torch.full((gaussians.count,), -1, dtype=torch.int32, device=gaussians.device)
+    return SavedFrame(
+        index=frame.index,
+        time=frame.time,
+        gaussians=gaussians,
+        groups=groups,
+        carried=frame.carried.count,
+        positions=frame.particles.position,
+        volumes=frame.particles.volume,
+        damage=frame.damage,
+        fragments=frame.fragments,
+        facts=dict(frame.stats) | {"energy": dict(frame.energy)},
+    )

@@ -1,0 +1,111 @@
+"""One stage from files to files: behind ``gsfluent reconstruct``, ``fill`` and ``texture``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.data import Capture, Solid
+from gsfluent.io import load, load_capture, write_json
+from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.isolate import Isolate
+from gsfluent.pipeline.reconstruct import Reconstruct
+from gsfluent.pipeline.render_cuts import save_cut_views
+from gsfluent.pipeline.stage import Progress
+from gsfluent.pipeline.texture import Texture
+
+
+def reconstruct_to(
+    capture: Path,
+    out: Path,
+    *,
+    device: torch.device,
+    seed: int = 0,
+    keep_background: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Photographs to a splat file, with ``reconstruct.json`` beside it.
+
+    Args:
+        capture: Folder of posed photographs.
+        out: The .ply to write.
+        device: Where to compute.
+        seed: Seed of everything random.
+        keep_background: Do not isolate the object.
+        progress: Told of each step.
+        **options: Arguments of :class:`gsfluent.pipeline.Reconstruct`.
+
+    Returns:
+        What stands in ``reconstruct.json``.
+
+    Raises:
+        InputError: The capture cannot be read.
+        RunError: The disk is full.
+    """
+    photographs = load_capture(capture)
+    stage = Reconstruct(**options, device=device, seed=seed)
+    gaussians, report = stage(photographs, progress=progress)
+    if not keep_background:
+        gaussians = Isolate(seed=seed)(gaussians, photographs)
+    gaussians.save(out)
+    values = dict(report) | {"gaussians_saved": gaussians.count, "output": str(out)}
+    write_json(out.with_name("reconstruct.json"), values)
+    return values
+
+
+def fill_to(
+    model: Path,
+    out: Path,
+    *,
+    capture: Path | None = None,
+    device: torch.device,
+    seed: int = 0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """A splat file to a solid: ``out`` and its ``.volume.npz``; arguments as above.
+
+    Raises:
+        InputError: The splat cannot be read or has no inside.
+        RunError: The disk is full.
+    """
+    gaussians = load(model).validated(model.name).to(device)
+    start = time.perf_counter()
+    stage = Fill(**options, seed=seed)
+    solid = stage(gaussians, _photographs(capture), progress=progress)
+    solid.save(out)
+    return dict(solid.report) | {"seconds": time.perf_counter() - start, "output": str(out)}
+
+
+def texture_to(
+    solid: Path,
+    out: Path,
+    *,
+    capture: Path | None = None,
+    device: torch.device,
+    seed: int = 0,
+    progress: Progress | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """A solid to one with a coloured inside, and ``<out>.cuts.png``; arguments as above.
+
+    Raises:
+        InputError: The solid or the exemplar cannot be read.
+        RunError: The disk is full.
+    """
+    filled = Solid.load(solid).to(device)
+    start = time.perf_counter()
+    textured = Texture(**options, seed=seed)(filled, _photographs(capture), progress=progress)
+    textured.save(out)
+    cuts = out.with_suffix(".cuts.png")
+    save_cut_views(textured, cuts)
+    seconds = time.perf_counter() - start
+    return dict(textured.report) | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
+
+
+def _photographs(capture: Path | None) -> Capture | None:
+    return None if capture is None else load_capture(capture)

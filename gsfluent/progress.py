@@ -1,0 +1,104 @@
+"""Progress of long work: a bar on a terminal, plain log lines anywhere else.
+
+Every stage takes ``progress: Callable[[int, int, str], None]``, called with (done, total, what is
+being done). The stages know nothing of terminals; :func:`reporter` decides once which of the two
+forms the caller sees. Both write to stderr, so that stdout stays free for ``--json``.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from gsfluent.pipeline.stage import Progress
+
+_log = logging.getLogger(__name__)
+
+# A log file is read later by a person: one line every few seconds says as much as a thousand.
+_SECONDS_BETWEEN_LINES = 5.0
+
+
+class Reporter(Protocol):
+    """Hands out one progress callback per task."""
+
+    def task(self, name: str) -> Progress:
+        """Return the callback for one task called ``name``."""
+        ...
+
+
+class LineReporter:
+    """Writes a log line per task at most every few seconds, and one when the task is complete."""
+
+    def __init__(self, seconds: float = _SECONDS_BETWEEN_LINES) -> None:
+        self._seconds = seconds
+
+    def task(self, name: str) -> Progress:
+        """Return the callback for one task called ``name``."""
+        last = time.monotonic()
+        finished = False
+
+        def report(done: int, total: int, text: str) -> None:
+            nonlocal last, finished
+            now = time.monotonic()
+            complete = total > 0 and done >= total
+            if (complete and not finished) or now - last >= self._seconds:
+                last, finished = now, complete
+                _log.info("%s: %s", name, f"{done}/{total} {text}".rstrip())
+
+        return report
+
+
+class BarReporter:
+    """Draws one rich progress bar per task on stderr."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+        from rich.progress import Progress as RichProgress
+
+        self.bars = RichProgress(
+            TextColumn("{task.fields[name]:<12}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+            console=Console(stderr=True),
+            refresh_per_second=4,
+        )
+
+    def task(self, name: str) -> Progress:
+        """Return the callback for one task called ``name``."""
+        bar = self.bars.add_task("", name=name, total=None)
+
+        def report(done: int, total: int, text: str) -> None:
+            self.bars.update(
+                bar, completed=done, total=total if total > 0 else None, description=text
+            )
+
+        return report
+
+
+@contextmanager
+def reporter(*, quiet: bool = False) -> Iterator[Reporter]:
+    """Yield the reporter that suits this process: bars on a terminal, lines elsewhere.
+
+    Args:
+        quiet: Lines even on a terminal (``--json``: logs, not drawings, beside the object).
+    """
+    if quiet or not sys.stderr.isatty():
+        yield LineReporter()
+        return
+    bars = BarReporter()
+    with bars.bars:
+        yield bars

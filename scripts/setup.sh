@@ -1,0 +1,34 @@
+# Sourced by demo.sh and test.sh: a virtual environment with gsfluent in it, from nothing. No root, no compiler choice.
+# Torch comes first because gsfluent's extension is built against it; then the build tools; then gsfluent.
+
+# prepare demo|test: install what that needs into .venv and set PYTHON; quick when nothing changed since the last time.
+prepare() {
+  local kind=$1 python=${GSFLUENT_PYTHON:-python3} venv=${GSFLUENT_VENV:-.venv} pip stamp have
+  export PIP_DISABLE_PIP_VERSION_CHECK=1 MAX_JOBS="${MAX_JOBS:-$(getconf _NPROCESSORS_ONLN)}"
+  "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
+    echo "gsfluent needs Python 3.11 or newer; set GSFLUENT_PYTHON to one" >&2
+    return 1
+  }
+  [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
+  PYTHON="$PWD/$venv/bin/python"
+  pip=("$PYTHON" -m pip install --quiet)
+
+  # the test install is editable (python files are live), the demo install is what `pip install .` gives
+  stamp="test $(cat pyproject.toml setup.py $(find csrc -type f | sort) | cksum)"
+  have=$(cat "$venv/.gsfluent-stamp" 2>/dev/null || true)
+  [ "$have" = "$stamp" ] && return 0
+  if [ "$kind" = demo ]; then
+    stamp="demo $(cat pyproject.toml setup.py $(find csrc gsfluent -name '*.py' -o -path 'csrc/*' -type f | sort) | cksum)"
+    [ "$have" = "$stamp" ] && return 0
+  fi
+
+  echo "installing into $venv (torch first; the first time takes a few minutes)"
+  "$PYTHON" -c 'import torch' 2>/dev/null || "${pip[@]}" 'torch==2.13.0' || return 1
+  "${pip[@]}" 'setuptools>=77' wheel ninja pybind11 numpy || return 1
+  if [ "$kind" = demo ]; then
+    "${pip[@]}" --no-build-isolation . || return 1
+  else
+    "${pip[@]}" --no-build-isolation -e '.[dev]' || return 1
+  fi
+  echo "$stamp" > "$venv/.gsfluent-stamp"
+}
