@@ -237,7 +237,7 @@ def test_apple_stands_on_its_table(data_root: Path, tmp_path: Path) -> None:
 
 @pytest.mark.data
 def test_skull_is_upright(data_root: Path) -> None:
-    """Its own axes already have y down: up must be close to -y; the cameras circle it without roll."""
+    """Its own axes have y down already, so up must be close to -y."""
     stance = orient(None, load_capture(data_root / "captures/skull"))
     assert stance.up @ np.array([0.0, -1.0, 0.0]) > math.cos(math.radians(6))
 
