@@ -41,7 +41,9 @@ class Isolate(Stage):
     """Split a reconstruction into the object and its background.
 
     Args:
-        method: How to find the object. "auto" takes masks when the capture has them, else "plane".
+        method: How to find the object. "auto" takes the labels of the splats when some are
+            ``BACKGROUND``, else masks when the capture has them, else "plane"; without a capture it
+            keeps everything. "labels": splats not labelled ``BACKGROUND``.
             "masks": splats that lie in the masks of most views. "box": splats in ``box``. "plane":
             what stands above the support plane (when there is one) near the point the cameras look
             at and hangs together. "all": everything.
@@ -66,10 +68,10 @@ class Isolate(Stage):
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
-        if method not in ("auto", "masks", "box", "plane", "all"):
+        if method not in ("auto", "labels", "masks", "box", "plane", "all"):
             raise InputError(
                 f"isolate.method {method!r} is not known",
-                "choose auto, masks, box, plane or all",
+                "choose auto, labels, masks, box, plane or all",
             )
         if method == "box" and box is None:
             raise InputError("isolate: method box needs a box", "give its two corners")
@@ -82,9 +84,21 @@ class Isolate(Stage):
         self.report: dict[str, Any] = {}
 
     def forward(
-        self, gaussians: Gaussians, capture: Capture | None, progress: Progress | None = None
+        self,
+        gaussians: Gaussians,
+        capture: Capture | None = None,
+        progress: Progress | None = None,
+    ) -> Gaussians:
+        """The object alone; see :meth:`split`."""
+        return self.split(gaussians, capture, progress)[0]
+
+    def split(
+        self,
+        gaussians: Gaussians,
+        capture: Capture | None = None,
+        progress: Progress | None = None,
     ) -> tuple[Gaussians, Gaussians]:
-        """Split ``gaussians``.
+        """Split ``gaussians`` into the object and the rest.
 
         Args:
             gaussians: A reconstruction, in the world frame of the capture.
@@ -98,9 +112,7 @@ class Isolate(Stage):
         Raises:
             InputError: Nothing is left, or the method needs a capture.
         """
-        method = self.method
-        if method == "auto":
-            method = "masks" if capture is not None and _has_masks(capture) else "plane"
+        method = self._method(gaussians, capture)
         if capture is None and method in ("masks", "plane"):
             raise InputError(
                 f"isolate: method {method} needs the capture", "give it, or use box or all"
@@ -109,6 +121,10 @@ class Isolate(Stage):
         self.report = {"method": method}
         if method == "all":
             keep = torch.ones(gaussians.count, dtype=torch.bool, device=gaussians.device)
+        elif method == "labels":
+            if gaussians.labels is None:
+                raise InputError("isolate: the splats have no labels", "choose another method")
+            keep = gaussians.labels != BACKGROUND
         elif method == "box":
             assert self.box is not None
             corners = torch.tensor(self.box, dtype=gaussians.dtype, device=gaussians.device)
@@ -127,9 +143,20 @@ class Isolate(Stage):
             )
         report_progress(progress, 1, 1, f"{int(keep.sum())} Gaussians are object")
         self.report |= {"object": int(keep.sum()), "background": int((~keep).sum())}
-        return _labelled(gaussians.select(keep), SURFACE), _labelled(
-            gaussians.select(~keep), BACKGROUND
-        )
+        rest = _labelled(gaussians.select(~keep), BACKGROUND)
+        found = gaussians.select(keep)
+        if method in ("all", "labels") and found.labels is not None:
+            return found, rest  # they say more than this stage knows
+        return _labelled(found, SURFACE), rest
+
+    def _method(self, gaussians: Gaussians, capture: Capture | None) -> str:
+        if self.method != "auto":
+            return self.method
+        if gaussians.labels is not None and bool((gaussians.labels == BACKGROUND).any()):
+            return "labels"
+        if capture is None:
+            return "all"
+        return "masks" if _has_masks(capture) else "plane"
 
     def _standing(self, gaussians: Gaussians, capture: Capture) -> Tensor:
         """Splats above the support plane, in the focus region, connected to its middle."""

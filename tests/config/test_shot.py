@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsfluent.config import Bullet, Drop, Shot, Throw, event_dict, load_shot
@@ -192,6 +192,11 @@ def test_what_would_do_nothing_yet_is_refused(folder: Path, keys: dict[str, Any]
         ({"floor": "low"}, "floor must be one of auto, none, got 'low'"),
         ({"reconstruct": {"iterations": 100}}, "does nothing when splats are given"),
         ({"texture": {"method": "exemplar"}}, "texture.exemplar is missing"),
+        ({"texture": {"method": "procedural"}}, "texture.preset is missing"),
+        ({"texture": {"method": "diffusion"}}, "texture.model is missing"),
+        ({"texture": {"model": "x"}}, "texture.model does nothing with method profile"),
+        ({"texture": {"exemplar": "cut.jpg", "prompt": "x"}}, "texture.prompt does nothing"),
+        ({"texture": {"method": "color_copy", "quality": "full"}}, "texture.quality does nothing"),
         ({"fill": {"hollow": -1}}, "fill.hollow must be above 0"),
         ({"fill": {"resolution": 64.5}}, "fill.resolution must be a whole number"),
         ({"fill": [1]}, "fill must be a section of keys"),
@@ -326,6 +331,7 @@ values = st.recursive(
 )
 
 
+@settings(derandomize=True, deadline=None)
 @given(st.sampled_from([field.name for field in dataclasses.fields(Shot)]), values)
 def test_any_value_reads_or_is_an_input_error(key: str, value: Any) -> None:
     given_keys = {"splats": ".", key: value}

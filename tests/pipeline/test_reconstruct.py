@@ -111,12 +111,12 @@ def test_count_stays_under_the_cap_and_isotropic_kernels_are_round(capture: Capt
 
 
 def test_a_capture_without_masks_is_learned_whole_and_the_object_isolated(table: Capture) -> None:
-    stage = Reconstruct(iterations=200, image_size=64, start_gaussians=3000)
+    stage = Reconstruct(iterations=200, image_size=64, start_gaussians=3000, separate=False)
     gaussians, report = stage(table)
     assert report["start"] == "sparse points" and report["psnr_region"] == "whole image"
     assert report["psnr"] > 14.0
     isolate = Isolate()
-    found, rest = isolate(gaussians, table)
+    found, rest = isolate.split(gaussians, table)
     assert isolate.report["plane"]["normal"][2] > 0.97
     assert found.labels is not None and rest.labels is not None
     assert set(found.labels.tolist()) == {SURFACE} and set(rest.labels.tolist()) == {BACKGROUND}
@@ -131,10 +131,15 @@ def test_isolate_by_box_and_by_masks(capture: Capture) -> None:
     truth = demo.make_object("watermelon", 0)
     means = torch.cat([truth.center[None].float(), torch.tensor([[0.6, 0.0, 0.1]])])
     pair = Gaussians.from_colors(means, torch.full((2,), 0.01), torch.rand(2, 3))
-    by_mask, rest = Isolate("masks")(pair, capture)
+    by_mask, rest = Isolate("masks").split(pair, capture)
     assert torch.equal(by_mask.means, means[:1]) and torch.equal(rest.means, means[1:])
-    by_box, _ = Isolate("box", box=((0.5, -0.1, 0.0), (0.7, 0.1, 0.2)))(pair, None)
+    by_box = Isolate("box", box=((0.5, -0.1, 0.0), (0.7, 0.1, 0.2)))(pair)
     assert torch.equal(by_box.means, means[1:])
+    labelled = pair.replace(labels=torch.tensor([BACKGROUND, SURFACE], dtype=torch.int32))
+    assert torch.equal(Isolate()(labelled, capture).means, means[1:])
+    assert Isolate()(pair).count == 2  # nothing known, nothing removed
+    with pytest.raises(InputError, match="needs the capture"):
+        Isolate("plane")(pair)
     with pytest.raises(InputError, match="found no object"):
         Isolate("box", box=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))(pair, None)
     with pytest.raises(InputError, match="needs a box"):
@@ -184,7 +189,7 @@ def test_a_diverged_loss_names_the_step(capture: Capture, monkeypatch: pytest.Mo
     def broken(model: object) -> torch.Tensor:
         return torch.tensor(float("nan"))
 
-    monkeypatch.setattr(stage, "_shape_loss", broken)
+    monkeypatch.setattr("gsfluent.pipeline.reconstruct_train.shape_loss", broken)
     with pytest.raises(RunError, match="loss became nan at step 0"):
         stage(capture)
 
