@@ -62,9 +62,12 @@ def _keys(cls: type[Any]) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _default(field: dataclasses.Field[Any]) -> str:
-    if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+    if field.default is not dataclasses.MISSING:
+        value = field.default
+    elif field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    else:
         return "required"
-    value = field.default_factory() if field.default is dataclasses.MISSING else field.default  # type: ignore[misc]
     if value is None or dataclasses.is_dataclass(value) or value in ({}, ()):
         return "-"
     shown = plain(value)

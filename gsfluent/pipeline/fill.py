@@ -22,10 +22,8 @@ from .fill_inside import (
 )
 from .fill_interior import (
     _INTERIOR_OPACITY,
-    SamplePoints,
     interior_gaussians,
     refine_opacity,
-    sample_points,
 )
 from .fill_view import cut_view, surface_colors
 from .stage import Progress, Stage, report_progress
@@ -33,7 +31,7 @@ from .stage import Progress, Stage, report_progress
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Gaussians, Solid
 
-__all__ = ["Fill", "SamplePoints", "cut_view", "sample_points"]
+__all__ = ["Fill", "cut_view"]
 
 logger = logging.getLogger(__name__)
 
@@ -87,8 +85,8 @@ class Fill(Stage):
         max_interior: int = 200_000,
         down: tuple[float, float, float] | None = None,
         close_underside: bool = True,
-        refine_iterations: int = 60,
-        refine_image_size: int = 320,
+        refine_iterations: int = 24,
+        refine_image_size: int = 200,
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -219,13 +217,13 @@ class Fill(Stage):
         )
         return Solid(
             gaussians=merged,
-            occupancy=torch.from_numpy(solid),
-            depth=torch.from_numpy(depth),
-            origin=torch.tensor(box.origin, dtype=torch.float32),
+            occupancy=torch.from_numpy(solid).to(merged.device),
+            depth=torch.from_numpy(depth).to(merged.device),
+            origin=torch.tensor(box.origin, dtype=torch.float32, device=merged.device),
             voxel=box.voxel,
             color=None,
             regions=None,
-            report={"fill": report},
+            report=report,
         )
 
     def _decide(
@@ -249,7 +247,8 @@ class Fill(Stage):
         if views:
             hull = visual_hull(box, views)
             # masks say what is not the object; rays cap the cone under objects seen only from above
-            solid = hull & (shell | (vote.score >= 0.5))
+            # (just outside a convex surface about half of the rays hit it)
+            solid = hull & (shell | (vote.score >= 0.65))
             method = "hull and vote"
             if not solid.any():
                 raise InputError(

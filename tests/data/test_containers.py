@@ -45,14 +45,14 @@ def make_solid() -> Solid:
     )
 
 
-# Gaussians -----------------------------------------------------------------------------------------------------------
+# Gaussians
 
 
 def test_wrong_shape_names_field_and_source() -> None:
     good = make_gaussians()
     with pytest.raises(
         ValueError,
-        match=r"Gaussians: quats must have shape \[N, 4\] with N = 20 \(from means\), got \[19, 4\]",
+        match=r"quats must have shape \[N, 4\] with N = 20 \(from means\), got \[19, 4\]",
     ):
         good.replace(quats=good.quats[:19])
 
@@ -63,7 +63,7 @@ def test_wrong_dtype_and_type_are_type_errors() -> None:
         good.replace(means=good.means.long())
     with pytest.raises(TypeError, match=r"means must be a torch\.Tensor, got list"):
         good.replace(means=[[0.0, 0.0, 0.0]])
-    with pytest.raises(TypeError, match="opacities must be torch.float64 like means"):
+    with pytest.raises(TypeError, match=r"opacities must be torch\.float64 like means"):
         good.replace(opacities=good.opacities.float())
     with pytest.raises(TypeError, match="labels must be int32, got int64"):
         good.replace(labels=torch.zeros(20, dtype=torch.int64))
@@ -165,7 +165,7 @@ def test_validated_refuses_no_gaussians_and_returns_good_ones() -> None:
         gaussians.select(torch.zeros(20, dtype=torch.bool)).validated()
 
 
-# Frame and Camera ----------------------------------------------------------------------------------------------------
+# Frame and Camera
 
 
 def test_frame_inverse_and_compose() -> None:
@@ -263,7 +263,7 @@ def test_capture_splits_every_eighth() -> None:
         Capture([], torch.zeros(0, 3), torch.zeros(0, 3), Path("."))
 
 
-# Particles and Solid -------------------------------------------------------------------------------------------------
+# Particles and Solid
 
 
 def test_particles_at_rest_select_and_cat() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from gsfluent import geometry
-from gsfluent.data import Camera
+from gsfluent.data import Camera, Capture
 
 MODEL_IDS = {
     "SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4,
@@ -116,3 +116,9 @@ def write_transforms(
             rows[-1].update(frames[index])
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({**shared, "frames": rows}))
+
+
+def assert_same_poses(capture: Capture, cameras: list[Camera]) -> None:
+    assert len(capture) == len(cameras)
+    for loaded, expected in zip(capture.cameras, cameras, strict=True):
+        torch.testing.assert_close(loaded.viewmat, expected.viewmat, atol=1e-9, rtol=0)

@@ -188,7 +188,8 @@ def test_other_encodings_read_the_same(tmp_path: Path, form: str) -> None:
 
 
 def test_mesh_lists_are_read_over(tmp_path: Path) -> None:
-    header = "ply\nformat {} 1.0\nelement face 2\nproperty list uchar int vertex_indices\nproperty float area\n"
+    header = "ply\nformat {} 1.0\nelement face 2\n"
+    header += "property list uchar int vertex_indices\nproperty float area\n"
     header += "element vertex 2\nproperty float x\nproperty uchar red\nend_header\n"
     text = header.format("ascii") + "3 0 1 2 0.5\n4 0 1 2 3 1.5\n7 255\n8 1\n"
     (tmp_path / "a.ply").write_text(text)
@@ -237,24 +238,35 @@ def test_damage_anywhere_never_crashes(tmp_path: Path, noise: bytes, place: int)
         assert "a.ply" in error.what
 
 
+ASCII = b"ply\nformat ascii 1.0\n"
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"", "not a PLY file"),
         (b"\x89PNG\r\n\x1a\n", "not a PLY file"),
-        (b"ply\nformat ascii 1.0\n", "no end_header"),
-        (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "header line 'element vertex many'"),
-        (b"ply\nformat ascii 1.0\nelement vertex -4\nend_header\n", "header line"),
+        (ASCII + b"", "no end_header"),
+        (ASCII + b"element vertex many\nend_header\n", "header line 'element vertex many'"),
+        (ASCII + b"element vertex -4\nend_header\n", "header line"),
         (b"ply\nformat odd 1.0\nend_header\n", "header line 'format odd 1.0'"),
         (b"ply\nelement vertex 0\nend_header\n", "names no format"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float x\nend_header\n1 1\n", "twice"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\nabc\n", "not a number"),
-        (b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n", "promises 2 rows"),
-        (b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "no element 'vertex'"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 1 1\n",
-         "properties missing: f_dc_0"),
+        (
+            ASCII + b"element vertex 1\nproperty float x\nproperty float x\nend_header\n1 1\n",
+            "twice",
+        ),
+        (ASCII + b"element vertex 1\nproperty float x\nend_header\nabc\n", "not a number"),
+        (ASCII + b"element vertex 2\nproperty float x\nend_header\n1\n", "promises 2 rows"),
+        (ASCII + b"element face 0\nend_header\n", "no element 'vertex'"),
+        (
+            ASCII
+            + b"element vertex 1\n"
+            + b"property float x\nproperty float y\nproperty float z\n"
+            + b"end_header\n1 1 1\n",
+            "properties missing: f_dc_0",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_splat_file_is_said(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(content)
