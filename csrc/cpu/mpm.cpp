@@ -13,7 +13,6 @@ namespace cpu {
 namespace {
 
 constexpr int64_t kBlockGrain = 4;
-constexpr int64_t kPrefetch = 12;  // particles ahead; positions are read through `order`
 
 template <typename T>
 ParticleMomentum<T> momentum_of(const P2GArgs<T>& a, const Stencil<T>& s, int64_t p) {

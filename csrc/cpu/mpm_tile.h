@@ -3,7 +3,7 @@
 // first-level cache.
 #pragma once
 
-#include <cstring>
+#include <algorithm>
 #include <vector>
 
 #include "core/mpm_args.h"
