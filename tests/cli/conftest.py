@@ -1,4 +1,4 @@
-"""A small closed shell of splats and a shot around it: the cheapest input that goes through every stage."""
+"""A small closed shell of splats and a shot around it: the cheapest input for every stage."""
 
 from __future__ import annotations
 
