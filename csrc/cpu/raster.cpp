@@ -96,19 +96,31 @@ struct RasterCpu {
     for (size_t k = 0; k < background.size(); ++k)
       b.grad_background[k % a.channels] += background[k];
 
+    // In the order of the inputs, where all memory but the splat's own row and slots is sequential.
     const SplatCamera<T> camera = raster_camera(a);
-    parallel_for(visible, 512, [&](int64_t begin, int64_t end) {
-      for (int64_t r = begin; r < end; ++r)
-        reduce_splat(b, camera, r, active, slots.get() + first_slot[r] * width,
-                     first_slot[r + 1] - first_slot[r]);
+    std::vector<int32_t> rank_of(static_cast<size_t>(a.count), -1);
+    for (int64_t r = 0; r < visible; ++r) rank_of[a.order[r]] = static_cast<int32_t>(r);
+    parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
+      constexpr int64_t kAhead = 8;
+      for (int64_t i = begin; i < end; ++i) {
+        if (i + kAhead < end && rank_of[i + kAhead] >= 0) {
+          const int32_t next = rank_of[i + kAhead];
+          __builtin_prefetch(a.splats + int64_t(next) * a.stride);
+          __builtin_prefetch(slots.get() + first_slot[next] * width);
+        }
+        const int32_t r = rank_of[i];
+        if (r < 0) continue;
+        reduce_splat(b, camera, i, a.splats + int64_t(r) * a.stride, active,
+                     slots.get() + first_slot[r] * width, first_slot[r + 1] - first_slot[r]);
+      }
     });
   }
 
   // Sums a splat's rows of slots in order, turns moments into gradients of the projected splat and
   // takes those to the inputs.
   template <typename T>
-  static void reduce_splat(const RasterGradArgs<T>& b, const SplatCamera<T>& camera, int64_t rank,
-                           int active, const T* slots, int64_t count) {
+  static void reduce_splat(const RasterGradArgs<T>& b, const SplatCamera<T>& camera, int64_t i,
+                           const T* row, int active, const T* slots, int64_t count) {
     const RasterArgs<T>& a = b.forward;
     const int width = kGradFeatures + active;
     T sum[kGradFeatures + kMaxFeatures] = {};
@@ -117,7 +129,6 @@ struct RasterCpu {
     bool any = false;
     for (int k = 0; k < width; ++k) any = any || sum[k] != T(0);
     if (!any) return;
-    const T* row = a.splats + rank * a.stride;
     T g[kGradFeatures + kMaxFeatures] = {};
     g[0] = row[kConicA] * sum[0] + row[kConicB] * sum[1];
     g[1] = row[kConicB] * sum[0] + row[kConicC] * sum[1];
@@ -126,7 +137,7 @@ struct RasterCpu {
     g[4] = T(-0.5) * sum[4];
     g[5] = sum[5] / row[kOpacity];
     std::copy_n(sum + kGradFeatures, active, g + kGradFeatures);
-    project_splat_backward(b, camera, a.order[rank], g);
+    project_splat_backward(b, camera, i, g);
   }
 };
 

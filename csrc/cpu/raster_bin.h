@@ -41,6 +41,7 @@ inline void sort_by_key(std::vector<uint64_t>& items) {
 template <typename T>
 int64_t project_and_sort(const RasterArgs<T>& a) {
   constexpr uint32_t kCulled = 0xffffffffu;
+  constexpr int64_t kAhead = 8;  // rows asked for before they are copied
   const SplatCamera<T> camera = raster_camera(a);
   // Uninitialised on purpose: rows of culled splats are never read.
   std::unique_ptr<T[]> rows(new T[static_cast<size_t>(a.count) * a.stride]);
@@ -64,6 +65,8 @@ int64_t project_and_sort(const RasterArgs<T>& a) {
   const int used = kFeatures + a.features;
   parallel_for(a.count, 2048, [&](int64_t begin, int64_t end) {
     for (int64_t r = begin; r < end; ++r) {
+      if (r + kAhead < visible)
+        __builtin_prefetch(rows.get() + (items[r + kAhead] & 0xffffffffu) * a.stride);
       const int64_t i = r < visible ? static_cast<int64_t>(items[r] & 0xffffffffu) : -1;
       a.order[r] = static_cast<int32_t>(i);
       if (i >= 0) std::copy_n(rows.get() + i * a.stride, used, a.splats + r * a.stride);

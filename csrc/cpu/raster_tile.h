@@ -124,6 +124,23 @@ struct BlockWalk {
   }
 };
 
+// Asks for the row of an instance some places ahead: rows lie in depth order, so that a tile jumps
+// through memory and would wait for every one of them (44 % of the blend's time when measured).
+// Inlined by force: GCC 12 takes a function of prefetches alone for one without effect and drops
+// it.
+template <typename T>
+__attribute__((always_inline)) inline void prefetch_instance(const RasterArgs<T>& a,
+                                                             const int64_t* first_slot, int32_t e,
+                                                             int32_t end) {
+  constexpr int32_t kAhead = 8;
+  if (e + kAhead >= end) return;
+  const int64_t rank = a.instances[e + kAhead];
+  const T* row = a.splats + rank * a.stride;
+  if (first_slot) __builtin_prefetch(first_slot + rank);
+  __builtin_prefetch(row);
+  __builtin_prefetch(row + a.stride - 1);
+}
+
 // The part of the image a tile covers.
 struct TileArea {
   int x, y, width, height;
@@ -138,10 +155,9 @@ inline TileArea tile_area(const RasterArgs<T>& a, int tile) {
 // Place of an instance among its splat's instances, which lie row by row over the tiles it touches.
 template <typename T>
 inline int64_t instance_slot(const RasterArgs<T>& a, const int64_t* first_slot, int32_t rank,
-                             int tile) {
+                             const TileArea& area) {
   const PixelBox box = splat_tiles(a.splats + int64_t(rank) * a.stride, a.width, a.height);
-  return first_slot[rank] + (tile / a.tiles_x - box.y0) * (box.x1 - box.x0) +
-         (tile % a.tiles_x - box.x0);
+  return first_slot[rank] + (area.y / kTile - box.y0) * (box.x1 - box.x0) + area.x / kTile - box.x0;
 }
 
 // Blends one tile and writes its pixels. kF: blended features when known at compile time, else 0.
@@ -162,6 +178,7 @@ void blend_tile(const RasterArgs<T>& a, int tile, const int64_t* first_slot, T* 
   const int32_t end = a.tile_start[tile + 1];
   int32_t e = a.tile_start[tile];
   for (; e < end && walk.alive; ++e) {
+    prefetch_instance(a, first_slot, e, end);
     const int32_t rank = a.instances[e];
     const T* splat = a.splats + int64_t(rank) * a.stride;
     int group = -1;
@@ -175,10 +192,10 @@ void blend_tile(const RasterArgs<T>& a, int tile, const int64_t* first_slot, T* 
       weights[block] += w.weight;
       total += w.weight;
     }
-    if (slots) slots[instance_slot(a, first_slot, rank, tile)] = pack_sum<T>(total);
+    if (slots) slots[instance_slot(a, first_slot, rank, area)] = pack_sum<T>(total);
   }
   if (slots)
-    for (; e < end; ++e) slots[instance_slot(a, first_slot, a.instances[e], tile)] = T(0);
+    for (; e < end; ++e) slots[instance_slot(a, first_slot, a.instances[e], area)] = T(0);
 
   for (int y = 0; y < area.height; ++y) {
     for (int x = 0; x < area.width; ++x) {
@@ -248,6 +265,7 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int tile, int active_featur
   const int32_t end = a.tile_start[tile + 1];
   int32_t e = a.tile_start[tile];
   for (; e < end && walk.alive; ++e) {
+    prefetch_instance(a, first_slot, e, end);
     const int32_t rank = a.instances[e];
     const T* splat = a.splats + int64_t(rank) * a.stride;
     int group = -1;
@@ -275,12 +293,12 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int tile, int active_featur
       moment[4] += v * (w.dy * w.dy);
       moment[5] += v;
     }
-    T* slot = slots + instance_slot(a, first_slot, rank, tile) * width;
+    T* slot = slots + instance_slot(a, first_slot, rank, area) * width;
     for (int k = 0; k < kGradFeatures; ++k) slot[k] = pack_sum<T>(moment[k]);
     for (int f = 0; f < active; ++f) slot[kGradFeatures + f] = pack_sum<T>(feature[f]);
   }
   for (; e < end; ++e)
-    std::fill_n(slots + instance_slot(a, first_slot, a.instances[e], tile) * width, width, T(0));
+    std::fill_n(slots + instance_slot(a, first_slot, a.instances[e], area) * width, width, T(0));
 }
 
 }  // namespace gsf::raster_cpu
