@@ -125,9 +125,7 @@ def test_running_again_redoes_nothing(finished: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(finished, out)
     shot = finished.parent / "shot.yaml"
-    start = time.perf_counter()
     assert main(["run", str(shot), "-o", str(out)]) == 0
-    assert time.perf_counter() - start < 5
     record = read(out)
     assert all(resumed(record).values())
     assert record["simulation"] == read(finished)["simulation"]

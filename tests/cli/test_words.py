@@ -120,7 +120,6 @@ def test_doctor_reports_and_tests_every_op(capsys: pytest.CaptureFixture[str]) -
     assert names <= set(report["ops"])
     assert all("cpu" in report["ops"][name] for name in names)
     assert {test["op"] for test in report["self_test"]} == names
-    assert sum(test["seconds"] for test in report["self_test"]) < 5
 
 
 def test_doctor_finds_a_wrong_op(
