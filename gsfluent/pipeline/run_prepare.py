@@ -63,14 +63,19 @@ def isolate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load(source).validated(source.name)
-        whole = Isolate(seed=context.seed)(gaussians, context.capture)
+        # a splat without photographs is taken as it is: `objects.*.select` picks from it
+        method = "auto" if context.capture is not None else "all"
+        stage = Isolate(method, seed=context.seed)
+        whole, background = stage(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
         whole.save(folder / "object.ply")
+        if background.count:
+            background.save(folder / "background.ply")
         write_json(folder / "frame.json", frame.to_dict())
-        return {
+        return dict(stage.report) | {
             "gaussians_kept": whole.count,
-            "gaussians_removed": gaussians.count - whole.count,
+            "gaussians_removed": background.count,
             "up": stance.up.tolist(),
             "up_from": stance.up_from,
             "floor_from": stance.floor_from,

@@ -50,7 +50,7 @@ def reconstruct_to(
     stage = Reconstruct(**options, device=device, seed=seed)
     gaussians, report = stage(photographs, progress=progress)
     if not keep_background:
-        gaussians = Isolate(seed=seed)(gaussians, photographs)
+        gaussians, _ = Isolate(seed=seed)(gaussians, photographs)
     gaussians.save(out)
     values = dict(report) | {"gaussians_saved": gaussians.count, "output": str(out)}
     write_json(out.with_name("reconstruct.json"), values)
