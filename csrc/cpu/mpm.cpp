@@ -13,6 +13,35 @@ namespace cpu {
 namespace {
 
 constexpr int64_t kBlockGrain = 4;
+constexpr int64_t kAhead = 8;  // particles; they are read through `order`, in any memory order
+
+inline void fetch(const void* p) { __builtin_prefetch(p); }
+
+template <typename T>
+void fetch_particle(const P2GArgs<T>& a, int64_t r, int64_t end) {
+  if (r >= end) return;
+  const int64_t p = a.blocks.order[r];  // a prefetch of a wrong address does nothing
+  fetch(a.position + 3 * p);
+  fetch(a.velocity + 3 * p);
+  fetch(a.affine + 9 * p);
+  fetch(a.affine + 9 * p + 8);
+  fetch(a.mass + p);
+  if (a.stress == nullptr) return;
+  fetch(a.stress + 6 * p);
+  fetch(a.volume + p);
+}
+
+template <typename T>
+void fetch_particle(const GatherArgs<T>& a, int64_t r, int64_t end) {
+  if (r >= end) return;
+  const int64_t p = a.blocks.order[r];
+  fetch(a.position + 3 * p);
+  if (a.deformation != nullptr) fetch(a.deformation + 9 * p);
+  if (a.position_out == nullptr) return;
+  __builtin_prefetch(a.position_out + 3 * p, 1);
+  __builtin_prefetch(a.velocity_out + 3 * p, 1);
+  __builtin_prefetch(a.affine_out + 9 * p, 1);
+}
 
 template <typename T>
 ParticleMomentum<T> momentum_of(const P2GArgs<T>& a, const Stencil<T>& s, int64_t p) {
@@ -105,6 +134,7 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
     tile.assign(window.nodes(), Lanes<T>{});
     if (a.moments != nullptr) moment.assign(2 * window.nodes(), Lanes<T>{});
     for (int64_t r = range.begin; r < range.end; ++r) {
+      fetch_particle(a, r + kAhead, range.end);
       const int64_t p = view.order[r];
       if (p < 0 || p >= view.particles) continue;
       if (a.body != nullptr && a.body[p] != field) continue;
@@ -269,6 +299,7 @@ int64_t gather_block(const GatherArgs<T>& a, int64_t block, std::vector<Lanes<T>
         for (int c = 0; c < kChannels; ++c) tile[t + n][c] = in[kChannels * n + c];
     });
     for (int64_t r = range.begin; r < range.end; ++r) {
+      fetch_particle(a, r + kAhead, range.end);
       const int64_t p = view.order[r];
       if (p < 0 || p >= view.particles) continue;
       if (a.body != nullptr && a.body[p] != field) continue;
