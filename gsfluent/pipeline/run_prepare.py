@@ -116,7 +116,7 @@ def fill_stage(context: RunContext) -> None:
                 progress=context.reporter.task("fill"),
             )
             solid.transformed(frame).save(folder / f"{name}.ply")
-            reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
+            reports.append(solid.report["fill"] | {"volume_m3": solid.volume * frame.scale**3})
         return _merged(reports)
 
     result = context.store.run("fill", key, work)
@@ -139,7 +139,7 @@ def texture_stage(context: RunContext) -> None:
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
             textured.save(folder / f"{name}.ply")
             save_cut_views(textured, folder / f"{name}.png")
-            reports.append(textured.report)
+            reports.append(textured.report["texture"])
         return _merged(reports)
 
     result = context.store.run("texture", key, work)

@@ -78,7 +78,7 @@ def fill_to(
     stage = Fill(**options, seed=seed)
     solid = stage(gaussians, _photographs(capture), progress=progress)
     solid.save(out)
-    return dict(solid.report) | {"seconds": time.perf_counter() - start, "output": str(out)}
+    return dict(solid.report["fill"]) | {"seconds": time.perf_counter() - start, "output": str(out)}
 
 
 def texture_to(
@@ -104,7 +104,7 @@ def texture_to(
     cuts = out.with_suffix(".cuts.png")
     save_cut_views(textured, cuts)
     seconds = time.perf_counter() - start
-    return dict(textured.report) | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
+    return dict(textured.report["texture"]) | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
 
 
 def _photographs(capture: Path | None) -> Capture | None:
