@@ -84,6 +84,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_blocks(Tensor position,
   const char* op = "build_blocks";
   check_shape(op, "position", position, {-1, 3});
   STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
+  STD_TORCH_CHECK(max_table >= 1 && max_table <= INT32_MAX / kBlockNodes, op,
+                  ": max_table is out of range, got ", max_table);
   STD_TORCH_CHECK(margin >= 0 && margin <= 2, op, ": margin must be 0, 1 or 2, got ", margin);
   const Tensor x = gsf::contiguous(position);
   const int64_t n = x.size(0);

@@ -78,8 +78,8 @@ struct RasterCpu {
     const RasterArgs<T>& a = b.forward;
     const int64_t visible = visible_count(a);
     const std::vector<int64_t> first_slot = instance_offsets(a, visible);
-    STD_TORCH_CHECK(first_slot[visible] == a.instance_count, kRasterOp,
-                    ": saved state does not belong to these inputs");
+    STD_TORCH_CHECK(first_slot[visible] == a.instance_count && lists_are_sound(a, visible),
+                    kRasterOp, ": saved state does not belong to these inputs");
     // Features are colours, normal, depth: those behind the last wanted one are left out.
     const int active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
     const int width = kGradFeatures + active;

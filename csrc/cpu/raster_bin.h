@@ -134,6 +134,18 @@ int64_t visible_count(const RasterArgs<T>& a) {
   return std::find_if(a.order, a.order + a.count, [](int32_t i) { return i < 0; }) - a.order;
 }
 
+// True when the lists the adjoint is handed back can be walked without leaving their arrays.
+template <typename T>
+bool lists_are_sound(const RasterArgs<T>& a, int64_t visible) {
+  const int64_t tiles = int64_t(a.tiles_x) * a.tiles_y;
+  bool sound = a.tile_start[0] == 0 && a.tile_start[tiles] == a.instance_count;
+  for (int64_t t = 0; t < tiles; ++t) sound &= a.tile_start[t] <= a.tile_start[t + 1];
+  for (int64_t r = 0; r < visible; ++r) sound &= a.order[r] < a.count;
+  for (int64_t e = 0; e < a.instance_count; ++e)
+    sound &= static_cast<uint32_t>(a.instances[e]) < static_cast<uint64_t>(visible);
+  return sound;
+}
+
 // first_slot[r]: instances of the ranks before r; one more entry holds their total.
 template <typename T>
 std::vector<int64_t> instance_offsets(const RasterArgs<T>& a, int64_t visible) {

@@ -152,12 +152,15 @@ inline TileArea tile_area(const RasterArgs<T>& a, int tile) {
   return {x, y, std::min(kTile, a.width - x), std::min(kTile, a.height - y)};
 }
 
-// Place of an instance among its splat's instances, which lie row by row over the tiles it touches.
+// Place of an instance among its splat's instances, which lie row by row over the tiles it touches;
+// -1 when the tile is not one of them (the adjoint is handed its lists back and trusts nothing).
 template <typename T>
 inline int64_t instance_slot(const RasterArgs<T>& a, const int64_t* first_slot, int32_t rank,
                              const TileArea& area) {
   const PixelBox box = splat_tiles(a.splats + int64_t(rank) * a.stride, a.width, a.height);
-  return first_slot[rank] + (area.y / kTile - box.y0) * (box.x1 - box.x0) + area.x / kTile - box.x0;
+  const int x = area.x / kTile, y = area.y / kTile;
+  if (x < box.x0 || x >= box.x1 || y < box.y0 || y >= box.y1) return -1;
+  return first_slot[rank] + (y - box.y0) * (box.x1 - box.x0) + x - box.x0;
 }
 
 // Blends one tile and writes its pixels. kF: blended features when known at compile time, else 0.
@@ -293,12 +296,16 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int tile, int active_featur
       moment[4] += v * (w.dy * w.dy);
       moment[5] += v;
     }
-    T* slot = slots + instance_slot(a, first_slot, rank, area) * width;
+    const int64_t place = instance_slot(a, first_slot, rank, area);
+    if (place < 0) continue;
+    T* slot = slots + place * width;
     for (int k = 0; k < kGradFeatures; ++k) slot[k] = pack_sum<T>(moment[k]);
     for (int f = 0; f < active; ++f) slot[kGradFeatures + f] = pack_sum<T>(feature[f]);
   }
-  for (; e < end; ++e)
-    std::fill_n(slots + instance_slot(a, first_slot, a.instances[e], area) * width, width, T(0));
+  for (; e < end; ++e) {
+    const int64_t place = instance_slot(a, first_slot, a.instances[e], area);
+    if (place >= 0) std::fill_n(slots + place * width, width, T(0));
+  }
 }
 
 }  // namespace gsf::raster_cpu

@@ -10,4 +10,7 @@ namespace gsf::cuda {
 template <typename T>
 cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream);
 
+template <typename T>
+cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream);
+
 }  // namespace gsf::cuda

@@ -8,10 +8,11 @@ namespace {
 
 template <typename T, int kF>
 __global__ void __launch_bounds__(kTileThreads)
-    blend_backward_kernel(RasterGradArgs<T> b, T* splat_grads) {
+    blend_backward_kernel(RasterGradArgs<T> b, int active, T* splat_grads) {
   __shared__ Stage<T, kF> stage;
   const RasterArgs<T>& a = b.forward;
-  const int features = kF ? kF : a.features, width = kGradFeatures + features;
+  // Only the first `active` features carry a gradient; rows of splat_grads have room for all.
+  const int features = kF ? kF : active, width = kGradFeatures + a.features;
   const int lane = threadIdx.x % 32;
   const PixelPlace place = pixel_place(a, blockIdx.x);
   const T px = T(place.x) + T(0.5), py = T(place.y) + T(0.5);
@@ -97,9 +98,11 @@ __global__ void splat_backward_kernel(RasterGradArgs<T> b, T* splat_grads) {
 template <typename T>
 cudaError_t raster_backward(const RasterGradArgs<T>& b, T* splat_grads, cudaStream_t stream) {
   const RasterArgs<T>& a = b.forward;
-  const cudaError_t error = with_features<T>(a.features, [&]<int kF>() {
+  // Features are colours, normal, depth: those behind the last wanted one are left out.
+  const int active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
+  const cudaError_t error = with_features<T>(active, [&]<int kF>() {
     blend_backward_kernel<T, kF>
-        <<<a.tiles_x * a.tiles_y, kTileThreads, 0, stream>>>(b, splat_grads);
+        <<<a.tiles_x * a.tiles_y, kTileThreads, 0, stream>>>(b, active, splat_grads);
     return cudaGetLastError();
   });
   if (error != cudaSuccess || a.count == 0) return error;

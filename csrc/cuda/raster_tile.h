@@ -119,7 +119,8 @@ struct Stage {
   __device__ void load(const RasterArgs<T>& a, int first, int count) {
     const int used = kF ? kUsed : kFeatures + a.features;
     for (int k = threadIdx.x; k < count; k += kTileThreads) {
-      id[k] = a.instances[first + k];
+      // Clamped: the adjoint is handed these lists back and trusts nothing it reads.
+      id[k] = clamp(a.instances[first + k], 0, static_cast<int32_t>(a.count) - 1);
       group[k] = a.groups ? a.groups[id[k]] : -1;
     }
     __syncthreads();
@@ -141,7 +142,9 @@ __device__ __forceinline__ T warp_sum(T v) {
 template <typename T, int kF, typename F>
 __device__ void for_each_splat(const RasterArgs<T>& a, int tile, const PixelPlace& place,
                                const PixelWalk<T>& walk, Stage<T, kF>& stage, const F& f) {
-  const int begin = a.tile_start[tile], end = a.tile_start[tile + 1];
+  const int total = static_cast<int>(a.instance_count);
+  const int begin = clamp(a.tile_start[tile], 0, total);
+  const int end = clamp(a.tile_start[tile + 1], 0, total);
   const int lane = threadIdx.x % 32;
   for (int first = begin; first < end; first += kBatch) {
     if (__syncthreads_and(walk.stopped)) return;
@@ -163,6 +166,7 @@ __device__ void for_each_splat(const RasterArgs<T>& a, int tile, const PixelPlac
 template <typename T, typename F>
 cudaError_t with_features(int features, const F& f) {
   if constexpr (sizeof(T) == sizeof(float)) {
+    if (features == 3) return f.template operator()<3>();  // rgb (adjoint)
     if (features == 4) return f.template operator()<4>();  // rgb, depth
     if (features == 7) return f.template operator()<7>();  // rgb, normal, depth
   }

@@ -19,10 +19,12 @@ from gsfluent.config.read import (
     nested,
     number,
     read_direction,
+    section,
     several,
     text,
     whole,
 )
+from gsfluent.errors import InputError
 
 Vector = tuple[float, float, float]
 
@@ -47,6 +49,9 @@ def _camera(value: Any, place: Place) -> str | int | Path:
     return index
 
 
+_TEXTURE_METHODS = ("exemplar", "diffusion", "color_copy", "procedural", "profile", "telea")
+
+
 @dataclasses.dataclass(frozen=True)
 class ReconstructSettings:
     """``reconstruct:`` - photographs to splats. None leaves the choice to the stage."""
@@ -55,7 +60,7 @@ class ReconstructSettings:
         whole(1, 1_000_000), default=None, doc="Optimisation steps.", example="7000"
     )
     max_gaussians: int | None = key(
-        whole(100, 100_000_000),
+        whole(10, 50_000_000),
         default=None,
         doc="Upper limit of the number of splats.",
         example="300000",
@@ -70,10 +75,13 @@ class ReconstructSettings:
         number(0.0, 1e6), default=None, doc="Weight of the penalty on large splats.", example="1.0"
     )
     image_size: int | None = key(
-        whole(16, 16384),
+        whole(24, 8192),
         default=None,
         doc="Longest side of the photographs while fitting [pixels].",
         example="800",
+    )
+    sh_degree: int | None = key(
+        whole(0, 3), default=None, doc="Degree of the view-dependent colours.", example="0"
     )
 
     def given(self) -> dict[str, Any]:
@@ -117,7 +125,7 @@ class TextureSettings:
     """``texture:`` - colours for the inside."""
 
     method: str | None = key(
-        choice("exemplar", "diffusion", "color_copy", "procedural", "profile"),
+        choice("auto", *_TEXTURE_METHODS),
         default=None,
         doc="How the inside gets its colours; by default from the exemplar if there is one.",
         example="exemplar",
@@ -125,25 +133,90 @@ class TextureSettings:
     exemplar: Path | None = key(
         existing_path,
         default=None,
-        doc="Photograph of a cut through such an object.",
+        doc="Photograph of a cut through such an object; other methods compare with it.",
         example="cut.jpg",
+    )
+    preset: str | None = key(
+        text, default=None, doc="Procedural recipe (method procedural).", example="watermelon"
     )
     prompt: str | None = key(
         text,
         default=None,
-        doc="What the inside looks like, for diffusion.",
+        doc="What the inside looks like (method diffusion).",
         example="ripe watermelon flesh",
     )
     model: str | None = key(
         text,
         default=None,
-        doc="Folder or hub id of a diffusers inpainting model.",
+        doc="Folder or hub id of a diffusers inpainting model (method diffusion).",
         example="models/sdxl-inpainting",
+    )
+    quality: str | None = key(
+        choice("preview", "fast", "full"),
+        default=None,
+        doc="Effort (method exemplar).",
+        example="fast",
+    )
+    scale: float | None = key(
+        number(0.01, 100.0),
+        default=None,
+        doc="Size of the exemplar's structure relative to the automatic choice.",
+        example="1.0",
+    )
+    guide: str | None = key(
+        choice("auto", "depth", "none"),
+        default=None,
+        doc="Whether rind meets rind (method exemplar).",
+        example="auto",
+    )
+    directional: bool | None = key(
+        flag,
+        default=None,
+        doc="Grained: the exemplar is not turned (method exemplar).",
+        example="true",
+    )
+    inclusions: bool | None = key(
+        flag,
+        default=None,
+        doc="Find seeds and stones in the exemplar and place them (method exemplar).",
+        example="true",
     )
 
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
         return given(self)
+
+
+_TEXTURE_READERS = {
+    "preset": ("procedural",),
+    "prompt": ("diffusion",),
+    "model": ("diffusion",),
+    **dict.fromkeys(("quality", "scale", "guide", "directional", "inclusions"), ("exemplar",)),
+}
+"""Keys of ``texture:`` that only these methods read."""
+
+
+def read_texture(value: Any, place: Place) -> TextureSettings:
+    """Read ``texture:`` and refuse keys that the method does not read."""
+    settings = section(TextureSettings, value, place)
+    method = settings.method
+    if method in (None, "auto"):
+        method = "exemplar" if settings.exemplar else "procedural" if settings.preset else "profile"
+    for name, readers in _TEXTURE_READERS.items():
+        if getattr(settings, name) is not None and method not in readers:
+            raise InputError(
+                f"{place.inside(name).path} does nothing with method {method}",
+                f"remove it, or set method: {readers[0]}",
+            )
+    needed = {"exemplar": "exemplar", "procedural": "preset", "diffusion": "model"}.get(
+        method or ""
+    )
+    if needed is not None and getattr(settings, needed) is None:
+        raise InputError(
+            f"{place.inside(needed).path} is missing",
+            f"method {method} needs it; or choose another",
+        )
+    return settings
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,6 +33,7 @@ from gsfluent.config.settings import (
     SolveSettings,
     TextureSettings,
     Vector,
+    read_texture,
 )
 from gsfluent.errors import InputError
 
@@ -100,7 +101,7 @@ class Shot:
         example="{hollow: none}",
     )
     texture: TextureSettings = key(
-        nested(TextureSettings),
+        read_texture,
         default=TextureSettings(),
         doc="Colours for the inside.",
         example="{method: color_copy}",
@@ -150,11 +151,6 @@ class Shot:
         if shot.scale is not None and shot.size is not None:
             raise InputError(
                 "'scale' and 'size' both set the size of the object", "keep one of them"
-            )
-        if shot.texture.exemplar is None and shot.texture.method == "exemplar":
-            raise InputError(
-                "texture.exemplar is missing",
-                "name a photograph of a cut, or choose another method",
             )
         if shot.splats is not None and shot.reconstruct != ReconstructSettings():
             raise InputError(

@@ -123,6 +123,10 @@ def build_blocks(
     dx = check_dx("build_blocks", dx)
     if margin not in (0, 1, 2):
         raise ValueError(f"build_blocks: margin must be 0, 1 or 2, got {margin}")
+    if not 1 <= max_blocks <= 2 * MAX_BLOCKS - 1:  # cell numbers are int32
+        raise ValueError(
+            f"build_blocks: max_blocks must be 1 to {2 * MAX_BLOCKS - 1}, got {max_blocks}"
+        )
     table, coords, order, start, info = torch.ops.gsfluent.build_blocks(
         position.detach(), dx, margin, max_blocks
     )

@@ -24,8 +24,8 @@ def polar_clamped(deformation: Tensor, lo: float = 0.3, hi: float = 2.0) -> tupl
         hi: Largest stretch kept [-], >= lo.
 
     Returns:
-        ``(R, F_clamped)``, both [N, 3, 3]. R is a rotation (det +1) for every input; a matrix with a
-        non-finite entry yields the identity in both.
+        ``(R, F_clamped)``, both [N, 3, 3]. R is a rotation (det +1) for every input; a matrix with
+        a non-finite entry yields the identity in both.
 
     Raises:
         TypeError: ``deformation`` is not a float32 or float64 tensor.

@@ -98,7 +98,7 @@ def cut_view(
 
     behind = occupancy[plane:]
     first = behind.argmax(0)
-    seen: np.ndarray = behind.any(0)
+    seen = np.asarray(behind.any(0))
     face = seen & (first == 0)
     image = np.full((*seen.shape, 3), background, np.float32)
     if solid.color is not None:

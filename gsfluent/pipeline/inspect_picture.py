@@ -1,4 +1,4 @@
-"""The picture of ``gsfluent inspect``: three views to scale with box, axes and floor, and a photo."""
+"""The picture of ``gsfluent inspect``: three views with box, axes and floor, and a photograph."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ def draw(picture: Picture) -> torch.Tensor:
     views = (("front", (0, 2, 1)), ("side", (1, 2, 0)), ("top", (0, 1, 2)))
     for (name, axes), corner in zip(views, ((0, 0), (_PANEL, 0), (0, _PANEL)), strict=True):
         sheet.paste(_flat_view(picture, name, axes), corner)
-    last = _oblique_view(picture) if picture.photograph is None else _photo_view(picture)
+    photograph = picture.photograph
+    last = _oblique_view(picture) if photograph is None else _photo_view(picture, photograph)
     sheet.paste(last, (_PANEL, _PANEL))
     pen = ImageDraw.Draw(sheet)
     for index, line in enumerate(picture.lines):
@@ -125,12 +126,11 @@ def _oblique_view(picture: Picture) -> Any:
     return image
 
 
-def _photo_view(picture: Picture) -> Any:
+def _photo_view(picture: Picture, photograph: tuple[View, Frame]) -> Any:
     """The photograph with box, axes and floor projected into it."""
     from PIL import Image
 
-    assert picture.photograph is not None  # chosen by the caller
-    view, frame = picture.photograph
+    view, frame = photograph
     pixels = (view.image.numpy() * 255).astype(np.uint8)
     factor = _PANEL / max(pixels.shape[:2])
     size = (round(pixels.shape[1] * factor), round(pixels.shape[0] * factor))

@@ -19,6 +19,9 @@ _THIN = 0.04
 _GRID = 48
 """Voxels along the longest side when looking for thin parts."""
 
+_WORTH = 0.0005
+"""Share of the volume from which a thin part is named."""
+
 
 def robust_box(points: Array) -> tuple[Array, Array]:
     """Box of points [N, 3] less 2 per thousand on each side: one floater must not set the scale."""
@@ -52,14 +55,17 @@ def cluster(points: Array, cells: int = 48) -> Clusters:
 
     Args:
         points: Points [N, 3], N > 0.
-        cells: Voxels along the longest side of the robust box.
+        cells: Voxels along the longest side of the robust box, fewer when the points are sparse.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     low, high = robust_box(points)
-    cell = max(float((high - low).max()) / cells, 1e-12)
+    # Voxels must not be finer than the points are dense, or a sparse surface falls into dust.
+    sample = points[:: max(1, len(points) // 4000)]
+    spacing = cKDTree(points).query(sample, k=min(5, len(points)))[0][..., -1]
+    cell = max(float((high - low).max()) / cells, 1.2 * float(np.median(spacing)), 1e-12)
     voxels, inverse = np.unique(np.floor((points - low) / cell), axis=0, return_inverse=True)
     pairs = cKDTree(voxels).query_pairs(1.9, output_type="ndarray")  # sqrt(3) < 1.9 < 2
     ones = np.ones(len(pairs), dtype=np.int8)
@@ -105,26 +111,29 @@ def thin_parts(points: Array, radii: Array) -> dict[str, Any]:
     step = float((high - low).max()) / _GRID
     if not step > 0:
         return {"share": 1.0, "limit": 0.0, "parts": []}
-    margin = 4
+    margin = 5
+    # The robust box cuts the outermost points off; they close the surface there.
+    slack = 2 * step
     size = np.ceil((high - low) / step).astype(int) + 2 * margin
-    inside = ((points >= low) & (points <= high)).all(axis=1)
+    inside = ((points >= low - slack) & (points <= high + slack)).all(axis=1)
     shell = np.zeros(size, dtype=bool)
     for offset in _ball_offsets(2):
         reach = np.linalg.norm(offset) * step <= np.maximum(radii[inside], 0.51 * step)
         place = np.floor((points[inside][reach] - low) / step).astype(int) + margin + offset
         place = np.clip(place, 0, size - 1)
         shell[tuple(place.T)] = True
-    shell = ndimage.binary_closing(shell, iterations=2)
+    shell = ndimage.binary_closing(shell, structure=np.ones((3, 3, 3)), iterations=2)
     solid = ndimage.binary_fill_holes(shell)
     ball = _THIN * _GRID
     core = ndimage.distance_transform_edt(solid) > ball
-    kept = ndimage.distance_transform_edt(~core) <= ball if core.any() else core
+    # Half a voxel more on the way back: the steps of a voxel surface are not thin parts.
+    kept = ndimage.distance_transform_edt(~core) <= ball + 0.5 if core.any() else core
     thin = solid & ~kept
     label, count = ndimage.label(thin, structure=np.ones((3, 3, 3)))
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
     parts = []
     for index in np.argsort(-sizes, kind="stable")[:8]:
-        if sizes[index] < 0.002 * solid.sum():
+        if sizes[index] < _WORTH * solid.sum():
             break
         where = np.argwhere(label == index + 1)
         extent = (where.max(axis=0) - where.min(axis=0) + 1) * step

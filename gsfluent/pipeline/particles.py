@@ -144,6 +144,7 @@ def build_matter(
     done = 0
     for number, body in enumerate(scene.bodies):
         points, volume = _sample_body(body, step, seed)
+        points = points[_cell_order(points, dx / body.frame.scale)]
         count = points.shape[0]
         params, law, alpha = _parameters(body, points)
         noise = torch.rand(
@@ -223,6 +224,19 @@ def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
     return lattice[lattice.norm(dim=1) <= body.radius], volume
 
 
+def _cell_order(points: Tensor, edge: float) -> Tensor:
+    """Order of points [N, 3] by block of 4^3 cells, then by cell: neighbours in memory as in space.
+
+    The transfers run several times faster on points that are stored in this order (docs/mpm.md).
+    """
+    cell = torch.floor((points - points.amin(dim=0)) / edge).to(torch.int64)
+    block, local = cell // 4, cell % 4
+    size = block.amax(dim=0) + 1
+    key = (block[:, 0] * size[1] + block[:, 1]) * size[2] + block[:, 2]
+    key = ((key * 4 + local[:, 0]) * 4 + local[:, 1]) * 4 + local[:, 2]
+    return torch.argsort(key, stable=True)
+
+
 def _placed(body: Body, points: Tensor) -> Tensor:
     """Bring a body's own points to scene metres, before its approach is undone."""
     return body.frame.apply(points) + torch.tensor(body.offset, dtype=torch.float64)
@@ -240,7 +254,8 @@ def _parameters(body: Body, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             if solid is None or value.shape != solid.occupancy.shape:
                 wanted = [] if solid is None else list(solid.occupancy.shape)
                 raise InputError(
-                    f"material {material.name!r}: a field must have the shape of the voxels {wanted}, "
+                    f"material {material.name!r}: a field must have the shape of the voxels "
+                    f"{wanted}, "
                     f"got {list(value.shape)}",
                     mend="sample the field on Solid.occupancy's grid",
                 )

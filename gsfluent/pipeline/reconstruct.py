@@ -66,15 +66,15 @@ class Reconstruct(Stage):
 
     def __init__(
         self,
-        iterations: int = 1200,
+        iterations: int = 800,
         max_gaussians: int = 60_000,
         kernel: str = "anisotropic",
         scale_regularization: float = 1.0,
         image_size: int = 400,
         *,
         sh_degree: int = 0,
-        start_gaussians: int = 8000,
-        gradient_threshold: float = 2e-4,
+        start_gaussians: int = 12_000,
+        gradient_threshold: float = 4e-4,
         checkpoint: str | Path | None = None,
         checkpoint_every: int = 250,
         device: str | torch.device = "cpu",
@@ -115,11 +115,11 @@ class Reconstruct(Stage):
 
         Args:
             capture: Posed photographs, with masks, or with sparse points.
-            progress: Called every 10 steps as ``progress(step, iterations, "NN.N dB, M Gaussians")``.
+            progress: Called every 10 steps as ``progress(step, iterations, note)``.
 
         Returns:
-            The Gaussians in the capture's world frame, and the report: ``images, held_out, psnr, ssim,
-            psnr_region, psnr_inside, gaussians, iterations, seconds, resumed_at, start``.
+            The Gaussians in the capture's world frame, and the report: ``images, held_out, psnr,
+            ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, resumed_at, start``.
 
         Raises:
             InputError: Black photographs, no masks and no points, or masks that contradict poses.
@@ -130,6 +130,7 @@ class Reconstruct(Stage):
         views = read_views(train, self.image_size, self.device, crop=True)
         generator = torch.Generator().manual_seed(self.seed)
         model, hull, start = self._start(train, views, generator)
+        self._eyes = train.centers().to(self.device, torch.float32)
         first = self._resume(model, generator)
         resumed_at = first
         small = [halved(view) for view in views] if min(_short(v) for v in views) >= 64 else views
@@ -206,13 +207,13 @@ class Reconstruct(Stage):
         if view.mask is not None:
             backdrop = torch.rand(3, generator=generator).to(self.device)
             miss = miss - (alpha - view.mask)[..., None] * backdrop
-            loss = loss + 0.5 * (alpha - view.mask).abs().mean()
+            loss = loss + 2.0 * (alpha - view.mask).abs().mean()
         loss = loss + 0.8 * miss.abs().mean() + 0.2 * (1.0 - ssim(image, view.target))
         if self.scale_regularization > 0:
             loss = loss + self.scale_regularization * self._shape_loss(model)
         if not bool(torch.isfinite(loss)):
             raise RunError(
-                f"reconstruct: the loss became {float(loss)} at step {step}",
+                f"reconstruct: the loss became {loss.item()} at step {step}",
                 "" if self.checkpoint is None else f"the last checkpoint, {self.checkpoint}",
                 "check the poses with `gsfluent inspect`, or change the seed",
             )
@@ -249,6 +250,11 @@ class Reconstruct(Stage):
             if hull is not None:
                 keep &= scales.amax(1) < 0.3 * model.extent
                 keep &= hull.contains(model.parameters["means"], slack=4)
+            else:
+                # Matter right before a lens explains one photograph and spoils all others.
+                apart = torch.cdist(model.parameters["means"], self._eyes)
+                keep &= apart.amin(1) > 0.3 * model.extent
+                keep &= scales.amax(1) < model.extent
             keep &= torch.isfinite(model.parameters["means"]).all(1)
             if not bool(keep.any()):
                 raise RunError(

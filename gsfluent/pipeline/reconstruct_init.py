@@ -1,4 +1,4 @@
-"""Where reconstruction starts from: the visual hull of the masks, or the sparse points of the capture."""
+"""Where reconstruction starts: on the visual hull of the masks, or at the sparse points."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def visual_hull(views: list[TrainView], resolution: int = 96) -> Hull:
 
 
 def _reach(views: list[TrainView], middle: Tensor) -> float:
-    """Half side of a cube around ``middle`` that holds the object: the widest mask, seen from afar."""
+    """Half side of a cube around ``middle`` that holds the object: the widest mask decides."""
     reach = []
     for view in views:
         assert view.mask is not None  # callers pass masked views
@@ -309,5 +309,5 @@ def _far_shell(
         seen |= inside.all(1) & (local[:, 2] > 0)
     color = _facing_colors(placed, -direction.to(device), views).cpu()
     kept = seen.cpu()
-    size = torch.full((count,), radius * math.sqrt(4.0 * math.pi / count) * 0.6)
+    size = torch.full((count,), radius * math.sqrt(4.0 * math.pi / count))
     return points[kept], color[kept], size[kept]

@@ -109,7 +109,7 @@ class SplatModel:
     # -- optimisation ----------------------------------------------------------------------------
     @torch.no_grad()
     def step(self, progress: float) -> None:
-        """One Adam step from the gradients, then clear them; ``progress`` in [0, 1] sets the decay."""
+        """One Adam step, then clear the gradients; ``progress`` in [0, 1] sets the decay."""
         self.steps += 1
         correction1 = 1.0 - _BETAS[0] ** self.steps
         correction2 = 1.0 - _BETAS[1] ** self.steps

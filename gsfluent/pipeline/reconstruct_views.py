@@ -14,7 +14,7 @@ from gsfluent.metrics import SsimTarget
 
 _log = logging.getLogger(__name__)
 
-_MARGIN = 12  # pixels kept around a mask; more than half an SSIM window
+_MARGIN = 8  # pixels kept around a mask; more than half an SSIM window
 _SMALLEST = 24  # pixels; a side of a crop is never shorter
 
 
@@ -142,7 +142,7 @@ def _prepare(
 
 
 def halved(view: TrainView) -> TrainView:
-    """The same view at half the size (2 x 2 means of premultiplied colour; an odd last line is cut)."""
+    """The same view at half the size (means of 2 x 2 pixels; an odd last line is cut)."""
     height, width = (side // 2 * 2 for side in view.color.shape[:2])
 
     def half(value: Tensor) -> Tensor:

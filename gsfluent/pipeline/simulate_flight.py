@@ -27,9 +27,10 @@ class Flight:
         particles: The body's points, moving as a rigid body.
         gravity: Acceleration [m/s^2], float64 [3].
         time: Time of the given state [s].
+        dx: Grid spacing [m]; an APIC point turns like a blob with second moment dx^2 / 4.
     """
 
-    def __init__(self, particles: Particles, gravity: Tensor, time: float) -> None:
+    def __init__(self, particles: Particles, gravity: Tensor, time: float, dx: float) -> None:
         position, velocity = (
             part.to("cpu", torch.float64) for part in (particles.position, particles.velocity)
         )
@@ -44,35 +45,43 @@ class Flight:
         squared = (self.arm**2).sum(dim=1, keepdim=True)
         eye = torch.eye(3, dtype=torch.float64)
         self.inertia = (mass * squared).sum() * eye - (mass * self.arm).T @ self.arm
+        self.inertia += 0.5 * dx * dx * total * eye
         gradient = particles.affine[0].to("cpu", torch.float64)
         spin = torch.stack([gradient[2, 1], gradient[0, 2], gradient[1, 0]])
         self.momentum = self.inertia @ spin
         self.spins = bool(spin.abs().max() > 0)
-        self.rotation = eye
-        self.turned = time
+        self._span = _ANGLE_STEP / max(float(spin.norm()), 1e-30)
+        self._whole, self._turned = 0, eye
         self.radius = float(squared.max().sqrt())
         self.low, self.high = self.arm.amin(dim=0), self.arm.amax(dim=0)
 
     @property
     def speed_limit(self) -> float:
         """Upper bound of the angular part of any point's speed [m/s]."""
-        return float(self._omega(self.rotation).norm()) * self.radius if self.spins else 0.0
+        return float(self._omega(self.rotation_at(self.start)).norm()) * self.radius
 
     def _omega(self, rotation: Tensor) -> Tensor:
         return rotation @ torch.linalg.solve(self.inertia, rotation.T @ self.momentum)
 
-    def _turn(self, time: float) -> None:
-        """Bring the orientation to ``time`` with the midpoint rule on the rotation group."""
-        if not self.spins or time <= self.turned:
-            return
-        span = time - self.turned
-        rate = float(self._omega(self.rotation).norm())
-        steps = max(1, math.ceil(rate * span / _ANGLE_STEP))
-        step = span / steps
-        for _ in range(steps):
-            half = _exponential(0.5 * step * self._omega(self.rotation)) @ self.rotation
-            self.rotation = _exponential(step * self._omega(half)) @ self.rotation
-        self.turned = time
+    def rotation_at(self, time: float) -> Tensor:
+        """Return the turn since the start, [3, 3], by the midpoint rule on the rotation group.
+
+        Whole steps are counted from the start, so the result does not depend on which times were
+        asked for before.
+        """
+        if not self.spins:
+            return self._turned
+        whole = max(0, math.floor((time - self.start) / self._span))
+        if whole < self._whole:
+            self._whole, self._turned = 0, torch.eye(3, dtype=torch.float64)
+        for _ in range(whole - self._whole):
+            self._turned = self._advance(self._turned, self._span)
+        self._whole = whole
+        return self._advance(self._turned, (time - self.start) - whole * self._span)
+
+    def _advance(self, rotation: Tensor, step: float) -> Tensor:
+        half = _exponential(0.5 * step * self._omega(rotation)) @ rotation
+        return _exponential(step * self._omega(half)) @ rotation
 
     def center_at(self, time: float) -> tuple[Tensor, Tensor]:
         """Return the centre of mass and its velocity at ``time``, float64 [3] each."""
@@ -90,8 +99,7 @@ class Flight:
         return center + self.low, center + self.high
 
     def particles_at(self, time: float) -> Particles:
-        """Return the body's points at ``time`` (not before the last time asked for)."""
-        self._turn(time)
+        """Return the body's points at ``time``."""
         center, velocity = self.center_at(time)
         like = self.particles
         if not self.spins:
@@ -99,12 +107,13 @@ class Flight:
                 position=(center + self.arm).to(like.position),
                 velocity=velocity.to(like.velocity).expand_as(like.velocity).contiguous(),
             )
-        omega = self._omega(self.rotation)
-        arm = self.arm @ self.rotation.T
+        rotation = self.rotation_at(time)
+        omega = self._omega(rotation)
+        arm = self.arm @ rotation.T
         gradient = _cross_matrix(omega)
         deformation = like.deformation
         if deformation is not None:
-            deformation = (self.rotation.to(deformation) @ deformation).contiguous()
+            deformation = (rotation.to(deformation) @ deformation).contiguous()
         return like.replace(
             position=(center + arm).to(like.position),
             velocity=(velocity + arm @ gradient.T).to(like.velocity),

@@ -216,6 +216,8 @@ def test_build_blocks_errors() -> None:
     x = torch.rand(5, 3)
     with pytest.raises(ValueError, match="margin must be 0, 1 or 2, got 3"):
         ops.build_blocks(x, DX, margin=3)
+    with pytest.raises(ValueError, match="max_blocks must be 1 to"):
+        ops.build_blocks(x, DX, max_blocks=2**26)
     with pytest.raises(ValueError, match="dx must be a positive number, got -1"):
         ops.build_blocks(x, -1.0)
     x[2] = float("nan")

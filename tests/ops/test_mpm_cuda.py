@@ -113,7 +113,7 @@ def test_gradients_match_cpu() -> None:
     for device in ("cpu", "cuda"):
         d, b = on(device, c), blocks_on(device, blocks)
         names = ("velocity", "affine", "mass", "stress", "volume")
-        leaves = [d[k].requires_grad_() for k in names]
+        leaves = [d[k].detach().clone().requires_grad_() for k in names]
         grid, _ = ops.p2g(
             d["position"], *leaves[:3], dx=DX, blocks=b, dt=0.1, stress=leaves[3], volume=leaves[4]
         )

@@ -128,14 +128,25 @@ def test_the_operator_itself_refuses_wrong_shapes() -> None:
         torch.ops.gsfluent.rasterize(*raw)
 
 
-def test_the_adjoint_refuses_state_of_another_call() -> None:
+@pytest.mark.parametrize("change", ["shorter", "rank", "order", "ranges", "splats"])
+def test_the_adjoint_survives_state_of_another_call(change: str) -> None:
     raw = raw_arguments(12, False)
-    first = torch.ops.gsfluent.rasterize(*raw)
-    state = [*first[:4], *first[6:9], first[9][:-1]]
-    scalars = (*raw[13:16], *raw[17:19])
+    out = [t.clone() for t in torch.ops.gsfluent.rasterize(*raw)]
+    splats, order, tile_start, instances = out[6:]
+    if change == "shorter":
+        instances = instances[:-1]
+    elif change == "rank":
+        instances[3] = 10**6
+    elif change == "order":
+        order[0] = 10**6
+    elif change == "ranges":
+        tile_start[2] = 10**6
+    else:
+        splats[:, :2] = splats.flip(0)[:, :2]  # centres of other splats: boxes no longer fit
+    state = [*out[:4], splats, order, tile_start, instances]
     with pytest.raises(RuntimeError, match="saved state does not belong to these inputs"):
         torch.ops.gsfluent.rasterize_backward(
-            torch.ones_like(first[0]), None, None, None, *state, *raw[:13], *scalars
+            torch.ones_like(out[0]), None, None, None, *state, *raw[:13], *raw[13:16], *raw[17:19]
         )
 
 

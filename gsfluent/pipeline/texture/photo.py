@@ -55,9 +55,7 @@ class Exemplar:
         if not mask.any():
             mask = share >= share.max()
         depth = cv2.resize(self.depth * factor, size, interpolation=method).clip(0.0, None)
-        nearest = ndimage.distance_transform_edt(
-            ~mask, return_distances=False, return_indices=True
-        )
+        nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
         image = image[tuple(nearest)].astype(np.float32)
         depth = np.where(mask, depth, 0.0).astype(np.float32)
         return Exemplar(image, mask, depth, self.silhouette, self.note)

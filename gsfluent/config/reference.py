@@ -1,0 +1,76 @@
+"""The tables of docs/shot.md, made from the dataclasses so that page and program cannot differ."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from gsfluent import materials
+from gsfluent.config.events import EVENTS
+from gsfluent.config.objects import Select, Where
+from gsfluent.config.read import key_name, plain
+from gsfluent.config.settings import (
+    FillSettings,
+    KeyLight,
+    LightSettings,
+    OutputSettings,
+    ReconstructSettings,
+    SolveSettings,
+    TextureSettings,
+)
+from gsfluent.config.shot import Shot
+
+SECTIONS: dict[str, type[Any]] = {
+    "(top level)": Shot,
+    "reconstruct": ReconstructSettings,
+    "fill": FillSettings,
+    "texture": TextureSettings,
+    "objects.NAME.select": Select,
+    "objects.NAME.parts[].where": Where,
+    **{f"events[] with type: {name}": cls for name, cls in EVENTS.items()},
+    "solve": SolveSettings,
+    "light": LightSettings,
+    "light.key": KeyLight,
+    "output": OutputSettings,
+}
+
+
+def tables() -> str:
+    """Markdown: one table per section with every key, its meaning, default and an example."""
+    blocks = []
+    for name, cls in SECTIONS.items():
+        rows = [
+            f"| `{key}` | {doc} | {default} | `{example}` |"
+            for key, doc, default, example in _keys(cls)
+        ]
+        head = ["| key | meaning | default | example |", "| --- | --- | --- | --- |"]
+        blocks.append("\n".join([f"### `{name}`", "", *head, *rows]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def parameters() -> str:
+    """Markdown: the material parameters that an object or part may override."""
+    laws = ", ".join(f"`{law}`" for law in materials.LAWS)
+    return f"`law` ({laws}), " + ", ".join(f"`{name}`" for name in materials.PARAMETERS) + ".\n"
+
+
+def _keys(cls: type[Any]) -> Iterator[tuple[str, str, str, str]]:
+    for field in dataclasses.fields(cls):
+        facts = field.metadata
+        yield key_name(field), facts["doc"], _default(field), facts["example"]
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    if field.default is not dataclasses.MISSING:
+        value = field.default
+    elif field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    else:
+        return "required"
+    if value is None or dataclasses.is_dataclass(value) or value in ({}, ()):
+        return "-"
+    shown = plain(value)
+    if isinstance(shown, bool):
+        return "`true`" if shown else "`false`"
+    return f"`{shown}`" if not isinstance(shown, list) else f"`[{', '.join(map(str, shown))}]`"

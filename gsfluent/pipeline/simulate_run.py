@@ -1,0 +1,212 @@
+"""One run of a simulation: its state, frames, records and verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+import time as clock
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.pipeline.fragments import Fragments, find_fragments, rest_links
+from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
+from gsfluent.pipeline.simulate_figures import Figures
+from gsfluent.pipeline.simulate_health import CHECK_EVERY, Ledger, Watch, figures_of
+from gsfluent.pipeline.simulate_state import load_state, save_state
+from gsfluent.pipeline.simulate_step import Counters, State, Stepper, Unhealthy
+from gsfluent.scene import Scene
+
+MOMENTUM_BAR = 1e-4
+"""Relative error of the momentum balance that a run should stay below."""
+Hook = Callable[[State], State]
+
+
+class Run:
+    """Advances a scene from frame to frame.
+
+    Args:
+        scene: The scene.
+        matter: Its material points.
+        fps: Frames per second.
+        options: Arguments of :class:`Stepper`.
+        max_rollbacks: Roll-backs in a row before giving up.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        matter: Matter,
+        fps: float,
+        options: dict[str, Any],
+        max_rollbacks: int,
+    ) -> None:
+        self.scene, self.matter, self.fps = scene, matter, fps
+        self.stepper = Stepper(scene, matter, **options)
+        self.state = self.stepper.initial()
+        self.figures = figures_of(matter, self.state, scene.gravity)
+        self.start = self.figures
+        self.watch = Watch(matter, scene.gravity, self.start, max_rollbacks=max_rollbacks)
+        self.ledger = Ledger(matter, scene.gravity, self.start)
+        self.per_frame: list[dict[str, Any]] = []
+        self.seconds = 0.0
+        self.failure = ""
+        self._links = rest_links(matter.rest, matter.ranges, matter.spacing)
+
+    @property
+    def next_frame(self) -> int:
+        """Number of the first frame that has not been made."""
+        return len(self.per_frame)
+
+    def advance_to(self, frame: int, hook: Hook | None) -> bool:
+        """Advance to the time of a frame; return False when the run had to be given up."""
+        begun = clock.perf_counter()
+        state, stepper, watch = self.state, self.stepper, self.watch
+        until = frame / self.fps
+        # A frame is a clean start: what follows does not depend on what was cached before it, so a
+        # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
+        stepper.reset()
+        watch.keep(state, only=True)
+        checked = state.step
+        while state.time < until:
+            try:
+                state = stepper.advance(state, until)
+                if hook is not None:
+                    state = hook(state)
+                due = state.time >= until or state.step - checked >= CHECK_EVERY
+                reason = watch.check(state, stepper) if due else ""
+                if due:
+                    checked = state.step
+            except Unhealthy as error:
+                reason = str(error)
+            if reason:
+                back = watch.roll_back(reason, state, stepper)
+                if back is None:
+                    self.failure = f"frame {frame}: {watch.reasons[-1]}"
+                    self.seconds += clock.perf_counter() - begun
+                    return False
+                state = back
+                checked = state.step
+        self.state = stepper.whole(state)
+        self.seconds += clock.perf_counter() - begun
+        return True
+
+    def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:
+        """Measure the present state and add it to the per-frame records."""
+        state, matter = self.state, self.matter
+        now = figures_of(matter, state, self.scene.gravity)
+        self.figures = now
+        pieces = find_fragments(
+            self._links,
+            matter.rest,
+            state.particles.position,
+            state.peak >= 0,
+            matter.particles.mass,
+        )
+        stats = {
+            "time": index / self.fps,
+            "kinetic": now.kinetic,
+            "elastic": now.elastic,
+            "dissipated": self.start.total - now.total,
+            "gravity": now.gravity,
+            "momentum": list(now.momentum),
+            "angular_momentum": list(now.angular_momentum),
+            "damaged_fraction": now.damaged_fraction,
+            "fragments": pieces.count,
+            "largest_fragment": pieces.largest,
+            "fragments_over_3_percent": int((pieces.mass_fractions > 0.03).sum()),
+            "alpha_max": now.alpha_max,
+            "non_finite": now.non_finite,
+            "momentum_error": self.ledger.error(state, now),
+        }
+        self.per_frame.append(stats)
+        return now, pieces, stats
+
+    def save(self, path: str | Path) -> None:
+        """Write the state of the last frame."""
+        counters = dataclasses.asdict(self.stepper.counters)
+        counters["return_map"] = torch.as_tensor(counters["return_map"]).tolist()
+        extra = {
+            "counters": counters,
+            "watch": self.watch.state(),
+            "ledger": {"worst": self.ledger.worst, "scale": self.ledger.scale},
+            "dt_scale": self.stepper.dt_scale,
+            "per_frame": self.per_frame,
+            "seconds": self.seconds,
+            "fps": self.fps,
+        }
+        save_state(path, self.state, self.matter, extra)
+
+    def resume(self, path: str | Path) -> None:
+        """Take up a saved run.
+
+        Raises:
+            InputError: The file is missing, damaged, or belongs to other settings.
+        """
+        from gsfluent.errors import InputError
+
+        state, extra = load_state(path, self.matter)
+        if extra["fps"] != self.fps:
+            raise InputError(
+                f"resume: {path} was made at {extra['fps']} frames per second, not {self.fps}",
+                mend="use the same fps, or start without resume",
+            )
+        self.state = state
+        counters = dict(extra["counters"])
+        total = counters.pop("return_map")
+        sums = torch.tensor(total) if isinstance(total, list) else int(total)
+        if isinstance(sums, torch.Tensor):
+            sums = sums.to(state.peak.device)
+        self.stepper.counters = Counters(**counters, return_map=sums)
+        self.stepper.dt_scale = float(extra["dt_scale"])
+        self.watch.restore(extra["watch"])
+        self.ledger.worst = float(extra["ledger"]["worst"])
+        self.ledger.scale = float(extra["ledger"]["scale"])
+        self.per_frame = list(extra["per_frame"])
+        self.seconds = float(extra["seconds"])
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures of run.json's section ``simulation``, with verdict and reason."""
+        c, matter = self.stepper.counters, self.matter
+        plastic, guarded, inverted, _ = _four(c.return_map)
+        verdict = "failed" if self.failure else "healed" if self.watch.rollbacks else "clean"
+        reason = self.failure or "; ".join(self.watch.reasons)
+        keys = self.per_frame[0] if self.per_frame else {}
+        per_frame = {key: [frame[key] for frame in self.per_frame] for key in keys}
+        return {
+            "verdict": verdict,
+            "reason": reason,
+            "frames": len(self.per_frame),
+            "substeps": c.steps,
+            "dt_min": c.dt_min if c.steps else 0.0,
+            "dt_max": c.dt_max,
+            "dx": matter.dx,
+            "particles": matter.particles.count,
+            "particles_per_cell": POINTS_PER_CELL,
+            "active_blocks_max": c.blocks_max,
+            "seconds": self.seconds,
+            "particle_steps_per_second": c.particle_steps / self.seconds if self.seconds else 0.0,
+            "rollbacks": self.watch.rollbacks,
+            "momentum_error": self.ledger.worst,
+            "momentum_bar": MOMENTUM_BAR,
+            "guarded_points": guarded,
+            "inverted_points": inverted,
+            "skipped": {
+                "free_flight_seconds": c.flight_seconds,
+                "free_flight_body_steps": c.flight_body_steps,
+                "contact_steps": c.contact_steps_skipped,
+                "contact_steps_done": c.contact_steps,
+                "block_searches": max(c.steps - c.block_builds, 0),
+                "elastic_only_fraction": 1.0 - plastic / max(c.particle_steps, 1),
+            },
+            "per_frame": per_frame,
+        }
+
+
+def _four(total: torch.Tensor | int) -> tuple[int, int, int, int]:
+    """Read the summed counters of the return map."""
+    if isinstance(total, int):
+        return 0, 0, 0, 0
+    a, b, c, d = (int(v) for v in total.tolist())
+    return a, b, c, d

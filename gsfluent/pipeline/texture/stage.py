@@ -1,0 +1,288 @@
+"""Texture: colours for the inside of a solid."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from gsfluent.errors import InputError
+
+from ..stage import Progress, Stage, report_progress
+from .baselines import color_copy, telea_slices
+from .domain import InteriorDomain, InteriorTexture, blend_skin
+from .exemplar import QUALITIES, exemplar_texture, load_exemplars
+from .metrics import (
+    depth_profile_error,
+    lab_histogram_distance,
+    neighbour_slice_ratio,
+    patch_distance,
+    volume_slices,
+)
+from .photo import Exemplar
+from .procedural import PRESETS, preset_names, procedural_texture
+from .profile import surface_profile
+
+if TYPE_CHECKING:
+    from gsfluent.data import Capture, Solid
+
+    from .inpaint import InpaintOptions
+
+__all__ = ["METHODS", "Texture"]
+
+logger = logging.getLogger(__name__)
+
+METHODS = ("auto", "exemplar", "procedural", "diffusion", "profile", "color_copy", "telea")
+
+
+class Texture(Stage):
+    """Give the inside of a solid its colours.
+
+    The result is a volume: any cut through it is consistent, and material points, transition
+    splats and interior Gaussians all sample the same field.
+
+    Methods:
+        ``exemplar``: guided patch synthesis from photographs of a cut object (the default when an
+        exemplar is given); ``procedural``: a preset; ``diffusion``: slices inpainted by a diffusers
+        pipeline; ``profile``: surface colour fading to its mean (the default with nothing given,
+        with a warning); ``color_copy`` and ``telea``: baselines for comparison.
+
+    Args:
+        method: One of the above, or ``auto``.
+        exemplar: Photograph of the inside (path or array), or one per axis ``{x: ..., z: ...}``.
+        preset: Name of a procedural preset.
+        prompt: Text for the diffusion model.
+        model: Local folder or hub id of an inpainting pipeline.
+        quality: ``preview``, ``fast`` or ``full`` (exemplar method).
+        scale: Size of the exemplar's structure relative to the automatic choice.
+        guide: ``auto``, ``depth`` or ``none`` (exemplar method).
+        directional: True for grained materials: the exemplar is not turned or mirrored.
+        inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
+        axis: The object's own axis in world coordinates; None takes scene "up", else +z.
+        inpaint: Settings of the diffusion method.
+        resume: Folder in which the diffusion method keeps finished slices.
+        seed: Seed of everything random.
+
+    Raises:
+        InputError: Unknown method or quality, or a method without what it needs.
+    """
+
+    name = "texture"
+
+    def __init__(
+        self,
+        method: str = "auto",
+        *,
+        exemplar: object = None,
+        preset: str | None = None,
+        prompt: str = "",
+        model: str | Path | None = None,
+        quality: str = "fast",
+        scale: float = 1.0,
+        guide: str = "auto",
+        directional: bool = False,
+        inclusions: bool = True,
+        axis: tuple[float, float, float] | None = None,
+        inpaint: InpaintOptions | None = None,
+        resume: str | Path | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(seed=seed)
+        if method not in METHODS:
+            raise InputError(
+                f"texture: method must be one of {', '.join(METHODS)}, got {method!r}",
+                mend="leave it at auto",
+            )
+        if quality not in QUALITIES:
+            raise InputError(
+                f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
+                mend="leave it at fast",
+            )
+        if method == "auto":
+            method = "exemplar" if exemplar is not None else "procedural" if preset else "profile"
+            if method == "profile":
+                logger.warning(
+                    "texture: neither exemplar nor preset given; the inside gets the mean surface "
+                    "colour. Give a photograph of a cut object (exemplar) or a preset (%s)",
+                    ", ".join(preset_names()),
+                )
+        if method == "exemplar" and exemplar is None:
+            raise InputError(
+                "texture: method 'exemplar' needs an exemplar photograph",
+                mend="add exemplar: cut.jpg, or use method: procedural with a preset",
+            )
+        if method == "procedural":
+            preset = preset or prompt
+            if preset not in PRESETS:
+                raise InputError(
+                    f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
+                    mend="choose one of these or give an exemplar photograph",
+                )
+        if method == "diffusion" and model is None:
+            raise InputError(
+                "texture: method 'diffusion' needs a model",
+                mend="give a local folder or hub id, for example "
+                "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
+            )
+        self.method = method
+        self.exemplar = exemplar
+        self.preset = preset
+        self.prompt = prompt
+        self.model = model
+        self.quality = quality
+        self.scale = float(scale)
+        self.guide = guide
+        self.directional = directional
+        self.inclusions = inclusions
+        self.axis = None if axis is None else np.asarray(axis, dtype=float)
+        self.inpaint = inpaint
+        self.resume = None if resume is None else Path(resume)
+
+    def forward(
+        self,
+        solid: Solid,
+        capture: Capture | None = None,
+        progress: Progress | None = None,
+    ) -> Solid:
+        """Texture a solid.
+
+        Args:
+            solid: A filled solid.
+            capture: Not used by the present methods; the surface colours come from the splats.
+            progress: Optional callback ``(done, total, note)``.
+
+        Returns:
+            The solid with ``color``, ``regions`` (inclusions, numbered from 1, where found) and
+            coloured interior Gaussians; surface Gaussians are untouched. ``report["texture"]``
+            holds method, slices, patch_distance, axis_consistency and more.
+
+        Raises:
+            InputError: The exemplar, preset or model cannot be used.
+        """
+        began = time.perf_counter()
+        exemplars = load_exemplars(self.exemplar) if self.exemplar is not None else None
+        domain = InteriorDomain.from_solid(solid, self.axis)
+        if not domain.inside.any():
+            raise InputError("texture: the solid is empty", mend="run fill first")
+        texture = self._make(domain, exemplars, progress)
+        rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
+        colored = _color_interior(solid, replace(texture, rgb=rgb), domain)
+        report = self._report(domain, texture, exemplars)
+        report["seconds"] = time.perf_counter() - began
+        device = solid.occupancy.device
+        regions = solid.regions
+        if texture.labels.any():
+            regions = torch.from_numpy(texture.labels).to(device)
+        report_progress(progress, 1, 1, "textured")
+        return replace(
+            solid,
+            gaussians=colored,
+            color=torch.from_numpy(rgb).to(device, solid.depth.dtype),
+            regions=regions,
+            report={**solid.report, "texture": report},
+        )
+
+    def _make(
+        self,
+        domain: InteriorDomain,
+        exemplars: dict[int, Exemplar] | None,
+        progress: Progress | None,
+    ) -> InteriorTexture:
+        """Run the chosen method."""
+        if self.method == "exemplar" and exemplars is not None:
+            return exemplar_texture(
+                domain,
+                exemplars,
+                quality=self.quality,
+                scale=self.scale,
+                guide=self.guide,
+                directional=self.directional,
+                inclusions=self.inclusions,
+                seed=self.seed,
+                progress=progress,
+            )
+        if self.method == "procedural" and self.preset is not None:
+            return procedural_texture(domain, self.preset, self.seed)
+        if self.method == "color_copy":
+            return color_copy(domain)
+        if self.method == "telea":
+            return telea_slices(domain)
+        if self.method == "diffusion" and self.model is not None:
+            from .inpaint import InpaintOptions, diffusion_texture
+
+            return diffusion_texture(
+                domain,
+                self.model,
+                prompt=self.prompt,
+                options=self.inpaint or InpaintOptions(),
+                exemplar=None if exemplars is None else exemplars[0],
+                resume=self.resume,
+                seed=self.seed,
+                progress=progress,
+            )
+        labels = np.zeros(domain.inside.shape, np.int32)
+        return InteriorTexture(surface_profile(domain), labels, {})
+
+    def _report(
+        self,
+        domain: InteriorDomain,
+        texture: InteriorTexture,
+        exemplars: dict[int, Exemplar] | None,
+    ) -> dict[str, Any]:
+        """Figures for ``run.json``; distances are to the exemplar and null without one."""
+        ratios = neighbour_slice_ratio(texture.rgb, domain.inside)
+        report: dict[str, Any] = {
+            "method": self.method,
+            "slices": 0,
+            "patch_distance": None,
+            # change across an axis over the change across the others: 1 is like a real solid
+            "axis_consistency": max(ratios),
+            "neighbour_slice_ratio": ratios,
+            **texture.report,
+        }
+        if exemplars is not None:
+            photo = exemplars[0]
+            if photo.silhouette:
+                factor = domain.max_depth / max(photo.max_depth, 1.0)
+            else:
+                factor = max(domain.inside.shape) / max(photo.mask.shape)
+            fitted = photo.resized(self.scale * factor)
+            slices = volume_slices(texture.rgb, domain.inside)
+            report["patch_distance"] = patch_distance(slices, [(fitted.image, fitted.mask)])
+            interior = texture.rgb[domain.inside]
+            report["color_distance"] = lab_histogram_distance(interior, photo.image[photo.mask])
+            if photo.silhouette:
+                report["depth_profile_error"] = depth_profile_error(domain, texture.rgb, photo)
+            skin = lab_histogram_distance(domain.skin[domain.shell], photo.image[photo.mask])
+            report["surface_like_interior"] = skin < 3.0
+            if skin < 3.0:
+                logger.info(
+                    "texture: the surface looks like the exemplar already (Lab distance %.1f); "
+                    "color_copy would do as well",
+                    skin,
+                )
+        return report
+
+
+def _color_interior(solid: Solid, texture: InteriorTexture, domain: InteriorDomain) -> Any:
+    """Gaussians whose INTERIOR rows wear the volume's colour; all other rows are the same."""
+    from gsfluent.data import INTERIOR
+    from gsfluent.geometry import rgb_to_sh0
+
+    gaussians = solid.gaussians
+    if gaussians.labels is None:
+        return gaussians
+    chosen = gaussians.labels == INTERIOR
+    if not bool(chosen.any()):
+        return gaussians
+    means = gaussians.means[chosen].detach().double().cpu().numpy()
+    color = texture.sample((means - domain.origin) / domain.voxel, domain.inside)
+    sh = gaussians.sh.clone()
+    sh[chosen] = 0.0
+    sh[chosen, 0] = rgb_to_sh0(torch.from_numpy(color).to(sh))
+    return gaussians.replace(sh=sh)
