@@ -22,10 +22,8 @@ from .fill_inside import (
 )
 from .fill_interior import (
     _INTERIOR_OPACITY,
-    SamplePoints,
     interior_gaussians,
     refine_opacity,
-    sample_points,
 )
 from .fill_view import cut_view, surface_colors
 from .stage import Progress, Stage, report_progress
@@ -33,7 +31,7 @@ from .stage import Progress, Stage, report_progress
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Gaussians, Solid
 
-__all__ = ["Fill", "SamplePoints", "cut_view", "sample_points"]
+__all__ = ["Fill", "cut_view"]
 
 logger = logging.getLogger(__name__)
 
@@ -219,13 +217,13 @@ class Fill(Stage):
         )
         return Solid(
             gaussians=merged,
-            occupancy=torch.from_numpy(solid),
-            depth=torch.from_numpy(depth),
-            origin=torch.tensor(box.origin, dtype=torch.float32),
+            occupancy=torch.from_numpy(solid).to(merged.device),
+            depth=torch.from_numpy(depth).to(merged.device),
+            origin=torch.tensor(box.origin, dtype=torch.float32, device=merged.device),
             voxel=box.voxel,
             color=None,
             regions=None,
-            report={"fill": report},
+            report=report,
         )
 
     def _decide(

@@ -3,46 +3,27 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.errors import InputError
-
 from .stage import Progress, report_progress
 
 if TYPE_CHECKING:
-    from gsfluent.data import Capture, Gaussians, Solid
+    from gsfluent.data import Capture, Gaussians
 
 __all__ = [
-    "SamplePoints",
     "interior_gaussians",
     "jittered_lattice",
     "refine_opacity",
-    "sample_points",
 ]
 
 logger = logging.getLogger(__name__)
 
 _SIGMA_PER_SPACING = 0.55  # neighbours overlap at 0.91 sigma: no gaps when the solid is cut open
 _INTERIOR_OPACITY = 0.95
-
-
-class SamplePoints(NamedTuple):
-    """Points inside a solid, in the solid's own (world) coordinates.
-
-    Attributes:
-        position: [M, 3] world units.
-        depth: [M] distance below the surface, world units.
-        voxel: int64 [M, 3] voxel that holds the point; ``solid.color[tuple(voxel.T)]`` is its
-            colour.
-    """
-
-    position: Tensor
-    depth: Tensor
-    voxel: Tensor
 
 
 def jittered_lattice(
@@ -81,39 +62,6 @@ def jittered_lattice(
         valid[valid] = inside[tuple(voxel[valid].T)]
         found.append(point[valid])
     return np.concatenate(found)
-
-
-def sample_points(solid: Solid, spacing: float, seed: int = 0) -> SamplePoints:
-    """Stratified points that fill a solid, for material points.
-
-    Args:
-        solid: The solid.
-        spacing: Mean distance between points, world units; each point stands for ``spacing**3``.
-        seed: Seed of the jitter.
-
-    Returns:
-        Points on the device of the solid's Gaussians.
-
-    Raises:
-        ValueError: The spacing is not positive.
-        InputError: The spacing is so large that no point falls inside.
-    """
-    if not (spacing > 0 and np.isfinite(spacing)):
-        raise ValueError(f"sample_points: spacing must be positive and finite, got {spacing}")
-    inside = solid.occupancy.cpu().numpy()
-    point = jittered_lattice(inside, spacing / solid.voxel, seed=seed)
-    if point.shape[0] == 0:
-        raise InputError(
-            f"sample_points: no point of spacing {spacing:g} falls inside the solid "
-            f"(volume {inside.sum() * solid.voxel**3:g})",
-            mend="use a smaller spacing",
-        )
-    device = solid.gaussians.means.device
-    index = torch.from_numpy(np.floor(point).astype(np.int64))
-    depth = solid.depth.cpu()[tuple(index.T)]
-    origin = np.asarray([float(v) for v in solid.origin])
-    position = torch.from_numpy(origin + point * solid.voxel).to(solid.gaussians.dtype)
-    return SamplePoints(position.to(device), depth.to(device), index.to(device))
 
 
 def interior_gaussians(

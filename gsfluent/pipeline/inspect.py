@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from gsfluent.data import Capture, Frame
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture, load_splats, save_image
+from gsfluent.pipeline.inspect_hull import hull_points, inside_masks, masked_views
 from gsfluent.pipeline.inspect_picture import Picture, draw
 from gsfluent.pipeline.inspect_shape import cluster, lone_points, robust_box, thin_parts
 from gsfluent.pipeline.orient import (
     DEFAULT_SIZE,
     Orientation,
+    look_at_point,
     near_points,
     orient,
     upright_rotation,
@@ -117,13 +119,26 @@ def _inspect_capture(path: Path, out: str | Path | None, size: float | None) -> 
         "points": len(capture.points),
     }
     if len(capture.points) < 20:
-        raise InputError(
-            f"{path}: {len(capture.points)} sparse points are too few to look at",
-            "reconstruct first, then inspect the .ply; or add points3D / ply_file_path",
+        points, colors = hull_points(capture, look_at_point(capture.cameras))
+        if len(points) < 20:
+            raise InputError(
+                f"{path}: neither sparse points nor masks say where the object is",
+                "reconstruct first, then inspect the .ply; or add points3D, ply_file_path or masks",
+            )
+        facts["points_from"] = "masks"
+        stance = orient(
+            None,
+            capture.replace(
+                points=torch.from_numpy(points), point_colors=torch.zeros(len(points), 3)
+            ),
         )
-    stance = orient(None, capture)
-    points, colors = _object_of(capture, stance)
-    found = _Found(points, colors, np.zeros(len(points)), lone_points(points), [])
+    else:
+        facts["points_from"] = "sparse model"
+        stance = orient(None, capture)
+        points, colors = _object_of(capture, stance)
+    # Sparse points are dots; hull voxels are as large as their spacing, so that the surface closes.
+    radius = float(np.ptp(points, axis=0).max()) / 60 if facts["points_from"] == "masks" else 0.0
+    found = _Found(points, colors, np.full(len(points), radius), lone_points(points), [])
     return _finish(facts, found, stance, None, capture, size, out)
 
 
@@ -146,6 +161,8 @@ def _object_of(capture: Capture, stance: Orientation) -> tuple[Array, Array]:
         )
         seen += (inside & (depth > 0)).numpy()
     keep &= seen >= 0.6 * len(capture)
+    if capture.has_masks:
+        keep &= inside_masks(masked_views(capture), capture.points) >= 0.6
     index = np.flatnonzero(keep)
     index = index[~lone_points(points[index])]
     if len(index) < 20:
@@ -187,7 +204,7 @@ def _finish(
         for corner in (low @ rotation, high @ rotation)
     )
     report = dict(facts)
-    report["up"] = {"axis": stance.up.round(4).tolist(), "from": stance.up_from}
+    report["up"] = {"axis": (stance.up.round(4) + 0.0).tolist(), "from": stance.up_from}
     report["floor"] = {"height": 0.0, "world": float(ground), "from": stance.floor_from}
     report["scale"] = {
         "metres_per_unit": scale,
@@ -207,7 +224,7 @@ def _finish(
     report["shot"] = {
         "capture" if capture is not None else "splats": facts["input"],
         "size": size or DEFAULT_SIZE,
-        "up": stance.up.round(4).tolist(),
+        "up": (stance.up.round(4) + 0.0).tolist(),
     }
     if out is not None:
         placed = frame.apply(torch.from_numpy(found.points)).numpy()
@@ -269,7 +286,7 @@ def _warnings(report: dict[str, Any], capture: Capture | None, size: float | Non
         found.append(
             f"{100 * thin['share']:.0f} % of it is thinner than {1000 * thin['limit']:.0f} mm"
         )
-    if capture is not None and report["masks"] == 0:
+    if capture is not None and report["masks"] == 0 and report["points_from"] != "masks":
         found.append("no masks: the background is removed by geometry")
     return found
 
@@ -279,7 +296,7 @@ def _lines(report: dict[str, Any]) -> list[str]:
     axis = ", ".join(f"{part:+.2f}" for part in report["up"]["axis"])
     wide, deep, tall = (100 * part for part in report["box"]["size"])
     what = (
-        f"{report['images']} photographs, {report['points']} sparse points"
+        f"{report['images']} photographs, points from the {report['points_from']}"
         if report["kind"] == "capture"
         else f"{report['gaussians']} Gaussians, SH degree {report['sh_degree']}"
     )

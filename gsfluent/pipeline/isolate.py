@@ -143,9 +143,11 @@ class Isolate(Stage):
             )
         report_progress(progress, 1, 1, f"{int(keep.sum())} Gaussians are object")
         self.report |= {"object": int(keep.sum()), "background": int((~keep).sum())}
-        return _labelled(gaussians.select(keep), SURFACE), _labelled(
-            gaussians.select(~keep), BACKGROUND
-        )
+        rest = _labelled(gaussians.select(~keep), BACKGROUND)
+        found = gaussians.select(keep)
+        if method in ("all", "labels") and found.labels is not None:
+            return found, rest  # they say more than this stage knows
+        return _labelled(found, SURFACE), rest
 
     def _method(self, gaussians: Gaussians, capture: Capture | None) -> str:
         if self.method != "auto":

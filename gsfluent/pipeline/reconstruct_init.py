@@ -73,7 +73,7 @@ def focus_point(viewmats: Tensor) -> Tensor:
     return torch.linalg.solve(project.mean(0) + pull, right)[:, 0]
 
 
-def visual_hull(views: list[TrainView], resolution: int = 96) -> Hull:
+def visual_hull(views: list[TrainView], resolution: int = 96, forgiven: float = 0.0) -> Hull:
     """Carve the space that every mask leaves, coarse to fine (Laurentini 1994).
 
     A voxel stays when its projection touches the mask in every view that sees it; at the coarse
@@ -82,6 +82,7 @@ def visual_hull(views: list[TrainView], resolution: int = 96) -> Hull:
     Args:
         views: Masked views.
         resolution: Voxels along the longest side of the object.
+        forgiven: Share of the views that may disagree, for masks that are not exact.
 
     Raises:
         InputError: Nothing is left, so masks and poses contradict each other.
@@ -89,7 +90,8 @@ def visual_hull(views: list[TrainView], resolution: int = 96) -> Hull:
     viewmats = torch.stack([view.viewmat for view in views])
     middle = focus_point(viewmats).float()
     half = _reach(views, middle)
-    hull = _carve(views, middle - half, 2.0 * half / _COARSE, (_COARSE,) * 3)
+    allowed = int(forgiven * len(views))
+    hull = _carve(views, middle - half, 2.0 * half / _COARSE, (_COARSE,) * 3, allowed)
     if not bool(hull.occupancy.any()):
         raise InputError(
             "reconstruct: the masks of the views have no common object",
@@ -98,7 +100,7 @@ def visual_hull(views: list[TrainView], resolution: int = 96) -> Hull:
     lower, upper = hull.bounds()
     voxel = float((upper - lower).max()) / resolution
     shape = [int(n) + 2 for n in ((upper - lower) / voxel).ceil()]
-    fine = _carve(views, lower - voxel, voxel, (shape[0], shape[1], shape[2]))
+    fine = _carve(views, lower - voxel, voxel, (shape[0], shape[1], shape[2]), allowed)
     return fine if bool(fine.occupancy.any()) else hull
 
 
@@ -123,13 +125,15 @@ def _reach(views: list[TrainView], middle: Tensor) -> float:
 
 
 def _carve(
-    views: list[TrainView], lower: Tensor, voxel: float, shape: tuple[int, int, int]
+    views: list[TrainView], lower: Tensor, voxel: float, shape: tuple[int, int, int], allowed: int
 ) -> Hull:
+    """Voxels that at most ``allowed`` masks contradict."""
     device = views[0].color.device
     axes = [torch.arange(n, device=device, dtype=torch.float32) + 0.5 for n in shape]
     grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     points = lower.to(device) + grid * voxel
     alive = torch.arange(len(points), device=device)
+    misses = torch.zeros(len(points), dtype=torch.int32, device=device)
     for view in views:
         assert view.mask is not None
         local = points[alive] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
@@ -145,7 +149,8 @@ def _carve(
         keep = grown[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5
         # Off the crop means off the mask, unless the mask touches the edge of the photograph.
         keep = torch.where(on, keep, torch.full_like(keep, _touches_edge(view.mask)) | (depth <= 0))
-        alive = alive[keep]
+        misses[alive] += (~keep).int()
+        alive = alive[misses[alive] <= allowed]
     occupancy = torch.zeros(len(points), dtype=torch.bool, device=device)
     occupancy[alive] = True
     return Hull(occupancy.view(shape), lower.to(device), voxel)

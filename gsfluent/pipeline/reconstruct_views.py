@@ -23,7 +23,7 @@ class TrainView:
     """One photograph, or the part of it that shows the object.
 
     Attributes:
-        color: Colour times mask (times validity), float32 [H, W, 3].
+        color: Colour times validity (times the mask once cropped), float32 [H, W, 3].
         mask: Coverage of the object in [0, 1], [H, W]; None without masks.
         valid: 1 where the photograph covers the pixel, [H, W]; None when everywhere.
         viewmat: World to camera [4, 4], float32.
@@ -84,23 +84,34 @@ def read_views(
         )
     prepared = []
     for view in views:
-        box = (0, 0, view.camera.width, view.camera.height)
-        if crop and view.mask is not None:
-            found = _mask_box(view.mask)
-            if found is None:
+        ready = _prepare(view.image, view.mask, view.valid, view.camera, device)
+        if crop and ready.mask is not None:
+            if float(ready.mask.max()) <= 0.02:
                 _log.info("skipping %s: its mask is empty", view.camera.name)
                 continue
-            box = found
-        prepared.append(_prepare(view.image, view.mask, view.valid, view.camera, box, device))
+            ready = cropped(ready)
+        prepared.append(ready)
     return prepared
 
 
-def _mask_box(mask: Tensor) -> tuple[int, int, int, int] | None:
-    """Box (left, top, right, bottom) around the mask with a margin, None when it is empty."""
+def cropped(view: TrainView) -> TrainView:
+    """The surroundings of the mask (there must be one, not empty), colours multiplied by it."""
+    assert view.mask is not None
+    left, top, right, bottom = _mask_box(view.mask)
+    rows, columns = slice(top, bottom), slice(left, right)
+    mask = view.mask[rows, columns].contiguous()
+    color = (view.color[rows, columns] * mask[..., None]).contiguous()
+    valid = None if view.valid is None else view.valid[rows, columns].contiguous()
+    K = view.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    return TrainView(color, mask, valid, view.viewmat, K, SsimTarget.of(color), view.full_width)
+
+
+def _mask_box(mask: Tensor) -> tuple[int, int, int, int]:
+    """Box (left, top, right, bottom) around the mask with a margin."""
     rows = (mask > 0.02).any(1).nonzero()[:, 0]
     columns = (mask > 0.02).any(0).nonzero()[:, 0]
-    if len(rows) == 0:
-        return None
     box = []
     for line, size in ((columns, mask.shape[1]), (rows, mask.shape[0])):
         low, high = int(line[0]) - _MARGIN, int(line[-1]) + 1 + _MARGIN
@@ -111,32 +122,21 @@ def _mask_box(mask: Tensor) -> tuple[int, int, int, int] | None:
 
 
 def _prepare(
-    image: Tensor,
-    mask: Tensor | None,
-    valid: Tensor | None,
-    camera: Camera,
-    box: tuple[int, int, int, int],
-    device: torch.device,
+    image: Tensor, mask: Tensor | None, valid: Tensor | None, camera: Camera, device: torch.device
 ) -> TrainView:
-    left, top, right, bottom = box
-    color = image[top:bottom, left:right]
-    cut_mask = None if mask is None else mask[top:bottom, left:right].contiguous().to(device)
-    cut_valid = None if valid is None else valid[top:bottom, left:right].float().to(device)
-    color = color.to(device)
-    if cut_mask is not None:
-        color = color * cut_mask[..., None]
-    if cut_valid is not None:
-        color = color * cut_valid[..., None]
-    K = camera.K.clone()
-    K[0, 2] -= left
-    K[1, 2] -= top
+    color = image.to(device)
+    soft = None if mask is None else mask.to(device)
+    share = None if valid is None else valid.float().to(device)
+    if share is not None:
+        color = color * share[..., None]
+        soft = None if soft is None else soft * share
     return TrainView(
         color.contiguous(),
-        cut_mask,
-        cut_valid,
+        soft,
+        share,
         camera.viewmat.to(device, torch.float32),
-        K.to(device, torch.float32),
-        SsimTarget.of(color),
+        camera.K.to(device, torch.float32),
+        SsimTarget.of(color if soft is None else color * soft[..., None]),
         camera.width,
     )
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsfluent.config import Bullet, Drop, Shot, Throw, event_dict, load_shot
@@ -331,6 +331,7 @@ values = st.recursive(
 )
 
 
+@settings(derandomize=True, deadline=None)
 @given(st.sampled_from([field.name for field in dataclasses.fields(Shot)]), values)
 def test_any_value_reads_or_is_an_input_error(key: str, value: Any) -> None:
     given_keys = {"splats": ".", key: value}

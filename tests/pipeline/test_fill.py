@@ -12,9 +12,10 @@ from interior_shapes import RADII, ellipsoid_shell, ellipsoid_truth, iou
 
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
-from gsfluent.pipeline.fill import Fill, cut_view, sample_points
+from gsfluent.pipeline.fill import Fill, cut_view
 from gsfluent.pipeline.fill_density import GridBox, density_field
 from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, count_leaks
+from gsfluent.pipeline.fill_interior import jittered_lattice
 
 
 def _bottom_missing(points: torch.Tensor) -> torch.Tensor:
@@ -53,7 +54,7 @@ def _matrices(gaussians: Gaussians) -> torch.Tensor:
 
 def test_closed_shell_is_filled(solid: Solid) -> None:
     assert iou(solid.occupancy.numpy(), ellipsoid_truth(solid)) > 0.97
-    report = solid.report["fill"]
+    report = solid.report
     assert report["volume"] == pytest.approx(4 / 3 * np.pi * np.prod(RADII), rel=0.03)
     assert report["leaks"] == 0
     assert report["closed_side"] is None
@@ -74,7 +75,7 @@ def test_missing_underside_is_closed_and_reported() -> None:
     z = float(filled.origin[2]) + (np.arange(truth.shape[2]) + 0.5) * filled.voxel
     truth &= (z > -0.5)[None, None]
     assert iou(filled.occupancy.numpy(), truth) > 0.94
-    report = filled.report["fill"]
+    report = filled.report
     assert report["closed_side"] == [0.0, 0.0, -1.0]
     assert report["leaks"] == 1
     assert report["leaking_voxels"] > 1000
@@ -128,7 +129,7 @@ def test_degenerate_splats_and_floaters_change_little(solid: Solid) -> None:
     dirty = clean.replace(quats=clean.quats * torch.linspace(0.2, 3.0, clean.count)[:, None])
     filled = Fill(40)(Gaussians.cat([dirty, junk]))
     assert iou(filled.occupancy.numpy(), ellipsoid_truth(filled)) > 0.95
-    assert filled.report["fill"]["stray_gaussians"] == 2
+    assert filled.report["stray_gaussians"] == 2
 
 
 def test_crevice_stays_open() -> None:
@@ -158,7 +159,7 @@ def test_thin_sheet_survives_trimming() -> None:
 def test_interior_gaussians_fill_without_spilling(solid: Solid) -> None:
     inner = solid.gaussians.select(solid.gaussians.labels == INTERIOR)
     outer = solid.gaussians.select(solid.gaussians.labels == SURFACE)
-    assert inner.count == solid.report["fill"]["interior_gaussians"] > 3000
+    assert inner.count == solid.report["interior_gaussians"] > 3000
     assert outer.count == 2500
     assert torch.equal(outer.means, ellipsoid_shell().means)
     reach = ((inner.means / torch.tensor(RADII)) ** 2).sum(1).sqrt().max()
@@ -173,22 +174,22 @@ def test_hollow_wall() -> None:
     radius = filled.voxel_centers().norm(dim=1)
     assert float(radius.min()) > 0.8
     expected = 1 - (1 - 0.85**3)
-    assert filled.report["fill"]["hollow_fraction"] == pytest.approx(expected, abs=0.06)
+    assert filled.report["hollow_fraction"] == pytest.approx(expected, abs=0.06)
     solid_again = Fill(48)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
-    assert solid_again.report["fill"]["hollow_fraction"] == 0.0
+    assert solid_again.report["hollow_fraction"] == 0.0
 
 
-def test_sample_points_are_stratified(solid: Solid) -> None:
-    spacing = 0.06
-    points = sample_points(solid, spacing, seed=3)
-    assert len(points.position) == pytest.approx(solid.volume / spacing**3, rel=0.02)
-    assert bool(solid.contains(points.position).all())
-    index, inside = solid.voxel_index(points.position)
-    assert bool(inside.all()) and torch.equal(index, points.voxel)
-    assert torch.equal(points.depth, solid.depth[tuple(index.T)])
-    again = sample_points(solid, spacing, seed=3)
-    assert torch.equal(points.position, again.position)
-    assert not torch.equal(points.position, sample_points(solid, spacing, seed=4).position)
+def test_lattice_is_stratified() -> None:
+    inside = np.ones((12, 10, 8), bool)
+    points = jittered_lattice(inside, 2.0, seed=3)
+    # one point per cube of two voxels, in its own cube
+    assert len(points) == 6 * 5 * 4
+    assert len(np.unique(np.floor(points / 2.0), axis=0)) == len(points)
+    assert np.array_equal(points, jittered_lattice(inside, 2.0, seed=3))
+    assert not np.array_equal(points, jittered_lattice(inside, 2.0, seed=4))
+    centered = jittered_lattice(inside, 2.0, seed=3, jitter=0.0)
+    assert np.allclose(centered % 2.0, 1.0)
+    assert len(jittered_lattice(np.zeros((4, 4, 4), bool), 2.0, seed=0)) == 0
 
 
 def test_same_seed_same_solid() -> None:
@@ -246,7 +247,7 @@ def test_masks_remove_what_is_not_the_object(tmp_path: Path) -> None:
     both = Gaussians.cat([ellipsoid_shell(), stray])
     hull = Fill(40, refine_iterations=0)(both, capture)
     vote = Fill(40, method="vote")(both)
-    assert hull.report["fill"]["method"] == "hull and vote"
+    assert hull.report["method"] == "hull and vote"
     assert iou(hull.occupancy.numpy(), ellipsoid_truth(hull)) > 0.93
     assert iou(vote.occupancy.numpy(), ellipsoid_truth(vote)) < iou(
         hull.occupancy.numpy(), ellipsoid_truth(hull)
@@ -287,7 +288,7 @@ def test_errors() -> None:
         Fill(24)(shell.replace(opacities=shell.opacities * 1e-3))
     filled = Fill(24)(shell)
     with pytest.raises(ValueError, match="spacing"):
-        sample_points(filled, 0.0)
+        jittered_lattice(np.ones((4, 4, 4), bool), 0.0, seed=0)
     with pytest.raises(ValueError, match="axis"):
         cut_view(filled, "w")
 
@@ -299,7 +300,7 @@ def test_real_plush_dog(data_root: Path) -> None:
     path = data_root / "splats" / "plush_dog" / "point_cloud_29999_clean.ply"
     dog = load(path)
     filled = Fill(64)(dog)
-    report = filled.report["fill"]
+    report = filled.report
     assert report["interior_gaussians"] > 2000
     box = torch.tensor([float(v) for v in filled.occupancy.shape]).prod() * filled.voxel**3
     assert 0.05 < report["volume"] / float(box) < 0.8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from gsfluent import geometry
 from gsfluent.config import Select, Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import load_capture, load_image, load_splats
+from gsfluent.io import load_capture, load_image, load_splats, save_image
 from gsfluent.pipeline.inspect import inspect
 from gsfluent.pipeline.inspect_shape import cluster, lone_points, robust_box, thin_parts
 from gsfluent.pipeline.orient import camera_up, look_at_point, make_frame, orient, support_plane
@@ -213,6 +214,48 @@ def test_inspect_splats_reports_and_draws(tmp_path: Path) -> None:
     assert picture.shape[1] == 880 and float(picture.std()) > 0.05
     magenta = torch.tensor([230.0, 0.0, 160.0]) / 255
     assert int(((picture - magenta).abs().amax(dim=2) < 0.02).sum()) > 20
+
+
+def masked_capture(folder: Path) -> None:
+    """Photographs of a red ball of radius 0.5 round (0, 0, 0.5), with alpha, no sparse points."""
+    cameras = []
+    (folder / "images").mkdir(parents=True)
+    y, x = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    for index, angle in enumerate(np.linspace(0, 2 * math.pi, 10, endpoint=False)):
+        eye = (3 * math.cos(angle), 3 * math.sin(angle), 0.5 + 1.5 * (index % 2))
+        camera = Camera.look_at(eye, (0, 0, 0.5), width=64, height=64, name=f"{index}.png")
+        # A ray meets the ball when its angle to the axis is below asin(radius / distance).
+        focal = float(camera.K[0, 0])
+        tangent = torch.hypot(x - 32, y - 32) / focal
+        distance = float((camera.center() - torch.tensor([0, 0, 0.5]).double()).norm())
+        hit = (torch.atan(tangent) < math.asin(0.5 / distance)).float()
+        save_image(
+            torch.stack([hit, 0 * hit, 0 * hit, hit], dim=-1), folder / "images" / camera.name
+        )
+        matrix = torch.linalg.inv(camera.viewmat)
+        matrix[:3, 1:3] *= -1
+        cameras.append({"file_path": f"images/{camera.name}", "transform_matrix": matrix.tolist()})
+    data = {"w": 64, "h": 64, "fl_x": focal, "frames": cameras}
+    (folder / "transforms.json").write_text(json.dumps(data))
+
+
+def test_masks_tell_the_object_where_there_are_no_points(tmp_path: Path) -> None:
+    masked_capture(tmp_path / "capture")
+    report = inspect(tmp_path / "capture", tmp_path / "a.png")
+    assert report["points"] == 0 and report["points_from"] == "masks"
+    assert report["world_extent"] == pytest.approx(1.0, abs=0.1)
+    assert report["up"]["axis"] == pytest.approx([0, 0, 1], abs=1e-3)
+    assert report["floor"]["world"] == pytest.approx(0.0, abs=0.06)
+    picture = load_image(tmp_path / "a.png")
+    assert int(((picture[..., 0] > 0.9) & (picture[..., 1] < 0.1)).sum()) > 5000
+
+
+def test_neither_points_nor_masks_is_said(tmp_path: Path) -> None:
+    masked_capture(tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        save_image(load_image(file), file)
+    with pytest.raises(InputError, match="neither sparse points nor masks"):
+        inspect(tmp_path)
 
 
 def test_inspect_refuses_bad_input(tmp_path: Path) -> None:

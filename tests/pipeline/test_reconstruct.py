@@ -111,7 +111,7 @@ def test_count_stays_under_the_cap_and_isotropic_kernels_are_round(capture: Capt
 
 
 def test_a_capture_without_masks_is_learned_whole_and_the_object_isolated(table: Capture) -> None:
-    stage = Reconstruct(iterations=200, image_size=64, start_gaussians=3000)
+    stage = Reconstruct(iterations=200, image_size=64, start_gaussians=3000, separate=False)
     gaussians, report = stage(table)
     assert report["start"] == "sparse points" and report["psnr_region"] == "whole image"
     assert report["psnr"] > 14.0
@@ -189,7 +189,7 @@ def test_a_diverged_loss_names_the_step(capture: Capture, monkeypatch: pytest.Mo
     def broken(model: object) -> torch.Tensor:
         return torch.tensor(float("nan"))
 
-    monkeypatch.setattr(stage, "_shape_loss", broken)
+    monkeypatch.setattr("gsfluent.pipeline.reconstruct_train.shape_loss", broken)
     with pytest.raises(RunError, match="loss became nan at step 0"):
         stage(capture)
 

@@ -102,11 +102,11 @@ def test_preview_is_close_and_cheap(melon: tuple[Solid, np.ndarray, InteriorText
     solid, photo, truth = melon
     preview = Texture(exemplar=photo, quality="preview")(solid)
     assert _distance(preview, truth) < 4.5
-    assert preview.report["texture"]["quality"] == "preview"
+    assert preview.report["quality"] == "preview"
 
 
 def test_report_and_consistency(textured: Solid) -> None:
-    report = textured.report["texture"]
+    report = textured.report
     assert report["method"] == "exemplar"
     assert 0 < report["patch_distance"] < 8.0
     # one volume: no axis flickers more than another
@@ -220,7 +220,7 @@ def test_nothing_given_warns_and_uses_the_surface(
     with caplog.at_level("WARNING"):
         result = Texture()(solid)
     assert "neither exemplar nor preset" in caplog.text
-    assert result.report["texture"]["method"] == "profile"
+    assert result.report["method"] == "profile"
     mean = result.color[result.occupancy].mean(0)
     assert torch.allclose(mean, torch.tensor([0.2, 0.4, 0.15]), atol=0.03)
 
@@ -252,7 +252,7 @@ def test_material_patch_needs_no_outline(melon: tuple[Solid, np.ndarray, Interio
     patch = (patch - patch.min()) / (patch.max() - patch.min())
     image = np.stack([patch, patch, patch], -1).astype(np.float32)
     result = Texture(exemplar=image, quality="preview", inclusions=False)(solid)
-    report = result.report["texture"]
+    report = result.report
     assert report["guide"] == "none"
     assert report["color_distance"] < 6.0
 
@@ -326,7 +326,7 @@ def test_real_apple_exemplar(
     solid, _, _ = melon
     photo = data_root / "exemplars" / "apple_cross_sections" / "apple_cs_03.png"
     result = Texture(exemplar=photo)(solid)
-    report = result.report["texture"]
+    report = result.report
     copy = Texture("color_copy", exemplar=photo)(solid)
     assert report["guide"] == "depth"
-    assert report["patch_distance"] < 0.4 * copy.report["texture"]["patch_distance"]
+    assert report["patch_distance"] < 0.4 * copy.report["patch_distance"]

@@ -178,7 +178,7 @@ def test_two_stage_texture_end_to_end(model: Path, solid: Solid, tmp_path: Path)
         "diffusion", model=model, prompt="flesh", inpaint=OPTIONS, resume=tmp_path / "slices"
     )
     result = stage(solid, progress=lambda done, total, note: seen.append((done, total)))
-    report = result.report["texture"]
+    report = result.report
     assert report["method"] == "diffusion"
     assert report["slices"] == 3 + 3 * 3
     assert report["passes"] == 4 and report["resumed_slices"] == 0
@@ -190,7 +190,7 @@ def test_two_stage_texture_end_to_end(model: Path, solid: Solid, tmp_path: Path)
     assert float(result.color[deep].std()) > 1e-3
     # a second run finds every slice and gives the same volume
     again = stage(solid)
-    assert again.report["texture"]["resumed_slices"] == 12
+    assert again.report["resumed_slices"] == 12
     assert torch.equal(again.color, result.color)
 
 

@@ -26,7 +26,7 @@ QUALITIES: dict[str, Schedule | None] = {
     "fast": Schedule(),
     "full": Schedule(iterations=(8, 5, 3), bank=6144, samples=2000, sinkhorn=5, stride=2),
 }
-_GUIDE_WEIGHT = 5.0  # the square root of 25: a guide difference of 0.1 weighs like 0.5 in colour
+_GUIDE_WEIGHT = 10.0  # a guide difference of 0.1 weighs like a colour difference of 1
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 

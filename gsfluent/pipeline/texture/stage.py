@@ -158,7 +158,7 @@ class Texture(Stage):
 
         Returns:
             The solid with ``color``, ``regions`` (inclusions, numbered from 1, where found) and
-            coloured interior Gaussians; surface Gaussians are untouched. ``report["texture"]``
+            coloured interior Gaussians; surface Gaussians are untouched. ``report``
             holds method, slices, patch_distance, axis_consistency and more.
 
         Raises:
@@ -184,7 +184,7 @@ class Texture(Stage):
             gaussians=colored,
             color=torch.from_numpy(rgb).to(device, solid.depth.dtype),
             regions=regions,
-            report={**solid.report, "texture": report},
+            report={**report, "fill": solid.report},
         )
 
     def _make(
