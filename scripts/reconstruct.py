@@ -14,7 +14,7 @@ import gsfluent as gf
 def main(capture_folder: str, out: str) -> None:
     capture = gf.load_capture(capture_folder)
     gaussians, report = gf.pipeline.Reconstruct()(capture)
-    thing, _ = gf.pipeline.Isolate()(gaussians, capture)
+    thing = gf.pipeline.Isolate()(gaussians, capture)
     thing.save(out)
     sys.stdout.write(f"{thing.count} Gaussians, held-out PSNR {report['psnr']:.2f} dB: {out}\n")
 

@@ -63,10 +63,8 @@ def isolate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load(source).validated(source.name)
-        # a splat without photographs is taken as it is: `objects.*.select` picks from it
-        method = "auto" if context.capture is not None else "all"
-        stage = Isolate(method, seed=context.seed)
-        whole, background = stage(gaussians, context.capture)
+        stage = Isolate(seed=context.seed)
+        whole, background = stage.split(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
         whole.save(folder / "object.ply")
@@ -116,7 +114,7 @@ def fill_stage(context: RunContext) -> None:
                 progress=context.reporter.task("fill"),
             )
             solid.transformed(frame).save(folder / f"{name}.ply")
-            reports.append(solid.report["fill"] | {"volume_m3": solid.volume * frame.scale**3})
+            reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
         return _merged(reports)
 
     result = context.store.run("fill", key, work)
@@ -139,7 +137,7 @@ def texture_stage(context: RunContext) -> None:
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
             textured.save(folder / f"{name}.ply")
             save_cut_views(textured, folder / f"{name}.png")
-            reports.append(textured.report["texture"])
+            reports.append({k: v for k, v in textured.report.items() if k != "fill"})
         return _merged(reports)
 
     result = context.store.run("texture", key, work)

@@ -50,7 +50,7 @@ def reconstruct_to(
     stage = Reconstruct(**options, device=device, seed=seed)
     gaussians, report = stage(photographs, progress=progress)
     if not keep_background:
-        gaussians, _ = Isolate(seed=seed)(gaussians, photographs)
+        gaussians = Isolate(seed=seed)(gaussians, photographs)
     gaussians.save(out)
     values = dict(report) | {"gaussians_saved": gaussians.count, "output": str(out)}
     write_json(out.with_name("reconstruct.json"), values)
@@ -78,7 +78,7 @@ def fill_to(
     stage = Fill(**options, seed=seed)
     solid = stage(gaussians, _photographs(capture), progress=progress)
     solid.save(out)
-    return dict(solid.report["fill"]) | {"seconds": time.perf_counter() - start, "output": str(out)}
+    return dict(solid.report) | {"seconds": time.perf_counter() - start, "output": str(out)}
 
 
 def texture_to(
@@ -104,7 +104,8 @@ def texture_to(
     cuts = out.with_suffix(".cuts.png")
     save_cut_views(textured, cuts)
     seconds = time.perf_counter() - start
-    return dict(textured.report["texture"]) | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
+    report = {k: v for k, v in textured.report.items() if k != "fill"}
+    return report | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
 
 
 def _photographs(capture: Path | None) -> Capture | None:
