@@ -223,7 +223,14 @@ def _softened(true_young: float, factor: float, what: str) -> str:
     )
 
 
-_RIND = {"name": "rind", "where": {"depth_below": 0.012}, "young_modulus": 8.0e5, "cohesion": 0.6}
+_RIND = {
+    "name": "rind",
+    "where": {"depth_below": 0.0175},
+    "young_modulus": 9.6e5,
+    "cohesion": 0.022,
+    "hardening": 2.33,
+    "alpha0": -0.21,
+}
 _PEEL = {"name": "peel", "where": {"depth_below": 0.005}, "cohesion": 0.6}
 
 _PRESETS: dict[str, Material] = {
@@ -231,12 +238,14 @@ _PRESETS: dict[str, Material] = {
     for m in (
         Material(
             "fruit.watermelon",
-            4e5,
-            0.35,
+            2.4e5,
+            0.32,
             950.0,
-            cohesion=0.1,
-            hardening=10.0,
-            alpha0=-0.08,
+            cohesion=0.055,
+            hardening=4.65,
+            friction_angle=60.0,
+            alpha0=-0.105,
+            shear_damage=0.025,
             parts=(_RIND,),
             sources={"density": _DENSITY + ", a melon just floats"},
         ),

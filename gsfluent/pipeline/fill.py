@@ -85,8 +85,8 @@ class Fill(Stage):
         max_interior: int = 200_000,
         down: tuple[float, float, float] | None = None,
         close_underside: bool = True,
-        refine_iterations: int = 60,
-        refine_image_size: int = 320,
+        refine_iterations: int = 24,
+        refine_image_size: int = 200,
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -247,7 +247,8 @@ class Fill(Stage):
         if views:
             hull = visual_hull(box, views)
             # masks say what is not the object; rays cap the cone under objects seen only from above
-            solid = hull & (shell | (vote.score >= 0.5))
+            # (just outside a convex surface about half of the rays hit it)
+            solid = hull & (shell | (vote.score >= 0.65))
             method = "hull and vote"
             if not solid.any():
                 raise InputError(

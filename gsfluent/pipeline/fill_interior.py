@@ -14,11 +14,7 @@ from .stage import Progress, report_progress
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Gaussians
 
-__all__ = [
-    "interior_gaussians",
-    "jittered_lattice",
-    "refine_opacity",
-]
+__all__ = ["interior_gaussians", "jittered_lattice", "refine_opacity"]
 
 logger = logging.getLogger(__name__)
 
@@ -131,7 +127,7 @@ def refine_opacity(
     sh[interior] = 0.0
     sh[interior, 0] = rgb_to_sh0(colors[interior])
     logit = torch.logit(gaussians.opacities[interior].clamp(0.02, 0.98)).requires_grad_(True)
-    optimizer = torch.optim.Adam([logit], lr=0.15)
+    optimizer = torch.optim.Adam([logit], lr=0.4)
     frozen = gaussians.opacities.detach()
     rng = np.random.default_rng(seed)
     order: list[int] = []

@@ -15,7 +15,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.fill import Fill, cut_view
 from gsfluent.pipeline.fill_density import GridBox, density_field
 from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, count_leaks
-from gsfluent.pipeline.fill_interior import jittered_lattice
+from gsfluent.pipeline.fill_interior import jittered_lattice, refine_opacity
 
 
 def _bottom_missing(points: torch.Tensor) -> torch.Tensor:
@@ -252,6 +252,37 @@ def test_masks_remove_what_is_not_the_object(tmp_path: Path) -> None:
     assert iou(vote.occupancy.numpy(), ellipsoid_truth(vote)) < iou(
         hull.occupancy.numpy(), ellipsoid_truth(hull)
     )
+
+
+def test_opacity_fit_hides_what_the_photographs_would_show(tmp_path: Path) -> None:
+    capture = _silhouettes(tmp_path)
+    surface = ellipsoid_shell(1500)
+    spilled = torch.tensor([[0.0, 1.1, 0.0], [0.0, 0.0, 1.0], [0.3, -1.05, 0.1]])
+    hidden = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.1, 0.0], [-0.4, 0.0, 0.1]])
+    inner = Gaussians.from_colors(
+        torch.cat([spilled, hidden]),
+        torch.full((6,), 0.08),
+        torch.full((6, 3), 0.5),
+        opacities=0.95,
+    )
+    both = Gaussians.cat([surface, inner])
+    chosen = torch.arange(both.count) >= surface.count
+    opacity, report = refine_opacity(both, chosen, capture, iterations=24, image_size=60, seed=0)
+    assert torch.equal(opacity[~chosen], both.opacities[~chosen])
+    assert float(opacity[chosen][:3].max()) < 0.3
+    assert float(opacity[chosen][3:].min()) > 0.85
+    assert report["opacity_loss_last"] < report["opacity_loss_first"]
+
+
+def test_capture_prunes_and_reports(tmp_path: Path) -> None:
+    filled = Fill(24, refine_iterations=4, refine_image_size=48)(
+        ellipsoid_shell(800), _silhouettes(tmp_path)
+    )
+    assert filled.report["method"] == "hull and vote"
+    assert "opacity_loss_last" in filled.report
+    inner = int((filled.gaussians.labels == INTERIOR).sum())
+    assert inner == filled.report["interior_gaussians"]
+    assert filled.report["leaks"] == 0
 
 
 def test_cut_view_shows_interior_and_skin(solid: Solid) -> None:
