@@ -253,11 +253,11 @@ def _has_masks(capture: Capture) -> bool:
 
 
 def _focus_radius(capture: Capture, middle: Tensor) -> float:
-    """Radius of the sphere around the focus that the narrowest field of view just holds."""
+    """Radius of the sphere around the focus that the wider field of view just holds."""
     radius = []
     for camera in capture.cameras:
         distance = float((camera.center() - middle).norm())
-        half = 0.5 * min(
+        half = 0.5 * max(
             camera.width / float(camera.K[0, 0]), camera.height / float(camera.K[1, 1])
         )
         radius.append(distance * math.sin(math.atan(half)))

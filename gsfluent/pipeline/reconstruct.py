@@ -23,7 +23,9 @@ from gsfluent.pipeline.reconstruct_checkpoint import Checkpoint
 from gsfluent.pipeline.reconstruct_evaluate import evaluate
 from gsfluent.pipeline.reconstruct_init import (
     Hull,
+    contradiction,
     hull_gaussians,
+    joined_start,
     point_gaussians,
     visual_hull,
 )
@@ -36,7 +38,10 @@ from gsfluent.pipeline.stage import Progress, Stage, report_progress
 _log = logging.getLogger(__name__)
 
 _HOLD_OUT = 8  # every eighth photograph judges, the others teach
-_FORGIVEN = 0.04  # share of found silhouettes that may be wrong about a voxel
+_MANY = 24  # views that carry a hull even when some silhouettes are distrusted
+_FORGIVEN = 0.1  # share of many silhouettes that may be wrong about a voxel
+_CONTRADICTION = 0.02  # of the hull denied by a silhouette before it is distrusted
+_SCENE_SHARE = 0.6  # of the steps for everything, before the object gets the rest
 _FAINT = 0.02  # opacity below which a trained Gaussian is dropped
 
 
@@ -55,8 +60,8 @@ class Reconstruct(Stage):
             Gaussian is cloned or split.
         checkpoint: File to save to while training and to resume from when it exists.
         checkpoint_every: Steps between saves.
-        separate: Without masks, spend the second half of the steps on the object alone: find it in
-            what the first half learned (:class:`Isolate`), and train it afresh on its silhouettes.
+        separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
+            what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
         device: Where to train.
         seed: Seed of everything random.
 
@@ -79,7 +84,7 @@ class Reconstruct(Stage):
         gradient_threshold: float = 4e-4,
         checkpoint: str | Path | None = None,
         checkpoint_every: int = 250,
-        separate: bool = False,
+        separate: bool = True,
         device: str | torch.device = "cpu",
         seed: int = 0,
     ) -> None:
@@ -136,7 +141,7 @@ class Reconstruct(Stage):
         generator = torch.Generator().manual_seed(self.seed)
         run = _Run(self, Checkpoint(self.checkpoint, self._identity()), generator, progress)
         if views[0].mask is not None:
-            gaussians, start = run.object_of(views, 0, self.iterations, None), "visual hull"
+            gaussians, start = run.object_of(views, 0, self.iterations), "visual hull"
             gaussians = _labelled(gaussians, SURFACE)
         else:
             gaussians, start = run.scene_of(train_set, views), "sparse points"
@@ -189,7 +194,9 @@ class _Run:
     def scene_of(self, capture: Capture, views: list[TrainView]) -> Gaussians:
         """Learn everything, then the object again from the silhouettes of what was found."""
         stage = self.stage
-        steps = stage.iterations - stage.iterations // 2 if stage.separate else stage.iterations
+        steps = stage.iterations
+        if stage.separate:
+            steps = max(1, round(_SCENE_SHARE * steps))
         scene = None
         if self.saved is not None and int(self.saved["phase"]) == 1:
             scene = Checkpoint.scene(self.saved, stage.device)
@@ -213,11 +220,17 @@ class _Run:
                 "the object shows in %d of %d views; not separated", len(masked), len(views)
             )
             return scene
-        found = self.object_of(masked, steps, stage.iterations - steps, scene)
+        masked = _agreeing(masked)
+        found = self.object_of(masked, steps, stage.iterations - steps, scene, found)
         return Gaussians.cat([_labelled(found, SURFACE), _labelled(rest, BACKGROUND)])
 
     def object_of(
-        self, views: list[TrainView], before: int, steps: int, scene: Gaussians | None
+        self,
+        views: list[TrainView],
+        before: int,
+        steps: int,
+        scene: Gaussians | None = None,
+        found: Gaussians | None = None,
     ) -> Gaussians:
         """Learn what the masks show, from the visual hull.
 
@@ -226,11 +239,14 @@ class _Run:
             before: Steps done in earlier phases.
             steps: Steps of this one.
             scene: Result of the earlier phase, kept in checkpoints.
+            found: The object as the earlier phase has it.
         """
         stage = self.stage
-        hull = visual_hull(views, forgiven=0.0 if scene is None else _FORGIVEN)
-        lower, upper = hull.bounds()
+        hull = visual_hull(views)
         start = hull_gaussians(hull, views, stage.start_gaussians, stage.sh_degree, self.generator)
+        if found is not None:
+            start = joined_start(hull, start, found)
+        lower, upper = hull.bounds()
         model = SplatModel(
             start,
             0.5 * float((upper - lower).max()),
@@ -282,6 +298,16 @@ class _Run:
             raise RunError(error.what, f"the last checkpoint, {kept}", error.mend) from error
         gaussians = model.gaussians(stage.sh_degree)
         return gaussians.select(gaussians.opacities > _FAINT)
+
+
+def _agreeing(views: list[TrainView]) -> list[TrainView]:
+    """Views whose found masks agree with the hull of most; a mask that misses a part spoils it."""
+    if len(views) < _MANY:
+        return views
+    hull = visual_hull(views, forgiven=_FORGIVEN)
+    agreeing = [view for view in views if contradiction(hull, view) < _CONTRADICTION]
+    _log.info("%d of %d silhouettes agree", len(agreeing), len(views))
+    return agreeing if len(agreeing) >= max(3, len(views) // 2) else views
 
 
 def _labelled(gaussians: Gaussians, label: int) -> Gaussians:

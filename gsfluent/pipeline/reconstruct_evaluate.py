@@ -7,8 +7,9 @@ from typing import Any
 import torch
 
 from gsfluent import ops
-from gsfluent.data import Camera, Capture, Gaussians
+from gsfluent.data import BACKGROUND, Camera, Capture, Gaussians
 from gsfluent.metrics import psnr, ssim
+from gsfluent.pipeline.reconstruct_masks import silhouette
 
 
 @torch.no_grad()
@@ -34,7 +35,8 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
 
     With masks the whole image is compared before white (object times mask plus white), and
     ``psnr_inside`` looks only at pixels inside the mask. Without masks the whole photograph is
-    compared.
+    compared, and ``psnr_inside`` looks at the silhouette of the splats not labelled ``BACKGROUND``
+    (when some are): the object as found, since nobody said where it is.
 
     Args:
         gaussians: What to judge.
@@ -42,12 +44,17 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
         max_size: Longer side of the images [px].
 
     Returns:
-        ``psnr``, ``ssim`` (means over the images, None without any), ``psnr_inside`` (None without
-        masks), ``psnr_region`` ("whole image before white" or "whole image"), ``psnr_views``.
+        ``psnr``, ``ssim`` (means over the images, None without any), ``psnr_inside`` (None when
+        nothing tells the object), ``psnr_region`` ("whole image before white" or "whole image"),
+        ``psnr_views``.
     """
     if held_out is None:
         return {"psnr": None, "ssim": None, "psnr_inside": None, "psnr_region": "none held out"}
     whole, inside, similar, masked = [], [], [], False
+    found = rest = None
+    if gaussians.labels is not None and bool((gaussians.labels == BACKGROUND).any()):
+        found = gaussians.select(gaussians.labels != BACKGROUND)
+        rest = gaussians.select(gaussians.labels == BACKGROUND)
     for index in range(len(held_out)):
         view = held_out.view(index, max_size)
         image, alpha = render_view(gaussians, view.camera)
@@ -62,9 +69,16 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
         valid = None if view.valid is None else view.valid.float()
         whole.append(psnr(image, target, valid))
         similar.append(float(ssim(image, target)))
-        if view.mask is not None and float((view.mask > 0.5).sum()) > 0:
-            region = (view.mask > 0.5).float() * (1.0 if valid is None else valid)
-            inside.append(psnr(image, target, region))
+        shown = view.mask
+        if shown is None and found is not None and rest is not None:
+            camera = view.camera
+            shown = silhouette(
+                found, rest, camera.viewmat, camera.K, camera.width, camera.height
+            ).cpu()
+        if shown is not None:
+            region = (shown > 0.5).float() * (1.0 if valid is None else valid)
+            if float(region.sum()) > 0:
+                inside.append(psnr(image, target, region))
     return {
         "psnr": round(sum(whole) / len(whole), 3),
         "ssim": round(sum(similar) / len(similar), 4),

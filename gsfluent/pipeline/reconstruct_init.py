@@ -6,6 +6,7 @@ import logging
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -101,7 +102,20 @@ def visual_hull(views: list[TrainView], resolution: int = 96, forgiven: float = 
     voxel = float((upper - lower).max()) / resolution
     shape = [int(n) + 2 for n in ((upper - lower) / voxel).ceil()]
     fine = _carve(views, lower - voxel, voxel, (shape[0], shape[1], shape[2]), allowed)
-    return fine if bool(fine.occupancy.any()) else hull
+    return _largest_body(fine) if bool(fine.occupancy.any()) else _largest_body(hull)
+
+
+def _largest_body(hull: Hull) -> Hull:
+    """The hull without what hangs apart from its largest body."""
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(hull.occupancy.cpu().numpy(), structure=np.ones((3, 3, 3)))
+    if count <= 1:
+        return hull
+    sizes = np.bincount(pieces.reshape(-1))
+    sizes[0] = 0
+    body = torch.from_numpy(pieces == int(sizes.argmax())).to(hull.occupancy.device)
+    return Hull(body, hull.origin, hull.voxel)
 
 
 def _reach(views: list[TrainView], middle: Tensor) -> float:
@@ -135,25 +149,36 @@ def _carve(
     alive = torch.arange(len(points), device=device)
     misses = torch.zeros(len(points), dtype=torch.int32, device=device)
     for view in views:
-        assert view.mask is not None
-        local = points[alive] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        depth = local[:, 2]
-        pixel = local @ view.K.T
-        pixel = pixel[:, :2] / depth.clamp_min(1e-6)[:, None]
-        footprint = 0.5 * voxel * float(view.K[0, 0]) / max(float(depth.median()), 1e-6)
-        grow = max(1, math.ceil(footprint))
-        grown = functional.max_pool2d(view.mask[None, None], 2 * grow + 1, 1, grow)[0, 0]
-        width, height = view.size
-        column, row = pixel.floor().long().unbind(1)
-        on = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        keep = grown[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5
-        # Off the crop means off the mask, unless the mask touches the edge of the photograph.
-        keep = torch.where(on, keep, torch.full_like(keep, _touches_edge(view.mask)) | (depth <= 0))
-        misses[alive] += (~keep).int()
+        misses[alive] += (~_allowed(points[alive], view, voxel)).int()
         alive = alive[misses[alive] <= allowed]
     occupancy = torch.zeros(len(points), dtype=torch.bool, device=device)
     occupancy[alive] = True
     return Hull(occupancy.view(shape), lower.to(device), voxel)
+
+
+def _allowed(points: Tensor, view: TrainView, voxel: float) -> Tensor:
+    """Whether voxels at ``points`` [N, 3] touch the mask of a view, or lie out of its sight."""
+    assert view.mask is not None
+    local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    depth = local[:, 2]
+    pixel = local @ view.K.T
+    pixel = pixel[:, :2] / depth.clamp_min(1e-6)[:, None]
+    footprint = 0.5 * voxel * float(view.K[0, 0])
+    grow = max(1, math.ceil(footprint / max(float(depth.median()), 1e-6)))
+    grown = functional.max_pool2d(view.mask[None, None], 2 * grow + 1, 1, grow)[0, 0]
+    width, height = view.size
+    column, row = pixel.floor().long().unbind(1)
+    on = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    keep = grown[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5
+    # Off the crop means off the mask, unless the mask touches the edge of the photograph.
+    unseen = torch.full_like(keep, _touches_edge(view.mask)) | (depth <= 0)
+    return torch.where(on, keep, unseen)
+
+
+def contradiction(hull: Hull, view: TrainView) -> float:
+    """Share of the hull that the mask of a view denies; large when that mask misses a part."""
+    points = hull.centers(hull.occupancy.nonzero())
+    return 1.0 - float(_allowed(points, view, hull.voxel).float().mean())
 
 
 def _touches_edge(mask: Tensor) -> bool:
@@ -199,6 +224,21 @@ def hull_gaussians(
         means, scales * 0.8, color, opacities=0.6, quats=_quats_of(normal)
     )
     return gaussians.with_sh_degree(degree)
+
+
+def joined_start(hull: Hull, sampled: Gaussians, found: Gaussians) -> Gaussians:
+    """Gaussians found earlier, where the hull allows them, and samples of the hull between them.
+
+    The hull closes every hollow that no silhouette shows; what was found there knows better.
+    """
+    from scipy.spatial import cKDTree
+
+    inside = found.select(hull.contains(found.means, slack=1) & (found.opacities > 0.1))
+    if inside.count == 0:
+        return sampled
+    gap, _ = cKDTree(inside.means.cpu().numpy()).query(sampled.means.cpu().numpy())
+    free = torch.from_numpy(gap).to(sampled.means) > 2.0 * sampled.scales.amax(1)
+    return Gaussians.cat([inside.replace(labels=None), sampled.select(free)])
 
 
 def _outward(hull: Hull) -> Tensor:

@@ -12,6 +12,10 @@ from gsfluent import ops
 from gsfluent.data import Gaussians
 from gsfluent.pipeline.reconstruct_views import TrainView, cropped
 
+_REACH = 0.018  # of the longer side: how far the border of a silhouette may be wrong
+_ROUNDS = 3
+_SMALLEST_BODY = 40  # pixels
+
 
 @torch.no_grad()
 def silhouette(
@@ -48,39 +52,57 @@ def silhouette(
 
 
 def masked_views(views: list[TrainView], found: Gaussians, rest: Gaussians) -> list[TrainView]:
-    """The photographs cut to the silhouette of the object; those that do not show it are left out.
+    """The photographs cut to the object; those that do not show it are left out.
 
-    The silhouette is made binary at one half, opened by one pixel, reduced to its largest body, its
-    holes closed, then softened over one pixel.
+    The rendered silhouette says roughly where the object is; GrabCut (Rother et al. 2004) moves its
+    border to where the photograph's colours change.
     """
     result = []
     for view in views:
         width, height = view.size
         share = silhouette(found, rest, view.viewmat, view.K, width, height)
-        mask = _clean(share)
-        if mask is None:
-            continue
-        result.append(cropped(replace(view, mask=mask.to(view.color))))
+        mask = refined_mask(share.cpu(), view.color.cpu())
+        if mask is not None:
+            result.append(cropped(replace(view, mask=mask.to(view.color))))
     return result
 
 
-def _clean(share: Tensor) -> Tensor | None:
-    """A single closed silhouette with soft edges [H, W], or None when nothing is left."""
+def refined_mask(share: Tensor, image: Tensor) -> Tensor | None:
+    """Mask of the object from a rough silhouette and the photograph.
+
+    Args:
+        share: Rough share of the object per pixel, [H, W].
+        image: The photograph, [H, W, 3] in [0, 1].
+
+    Returns:
+        One closed body with soft edges, [H, W], or None when the silhouette is all but empty.
+    """
+    import cv2
     from scipy import ndimage
 
-    values = share.cpu().numpy()
-    body = ndimage.binary_opening(values > 0.5, iterations=1)
-    pieces, count = ndimage.label(body)
+    values = share.numpy()
+    reach = max(3, round(_REACH * max(values.shape)))
+    body = ndimage.binary_fill_holes(ndimage.binary_opening(values > 0.5))
+    if int(body.sum()) < _SMALLEST_BODY:
+        return None
+    trimap = np.where(body, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap[ndimage.binary_erosion(body, iterations=reach)] = cv2.GC_FGD
+    trimap[~ndimage.binary_dilation(values > 0.3, iterations=reach)] = cv2.GC_BGD
+    known = np.isin(trimap, (cv2.GC_BGD, cv2.GC_PR_BGD))
+    if bool(known.any()) and not bool(known.all()):
+        pixels = np.ascontiguousarray((image.numpy()[..., ::-1] * 255).astype(np.uint8))
+        cv2.setRNGSeed(0)
+        behind, before = np.zeros((1, 65)), np.zeros((1, 65))
+        box = (0, 0, 1, 1)  # not read in this mode
+        cv2.grabCut(pixels, trimap, box, behind, before, _ROUNDS, cv2.GC_INIT_WITH_MASK)
+        body = np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    pieces, count = ndimage.label(ndimage.binary_opening(body))
     if count == 0:
         return None
     sizes = np.bincount(pieces.reshape(-1))
     sizes[0] = 0
-    body = ndimage.binary_fill_holes(pieces == int(sizes.argmax()))
-    if int(body.sum()) < 30:
+    if int(sizes.max()) < _SMALLEST_BODY:
         return None
-    soft = np.where(body, np.maximum(values, 0.5), 0.0)
-    edge = ndimage.binary_dilation(body) & ~body
-    soft[edge] = values[edge] * 0.5
-    inner = ndimage.binary_erosion(body)
-    soft[inner] = 1.0
-    return torch.from_numpy(soft.astype(np.float32))
+    body = ndimage.binary_fill_holes(pieces == int(sizes.argmax()))
+    soft = cv2.GaussianBlur(body.astype(np.float32), (3, 3), 0.6)
+    return torch.from_numpy(soft)

@@ -14,6 +14,7 @@ from gsfluent.io import load_capture, save_image
 from gsfluent.pipeline.isolate import Isolate, find_plane
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.reconstruct_init import focus_point, hull_gaussians, visual_hull
+from gsfluent.pipeline.reconstruct_masks import refined_mask
 from gsfluent.pipeline.reconstruct_views import halved, read_views
 
 
@@ -125,6 +126,41 @@ def test_a_capture_without_masks_is_learned_whole_and_the_object_isolated(table:
     near = (found.means > lower - 0.03).all(1) & (found.means < upper + 0.03).all(1)
     assert float(near.float().mean()) > 0.9
     assert float(found.means[:, 2].max()) > 0.7 * float(upper[2])
+
+
+def test_object_is_learned_again_from_its_silhouettes_and_resumes(
+    table: Capture, tmp_path: Path
+) -> None:
+    file = tmp_path / "state.pt"
+    settings = {"iterations": 250, "image_size": 64, "start_gaussians": 3000}
+    stage = Reconstruct(**settings, checkpoint=file, checkpoint_every=20)
+
+    def interrupt(done: int, total: int, note: str) -> None:
+        if done >= 200:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stage(table, progress=interrupt)
+    gaussians, report = stage(table)
+    assert report["resumed_at"] == 190
+    assert gaussians.labels is not None
+    assert report["object_gaussians"] == int((gaussians.labels == SURFACE).sum()) > 500
+    found = Isolate()(gaussians, table)
+    assert found.count == report["object_gaussians"]
+    truth = demo.make_object("watermelon", 0)
+    depth = truth.depth(found.means.double())
+    assert float((depth > -0.01).double().mean()) > 0.9  # nothing of table or shadow
+
+
+def test_mask_is_refined_by_the_photograph() -> None:
+    y, x = torch.meshgrid(torch.arange(80.0), torch.arange(80.0), indexing="ij")
+    disc = ((x - 40) ** 2 + (y - 42) ** 2 < 20**2).float()
+    rough = ((x - 41) ** 2 + (y - 43) ** 2 < 18**2).float()
+    image = disc[..., None] * torch.tensor([0.8, 0.2, 0.1]) + 0.1 * torch.rand(80, 80, 3)
+    mask = refined_mask(rough, image)
+    assert mask is not None
+    assert float(((mask > 0.5) == (disc > 0.5)).float().mean()) > 0.995
+    assert refined_mask(torch.zeros(80, 80), image) is None
 
 
 def test_isolate_by_box_and_by_masks(capture: Capture) -> None:
