@@ -37,6 +37,10 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");
 
   // --- mvee: minimum-volume enclosing ellipsoids ---
+  m.def("mvee(Tensor points, float tolerance, int max_iterations) -> (Tensor, Tensor)");
+  m.def(
+      "mvee_lens(Tensor mean_a, Tensor covariance_a, Tensor mean_b, Tensor covariance_b, float "
+      "radius) -> (Tensor, Tensor, Tensor)");
 
   // --- raster: Gaussian splatting ---
   // Returns image, alpha, depth, normal, contribution, radii, then what the adjoint needs: splats,

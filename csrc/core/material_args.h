@@ -33,4 +33,28 @@ struct ReturnMappingArgs {
   int32_t* info;  // [4] plastic, guarded, inverted, invalid particles; zeroed by the caller
 };
 
+template <typename T>
+struct MveeArgs {
+  int64_t batch, count;  // fits, points per fit
+  const T* points;       // [batch, count, 3]
+  T* weight;             // scratch [batch, count]
+  T tolerance;
+  int max_iterations;
+  T* center;  // [batch, 3]
+  T* shape;   // [batch, 9]
+};
+
+template <typename T>
+struct MveeLensArgs {
+  int64_t batch;
+  const T* mean_a;        // [batch, 3]
+  const T* covariance_a;  // [batch, 6]
+  const T* mean_b;
+  const T* covariance_b;
+  T radius;       // k_sigma
+  T* mean;        // [batch, 3]
+  T* covariance;  // [batch, 6]
+  bool* overlap;  // [batch]
+};
+
 }  // namespace gsf

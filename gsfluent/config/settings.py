@@ -164,9 +164,9 @@ class TextureSettings:
         example="1.0",
     )
     guide: str | None = key(
-        choice("auto", "depth", "none"),
+        choice("auto", "depth", "axis", "none"),
         default=None,
-        doc="Whether rind meets rind (method exemplar).",
+        doc="What patches are matched by: depth, or a cut across the axis (method exemplar).",
         example="auto",
     )
     directional: bool | None = key(

@@ -190,6 +190,52 @@ def test_inclusions_are_found_counted_and_labelled() -> None:
     assert texture.rgb[body].mean() < 0.45 < texture.rgb[domain.inside & ~body].mean()
 
 
+def _star_photo() -> np.ndarray:
+    """A disc with a dark five-lobed core."""
+    v, u = np.mgrid[:200, :200] - 99.5
+    radius, angle = np.hypot(u, v) / 90, np.arctan2(-v, u)
+    core = radius < 0.45 + 0.2 * np.cos(5 * angle)
+    image = np.where(core[..., None], (0.15, 0.1, 0.05), (0.9, 0.85, 0.6))
+    image = image + 0.03 * np.random.default_rng(0).standard_normal((200, 200, 1))
+    return np.concatenate([image.clip(0, 1), (radius < 1)[..., None]], -1).astype(np.float32)
+
+
+def test_axis_guide_keeps_the_star_across_the_axis() -> None:
+    from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
+
+    domain = _domain(40)
+    photo = load_exemplars(_star_photo())
+    k = 20
+    v, u = np.mgrid[:40, :40] + 0.5 - 20
+    angle, radius = np.arctan2(u, v), np.hypot(u / 0.82, v) / 18
+
+    def star(guide: str) -> float:
+        rgb = exemplar_texture(domain, photo, guide=guide, inclusions=False, seed=0).rgb
+        ring = (radius > 0.32) & (radius < 0.58)
+        tone = rgb[:, :, k].mean(-1)[ring]
+        return float(np.abs(((tone - tone.mean()) * np.exp(5j * angle[ring])).mean()))
+
+    assert star("axis") > 0.1
+    assert star("axis") > 2.5 * star("depth")
+
+
+def test_sweep_repeats_the_photograph_in_the_middle_plane() -> None:
+    from gsfluent.pipeline.texture.sweep import swept_color
+
+    grid = np.stack(np.meshgrid(*[np.arange(40)] * 3, indexing="ij"), -1) + 0.5 - 20
+    inside = (grid**2).sum(-1) <= 18**2
+    depth = np.where(inside, ndimage.distance_transform_edt(inside) - 0.5, 0)
+    photo = load_exemplar(_star_photo())
+    rgb = swept_color(inside, depth, np.array([0.0, 0.0, 1.0]), photo)
+    # x runs along photograph columns, y against its rows
+    plane = rgb[:, :, 20].transpose(1, 0, 2)[::-1]
+    small = photo.resized(18 / 90)
+    offset = (40 - small.mask.shape[0]) // 2
+    mine = plane[offset : offset + small.mask.shape[0], offset : offset + small.mask.shape[1]]
+    clear = ndimage.binary_erosion(small.mask, iterations=2)
+    assert np.abs(mine - small.image)[clear].mean() < 0.1
+
+
 @pytest.mark.parametrize("preset", preset_names())
 def test_presets_are_point_functions(preset: str) -> None:
     domain = _domain(24)
@@ -312,6 +358,11 @@ def test_errors(melon: tuple[Solid, np.ndarray, InteriorTexture], tmp_path: Path
         Texture(exemplar=np.zeros((40, 40), np.float32))(solid)
     with pytest.raises(InputError, match="axes must be"):
         Texture(exemplar={"w": photo})(solid)
+    with pytest.raises(InputError, match="outline"):
+        material = np.random.default_rng(0).random((64, 64, 3)).astype(np.float32)
+        Texture(exemplar=material, guide="axis")(solid)
+    with pytest.raises(InputError, match="guide must be"):
+        Texture(exemplar=photo, guide="sideways")(solid)
     with pytest.raises(InputError, match="scale"):
         Texture(exemplar=photo, scale=-1.0)(solid)
     empty = replace(solid, occupancy=torch.zeros_like(solid.occupancy))

@@ -12,7 +12,7 @@ from ..fill_view import surface_colors
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
-__all__ = ["InteriorDomain", "InteriorTexture", "blend_skin", "smoothstep"]
+__all__ = ["InteriorDomain", "InteriorTexture", "axis_frame", "blend_skin", "smoothstep"]
 
 SHELL = 1.6
 """Depth [voxels] down to which the colour is that of the surface splats."""
@@ -108,6 +108,15 @@ class InteriorTexture:
             weight += share
         result: np.ndarray = (total / np.maximum(weight, 1e-9)[:, None]).astype(np.float32)
         return result
+
+
+def axis_frame(axis: np.ndarray) -> np.ndarray:
+    """Rotation [3, 3] that turns ``axis`` onto +z."""
+    z = axis / max(float(np.linalg.norm(axis)), 1e-12)
+    helper = np.array([1.0, 0, 0]) if abs(z[0]) < 0.8 else np.array([0, 1.0, 0])
+    x = helper - (helper @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
 
 
 def smoothstep(x: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from .domain import InteriorDomain, InteriorTexture
 from .inclusions import Inclusions, find_inclusions, paint_inclusions, remove_inclusions
 from .photo import Exemplar, load_exemplar
 from .profile import band_noise, depth_profile, match_colors, profile_volume
+from .sweep import swept_color
 from .synthesis import Schedule, SynthesisLevel, synthesize_level
 
 __all__ = ["QUALITIES", "exemplar_texture", "load_exemplars"]
@@ -27,6 +28,7 @@ QUALITIES: dict[str, Schedule | None] = {
     "full": Schedule(iterations=(8, 5, 3), bank=6144, samples=2000, sinkhorn=5, stride=2),
 }
 _GUIDE_WEIGHT = 10.0  # a guide difference of 0.1 weighs like a colour difference of 1
+_SWEEP_WEIGHT = 3.0  # against the 75 pixel values of a patch: structure leads, texture decides
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
@@ -80,7 +82,9 @@ def exemplar_texture(
         scale: Size of the photographed structure relative to the automatic choice, which makes the
             deepest point of the photograph as deep as the object's (or, for a patch of material,
             the photograph as wide as the object).
-        guide: ``depth``, ``none``, or ``auto`` (depth when the photographs show an outline).
+        guide: ``depth``; ``axis`` (depth, and the photograph is a cut across the object's axis
+            whose structure is swept along it); ``none``; or ``auto`` (depth when the photographs
+            show an outline).
         directional: True for grained materials: the photographs are not turned or mirrored.
         inclusions: Find seeds and stones and place them as labelled ellipsoids.
         seed: Seed.
@@ -97,15 +101,23 @@ def exemplar_texture(
             f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
             mend="leave it at fast",
         )
-    if guide not in ("auto", "depth", "none"):
+    if guide not in ("auto", "depth", "axis", "none"):
         raise InputError(
-            f"texture: guide must be auto, depth or none, got {guide!r}", mend="leave it at auto"
+            f"texture: guide must be auto, depth, axis or none, got {guide!r}",
+            mend="leave it at auto",
         )
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"texture: scale must be positive, got {scale}", mend="1 is neutral")
     rng = np.random.default_rng(seed)
     crop, back = _crop(domain)
-    guided = guide == "depth" or (guide == "auto" and all(e.silhouette for e in exemplars.values()))
+    if guide == "axis" and not all(e.silhouette for e in exemplars.values()):
+        raise InputError(
+            "texture: guide 'axis' needs a photograph with an outline",
+            mend="cut the object out (RGBA) or use guide: none",
+        )
+    guided = guide in ("depth", "axis") or (
+        guide == "auto" and all(e.silhouette for e in exemplars.values())
+    )
     fitted: dict[int, tuple[Exemplar, Exemplar, float]] = {}
     found: dict[int, Inclusions | None] = {}
     for axis, photo in exemplars.items():
@@ -119,8 +131,9 @@ def exemplar_texture(
         rgb = _preview(crop, fitted[0][0], guided, rng)
         consistency, levels = 0.0, 0
     else:
+        photos = {a: f[0] for a, f in fitted.items()}
         rgb, consistency, levels = _patches(
-            crop, {a: f[0] for a, f in fitted.items()}, schedule, guided, directional, rng, progress
+            crop, photos, schedule, guided, guide == "axis", directional, rng, progress
         )
     labels = np.zeros(crop.inside.shape, np.int32)
     count = 0
@@ -137,7 +150,7 @@ def exemplar_texture(
     full_labels[back] = labels
     report = {
         "quality": quality,
-        "guide": "depth" if guided else "none",
+        "guide": "axis" if guide == "axis" else "depth" if guided else "none",
         "exemplar_mask": exemplars[0].note,
         "inclusions": count,
         "levels": levels,
@@ -219,6 +232,7 @@ def _patches(
     photos: dict[int, Exemplar],
     schedule: Schedule,
     guided: bool,
+    swept: bool,
     directional: bool,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -243,16 +257,26 @@ def _patches(
         else:
             rgb = _upsample(rgb, inside.shape)
         fixed = shell if keep_shell else np.zeros_like(shell)
+        guides = [_guide(depth, largest) if guided else np.zeros_like(depth)]
+        seen = {
+            a: [_guide(p.depth, p.max_depth) if guided else np.zeros_like(p.depth)]
+            for a, p in small.items()
+        }
+        if swept:
+            section = swept_color(inside, depth, domain.axis, small[0])
+            if step == 0:
+                rgb = np.where(inside[..., None], section, rgb)
+            guides += list(_SWEEP_WEIGHT * np.moveaxis(_lowpass(section, inside), -1, 0))
+            for axis, photo in small.items():
+                blurred = _lowpass(photo.image, np.ones(photo.mask.shape, bool))
+                seen[axis] += list(_SWEEP_WEIGHT * np.moveaxis(blurred, -1, 0))
         rgb = np.where(fixed[..., None], skin, rgb).astype(np.float32)
         level = SynthesisLevel(
             rgb=rgb,
             inside=inside,
             fixed=fixed,
-            guide=_guide(depth, largest) if guided else np.zeros_like(depth),
-            exemplars={
-                a: (p, _guide(p.depth, p.max_depth) if guided else np.zeros_like(p.depth))
-                for a, p in small.items()
-            },
+            guide=np.stack(guides, -1),
+            exemplars={a: (p, np.stack(seen[a], -1)) for a, p in small.items()},
             depth=depth if guided else None,
         )
         disagreement = synthesize_level(
@@ -266,6 +290,18 @@ def _patches(
         rgb = level.rgb
     report_progress(progress, len(factors), len(factors), "patches")
     return rgb, disagreement, len(factors)
+
+
+def _lowpass(image: np.ndarray, mask: np.ndarray, sigma: float = 1.0) -> np.ndarray:
+    """Blur of the pixels or voxels in a mask, not diluted by those outside."""
+    from scipy import ndimage
+
+    share = ndimage.gaussian_filter(mask.astype(np.float32), sigma)
+    sums = [
+        ndimage.gaussian_filter(image[..., c] * mask, sigma) / np.maximum(share, 1e-3)
+        for c in range(3)
+    ]
+    return np.stack(sums, -1).astype(np.float32)
 
 
 def _skin_is_material(domain: InteriorDomain, photo: Exemplar) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsfluent.errors import InputError
 
-from .domain import InteriorDomain, InteriorTexture, smoothstep
+from .domain import InteriorDomain, InteriorTexture, axis_frame, smoothstep
 from .noise import cells, fractal, value_noise
 
 __all__ = ["PRESETS", "preset_names", "procedural_texture"]
@@ -311,7 +311,7 @@ def procedural_texture(domain: InteriorDomain, preset: str, seed: int) -> Interi
     scale = max(domain.max_depth, 1.0)
     middle = 0.5 * (index.min(0) + index.max(0)) + 0.5
     points = (index + 0.5 - middle) / scale
-    points = points @ _to_axis(domain.axis).T
+    points = points @ axis_frame(domain.axis).T
     depth = domain.depth[domain.inside] / scale
     color, label = PRESETS[preset](points, depth, seed)
     rgb = np.zeros((*domain.inside.shape, 3), np.float32)
@@ -319,12 +319,3 @@ def procedural_texture(domain: InteriorDomain, preset: str, seed: int) -> Interi
     labels = np.zeros(domain.inside.shape, np.int32)
     labels[domain.inside] = label
     return InteriorTexture(rgb, labels, {"preset": preset, "inclusions": int(label.max(initial=0))})
-
-
-def _to_axis(axis: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] that turns ``axis`` onto +z."""
-    z = axis / max(float(np.linalg.norm(axis)), 1e-12)
-    helper = np.array([1.0, 0, 0]) if abs(z[0]) < 0.8 else np.array([0, 1.0, 0])
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])

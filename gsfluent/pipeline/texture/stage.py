@@ -60,7 +60,8 @@ class Texture(Stage):
         model: Local folder or hub id of an inpainting pipeline.
         quality: ``preview``, ``fast`` or ``full`` (exemplar method).
         scale: Size of the exemplar's structure relative to the automatic choice.
-        guide: ``auto``, ``depth`` or ``none`` (exemplar method).
+        guide: ``auto``, ``depth``, ``none``, or ``axis`` when the photograph is a cut across the
+            object's axis (exemplar method).
         directional: True for grained materials: the exemplar is not turned or mirrored.
         inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.

@@ -57,8 +57,9 @@ class SynthesisLevel:
         rgb: Volume, float32 [X, Y, Z, 3]; updated by :func:`synthesize_level`.
         inside: Voxels to synthesise, bool [X, Y, Z].
         fixed: Voxels whose colour stays, bool [X, Y, Z].
-        guide: Guide value per voxel, float32 [X, Y, Z], already weighted; zeros when there is none.
-        exemplars: Photograph per axis, at this level's pitch, with its guide image [H, W].
+        guide: Guide values per voxel, float32 [X, Y, Z, G], already weighted; the first one grows
+            with depth (zeros when there is no guide).
+        exemplars: Photograph per axis, at this level's pitch, with its guide image [H, W, G].
         depth: Depth [voxels of this level] for the colour transport; None without a guide.
     """
 
@@ -107,20 +108,21 @@ class _Bank:
         _, vectors = torch.linalg.eigh(covariance)
         self.basis = vectors[:, -_DIMENSIONS:]
         self.guide = torch.from_numpy(guide[rows, columns].astype(np.float32))
-        self.descriptor = torch.cat([centered @ self.basis, self.guide[:, None]], 1)
+        self.descriptor = torch.cat([centered @ self.basis, self.guide], 1)
         self.norm = (self.descriptor**2).sum(1)
-        order = self.guide.argsort()
-        bins = 12 if float(self.guide.std()) > 1e-6 else 1
+        layer = self.guide[:, 0]
+        order = layer.argsort()
+        bins = 12 if float(layer.std()) > 1e-6 else 1
         self.bin = torch.empty(len(order), dtype=torch.long)
         self.bin[order] = torch.arange(len(order)) * bins // len(order)
         self.bins = bins
         starts = torch.arange(bins) * len(order) // bins
-        self.edges = self.guide[order][starts[1:]].contiguous()
+        self.edges = layer[order][starts[1:]].contiguous()
         self.dual = torch.zeros(len(order))
 
     def describe(self, patches: Tensor, guide: Tensor) -> Tensor:
-        """Descriptors [n, 25] of patches [n, P] with guide values [n]."""
-        return torch.cat([(patches - self.mean) @ self.basis, guide[:, None]], 1)
+        """Descriptors [n, 24 + G] of patches [n, P] with guide values [n, G]."""
+        return torch.cat([(patches - self.mean) @ self.basis, guide], 1)
 
     def balance(self, query: Tensor, steps: int) -> None:
         """Estimate the dual weights so that patches of a depth bin share its queries equally.
@@ -133,7 +135,8 @@ class _Bank:
         nearest = cost.min(1).values
         softness = float(nearest.median()) * 0.5 + 1e-4
         share = torch.bincount(
-            torch.bucketize(query[:, -1].contiguous(), self.edges), minlength=self.bins
+            torch.bucketize(query[:, self.basis.shape[1]].contiguous(), self.edges),
+            minlength=self.bins,
         ).float()
         population = torch.bincount(self.bin, minlength=self.bins).float()
         target = ((share + 0.5) / (share + 0.5).sum() / population)[self.bin]
@@ -200,7 +203,7 @@ def synthesize_level(
     }
     coordinates = torch.from_numpy(np.argwhere(padded))
     flat = coordinates @ torch.tensor(strides)
-    guide = torch.from_numpy(np.pad(level.guide, pad).reshape(-1)[flat.numpy()].astype(np.float32))
+    guide = torch.from_numpy(level.guide[level.inside].astype(np.float32))
     fixed = torch.from_numpy(np.pad(level.fixed, pad).reshape(-1)[flat.numpy()])
     kept = volume[flat[fixed]].clone()
     reference = level.exemplars[axes[0]][0]

@@ -1,0 +1,57 @@
+// CPU kernels of the enclosing-ellipsoid ops: fits in parallel, one thread each.
+#include "host/mvee.h"
+
+#include "core/mvee_lens.h"
+
+namespace gsf {
+namespace {
+
+template <typename T>
+Vec3<T> load_vec3(const T* p) {
+  return {p[0], p[1], p[2]};
+}
+template <typename T>
+void store_vec3(T* p, const Vec3<T>& v) {
+  p[0] = v.x;
+  p[1] = v.y;
+  p[2] = v.z;
+}
+
+struct MveeCpu {
+  template <typename T>
+  static void mvee(const MveeArgs<T>& a, const Tensor&) {
+    parallel_for(a.batch, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        const Ellipsoid<T> fit =
+            mvee_fit(SerialTeam{}, a.points + 3 * a.count * i, static_cast<int>(a.count),
+                     a.weight + a.count * i, a.tolerance, a.max_iterations);
+        store_vec3(a.center + 3 * i, fit.center);
+        store_mat3(a.shape + 9 * i, to_mat3(fit.shape));
+      }
+    });
+  }
+
+  template <typename T>
+  static void mvee_lens(const MveeLensArgs<T>& a, const Tensor&) {
+    parallel_for(a.batch, 16, [&](int64_t begin, int64_t end) {
+      T points[3 * kLensRays], weight[kLensRays];
+      for (int64_t i = begin; i < end; ++i) {
+        const LensResult<T> r =
+            gsf::mvee_lens(SerialTeam{}, load_vec3(a.mean_a + 3 * i),
+                           load_sym3(a.covariance_a + 6 * i), load_vec3(a.mean_b + 3 * i),
+                           load_sym3(a.covariance_b + 6 * i), a.radius, points, weight);
+        store_vec3(a.mean + 3 * i, r.mean);
+        store_sym3(a.covariance + 6 * i, r.covariance);
+        a.overlap[i] = r.overlap;
+      }
+    });
+  }
+};
+
+}  // namespace
+}  // namespace gsf
+
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
+  m.impl("mvee", TORCH_BOX(&gsf::MveeOps<gsf::MveeCpu>::mvee));
+  m.impl("mvee_lens", TORCH_BOX(&gsf::MveeOps<gsf::MveeCpu>::mvee_lens));
+}
