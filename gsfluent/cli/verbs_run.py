@@ -93,12 +93,12 @@ class Render(Verb):
     """Render a finished simulation again: another camera, light or size.
 
     Examples:
-      gsfluent render out                                       # as the shot says, to
-      out/render.mp4 gsfluent render out --size 1920x1080 -o big.mp4
-      gsfluent render out --camera 3                            # from the pose of photograph 3
-      gsfluent render out --camera path.json                    # {"frames": [{"eye": [..],
-      "target": [..]}]} gsfluent render out --light=-1,-1,3 --ambient 0.3         # harder light
-      from the left gsfluent render out --frame 20 -o still.png               # one picture
+      gsfluent render out                                   # as the shot says: out/render.mp4
+      gsfluent render out --size 1920x1080 -o big.mp4
+      gsfluent render out --camera 3                        # from the pose of photograph 3
+      gsfluent render out --camera path.json                # eyes and targets, see docs/render.md
+      gsfluent render out --light=-1,-1,3 --ambient 0.3     # harder light from the left
+      gsfluent render out --frame 20 -o still.png           # one picture
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
@@ -143,9 +143,9 @@ class Export(Verb):
     """Write a finished simulation in other programs' formats.
 
     Examples:
-      gsfluent export out --to ply-seq              # frames/frame_0001.ply ..., standard 3DGS, any
-      splat viewer gsfluent export out --to vtk                  # particles/particles_0001.vtk ...,
-      ParaView gsfluent export out --to ply-seq,mp4,vtk
+      gsfluent export out --to ply-seq        # frames/frame_0001.ply ..., for any splat viewer
+      gsfluent export out --to vtk            # particles/particles_0001.vtk ..., for ParaView
+      gsfluent export out --to ply-seq,mp4,vtk
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]

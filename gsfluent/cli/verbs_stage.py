@@ -82,8 +82,8 @@ class Fill(Verb):
 
     Examples:
       gsfluent fill melon.ply -o solid.ply
-      gsfluent fill melon.ply -o solid.ply --capture captures/melon     # refine against the
-      photographs gsfluent fill cup.ply -o cup_solid.ply --hollow auto
+      gsfluent fill melon.ply -o solid.ply --capture captures/melon    # refine by photographs
+      gsfluent fill cup.ply -o cup_solid.ply --hollow auto
 
     Writes solid.ply (opens in any splat viewer) and solid.volume.npz (the voxels) beside it.
     """
@@ -125,10 +125,9 @@ class Texture(Verb):
     """Give the inside of a solid its colours.
 
     Examples:
-      gsfluent texture solid.ply -o textured.ply                                       # by default
-      from the skin gsfluent texture solid.ply -o textured.ply --method exemplar --exemplar cut.jpg
-        # from a photo of a cut gsfluent texture solid.ply -o textured.ply --method diffusion
-        # --model PATH --prompt "watermelon flesh"
+      gsfluent texture solid.ply -o textured.ply                       # from the skin's colours
+      gsfluent texture solid.ply -o textured.ply --exemplar cut.jpg    # from a photo of a cut
+      gsfluent texture solid.ply -o textured.ply --method diffusion --model PATH --prompt "flesh"
 
     Writes textured.ply with its volume, and textured.cuts.png with three cut views.
     """

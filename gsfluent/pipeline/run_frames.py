@@ -151,6 +151,10 @@ def _tensor(array: np.ndarray) -> Tensor:
 def _gaussians(arrays: dict[str, np.ndarray]) -> Gaussians:
     labels = arrays.get("labels")
     return Gaussians(
-        *(_tensor(arrays[name]) for name in ("means", "quats", "scales", "opacities", "sh")),
+        means=_tensor(arrays["means"]),
+        quats=_tensor(arrays["quats"]),
+        scales=_tensor(arrays["scales"]),
+        opacities=_tensor(arrays["opacities"]),
+        sh=_tensor(arrays["sh"]),
         labels=None if labels is None else torch.from_numpy(labels.astype(np.int32)),
     )

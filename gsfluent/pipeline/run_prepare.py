@@ -63,14 +63,17 @@ def isolate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load(source).validated(source.name)
-        whole = Isolate(seed=context.seed)(gaussians, context.capture)
+        stage = Isolate(seed=context.seed)
+        whole, background = stage.split(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
         whole.save(folder / "object.ply")
+        if background.count:
+            background.save(folder / "background.ply")
         write_json(folder / "frame.json", frame.to_dict())
-        return {
+        return dict(stage.report) | {
             "gaussians_kept": whole.count,
-            "gaussians_removed": gaussians.count - whole.count,
+            "gaussians_removed": background.count,
             "up": stance.up.tolist(),
             "up_from": stance.up_from,
             "floor_from": stance.floor_from,
@@ -134,7 +137,7 @@ def texture_stage(context: RunContext) -> None:
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
             textured.save(folder / f"{name}.ply")
             save_cut_views(textured, folder / f"{name}.png")
-            reports.append(textured.report)
+            reports.append({k: v for k, v in textured.report.items() if k != "fill"})
         return _merged(reports)
 
     result = context.store.run("texture", key, work)

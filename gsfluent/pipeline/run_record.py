@@ -54,7 +54,7 @@ class RunRecord:
         """Write the file for a run that stopped."""
         at = f" during {stages[-1].name}" if stages else ""
         if isinstance(error, KeyboardInterrupt):
-            reason = f"{error or 'interrupted by Ctrl-C'}{at}"
+            reason = f"{str(error) or 'interrupted by Ctrl-C'}{at}"
         elif isinstance(error, GsfluentError):
             reason = f"{error}{at}"
         else:

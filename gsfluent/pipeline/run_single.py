@@ -104,7 +104,8 @@ def texture_to(
     cuts = out.with_suffix(".cuts.png")
     save_cut_views(textured, cuts)
     seconds = time.perf_counter() - start
-    return dict(textured.report) | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
+    report = {k: v for k, v in textured.report.items() if k != "fill"}
+    return report | {"seconds": seconds, "output": str(out), "cuts": str(cuts)}
 
 
 def _photographs(capture: Path | None) -> Capture | None:

@@ -1,0 +1,265 @@
+"""Time every op and measure its error against the float64 reference; print markdown, optionally
+write JSON.
+
+    python scripts/bench.py                              # this machine's CPU, and its GPU when
+    there is one python scripts/bench.py --device cuda --json bench.json --markdown docs/bench.md
+    python scripts/bench.py --quick                      # a tenth of the size
+    python scripts/bench.py --compare before.json        # ratio to an earlier run
+
+Errors are relative to the largest value: CPU float32 against the reference in float64, CUDA float32
+against the CPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsfluent import has_cuda, ops
+from gsfluent.ops.reference import mpm as reference_mpm
+from gsfluent.ops.reference import mvee as reference_mvee
+from gsfluent.ops.reference import plasticity as reference_plasticity
+from gsfluent.ops.reference import raster as reference_raster
+
+DX = 0.01
+DT = 1e-4
+
+
+@dataclass(frozen=True)
+class Case:
+    """One op on one workload; builds its call from a namespace holding the op or its reference."""
+
+    name: str
+    unit: str
+    count: int
+    reference: Any
+    build: Callable[[Any, torch.device, torch.dtype, int], Callable[[], Any]]
+
+
+def random(shape: tuple[int, ...], seed: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    # drawn in float32 whatever the dtype, so that all precisions see the same numbers
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed)).to(device, dtype)
+
+
+def points(count: int, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+    side = (count / 8) ** (1 / 3) * DX  # eight per cell
+    state = {
+        "position": random((count, 3), 0, device, dtype) * side + 0.5,
+        "velocity": random((count, 3), 1, device, dtype) - 0.5,
+        "affine": random((count, 3, 3), 2, device, dtype) - 0.5,
+        "mass": random((count,), 3, device, dtype) + 0.5,
+        "stress": (random((count, 6), 4, device, dtype) - 0.5) * 1e3,
+        "volume": torch.full((count,), DX**3 / 8, device=device, dtype=dtype),
+    }
+    return state
+
+
+def scatter(op: Any, device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    p = points(count, device, dtype)
+    blocks = ops.build_blocks(p["position"], DX)
+    args = (p["position"], p["velocity"], p["affine"], p["mass"])
+    extra = {"stress": p["stress"], "volume": p["volume"]}
+    return lambda: op.p2g(*args, dx=DX, blocks=blocks, dt=DT, **extra)[0]
+
+
+def update(op: Any, device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    p = points(count, device, dtype)
+    blocks = ops.build_blocks(p["position"], DX)
+    grid, _ = ops.p2g(p["position"], p["velocity"], p["affine"], p["mass"], dx=DX, blocks=blocks)
+    plane = [[0.0, 2.0, 0.4, 0, 0, 0.52, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]]
+    floor = torch.tensor(plane, device=device, dtype=dtype)
+    return lambda: op.grid_update(grid, dx=DX, dt=DT, blocks=blocks, colliders=floor)[0]
+
+
+def gather(op: Any, device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    p = points(count, device, dtype)
+    blocks = ops.build_blocks(p["position"], DX)
+    nodes = (1, blocks.coords.shape[0], 64, 3)
+    field = random(nodes, 5, device, dtype) - 0.5
+    rest = torch.eye(3, device=device, dtype=dtype).expand(count, 3, 3).contiguous()
+    options = {"dx": DX, "dt": DT, "blocks": blocks, "deformation": rest}
+    return lambda: op.g2p(field, p["position"], **options)[1]
+
+
+def yield_(op: Any, device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    strain = (random((count, 6), 6, device, dtype) - 0.5) * 0.1
+    alpha = -0.08 * random((count,), 7, device, dtype)
+    increment = (random((count, 3, 3), 8, device, dtype) - 0.5) * 0.05
+    law = torch.tensor([1], dtype=torch.int32, device=device)
+    row = [[3.6e4, 1.2e5, 1.85, 0.6, 3.0, 0.0, 1000.0, 0.0]]
+    params = torch.tensor(row, device=device, dtype=dtype)
+    return lambda: op.return_mapping(strain, alpha, increment, law=law, params=params)[0]
+
+
+def splats(device: torch.device, dtype: torch.dtype, count: int) -> tuple[tuple, dict[str, Tensor]]:
+    means = (random((count, 3), 9, device, dtype) - 0.5) * 0.3
+    means[:, 2] += 1.0
+    size = 0.5 * 0.3 / count ** (1 / 3)
+    scales = size * (0.5 + random((count, 3), 10, device, dtype))
+    focal = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], device=device, dtype=dtype)
+    args = (means, random((count,), 11, device, dtype) * 0.8 + 0.1, torch.eye(4).to(means), focal)
+    sh = (random((count, 4, 3), 13, device, dtype) - 0.5) * 0.5
+    return args, {"quats": random((count, 4), 12, device, dtype) - 0.5, "scales": scales, "sh": sh}
+
+
+def draw(op: Any, device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    args, extra = splats(device, dtype, count)
+    return lambda: op.rasterize(*args, 640, 480, **extra)[0]
+
+
+def draw_backward(
+    op: Any, device: torch.device, dtype: torch.dtype, count: int
+) -> Callable[[], Any]:
+    (means, opacities, view, focal), extra = splats(device, dtype, count)
+    means.requires_grad_()
+
+    def step() -> Tensor:
+        means.grad = None
+        image = op.rasterize(means, opacities, view, focal, 640, 480, **extra)[0]
+        (image * image).sum().backward()
+        return means.grad
+
+    return step
+
+
+def enclose(op: Any, device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    cloud = random((count, 32, 3), 14, device, dtype)
+    return lambda: op.mvee(cloud, tolerance=1e-3)[1]
+
+
+# name, unit, full count, reference module, builder; the reference is run at a size its memory
+# allows
+CASES = [
+    Case("p2g", "particles", 200_000, reference_mpm, scatter),
+    Case("grid_update", "particles", 200_000, reference_mpm, update),
+    Case("g2p", "particles", 200_000, reference_mpm, gather),
+    Case("return_mapping", "particles", 1_000_000, reference_plasticity, yield_),
+    Case("rasterize", "splats", 60_000, reference_raster, draw),
+    Case("rasterize + backward", "splats", 60_000, reference_raster, draw_backward),
+    Case("mvee", "fits", 20_000, reference_mvee, enclose),
+]
+REFERENCE_COUNT = {"particles": 4000, "splats": 400, "fits": 200}
+
+
+def seconds(call: Callable[[], Any], device: torch.device, budget: float) -> float:
+    """Median of as many calls as fit the budget, at least three, after one warm-up."""
+
+    def timed() -> float:
+        start = time.perf_counter()
+        call()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter() - start
+
+    timed()
+    times: list[float] = []
+    while len(times) < 3 or (sum(times) < budget and len(times) < 200):
+        times.append(timed())
+    return sorted(times)[len(times) // 2]
+
+
+def error(case: Case, device: torch.device) -> float:
+    """Largest difference, relative to the largest value of the truth."""
+    count = REFERENCE_COUNT[case.unit]
+    cpu = torch.device("cpu")
+    ours = case.build(ops, device, torch.float32, count)()
+    if device.type == "cuda":
+        truth = case.build(ops, cpu, torch.float32, count)()
+    else:
+        truth = case.build(case.reference, cpu, torch.float64, count)()
+    difference = (ours.detach().cpu().double() - truth.detach().double()).abs().max()
+    return float(difference / truth.abs().max().clamp(min=1e-30))
+
+
+def measure(device: torch.device, *, quick: bool, budget: float) -> dict[str, Any]:
+    rows = []
+    for case in CASES:
+        count = case.count // 10 if quick else case.count
+        time_s = seconds(case.build(ops, device, torch.float32, count), device, budget)
+        rows.append(
+            {
+                "op": case.name,
+                "unit": case.unit,
+                "count": count,
+                "seconds": time_s,
+                "per_second": count / time_s,
+                "error": error(case, device),
+            }
+        )
+        sys.stderr.write(f"{device} {case.name}: {1e3 * time_s:.3f} ms\n")
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor()
+    return {
+        "device": device.type,
+        "name": name or platform.machine(),
+        "threads": torch.get_num_threads(),
+        "load": os.getloadavg()[0],
+        "torch": torch.__version__,
+        "rows": rows,
+    }
+
+
+def markdown(results: list[dict[str, Any]], before: dict[str, float]) -> str:
+    lines = []
+    for result in results:
+        against = "the CPU op" if result["device"] == "cuda" else "the float64 reference"
+        lines += [
+            f"### {result['device']}: {result['name']} (torch {result['torch']}, "
+            f"{result['threads']} threads, load {result['load']:.1f})",
+            "",
+            f"| op | size | ms | million/s | error against {against} |"
+            + (" before, ms |" if before else ""),
+            "| --- | --- | --- | --- | --- |" + (" --- |" if before else ""),
+        ]
+        for row in result["rows"]:
+            size = f"{row['count']:,} {row['unit']}"
+            line = f"| {row['op']} | {size} | {1e3 * row['seconds']:.3f} | "
+            line += f"{row['per_second'] / 1e6:.2f} | {row['error']:.1e} |"
+            if before:
+                line += f" {1e3 * before.get(result['device'] + row['op'], float('nan')):.3f} |"
+            lines.append(line)
+        lines.append("")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=["all", "cpu", "cuda"], default="all")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the size")
+    parser.add_argument("--budget", type=float, default=2.0, help="seconds per op")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--markdown", type=Path, help="write the tables here")
+    parser.add_argument("--compare", type=Path, help="an earlier --json file")
+    options = parser.parse_args()
+    if options.device == "cuda" and not has_cuda():
+        parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
+    names = ["cpu"] if options.device != "cuda" else []
+    if options.device != "cpu" and has_cuda():
+        names.append("cuda")
+    budget = 0.3 if options.quick else options.budget
+    results = [measure(torch.device(n), quick=options.quick, budget=budget) for n in names]
+    before = {}
+    if options.compare:
+        old = json.loads(options.compare.read_text())
+        before = {r["device"] + row["op"]: row["seconds"] for r in old for row in r["rows"]}
+    text = markdown(results, before)
+    sys.stdout.write(text)
+    if options.json:
+        options.json.write_text(json.dumps(results, indent=1) + "\n")
+    if options.markdown:
+        options.markdown.write_text(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""A small closed shell of splats and a shot around it: the cheapest input for every stage."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from gsfluent.data import SURFACE, Gaussians
+
+
+AXES = (1.0, 0.45, 0.45)  # slender, so that the fixed number of cells along it holds few points
+
+
+def shell(count: int = 1500) -> Gaussians:
+    """Splats over an ellipsoid 2 m long, striped so that there is a texture to look at."""
+    index = torch.arange(count) + 0.5
+    polar = torch.acos(1 - 2 * index / count)
+    turn = math.pi * (1 + math.sqrt(5)) * index
+    unit = torch.stack([turn.cos() * polar.sin(), turn.sin() * polar.sin(), polar.cos()], dim=-1)
+    scales = torch.full((count,), 0.6 * math.sqrt(4 * math.pi / count))
+    stripe = (unit[:, :1] * 20).sin() > 0
+    colors = torch.where(stripe, torch.tensor([0.1, 0.4, 0.1]), torch.tensor([0.5, 0.7, 0.3]))
+    return Gaussians.from_colors(unit * torch.tensor(AXES), scales, colors, opacities=0.95, label=SURFACE)
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shell as a .ply file."""
+    path = tmp_path_factory.mktemp("splat") / "ball.ply"
+    shell().save(path)
+    return path
+
+
+@pytest.fixture
+def shot(ball: Path, tmp_path: Path) -> Path:
+    """A shot that drops the ball: a few seconds of work in all."""
+    values = {
+        "splats": str(ball),
+        "scale": 1.0,
+        "up": "+z",
+        "fill": {"resolution": 24},
+        "texture": {"method": "color_copy"},
+        "objects": {"ball": {"material": "bread"}},
+        "events": [{"type": "drop", "height": 0.3}],
+        "solve": {"quality": "preview"},
+        "output": {"fps": 20, "seconds": 0.5, "size": [96, 64], "what": ["mp4", "ply-seq"]},
+    }
+    path = tmp_path / "shot.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return path
