@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pybind11
 import torch
-from setuptools import setup
+from setuptools import Extension, setup
 from torch.utils import cpp_extension
 
 ROOT = Path(__file__).resolve().parent
@@ -116,12 +116,13 @@ def core_extension() -> list:
     if not (ROOT / "csrc" / "bindings.cpp").exists():
         return []
     return [
-        cpp_extension.CppExtension(
+        Extension(
             "gsfluent._core",
             ["csrc/bindings.cpp"],
             include_dirs=[pybind11.get_include(), str(ROOT / "csrc")],
             depends=sources("csrc/core/*.h"),
-            extra_compile_args={"cxx": cxx_flags()},
+            extra_compile_args=cxx_flags(),
+            language="c++",
         )
     ]
 

@@ -87,9 +87,8 @@ def write_vtk_frame(path: Path, frame: SavedFrame) -> None:
     vertices[:, 0], vertices[:, 1] = 1, np.arange(count)
     with atomic_path(path) as part, part.open("wb") as stream:
         title = f"gsfluent frame {frame.index + 1}, time {frame.time:.6g} s"
-        stream.write(
-            f"# vtk DataFile Version 3.0\n{title}\nBINARY\nDATASET POLYDATA\nPOINTS {count} float\n".encode()
-        )
+        kind_of_file = f"# vtk DataFile Version 3.0\n{title}\nBINARY\nDATASET POLYDATA\n"
+        stream.write(f"{kind_of_file}POINTS {count} float\n".encode())
         stream.write(points.tobytes())
         stream.write(f"\nVERTICES {count} {2 * count}\n".encode())
         stream.write(vertices.tobytes())

@@ -17,6 +17,7 @@ from .fill_inside import (
     cast_votes,
     count_leaks,
     keep_components,
+    smooth_boundary,
     trim_outer_flank,
     visual_hull,
 )
@@ -26,6 +27,7 @@ from .fill_interior import (
     refine_opacity,
 )
 from .fill_view import cut_view, surface_colors
+from .orient import orient
 from .stage import Progress, Stage, report_progress
 
 if TYPE_CHECKING:
@@ -60,7 +62,8 @@ class Fill(Stage):
         spacing: Distance between interior Gaussians in voxels; None picks 1.25, wider when more
             than ``max_interior`` Gaussians would be needed.
         max_interior: Upper bound on the number of interior Gaussians.
-        down: Downward direction in world coordinates; None finds an unseen underside by itself.
+        down: Downward direction in world coordinates; None asks the capture, and without one finds
+            an unseen side by itself.
         close_underside: Close the side that no photograph shows, at its rim.
         refine_iterations: Steps of the opacity fit (0 switches it off).
         refine_image_size: Longest image side in the fit [pixels].
@@ -79,7 +82,7 @@ class Fill(Stage):
         hollow: str | float = "auto",
         *,
         threshold: float = 0.5,
-        agreement: float = 0.8,
+        agreement: float = 0.7,
         rays: int = 26,
         spacing: float | None = None,
         max_interior: int = 200_000,
@@ -108,7 +111,7 @@ class Fill(Stage):
             raise InputError(f"fill: threshold must be > 0, got {threshold}", mend="0.5 is usual")
         if not 0.5 <= agreement <= 1.0:
             raise InputError(
-                f"fill: agreement must be in 0.5..1, got {agreement}", mend="0.8 is usual"
+                f"fill: agreement must be in 0.5..1, got {agreement}", mend="0.7 is usual"
             )
         if spacing is not None and not 0.5 <= spacing <= 16:
             raise InputError(
@@ -169,7 +172,10 @@ class Fill(Stage):
                 mend="lower threshold or resolution: the splats are transparent or sparse",
             )
         report_progress(progress, 1, total, "inside")
-        solid, report = self._decide(box, density, shell, capture)
+        down = self.down
+        if down is None and capture is not None:
+            down = -np.asarray(orient(gaussians, capture).up, dtype=float)
+        solid, report = self._decide(box, density, shell, capture, down)
         report_progress(progress, 2, total, "depth")
         solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel)
         report_progress(progress, 3, total, "interior Gaussians")
@@ -227,14 +233,17 @@ class Fill(Stage):
         )
 
     def _decide(
-        self, box: GridBox, density: np.ndarray, shell: np.ndarray, capture: Capture | None
+        self,
+        box: GridBox,
+        density: np.ndarray,
+        shell: np.ndarray,
+        capture: Capture | None,
+        down: np.ndarray | None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Occupied voxels and what was noticed on the way."""
         from scipy import ndimage
 
-        vote = cast_votes(
-            shell, rays=self.rays, down=self.down, close_open_side=self.close_underside
-        )
+        vote = cast_votes(shell, rays=self.rays, down=down, close_open_side=self.close_underside)
         views = _masked_views(capture) if self.method != "vote" else []
         if self.method == "hull" and not views:
             raise InputError(
@@ -261,7 +270,7 @@ class Fill(Stage):
         if vote.open_side is not None:
             leaks = max(leaks, 1)
         untrimmed = solid
-        solid = trim_outer_flank(solid, shell, density)
+        solid = smooth_boundary(trim_outer_flank(solid, shell, density))
         solid, more = keep_components(solid)
         inner = int((solid & ~shell).sum())
         if inner == 0:

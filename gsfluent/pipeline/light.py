@@ -1,5 +1,4 @@
-"""One directional light: Blinn-Phong on linear radiance, with a shadow map made by our own
-rasterizer.
+"""One directional light: Blinn-Phong on linear radiance, with a shadow map of our rasterizer.
 
 equations.md section 16: ``L = c_0 (I_a + T I_L (D + S))`` with ``D = max(0, n.l)``,
 ``S = k_s max(0, n.h)^{n_s}`` and ``h = (l + v) / |l + v|``. The captured colour ``c_0`` already

@@ -15,6 +15,7 @@ from gsfluent.metrics import SsimTarget
 _log = logging.getLogger(__name__)
 
 _MARGIN = 8  # pixels kept around a mask; more than half an SSIM window
+_SHORTEST = 12  # pixels; an SSIM window must fit
 _SMALLEST = 24  # pixels; a side of a crop is never shorter
 
 
@@ -58,11 +59,18 @@ def read_views(
         crop: Keep only the surroundings of the mask (where there is one).
 
     Raises:
-        InputError: All photographs are black, all masks are empty, or only some images have masks.
+        InputError: Photographs are too small or all black, all masks are empty, or only some images
+            have masks.
     """
     views, masked, brightest, covered = [], 0, 0.0, 0.0
     for index in range(len(capture)):
         view = capture.view(index, max_size)
+        if min(view.image.shape[:2]) < _SHORTEST:
+            raise InputError(
+                f"reconstruct: {view.camera.name} has {view.camera.width} x {view.camera.height} "
+                f"pixels at image_size {max_size}; both sides must be at least {_SHORTEST}",
+                "choose a larger image_size, or larger photographs",
+            )
         brightest = max(brightest, float(view.image.max()))
         masked += view.mask is not None
         if view.mask is not None:

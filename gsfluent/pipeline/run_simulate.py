@@ -8,8 +8,9 @@ from typing import Any
 import torch
 
 from gsfluent import materials
-from gsfluent.config import Shot, event_dict
+from gsfluent.config import ObjectSettings, Shot, event_dict
 from gsfluent.data import Frame, Solid
+from gsfluent.materials import Material
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
 from gsfluent.pipeline.run_store import fingerprint
@@ -32,12 +33,15 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     """
     scene = Scene(floor=None if shot.floor == "none" else 0.0)
     for name, settings in shot.objects.items():
-        material = materials.get(settings.material).override(**dict(settings.overrides))
         parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
-        scene.add(solids[name], material, frame=frame, parts=parts, name=name)
+        scene.add(solids[name], _material(settings), frame=frame, parts=parts, name=name)
     for event in shot.events:
         scene.add_event(event_dict(event))
     return scene
+
+
+def _material(settings: ObjectSettings) -> Material:
+    return materials.get(settings.material).override(**dict(settings.overrides))
 
 
 def load_solids(context: RunContext) -> dict[str, Solid]:
@@ -49,7 +53,11 @@ def load_solids(context: RunContext) -> dict[str, Solid]:
 def simulate_stage(context: RunContext) -> None:
     """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
     shot = context.shot
-    objects = {name: settings.to_dict() for name, settings in shot.objects.items()}
+    objects = {
+        # the numbers of a preset, not its name: a retuned preset is another simulation
+        name: [settings.to_dict(), repr(_material(settings))]
+        for name, settings in shot.objects.items()
+    }
     events = [event_dict(event) for event in shot.events]
     settings = [
         objects,

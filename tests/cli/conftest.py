@@ -11,7 +11,6 @@ import yaml
 
 from gsfluent.data import SURFACE, Gaussians
 
-
 AXES = (1.0, 0.45, 0.45)  # slender, so that the fixed number of cells along it holds few points
 
 
@@ -24,7 +23,8 @@ def shell(count: int = 1500) -> Gaussians:
     scales = torch.full((count,), 0.6 * math.sqrt(4 * math.pi / count))
     stripe = (unit[:, :1] * 20).sin() > 0
     colors = torch.where(stripe, torch.tensor([0.1, 0.4, 0.1]), torch.tensor([0.5, 0.7, 0.3]))
-    return Gaussians.from_colors(unit * torch.tensor(AXES), scales, colors, opacities=0.95, label=SURFACE)
+    means = unit * torch.tensor(AXES)
+    return Gaussians.from_colors(means, scales, colors, opacities=0.95, label=SURFACE)
 
 
 @pytest.fixture(scope="session")

@@ -195,6 +195,18 @@ def test_ellipsoid_lens_matches_dense_sampling(same_shape: bool, dtype: torch.dt
         assert ratio.max() < 1.25
 
 
+def test_lens_matches_the_reference() -> None:
+    args = pairs(4, False)
+    mean, cov, overlap = mvee_lens(*args)
+    want_mean, want, want_overlap = reference.mvee_lens(*args)
+    assert torch.equal(overlap, want_overlap)
+    size = volume(cov) ** (1.0 / 3.0)
+    assert ((mean - want_mean).norm(dim=1) / size).max() < 0.1
+    ratio = volume(cov) / volume(want)
+    assert ratio.min() > 0.9
+    assert ratio.max() < 1.25
+
+
 def test_packed_and_full_covariances_agree() -> None:
     mean_a, cov_a, mean_b, cov_b = pairs(10, False)
 

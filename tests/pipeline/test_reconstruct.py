@@ -206,6 +206,13 @@ def test_black_photographs_are_refused(table: Capture, tmp_path: Path) -> None:
         Reconstruct(iterations=1, image_size=64)(table.replace(cameras=cameras))
 
 
+def test_photographs_too_small_for_the_window_are_refused(table: Capture, tmp_path: Path) -> None:
+    save_image(torch.rand(8, 8, 3), tmp_path / "tiny.png")
+    cameras = [c.replace(image_path=tmp_path / "tiny.png") for c in table.cameras]
+    with pytest.raises(InputError, match="at least 12"):
+        Reconstruct(iterations=1)(table.replace(cameras=cameras))
+
+
 def test_neither_masks_nor_points_is_refused(table: Capture) -> None:
     bare = table.replace(points=table.points[:0], point_colors=table.point_colors[:0])
     with pytest.raises(InputError, match="no masks, and only 0 usable sparse points"):

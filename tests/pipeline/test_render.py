@@ -1,4 +1,4 @@
-"""Render: light, shadow, floor, normals, holes, cameras. Each test draws something whose look is known."""
+"""Render: light, shadow, floor, normals, holes, cameras, each on something of known look."""
 
 from __future__ import annotations
 

@@ -1,0 +1,155 @@
+// gsfluent._core: the physics of csrc/core for one particle or one fit, from Python, in float32 and
+// float64 (submodules of those names). For tests and material-point studies; tensors go through
+// torch.ops.gsfluent.
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "core/mvee_lens.h"
+#include "core/nacc.h"
+
+namespace py = pybind11;
+
+namespace gsf {
+namespace {
+
+template <typename T>
+using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
+
+template <typename T>
+const T* expect(const Array<T>& a, const char* name, std::vector<py::ssize_t> shape) {
+  bool ok = a.ndim() == static_cast<py::ssize_t>(shape.size());
+  for (size_t i = 0; ok && i < shape.size(); ++i) ok = shape[i] < 0 || a.shape(i) == shape[i];
+  if (!ok) {
+    std::string want;
+    for (py::ssize_t s : shape)
+      want += (want.empty() ? "" : ", ") + (s < 0 ? "N" : std::to_string(s));
+    throw std::invalid_argument(std::string(name) + " must have shape [" + want + "]");
+  }
+  return a.data();
+}
+
+template <typename T>
+Array<T> to_array(const Sym3<T>& s) {
+  Array<T> a(6);
+  store_sym3(a.mutable_data(), s);
+  return a;
+}
+template <typename T>
+Array<T> to_array(const Mat3<T>& m) {
+  Array<T> a({3, 3});
+  store_mat3(a.mutable_data(), m);
+  return a;
+}
+template <typename T>
+Array<T> to_array(const Vec3<T>& v) {
+  Array<T> a(3);
+  for (int i = 0; i < 3; ++i) a.mutable_data()[i] = v[i];
+  return a;
+}
+template <typename T>
+Vec3<T> vec3(const Array<T>& a, const char* name) {
+  const T* p = expect(a, name, {3});
+  return {p[0], p[1], p[2]};
+}
+
+template <typename T>
+NaccMaterial<T> material(T mu, T kappa, T friction, T cohesion, T hardening, T shear_damage) {
+  return {mu, kappa, friction, cohesion, hardening, shear_damage};
+}
+
+template <typename T>
+py::dict one_particle(const Array<T>& strain, T alpha, const Array<T>& increment, int law,
+                      const NaccMaterial<T>& m, T k, T epsilon, bool implicit) {
+  if (law != 0 && law != 1) throw std::invalid_argument("law must be 0 (elastic) or 1 (nacc)");
+  const ReturnMapped<T> r = return_mapping(load_sym3(expect(strain, "strain", {6})), alpha,
+                                           load_mat3(expect(increment, "increment", {3, 3})), law,
+                                           m, NaccOptions<T>{k, epsilon, implicit});
+  py::dict d;
+  d["strain"] = to_array(r.strain);
+  d["stress"] = to_array(r.stress);
+  d["alpha"] = r.alpha;
+  d["plastic"] = r.plastic;
+  d["guarded"] = r.guarded;
+  d["inverted"] = r.inverted;
+  d["invalid"] = r.invalid;
+  return d;
+}
+
+template <typename T>
+void bind(py::module_ m) {
+  using py::arg;
+  py::class_<NaccMaterial<T>>(m, "Material", "Moduli [Pa], M, beta, xi, eta of one material.")
+      .def(py::init(&material<T>), arg("mu"), arg("kappa"), arg("friction") = T(0),
+           arg("cohesion") = T(0), arg("hardening") = T(0), arg("shear_damage") = T(0));
+  m.def("return_mapping", &one_particle<T>, arg("strain"), arg("alpha"), arg("increment"),
+        arg("law"), arg("material"), arg("k") = T(2), arg("epsilon") = T(0.1),
+        arg("implicit") = true, "One constitutive step of one particle (core/nacc.h).");
+  m.def(
+      "elastic_energy",
+      [](const Array<T>& strain, T mu, T kappa) {
+        const Sym3<T> e = load_sym3(expect(strain, "strain", {6}));
+        return elastic_energy(mu, kappa, elastic_state(e, false));
+      },
+      arg("strain"), arg("mu"), arg("kappa"),
+      "Stored energy per initial volume of one particle [J/m^3] (core/elastic.h).");
+  m.def(
+      "yield_surface",
+      [](const NaccMaterial<T>& material, T alpha) {
+        const YieldSurface<T> y = yield_surface(material, alpha);
+        return py::make_tuple(y.p0, y.tip, y.center, y.a, y.b);
+      },
+      arg("material"), arg("alpha"), "(p0, -beta p0, centre, half-width, half-height) [Pa].");
+  m.def(
+      "svd3",
+      [](const Array<T>& f) {
+        const Svd3<T> r = svd3(load_mat3(expect(f, "f", {3, 3})));
+        return py::make_tuple(to_array(r.u), to_array(r.sigma), to_array(r.v));
+      },
+      arg("f"), "(U, sigma, V) of F = U diag(sigma) V^T with rotations U, V (core/svd3.h).");
+  m.def(
+      "mvee",
+      [](const Array<T>& points, T tolerance, int max_iterations) {
+        const T* p = expect(points, "points", {-1, 3});
+        const py::ssize_t n = points.shape(0);
+        if (n < 1) throw std::invalid_argument("points must hold at least one point");
+        std::vector<T> weight(n);
+        const Ellipsoid<T> e = mvee_fit(SerialTeam{}, p, static_cast<int>(n), weight.data(),
+                                        tolerance, max_iterations);
+        return py::make_tuple(to_array(e.center), to_array(to_mat3(e.shape)));
+      },
+      arg("points"), arg("tolerance") = T(1e-3), arg("max_iterations") = 1000,
+      "(centre, shape) of the ellipsoid around one point set (core/mvee.h).");
+  m.def(
+      "ball_lens",
+      [](T r1, T r2, T distance) {
+        const BallLens<T> b = ball_lens(r1, r2, distance);
+        return py::make_tuple(b.center, b.axial, b.radial, b.overlap);
+      },
+      arg("r1"), arg("r2"), arg("distance"),
+      "(centre on the axis, axial, radial semi-axis, overlap) of two balls (core/mvee_lens.h).");
+  m.def(
+      "mvee_lens",
+      [](const Array<T>& mean_a, const Array<T>& cov_a, const Array<T>& mean_b,
+         const Array<T>& cov_b, T radius) {
+        T points[3 * kLensRays], weight[kLensRays];
+        const LensResult<T> r = mvee_lens(
+            SerialTeam{}, vec3(mean_a, "mean_a"), load_sym3(expect(cov_a, "cov_a", {6})),
+            vec3(mean_b, "mean_b"), load_sym3(expect(cov_b, "cov_b", {6})), radius, points, weight);
+        return py::make_tuple(to_array(r.mean), to_array(r.covariance), r.overlap);
+      },
+      arg("mean_a"), arg("cov_a"), arg("mean_b"), arg("cov_b"), arg("radius") = T(2),
+      "(mean, covariance, overlap) around one pair of Gaussians (core/mvee_lens.h).");
+}
+
+}  // namespace
+}  // namespace gsf
+
+PYBIND11_MODULE(_core, m) {
+  m.doc() = "csrc/core for one particle or one fit; submodules float32 and float64.";
+  gsf::bind<float>(m.def_submodule("float32"));
+  gsf::bind<double>(m.def_submodule("float64"));
+}
