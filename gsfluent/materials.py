@@ -245,7 +245,7 @@ _RIND = {
     "hardening": 2.33,
     "alpha0": -0.21,
 }
-_PEEL = {"name": "peel", "where": {"depth_below": 0.005}, "cohesion": 0.6}
+_PEEL = {"name": "peel", "where": {"depth_below": 0.004}, "cohesion": 0.12, "young_modulus": 5e5}
 
 _PRESETS: dict[str, Material] = {
     m.name: m
@@ -266,25 +266,33 @@ _PRESETS: dict[str, Material] = {
         ),
         Material(
             "fruit.apple",
-            1e6,
+            2.5e5,
             0.35,
             840.0,
             cohesion=0.1,
-            hardening=10.0,
-            alpha0=-0.06,
+            hardening=5.0,
+            friction_angle=60.0,
+            alpha0=-0.1,
+            shear_damage=0.025,
+            variation=0.3,
+            grain=0.008,
             sources={
                 "density": _DENSITY + ", an apple floats with a sixth above water",
-                "young_modulus": _softened(3e6, 3, "apple flesh"),
+                "young_modulus": _softened(3e6, 12, "apple flesh"),
             },
         ),
         Material(
             "fruit.orange",
-            3e5,
+            2e5,
             0.4,
             950.0,
-            cohesion=0.2,
-            hardening=8.0,
-            alpha0=-0.08,
+            cohesion=0.1,
+            hardening=5.0,
+            friction_angle=60.0,
+            alpha0=-0.1,
+            shear_damage=0.025,
+            variation=0.3,
+            grain=0.008,
             parts=(_PEEL,),
             sources={"density": _DENSITY},
         ),
