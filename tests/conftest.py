@@ -6,6 +6,10 @@ import os
 from pathlib import Path
 
 import pytest
+
+# before torch loads OpenMP: threads that sleep while they wait, see gsfluent/cli
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import torch
 
 REPO = Path(__file__).resolve().parent.parent
