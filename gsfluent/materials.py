@@ -45,7 +45,11 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "alpha0": (-10.0, 0.5, "no unit"),
     "shear_damage": (0.0, 10.0, "no unit"),
 }
-_POSITIVE = ("young_modulus", "density")
+_POSITIVE = ("young_modulus", "density", "grain")
+_SCATTER: dict[str, tuple[float, float, str]] = {
+    "variation": (0.0, 1.0, "no unit"),
+    "grain": (0.0, math.inf, "m"),
+}
 PARAMETERS = tuple(_RANGES)
 """The fields of a material that may vary in space."""
 
@@ -65,6 +69,10 @@ class Material:
         friction_angle: Internal friction [degrees]; sets the slope M of the yield surface.
         alpha0: Log plastic volume ratio at the start; negative is intact.
         shear_damage: How much plastic shear counts as damage, eta; 0 is the plain model.
+        variation: Relative scatter of strength in space (standard deviation of a smooth random
+            factor on ``alpha0``); natural solids have weak and strong places, and that decides
+            where cracks run and how many pieces survive a harder landing.
+        grain: Length over which the strength varies [m].
         parts: Default parts (for :meth:`gsfluent.Scene.add`), e.g. the rind of a melon.
         sources: Field name -> where the number is from. A field that is not named was chosen by
             eye.
@@ -83,6 +91,8 @@ class Material:
     friction_angle: Field = 45.0
     alpha0: Field = -0.04
     shear_damage: Field = 0.0
+    variation: float = 0.0
+    grain: float = 0.025
     parts: tuple[Mapping[str, Any], ...] = ()
     sources: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -101,6 +111,10 @@ class Material:
             )
         for field, (low, high, unit) in _RANGES.items():
             _check_number(self.name, field, getattr(self, field), low, high, unit)
+        for field, (low, high, unit) in _SCATTER.items():
+            if isinstance(getattr(self, field), Tensor):
+                raise InputError(f"material {self.name!r}: {field} must be one number")
+            _check_number(self.name, field, getattr(self, field), low, high, unit)
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     def override(self, **changes: Any) -> Material:
@@ -109,7 +123,7 @@ class Material:
         Raises:
             InputError: An unknown field or a number outside its range.
         """
-        known = [*PARAMETERS, "law", "name", "parts"]
+        known = [*PARAMETERS, *_SCATTER, "law", "name", "parts"]
         for key in changes:
             if key in LATER_FIELDS:
                 raise InputError(
@@ -126,7 +140,7 @@ class Material:
 
     def source(self, field: str) -> str:
         """Say where a number is from: ``measured: ...``, ``derived: ...`` or ``chosen by eye``."""
-        if field not in PARAMETERS:
+        if field not in (*PARAMETERS, *_SCATTER):
             raise InputError(
                 f"material {self.name!r}: unknown parameter {field!r}",
                 mend=_nearest(field, PARAMETERS),
@@ -227,11 +241,11 @@ _RIND = {
     "name": "rind",
     "where": {"depth_below": 0.0175},
     "young_modulus": 9.6e5,
-    "cohesion": 0.022,
+    "cohesion": 0.03,
     "hardening": 2.33,
     "alpha0": -0.21,
 }
-_PEEL = {"name": "peel", "where": {"depth_below": 0.005}, "cohesion": 0.6}
+_PEEL = {"name": "peel", "where": {"depth_below": 0.004}, "cohesion": 0.12, "young_modulus": 5e5}
 
 _PRESETS: dict[str, Material] = {
     m.name: m
@@ -241,35 +255,44 @@ _PRESETS: dict[str, Material] = {
             2.4e5,
             0.32,
             950.0,
-            cohesion=0.055,
+            cohesion=0.095,
             hardening=4.65,
             friction_angle=60.0,
             alpha0=-0.105,
             shear_damage=0.025,
+            variation=0.35,
             parts=(_RIND,),
             sources={"density": _DENSITY + ", a melon just floats"},
         ),
         Material(
             "fruit.apple",
-            1e6,
+            2.5e5,
             0.35,
             840.0,
             cohesion=0.1,
-            hardening=10.0,
-            alpha0=-0.06,
+            hardening=5.0,
+            friction_angle=60.0,
+            alpha0=-0.1,
+            shear_damage=0.025,
+            variation=0.3,
+            grain=0.008,
             sources={
                 "density": _DENSITY + ", an apple floats with a sixth above water",
-                "young_modulus": _softened(3e6, 3, "apple flesh"),
+                "young_modulus": _softened(3e6, 12, "apple flesh"),
             },
         ),
         Material(
             "fruit.orange",
-            3e5,
+            2e5,
             0.4,
             950.0,
-            cohesion=0.2,
-            hardening=8.0,
-            alpha0=-0.08,
+            cohesion=0.1,
+            hardening=5.0,
+            friction_angle=60.0,
+            alpha0=-0.1,
+            shear_damage=0.025,
+            variation=0.3,
+            grain=0.008,
             parts=(_PEEL,),
             sources={"density": _DENSITY},
         ),

@@ -69,7 +69,14 @@ class Part:
             _known(
                 f"part {name!r}",
                 key,
-                [*materials.PARAMETERS, *materials.LATER_FIELDS, "material", "law"],
+                [
+                    *materials.PARAMETERS,
+                    *materials.LATER_FIELDS,
+                    "variation",
+                    "grain",
+                    "material",
+                    "law",
+                ],
             )
         return Part(name, dict(where), rest)
 

@@ -206,6 +206,25 @@ def test_weakness_noise_is_bounded_and_seeded():
     assert torch.equal(alpha, build_matter(scene, 0.02).particles.alpha)
 
 
+def test_strength_scatter_is_smooth_seeded_and_of_the_size_asked_for():
+    varied = materials.glass.override(variation=0.3, grain=0.03)
+    scene, plain = Scene(), Scene()
+    scene.add(ellipsoid(), varied)
+    plain.add(ellipsoid(), materials.glass)
+    matter = build_matter(scene, 0.01, jitter=0.0)
+    factor = matter.particles.alpha / build_matter(plain, 0.01, jitter=0.0).particles.alpha
+    assert 0.2 < float(factor.std()) < 0.4
+    near = torch.cdist(matter.rest[:2000], matter.rest)
+    near[near == 0] = 1.0
+    neighbour = factor[near.argmin(dim=1)]
+    assert float((neighbour - factor[:2000]).abs().max()) < 0.3
+    coarse = build_matter(scene, 0.02, jitter=0.0)
+    match = torch.cdist(coarse.rest, matter.rest).argmin(dim=1)
+    assert float((coarse.particles.alpha - matter.particles.alpha[match]).abs().mean()) < 0.01
+    with pytest.raises(InputError, match="variation"):
+        varied.override(variation=2.0)
+
+
 def test_points_are_stored_in_cell_order():
     scene = Scene()
     scene.add(ellipsoid((0.2, 0.1, 0.1)), materials.glass)

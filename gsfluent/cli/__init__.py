@@ -18,9 +18,9 @@ from typing import Any
 
 from gsfluent.errors import GsfluentError, InputError, RunError
 
-# Read by OpenMP when torch loads it. By default its threads spin while they wait, which on a busy
-# machine makes a simulation ten times slower (measured on two loaded cores: 66 s against 7 s).
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# Read by OpenMP when torch is first imported. Thread teams that spin at their barriers make small
+# torch operations tens of times slower as soon as anything else runs on the machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # errno of things a user can mend by naming another path
 _USER_ERRNO = (

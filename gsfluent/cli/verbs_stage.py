@@ -140,6 +140,12 @@ class Texture(Verb):
     """exemplar, diffusion, color_copy or procedural."""
     exemplar: Path | None = None
     """Photograph of a cut through such an object."""
+    preset: str | None = None
+    """Procedural recipe: watermelon, apple, orange, bread, wood, marble, bone, ..."""
+    quality: str | None = None
+    """Effort of the exemplar method: preview, fast or full."""
+    guide: str | None = None
+    """What patches are matched by: auto, depth, axis (a cut across the axis) or none."""
     prompt: str | None = None
     """What the inside looks like, for diffusion."""
     model: str | None = None
@@ -156,6 +162,9 @@ class Texture(Verb):
         given = {
             "method": method,
             "exemplar": self.exemplar,
+            "preset": self.preset,
+            "quality": self.quality,
+            "guide": self.guide,
             "prompt": self.prompt,
             "model": self.model,
         }

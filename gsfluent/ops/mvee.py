@@ -28,8 +28,7 @@ def mvee(
     Args:
         points: Point sets [any length unit], shape [B, N, 3], N >= 1, float32 or float64.
         tolerance: Relative optimality gap at which the iteration stops, > 0. The volume exceeds
-            the smallest one by at most about ``1.5 * tolerance`` of itself plus what containment
-            needs.
+            the smallest one by at most about twice this fraction.
         max_iterations: Bound on the iterations per fit; the result contains its points even when
             it stops early.
 
@@ -108,7 +107,9 @@ def mvee_lens(
     of equal shape, give the exact smallest ellipsoid around the overlap (closed form, three cases
     by cap height, its axial semi-axis raised to 0.15 of the radial one so that a vanishing
     overlap does not become a disc). Other pairs are fitted to 128 boundary points and widened to
-    contain 512; measured against dense sampling the overlap reaches out by a few percent at most.
+    contain 512: over 266 random pairs (axis ratios to about 40) the true overlap reached out by 0.8
+    percent in the median and 17 percent at worst, and the volume was 1.07 (0.99 to 1.8) times that
+    of a dense fit.
 
     Args:
         mean_a: Centres [m], [B, 3], float32 or float64.

@@ -24,6 +24,7 @@ from gsfluent.scene import Body, Part, Scene
 _log = logging.getLogger(__name__)
 
 POINTS_PER_CELL = 8
+_WAVES = 128
 ALPHA_JITTER = 0.15
 """Relative half-width of the uniform weakness noise that seeds cracks (equations.md section 17)."""
 
@@ -146,7 +147,7 @@ def build_matter(
         points, volume = _sample_body(body, step, seed)
         points = points[_cell_order(points, dx / body.frame.scale)]
         count = points.shape[0]
-        params, law, alpha = _parameters(body, points)
+        params, law, alpha = _parameters(body, points, seed)
         noise = torch.rand(
             count, generator=torch.Generator().manual_seed(seed + 7919 * (number + 1))
         )
@@ -242,7 +243,7 @@ def _placed(body: Body, points: Tensor) -> Tensor:
     return body.frame.apply(points) + torch.tensor(body.offset, dtype=torch.float64)
 
 
-def _parameters(body: Body, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _parameters(body: Body, points: Tensor, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return per-point parameters [N, 8], law [N] (int32) and alpha0 [N] (float64)."""
     count = points.shape[0]
     solid = body.solid
@@ -277,8 +278,24 @@ def _parameters(body: Body, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         at = sampler(material, index)
         params[index] = material.parameters(at)
         law[index] = materials.LAWS[material.law]
-        alpha[index] = at(material.alpha0)
+        alpha[index] = at(material.alpha0) * _weakness(material, points[index], body, seed)
     return params, law, alpha
+
+
+def _weakness(material: Material, points: Tensor, body: Body, seed: int) -> Tensor:
+    """Smooth random factor on strength at points in the body's own coordinates, [N].
+
+    A sum of plane waves with random directions and phases is a Gaussian random field of unit
+    variance and correlation length ``grain``; it is fixed in object space.
+    """
+    if material.variation == 0.0:
+        return torch.ones(points.shape[0], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(seed + 104729)
+    waves = torch.randn(_WAVES, 3, generator=generator, dtype=torch.float64)
+    phases = torch.rand(_WAVES, generator=generator, dtype=torch.float64) * (2.0 * math.pi)
+    angle = (points * body.frame.scale) @ (waves / material.grain).T + phases
+    field = torch.cos(angle).sum(dim=1) * math.sqrt(2.0 / _WAVES)
+    return (1.0 + material.variation * field.clamp(-2.0, 2.0)).clamp(min=0.05)
 
 
 def select(part: Part, body: Body, points: Tensor) -> Tensor:
