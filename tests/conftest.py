@@ -5,7 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+# before torch starts its threads: spinning barriers crawl on a busy machine (see gsfluent/cli)
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import pytest
+
+# before torch loads OpenMP: threads that sleep while they wait, see gsfluent/cli
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 import torch
 
 REPO = Path(__file__).resolve().parent.parent

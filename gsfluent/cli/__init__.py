@@ -18,6 +18,10 @@ from typing import Any
 
 from gsfluent.errors import GsfluentError, InputError, RunError
 
+# Read by OpenMP when torch is first imported. Thread teams that spin at their barriers make small
+# torch operations tens of times slower as soon as anything else runs on the machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 # errno of things a user can mend by naming another path
 _USER_ERRNO = (
     errno.ENOENT,

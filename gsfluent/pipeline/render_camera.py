@@ -77,12 +77,12 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     """One camera per frame, slowly circling; it follows the matter softly and never zooms.
 
     The distance is the one that shows nine tenths of the matter at its widest, but the whole object
-    at least and three times the object at most: a burst of crumbs must not shrink the subject to a
+    at least and about twice the object at most: a burst of crumbs must not shrink the subject to a
     dot.
     """
     count = action.center.shape[0]
     first = float(action.radius[0])
-    shown = _ROOM * min(max(float(action.radius.amax()), 1.35 * first), 3.0 * first)
+    shown = _ROOM * min(max(float(action.radius.amax()), 1.35 * first), 2.2 * first)
     distance = shown / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
     centers = _follow(action, shown)
     steps = [i / max(1, count - 1) for i in range(count)]
