@@ -94,7 +94,7 @@ def test_drop_puts_the_lowest_point_at_the_height():
 
 
 def test_events_of_a_shot_are_checked():
-    scene = Scene()
+    scene = Scene(floor=None)
     with pytest.raises(InputError, match="no solid"):
         scene.add_event({"type": "drop", "height": 1.0})
     scene.add(ellipsoid(), "apple")
@@ -111,7 +111,7 @@ def test_events_of_a_shot_are_checked():
 
 
 def test_bullet_keeps_the_time_step():
-    scene = Scene()
+    scene = Scene(floor=None)
     scene.add(ellipsoid(), "watermelon")
     scene.add_event(
         {"type": "bullet", "from": [1, 0, 0], "toward": [0, 0, 0], "speed": 60, "density": 7800}
@@ -125,7 +125,7 @@ def test_bullet_keeps_the_time_step():
 
 def test_sampled_mass_is_density_times_volume():
     solid = ellipsoid((0.1, 0.08, 0.06))
-    scene = Scene()
+    scene = Scene(floor=None)
     scene.add(solid, materials.elastic)
     matter = build_matter(scene, 0.02)
     assert math.isclose(float(matter.particles.mass.sum()), 1000 * solid.volume, rel_tol=1e-5)
@@ -139,7 +139,7 @@ def test_sampling_follows_the_frame_and_the_seed():
     half_turn = Frame(
         torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.tensor([0.0, 0.0, 0.06]), 0.1
     )
-    scene = Scene()
+    scene = Scene(floor=None)
     scene.add(solid, materials.elastic, frame=half_turn)
     matter = build_matter(scene, 0.02)
     back = half_turn.inverse().apply(matter.rest)
@@ -152,7 +152,7 @@ def test_sampling_follows_the_frame_and_the_seed():
 
 def test_parts_select_by_depth_colour_box_and_sphere():
     solid = ellipsoid((0.1, 0.1, 0.1))
-    scene = Scene()
+    scene = Scene(floor=None)
     parts = [
         {"name": "rind", "where": {"depth_below": 0.02}, "density": 2000.0},
         {
@@ -183,21 +183,21 @@ def test_a_parameter_field_varies_in_space():
     solid = ellipsoid()
     field = torch.full(solid.occupancy.shape, 0.1)
     field[: solid.occupancy.shape[0] // 2] = 0.3
-    scene = Scene()
+    scene = Scene(floor=None)
     scene.add(solid, materials.glass.override(cohesion=field))
     matter = build_matter(scene, 0.02)
     cohesion = matter.params[matter.particles.material, 3]
     left = matter.rest[:, 0] < -solid.voxel
     assert torch.allclose(cohesion[left], torch.tensor(0.3))
     assert torch.allclose(cohesion[matter.rest[:, 0] > solid.voxel], torch.tensor(0.1))
-    wrong = Scene()
+    wrong = Scene(floor=None)
     wrong.add(solid, materials.glass.override(cohesion=torch.ones(2, 2, 2)))
     with pytest.raises(InputError, match="shape of the voxels"):
         build_matter(wrong, 0.02)
 
 
 def test_weakness_noise_is_bounded_and_seeded():
-    scene = Scene()
+    scene = Scene(floor=None)
     scene.add(ellipsoid(), materials.glass)
     alpha = build_matter(scene, 0.02).particles.alpha
     base = materials.glass.alpha0
@@ -208,7 +208,7 @@ def test_weakness_noise_is_bounded_and_seeded():
 
 def test_strength_scatter_is_smooth_seeded_and_of_the_size_asked_for():
     varied = materials.glass.override(variation=0.3, grain=0.03)
-    scene, plain = Scene(), Scene()
+    scene, plain = Scene(floor=None), Scene(floor=None)
     scene.add(ellipsoid(), varied)
     plain.add(ellipsoid(), materials.glass)
     matter = build_matter(scene, 0.01, jitter=0.0)
@@ -226,7 +226,7 @@ def test_strength_scatter_is_smooth_seeded_and_of_the_size_asked_for():
 
 
 def test_points_are_stored_in_cell_order():
-    scene = Scene()
+    scene = Scene(floor=None)
     scene.add(ellipsoid((0.2, 0.1, 0.1)), materials.glass)
     rest = build_matter(scene, 0.02).rest
     step = (rest[1:] - rest[:-1]).norm(dim=1)
@@ -239,7 +239,11 @@ def test_points_are_stored_in_cell_order():
 def test_empty_and_oversized_scenes_are_refused():
     with pytest.raises(InputError, match="empty"):
         build_matter(Scene(), 0.02)
-    scene = Scene()
+    sunk = Scene(floor=0.0)
+    sunk.add(ellipsoid(), materials.glass)
+    with pytest.raises(InputError, match="below the floor"):
+        build_matter(sunk, 0.02)
+    scene = Scene(floor=None)
     scene.add(ellipsoid(), materials.glass)
     with pytest.raises(InputError, match="material points"):
         build_matter(scene, 1e-4)

@@ -26,6 +26,8 @@ STRETCH = (0.6, 1.5)
 """Bounds of the stretch that splats show."""
 RIGID = 1e-3
 """Splats that are stretched by less than this keep their shape exactly."""
+CHUNK = 100_000
+"""Splats that are moved at once; bounds the memory of a frame."""
 REACH = 2.5
 """A splat on a broken point looks for an unbroken one within this many point spacings."""
 
@@ -117,8 +119,21 @@ class Carry:
         Returns:
             The motion of each splat since time 0.
         """
-        index = self.index
-        whole = ~broken[index] & (self.distance <= REACH * self.spacing[:, None])
+        rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
+        # Broken points deform without limit; only their rotation means anything.
+        stretch = torch.where(broken[:, None, None], rotation, clamped)
+        parts = [
+            self._follow(rows, position, stretch, fragments, broken)
+            for rows in torch.arange(self.gaussians.count, device=position.device).split(CHUNK)
+        ]
+        return Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+
+    def _follow(
+        self, rows: Tensor, position: Tensor, stretch: Tensor, fragments: Tensor, broken: Tensor
+    ) -> Motion:
+        """Motion of some splats; ``stretch`` [N, 3, 3] is what each point does to its splats."""
+        index, distance = self.index[rows], self.distance[rows]
+        whole = ~broken[index] & (distance <= REACH * self.spacing[rows, None])
         riding = whole.any(dim=1)
         # First unbroken neighbour, or the nearest point when all are broken.
         slot = torch.where(riding, whole.to(torch.int8).argmax(dim=1), 0)
@@ -126,14 +141,10 @@ class Carry:
         piece = fragments[anchor]
         together = whole & (fragments[index] == piece[:, None]) & (piece >= 0)[:, None]
         together.scatter_(1, slot[:, None], True)
-        weight = self.weight * together
-        weight = weight.clamp(min=1e-12) * together
+        weight = self.weight[rows].clamp(min=1e-12) * together
         weight = weight / weight.sum(dim=1, keepdim=True)
-        rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
-        # Broken points deform without limit; only their rotation means anything.
-        stretch = torch.where(broken[:, None, None], rotation, clamped)
         local = stretch[index]
-        arm = self.gaussians.means[:, None] - self.matter.rest[index]
+        arm = self.gaussians.means[rows][:, None] - self.matter.rest[index]
         moved = position[index] + (local @ arm[..., None])[..., 0]
         means = (weight[..., None] * moved).sum(dim=1)
         blend = (weight[..., None, None] * local).sum(dim=1)

@@ -129,6 +129,13 @@ def build_matter(
         raise InputError(
             "simulate: the scene is empty", mend="scene.add(solid, material=...) first"
         )
+    for body in scene.bodies if scene.floor is not None else ():
+        depth = (scene.floor or 0.0) - float(body.bounds()[0][2])
+        if depth > dx:
+            raise InputError(
+                f"simulate: {body.name!r} starts {depth:.3g} m below the floor",
+                mend="add a drop event, or give a frame that puts it on the floor",
+            )
     step = dx / POINTS_PER_CELL ** (1 / 3)
     expected = sum(_volume(body) for body in scene.bodies) / step**3
     if expected > max_particles:

@@ -197,6 +197,7 @@ class Run:
                 "free_flight_body_steps": c.flight_body_steps,
                 "contact_steps": c.contact_steps_skipped,
                 "contact_steps_done": c.contact_steps,
+                "stray_points": int(self.state.stray.sum()),
                 "block_searches": max(c.steps - c.block_builds, 0),
                 "elastic_only_fraction": 1.0 - plastic / max(c.particle_steps, 1),
             },

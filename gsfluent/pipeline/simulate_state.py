@@ -34,6 +34,7 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "peak": state.peak.cpu(),
         "stress": state.stress.cpu(),
         "impulse": state.impulse.cpu(),
+        "stray": state.stray.cpu(),
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
@@ -77,6 +78,7 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
         step=int(values["step"]),
         landed=tuple(bool(v) for v in values["landed"]),
         impulse=values["impulse"],
+        stray=values["stray"],
     )
     return state, values["extra"]
 

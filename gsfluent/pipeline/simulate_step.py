@@ -17,6 +17,7 @@ from gsfluent import ops
 from gsfluent.data import Particles
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.simulate_flight import Flight
+from gsfluent.pipeline.simulate_strays import drift, find_strays, reach_of
 from gsfluent.scene import Scene
 
 CFL = 0.5
@@ -46,6 +47,8 @@ class State(NamedTuple):
         step: Grid steps so far.
         landed: Which bodies are on the grid.
         impulse: Sum of collider impulses on the bodies [N s], float64 [3].
+        stray: Crumbs that left the grid for good, bool [N] (see
+            :mod:`gsfluent.pipeline.simulate_strays`).
     """
 
     particles: Particles
@@ -55,6 +58,7 @@ class State(NamedTuple):
     step: int
     landed: tuple[bool, ...]
     impulse: Tensor
+    stray: Tensor
 
 
 @dataclasses.dataclass
@@ -103,6 +107,7 @@ class Stepper:
         self.return_map = dict(return_map or {})
         self.counters = Counters()
         self.dt_scale = 1.0
+        self._reach = reach_of(matter)
         self.lost: Tensor | int = 0
         """Points that were not finite or not covered since the last :meth:`reset`."""
         device = matter.particles.device
@@ -130,6 +135,7 @@ class Stepper:
         self._params: Tensor | None = None
         self._law: Tensor | None = None
         self._fields: Tensor | None = None
+        self._strays = torch.zeros(0, dtype=torch.int64)
 
     def initial(self) -> State:
         """Return the state at time 0."""
@@ -144,6 +150,7 @@ class Stepper:
             if self.free_flight
             else (True,) * len(self.flights),
             impulse=torch.zeros(3, dtype=torch.float64, device=particles.device),
+            stray=torch.zeros(particles.count, dtype=torch.bool, device=particles.device),
         )
         return self._land(state)
 
@@ -171,6 +178,7 @@ class Stepper:
         if not any(state.landed):
             return self._fly(state, until)
         if self._refresh <= 0:
+            state = self._retire(state)
             self._look(state)
             self._refresh = REFRESH
         self._refresh -= 1
@@ -233,12 +241,34 @@ class Stepper:
         return state
 
     def _active(self, state: State) -> Tensor | None:
-        """Rows of the bodies on the grid; None means all of them."""
-        if all(state.landed):
+        """Rows on the grid, without flying bodies and strays; None means all of them."""
+        self._strays = state.stray.nonzero()[:, 0]
+        if all(state.landed) and self._strays.numel() == 0:
             return None
-        device = state.particles.device
-        ranges = [r for r, on in zip(self.matter.ranges, state.landed, strict=True) if on]
-        return torch.cat([torch.arange(a, b, device=device) for a, b in ranges])
+        return (self._on_grid(state) & ~state.stray).nonzero()[:, 0]
+
+    def _on_grid(self, state: State) -> Tensor:
+        """Points of the bodies that have landed, bool [N]."""
+        mask = torch.ones_like(state.stray)
+        for (a, b), landed in zip(self.matter.ranges, state.landed, strict=True):
+            if not landed:
+                mask[a:b] = False
+        return mask
+
+    def _retire(self, state: State) -> State:
+        """Take broken points that are far away off the grid."""
+        candidate = self._on_grid(state) & ~state.stray
+        far = find_strays(state.particles.position, state.peak, candidate, self._reach)
+        if not bool(far.any()):
+            return state
+        self._params, self._blocks = None, None
+        particles = state.particles
+        particles = particles.replace(strain=particles.strain.masked_fill(far[:, None], 0.0))
+        return state._replace(
+            particles=particles,
+            stray=state.stray | far,
+            stress=state.stress.masked_fill(far[:, None], 0.0),
+        )
 
     def _look(self, state: State) -> None:
         """Read speeds and stiffness; choose the time step and the parameters of the return map."""
@@ -317,6 +347,9 @@ class Stepper:
             moved = _scatter(state.particles, rows, moved)
             peak = state.peak.index_copy(0, rows, peak)
             stress = state.stress.index_copy(0, rows, stress)
+        if self._strays.numel():
+            moved, push = drift(moved, self._strays, dt, self.scene.gravity, self.scene.floor)
+            total = total + push
         return state._replace(
             particles=moved,
             peak=peak,

@@ -294,6 +294,32 @@ def test_irreversible_breaking_changes_what_pressed_debris_can_hold():
     assert not torch.equal(shares[0], shares[1])
 
 
+def test_far_crumbs_leave_the_grid_and_still_balance_momentum():
+    def throw(state):
+        if state.step != 20:
+            return state
+        p = state.particles
+        position = p.position.clone()
+        position[:10] += torch.tensor([3.0, 0.0, 0.0])
+        peak = state.peak.clone()
+        peak[:10] = 0.1
+        return state._replace(particles=p.replace(position=position), peak=peak)
+
+    scene = Scene()
+    material = materials.fruit.apple.override(variation=0.0)
+    scene.add(ellipsoid((0.05,) * 3), material)
+    scene.drop(0.001)
+    simulate = Simulate(dx=0.02, splats=False, step_hook=throw)
+    *_, last = simulate(scene, fps=20, seconds=0.7)
+    report = simulate.report()
+    assert report["skipped"]["stray_points"] == 10
+    assert report["active_blocks_max"] < 200
+    assert report["momentum_error"] < 1e-5
+    crumbs = last.particles.position[:10]
+    assert float(crumbs[:, 2].abs().max()) < 1e-6 and float(crumbs[:, 0].min()) > 2.5
+    assert float(last.particles.velocity[:10].abs().max()) < 1e-6
+
+
 def test_points_on_the_device_are_whole_after_landing_one_by_one():
     """The bodies land at different times; nothing is lost and rows keep their meaning."""
     scene = Scene()
