@@ -76,7 +76,7 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    The distance shows nine tenths of the matter, but the whole object at least and three times the
+    The distance shows nine tenths of the matter, but the whole object at least and 2.6 times the
     object at most: a spray of crumbs must not shrink the subject to a dot.
     """
     count = action.center.shape[0]
@@ -93,7 +93,7 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
 def _shown(action: Action) -> Tensor:
     """Radius that is in the picture, per frame [m], shape [F]: it grows ahead of the burst."""
     first = float(action.radius[0])
-    wanted = action.radius.clamp(min=1.35 * first, max=3.0 * first)
+    wanted = action.radius.clamp(min=1.35 * first, max=2.6 * first)
     ahead = round(2.0 * _SMOOTH_FRAMES)
     padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
     widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values

@@ -39,8 +39,8 @@ SIZES = {
     "preview": DemoSize(26, 128, 300, 8_000, 64, "preview", (320, 240), 0.8, 15.0),
 }
 SCENES: dict[str, dict[str, Any]] = {
-    "watermelon": {"material": "fruit.watermelon", "height": 1.0},
-    "orange": {"material": "fruit.orange", "height": 1.2},
+    "watermelon": {"material": "fruit.watermelon", "height": 0.75},
+    "orange": {"material": "fruit.orange", "height": 1.0},
 }
 
 
