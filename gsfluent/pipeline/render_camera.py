@@ -41,7 +41,11 @@ class Action:
     @classmethod
     def of(cls, positions: Sequence[Tensor]) -> Action:
         """Measure the action from positions [N, 3] of each frame."""
-        center = torch.stack([p.median(dim=0).values.double().cpu() for p in positions])
+        # the middle of what lies between the outer tenths: a median follows the largest heap only
+        tenths = torch.tensor([0.1, 0.9], dtype=torch.float64)
+        center = torch.stack(
+            [torch.quantile(_thin(p.double().cpu()), tenths, dim=0).mean(dim=0) for p in positions]
+        )
         radius = [
             torch.quantile(_thin((p.double().cpu() - c).norm(dim=-1)), 0.9)
             for p, c in zip(positions, center, strict=True)
@@ -50,8 +54,8 @@ class Action:
 
 
 def _thin(values: Tensor) -> Tensor:
-    """Every n-th value: a quantile needs thousands (and torch.quantile refuses 2^24)."""
-    return values[:: max(1, values.numel() // 20_000)]
+    """Every n-th row: a quantile needs thousands (and torch.quantile refuses 2^24)."""
+    return values[:: max(1, values.shape[0] // 20_000)]
 
 
 def look_at(
@@ -76,7 +80,7 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    The distance shows nine tenths of the matter, but the whole object at least and 2.6 times the
+    The distance shows nine tenths of the matter, but the whole object at least and three times the
     object at most: a spray of crumbs must not shrink the subject to a dot.
     """
     count = action.center.shape[0]
@@ -93,7 +97,7 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
 def _shown(action: Action) -> Tensor:
     """Radius that is in the picture, per frame [m], shape [F]: it grows ahead of the burst."""
     first = float(action.radius[0])
-    wanted = action.radius.clamp(min=1.35 * first, max=2.6 * first)
+    wanted = action.radius.clamp(min=1.35 * first, max=3.0 * first)
     ahead = round(2.0 * _SMOOTH_FRAMES)
     padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
     widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values
