@@ -11,13 +11,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsfluent import geometry
+from gsfluent import geometry, ops
 from gsfluent.data import Gaussians
 
 # Gaussians per occupied cell wanted in the occupancy grid: fewer leaves pinholes, more rounds edges
 # away.
 _PER_CELL = 3.0
-_MAX_CELLS = 4_000_000
 # A Gaussian is called flat when its shortest axis is below this share of the middle one.
 _FLAT = 0.5
 
@@ -40,43 +39,30 @@ def occupancy_cell(means: Tensor) -> float:
         if 0.7 * _PER_CELL < per_cell < 1.4 * _PER_CELL:
             break
         cell *= float(min(2.0, max(0.5, (_PER_CELL / per_cell) ** (1.0 / 3.0))))
-    # debris that flew far must not ask for a grid of its own flight
-    cells = float(((high - low) / cell + 7.0).prod())
-    return cell * max(1.0, (cells / _MAX_CELLS) ** (1.0 / 3.0))
+    return cell
 
 
 def density_normals(means: Tensor, cell: float) -> Tensor:
     """Outward unit normals [N, 3]: minus the gradient of the blurred occupancy at each point.
 
-    Occupancy saturates at one per cell; otherwise the crowded skin of a reconstruction would be a
-    ridge whose inner half points inward.
+    Occupancy is the scattered count, cut off at what full matter has; otherwise the crowded skin of
+    a reconstruction would be a ridge whose inner half points inward. Scatter and gather are the
+    solver's own: its sparse grid costs nothing where there is nothing, however far debris flies,
+    and the affine part of the gather is the least-squares gradient.
 
     Args:
         means: Positions, shape [N, 3].
         cell: Grid spacing, see :func:`occupancy_cell`.
     """
-    low = means.amin(0) - 3.0 * cell
-    size = ((means.amax(0) - low) / cell).long() + 4
-    nx, ny, nz = (int(s) for s in size)
-    index = ((means - low) / cell).long()
-    flat = (index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]
-    grid = torch.zeros(nx * ny * nz, dtype=means.dtype, device=means.device)
-    grid[flat] = 1.0
-    grid = grid.reshape(1, 1, nx, ny, nz)
-    kernel = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=means.dtype, device=means.device) / 16.0
-    for axis in range(3):
-        shape = [1, 1, 1, 1, 1]
-        shape[2 + axis] = 5
-        padding = [0, 0, 0]
-        padding[axis] = 2
-        grid = torch.nn.functional.conv3d(grid, kernel.reshape(shape), padding=padding)
-    gradient = torch.stack(torch.gradient(grid[0, 0]))
-    # grid_sample wants (z, y, x) order in [-1, 1], cell centres at +0.5
-    unit = ((means - low) / cell) / size.to(means.dtype) * 2.0 - 1.0
-    sampled = torch.nn.functional.grid_sample(
-        gradient[None], unit.flip(-1)[None, None, None], mode="bilinear", align_corners=False
-    )
-    return torch.nn.functional.normalize(-sampled[0, :, 0, 0].T, dim=-1)
+    blocks = ops.build_blocks(means, cell)
+    still = torch.zeros_like(means)
+    flat = torch.zeros(means.shape[0], 3, 3, dtype=means.dtype, device=means.device)
+    count = torch.ones_like(means[:, 0])
+    grid, _ = ops.p2g(means, still, flat, count, dx=cell, blocks=blocks)
+    field = torch.zeros_like(grid[..., :3])
+    field[..., 0] = grid[..., 3].clamp(max=_PER_CELL)
+    _, _, affine, _ = ops.g2p(field, means, dx=cell, dt=0.0, blocks=blocks)
+    return torch.nn.functional.normalize(-affine[:, 0], dim=-1)
 
 
 def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tensor:
