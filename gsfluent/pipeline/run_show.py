@@ -92,9 +92,7 @@ class Film:
             capture=load_capture(shot.capture) if needs_capture and shot.capture else None,
             frame=read_frame(out / "stages" / "isolate") if needs_capture else None,
         )
-        render = Render(
-            light=light, studio=studio, normal_cell=occupancy_cell(first.gaussians.means)
-        )
+        render = Render(light=light, studio=studio, normal_cell=occupancy_cell(first.gaussians))
         return cls(folder, cameras, render, device)
 
     def __len__(self) -> int:

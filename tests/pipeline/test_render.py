@@ -125,7 +125,7 @@ def test_contact_shadow_fades_with_height() -> None:
 
 def test_normals_of_a_ball_point_outward() -> None:
     grey = ball()
-    normals = estimate_normals(grey)
+    normals = torch.nn.functional.normalize(estimate_normals(grey), dim=1)
     away = grey.means - torch.tensor([0.0, 0.0, 0.1])
     skin = away.norm(dim=1) > 0.09
     agreement = (normals[skin] * torch.nn.functional.normalize(away[skin], dim=1)).sum(1)
