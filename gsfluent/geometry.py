@@ -101,17 +101,49 @@ def covariance(quats: Tensor, scales: Tensor) -> Tensor:
     return pack_symmetric(root @ root.mT)
 
 
+# Sweeps of the cyclic Jacobi method: quadratic convergence leaves nothing after five for 3x3.
+_JACOBI_SWEEPS = 6
+
+
+def symmetric_eigen(packed: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues [..., 3] (unordered) and eigenvectors [..., 3, 3] (columns) of packed [..., 6].
+
+    Cyclic Jacobi rotations on whole tensors: ``torch.linalg.eigh`` is slow for many 3x3 matrices on
+    the CPU, and cuSOLVER's batched solver refuses the batch of a whole scene.
+    """
+    a = {(i, i): packed[..., i] for i in range(3)}
+    a |= {(0, 1): packed[..., 3], (0, 2): packed[..., 4], (1, 2): packed[..., 5]}
+    one, zero = torch.ones_like(packed[..., 0]), torch.zeros_like(packed[..., 0])
+    vectors = [[one if i == j else zero for j in range(3)] for i in range(3)]
+    tiny = torch.finfo(packed.dtype).tiny
+    for p, q in ((0, 1), (0, 2), (1, 2)) * _JACOBI_SWEEPS:
+        r = 3 - p - q
+        off = a[p, q]
+        # t = tan of the angle that annuls a_pq, the smaller root (Golub & Van Loan, 8.5.2)
+        theta = (a[q, q] - a[p, p]) / (2.0 * torch.where(off.abs() > tiny, off, one))
+        t = torch.where(theta < 0, -one, one) / (theta.abs() + (theta * theta + 1.0).sqrt())
+        t = torch.where(off.abs() > tiny, t, zero)
+        cos = (t * t + 1.0).rsqrt()
+        sin = t * cos
+        rp, rq = (min(r, p), max(r, p)), (min(r, q), max(r, q))
+        a[p, p], a[q, q], a[p, q] = a[p, p] - t * off, a[q, q] + t * off, zero
+        a[rp], a[rq] = cos * a[rp] - sin * a[rq], sin * a[rp] + cos * a[rq]
+        for row in vectors:
+            row[p], row[q] = cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]
+    values = torch.stack([a[0, 0], a[1, 1], a[2, 2]], dim=-1)
+    return values, torch.stack([torch.stack(row, dim=-1) for row in vectors], dim=-2)
+
+
 def covariance_to_quats_scales(packed: Tensor) -> tuple[Tensor, Tensor]:
     """Quaternions [..., 4] and standard deviations [..., 3] of packed covariances [..., 6].
 
     Eigenvalues are floored at 1e-12 of the largest, so a flattened covariance gives a thin splat
     and not NaN.
     """
-    values, vectors = torch.linalg.eigh(unpack_symmetric(packed))
-    largest = values[..., -1:].clamp_min(torch.finfo(packed.dtype).tiny)
+    values, vectors = symmetric_eigen(packed)
+    largest = values.amax(-1, keepdim=True).clamp_min(torch.finfo(packed.dtype).tiny)
     values = torch.maximum(values, 1e-12 * largest)
-    flip = torch.where(torch.linalg.det(vectors) < 0, -1.0, 1.0).to(packed.dtype)
-    vectors = torch.cat([vectors[..., :2], vectors[..., 2:] * flip[..., None, None]], dim=-1)
+    # Jacobi rotations compose to a proper rotation: no flip is needed
     return matrix_to_quaternion(vectors), values.sqrt()
 
 

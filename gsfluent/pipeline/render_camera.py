@@ -41,7 +41,11 @@ class Action:
     @classmethod
     def of(cls, positions: Sequence[Tensor]) -> Action:
         """Measure the action from positions [N, 3] of each frame."""
-        center = torch.stack([p.median(dim=0).values.double().cpu() for p in positions])
+        # the middle of what lies between the outer tenths: a median follows the largest heap only
+        tenths = torch.tensor([0.1, 0.9], dtype=torch.float64)
+        center = torch.stack(
+            [torch.quantile(_thin(p.double().cpu()), tenths, dim=0).mean(dim=0) for p in positions]
+        )
         radius = [
             torch.quantile(_thin((p.double().cpu() - c).norm(dim=-1)), 0.9)
             for p, c in zip(positions, center, strict=True)
@@ -50,8 +54,8 @@ class Action:
 
 
 def _thin(values: Tensor) -> Tensor:
-    """Every n-th value: a quantile needs thousands (and torch.quantile refuses 2^24)."""
-    return values[:: max(1, values.numel() // 20_000)]
+    """Every n-th row: a quantile needs thousands (and torch.quantile refuses 2^24)."""
+    return values[:: max(1, values.shape[0] // 20_000)]
 
 
 def look_at(
@@ -74,29 +78,37 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 
 
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
-    """One camera per frame, slowly circling; it follows the matter softly and never zooms.
+    """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    The distance is the one that shows nine tenths of the matter at its widest, but the whole object
-    at least and about twice the object at most: a burst of crumbs must not shrink the subject to a
-    dot.
+    The distance shows nine tenths of the matter, but the whole object at least and three times the
+    object at most: a spray of crumbs must not shrink the subject to a dot.
     """
     count = action.center.shape[0]
-    first = float(action.radius[0])
-    shown = _ROOM * min(max(float(action.radius.amax()), 1.35 * first), 2.2 * first)
+    shown = _shown(action)
     distance = shown / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
     centers = _follow(action, shown)
     steps = [i / max(1, count - 1) for i in range(count)]
     return [
-        look_at(centers[i], distance, _START + _SWEEP * step, _ELEVATION, size)
+        look_at(centers[i], float(distance[i]), _START + _SWEEP * step, _ELEVATION, size)
         for i, step in enumerate(steps)
     ]
 
 
-def _follow(action: Action, shown: float) -> Tensor:
+def _shown(action: Action) -> Tensor:
+    """Radius that is in the picture, per frame [m], shape [F]: it grows ahead of the burst."""
+    first = float(action.radius[0])
+    wanted = action.radius.clamp(min=1.35 * first, max=3.0 * first)
+    ahead = round(2.0 * _SMOOTH_FRAMES)
+    padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
+    widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values
+    return _ROOM * _smooth(widest[:, None], 1.5 * _SMOOTH_FRAMES)[:, 0]
+
+
+def _follow(action: Action, shown: Tensor) -> Tensor:
     """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
     smooth = _smooth(action.center, _SMOOTH_FRAMES)
     lag = smooth - action.center
-    room = (shown - _ROOM * action.radius).clamp(min=0.1 * shown)
+    room = torch.maximum(shown - _ROOM * action.radius, 0.1 * shown)
     length = lag.norm(dim=1).clamp(min=1e-12)
     held = action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
     return _smooth(held, 0.5)

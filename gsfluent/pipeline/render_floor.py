@@ -33,12 +33,14 @@ class Studio:
     Attributes:
         height: z of the floor [m].
         center: Horizontal centre of the lit pool [m].
-        radius: Size of the scene [m]; the floor fades over a few of these.
+        radius: Size of the object [m], over which its contact shadow reaches.
+        extent: Size of the whole action [m]; the floor fades over a few of these.
     """
 
     height: float
     center: tuple[float, float]
     radius: float
+    extent: float
 
     def backdrop(self, rays: Tensor) -> Tensor:
         """Linear radiance [..., 3] of the backdrop along unit rays [..., 3]."""
@@ -85,7 +87,7 @@ class Studio:
             light.ambient + light.intensity * float(toward[2].clamp(min=0.0))
         )
         paint = points.new_tensor(_FLOOR) * irradiance[:, None]
-        away = (points[:, :2] - points.new_tensor(self.center)).norm(dim=-1) / (6.0 * self.radius)
+        away = (points[:, :2] - points.new_tensor(self.center)).norm(dim=-1) / (6.0 * self.extent)
         keep = torch.exp(-(away**2))[:, None]
         image[hits] = keep * paint + (1.0 - keep) * image[hits]
         return image

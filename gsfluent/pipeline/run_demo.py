@@ -35,12 +35,12 @@ class DemoSize:
 
 
 SIZES = {
-    "full": DemoSize(42, 256, 800, 30_000, 96, "preview", (640, 480), 1.3, 40.0),
+    "full": DemoSize(42, 256, 800, 30_000, 80, "preview", (640, 480), 1.3, 40.0),
     "preview": DemoSize(26, 128, 300, 8_000, 64, "preview", (320, 240), 0.8, 15.0),
 }
 SCENES: dict[str, dict[str, Any]] = {
-    "watermelon": {"material": "fruit.watermelon", "height": 1.0},
-    "orange": {"material": "fruit.orange", "height": 1.2},
+    "watermelon": {"material": "fruit.watermelon", "height": 0.75},
+    "orange": {"material": "fruit.orange", "height": 1.0},
 }
 
 

@@ -32,7 +32,7 @@ from gsfluent.pipeline.stage import Progress, report_progress
 from gsfluent.pipeline.video import to_bytes, write_video
 
 # The pieces need a moment to part before a picture of them tells anything.
-_POSTER_DELAY = 0.2
+_POSTER_DELAY = 0.08
 
 
 def light_of(shot: Shot) -> Light:
@@ -81,7 +81,9 @@ class Film:
         studio = None
         if floor is not None:
             x, y = action.center[:, :2].mean(dim=0).tolist()
-            studio = Studio(floor, (x, y), 1.3 * float(action.radius.amax()))
+            studio = Studio(
+                floor, (x, y), float(action.radius[0]), 1.3 * float(action.radius.amax())
+            )
         needs_capture = shot.capture is not None and isinstance(shot.output.camera, int)
         cameras = cameras_for(
             str(shot.output.camera),
@@ -90,9 +92,7 @@ class Film:
             capture=load_capture(shot.capture) if needs_capture and shot.capture else None,
             frame=read_frame(out / "stages" / "isolate") if needs_capture else None,
         )
-        render = Render(
-            light=light, studio=studio, normal_cell=occupancy_cell(first.gaussians.means)
-        )
+        render = Render(light=light, studio=studio, normal_cell=occupancy_cell(first.gaussians))
         return cls(folder, cameras, render, device)
 
     def __len__(self) -> int:

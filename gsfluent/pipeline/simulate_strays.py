@@ -13,7 +13,7 @@ from torch import Tensor
 from gsfluent.data import Particles
 from gsfluent.pipeline.particles import Matter
 
-DISTANCE = 5.0
+DISTANCE = 8.0
 """Distance from the middle of the unbroken matter, in extents of the largest body."""
 
 

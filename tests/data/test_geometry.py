@@ -180,3 +180,24 @@ def test_rotation_between_opposite_directions() -> None:
     rotation = geometry.rotation_between(up, -up)
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
     torch.testing.assert_close(rotation @ up.double(), -up.double())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_symmetric_eigen_rebuilds_its_matrix(dtype: torch.dtype) -> None:
+    torch.manual_seed(3)
+    root = torch.randn(500, 3, 3, dtype=dtype) * torch.tensor([1.0, 1e-2, 1e-3], dtype=dtype)
+    matrix = root @ root.mT
+    matrix[:3] = (
+        torch.eye(3, dtype=dtype) * torch.tensor([0.0, 1.0, 1e-20], dtype=dtype)[:, None, None]
+    )
+    values, vectors = geometry.symmetric_eigen(geometry.pack_symmetric(matrix))
+    eps = torch.finfo(dtype).eps
+    scale = matrix.abs().amax((-2, -1)).clamp_min(1e-30)[:, None, None]
+    rebuilt = vectors @ torch.diag_embed(values) @ vectors.mT
+    assert float(((rebuilt - matrix) / scale).abs().max()) < 30 * eps
+    assert float((vectors.mT @ vectors - torch.eye(3, dtype=dtype)).abs().max()) < 20 * eps
+    assert float((torch.linalg.det(vectors) - 1).abs().max()) < 30 * eps
+    expected = torch.linalg.eigvalsh(matrix.double())
+    assert torch.allclose(
+        values.double().sort(-1).values, expected, atol=30 * eps * float(matrix.abs().max())
+    )

@@ -97,7 +97,7 @@ def test_shadow_map_darkens_what_lies_behind() -> None:
 
 def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
     light = Light(direction=(1.0, 0.0, 1.0), ambient=0.3, intensity=1.0)
-    studio = Studio(0.0, (0.0, 0.0), 0.2)
+    studio = Studio(0.0, (0.0, 0.0), 0.2, 0.2)
     camera = Camera.look_at((0.0, -0.01, 3.0), (0.0, 0.0, 0.0), width=SIZE, height=SIZE, fov=20.0)
     high = ball(center=(0.0, 0.0, 0.3))
     image = Render(camera, light, studio=studio)(high)
@@ -115,7 +115,7 @@ def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
 
 
 def test_contact_shadow_fades_with_height() -> None:
-    studio = Studio(0.0, (0.0, 0.0), 0.2)
+    studio = Studio(0.0, (0.0, 0.0), 0.2, 0.2)
     spot = torch.tensor([[0.0, 0.0, 0.0]])
     resting = float(studio.contact(ball(), spot))
     flying = float(studio.contact(ball(center=(0.0, 0.0, 0.5)), spot))
@@ -125,7 +125,7 @@ def test_contact_shadow_fades_with_height() -> None:
 
 def test_normals_of_a_ball_point_outward() -> None:
     grey = ball()
-    normals = estimate_normals(grey)
+    normals = torch.nn.functional.normalize(estimate_normals(grey), dim=1)
     away = grey.means - torch.tensor([0.0, 0.0, 0.1])
     skin = away.norm(dim=1) > 0.09
     agreement = (normals[skin] * torch.nn.functional.normalize(away[skin], dim=1)).sum(1)
