@@ -1,0 +1,76 @@
+"""The documents do not drift: links lead somewhere, commands parse, examples are valid."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+import gsfluent
+from gsfluent.cli.parse import VERBS, parse
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"```(\w+)\n(.*?)```", re.DOTALL)
+
+
+def blocks(kind: str) -> list[tuple[str, str]]:
+    return [
+        (page.name, text)
+        for page in PAGES
+        for found, text in BLOCK.findall(page.read_text(encoding="utf-8"))
+        if found == kind
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)#\s]+)", text)
+    broken = [t for t in targets if "://" not in t and not (page.parent / t).exists()]
+    assert broken == []
+
+
+def commands() -> list[tuple[str, str]]:
+    lines = [(page, line.strip()) for page, text in blocks("bash") for line in text.splitlines()]
+    return [(p, x) for p, x in lines if re.match(rf"gsfluent ({'|'.join(VERBS)})\b", x)]
+
+
+@pytest.mark.parametrize(("page", "line"), commands())
+def test_commands_parse(page: str, line: str) -> None:
+    words = shlex.split(line, comments=True)[1:]
+    if "--help" in words or "..." in words:
+        words = [words[0], "--help"]
+        with pytest.raises(SystemExit) as stop:
+            parse(words)
+        assert stop.value.code == 0
+    else:
+        assert isinstance(parse(words), VERBS[words[0]])
+
+
+@pytest.mark.parametrize(("page", "text"), blocks("python"))
+def test_python_examples_use_names_that_exist(page: str, text: str) -> None:
+    ast.parse(text)
+    for name in set(re.findall(r"\bgf\.([\w.]+)", text)):
+        value: object = gsfluent
+        for part in name.split("."):
+            value = getattr(value, part)
+
+
+@pytest.mark.parametrize(("page", "text"), blocks("yaml"))
+def test_yaml_examples_load(page: str, text: str) -> None:
+    assert yaml.safe_load(text) is not None
+
+
+def test_the_smallest_shot_of_the_readme_is_a_shot(tmp_path: Path) -> None:
+    from gsfluent.config import load_shot
+
+    text = next(text for page, text in blocks("yaml") if page == "README.md")
+    (tmp_path / "captures" / "apple").mkdir(parents=True)
+    (tmp_path / "shot.yaml").write_text(text)
+    shot = load_shot(tmp_path / "shot.yaml")
+    assert [type(event).__name__ for event in shot.events] == ["Drop"]
