@@ -35,14 +35,14 @@ SHOTS: dict[str, dict[str, Any]] = {
             "exemplar": "exemplars/apple_cross_sections/apple_cs_09.png",
         },
         "objects": {"apple": {"material": "fruit.apple"}},
-        "events": [{"type": "drop", "height": 2.0}],
+        "events": [{"type": "drop", "height": 0.6}],
     },
     "skull": {
         "capture": "captures/skull",
         "size": 0.2,
         "reconstruct": REDUCED,
         "texture": {"method": "color_copy"},
-        "objects": {"skull": {"material": "bone"}},
+        "objects": {"skull": {"material": "ceramic"}},
         "events": [{"type": "drop", "height": 1.5}],
     },
     "playbot": {

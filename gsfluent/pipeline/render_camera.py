@@ -108,7 +108,7 @@ def _follow(action: Action, shown: Tensor) -> Tensor:
     """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
     smooth = _smooth(action.center, _SMOOTH_FRAMES)
     lag = smooth - action.center
-    room = torch.maximum(shown - _ROOM * action.radius, 0.1 * shown)
+    room = torch.maximum(shown - 1.5 * action.radius, 0.05 * shown)
     length = lag.norm(dim=1).clamp(min=1e-12)
     held = action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
     return _smooth(held, 0.5)

@@ -19,6 +19,8 @@ from gsfluent.data import INTERIOR, Gaussians
 _PER_CELL = 3.0
 # Share of the full count from which a place is full; below one, because counts scatter.
 _FULL = 0.8
+# Debris all over the place gets a coarser grid rather than a look-up table of gigabytes.
+_MAX_CELLS_ACROSS = 800
 # Cell of the wide look that settles which side is out, in fine cells, and how clear it must be.
 _WIDER = 4.0
 _CLEAR = 0.1
@@ -69,8 +71,11 @@ def density_normals(means: Tensor, cell: float) -> Tensor:
     """
     core = _together(means)
     normals = torch.zeros_like(means)
-    fine = _occupancy_gradient(means[core], cell, _PER_CELL)
-    wide = _occupancy_gradient(means[core], _WIDER * cell, _PER_CELL * _WIDER**3)
+    extent = float((means[core].amax(0) - means[core].amin(0)).amax())
+    coarser = max(1.0, extent / (_MAX_CELLS_ACROSS * cell))
+    fine = _occupancy_gradient(means[core], coarser * cell, _PER_CELL * coarser**3)
+    coarser *= _WIDER
+    wide = _occupancy_gradient(means[core], coarser * cell, _PER_CELL * coarser**3)
     # a skin with a gap below it is a sheet to the fine grid, and a sheet has no inside
     against = ((fine * wide).sum(-1) < 0) & (wide.norm(dim=-1) > _CLEAR)
     normals[core] = torch.where(against[:, None], -fine, fine)

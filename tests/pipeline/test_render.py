@@ -133,6 +133,15 @@ def test_normals_of_a_ball_point_outward() -> None:
     assert float(agreement.min()) > 0.7
 
 
+def test_debris_far_apart_does_not_need_a_huge_grid() -> None:
+    near, far = ball(), ball(center=(40.0, 0.0, 0.1))
+    spray = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * 100.0
+    crumbs = Gaussians.from_colors(spray, torch.full((400,), 0.005), torch.rand(400, 3))
+    normals = estimate_normals(Gaussians.cat([near, far, crumbs]), cell=0.012)
+    assert torch.isfinite(normals).all()
+    assert float(normals.norm(dim=1).max()) <= 1.0 + 1e-6
+
+
 def test_flat_splats_use_their_own_plane() -> None:
     grey = ball()
     away = torch.nn.functional.normalize(grey.means - torch.tensor([0.0, 0.0, 0.1]), dim=1)
