@@ -184,6 +184,11 @@ GSF_HOST_DEVICE Ellipsoid<T> mvee_fit(const Team& team, const T* points, int n, 
           for (int b = 0; b <= a; ++b, ++e) x.m[e] += weight[j] * q[a] * q[b];
       }
       for (int e = 0; e < 10; ++e) x.m[e] = team.sum(x.m[e]);
+      // So does the sum of the weights (the last entry), which is one by definition.
+      const T total = T(1) / x.m[9];
+      for (int e = 0; e < 10; ++e) x.m[e] *= total;
+      for (int j = team.rank(); j < n; j += team.size()) weight[j] *= total;
+      team.sync();
       for (int c = d; c < 3; ++c) x.at(c, c) = T(1);  // flat axes: any value, their y is zero
       inv = detail::inverse(x);
     }

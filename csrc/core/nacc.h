@@ -162,11 +162,16 @@ GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
     x1 = abs(x1 + step - alpha) < T(kAlphaStepMax) ? x1 + step : far;
     f1 = alpha_residual(m, o, trial, p, q, alpha, x1);
   }
+  T before = abs(f1);
   for (int i = 0; i < 60; ++i) {
     if (abs(f1) <= tolerance || !(abs(x1 - x0) > tolerance)) break;
     T x = x1 - f1 * (x1 - x0) / (f1 - f0);
     const T lo = min(x0, x1), hi = max(x0, x1);
-    if (!(x > lo && x < hi) || (i & 7) == 7) x = T(0.5) * (lo + hi);  // bisect now and then
+    // Bisect when eight secants gained little, and only then: from the root that float32 has
+    // reached by now, float64 would be thrown to another one.
+    const bool check = (i & 7) == 7;
+    if (!(x > lo && x < hi) || (check && abs(f1) > T(0.1) * before)) x = T(0.5) * (lo + hi);
+    if (check) before = abs(f1);
     const T f = alpha_residual(m, o, trial, p, q, alpha, x);
     if (f * f1 < T(0)) {
       x0 = x1;

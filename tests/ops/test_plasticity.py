@@ -57,6 +57,21 @@ def test_float64_matches_the_reference(implicit: bool, k: float, epsilon: float)
         assert (g - w).abs().max() <= 1e-12 * w.abs().max()
 
 
+@pytest.mark.parametrize("op", [return_mapping, reference.return_mapping])
+def test_both_precisions_take_the_same_of_several_roots(op: Any) -> None:
+    """Steps that overshoot a brittle surface several times over: alpha has up to three roots."""
+    generator = torch.Generator().manual_seed(6)
+    strain = 0.1 * (torch.rand(4000, 6, generator=generator) - 0.5)
+    alpha = -0.08 * torch.rand(4000, generator=generator)
+    increment = 0.05 * (torch.rand(4000, 3, 3, generator=generator) - 0.5)
+    params = torch.tensor([[3.6e4, 1.2e5, 1.85, 0.6, 3.0, 0.0, 1.0, 0.0]])
+    law = torch.ones(1, dtype=torch.int32)
+    got = op(strain, alpha, increment, law=law, params=params)
+    wide = (strain.double(), alpha.double(), increment.double())
+    want = op(*wide, law=law, params=params.double())
+    assert (got[1].double() - want[1]).abs().max() < 1e-5
+
+
 @pytest.mark.parametrize("implicit", [True, False])
 def test_float32_matches_the_float64_reference(implicit: bool) -> None:
     s = states(4000, dtype=torch.float32)

@@ -172,14 +172,17 @@ def _bracketed_root(
         lo, f_lo = torch.where(walking, hi, lo), torch.where(walking, f_hi, f_lo)
         hi = torch.where(walking, ahead, hi)
         f_hi = torch.where(walking, residual(hi), f_hi)
-    open_ = solve
+    open_, before = solve, f_hi.abs()
     for i in range(60):
         open_ = open_ & (f_hi.abs() > tolerance) & ((hi - lo).abs() > tolerance)
         if not bool(open_.any()):
             break
         guess = hi - f_hi * (hi - lo) / torch.where(open_, f_hi - f_lo, 1.0)
         left, right = torch.minimum(lo, hi), torch.maximum(lo, hi)
-        halve = ~((guess > left) & (guess < right)) | (i % 8 == 7)
+        halve = ~((guess > left) & (guess < right))
+        if i % 8 == 7:  # secants that gain little
+            halve |= f_hi.abs() > 0.1 * before
+            before = f_hi.abs()
         guess = torch.where(halve, 0.5 * (left + right), guess)
         f = residual(guess)
         crossed = f * f_hi < 0
