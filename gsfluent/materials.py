@@ -241,7 +241,7 @@ _RIND = {
     "name": "rind",
     "where": {"depth_below": 0.0175},
     "young_modulus": 9.6e5,
-    "cohesion": 0.03,
+    "cohesion": 0.015,
     "hardening": 2.33,
     "alpha0": -0.21,
 }
@@ -252,7 +252,7 @@ _PRESETS: dict[str, Material] = {
     for m in (
         Material(
             "fruit.watermelon",
-            2.4e5,
+            4e5,
             0.32,
             950.0,
             cohesion=0.095,
