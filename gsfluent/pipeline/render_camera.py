@@ -23,7 +23,7 @@ _SWEEP = (
     70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
 )
 _SMOOTH_FRAMES = 5.0
-_ROOM = 1.2  # free space around the matter, as a factor on its radius
+_ROOM = 1.3  # free space around the matter, as a factor on its radius
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    The distance shows nine tenths of the matter, but the whole object at least and three times the
+    The distance shows nine tenths of the matter, but the whole object at least and 3.6 times the
     object at most: a spray of crumbs must not shrink the subject to a dot.
     """
     count = action.center.shape[0]
@@ -97,7 +97,7 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
 def _shown(action: Action) -> Tensor:
     """Radius that is in the picture, per frame [m], shape [F]: it grows ahead of the burst."""
     first = float(action.radius[0])
-    wanted = action.radius.clamp(min=1.35 * first, max=3.0 * first)
+    wanted = action.radius.clamp(min=1.35 * first, max=3.6 * first)
     ahead = round(2.0 * _SMOOTH_FRAMES)
     padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
     widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values
