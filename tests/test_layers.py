@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -148,3 +149,10 @@ def test_heavy_libraries_are_imported_late() -> None:
                 continue
             found += [f"{path.relative_to(ROOT)}: {n}" for n in names if n.split(".")[0] in heavy]
     assert found == []
+
+
+def test_an_op_is_a_function_whichever_is_asked_for_first() -> None:
+    # gsfluent.ops.mvee is a module and a function
+    code = "from gsfluent import ops; ops.mvee_lens; assert callable(ops.mvee)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr

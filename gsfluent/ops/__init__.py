@@ -31,6 +31,9 @@ __all__ = list(_PUBLIC)
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'gsfluent.ops' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_PUBLIC[name]), name)
-    globals()[name] = value
-    return value
+    module = importlib.import_module(_PUBLIC[name])
+    # all names of the module at once: importing gsfluent.ops.mvee has just put the module under the
+    # name of its function
+    siblings = [n for n, home in _PUBLIC.items() if home == _PUBLIC[name]]
+    globals().update({n: getattr(module, n) for n in siblings})
+    return globals()[name]

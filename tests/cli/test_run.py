@@ -268,7 +268,7 @@ def test_plan_agrees_with_the_run(finished: Path, capsys: pytest.CaptureFixture[
 
 @pytest.mark.parametrize(
     ("fragments", "expected"),
-    [([1, 1, 1, 9, 9, 9, 9, 9], 5), ([1] * 8, 4), ([1, 1, 5], 2)],
+    [([1, 1, 1, 9, 9, 9, 9, 9], 4), ([1] * 8, 4), ([1, 1, 5], 2)],
 )
 def test_the_poster_follows_the_largest_break(fragments: list[int], expected: int) -> None:
     assert poster_frame(fragments, fps=10) == expected
