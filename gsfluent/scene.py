@@ -171,7 +171,8 @@ class Scene:
         Args:
             solid: The filled object.
             material: A :class:`Material` or the name of a preset.
-            frame: World to scene; default: ``solid.frame``, or the identity when it has none.
+            frame: World to scene; default: ``solid.frame``. Without either the solid stays where
+                it is, but is lifted onto the floor when it starts below it.
             velocity: Velocity of the centre of mass at time 0 [m/s].
             angular_velocity: Spin about the centre of mass at time 0 [rad/s].
             parts: Regions with parameters of their own; default: those of the material.
@@ -193,15 +194,19 @@ class Scene:
             part.material(
                 chosen
             )  # refuse bad parameters here, where the user can see which call is meant
+        placed = frame or solid.frame
         body = Body(
             name=self._name(name, "object"),
             material=chosen,
             solid=solid,
-            frame=frame or solid.frame or Frame.identity(),
+            frame=placed or Frame.identity(),
             parts=regions,
             velocity=_vector("velocity", velocity),
             angular_velocity=_vector("angular_velocity", angular_velocity),
         )
+        if placed is None and self.floor is not None:
+            rise = self.floor - float(body.bounds()[0][2])
+            body = dataclasses.replace(body, offset=(0.0, 0.0, max(rise, 0.0)))
         self.bodies.append(body)
         return body.name
 
