@@ -32,10 +32,10 @@ SHOTS: dict[str, dict[str, Any]] = {
         "reconstruct": REDUCED,
         "texture": {
             "method": "exemplar",
-            "exemplar": "exemplars/apple_cross_sections/apple_cs_09.png",
+            "exemplar": "exemplars/apple_cross_sections/apple_cs_04.png",
         },
         "objects": {"apple": {"material": "fruit.apple"}},
-        "events": [{"type": "drop", "height": 0.6}],
+        "events": [{"type": "drop", "height": 1.0}],
     },
     "skull": {
         "capture": "captures/skull",
@@ -43,7 +43,7 @@ SHOTS: dict[str, dict[str, Any]] = {
         "reconstruct": REDUCED,
         "texture": {"method": "color_copy"},
         "objects": {"skull": {"material": "ceramic"}},
-        "events": [{"type": "drop", "height": 1.5}],
+        "events": [{"type": "drop", "height": 2.5}],
     },
     "playbot": {
         "splats": "splats/playbot/playbot_robot_lod1_sh3.ply",

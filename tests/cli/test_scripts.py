@@ -1,0 +1,57 @@
+"""The thin scripts over the stages run on small inputs and leave what they say."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from PIL import Image
+
+import gsfluent as gf
+from gsfluent.demo import make_capture
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+
+
+def script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"scripts_{name}", SCRIPTS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "fill", "simulate", "render"])
+def test_scripts_are_thin(name: str) -> None:
+    assert len((SCRIPTS / f"{name}.py").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+def test_reconstruct_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_capture("watermelon", tmp_path / "capture", views=9, size=64)
+    quick = functools.partial(gf.pipeline.Reconstruct, iterations=10, start_gaussians=500)
+    monkeypatch.setattr(gf.pipeline, "Reconstruct", quick)
+    script("reconstruct").main(str(tmp_path / "capture"), str(tmp_path / "model.ply"))
+    assert "held-out PSNR" in capsys.readouterr().out
+    assert gf.load(tmp_path / "model.ply").count > 100
+
+
+def test_fill_and_simulate_scripts(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    solid = tmp_path / "solid.ply"
+    script("fill").main(str(ball), str(solid))
+    assert gf.Solid.load(solid).color is not None
+    script("simulate").main(str(solid), "bread", "0.3", "2.0")
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("t = ") for line in lines) == 30
+
+
+def test_render_script(ball: Path, tmp_path: Path) -> None:
+    script("render").main(str(ball), str(tmp_path / "ball.png"))
+    low, high = Image.open(tmp_path / "ball.png").convert("L").getextrema()
+    assert high - low > 50
