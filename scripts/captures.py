@@ -43,7 +43,17 @@ SHOTS: dict[str, dict[str, Any]] = {
         "reconstruct": REDUCED,
         "texture": {"method": "color_copy"},
         "objects": {"skull": {"material": "ceramic"}},
-        "events": [{"type": "drop", "height": 2.5}],
+        "events": [
+            {
+                "type": "bullet",
+                "from": [0.5, -0.2, 0.14],
+                "toward": [0.0, 0.0, 0.12],
+                "speed": 60,
+                "radius": 0.012,
+                "at": 0.15,
+            }
+        ],
+        "output": OUTPUT | {"seconds": 0.5, "fps": 60},
     },
     "playbot": {
         "splats": "splats/playbot/playbot_robot_lod1_sh3.ply",

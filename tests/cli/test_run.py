@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from gsfluent.cli import main
@@ -272,3 +273,27 @@ def test_plan_agrees_with_the_run(finished: Path, capsys: pytest.CaptureFixture[
 )
 def test_the_poster_follows_the_largest_break(fragments: list[int], expected: int) -> None:
     assert poster_frame(fragments, fps=10) == expected
+
+
+def test_a_bullet_can_be_seen(finished: Path, ball: Path, tmp_path: Path) -> None:
+    from gsfluent.data import TRANSITION
+    from gsfluent.pipeline.run_frames import load_frame
+
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    bullet = {"type": "bullet", "from": [0, -3, 0.5], "toward": [0, 0, 0.5], "speed": 20}
+    shot = write_shot(
+        tmp_path / "shot.yaml",
+        ball,
+        events=[{**bullet, "radius": 0.2}],
+        output={"fps": 20, "seconds": 0.1, "size": [96, 64]},
+    )
+    assert main(["run", str(shot), "-o", str(out)]) == 0
+    frame = load_frame(out / "stages" / "simulate", 0)
+    before = load_frame(finished / "stages" / "simulate", 0)
+    added = frame.carried - before.carried
+    assert added > 100
+    steel = frame.gaussians.means[before.carried : frame.carried]
+    torch.testing.assert_close(steel.mean(dim=0), torch.tensor([0.0, -3.0, 0.5]), atol=0.05, rtol=0)
+    labels = frame.gaussians.labels
+    assert labels is not None and bool((labels[frame.carried :] == TRANSITION).all())
