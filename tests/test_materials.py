@@ -240,7 +240,7 @@ def test_empty_and_oversized_scenes_are_refused():
     with pytest.raises(InputError, match="empty"):
         build_matter(Scene(), 0.02)
     sunk = Scene(floor=0.0)
-    sunk.add(ellipsoid(), materials.glass)
+    sunk.add(ellipsoid(), materials.glass, frame=Frame.identity())
     with pytest.raises(InputError, match="below the floor"):
         build_matter(sunk, 0.02)
     scene = Scene(floor=None)

@@ -12,11 +12,16 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsfluent.errors import GsfluentError, InputError, RunError
+
+if TYPE_CHECKING:
+    from gsfluent.cli.common import Verb
 
 # Read by OpenMP when torch is first imported. Thread teams that spin at their barriers make small
 # torch operations tens of times slower as soon as anything else runs on the machine.
@@ -56,8 +61,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 {"error": {"kind": "InputError", "message": "see stderr"}, "exit_code": code}
             )
         return code
-    _configure_logging()
-    _treat_termination_as_interrupt()
+    with _logging_to_stderr(), _termination_as_interrupt():
+        return _execute(command, as_json)
+
+
+def _execute(command: Verb, as_json: bool) -> int:
+    """Run a verb and turn whatever happens into words and an exit code."""
     try:
         result = command.execute()
     except KeyboardInterrupt as stop:
@@ -122,24 +131,36 @@ def _show_traceback() -> None:
         traceback.print_exc()
 
 
-def _configure_logging() -> None:
+@contextmanager
+def _logging_to_stderr() -> Iterator[None]:
+    """Show gsfluent's log lines plainly on stderr while a verb runs."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
-    _log.handlers = [handler]
+    before = (_log.handlers, _log.level, _log.propagate)
+    _log.handlers, _log.propagate = [handler], False
     _log.setLevel(logging.DEBUG if os.environ.get("GSFLUENT_DEBUG") == "1" else logging.INFO)
-    _log.propagate = False
+    try:
+        yield
+    finally:
+        _log.handlers, _log.propagate = before[0], before[2]
+        _log.setLevel(before[1])
 
 
-def _treat_termination_as_interrupt() -> None:
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
     """Let SIGTERM unwind like Ctrl-C: a batch system's kill leaves the same resumable state."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt(f"stopped by {signal.Signals(number).name}")
 
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+    before = signal.signal(signal.SIGTERM, stop)
     try:
-        signal.signal(signal.SIGTERM, stop)
-    except ValueError:
-        _log.debug("not in the main thread; SIGTERM keeps its default")
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 __all__ = ["InputError", "RunError", "main"]

@@ -167,3 +167,12 @@ def test_sizes_and_vectors_are_read() -> None:
 def test_json_has_no_nan() -> None:
     text = to_json({"a": float("nan"), "b": [float("inf"), 1.0], "c": Path("x"), "d": (1, 2)})
     assert json.loads(text) == {"a": None, "b": [None, 1.0], "c": "x", "d": [1, 2]}
+
+
+def test_logging_is_left_as_it_was() -> None:
+    import logging
+
+    logger = logging.getLogger("gsfluent")
+    before = (list(logger.handlers), logger.level, logger.propagate)
+    assert main(["demo", "brick"]) == 2
+    assert (logger.handlers, logger.level, logger.propagate) == before
