@@ -20,6 +20,7 @@ from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture
 from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.inspect import inspect
 from gsfluent.pipeline.orient import DEFAULT_SIZE, make_frame
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.run_simulate import build_scene
@@ -96,21 +97,17 @@ def _stand_in(shot: Shot, warnings: list[str]) -> tuple[Solid, Frame, str]:
         return _grey(solid), frame, f"the splat, filled at {_STAND_IN_VOXELS} voxels"
     if shot.capture is None:
         raise InputError("the shot has neither capture nor splats", "name one input")
-    capture = load_capture(shot.capture)
-    if len(capture.points) < 20:
+    load_capture(shot.capture)  # what is wrong with it is an error; what is not in it is a warning
+    try:
+        report = inspect(shot.capture, None, size=shot.size)
+    except InputError as error:
         size = shot.size or DEFAULT_SIZE
-        warnings.append(
-            f"the capture has {len(capture.points)} sparse points, so its size is not known: "
-            f"assumed {size:g} m"
-        )
+        warnings.append(f"the object's size is not known ({error.what}): assumed {size:g} m")
         return _ellipsoid([size] * 3), Frame.identity(), f"a ball of {size:g} m"
-    from gsfluent.pipeline.inspect import inspect
-
-    report = inspect(shot.capture, None, size=shot.size)
     box = [float(x) for x in report["box"]["size"]]
     if shot.scale is not None:
         box = [x * shot.scale / float(report["scale"]["metres_per_unit"]) for x in box]
-    return _ellipsoid(box), Frame.identity(), "an ellipsoid in the box of the sparse points"
+    return _ellipsoid(box), Frame.identity(), "an ellipsoid in the box of what is seen"
 
 
 def _ellipsoid(size: list[float]) -> Solid:

@@ -187,3 +187,23 @@ def test_label_file_that_does_not_fit(
     )
     shot.write_text(text)
     assert "labels" in refused(["run", str(shot), "-o", str(tmp_path / "out")], capsys)
+
+
+def test_plan_refuses_an_empty_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "nothing").mkdir()
+    shot = tmp_path / "shot.yaml"
+    shot.write_text("capture: nothing\nevents: [{type: drop, height: 1}]\n")
+    assert "empty" in refused(["plan", str(shot)], capsys)
+
+
+def test_plan_measures_a_capture_with_masks_only(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shot = tmp_path / "shot.yaml"
+    shot.write_text(
+        "capture: capture\nscale: 1.0\nup: +z\nsolve: {quality: preview}\n"
+        "events: [{type: drop, height: 1}]\n"
+    )
+    assert main(["plan", str(shot), "--json"]) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert max(plan["size_m"]) == pytest.approx(0.26, rel=0.3)  # the melon is 0.26 m long
