@@ -42,18 +42,9 @@ SHOTS: dict[str, dict[str, Any]] = {
         "size": 0.2,
         "reconstruct": REDUCED,
         "texture": {"method": "color_copy"},
-        "objects": {"skull": {"material": "ceramic"}},
-        "events": [
-            {
-                "type": "bullet",
-                "from": [0.5, -0.2, 0.14],
-                "toward": [0.0, 0.0, 0.12],
-                "speed": 60,
-                "radius": 0.012,
-                "at": 0.15,
-            }
-        ],
-        "output": OUTPUT | {"seconds": 0.5, "fps": 60},
+        # as soft as a melon, so that a fall from a table breaks it within a short film
+        "objects": {"skull": {"material": "fruit.watermelon"}},
+        "events": [{"type": "drop", "height": 1.2}],
     },
     "playbot": {
         "splats": "splats/playbot/playbot_robot_lod1_sh3.ply",
