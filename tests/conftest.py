@@ -9,10 +9,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import pytest
-
-# before torch loads OpenMP: threads that sleep while they wait, see gsfluent/cli
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-
 import torch
 
 REPO = Path(__file__).resolve().parent.parent

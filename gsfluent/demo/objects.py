@@ -16,7 +16,6 @@ from torch import Tensor
 from gsfluent.demo.noise import SolidNoise
 
 RIND, PITH, FLESH, SEED = 1, 2, 3, 4
-LABEL_NAMES = {0: "outside", RIND: "rind", PITH: "pith", FLESH: "flesh", SEED: "seed"}
 
 
 class DemoObject:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
+from ball_shot import write_shot
 
 from gsfluent.data import SURFACE, Gaussians
 
@@ -38,17 +38,4 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def shot(ball: Path, tmp_path: Path) -> Path:
     """A shot that drops the ball: a few seconds of work in all."""
-    values = {
-        "splats": str(ball),
-        "scale": 1.0,
-        "up": "+z",
-        "fill": {"resolution": 24},
-        "texture": {"method": "color_copy"},
-        "objects": {"ball": {"material": "bread"}},
-        "events": [{"type": "drop", "height": 0.3}],
-        "solve": {"quality": "preview"},
-        "output": {"fps": 20, "seconds": 0.5, "size": [96, 64], "what": ["mp4", "ply-seq"]},
-    }
-    path = tmp_path / "shot.yaml"
-    path.write_text(yaml.safe_dump(values))
-    return path
+    return write_shot(tmp_path / "shot.yaml", ball)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
+from ball_shot import write_shot
 
 from gsfluent.cli import main
 from gsfluent.io import load
@@ -43,22 +43,6 @@ def finished(ball: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_shot(root / "shot.yaml", ball)
     assert main(["run", str(root / "shot.yaml"), "-o", str(root / "out")]) == 0
     return root / "out"
-
-
-def write_shot(path: Path, ball: Path, **changes: Any) -> Path:
-    values: dict[str, Any] = {
-        "splats": str(ball),
-        "scale": 1.0,
-        "up": "+z",
-        "fill": {"resolution": 24},
-        "texture": {"method": "color_copy"},
-        "objects": {"ball": {"material": "bread"}},
-        "events": [{"type": "drop", "height": 0.3}],
-        "solve": {"quality": "preview"},
-        "output": {"fps": 20, "seconds": 0.5, "size": [96, 64], "what": ["mp4", "ply-seq"]},
-    }
-    path.write_text(yaml.safe_dump(values | changes))
-    return path
 
 
 def read(out: Path) -> dict[str, Any]:
