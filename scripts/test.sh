@@ -7,7 +7,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 prepare test
 if [ $# -eq 0 ]; then
   "$PYTHON" -m ruff check .
-  "$PYTHON" -m ruff format --check gsfluent tests scripts setup.py
+  "$PYTHON" -m ruff format --check .
   "$PYTHON" -m mypy
   find csrc -name '*.h' -o -name '*.cpp' -o -name '*.cu' | sort | xargs "$(dirname "$PYTHON")/clang-format" --dry-run -Werror
 fi
