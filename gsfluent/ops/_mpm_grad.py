@@ -51,12 +51,13 @@ def _p2g_adjoint_fake(
 
 @torch.library.register_fake("gsfluent::grid_update")
 def _grid_update_fake(
-    grid: Tensor, moments: Tensor | None, colliders: Tensor | None, coords: Tensor, *rest: float
-) -> tuple[Tensor, Tensor, Tensor]:
+    grid: Tensor, moments: Tensor | None, colliders: Tensor | None, *rest: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     rows = 0 if colliders is None else colliders.shape[0]
     velocity = grid.new_empty((grid.shape[0], grid.shape[1], 64, 3))
-    impulse = grid.new_empty((rows, 3), dtype=torch.float64)
-    return velocity, impulse, grid.new_empty((), dtype=torch.int64)
+    impulse = grid.new_empty((rows, 6), dtype=torch.float64)
+    mass = grid.new_empty((rows,), dtype=torch.float64)
+    return velocity, impulse, mass, grid.new_empty((), dtype=torch.int64)
 
 
 @torch.library.register_fake("gsfluent::g2p")
@@ -202,14 +203,14 @@ def _grid_update_backward(
 ) -> tuple[Tensor | None, ...]:
     none: tuple[None, ...] = (None,)
     if g_velocity is None:
-        return none * 12
+        return none * 13
     (grid,) = ctx.saved_tensors
     mass = grid[..., 3:]
     heavy = mass > MASS_FLOOR
     inverse = torch.where(heavy, 1.0 / torch.where(heavy, mass, torch.ones_like(mass)), 0.0)
     g_momentum = g_velocity * inverse
     g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
-    return torch.cat([g_momentum, g_mass], dim=-1), *(none * 11)
+    return torch.cat([g_momentum, g_mass], dim=-1), *(none * 12)
 
 
 torch.library.register_autograd("gsfluent::p2g", _p2g_backward, setup_context=_p2g_setup)

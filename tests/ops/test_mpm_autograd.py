@@ -234,7 +234,7 @@ def test_build_blocks_errors() -> None:
         ({"gravity": (0.0, 1.0)}, "gravity must have three numbers, got 2"),
         ({"friction": -1.0}, "friction must be >= 0"),
         ({"restitution": 1.5}, r"restitution must be in \[0, 1\]"),
-        ({"colliders": torch.zeros(1, 3).double()}, r"colliders must have shape \[\*, 16\]"),
+        ({"colliders": torch.zeros(1, 3).double()}, r"colliders must have shape \[\*, 32\]"),
         ({"colliders": torch.zeros(1, 16).double()}, "colliders row 0 must be finite, with type 0"),
         ({"colliders": torch.full((1, 16), 7.0).double()}, "colliders row 0"),
         ({"moments": torch.zeros(1, 1, 64, 6).double()}, "moments must have shape"),
