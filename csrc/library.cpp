@@ -29,7 +29,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
 
   // --- solver: the resident state of a simulation (gsfluent/ops/solver.py), advanced in place ---
   m.def("solver_prime(Tensor(a!)[] buffers, int[] ints, float[] floats) -> ()");
-  m.def("solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
+  m.def(
+      "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
 
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(

@@ -58,9 +58,7 @@ GSF_HOST_DEVICE double choose_step(const SolverClock& c, double from, double dx)
   return 2.0 * step > left ? 0.5 * left : step;
 }
 
-GSF_HOST_DEVICE void reset_largest(SolverClock& c) {
-  c.speed = c.wave = c.gradient = 0;
-}
+GSF_HOST_DEVICE void reset_largest(SolverClock& c) { c.speed = c.wave = c.gradient = 0; }
 
 GSF_HOST_DEVICE bool check_largest(SolverClock& c) {
   const double speed = float_of_bits(c.speed), wave = float_of_bits(c.wave);
@@ -115,8 +113,8 @@ GSF_HOST_DEVICE void end_step(SolverClock& c, double dx, int64_t count) {
   if (!check_largest(c)) return;
   const double before = c.time;
   const bool last = !(c.dt_next > 0.0);
-  c.time = last && c.dt_fixed <= 0.0 && c.until > before && c.steps_left != 1 ? c.until
-                                                                             : before + c.dt;
+  c.time =
+      last && c.dt_fixed <= 0.0 && c.until > before && c.steps_left != 1 ? c.until : before + c.dt;
   if (!(c.time > before)) c.reason = kStepTooSmall;
   if (c.steps_left > 0) c.steps_left -= 1;
   if (last || c.steps_left == 0) {

@@ -9,8 +9,8 @@ namespace gsf {
 // Sums of one node in natural units, as both back ends hand them over.
 template <typename T>
 struct NodeSums {
-  double mass;         // kg
-  double momentum[3];  // kg m/s
+  double mass;                 // kg
+  double momentum[3];          // kg m/s
   T moments[kContactMoments];  // only when the site is shared
 };
 

@@ -82,8 +82,7 @@ template <typename T>
 GSF_HOST_DEVICE T wave_squared(T mu, T kappa, T density, T j2m1, T log_j) {
   using std::exp;
   const T third = exp(T(2.0 / 3.0) * log_j);  // J^(2/3)
-  return (kappa * (T(1) + T(0.5) * j2m1) +
-          T(2.0 / 9.0) * mu * (third * third + T(5) / third)) /
+  return (kappa * (T(1) + T(0.5) * j2m1) + T(2.0 / 9.0) * mu * (third * third + T(5) / third)) /
          density;
 }
 
@@ -159,9 +158,8 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, con
     wave2 = wave_squared(r[0], r[1], r[6], state.j2m1, state.log_j);
   } else {
     const T alpha = s.alpha[p], peak = s.peak[p];
-    const ReturnMapped<T> out =
-        return_mapping(load_sym3(s.strain + 6 * p), alpha, increment, s.law[row],
-                       material_now(s, row, peak), s.options);
+    const ReturnMapped<T> out = return_mapping(load_sym3(s.strain + 6 * p), alpha, increment,
+                                               s.law[row], material_now(s, row, peak), s.options);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -198,7 +196,8 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   const uint32_t row = meta_row(s.meta[p]) < uint64_t(s.row_count) ? meta_row(s.meta[p]) : 0;
   const T* r = s.rows + int64_t(row) * kRowColumns;
   const T mass = r[kMassColumn];
-  const T alpha = s.alpha != nullptr ? s.alpha[p] : T(0), peak = s.peak != nullptr ? s.peak[p] : alpha;
+  const T alpha = s.alpha != nullptr ? s.alpha[p] : T(0),
+          peak = s.peak != nullptr ? s.peak[p] : alpha;
   Mat3<T> c = load_mat3(s.slope + 9 * p);
   const T inverse = mass > T(0) ? T(1) / mass : T(0);
   for (int i = 0; i < 9; ++i) c.m[i] *= inverse;

@@ -21,16 +21,16 @@ namespace gsf {
 
 constexpr int kWindowEdge = 8;
 constexpr int kWindowNodes = 512;
-constexpr int kNeighbours = 27;   // blocks a window can touch
+constexpr int kNeighbours = 27;     // blocks a window can touch
 constexpr int kContactMoments = 6;  // mass gradient and first moment
-constexpr int kLastCell = 5;      // largest l
-constexpr int kRowColumns = 10;   // eight material parameters, particle mass, particle volume
+constexpr int kLastCell = 5;        // largest l
+constexpr int kRowColumns = 10;     // eight material parameters, particle mass, particle volume
 constexpr int kMassColumn = 8;
 constexpr int kVolumeColumn = 9;
-constexpr int kSiteFields = 16;   // fields that may share one block
-constexpr int kFieldBits = 13;    // fields of a scene
+constexpr int kSiteFields = 16;  // fields that may share one block
+constexpr int kFieldBits = 13;   // fields of a scene
 constexpr int kMaxSolverFields = (1 << kFieldBits) - 1;
-constexpr int kBlockBits = 17;    // block coordinates lie in [-2^16, 2^16)
+constexpr int kBlockBits = 17;  // block coordinates lie in [-2^16, 2^16)
 constexpr int32_t kBlockRange = 1 << (kBlockBits - 1);
 constexpr uint64_t kNoKey = ~uint64_t(0);
 
@@ -79,18 +79,18 @@ enum SolverReason : int64_t {
 // Everything about time and health that kernels read and write; every member is eight bytes, so
 // that Python reads it as one int64 or float64 tensor.
 struct SolverClock {
-  double time, until, dt, dt_next;                     // 0..3  [s]
-  double dt_fixed, dt_scale, cfl, gradient_limit;      // 4..7
-  double momentum_unit, mass_unit, dt_min, dt_max;     // 8..11
-  int64_t step, steps_left, done, rebuild;             // 12..15
-  int64_t grow, reason, parity, homes;                 // 16..19
-  int64_t slots, sites, cursor, arrived;               // 20..23
-  uint64_t speed, wave, gradient, bound;               // 24..27 bits of floats, largest of the step
-  int64_t plastic, guarded, inverted, invalid;         // 28..31 sums over steps
-  int64_t contact_nodes, contact_steps, builds, wanted_homes;   // 32..35
-  int64_t wanted_slots, homes_max, slots_max, particle_steps;   // 36..39
-  int64_t touched, lost, unit_bits, shared_sites;               // 40..43
-  double speed_seen, wave_seen, spare0, spare1;                 // 44..47
+  double time, until, dt, dt_next;                  // 0..3  [s]
+  double dt_fixed, dt_scale, cfl, gradient_limit;   // 4..7
+  double momentum_unit, mass_unit, dt_min, dt_max;  // 8..11
+  int64_t step, steps_left, done, rebuild;          // 12..15
+  int64_t grow, reason, parity, homes;              // 16..19
+  int64_t slots, sites, cursor, arrived;            // 20..23
+  uint64_t speed, wave, gradient, bound;            // 24..27 bits of floats, largest of the step
+  int64_t plastic, guarded, inverted, invalid;      // 28..31 sums over steps
+  int64_t contact_nodes, contact_steps, builds, wanted_homes;  // 32..35
+  int64_t wanted_slots, homes_max, slots_max, particle_steps;  // 36..39
+  int64_t touched, lost, unit_bits, shared_sites;              // 40..43
+  double speed_seen, wave_seen, spare0, spare1;                // 44..47
 };
 constexpr int kClockWords = 48;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
@@ -113,18 +113,18 @@ struct SolverView {
   bool irreversible;
   SolverClock* clock;
   // particles, grouped by home
-  T* offset;        // [N, 3] o
-  uint32_t* meta;   // [N]
-  T* velocity;      // [N, 3] m/s
-  T* slope;         // [N, 3, 3] m C - dt V0 (4 / dx^2) tau with the dt of the coming step; kg/s
-  T* strain;        // [N, 6] e = b - I
-  T* alpha;         // [N] or null when no law uses it
-  T* peak;          // [N] largest alpha so far, or null
-  T* deformation;   // [N, 3, 3] total deformation gradient, or null
-  int32_t* id;      // [N] row of the particle when it was loaded
-  T* spare;         // [N, 9] scratch of the re-sort
-  int32_t* entry;   // [N] scratch
-  int32_t* place;   // [N] scratch
+  T* offset;       // [N, 3] o
+  uint32_t* meta;  // [N]
+  T* velocity;     // [N, 3] m/s
+  T* slope;        // [N, 3, 3] m C - dt V0 (4 / dx^2) tau with the dt of the coming step; kg/s
+  T* strain;       // [N, 6] e = b - I
+  T* alpha;        // [N] or null when no law uses it
+  T* peak;         // [N] largest alpha so far, or null
+  T* deformation;  // [N, 3, 3] total deformation gradient, or null
+  int32_t* id;     // [N] row of the particle when it was loaded
+  T* spare;        // [N, 9] scratch of the re-sort
+  int32_t* entry;  // [N] scratch
+  int32_t* place;  // [N] scratch
   // materials
   const int32_t* law;  // [rows]
   const T* rows;       // [rows, kRowColumns]
@@ -140,16 +140,16 @@ struct SolverView {
   void* moments;         // [S, 64, kContactMoments] likewise, or null with one field
   T* node_velocity;      // [S, 64, 4]
   // hash table
-  uint64_t* key;        // [table_size]
-  int32_t* table_count; // [table_size] particles of a home
-  int32_t* table_mask;  // [table_size] neighbours a home reaches
-  int32_t* table_home;  // [table_size]
-  int32_t* table_slot;  // [table_size] slot, or head of the slot list of a site
-  int32_t* slot_next;   // [S] chain of the slots of a site
+  uint64_t* key;         // [table_size]
+  int32_t* table_count;  // [table_size] particles of a home
+  int32_t* table_mask;   // [table_size] neighbours a home reaches
+  int32_t* table_home;   // [table_size]
+  int32_t* table_slot;   // [table_size] slot, or head of the slot list of a site
+  int32_t* slot_next;    // [S] chain of the slots of a site
   // colliders
-  T* colliders;             // [K, kColliderColumns]
-  int64_t* impulse_units;   // [K, 3] of this step, in momentum units (CUDA)
-  double* impulse;          // [K, 3] N s since the load
+  T* colliders;            // [K, kColliderColumns]
+  int64_t* impulse_units;  // [K, 3] of this step, in momentum units (CUDA)
+  double* impulse;         // [K, 3] N s since the load
 
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE HomeList<T>& next_homes() { return home[1 - (clock->parity & 1)]; }

@@ -9,16 +9,59 @@
 namespace gsf {
 
 enum SolverBuffer : int {
-  kClock, kOffset, kMeta, kVelocityBuffer, kSlope, kStrain, kAlpha, kPeak, kDeformation, kId,
-  kSpare, kEntry, kPlace, kLaw, kRows, kHomeCoord0, kHomeStart0, kHomeCount0, kHomeCoord1,
-  kHomeStart1, kHomeCount1, kNeighbour, kHomeBound, kHomeMass, kSlotCoord, kSlotShared,
-  kSiteSlots, kSums, kMoments, kNodeVelocity, kKey, kTableCount, kTableMask, kTableHome,
-  kTableSlot, kSlotNext, kColliders, kImpulseUnits, kImpulse, kSolverBuffers
+  kClock,
+  kOffset,
+  kMeta,
+  kVelocityBuffer,
+  kSlope,
+  kStrain,
+  kAlpha,
+  kPeak,
+  kDeformation,
+  kId,
+  kSpare,
+  kEntry,
+  kPlace,
+  kLaw,
+  kRows,
+  kHomeCoord0,
+  kHomeStart0,
+  kHomeCount0,
+  kHomeCoord1,
+  kHomeStart1,
+  kHomeCount1,
+  kNeighbour,
+  kHomeBound,
+  kHomeMass,
+  kSlotCoord,
+  kSlotShared,
+  kSiteSlots,
+  kSums,
+  kMoments,
+  kNodeVelocity,
+  kKey,
+  kTableCount,
+  kTableMask,
+  kTableHome,
+  kTableSlot,
+  kSlotNext,
+  kColliders,
+  kImpulseUnits,
+  kImpulse,
+  kSolverBuffers
 };
 
 enum SolverFloat : int {
-  kDx, kGravityX, kGravityY, kGravityZ, kFrictionBetween, kRestitutionBetween, kGap, kPower,
-  kEpsilon, kSolverFloats
+  kDx,
+  kGravityX,
+  kGravityY,
+  kGravityZ,
+  kFrictionBetween,
+  kRestitutionBetween,
+  kGap,
+  kPower,
+  kEpsilon,
+  kSolverFloats
 };
 enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kSolverInts };
 
@@ -101,8 +144,8 @@ struct SolverOps {
                       " has the wrong dtype");
       STD_TORCH_CHECK(b[i].device() == like.device(), "solver: ", wanted[i].name,
                       " must be on the device of offset");
-      STD_TORCH_CHECK(wanted[i].optional || b[i].numel() > 0 || wanted[i].rows == 0, "solver: ",
-                      wanted[i].name, " must not be empty");
+      STD_TORCH_CHECK(wanted[i].optional || b[i].numel() > 0 || wanted[i].rows == 0,
+                      "solver: ", wanted[i].name, " must not be empty");
     }
     const auto real_at = [&](int i) { return b[i].numel() ? mptr<T>(b[i]) : nullptr; };
     const auto int_at = [&](int i) { return b[i].numel() ? mptr<int32_t>(b[i]) : nullptr; };
