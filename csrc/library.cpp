@@ -31,6 +31,11 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "int margin, float dx, float dt) -> (Tensor position, Tensor velocity, Tensor affine, "
       "Tensor deformation, Tensor skipped)");
 
+  // --- solver: the resident state of a simulation (gsfluent/ops/solver.py), advanced in place ---
+  m.def("solver_prime(Tensor(a!)[] buffers, int[] ints, float[] floats) -> ()");
+  m.def(
+      "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
+
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
