@@ -162,8 +162,10 @@ def _contact(
     jn = (1 + restitution) * reduced * approach
     slip = relative - approach * n
     speed = slip.norm(dim=-1, keepdim=True)
-    jt = torch.minimum(friction * jn, reduced * speed)
-    impulse = torch.where(touch, jn * n + jt * slip / speed.clamp_min(1e-300), 0.0)
+    # min(friction j_n, m_r |slip|) slip / |slip|, without the 0 / 0 of a node that does not slide.
+    slides = (friction * jn < reduced * speed) & (speed > 0)
+    drag = torch.where(slides, friction * jn / torch.where(slides, speed, 1.0), reduced)
+    impulse = torch.where(touch, jn * n + drag * slip, 0.0)
     return velocity[a] - impulse / ma, velocity[b] + impulse / mb, touch.squeeze(-1)
 
 
