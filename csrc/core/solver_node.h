@@ -2,6 +2,7 @@
 // between fields, colliders.
 #pragma once
 
+#include "core/collider.h"
 #include "core/solver_state.h"
 
 namespace gsf {

@@ -123,7 +123,12 @@ def pad_colliders(colliders: Tensor) -> Tensor:
 
 def check_colliders(op: str, rows: Tensor, sdf_count: int) -> None:
     """Refuse rows that are no collider; the same conditions as ``collider_valid`` of the core."""
-    kind, mode, radius, extent = rows[:, TYPE], rows[:, MODE], rows[:, RADIUS], rows[:, EXTENT:OFFSET]
+    kind, mode, radius, extent = (
+        rows[:, TYPE],
+        rows[:, MODE],
+        rows[:, RADIUS],
+        rows[:, EXTENT:OFFSET],
+    )
     count, offset = extent.double().prod(dim=1), rows[:, OFFSET].double()
     whole = ((extent >= 2) & (extent <= 4096) & (extent == extent.floor())).all(dim=1)
     whole &= (offset >= 0) & (offset == offset.floor()) & (SDF_ALIGN * offset + count <= sdf_count)

@@ -247,7 +247,9 @@ def test_opcheck(grad: bool) -> None:
     grid = torch.rand(2, blocks.block_count, 64, 4, dtype=torch.float64, requires_grad=grad)
     moments = None if grad else torch.rand(2, blocks.block_count, 64, 6, dtype=torch.float64)
     rest = (DX, 0.1, 0.0, 0.0, -9.81, 0.3, 0.0, 1.0)
-    torch.library.opcheck(lib.grid_update.default, (grid, moments, None, blocks.coords, *rest))
+    torch.library.opcheck(
+        lib.grid_update.default, (grid, moments, None, None, blocks.coords, *rest)
+    )
     position = position.detach()
     torch.library.opcheck(lib.p2g_adjoint.default, (grid.detach(), position, body, *index, DX))
     slopes = (grid.detach(), torch.ones(N, 4).double(), torch.ones(N, 3, 3).double(), position)

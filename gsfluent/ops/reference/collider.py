@@ -121,7 +121,7 @@ def give(row: Tensor, contact_mass: Tensor) -> Tensor:
     moments = row[23:26][row[23:26] > 0]
     turning = mass * bounds[kind] ** 2 / moments.min() if len(moments) else 0 * mass
     if kind == 1:
-        turning = turning * [1.0, 0.0, mu**2 / (1 + mu**2)][mode]
+        turning = turning * (mode == 0) + turning * (mode == 2) * mu**2 / (1 + mu**2)
     return 1 / (1 + contact_mass / mass * (1 + turning))
 
 
