@@ -17,6 +17,10 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor order, Tensor start, int[3] origin, int margin, float dx) -> "
       "(Tensor value, Tensor first)");
   m.def(
+      "transfer_slope(Tensor grid, Tensor constant, Tensor linear, Tensor position, Tensor? body, "
+      "Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, int margin, "
+      "float dx) -> Tensor");
+  m.def(
       "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor coords, float dx, "
       "float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
       "float restitution, float contact_gap) -> "

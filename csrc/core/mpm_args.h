@@ -30,7 +30,8 @@ struct P2GArgs {
   int64_t* skipped;  // [] particles given to no node, zeroed
 };
 
-// Gather of velocities (g2p) or of four plain channels (adjoint of p2g), told apart by `channels`.
+// Gather of velocities (g2p) or of four plain channels (adjoint of p2g; derivative of a transfer
+// with respect to the particle position), told apart by which outputs are set.
 template <typename T>
 struct GatherArgs {
   BlockView blocks;
@@ -50,6 +51,10 @@ struct GatherArgs {
   // adjoint (channels = 4)
   T* value_out;  // [N, 4] sum w g
   T* first_out;  // [N, 3, 3] sum w g (x_i - x_p)^T
+  // transfer_slope (channels = 4)
+  const T* constant;  // [N, 4]
+  const T* linear;    // [N, 3, 3]
+  T* slope_out;       // [N, 3] d/dx_p of sum w g . (constant + linear (x_i - x_p))
 };
 
 template <typename T>

@@ -199,6 +199,41 @@ struct MpmOps {
     return {value, first};
   }
 
+  // Derivative of a transfer with respect to the particle positions.
+  static Tensor transfer_slope(Tensor grid_in, Tensor constant_in, Tensor linear_in,
+                               Tensor position, OptTensor body, Tensor table, Tensor coords,
+                               Tensor order, Tensor start, Ints origin, int64_t margin, double dx) {
+    const char* op = "transfer_slope";
+    const int64_t n = position.dim() > 0 ? position.size(0) : -1;
+    const ScalarType type = position.scalar_type();
+    const Tensor x = ready(op, "position", position, position, {n, 3});
+    const BlockTensors b(op, x, table, coords, order, start, origin, margin, n);
+    const Tensor grid = ready(op, "grid", grid_in, x, {-1, b.view.count, kBlockNodes, 4});
+    const Tensor constant = ready(op, "constant", constant_in, x, {n, 4});
+    const Tensor linear = ready(op, "linear", linear_in, x, {n, 3, 3});
+    const OptTensor ids = ready(op, "body", body, x, {n}, ScalarType::Int);
+    STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
+    check_fields(op, grid.size(0));
+    const typename Backend::Scope scope(x);
+    const Tensor slope = new_zeros(x, {n, 3}, type);
+    const Tensor skipped = new_zeros(x, {}, ScalarType::Long);
+    dispatch_floating(op, x, [&]<typename T>() {
+      GatherArgs<T> a{};
+      a.blocks = b.view;
+      a.grid = cptr<T>(grid);
+      a.position = cptr<T>(x);
+      a.body = pointer<int32_t>(ids);
+      a.dx = static_cast<T>(dx);
+      a.fields = static_cast<int32_t>(grid.size(0));
+      a.skipped = mptr<int64_t>(skipped);
+      a.constant = cptr<T>(constant);
+      a.linear = cptr<T>(linear);
+      a.slope_out = mptr<T>(slope);
+      Backend::transfer_slope(a, scope);
+    });
+    return slope;
+  }
+
   static std::tuple<Tensor, Tensor, Tensor> grid_update(Tensor grid_in, OptTensor moments,
                                                         OptTensor colliders, Tensor coords_in,
                                                         double dx, double dt, double gravity_x,

@@ -76,11 +76,11 @@ def p2g(
     Raises:
         TypeError: Wrong type or dtype.
         ValueError: Wrong shape, device or range; blocks built for another particle count.
-        NotImplementedError: A gradient with respect to ``position`` or through ``moments``.
 
     A particle that is not finite, not covered by ``blocks`` or not in a field gives nothing;
-    :func:`g2p` counts the same particles. Gradient: ``velocity``, ``affine``, ``mass``, ``stress``,
-    ``volume``. Determinism: on the CPU the result does not depend on the number of threads; on CUDA
+    :func:`g2p` counts the same particles. Gradient: every floating tensor, ``position`` included,
+    through ``grid`` and ``moments`` (docs/gradients.md). Determinism: on the CPU the result does
+    not depend on the number of threads; on CUDA
     sums are reordered by atomics. Source: Jiang et al. 2015; Hu et al. 2018; docs/mpm.md.
     """
     op = "p2g"
@@ -166,10 +166,11 @@ def grid_update(
         TypeError: Wrong type or dtype.
         ValueError: Wrong shape, device or range; on the CPU also a collider row of unknown type or
             mode or without normal (on CUDA such a row does nothing and its impulse is NaN).
-        NotImplementedError: A gradient through contact or colliders.
+        NotImplementedError: A gradient with respect to ``colliders``.
 
-    Gradient: ``grid`` when there is neither contact nor a collider. Determinism: independent of
-    thread count on the CPU and of scheduling on CUDA.
+    Gradient: ``grid`` and ``moments``, through velocity and impulse; on the piece (touching or not,
+    sticking or sliding) the forward pass was on. Determinism: independent of thread count on the
+    CPU and of scheduling on CUDA.
     Source: Bardenhagen et al. 2001; the corrected force of docs/mpm.md.
     """
     op = "grid_update"
@@ -292,9 +293,9 @@ def g2p(
     Raises:
         TypeError: Wrong type or dtype.
         ValueError: Wrong shape, device or range; blocks built for another particle count.
-        NotImplementedError: A gradient with respect to ``position``.
 
-    Gradient: ``velocity_grid``, ``deformation``, ``velocity``. Deterministic on CPU and CUDA.
+    Gradient: ``velocity_grid``, ``position``, ``deformation``, ``velocity``. Deterministic on
+    CPU and CUDA.
     Source: Jiang et al. 2015; Hu et al. 2018; docs/mpm.md.
     """
     op = "g2p"

@@ -160,8 +160,10 @@ def _contact(
     jn = (1 + restitution) * reduced * approach
     slip = relative - approach * n
     speed = slip.norm(dim=-1, keepdim=True)
-    jt = torch.minimum(friction * jn, reduced * speed)
-    impulse = torch.where(touch, jn * n + jt * slip / speed.clamp_min(1e-300), 0.0)
+    # min(friction j_n, m_r |slip|) slip / |slip|, without the 0 / 0 of a node that does not slide.
+    slides = (friction * jn < reduced * speed) & (speed > 0)
+    drag = torch.where(slides, friction * jn / torch.where(slides, speed, 1.0), reduced)
+    impulse = torch.where(touch, jn * n + drag * slip, 0.0)
     return velocity[a] - impulse / ma, velocity[b] + impulse / mb, touch.squeeze(-1)
 
 
@@ -188,8 +190,10 @@ def _collide(row: Sequence[float], x: Tensor, dx: float, velocity: Tensor) -> Te
         after = own + slip
     else:
         speed = slip.norm(dim=-1, keepdim=True)
-        kept = (speed + friction * (1 + restitution) * vn).clamp_min(0)
-        bounced = own + kept * slip / speed.clamp_min(1e-300) - restitution * vn * n
+        drag = -friction * (1 + restitution) * vn
+        sticks = (drag >= speed) & (drag > 0)
+        kept = torch.where(sticks, 0.0, 1.0 - drag / torch.where((speed > 0) & ~sticks, speed, 1.0))
+        bounced = own + kept * slip - restitution * vn * n
         after = torch.where(vn < 0, bounced, velocity)
     return torch.where(inside, after, velocity)
 
