@@ -17,15 +17,31 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor order, Tensor start, int[3] origin, int margin, float dx) -> "
       "(Tensor value, Tensor first)");
   m.def(
-      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor coords, float dx, "
-      "float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
+      "transfer_slope(Tensor grid, Tensor constant, Tensor linear, Tensor position, Tensor? body, "
+      "Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, int margin, "
+      "float dx) -> Tensor");
+  m.def(
+      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor? sdf, Tensor coords, "
+      "float dx, float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
       "float restitution, float contact_gap) -> "
-      "(Tensor velocity, Tensor impulse, Tensor contact_nodes)");
+      "(Tensor velocity, Tensor impulse, Tensor contact_mass, Tensor contact_nodes)");
   m.def(
       "g2p(Tensor velocity_grid, Tensor position, Tensor? velocity, Tensor? deformation, "
       "Tensor? body, Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, "
       "int margin, float dx, float dt) -> (Tensor position, Tensor velocity, Tensor affine, "
       "Tensor deformation, Tensor skipped)");
+
+  // --- collider: rigid bodies as rows ---
+  m.def(
+      "collider_distance(Tensor position, Tensor colliders, Tensor? sdf) -> "
+      "(Tensor distance, Tensor normal)");
+  m.def(
+      "advance_colliders(Tensor colliders, Tensor impulse, float dt, float gravity_x, "
+      "float gravity_y, float gravity_z) -> Tensor");
+  // --- solver: the resident state of a simulation (gsfluent/ops/solver.py), advanced in place ---
+  m.def("solver_prime(Tensor(a!)[] buffers, int[] ints, float[] floats) -> ()");
+  m.def(
+      "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
 
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(

@@ -18,13 +18,25 @@ LINE_LIMIT = 450
 
 # layer -> gsfluent packages it must not import (cli -> pipeline -> ops; data below all)
 FORBIDDEN = {
-    "ops": ("data", "io", "config", "pipeline", "cli", "scene", "materials", "demo", "progress"),
-    "data": ("pipeline", "cli", "ops.mpm", "scene", "config", "progress"),
-    "io": ("pipeline", "cli", "scene", "progress"),
-    "pipeline": ("cli",),
-    "demo": ("cli", "ops", "pipeline.run", "pipeline.render"),
-    "scene": ("cli", "pipeline.run"),
-    "config": ("cli", "pipeline.run"),
+    "ops": (
+        "data",
+        "io",
+        "config",
+        "pipeline",
+        "cli",
+        "scene",
+        "materials",
+        "demo",
+        "progress",
+        "lab",
+    ),
+    "data": ("pipeline", "cli", "ops.mpm", "scene", "config", "progress", "lab"),
+    "io": ("pipeline", "cli", "scene", "progress", "lab"),
+    "pipeline": ("cli", "lab"),
+    "demo": ("cli", "ops", "pipeline.run", "pipeline.render", "lab"),
+    "scene": ("cli", "pipeline.run", "lab"),
+    "config": ("cli", "pipeline.run", "lab"),
+    "lab": ("pipeline", "cli", "scene", "config", "io", "progress", "demo"),
 }
 
 

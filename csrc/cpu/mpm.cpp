@@ -4,8 +4,8 @@
 
 #include <algorithm>
 #include <atomic>
-#include <numeric>
 
+#include "cpu/mpm_grid.h"
 #include "cpu/mpm_tile.h"
 
 namespace gsf {
@@ -236,6 +236,10 @@ Gathered<T> gather(const Stencil<T>& s, T dx, const Lanes<T>* node, int32_t edge
 template <typename T>
 struct VelocityGather {
   static constexpr int kChannels = 3;
+  static void visit(const GatherArgs<T>& a, int64_t p, const Stencil<T>& s, const Lanes<T>* node,
+                    int32_t edge) {
+    store(a, p, gather(s, a.dx, node, edge));
+  }
   static void store(const GatherArgs<T>& a, int64_t p, const Gathered<T>& g) {
     finish_g2p(g, a.dx, a.dt, a.position + 3 * p, a.deformation ? a.deformation + 9 * p : nullptr,
                a.position_out + 3 * p, a.velocity_out + 3 * p, a.affine_out + 9 * p,
@@ -252,11 +256,56 @@ struct VelocityGather {
 template <typename T>
 struct AdjointGather {
   static constexpr int kChannels = 4;
+  static void visit(const GatherArgs<T>& a, int64_t p, const Stencil<T>& s, const Lanes<T>* node,
+                    int32_t edge) {
+    store(a, p, gather(s, a.dx, node, edge));
+  }
   static void store(const GatherArgs<T>& a, int64_t p, const Gathered<T>& g) {
     for (int c = 0; c < 4; ++c) a.value_out[4 * p + c] = g.value[c];
     store_mat3(a.first_out + 9 * p, g.first);
   }
   static void skip(const GatherArgs<T>& a, int64_t p) { store(a, p, Gathered<T>{}); }
+};
+
+// d/dx_p of sum w g . (constant + linear d), d = x_i - x_p: what p2g and g2p need for the gradient
+// with respect to positions.
+template <typename T>
+struct SlopeGather {
+  static constexpr int kChannels = 4;
+  static void visit(const GatherArgs<T>& a, int64_t p, const Stencil<T>& s, const Lanes<T>* node,
+                    int32_t edge) {
+    const T* c = a.constant + 4 * p;
+    const Mat3<T> m = load_mat3(a.linear + 9 * p);
+    const Lanes<T> mx{m(0, 0), m(1, 0), m(2, 0), T(0)};
+    const Lanes<T> my{m(0, 1), m(1, 1), m(2, 1), T(0)};
+    const Lanes<T> mz{m(0, 2), m(1, 2), m(2, 2), T(0)};
+    const Lanes<T> constant{c[0], c[1], c[2], c[3]};
+    Lanes<T> value{}, along_x{}, along_y{}, along_z{};
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        const T w = s.w[0][i] * s.w[1][j];
+        const T wx = s.slope(0, i) * s.w[1][j], wy = s.w[0][i] * s.slope(1, j);
+        const Lanes<T> plane = constant + a.dx * ((T(i) - s.f[0]) * mx + (T(j) - s.f[1]) * my);
+        const Lanes<T>* n = node + (i * edge + j) * edge;
+        for (int k = 0; k < 3; ++k) {
+          const Lanes<T> g = n[k] * (plane + (a.dx * (T(k) - s.f[2])) * mz);
+          value += (w * s.w[2][k]) * n[k];
+          along_x += (wx * s.w[2][k]) * g;
+          along_y += (wy * s.w[2][k]) * g;
+          along_z += (w * s.slope(2, k)) * g;
+        }
+      }
+    const Lanes<T> along[3] = {along_x, along_y, along_z};
+    for (int axis = 0; axis < 3; ++axis) {
+      const Lanes<T>& q = along[axis];
+      a.slope_out[3 * p + axis] =
+          (q[0] + q[1] + q[2] + q[3]) / a.dx -
+          (m(0, axis) * value[0] + m(1, axis) * value[1] + m(2, axis) * value[2]);
+    }
+  }
+  static void skip(const GatherArgs<T>& a, int64_t p) {
+    for (int axis = 0; axis < 3; ++axis) a.slope_out[3 * p + axis] = T(0);
+  }
 };
 
 template <typename T, typename Kind>
@@ -273,7 +322,7 @@ bool gather_stray(const GatherArgs<T>& a, int64_t p) {
     const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
     for (int c = 0; c < Kind::kChannels; ++c) tile[n][c] = a.grid[Kind::kChannels * node + c];
   }
-  Kind::store(a, p, gather(s, a.dx, tile, 3));
+  Kind::visit(a, p, s, tile, 3);
   return true;
 }
 
@@ -307,7 +356,7 @@ int64_t gather_block(const GatherArgs<T>& a, int64_t block, std::vector<Lanes<T>
       const bool inside = make_stencil(a.position + 3 * p, inv_dx, nodes, s);
       const int32_t o = inside ? window.offset(s) : -1;
       if (o >= 0) {
-        Kind::store(a, p, gather(s, a.dx, tile.data() + o, edge));
+        Kind::visit(a, p, s, tile.data() + o, edge);
       } else if (!gather_stray<T, Kind>(a, p)) {
         Kind::skip(a, p);
         ++skipped;
@@ -338,28 +387,6 @@ void gather_all(const GatherArgs<T>& a) {
   *a.skipped += skipped;
 }
 
-template <typename T>
-void grid_update(const GridUpdateArgs<T>& a) {
-  const int64_t chunks = grid_update_chunks(a.count);
-  std::vector<int64_t> touched(chunks, 0);
-  parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t chunk = begin; chunk < end; ++chunk) {
-      double* partial = a.partial + 3 * chunk * a.collider_count;
-      std::fill(partial, partial + 3 * a.collider_count, 0.0);
-      const int64_t first = chunk * kChunkBlocks * kBlockNodes;
-      const int64_t last = std::min(first + kChunkBlocks * kBlockNodes, a.count * kBlockNodes);
-      for (int64_t node = first; node < last; ++node) touched[chunk] += update_node(a, node);
-      for (int64_t c = 0; c < a.collider_count; ++c)
-        for (int64_t node = first; node < last; ++node) collide_node(a, c, node, partial + 3 * c);
-    }
-  });
-  // Ordered sums: the same for any number of threads.
-  for (int64_t chunk = 0; chunk < chunks; ++chunk)
-    for (int64_t i = 0; i < 3 * a.collider_count; ++i)
-      a.impulse[i] += a.partial[3 * chunk * a.collider_count + i];
-  *a.contact_nodes = std::accumulate(touched.begin(), touched.end(), int64_t(0));
-}
-
 struct Cpu {
   struct Scope {
     explicit Scope(const Tensor&) {}
@@ -377,6 +404,10 @@ struct Cpu {
     gather_all<T, AdjointGather<T>>(a);
   }
   template <typename T>
+  static void transfer_slope(const GatherArgs<T>& a, const Scope&) {
+    gather_all<T, SlopeGather<T>>(a);
+  }
+  template <typename T>
   static void grid_update(const GridUpdateArgs<T>& a, const Scope&) {
     cpu::grid_update(a);
   }
@@ -386,4 +417,8 @@ struct Cpu {
 }  // namespace cpu
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) { gsf::MpmOps<gsf::cpu::Cpu>::register_all(m); }
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
+  gsf::MpmOps<gsf::cpu::Cpu>::register_all(m);
+  // CUDA has this one in torch operations: gsfluent/ops/_mpm_grad.py.
+  m.impl("transfer_slope", TORCH_BOX(&gsf::MpmOps<gsf::cpu::Cpu>::transfer_slope));
+}

@@ -199,12 +199,45 @@ struct MpmOps {
     return {value, first};
   }
 
-  static std::tuple<Tensor, Tensor, Tensor> grid_update(Tensor grid_in, OptTensor moments,
-                                                        OptTensor colliders, Tensor coords_in,
-                                                        double dx, double dt, double gravity_x,
-                                                        double gravity_y, double gravity_z,
-                                                        double friction, double restitution,
-                                                        double contact_gap) {
+  // Derivative of a transfer with respect to the particle positions.
+  static Tensor transfer_slope(Tensor grid_in, Tensor constant_in, Tensor linear_in,
+                               Tensor position, OptTensor body, Tensor table, Tensor coords,
+                               Tensor order, Tensor start, Ints origin, int64_t margin, double dx) {
+    const char* op = "transfer_slope";
+    const int64_t n = position.dim() > 0 ? position.size(0) : -1;
+    const ScalarType type = position.scalar_type();
+    const Tensor x = ready(op, "position", position, position, {n, 3});
+    const BlockTensors b(op, x, table, coords, order, start, origin, margin, n);
+    const Tensor grid = ready(op, "grid", grid_in, x, {-1, b.view.count, kBlockNodes, 4});
+    const Tensor constant = ready(op, "constant", constant_in, x, {n, 4});
+    const Tensor linear = ready(op, "linear", linear_in, x, {n, 3, 3});
+    const OptTensor ids = ready(op, "body", body, x, {n}, ScalarType::Int);
+    STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
+    check_fields(op, grid.size(0));
+    const typename Backend::Scope scope(x);
+    const Tensor slope = new_zeros(x, {n, 3}, type);
+    const Tensor skipped = new_zeros(x, {}, ScalarType::Long);
+    dispatch_floating(op, x, [&]<typename T>() {
+      GatherArgs<T> a{};
+      a.blocks = b.view;
+      a.grid = cptr<T>(grid);
+      a.position = cptr<T>(x);
+      a.body = pointer<int32_t>(ids);
+      a.dx = static_cast<T>(dx);
+      a.fields = static_cast<int32_t>(grid.size(0));
+      a.skipped = mptr<int64_t>(skipped);
+      a.constant = cptr<T>(constant);
+      a.linear = cptr<T>(linear);
+      a.slope_out = mptr<T>(slope);
+      Backend::transfer_slope(a, scope);
+    });
+    return slope;
+  }
+
+  static std::tuple<Tensor, Tensor, Tensor, Tensor> grid_update(
+      Tensor grid_in, OptTensor moments, OptTensor colliders, OptTensor sdf, Tensor coords_in,
+      double dx, double dt, double gravity_x, double gravity_y, double gravity_z, double friction,
+      double restitution, double contact_gap) {
     const char* op = "grid_update";
     const int64_t fields = grid_in.dim() > 0 ? grid_in.size(0) : 0;
     check_fields(op, fields);
@@ -218,13 +251,15 @@ struct MpmOps {
     const OptTensor mom =
         ready(op, "moments", moments, grid, {fields, count, kBlockNodes, 6}, type);
     const OptTensor rows = ready(op, "colliders", colliders, grid, {-1, kColliderColumns}, type);
+    const OptTensor distances = ready(op, "sdf", sdf, grid, {-1}, ScalarType::Float);
     STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
     const int64_t rows_count = rows.has_value() ? rows->size(0) : 0;
     const typename Backend::Scope scope(grid);
     const Tensor velocity = new_empty(grid, {fields, count, kBlockNodes, 3}, type);
     const Tensor partial =
-        new_empty(grid, {grid_update_chunks(count), rows_count, 3}, ScalarType::Double);
-    const Tensor impulse = new_zeros(grid, {rows_count, 3}, ScalarType::Double);
+        new_empty(grid, {grid_update_chunks(count), rows_count, 6}, ScalarType::Double);
+    const Tensor contact_mass = new_zeros(grid, {rows_count}, ScalarType::Double);
+    const Tensor impulse = new_zeros(grid, {rows_count, 6}, ScalarType::Double);
     const Tensor contact_nodes = new_zeros(grid, {}, ScalarType::Long);
     dispatch_floating(op, grid, [&]<typename T>() {
       GridUpdateArgs<T> a{};
@@ -235,6 +270,8 @@ struct MpmOps {
       a.moments = pointer<T>(mom);
       a.colliders = pointer<T>(rows);
       a.collider_count = rows_count;
+      a.sdf = pointer<float>(distances);
+      a.sdf_count = distances.has_value() ? distances->size(0) : 0;
       a.dx = static_cast<T>(dx);
       a.dt = static_cast<T>(dt);
       a.gravity[0] = static_cast<T>(gravity_x);
@@ -243,11 +280,12 @@ struct MpmOps {
       a.law = {friction, restitution, contact_gap};
       a.velocity = mptr<T>(velocity);
       a.partial = mptr<double>(partial);
+      a.contact_mass = mptr<double>(contact_mass);
       a.impulse = mptr<double>(impulse);
       a.contact_nodes = mptr<int64_t>(contact_nodes);
       Backend::grid_update(a, scope);
     });
-    return {velocity, impulse, contact_nodes};
+    return {velocity, impulse, contact_mass, contact_nodes};
   }
 
   static void register_all(torch::stable::detail::StableLibrary& m) {

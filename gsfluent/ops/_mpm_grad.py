@@ -1,80 +1,23 @@
-"""Shape functions and gradients of the MPM operators (:mod:`gsfluent.ops.mpm`).
+"""Gradients of the MPM operators (:mod:`gsfluent.ops.mpm`).
 
 p2g and g2p are adjoint: the gradient of the scatter is a gather, the gradient of the gather is a
-scatter, so both backward passes are calls of the same kernels.
+scatter, so both backward passes are calls of the same kernels. The derivative with respect to the
+positions, through the weights, is one more gather: :mod:`gsfluent.ops._mpm_slope`. Contact and
+colliders are piecewise smooth; their gradient is that of the reference
+(:mod:`gsfluent.ops.reference.mpm`), in float64, on the piece the forward pass was on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsfluent.ops import _mpm_fake, _mpm_slope  # noqa: F401  (register shape functions, slopes)
+from gsfluent.ops.blocks import Blocks
+
 MASS_FLOOR = 1e-30  # core/contact.h mass_floor
-
-
-@torch.library.register_fake("gsfluent::p2g")
-def _p2g_fake(
-    position: Tensor,
-    velocity: Tensor,
-    affine: Tensor,
-    mass: Tensor,
-    stress: Tensor | None,
-    volume: Tensor | None,
-    body: Tensor | None,
-    table: Tensor,
-    coords: Tensor,
-    order: Tensor,
-    start: Tensor,
-    origin: Sequence[int],
-    margin: int,
-    dx: float,
-    dt: float,
-    fields: int,
-    contact: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    count = coords.shape[0]
-    grid = position.new_empty((fields, count, 64, 4))
-    moments = position.new_empty((fields if contact else 0, count, 64, 6))
-    return grid, moments, position.new_empty((), dtype=torch.int64)
-
-
-@torch.library.register_fake("gsfluent::p2g_adjoint")
-def _p2g_adjoint_fake(
-    grid: Tensor, position: Tensor, body: Tensor | None, *blocks_and_dx: Any
-) -> tuple[Tensor, Tensor]:
-    n = position.shape[0]
-    return position.new_empty((n, 4)), position.new_empty((n, 3, 3))
-
-
-@torch.library.register_fake("gsfluent::grid_update")
-def _grid_update_fake(
-    grid: Tensor, moments: Tensor | None, colliders: Tensor | None, coords: Tensor, *rest: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    rows = 0 if colliders is None else colliders.shape[0]
-    velocity = grid.new_empty((grid.shape[0], grid.shape[1], 64, 3))
-    impulse = grid.new_empty((rows, 3), dtype=torch.float64)
-    return velocity, impulse, grid.new_empty((), dtype=torch.int64)
-
-
-@torch.library.register_fake("gsfluent::g2p")
-def _g2p_fake(
-    velocity_grid: Tensor,
-    position: Tensor,
-    velocity: Tensor | None,
-    deformation: Tensor | None,
-    *rest: Any,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    n = position.shape[0]
-    return (
-        position.new_empty((n, 3)),
-        position.new_empty((n, 3)),
-        position.new_empty((n, 3, 3)),
-        position.new_empty((0 if deformation is None else n, 3, 3)),
-        position.new_empty((), dtype=torch.int64),
-    )
 
 
 def _full(stress: Tensor) -> Tensor:
@@ -82,59 +25,58 @@ def _full(stress: Tensor) -> Tensor:
     return stress[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
 
 
+def _four(vector: Tensor, last: Tensor | None = None) -> Tensor:
+    """[..., 3] and [...] (default 0) -> [..., 4]."""
+    if last is None:
+        last = vector.new_zeros(vector.shape[:-1])
+    return torch.cat([vector, last[..., None]], dim=-1)
+
+
 def _p2g_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    position, velocity, affine, mass, stress, volume, body = inputs[:7]
-    if ctx.needs_input_grad[0]:
-        raise NotImplementedError(
-            "p2g: no gradient with respect to position; detach it or differentiate the velocity"
-        )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(position, velocity, affine, mass, stress, volume, body, *inputs[7:11])
+    ctx.save_for_backward(*inputs[:11])
     ctx.origin, ctx.margin, ctx.dx, ctx.dt = inputs[11:15]
 
 
 def _p2g_backward(
     ctx: Any, g_grid: Tensor | None, g_moments: Tensor | None, _: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    if g_moments is not None and g_moments.numel():
-        raise NotImplementedError("p2g: no gradient through moments (contact)")
-    none: tuple[None, ...] = (None,)
-    if g_grid is None:
-        return none * 17
     position, velocity, affine, mass, stress, volume, body, *index = ctx.saved_tensors
-    value, first = torch.ops.gsfluent.p2g_adjoint(
-        g_grid, position, body, *index, ctx.origin, ctx.margin, ctx.dx
-    )
-    g_velocity = mass[:, None] * value[:, :3]
-    g_affine = mass[:, None, None] * first
-    g_mass = (velocity * value[:, :3]).sum(1) + (affine * first).sum((1, 2)) + value[:, 3]
-    g_stress = g_volume = None
-    if stress is not None:
-        scale = -ctx.dt * 4.0 / ctx.dx**2
-        pull = torch.stack(
-            [
-                first[:, 0, 0],
-                first[:, 1, 1],
-                first[:, 2, 2],
-                first[:, 0, 1] + first[:, 1, 0],
-                first[:, 0, 2] + first[:, 2, 0],
-                first[:, 1, 2] + first[:, 2, 1],
-            ],
-            dim=1,
+    where = (*index, ctx.origin, ctx.margin, ctx.dx)
+    g_position = g_velocity = g_affine = g_mass = g_stress = g_volume = None
+    if g_grid is not None:
+        value, first = torch.ops.gsfluent.p2g_adjoint(g_grid, position, body, *where)
+        g_velocity = mass[:, None] * value[:, :3]
+        g_affine = mass[:, None, None] * first
+        g_mass = (velocity * value[:, :3]).sum(1) + (affine * first).sum((1, 2)) + value[:, 3]
+        slope = mass[:, None, None] * affine
+        if stress is not None:
+            scale = -ctx.dt * 4.0 / ctx.dx**2
+            push = _full(stress)
+            slope = slope + scale * volume[:, None, None] * push
+            i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+            pull = first[:, i, j] + first[:, j, i]  # a symmetric pair of entries is one component
+            g_stress = scale * volume[:, None] * torch.cat([0.5 * pull[:, :3], pull[:, 3:]], dim=1)
+            g_volume = scale * (push * first).sum((1, 2))
+        if ctx.needs_input_grad[0]:
+            constant = _four(mass[:, None] * velocity, mass)
+            g_position = torch.ops.gsfluent.transfer_slope(
+                g_grid, constant, slope, position, body, *where
+            )
+    if g_moments is not None and g_moments.numel():
+        moved, weighed = torch.ops.gsfluent.moments_backward(
+            g_moments, position, mass, body, *where
         )
-        g_stress = scale * volume[:, None] * pull
-        g_volume = scale * (_full(stress) * first).sum((1, 2))
-    return None, g_velocity, g_affine, g_mass, g_stress, g_volume, *(none * 11)
+        g_position = moved if g_position is None else g_position + moved
+        g_mass = weighed if g_mass is None else g_mass + weighed
+    return g_position, g_velocity, g_affine, g_mass, g_stress, g_volume, *((None,) * 11)
 
 
 def _g2p_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     velocity_grid, position, _, deformation, body = inputs[:5]
-    if ctx.needs_input_grad[1]:
-        raise NotImplementedError(
-            "g2p: no gradient with respect to position; detach it or differentiate velocity_grid"
-        )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(position, deformation, body, output[2], *inputs[5:9])
+    grid = velocity_grid if ctx.needs_input_grad[1] else None
+    ctx.save_for_backward(position, deformation, body, output[2], grid, *inputs[5:9])
     ctx.fields = velocity_grid.shape[0]
     ctx.origin, ctx.margin, ctx.dx, ctx.dt = inputs[9:13]
 
@@ -147,7 +89,7 @@ def _g2p_backward(
     g_deformation: Tensor | None,
     _: Tensor | None,
 ) -> tuple[Tensor | None, ...]:
-    position, deformation, body, affine, *index = ctx.saved_tensors
+    position, deformation, body, affine, velocity_grid, *index = ctx.saved_tensors
     n = position.shape[0]
     vector = position.new_zeros(n, 3)
     if g_velocity is not None:
@@ -161,13 +103,14 @@ def _g2p_backward(
     if g_deformation is not None and deformation is not None:
         matrix = matrix + ctx.dt * g_deformation @ deformation.mT
         g_f = g_deformation + ctx.dt * affine.mT @ g_deformation
-    g_grid = g_kept = None
+    matrix = (4.0 / ctx.dx**2) * matrix
+    g_grid = g_x = g_kept = None
     where = (*index, ctx.origin, ctx.margin, ctx.dx)
     if ctx.needs_input_grad[0]:
         scattered, _, _ = torch.ops.gsfluent.p2g(
             position,
             vector,
-            (4.0 / ctx.dx**2) * matrix,
+            matrix,
             position.new_ones(n),
             None,
             None,
@@ -178,38 +121,116 @@ def _g2p_backward(
             False,
         )
         g_grid = scattered[..., :3].contiguous()
+    if ctx.needs_input_grad[1]:
+        g_x = torch.ops.gsfluent.transfer_slope(
+            _four(velocity_grid), _four(vector), matrix, position, body, *where
+        )
+        if g_position is not None:
+            g_x = g_x + g_position
     if ctx.needs_input_grad[2]:
         # Weights sum to one at covered particles and to nothing at skipped ones.
         ones = position.new_ones((ctx.fields, index[1].shape[0], 64, 4))
         covered, _ = torch.ops.gsfluent.p2g_adjoint(ones, position, body, *where)
         g_kept = torch.where(covered[:, 3:] > 0.5, torch.zeros_like(vector), vector)
-    return g_grid, None, g_kept, g_f, *((None,) * 9)
+    return g_grid, g_x, g_kept, g_f, *((None,) * 9)
 
 
 def _grid_update_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    grid, moments, colliders = inputs[:3]
-    if moments is not None or (colliders is not None and colliders.shape[0]):
+    grid, moments, colliders, sdf, coords = inputs[:5]
+    if colliders is not None and ctx.needs_input_grad[2]:
         raise NotImplementedError(
-            "grid_update: no gradient through contact or colliders; pass moments=None and "
-            "colliders=None, or call it under torch.no_grad()"
+            "grid_update: no gradient with respect to colliders; detach the rows"
         )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(grid)
+    ctx.save_for_backward(grid, moments, colliders, sdf, coords)
+    ctx.options = inputs[5:]
 
 
 def _grid_update_backward(
-    ctx: Any, g_velocity: Tensor | None, *_: Tensor | None
+    ctx: Any, g_velocity: Tensor | None, g_impulse: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    none: tuple[None, ...] = (None,)
-    if g_velocity is None:
-        return none * 12
-    (grid,) = ctx.saved_tensors
-    mass = grid[..., 3:]
-    heavy = mass > MASS_FLOOR
-    inverse = torch.where(heavy, 1.0 / torch.where(heavy, mass, torch.ones_like(mass)), 0.0)
-    g_momentum = g_velocity * inverse
-    g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
-    return torch.cat([g_momentum, g_mass], dim=-1), *(none * 11)
+    grid, moments, colliders, sdf, coords = ctx.saved_tensors
+    rest: tuple[None, ...] = (None,) * 11
+    if g_velocity is None and g_impulse is None:
+        return None, None, *rest
+    if moments is None and (colliders is None or colliders.shape[0] == 0):
+        if g_velocity is None:
+            return None, None, *rest
+        mass = grid[..., 3:]
+        heavy = mass > MASS_FLOOR
+        inverse = torch.where(heavy, 1.0 / torch.where(heavy, mass, torch.ones_like(mass)), 0.0)
+        g_momentum = g_velocity * inverse
+        g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
+        return torch.cat([g_momentum, g_mass], dim=-1), None, *rest
+    g_grid, g_moments = torch.ops.gsfluent.grid_update_backward(
+        g_velocity, g_impulse, grid, moments, colliders, sdf, coords, *ctx.options
+    )
+    return g_grid, g_moments if moments is not None else None, *rest
+
+
+@torch.library.custom_op("gsfluent::grid_update_backward", mutates_args=())
+def _grid_update_by_reference(
+    g_velocity: Tensor | None,
+    g_impulse: Tensor | None,
+    grid: Tensor,
+    moments: Tensor | None,
+    colliders: Tensor | None,
+    sdf: Tensor | None,
+    coords: Tensor,
+    dx: float,
+    dt: float,
+    gravity_x: float,
+    gravity_y: float,
+    gravity_z: float,
+    friction: float,
+    restitution: float,
+    contact_gap: float,
+) -> tuple[Tensor, Tensor]:
+    from gsfluent.ops.reference import mpm as reference
+
+    none = coords.new_empty(0)
+    blocks = Blocks(none.view(0, 0, 0), (0, 0, 0), coords, none, none)
+
+    def forward(grid: Tensor, moments: Tensor | None) -> tuple[Tensor, Tensor]:
+        velocity, impulse, torque, _ = reference.grid_update(
+            grid,
+            dx=dx,
+            dt=dt,
+            blocks=blocks,
+            gravity=(gravity_x, gravity_y, gravity_z),
+            colliders=None if colliders is None else colliders.double(),
+            sdf=sdf,
+            moments=moments,
+            friction=friction,
+            restitution=restitution,
+            contact_gap=contact_gap,
+        )
+        return velocity, torch.cat([impulse, torque], dim=1)
+
+    # torch.func works inside a custom op, where ordinary autograd is switched off.
+    count = 0 if colliders is None else colliders.shape[0]
+    g_v = grid.new_zeros((*grid.shape[:3], 3)) if g_velocity is None else g_velocity
+    g_i = grid.new_zeros(count, 6) if g_impulse is None else g_impulse
+    if moments is None:
+        _, pull_back, *_ = torch.func.vjp(lambda g: forward(g, None), grid.double())
+        (g_grid,) = pull_back((g_v.double(), g_i.double()))
+        return g_grid.to(grid.dtype), grid.new_empty(0)
+    _, pull_back, *_ = torch.func.vjp(forward, grid.double(), moments.double())
+    g_grid, g_moments = pull_back((g_v.double(), g_i.double()))
+    return g_grid.to(grid.dtype), g_moments.to(grid.dtype)
+
+
+@_grid_update_by_reference.register_fake
+def _grid_update_by_reference_fake(
+    g_velocity: Tensor | None,
+    g_impulse: Tensor | None,
+    grid: Tensor,
+    moments: Tensor | None,
+    *rest: Any,
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(grid), (
+        grid.new_empty(0) if moments is None else torch.empty_like(moments)
+    )
 
 
 torch.library.register_autograd("gsfluent::p2g", _p2g_backward, setup_context=_p2g_setup)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from gsfluent import ops
+from gsfluent.ops._mpm_slope import transfer_slope
 
 DX = 0.25
 N = 8
@@ -104,23 +105,128 @@ def test_gradients_flow_through_a_whole_step() -> None:
     assert gradcheck(step, (v, c), fast_mode=True)
 
 
-def test_missing_gradients_are_refused() -> None:
+def test_p2g_position_gradient() -> None:
+    position, blocks, body = setup()
+    v, c, m, stress, volume = p2g_inputs()
+
+    def scatter(x: Tensor, v: Tensor, c: Tensor, m: Tensor, s: Tensor, vol: Tensor) -> Tensor:
+        kw: dict[str, Any] = {"dt": 0.1, "stress": s, "volume": vol, "body": body, "fields": 2}
+        return ops.p2g(x, v, c, m, dx=DX, blocks=blocks, **kw)[0]
+
+    assert gradcheck(scatter, (position.requires_grad_(), v, c, m, stress, volume), fast_mode=True)
+
+
+def test_p2g_moments_gradient() -> None:
     position, blocks, body = setup()
     v, c, m, _, _ = p2g_inputs()
-    with pytest.raises(NotImplementedError, match="p2g: no gradient with respect to position"):
-        ops.p2g(position.requires_grad_(), v, c, m, dx=DX, blocks=blocks)
-    field = torch.zeros(1, blocks.block_count, 64, 3, dtype=torch.float64)
-    with pytest.raises(NotImplementedError, match="g2p: no gradient with respect to position"):
-        ops.g2p(field, position, dx=DX, dt=0.1, blocks=blocks)
-    position = position.detach()
-    grid, moments = ops.p2g(
-        position, v, c, m, dx=DX, blocks=blocks, body=body, fields=2, contact=True
-    )
-    with pytest.raises(NotImplementedError, match="no gradient through contact or colliders"):
-        ops.grid_update(grid, dx=DX, dt=0.1, blocks=blocks, moments=moments)
-    assert moments is not None
-    with pytest.raises(NotImplementedError, match="no gradient through moments"):
-        moments.sum().backward()
+
+    def scatter(x: Tensor, v: Tensor, m: Tensor) -> tuple[Tensor, ...]:
+        out = ops.p2g(x, v, c, m, dx=DX, blocks=blocks, body=body, fields=2, contact=True)
+        assert out[1] is not None
+        return out[0], out[1]
+
+    assert gradcheck(scatter, (position.requires_grad_(), v, m), fast_mode=True)
+
+
+def test_g2p_position_gradient() -> None:
+    position, blocks, body = setup()
+    field, f, v = leaf(2, blocks.block_count, 64, 3), leaf(N, 3, 3), leaf(N, 3)
+    body[0] = 7  # in no field: flies on, x' = x + dt v
+
+    def gather(field: Tensor, x: Tensor, f: Tensor, v: Tensor) -> tuple[Tensor, ...]:
+        out = ops.g2p(field, x, dx=DX, dt=0.1, blocks=blocks, body=body, deformation=f, velocity=v)
+        assert out[3] is not None
+        return out[0], out[1], out[2], out[3]
+
+    assert gradcheck(gather, (field, position.requires_grad_(), f, v), fast_mode=True)
+
+
+def test_position_kernel_agrees_with_its_definition() -> None:
+    position, blocks, body = setup()
+    position[3] = float("nan")
+    body[5] = -1
+    grid = torch.randn(2, blocks.block_count, 64, 4, dtype=torch.float64)
+    constant, linear = torch.randn(N, 4).double(), torch.randn(N, 3, 3).double()
+    index: tuple[Any, ...] = (*blocks[:1], *blocks[2:5], blocks.origin, blocks.margin, DX)
+    kernel = torch.ops.gsfluent.transfer_slope(grid, constant, linear, position, body, *index)
+    definition = transfer_slope(grid, constant, linear, position, body, *index)
+    torch.testing.assert_close(kernel, definition, rtol=1e-12, atol=1e-12)
+    assert (kernel[[3, 5]] == 0).all()
+    assert (kernel[[0, 1]] != 0).all()
+
+
+def rows(*kinds: tuple[int, float, float]) -> Tensor:
+    """A floor and a ball, (mode, friction, restitution) each."""
+    out = torch.zeros(len(kinds), 16, dtype=torch.float64)
+    for row, (mode, friction, restitution) in zip(out, kinds, strict=True):
+        row[[1, 2, 13]] = torch.tensor([mode, friction, restitution], dtype=torch.float64)
+    out[0, [5, 8, 10]] = torch.tensor([0.4, 1.0, 0.2], dtype=torch.float64)
+    out[1:, [0, 3, 4, 5, 9]] = torch.tensor([1.0, 0.6, 0.5, 1.1, 0.5], dtype=torch.float64)
+    return out
+
+
+@pytest.mark.parametrize("mode", [0, 1, 2])
+def test_grid_update_gradient_with_colliders(mode: int) -> None:
+    _, blocks, _ = setup()
+    grid = torch.randn(1, blocks.block_count, 64, 4, dtype=torch.float64)
+    grid[..., 3] = torch.rand_like(grid[..., 3]) + 0.5
+    colliders = rows((mode, 0.4, 0.3), (mode, 0.1, 0.0))
+
+    def update(grid: Tensor) -> tuple[Tensor, Tensor]:
+        v, impulse, _ = ops.grid_update(grid, dx=DX, dt=0.1, blocks=blocks, colliders=colliders)
+        return v, impulse
+
+    assert (update(grid)[1].abs().sum(1) > 0).all()  # both take part
+    assert gradcheck(update, (grid.requires_grad_(),), fast_mode=True)
+
+
+def test_frictionless_floor_passes_the_tangential_gradient_of_a_vertical_fall() -> None:
+    _, blocks, _ = setup()
+    grid = torch.zeros(1, blocks.block_count, 64, 4, dtype=torch.float64)
+    grid[..., 2], grid[..., 3] = -1.0, 1.0
+    grid.requires_grad_()
+    for friction, passed in ((0.0, 1.0), (0.5, 0.0)):
+        colliders = rows((2, friction, 0.0))
+        v, _, _ = ops.grid_update(grid, dx=DX, dt=0.0, blocks=blocks, colliders=colliders)
+        below = blocks.node_positions(DX)[..., 2] < 0.4
+        (slope,) = torch.autograd.grad(v[..., 1].sum(), grid)
+        assert (slope[0, below][:, 1] == passed).all()
+        assert (slope[0, ~below][:, 1] == 1.0).all()
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.2, 5.0])
+def test_gradients_flow_through_a_step_with_contact(friction: float) -> None:
+    position, blocks, body = setup()
+    body[:] = (position[:, 0] > 0.5).int()
+    v, c, m = leaf(N, 3), leaf(N, 3, 3), torch.rand(N, dtype=torch.float64) + 0.5
+    v = (v.detach() + torch.where(body[:, None] == 0, 2.0, -2.0)).requires_grad_()
+    colliders = rows((2, 0.3, 0.2))
+
+    def step(x: Tensor, v: Tensor, c: Tensor, m: Tensor) -> tuple[Tensor, ...]:
+        kw: dict[str, Any] = {"dx": DX, "blocks": blocks}
+        grid, moments = ops.p2g(x, v, c, m, body=body, fields=2, contact=True, **kw)
+        field, _, touched = ops.grid_update(
+            grid,
+            dt=0.01,
+            colliders=colliders,
+            moments=moments,
+            friction=friction,
+            restitution=0.4,
+            contact_gap=3.0,
+            **kw,
+        )
+        assert touched > 10
+        return ops.g2p(field, x, dt=0.01, body=body, **kw)[:3]
+
+    assert gradcheck(step, (position.requires_grad_(), v, c, m.requires_grad_()), fast_mode=True)
+
+
+def test_missing_gradients_are_refused() -> None:
+    _, blocks, _ = setup()
+    grid = torch.ones(1, blocks.block_count, 64, 4, dtype=torch.float64)
+    colliders = rows((2, 0.3, 0.0)).requires_grad_()
+    with pytest.raises(NotImplementedError, match="no gradient with respect to colliders"):
+        ops.grid_update(grid, dx=DX, dt=0.1, blocks=blocks, colliders=colliders)
 
 
 # --- registration ---
@@ -132,6 +238,7 @@ def test_opcheck(grad: bool) -> None:
     inputs = [t if grad else t.detach() for t in p2g_inputs()]
     index: tuple[Any, ...] = (*blocks[:1], *blocks[2:5], blocks.origin, blocks.margin)
     lib = torch.ops.gsfluent
+    position.requires_grad_(grad)
     torch.library.opcheck(lib.p2g.default, (position, *inputs, body, *index, DX, 0.1, 2, not grad))
     field = torch.randn(2, blocks.block_count, 64, 3, dtype=torch.float64, requires_grad=grad)
     torch.library.opcheck(
@@ -140,8 +247,13 @@ def test_opcheck(grad: bool) -> None:
     grid = torch.rand(2, blocks.block_count, 64, 4, dtype=torch.float64, requires_grad=grad)
     moments = None if grad else torch.rand(2, blocks.block_count, 64, 6, dtype=torch.float64)
     rest = (DX, 0.1, 0.0, 0.0, -9.81, 0.3, 0.0, 1.0)
-    torch.library.opcheck(lib.grid_update.default, (grid, moments, None, blocks.coords, *rest))
+    torch.library.opcheck(
+        lib.grid_update.default, (grid, moments, None, None, blocks.coords, *rest)
+    )
+    position = position.detach()
     torch.library.opcheck(lib.p2g_adjoint.default, (grid.detach(), position, body, *index, DX))
+    slopes = (grid.detach(), torch.ones(N, 4).double(), torch.ones(N, 3, 3).double(), position)
+    torch.library.opcheck(lib.transfer_slope.default, (*slopes, body, *index, DX))
     torch.library.opcheck(lib.build_blocks.default, (position, DX, 1, 1000))
 
 
@@ -234,7 +346,7 @@ def test_build_blocks_errors() -> None:
         ({"gravity": (0.0, 1.0)}, "gravity must have three numbers, got 2"),
         ({"friction": -1.0}, "friction must be >= 0"),
         ({"restitution": 1.5}, r"restitution must be in \[0, 1\]"),
-        ({"colliders": torch.zeros(1, 3).double()}, r"colliders must have shape \[\*, 16\]"),
+        ({"colliders": torch.zeros(1, 3).double()}, r"colliders must have shape \[\*, 32\]"),
         ({"colliders": torch.zeros(1, 16).double()}, "colliders row 0 must be finite, with type 0"),
         ({"colliders": torch.full((1, 16), 7.0).double()}, "colliders row 0"),
         ({"moments": torch.zeros(1, 1, 64, 6).double()}, "moments must have shape"),

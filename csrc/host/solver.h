@@ -1,0 +1,246 @@
+// Checks and dtype dispatch of the resident solver, once for both back ends. The state is a list of
+// tensors in the order of `SolverBuffer`; gsfluent/ops/solver_buffers.py allocates them by the same
+// names. An empty tensor stands for a part the scene does not use.
+#pragma once
+
+#include "core/collider.h"
+#include "core/solver_state.h"
+#include "torch_api.h"
+
+namespace gsf {
+
+enum SolverBuffer : int {
+  kClock,
+  kOffset,
+  kMeta,
+  kVelocityBuffer,
+  kSlope,
+  kStrain,
+  kAlpha,
+  kPeak,
+  kDeformation,
+  kId,
+  kSpare,
+  kEntry,
+  kPlace,
+  kLaw,
+  kRows,
+  kHomeCoord0,
+  kHomeStart0,
+  kHomeCount0,
+  kHomeCoord1,
+  kHomeStart1,
+  kHomeCount1,
+  kNeighbour,
+  kHomeBound,
+  kHomeMass,
+  kSlotCoord,
+  kSlotShared,
+  kSiteSlots,
+  kSums,
+  kMoments,
+  kNodeVelocity,
+  kKey,
+  kTableCount,
+  kTableMask,
+  kTableHome,
+  kTableSlot,
+  kSlotNext,
+  kColliders,
+  kImpulseUnits,
+  kImpulse,
+  kSolverBuffers
+};
+
+enum SolverFloat : int {
+  kDx,
+  kGravityX,
+  kGravityY,
+  kGravityZ,
+  kFrictionBetween,
+  kRestitutionBetween,
+  kGap,
+  kPower,
+  kEpsilon,
+  kSolverFloats
+};
+enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kSolverInts };
+
+template <class Backend>
+struct SolverOps {
+  using Buffers = std::vector<Tensor>;
+
+  static void check_rows(const char* name, const Tensor& t, int64_t rows, int64_t columns) {
+    STD_TORCH_CHECK(t.numel() == 0 || t.numel() == rows * columns, "solver: ", name, " must hold ",
+                    rows, " x ", columns, " values, got ", t.numel());
+    STD_TORCH_CHECK(t.is_contiguous(), "solver: ", name, " must be contiguous");
+  }
+
+  template <typename T>
+  static SolverView<T> view(const Buffers& b, const std::vector<int64_t>& ints,
+                            const std::vector<double>& floats) {
+    SolverView<T> s{};
+    const Tensor& like = b[kOffset];
+    s.count = like.size(0);
+    s.home_capacity = b[kHomeStart0].size(0);
+    s.slot_capacity = b[kSlotNext].size(0);
+    s.table_size = b[kKey].size(0);
+    s.row_count = b[kLaw].size(0);
+    s.collider_count = b[kColliders].numel() / kColliderColumns;
+    STD_TORCH_CHECK(s.table_size > 0 && (s.table_size & (s.table_size - 1)) == 0,
+                    "solver: the hash table must have a power of two entries");
+    const ScalarType real = like.scalar_type(), i32 = ScalarType::Int, i64 = ScalarType::Long;
+    const bool device = like.is_cuda();
+    const int64_t n = s.count, h = s.home_capacity, c = s.slot_capacity, t = s.table_size;
+    const ScalarType sum = device ? i64 : real;
+    const struct {
+      const char* name;
+      int64_t rows, columns;
+      ScalarType type;
+      bool optional;
+    } wanted[kSolverBuffers] = {
+        {"clock", 1, kClockWords, i64, false},
+        {"offset", n, 3, real, false},
+        {"meta", n, 1, i32, false},
+        {"velocity", n, 3, real, false},
+        {"slope", n, 9, real, false},
+        {"strain", n, 6, real, false},
+        {"alpha", n, 1, real, true},
+        {"peak", n, 1, real, true},
+        {"deformation", n, 9, real, true},
+        {"id", n, 1, i32, false},
+        {"spare", n, 9, real, false},
+        {"entry", n, 1, i32, false},
+        {"place", n, 1, i32, false},
+        {"law", s.row_count, 1, i32, false},
+        {"rows", s.row_count, kRowColumns, real, false},
+        {"home_coord0", h, 4, i32, false},
+        {"home_start0", h, 1, i32, false},
+        {"home_count0", h, 1, i32, false},
+        {"home_coord1", h, 4, i32, false},
+        {"home_start1", h, 1, i32, false},
+        {"home_count1", h, 1, i32, false},
+        {"neighbour", h, kNeighbours, i32, false},
+        {"home_bound", h, 1, real, false},
+        {"home_mass", h, 1, real, false},
+        {"slot_coord", c, 4, i32, false},
+        {"slot_shared", c, 1, i32, false},
+        {"site_slots", c, kSiteFields, i32, false},
+        {"sums", c * kBlockNodes, 4, sum, false},
+        {"moments", c * kBlockNodes, kContactMoments, sum, true},
+        {"node_velocity", c * kBlockNodes, 4, real, false},
+        {"key", t, 1, i64, false},
+        {"table_count", t, 1, i32, false},
+        {"table_mask", t, 1, i32, false},
+        {"table_home", t, 1, i32, false},
+        {"table_slot", t, 1, i32, false},
+        {"slot_next", c, 1, i32, false},
+        {"colliders", s.collider_count, kColliderColumns, real, true},
+        {"impulse_units", s.collider_count, 3, i64, true},
+        {"impulse", s.collider_count, 3, ScalarType::Double, true},
+    };
+    for (int i = 0; i < kSolverBuffers; ++i) {
+      check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
+      STD_TORCH_CHECK(b[i].scalar_type() == wanted[i].type, "solver: ", wanted[i].name,
+                      " has the wrong dtype");
+      STD_TORCH_CHECK(b[i].device() == like.device(), "solver: ", wanted[i].name,
+                      " must be on the device of offset");
+      STD_TORCH_CHECK(wanted[i].optional || b[i].numel() > 0 || wanted[i].rows == 0,
+                      "solver: ", wanted[i].name, " must not be empty");
+    }
+    const auto real_at = [&](int i) { return b[i].numel() ? mptr<T>(b[i]) : nullptr; };
+    const auto int_at = [&](int i) { return b[i].numel() ? mptr<int32_t>(b[i]) : nullptr; };
+    const auto any_at = [&](int i) -> void* {
+      return b[i].numel() ? b[i].mutable_data_ptr() : nullptr;
+    };
+    s.fields = static_cast<int32_t>(ints[kFields]);
+    STD_TORCH_CHECK(s.fields >= 1 && s.fields < kMaxSolverFields, "solver: fields must be 1 to ",
+                    kMaxSolverFields - 1);
+    STD_TORCH_CHECK(s.fields == 1 || b[kMoments].numel() > 0,
+                    "solver: several fields need moments");
+    const bool any_law = ints[kLawSet] != 0;
+    STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),
+                    "solver: these laws need alpha and peak");
+    s.dx = static_cast<T>(floats[kDx]);
+    for (int i = 0; i < 3; ++i) s.gravity[i] = static_cast<T>(floats[kGravityX + i]);
+    s.contact = {floats[kFrictionBetween], floats[kRestitutionBetween], floats[kGap]};
+    s.options = {static_cast<T>(floats[kPower]), static_cast<T>(floats[kEpsilon]),
+                 ints[kImplicit] != 0};
+    s.irreversible = ints[kIrreversible] != 0;
+    s.clock = static_cast<SolverClock*>(any_at(kClock));
+    s.offset = real_at(kOffset);
+    s.meta = static_cast<uint32_t*>(any_at(kMeta));
+    s.velocity = real_at(kVelocityBuffer);
+    s.slope = real_at(kSlope);
+    s.strain = real_at(kStrain);
+    s.alpha = real_at(kAlpha);
+    s.peak = real_at(kPeak);
+    s.deformation = real_at(kDeformation);
+    s.id = int_at(kId);
+    s.spare = real_at(kSpare);
+    s.entry = int_at(kEntry);
+    s.place = int_at(kPlace);
+    s.law = int_at(kLaw);
+    s.rows = real_at(kRows);
+    s.home[0] = {int_at(kHomeCoord0), int_at(kHomeStart0), int_at(kHomeCount0)};
+    s.home[1] = {int_at(kHomeCoord1), int_at(kHomeStart1), int_at(kHomeCount1)};
+    s.neighbour = int_at(kNeighbour);
+    s.home_bound = real_at(kHomeBound);
+    s.home_mass = real_at(kHomeMass);
+    s.slot_coord = int_at(kSlotCoord);
+    s.slot_shared = int_at(kSlotShared);
+    s.site_slots = int_at(kSiteSlots);
+    s.sums = any_at(kSums);
+    s.moments = any_at(kMoments);
+    s.node_velocity = real_at(kNodeVelocity);
+    s.key = static_cast<uint64_t*>(any_at(kKey));
+    s.table_count = int_at(kTableCount);
+    s.table_mask = int_at(kTableMask);
+    s.table_home = int_at(kTableHome);
+    s.table_slot = int_at(kTableSlot);
+    s.slot_next = int_at(kSlotNext);
+    s.colliders = real_at(kColliders);
+    s.impulse_units = static_cast<int64_t*>(any_at(kImpulseUnits));
+    s.impulse = static_cast<double*>(any_at(kImpulse));
+    return s;
+  }
+
+  // Starts the clock and takes the stress of the first step into the slopes.
+  static void solver_prime(Buffers buffers, std::vector<int64_t> ints, std::vector<double> floats) {
+    call(buffers, ints, floats,
+         [&](auto view, const auto& scope) { Backend::prime(view, law_set(ints), scope); });
+  }
+
+  // Up to `rounds` rounds of `steps` steps, building blocks where needed; ends early when the clock
+  // says so. On CUDA this returns at once: the clock holds the outcome.
+  static void solver_run(Buffers buffers, std::vector<int64_t> ints, std::vector<double> floats,
+                         int64_t rounds, int64_t steps) {
+    STD_TORCH_CHECK(rounds >= 0 && steps > 0, "solver_run: rounds and steps must be positive");
+    call(buffers, ints, floats, [&](auto view, const auto& scope) {
+      Backend::run(view, law_set(ints), rounds, steps, scope);
+    });
+  }
+
+  static void register_all(torch::stable::detail::StableLibrary& m) {
+    m.impl("solver_prime", TORCH_BOX(&SolverOps::solver_prime));
+    m.impl("solver_run", TORCH_BOX(&SolverOps::solver_run));
+  }
+
+ private:
+  static int law_set(const std::vector<int64_t>& ints) { return static_cast<int>(ints[kLawSet]); }
+
+  template <typename F>
+  static void call(const Buffers& b, const std::vector<int64_t>& ints,
+                   const std::vector<double>& floats, F&& f) {
+    STD_TORCH_CHECK(b.size() == kSolverBuffers, "solver: expected ", int(kSolverBuffers),
+                    " buffers, got ", b.size());
+    STD_TORCH_CHECK(ints.size() == kSolverInts && floats.size() == kSolverFloats,
+                    "solver: wrong number of settings");
+    STD_TORCH_CHECK(floats[kDx] > 0, "solver: dx must be positive");
+    const typename Backend::Scope scope(b[kOffset]);
+    dispatch_floating("solver", b[kOffset],
+                      [&]<typename T>() { f(view<T>(b, ints, floats), scope); });
+  }
+};
+
+}  // namespace gsf

@@ -1,0 +1,131 @@
+"""Derivatives of particle-grid transfers with respect to the particle positions.
+
+``transfer_slope`` is the derivative of ``sum_i w_i g_i . (c + S (x_i - x_p))``: with g the gradient
+of the grid it is what p2g needs, with g the grid velocity what g2p needs. Its CPU kernel is
+``csrc/cpu/mpm.cpp``; here is its definition, which also serves CUDA. ``moments_backward`` is the
+gradient of the contact moments of p2g.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from gsfluent.ops.blocks import Blocks
+
+CHUNK = 1 << 15  # particles whose 27 nodes are laid out at once
+
+
+def _gathered(
+    grid: Tensor, position: Tensor, body: Tensor | None, blocks: Blocks, dx: float
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Covered particles, chunk by chunk: their indices, positions and values at 27 nodes."""
+    from gsfluent.ops.reference import mpm as reference
+
+    channels = grid.shape[-1]
+    per_field = blocks.coords.shape[0] * 64
+    covered = reference.covered(position, dx, blocks, body, grid.shape[0]).nonzero().squeeze(1)
+    for rows in covered.split(CHUNK):
+        x = position[rows]
+        node, _, _ = reference.stencil(x, dx)
+        flat = reference.node_index(node, blocks)
+        if body is not None:
+            flat = flat + body[rows].long()[:, None] * per_field
+        yield rows, x, grid.reshape(-1, channels)[flat]
+
+
+def _offsets(x: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights [N, 27], their gradients [N, 27, 3] and x_i - x_p [N, 27, 3], differentiable in x."""
+    from gsfluent.ops.reference import mpm as reference
+
+    node, weight, gradient = reference.stencil(x, dx)
+    return weight, gradient, node.to(x.dtype) * dx - x[:, None]
+
+
+def transfer_slope(
+    grid: Tensor,
+    constant: Tensor,
+    linear: Tensor,
+    position: Tensor,
+    body: Tensor | None,
+    table: Tensor,
+    coords: Tensor,
+    order: Tensor,
+    start: Tensor,
+    origin: Sequence[int],
+    margin: int,
+    dx: float,
+) -> Tensor:
+    """Derivative of ``sum_i w_i g_i . (c + S (x_i - x_p))`` with respect to ``x_p``.
+
+    Args:
+        grid: Node values g, [K, B, 64, 4].
+        constant: c, [N, 4].
+        linear: S of the first three channels, [N, 3, 3].
+        position: Particle positions [m], [N, 3].
+        body: Field of each particle, int32 [N] or None.
+        table: With the next five: the fields of :class:`gsfluent.ops.Blocks`.
+        coords: See ``table``.
+        order: See ``table``.
+        start: See ``table``.
+        origin: See ``table``.
+        margin: See ``table``.
+        dx: Node spacing [m].
+
+    Returns:
+        [N, 3]; zero for particles the blocks do not cover.
+    """
+    blocks = Blocks(table, (origin[0], origin[1], origin[2]), coords, order, start, margin)
+    slope = torch.zeros_like(position)
+    for rows, x, g in _gathered(grid, position, body, blocks, dx):
+        c, s = constant[rows], linear[rows]
+
+        def total(x: Tensor, g: Tensor = g, c: Tensor = c, s: Tensor = s) -> Tensor:
+            weight, _, d = _offsets(x, dx)
+            pushed = torch.einsum("nia,nab,nib->ni", g[..., :3], s, d)
+            return (weight * ((g * c[:, None]).sum(-1) + pushed)).sum()
+
+        slope[rows] = torch.func.grad(total)(x)
+    return slope
+
+
+torch.library.register_kernel("gsfluent::transfer_slope", "cuda")(transfer_slope)
+
+
+@torch.library.custom_op("gsfluent::moments_backward", mutates_args=())
+def _moments_backward(
+    g_moments: Tensor,
+    position: Tensor,
+    mass: Tensor,
+    body: Tensor | None,
+    table: Tensor,
+    coords: Tensor,
+    order: Tensor,
+    start: Tensor,
+    origin: Sequence[int],
+    margin: int,
+    dx: float,
+) -> tuple[Tensor, Tensor]:
+    """Gradients of position and mass through the contact moments of p2g."""
+    blocks = Blocks(table, (origin[0], origin[1], origin[2]), coords, order, start, margin)
+    g_position, g_mass = torch.zeros_like(position), torch.zeros_like(mass)
+    for rows, x, h in _gathered(g_moments, position, body, blocks, dx):
+
+        def total(x: Tensor, m: Tensor, h: Tensor = h) -> Tensor:
+            weight, gradient, d = _offsets(x, dx)
+            first = weight * (h[..., 3:] * d).sum(-1)
+            return (m * ((gradient * h[..., :3]).sum(-1) - first).sum(1)).sum()
+
+        slope: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+        slope = torch.func.grad(total, argnums=(0, 1))
+        g_position[rows], g_mass[rows] = slope(x, mass[rows])
+    return g_position, g_mass
+
+
+@_moments_backward.register_fake
+def _moments_backward_fake(
+    g_moments: Tensor, position: Tensor, mass: Tensor, *rest: object
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(position), torch.empty_like(mass)
