@@ -21,6 +21,7 @@ _PUBLIC: dict[str, str] = {
     "advance_colliders": "gsfluent.ops.collider",
     "return_mapping": "gsfluent.ops.plasticity",
     "elastic_energy": "gsfluent.ops.plasticity",
+    "wave_speed": "gsfluent.ops.plasticity",
     "Solver": "gsfluent.ops.solver",
     "SolverError": "gsfluent.ops.solver",
     "polar_clamped": "gsfluent.ops.deform",
