@@ -23,8 +23,8 @@ from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
-from gsfluent.ops.plasticity import return_mapping
 from gsfluent.ops.collider import pad_colliders
+from gsfluent.ops.plasticity import return_mapping
 from gsfluent.ops.solver_buffers import INDEX
 
 ELASTIC, NACC = 0, 1
