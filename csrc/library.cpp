@@ -46,8 +46,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
-      "Tensor? material, float k, float epsilon, bool implicit) -> (Tensor, Tensor, Tensor, "
-      "Tensor)");
+      "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0) -> "
+      "(Tensor, Tensor, Tensor, Tensor)");
 
   // --- deform: polar decomposition, clamped deformation ---
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");
