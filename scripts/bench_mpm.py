@@ -5,10 +5,10 @@ python scripts/bench_mpm.py --device cpu --rows 100:24         # one row on the 
 python scripts/bench_mpm.py --json bench_mpm.json --markdown docs/benchmarks.md
 
 Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
-eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000, E =
-1e5, nu = 0.3, dt = 1e-4, walls three cells inside the domain. 50 steps to warm up, then the median of
-five runs of 100 steps; the clock is read once per run. PhysGaussian's column is its published figure
-in that table (CUDA graph, same scene, same kind of GPU), or measured beside with --peer.
+eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
+E = 1e5, nu = 0.3, dt = 1e-4, walls three cells inside the domain. 50 steps to warm up, then the
+median of five runs of 100 steps; the clock is read once per run. PhysGaussian's column is the
+figure of that table: CUDA graph, same scene, same kind of GPU.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def measure(n: int, cells: int, order: str, kind: str, device: torch.device) -> 
     height = float(solver.position[:, 2].mean())
     return {
         "grid": n, "cells": cells, "order": order, "kind": kind, "particles": solver.count,
-        "ms": 1e3 * middle, "ms_best": 1e3 * times[0], "ns_per_particle": 1e9 * middle / solver.count,
+        "ms": 1e3 * middle, "ms_best": 1e3 * times[0],
+        "ns_per_particle": 1e9 * middle / solver.count,
         "gb_per_second": need / middle / 1e9, "memory_mib": solver.memory() / 2**20,
         "builds_per_step": counters["builds"] / counters["step"], "mean_height": height,
         "slots": counters["slots"], "homes": counters["homes"],
@@ -135,10 +136,11 @@ def markdown(name: str, rows: list[dict[str, Any]]) -> str:
         key = (r["grid"], r["cells"], r["order"])
         plain = r["kind"] == "elastic"
         bar, peer = (BARS.get(key), PEER.get(key)) if plain else (None, None)
+        ratio = f"{peer / r['ms']:.1f}" if peer else ""
         lines.append(
             f"| {r['kind']}, {r['grid']}^3 | {r['particles']:,} | {r['order']} | {r['ms']:.4f} | "
             f"{r['ns_per_particle']:.3f} | {r['gb_per_second']:.0f} | {r['memory_mib']:.0f} | "
-            f"{bar or ''} | {peer or ''} | {f'{peer / r["ms"]:.1f}' if peer else ''} |"
+            f"{bar or ''} | {peer or ''} | {ratio} |"
         )
     return "\n".join(lines) + "\n"
 

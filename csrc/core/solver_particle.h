@@ -94,21 +94,22 @@ struct StepFlags {
 };
 
 template <typename T>
-GSF_HOST_DEVICE NaccMaterial<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
-  NaccMaterial<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
+GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
+  MaterialRow<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
   if (s.irreversible) m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
   return m;
 }
 
-// Speed of the pressure wave in the present state, squared (equations.md 2.1, docs/simulation.md):
-// for a uniaxial state of the neo-Hookean law the acoustic modulus is kappa (1 + J^2) / 2 + (2 mu /
-// 9) (J^(4/3) + 5 J^(-2/3)).
+// wave_speed_squared of the neo-Hookean law where the state's invariants are at hand.
 template <typename T>
-GSF_HOST_DEVICE T wave_squared(T mu, T kappa, T density, T j2m1, T log_j) {
+GSF_HOST_DEVICE T elastic_wave_squared(const MaterialRow<T>& m, const ElasticState<T>& state) {
   using std::exp;
-  const T third = exp(T(2.0 / 3.0) * log_j);  // J^(2/3)
-  return (kappa * (T(1) + T(0.5) * j2m1) + T(2.0 / 9.0) * mu * (third * third + T(5) / third)) /
-         density;
+  const T mean = clamp(exp(T(-2.0 / 3.0) * state.log_j) * (T(1) + trace(state.e) * T(1.0 / 3.0)),
+                       T(1), T(kDeviatorMax));
+  const T along = m.mu * (T(4.0 / 3.0) * mean + T(0.272165526975909) * state.n) +
+                  T(0.5) * m.kappa * (T(2) + state.j2m1);
+  const T across = m.mu * (mean + T(0.816496580927726) * state.n);
+  return max(along, across) / m.density;
 }
 
 // m C - dt V0 (4 / dx^2) tau.
@@ -142,9 +143,11 @@ GSF_HOST_DEVICE bool move_axis(T step, int& l, T& o, bool& leaves) {
 
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
+// `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
 template <typename T, int kLaws, bool kTrack>
-GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, const T* value,
-                                          const Mat3<T>& first, T dt, T dt_next, Largest& largest) {
+GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uint32_t reach,
+                                          const T* value, const Mat3<T>& first, T dt, T dt_next,
+                                          Largest& largest) {
   StepFlags flags{};
   const T inv_dx = T(1) / s.dx;
   const uint32_t meta = s.meta[p];
@@ -156,6 +159,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, con
   for (int axis = 0; axis < 3; ++axis) {
     T o = s.offset[s.at(3, p, axis)];
     if (!move_axis(dt * inv_dx * value[axis], l[axis], o, flags.leaves)) flags.lost = true;
+    flags.leaves = flags.leaves || !cell_in_reach(reach, axis, l[axis]);
     s.offset[s.at(3, p, axis)] = o;
     s.velocity[s.at(3, p, axis)] = value[axis];
   }
@@ -181,11 +185,13 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, con
     flags.invalid = !finite(e);
     set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, state.log_j) : state.e);
     stress = kirchhoff_stress(r[0], r[1], state.d, state.j2m1);
-    wave2 = wave_squared(r[0], r[1], r[6], state.j2m1, state.log_j);
+    wave2 = elastic_wave_squared(load_material(r), state);
   } else {
     const T alpha = s.alpha[p], peak = s.peak[p];
-    const ReturnMapped<T> out = return_mapping(strain_of(s, p), alpha, increment, s.law[row],
-                                               material_now(s, row, peak), s.options);
+    const MaterialRow<T> material = material_now(s, row, peak);
+    const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
+    const ReturnMapped<T> out =
+        return_mapping(strain_of(s, p), alpha, increment, law, material, s.options, dt);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -194,9 +200,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, con
     s.alpha[p] = out.alpha;
     s.peak[p] = out.alpha > peak ? out.alpha : peak;
     stress = out.stress;
-    const T j2m1 = max(det_minus_one(out.strain), T(-0.9999));
-    using std::log1p;
-    wave2 = wave_squared(r[0], r[1], r[6], j2m1, T(0.5) * log1p(j2m1));
+    wave2 = wave_speed_squared(law, material, out.strain);
   }
   T slope[9];
   store_slope(slope, c, stress, mass, volume, s.dx, dt_next);
@@ -206,7 +210,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, con
   for (int i = 0; i < 3; ++i) speed2 += value[i] * value[i];
   for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
   bool whole = true;  // broken points carry no stress: how fast they are torn does not matter
-  if constexpr (kLaws != kElasticOnly) whole = s.peak[p] < T(0) || s.law[row] != 1;
+  if constexpr (kLaws != kElasticOnly) whole = s.peak[p] < T(0) || s.law[row] != kNacc;
   largest.speed2 = larger(float(speed2), largest.speed2);
   largest.wave2 = larger(float(wave2), largest.wave2);
   if (whole) largest.gradient2 = larger(float(gradient2), largest.gradient2);
@@ -231,22 +235,19 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   T v[3];
   load_three(s, s.velocity, p, v);
   if (measure) {
-    const Sym3<T> e = strain_of(s, p);
-    using std::log1p;
-    const T j2m1 = max(det_minus_one(e), T(-0.9999));
     T speed2 = T(0), gradient2 = T(0);
     for (int i = 0; i < 3; ++i) speed2 += v[i] * v[i];
     for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
-    const T wave2 = wave_squared(r[0], r[1], r[6], j2m1, T(0.5) * log1p(j2m1));
+    const T wave2 = wave_speed_squared(s.law[row], load_material(r), strain_of(s, p));
     largest.speed2 = larger(float(speed2), largest.speed2);
     largest.wave2 = larger(float(wave2), largest.wave2);
-    if (peak < T(0) || s.law[row] != 1)
+    if (peak < T(0) || s.law[row] != kNacc)
       largest.gradient2 = larger(float(gradient2), largest.gradient2);
     return;
   }
   const Mat3<T> none{};
   const ReturnMapped<T> state = return_mapping(strain_of(s, p), alpha, none, s.law[row],
-                                               material_now(s, row, peak), s.options);
+                                               material_now(s, row, peak), s.options, dt);
   T slope[9];
   store_slope(slope, c, state.stress, mass, r[kVolumeColumn], s.dx, dt);
   store_nine(s, s.slope, p, slope);

@@ -54,22 +54,6 @@ __global__ void clear_kernel(SolverView<T> s) {
   }
 }
 
-// Neighbours that the stencil of a particle can reach before the next build, as bits over (i, j, k)
-// in {0, 1, 2}^3: one node of slack on both sides.
-__device__ uint32_t reach_mask(const int32_t* local) {
-  uint32_t mask = 0;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j)
-      for (int k = 0; k < 3; ++k) {
-        const int step[3] = {i, j, k};
-        bool in = true;
-        for (int axis = 0; axis < 3; ++axis)
-          in = in && (step[axis] == 1 || (step[axis] == 0 ? local[axis] == 0 : local[axis] >= 1));
-        mask |= in ? 1u << ((i * 3 + j) * 3 + k) : 0u;
-      }
-  return mask;
-}
-
 // Home of every particle: counts, masks, and the particle's rank among those of its home.
 template <typename T>
 __global__ void __launch_bounds__(kThreads) insert_kernel(SolverView<T> s) {
@@ -103,7 +87,7 @@ __global__ void __launch_bounds__(kThreads) insert_kernel(SolverView<T> s) {
       continue;
     }
     s.place[p] = atomicAdd(s.table_count + e, 1);
-    const uint32_t mask = reach_mask(local);
+    const uint32_t mask = reach_of(local[0], local[1], local[2]);
     if ((uint32_t(s.table_mask[e]) & mask) != mask)
       atomicOr(reinterpret_cast<uint32_t*>(s.table_mask + e), mask);
   }
@@ -129,7 +113,7 @@ __global__ void __launch_bounds__(kThreads) homes_kernel(SolverView<T> s) {
   }
   const uint32_t mask = uint32_t(s.table_mask[e]);
   for (int n = 0; n < kNeighbours; ++n) {
-    if ((mask >> n & 1u) == 0) continue;
+    if (!in_reach(mask, n)) continue;
     const int32_t other =
         insert(s, block_key(key_block(key, 0) + n / 9 - 1, key_block(key, 1) + n / 3 % 3 - 1,
                             key_block(key, 2) + n % 3 - 1, key_field(key)));

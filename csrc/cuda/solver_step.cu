@@ -281,6 +281,7 @@ __global__ void __launch_bounds__(kThreads, 2) g2p_kernel(SolverView<T> s) {
   const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
   const T dt = T(clock.dt), dt_next = T(clock.dt_next);
   const int64_t home_total = clock.homes;
+  const uint32_t reach = reach_of_row(s.neighbour + int64_t(blockIdx.x) * kNeighbours);
   for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
@@ -324,7 +325,7 @@ __global__ void __launch_bounds__(kThreads, 2) g2p_kernel(SolverView<T> s) {
           }
       for (int c = 0; c < 3; ++c)
         for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
-      flags = finish_particle<T, kLaws, kTrack>(s, p, value, moment, dt, dt_next, largest);
+      flags = finish_particle<T, kLaws, kTrack>(s, p, reach, value, moment, dt, dt_next, largest);
     }
     if constexpr (kLaws != kElasticOnly) count_lanes(flags.plastic, &s.clock->plastic);
     if (__any_sync(kAllLanes, flags.guarded || flags.inverted || flags.invalid)) {
@@ -394,10 +395,14 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     g2p_kernel<T, kElasticOnly, false><<<homes, kThreads, 0, stream>>>(s);
   else if (law_set == kElasticOnly)
     g2p_kernel<T, kElasticOnly, true><<<homes, kThreads, 0, stream>>>(s);
-  else if (!track)
+  else if (law_set == kBrittle && !track)
     g2p_kernel<T, kBrittle, false><<<homes, kThreads, 0, stream>>>(s);
-  else
+  else if (law_set == kBrittle)
     g2p_kernel<T, kBrittle, true><<<homes, kThreads, 0, stream>>>(s);
+  else if (!track)
+    g2p_kernel<T, kAnyLaw, false><<<homes, kThreads, 0, stream>>>(s);
+  else
+    g2p_kernel<T, kAnyLaw, true><<<homes, kThreads, 0, stream>>>(s);
   return cudaGetLastError();
 }
 

@@ -23,10 +23,11 @@ from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
+from gsfluent.ops.collider import pad_colliders
 from gsfluent.ops.plasticity import return_mapping
 from gsfluent.ops.solver_buffers import INDEX
 
-ELASTIC, NACC = 0, 1
+ELASTIC, NACC, LAWS = 0, 1, 7
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -159,9 +160,9 @@ class Solver:
         if dt is not None and not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"{op}: dt must be positive, got {dt}")
         laws = set(law.tolist())
-        if not laws <= {ELASTIC, NACC}:
-            raise ValueError(f"{op}: law must be 0 (elastic) or 1 (nacc), got {sorted(laws)}")
-        self._law_set = 0 if laws <= {ELASTIC} else 1
+        if not laws <= set(range(LAWS)):
+            raise ValueError(f"{op}: law must lie in 0 to {LAWS - 1}, got {sorted(laws)}")
+        self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
         self._fixed = dt
@@ -172,7 +173,7 @@ class Solver:
         b = layout.empty_buffers(velocity, n)
         b.law, b.rows = row_law, rows
         if colliders is not None and colliders.shape[0] > 0:
-            b.colliders = colliders.to(velocity).clone().contiguous()
+            b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
             count = colliders.shape[0]
             b.impulse_units = torch.zeros(count, 3, dtype=torch.int64, device=self.device)
             b.impulse = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
