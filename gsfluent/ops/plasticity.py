@@ -54,7 +54,7 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
                 "other laws are not built yet"
             )
     if params.numel() and _is_new(params, rows):
-        used = params[:, :6]
+        used = params.detach()[:, :6]  # checking is not part of any graph
         wrong = ~torch.isfinite(used) | (used < 0)
         wrong[:, 1] |= used[:, 1] == 0  # without bulk stiffness there is no pressure
         if bool(wrong.any()):
