@@ -138,6 +138,7 @@ def _return_mapping_backward(
     k: float,
     epsilon: float,
     implicit: bool,
+    dt: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     count, rows = strain.shape[0], params.shape[0]
     if material is not None:
@@ -176,6 +177,7 @@ def _return_mapping_backward(
                 k=k,
                 epsilon=epsilon,
                 implicit=implicit,
+                dt=dt,
                 root=new_alpha[rest],
             )[:3]
 

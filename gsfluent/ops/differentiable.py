@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsfluent._check import check_tensor
 from gsfluent.ops.mpm import build_blocks, g2p, grid_update, p2g
-from gsfluent.ops.plasticity import LAW_ELASTIC, return_mapping
+from gsfluent.ops.plasticity import LAWS, return_mapping
 
 __all__ = ["MpmState", "material_params", "mpm_state", "mpm_step", "rollout"]
 
@@ -127,7 +127,8 @@ def mpm_state(
     n = position.shape[0]
     check_tensor(op, "velocity", velocity, shape=(n, 3), like=position)
     if alpha is None:
-        if bool((law != LAW_ELASTIC).any()):
+        stateless = (law == LAWS["elastic"]) | (law == LAWS["corotated"])
+        if not bool(stateless.all()):
             raise ValueError(f"{op}: alpha must be given for material that is not elastic")
         alpha = position.new_zeros(n)
     if affine is None:
@@ -232,6 +233,7 @@ def mpm_step(
         law=law,
         params=params,
         material=material,
+        dt=dt,
         **return_map,
     )
     return MpmState(position, velocity, affine, strain, alpha, stress)
