@@ -117,9 +117,11 @@ GSF_HOST_DEVICE bool move_axis(T step, int& l, T& o, bool& leaves) {
 
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
+// `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
 template <typename T, int kLaws, bool kTrack>
-GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, const T* value,
-                                          const Mat3<T>& first, T dt, T dt_next, Largest& largest) {
+GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uint32_t reach,
+                                          const T* value, const Mat3<T>& first, T dt, T dt_next,
+                                          Largest& largest) {
   StepFlags flags{};
   const T inv_dx = T(1) / s.dx;
   const uint32_t meta = s.meta[p];
@@ -131,6 +133,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, con
   for (int axis = 0; axis < 3; ++axis) {
     T o = s.offset[3 * p + axis];
     if (!move_axis(dt * inv_dx * value[axis], l[axis], o, flags.leaves)) flags.lost = true;
+    flags.leaves = flags.leaves || !cell_in_reach(reach, axis, l[axis]);
     s.offset[3 * p + axis] = o;
     s.velocity[3 * p + axis] = value[axis];
   }

@@ -28,7 +28,7 @@ constexpr int kRowColumns = 10;     // eight material parameters, particle mass,
 constexpr int kMassColumn = 8;
 constexpr int kVolumeColumn = 9;
 constexpr int kSiteFields = 16;  // fields that may share one block
-constexpr int kFieldBits = 13;   // fields of a scene
+constexpr int kFieldBits = 12;   // fields of a scene
 constexpr int kMaxSolverFields = (1 << kFieldBits) - 1;
 constexpr int kBlockBits = 17;  // block coordinates lie in [-2^16, 2^16)
 constexpr int32_t kBlockRange = 1 << (kBlockBits - 1);
@@ -65,6 +65,33 @@ GSF_HOST_DEVICE uint64_t hash_key(uint64_t k) {  // splitmix64 finaliser
 // Index of the neighbour block of window node i (0..7) along one axis: 0, 1, 2 for B - 1, B, B + 1.
 GSF_HOST_DEVICE int window_block(int i) { return (i + 3) >> 2; }
 GSF_HOST_DEVICE int window_local(int i) { return (i + 3) & 3; }
+
+// Reach of a home, six bits: bit `axis` when its window touches block B - 1 on that axis, bit 3 +
+// axis for B + 1. The blocks it needs are the whole box of these (an edge or corner block may be
+// reached by a particle that was elsewhere in the home when the blocks were built). One particle,
+// `local` = its cell in the block (0..3), with one cell of slack:
+GSF_HOST_DEVICE uint32_t reach_of(int local_x, int local_y, int local_z) {
+  return (local_x == 0 ? 1u : 8u) | (local_y == 0 ? 2u : 16u) | (local_z == 0 ? 4u : 32u);
+}
+// Whether neighbour n = (i, j, k) in {0, 1, 2}^3 is within reach.
+GSF_HOST_DEVICE bool in_reach(uint32_t reach, int n) {
+  const int step[3] = {n / 9, n / 3 % 3, n % 3};
+  bool in = true;
+  for (int axis = 0; axis < 3; ++axis)
+    in = in && (step[axis] == 1 || (reach >> (step[axis] == 0 ? axis : 3 + axis) & 1u) != 0);
+  return in;
+}
+// Reach of a home from its row of SolverView::neighbour (the six face blocks tell).
+GSF_HOST_DEVICE uint32_t reach_of_row(const int32_t* neighbour) {
+  return (neighbour[4] >= 0 ? 1u : 0u) | (neighbour[10] >= 0 ? 2u : 0u) |
+         (neighbour[12] >= 0 ? 4u : 0u) | (neighbour[22] >= 0 ? 8u : 0u) |
+         (neighbour[16] >= 0 ? 16u : 0u) | (neighbour[14] >= 0 ? 32u : 0u);
+}
+// Whether a particle at l on this axis stays on blocks within reach: nodes l to l + 2, of which
+// block B holds 1 to 4.
+GSF_HOST_DEVICE bool cell_in_reach(uint32_t reach, int axis, int l) {
+  return (l >= 1 || (reach >> axis & 1u) != 0) && (l <= 2 || (reach >> (3 + axis) & 1u) != 0);
+}
 
 // Why the solver stopped before the end; 0 while all is well. Python words them (ops/solver.py).
 enum SolverReason : int64_t {

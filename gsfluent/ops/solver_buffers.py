@@ -1,0 +1,144 @@
+"""Tensors of the resident solver, in the order of ``SolverBuffer`` in ``csrc/host/solver.h``."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+CLOCK_WORDS = 48
+BLOCK_NODES = 64
+NEIGHBOURS = 27
+SITE_FIELDS = 16
+CONTACT_MOMENTS = 6
+ROW_COLUMNS = 10
+BLOCK_RANGE = 2**16
+MAX_FIELDS = 2**12 - 1
+MAX_ROWS = 2**23
+MAX_PARTICLES = 2**26
+"""More could overflow the fixed-point sums (``csrc/core/solver_clock.h``)."""
+
+FLOATS = (
+    "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
+    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen",
+)  # fmt: skip
+"""Members of the clock that are doubles; the others are integers."""
+CLOCK = (
+    "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
+    "momentum_unit", "mass_unit", "dt_min", "dt_max",
+    "step", "steps_left", "done", "rebuild", "grow", "reason", "parity", "homes",
+    "slots", "sites", "cursor", "arrived", "speed", "wave", "gradient", "bound",
+    "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
+    "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
+    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "spare0", "spare1",
+)  # fmt: skip
+"""Members of ``SolverClock``, word by word."""
+INDEX = {name: index for index, name in enumerate(CLOCK)}
+
+
+@dataclasses.dataclass
+class Buffers:
+    """Every tensor of a solver; see ``csrc/core/solver_state.h`` for what each holds."""
+
+    clock: Tensor
+    offset: Tensor
+    meta: Tensor
+    velocity: Tensor
+    slope: Tensor
+    strain: Tensor
+    alpha: Tensor
+    peak: Tensor
+    deformation: Tensor
+    id: Tensor
+    spare: Tensor
+    entry: Tensor
+    place: Tensor
+    law: Tensor
+    rows: Tensor
+    home_coord0: Tensor
+    home_start0: Tensor
+    home_count0: Tensor
+    home_coord1: Tensor
+    home_start1: Tensor
+    home_count1: Tensor
+    neighbour: Tensor
+    home_bound: Tensor
+    home_mass: Tensor
+    slot_coord: Tensor
+    slot_shared: Tensor
+    site_slots: Tensor
+    sums: Tensor
+    moments: Tensor
+    node_velocity: Tensor
+    key: Tensor
+    table_count: Tensor
+    table_mask: Tensor
+    table_home: Tensor
+    table_slot: Tensor
+    slot_next: Tensor
+    colliders: Tensor
+    impulse_units: Tensor
+    impulse: Tensor
+
+    def listed(self) -> list[Tensor]:
+        """Return the tensors in the order the operators take them."""
+        return [getattr(self, field.name) for field in dataclasses.fields(self)]
+
+    def memory(self) -> int:
+        """Return the bytes of all tensors."""
+        return sum(t.numel() * t.element_size() for t in self.listed())
+
+    def reserve_blocks(self, homes: int, slots: int, fields: int) -> None:
+        """Make room for blocks; the list of present homes is kept, nothing else needs to be."""
+        like = self.offset
+        device, real = like.device, like.dtype
+        sums = torch.int64 if device.type == "cuda" else real
+
+        def whole(*shape: int) -> Tensor:
+            return torch.zeros(shape, dtype=torch.int32, device=device)
+
+        for side in "01":
+            for name, width in (("coord", 4), ("start", 1), ("count", 1)):
+                key = f"home_{name}{side}"
+                old, new = getattr(self, key), whole(homes, width) if width > 1 else whole(homes)
+                kept = min(old.shape[0], homes)
+                new[:kept] = old[:kept]
+                setattr(self, key, new)
+        self.neighbour = whole(homes, NEIGHBOURS)
+        self.home_bound = torch.zeros(homes, dtype=real, device=device)
+        self.home_mass = torch.zeros(homes, dtype=real, device=device)
+        self.slot_coord, self.slot_shared = whole(slots, 4), whole(slots)
+        self.site_slots, self.slot_next = whole(slots, SITE_FIELDS), whole(slots)
+        self.sums = torch.zeros(slots, BLOCK_NODES, 4, dtype=sums, device=device)
+        many = slots if fields > 1 else 0
+        self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=sums, device=device)
+        self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
+        # Homes and slots share the table with one entry per site; half full at most.
+        entries = 1 << max(10, (4 * slots - 1).bit_length())
+        self.key = torch.zeros(entries, dtype=torch.int64, device=device)
+        self.table_count, self.table_mask = whole(entries), whole(entries)
+        self.table_home, self.table_slot = whole(entries), whole(entries)
+
+
+def empty_buffers(like: Tensor, count: int) -> Buffers:
+    """Buffers for ``count`` particles without blocks, materials or optional parts."""
+    device, real = like.device, like.dtype
+
+    def zeros(*shape: int, dtype: torch.dtype = real) -> Tensor:
+        return torch.zeros(shape, dtype=dtype, device=device)
+
+    values = {}
+    for field in dataclasses.fields(Buffers):
+        values[field.name] = zeros(0)
+    for name, width in (("offset", 3), ("velocity", 3), ("slope", 9), ("strain", 6), ("spare", 9)):
+        values[name] = zeros(count, width)
+    for name in ("meta", "id", "entry", "place"):
+        values[name] = zeros(count, dtype=torch.int32)
+    for name in ("law", "home_coord0", "home_start0", "home_count0", "home_coord1", "home_start1",
+                 "home_count1"):  # fmt: skip
+        values[name] = zeros(0, dtype=torch.int32)
+    values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
+    values["impulse_units"] = zeros(0, 3, dtype=torch.int64)
+    values["impulse"] = zeros(0, 3, dtype=torch.float64)
+    return Buffers(**values)
