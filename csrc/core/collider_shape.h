@@ -24,7 +24,7 @@ enum ColliderColumn {
   kInertia = 23,          // principal moments in the body frame [kg m^2]; 0: no turning by impulse
   kExtent = 26,           // box: half edges; capsule, cylinder: half length in z (third) [m];
                           // distance grid: number of values along x, y, z
-  kOffset = 29            // distance grid: its first value in the buffer, in units of 64 values
+  kSdfStart = 29          // distance grid: its first value in the buffer, in units of 64 values
 };
 constexpr int kColliderColumns = 32;
 constexpr int kColliderColumnsBefore = 16;  // the columns up to kSweep, with the last two 0
@@ -121,7 +121,7 @@ GSF_HOST_DEVICE T sdf_distance(const T* row, const float* sdf, const Vec3<T>& p,
     base[i] = min(static_cast<int64_t>(floor(inside)), size[i] - 2);
     f[i] = inside - T(base[i]);
   }
-  const float* at = sdf + kSdfAlign * static_cast<int64_t>(row[kOffset]) +
+  const float* at = sdf + kSdfAlign * static_cast<int64_t>(row[kSdfStart]) +
                     (base[0] * size[1] + base[1]) * size[2] + base[2];
   T value = T(0);
   Vec3<T> slope{T(0), T(0), T(0)};
@@ -163,15 +163,15 @@ GSF_HOST_DEVICE bool collider_valid(const T* row, int64_t sdf_count) {
   if (type == T(kBox)) return e[0] > T(0) && e[1] > T(0) && e[2] > T(0);
   if (type == T(kCapsule)) return r > T(0);
   if (type == T(kCylinder)) return r > T(0) && e[2] > T(0);
-  if (type != T(kSdf) || !(r > T(0)) || !(row[kOffset] >= T(0))) return false;
+  if (type != T(kSdf) || !(r > T(0)) || !(row[kSdfStart] >= T(0))) return false;
   double values = 1.0;
   for (int i = 0; i < 3; ++i) {
     // A float that is no whole number would be cut down below: refuse it instead.
     if (!(e[i] >= T(2) && e[i] <= T(4096) && e[i] == T(static_cast<int64_t>(e[i])))) return false;
     values *= double(e[i]);
   }
-  return double(kSdfAlign) * double(row[kOffset]) + values <= double(sdf_count) &&
-         row[kOffset] == T(static_cast<int64_t>(row[kOffset]));
+  return double(kSdfAlign) * double(row[kSdfStart]) + values <= double(sdf_count) &&
+         row[kSdfStart] == T(static_cast<int64_t>(row[kSdfStart]));
 }
 
 // Signed distance [m] of x from a valid collider, negative inside, and the unit normal out of it.

@@ -139,18 +139,29 @@ def _bracketed_root(
 
 
 def solve_alpha(
-    m: Material, o: Options, log_j: Tensor, n: Tensor, p: Tensor, q: Tensor, alpha: Tensor
+    m: Material,
+    o: Options,
+    log_j: Tensor,
+    n: Tensor,
+    p: Tensor,
+    q: Tensor,
+    alpha: Tensor,
+    root: Tensor | None = None,
 ) -> Tensor:
-    """X = alpha + step(surface at x), with its derivative when a graph is wanted."""
+    """X = alpha + step(surface at x), with its derivative; ``root`` is x where it is known."""
 
     def residual(x: Tensor) -> Tensor:
         cross, _, r = project(m, o, x, p, q)
         return x - alpha - alpha_step(m, log_j, n, cross, r)
 
     with torch.no_grad():
-        step = -residual(alpha)
-        eps = 4.0 * torch.finfo(alpha.dtype).eps
-        x = _bracketed_root(residual, alpha, step, eps * (alpha.abs() + step.abs() + log_j.abs()))
+        if root is None:
+            step = -residual(alpha)
+            eps = 4.0 * torch.finfo(alpha.dtype).eps
+            size = alpha.abs() + step.abs() + log_j.abs()
+            x = _bracketed_root(residual, alpha, step, eps * size)
+        else:
+            x = root
         # The residual of a particle depends on its own x only: one tangent gives every slope.
         slope = torch.func.jvp(residual, (x,), (torch.ones_like(x),))[1]
         slope = torch.where(slope.abs() > 1e-6, slope, 1.0)

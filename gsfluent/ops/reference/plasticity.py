@@ -34,6 +34,8 @@ from gsfluent.ops.reference.tensors import (
 )
 
 __all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
     "Material",
     "Options",
     "elastic_energy",
@@ -93,7 +95,13 @@ def _trial(e: Tensor, inverted: Tensor) -> Trial:
 
 
 def _neo_hookean(
-    t: Trial, alpha: Tensor, m: Material, o: Options, nacc: Tensor, valid: Tensor
+    t: Trial,
+    alpha: Tensor,
+    m: Material,
+    o: Options,
+    nacc: Tensor,
+    valid: Tensor,
+    root: Tensor | None,
 ) -> other.Returned:
     """Laws 0 and 1 (csrc/core/nacc.h)."""
     d, j2m1, log_j = t.d, t.j2m1, t.log_j
@@ -103,7 +111,10 @@ def _neo_hookean(
     slack = 2e-15 if d.dtype == torch.float64 else 1e-6
     plastic = valid & nacc & (u**2 + w**2 > 1.0 + slack)
     if o.implicit:
-        new_alpha = solve_alpha(m, o, log_j, t.n, p, q, alpha).clamp(ALPHA_MIN, ALPHA_MAX)
+        new_alpha = solve_alpha(m, o, log_j, t.n, p, q, alpha, root)
+        if root is not None:  # at a limit it moves no further
+            new_alpha = torch.where((root > ALPHA_MIN) & (root < ALPHA_MAX), new_alpha, root)
+        new_alpha = new_alpha.clamp(ALPHA_MIN, ALPHA_MAX)
         _, p_new, r = project(m, o, new_alpha, p, q)
     else:
         cross, p_new, r = project(m, o, alpha, p, q)
@@ -130,8 +141,12 @@ def return_mapping(
     epsilon: float = 0.1,
     implicit: bool = True,
     dt: float = 0.0,
+    root: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One constitutive step; arguments and results as :func:`gsfluent.ops.return_mapping`."""
+    """One constitutive step; arguments and results as :func:`gsfluent.ops.return_mapping`.
+
+    ``root``, [N], is the implicit alpha when it is known already; only its derivative is computed.
+    """
     count = strain.shape[0]
     m = gather_material(params, material, count)
     laws = _gather_law(law, material, count)
@@ -158,7 +173,8 @@ def return_mapping(
         own = Material(*(column[rows] for column in m))
         if number <= 1:
             t = _trial(e[rows], inverted[rows])
-            r = _neo_hookean(t, alpha[rows], own, o, laws[rows] == 1, valid[rows])
+            known = None if root is None else root[rows]
+            r = _neo_hookean(t, alpha[rows], own, o, laws[rows] == 1, valid[rows], known)
         elif number == other.RIGID:
             continue
         elif number == other.FLUID:

@@ -59,7 +59,10 @@ def unit_det_shift(d: Tensor) -> Tensor:
     with torch.no_grad():
         y = 2.0 * (h / 3.0).sqrt()
         for _ in range(60):  # monotone from above
-            y = y - torch.where(slope(y, h) > 0, residual(y, h, c) / slope(y, h), 0.0)
+            step = torch.where(slope(y, h) > 0, residual(y, h, c) / slope(y, h), 0.0)
+            y = y - step
+            if not bool((step.abs() > 1e-15 * (1.0 + y.abs())).any()):
+                break
         safe_slope = torch.where(slope(y, h) > 0, slope(y, h), 1.0)
     return y - residual(y, h, c) / safe_slope
 
