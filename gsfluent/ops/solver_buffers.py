@@ -103,7 +103,8 @@ class Buffers:
                 key = f"home_{name}{side}"
                 old, new = getattr(self, key), whole(homes, width) if width > 1 else whole(homes)
                 kept = min(old.shape[0], homes)
-                new[:kept] = old[:kept]
+                if kept > 0:  # before the first homes, the old list has no columns
+                    new[:kept] = old[:kept]
                 setattr(self, key, new)
         self.neighbour = whole(homes, NEIGHBOURS)
         self.home_bound = torch.zeros(homes, dtype=real, device=device)
