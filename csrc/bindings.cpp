@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "core/mvee_lens.h"
-#include "core/nacc.h"
+#include "core/return_mapping.h"
 
 namespace py = pybind11;
 
@@ -57,17 +57,18 @@ Vec3<T> vec3(const Array<T>& a, const char* name) {
 }
 
 template <typename T>
-NaccMaterial<T> material(T mu, T kappa, T friction, T cohesion, T hardening, T shear_damage) {
-  return {mu, kappa, friction, cohesion, hardening, shear_damage};
+MaterialRow<T> material(T mu, T kappa, T strength, T cohesion, T hardening, T damage, T density,
+                        T exponent) {
+  return {mu, kappa, strength, cohesion, hardening, damage, density, exponent};
 }
 
 template <typename T>
 py::dict one_particle(const Array<T>& strain, T alpha, const Array<T>& increment, int law,
-                      const NaccMaterial<T>& m, T k, T epsilon, bool implicit) {
-  if (law != 0 && law != 1) throw std::invalid_argument("law must be 0 (elastic) or 1 (nacc)");
+                      const MaterialRow<T>& m, T k, T epsilon, bool implicit, T dt) {
+  if (law < 0 || law >= kLawCount) throw std::invalid_argument("law must be 0 to 6");
   const ReturnMapped<T> r = return_mapping(load_sym3(expect(strain, "strain", {6})), alpha,
                                            load_mat3(expect(increment, "increment", {3, 3})), law,
-                                           m, NaccOptions<T>{k, epsilon, implicit});
+                                           m, NaccOptions<T>{k, epsilon, implicit}, dt);
   py::dict d;
   d["strain"] = to_array(r.strain);
   d["stress"] = to_array(r.stress);
@@ -82,12 +83,21 @@ py::dict one_particle(const Array<T>& strain, T alpha, const Array<T>& increment
 template <typename T>
 void bind(py::module_ m) {
   using py::arg;
-  py::class_<NaccMaterial<T>>(m, "Material", "Moduli [Pa], M, beta, xi, eta of one material.")
-      .def(py::init(&material<T>), arg("mu"), arg("kappa"), arg("friction") = T(0),
-           arg("cohesion") = T(0), arg("hardening") = T(0), arg("shear_damage") = T(0));
+  py::class_<MaterialRow<T>>(m, "Material", "One row of params (core/laws.h).")
+      .def(py::init(&material<T>), arg("mu"), arg("kappa"), arg("strength") = T(0),
+           arg("cohesion") = T(0), arg("hardening") = T(0), arg("damage") = T(0),
+           arg("density") = T(1), arg("exponent") = T(0));
   m.def("return_mapping", &one_particle<T>, arg("strain"), arg("alpha"), arg("increment"),
         arg("law"), arg("material"), arg("k") = T(2), arg("epsilon") = T(0.1),
-        arg("implicit") = true, "One constitutive step of one particle (core/nacc.h).");
+        arg("implicit") = true, arg("dt") = T(0),
+        "One constitutive step of one particle (core/return_mapping.h).");
+  m.def(
+      "wave_speed_squared",
+      [](const Array<T>& strain, int law, const MaterialRow<T>& material) {
+        return wave_speed_squared(law, material, load_sym3(expect(strain, "strain", {6})));
+      },
+      arg("strain"), arg("law"), arg("material"),
+      "Square of the fastest wave speed of one particle [m^2/s^2] (core/wave_speed.h).");
   m.def(
       "elastic_energy",
       [](const Array<T>& strain, T mu, T kappa) {
@@ -98,8 +108,9 @@ void bind(py::module_ m) {
       "Stored energy per initial volume of one particle [J/m^3] (core/elastic.h).");
   m.def(
       "yield_surface",
-      [](const NaccMaterial<T>& material, T alpha) {
-        const YieldSurface<T> y = yield_surface(material, alpha);
+      [](const MaterialRow<T>& r, T alpha) {
+        const NaccMaterial<T> nacc{r.mu, r.kappa, r.strength, r.cohesion, r.hardening, r.damage};
+        const YieldSurface<T> y = yield_surface(nacc, alpha);
         return py::make_tuple(y.p0, y.tip, y.center, y.a, y.b);
       },
       arg("material"), arg("alpha"), "(p0, -beta p0, centre, half-width, half-height) [Pa].");

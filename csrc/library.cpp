@@ -21,16 +21,23 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, int margin, "
       "float dx) -> Tensor");
   m.def(
-      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor coords, float dx, "
-      "float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
+      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor? sdf, Tensor coords, "
+      "float dx, float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
       "float restitution, float contact_gap) -> "
-      "(Tensor velocity, Tensor impulse, Tensor contact_nodes)");
+      "(Tensor velocity, Tensor impulse, Tensor contact_mass, Tensor contact_nodes)");
   m.def(
       "g2p(Tensor velocity_grid, Tensor position, Tensor? velocity, Tensor? deformation, "
       "Tensor? body, Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, "
       "int margin, float dx, float dt) -> (Tensor position, Tensor velocity, Tensor affine, "
       "Tensor deformation, Tensor skipped)");
 
+  // --- collider: rigid bodies as rows ---
+  m.def(
+      "collider_distance(Tensor position, Tensor colliders, Tensor? sdf) -> "
+      "(Tensor distance, Tensor normal)");
+  m.def(
+      "advance_colliders(Tensor colliders, Tensor impulse, float dt, float gravity_x, "
+      "float gravity_y, float gravity_z) -> Tensor");
   // --- solver: the resident state of a simulation (gsfluent/ops/solver.py), advanced in place ---
   m.def("solver_prime(Tensor(a!)[] buffers, int[] ints, float[] floats) -> ()");
   m.def(
@@ -39,8 +46,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
-      "Tensor? material, float k, float epsilon, bool implicit) -> (Tensor, Tensor, Tensor, "
-      "Tensor)");
+      "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0) -> "
+      "(Tensor, Tensor, Tensor, Tensor)");
 
   // --- deform: polar decomposition, clamped deformation ---
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");

@@ -99,7 +99,7 @@ def _p2g_contact(op: Any, p: dict[str, Any]) -> Results:
 
 def _grid_update(op: Any, p: dict[str, Any]) -> Results:
     options = {k: p[k] for k in ("blocks", "colliders", "moments")}
-    velocity, impulse, touched = op.grid_update(p["grid"], dx=DX, dt=DT, **options)
+    velocity, impulse, *_, touched = op.grid_update(p["grid"], dx=DX, dt=DT, **options)
     return {"velocity": velocity, "impulse": impulse, "contact nodes": touched.double()}
 
 

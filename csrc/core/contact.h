@@ -1,6 +1,6 @@
-// What happens at one grid node: momentum to velocity, contact between two bodies, rigid colliders.
-// No torch, no loops over nodes. Source: equations.md 11.3 (corrected Collision-MPM force), section
-// 8 (boundaries); Bardenhagen et al. 2001.
+// What happens at one grid node: momentum to velocity, contact between two bodies. No torch, no
+// loops over nodes. Source: equations.md 11.3 (corrected Collision-MPM force); Bardenhagen et al.
+// 2001. Rigid colliders: core/collider.h.
 #pragma once
 
 #include "core/grid.h"
@@ -69,64 +69,6 @@ GSF_HOST_DEVICE bool contact_pair(T mass_a, T mass_b, const T* moments_a, const 
   v_a = v_a - (T(1) / mass_a) * impulse;
   v_b = v_b + (T(1) / mass_b) * impulse;
   return true;
-}
-
-// One collider row of 16 numbers, the layout of grid_update's `colliders`.
-enum ColliderColumn {
-  kType = 0,         // 0 plane, 1 sphere
-  kMode = 1,         // 0 sticky, 1 slip, 2 separate
-  kFriction = 2,     // Coulomb coefficient (separate only)
-  kPoint = 3,        // plane point or sphere centre [m]
-  kNormal = 6,       // plane normal, out of the collider; need not be of unit length
-  kRadius = 9,       // sphere radius [m]
-  kVelocity = 10,    // collider velocity [m/s]
-  kRestitution = 13  // of a separating collider
-};
-constexpr int kColliderColumns = 16;
-
-// Outward normal at x when x is on or inside the collider; 1e-4 dx of tolerance keeps a node that
-// lies on the surface inside whatever the rounding. A row that is no collider (unknown type or
-// mode, no normal) sets `valid` to false; the caller then reports NaN for its impulse instead of
-// quietly ignoring it.
-template <typename T>
-GSF_HOST_DEVICE bool collider_normal(const T* row, const Vec3<T>& x, T dx, Vec3<T>& normal,
-                                     bool& valid) {
-  const T touching = T(1e-4) * dx;
-  valid = (row[kType] == T(0) || row[kType] == T(1)) &&
-          (row[kMode] == T(0) || row[kMode] == T(1) || row[kMode] == T(2));
-  const Vec3<T> point{row[kPoint], row[kPoint + 1], row[kPoint + 2]};
-  const Vec3<T> offset = x - point;
-  if (row[kType] == T(0)) {
-    const Vec3<T> n{row[kNormal], row[kNormal + 1], row[kNormal + 2]};
-    const T len = norm(n);
-    valid = valid && len > T(0);
-    if (!valid) return false;
-    normal = (T(1) / len) * n;
-    return dot(offset, normal) <= touching;
-  }
-  const T distance = norm(offset);
-  if (!valid || !(distance <= row[kRadius] + touching)) return false;
-  // The centre itself has no normal; up is as good as any and never NaN.
-  normal = distance > T(0) ? (T(1) / distance) * offset : Vec3<T>{T(0), T(0), T(1)};
-  return true;
-}
-
-// Velocity of a node inside a collider after it (equations.md section 8: sticky, slip, separate +
-// Coulomb).
-template <typename T>
-GSF_HOST_DEVICE Vec3<T> collide(const T* row, const Vec3<T>& normal, const Vec3<T>& velocity) {
-  const Vec3<T> own{row[kVelocity], row[kVelocity + 1], row[kVelocity + 2]};
-  if (row[kMode] == T(0)) return own;
-  const Vec3<T> relative = velocity - own;
-  const T vn = dot(relative, normal);
-  const Vec3<T> slip = relative - vn * normal;
-  if (row[kMode] == T(1)) return own + slip;
-  if (vn >= T(0)) return velocity;
-  const T rebound = row[kRestitution];
-  const T speed = norm(slip);
-  const T kept = max(T(0), speed + row[kFriction] * (T(1) + rebound) * vn);
-  const Vec3<T> tangential = speed > T(0) ? (kept / speed) * slip : slip;
-  return own + tangential + (-rebound * vn) * normal;
 }
 
 }  // namespace gsf

@@ -2,6 +2,7 @@
 // end.
 #pragma once
 
+#include "core/collider.h"
 #include "core/contact.h"
 
 namespace gsf {
@@ -64,14 +65,17 @@ struct GridUpdateArgs {
   int32_t fields;
   const T* grid;       // [fields, count, 64, 4]
   const T* moments;    // [fields, count, 64, 6] or null
-  const T* colliders;  // [collider_count, 16] or null
+  const T* colliders;  // [collider_count, kColliderColumns] or null
   int64_t collider_count;
+  const float* sdf;  // [sdf_count] distance grids of all colliders, or null
+  int64_t sdf_count;
   T dx, dt;
   T gravity[3];
   ContactLaw law;
   T* velocity;             // [fields, count, 64, 3]
-  double* partial;         // [chunks, collider_count, 3] scratch
-  double* impulse;         // [collider_count, 3]
+  double* partial;         // [chunks, collider_count, 6] scratch
+  double* contact_mass;    // [collider_count] kg that colliders with mass touch; scratch
+  double* impulse;         // [collider_count, 6] impulse and torque
   int64_t* contact_nodes;  // [] zeroed
 
   GSF_HOST_DEVICE const T* node(int32_t field, int64_t node) const {
@@ -118,31 +122,44 @@ GSF_HOST_DEVICE bool update_node(const GridUpdateArgs<T>& a, int64_t node) {
   return touched;
 }
 
-// Applies collider `c` to every field at one node and adds the impulse given to the bodies [N s],
-// in double.
 template <typename T>
-GSF_HOST_DEVICE void collide_node(const GridUpdateArgs<T>& a, int64_t c, int64_t node,
-                                  double* impulse) {
-  const T* row = a.colliders + c * kColliderColumns;
+GSF_HOST_DEVICE Vec3<T> node_position(const GridUpdateArgs<T>& a, int64_t node) {
   const int32_t* block = a.coords + 3 * (node / kBlockNodes);
   const int32_t local = static_cast<int32_t>(node % kBlockNodes);
-  const Vec3<T> x{(T(block[0]) * kBlockEdge + T(local / 16)) * a.dx,
-                  (T(block[1]) * kBlockEdge + T(local / 4 % 4)) * a.dx,
-                  (T(block[2]) * kBlockEdge + T(local % 4)) * a.dx};
-  Vec3<T> normal;
-  bool valid;
-  const bool inside = collider_normal(row, x, a.dx, normal, valid);
-  if (!valid) impulse[0] = impulse[1] = impulse[2] = double(NAN);
-  if (!inside) return;
+  return {(T(block[0]) * kBlockEdge + T(local / 16)) * a.dx,
+          (T(block[1]) * kBlockEdge + T(local / 4 % 4)) * a.dx,
+          (T(block[2]) * kBlockEdge + T(local % 4)) * a.dx};
+}
+
+// Mass of the fields at one node that touch a valid collider `row` [kg].
+template <typename T>
+GSF_HOST_DEVICE double touching_mass(const GridUpdateArgs<T>& a, const T* row, int64_t node) {
+  const Vec3<T> x = node_position(a, node);
+  double total = 0.0;
+  for (int32_t f = 0; f < a.fields; ++f) {
+    const T mass = a.node(f, node)[3];
+    if (!(mass > mass_floor<T>())) continue;
+    Vec3<T> normal;
+    T share;
+    if (collider_touch(row, a.sdf, x, load_vec3(a.out(f, node)), a.dx, a.dt, normal, share))
+      total += double(mass);
+  }
+  return total;
+}
+
+// Applies a valid collider `row` to every field at one node and adds the impulse and the torque
+// given to the bodies.
+template <typename T>
+GSF_HOST_DEVICE void collide_node(const GridUpdateArgs<T>& a, const T* row, T give, int64_t node,
+                                  double* sums) {
+  const Vec3<T> x = node_position(a, node);
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
     if (!(mass > mass_floor<T>())) continue;
     T* p = a.out(f, node);
-    const Vec3<T> after = collide(row, normal, Vec3<T>{p[0], p[1], p[2]});
-    for (int i = 0; i < 3; ++i) {
-      impulse[i] += double(mass) * (double(after[i]) - double(p[i]));
-      p[i] = after[i];
-    }
+    Vec3<T> v = load_vec3(p);
+    if (!collide_with(row, a.sdf, give, x, mass, a.dx, a.dt, v, sums)) continue;
+    for (int i = 0; i < 3; ++i) p[i] = v[i];
   }
 }
 

@@ -186,65 +186,65 @@ GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
   return x1;
 }
 
+// Part of a trial state that a law hands back: deviator, volume, alpha.
 template <typename T>
-struct ReturnMapped {
-  Sym3<T> strain;  // returned elastic strain b' - I
-  Sym3<T> stress;  // Kirchhoff stress of the returned state [Pa]
-  T alpha;
-  bool plastic, guarded, inverted, invalid;
+struct NaccState {
+  Sym3<T> d;
+  T log_j, j2m1, alpha;
+  bool plastic;
 };
 
-// One constitutive step: strain pushed forward by A = dt grad v, then returned to the surface.
+// The way back to the surface, taken by yielding particles only (kept out of line on the device).
 template <typename T>
-GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
-                                               const Mat3<T>& increment, int law,
-                                               const NaccMaterial<T>& m, const NaccOptions<T>& o) {
+GSF_HOST_DEVICE_COLD NaccState<T> nacc_plastic(const NaccMaterial<T>& m, const NaccOptions<T>& o,
+                                               const ElasticState<T>& s, T alpha) {
   using std::log1p;
-  using std::sqrt;
-  ReturnMapped<T> out;
-  out.plastic = out.guarded = out.inverted = out.invalid = false;
-  const Sym3<T> e = update_strain(strain, increment);
-  if (!finite(e) || !finite(alpha)) {
-    // A lost state becomes stress-free debris: it must not reach its neighbours through the grid.
-    out.strain = out.stress = {T(0), T(0), T(0), T(0), T(0), T(0)};
-    out.alpha = finite(alpha) ? alpha : T(0);
-    out.invalid = true;
-    return out;
+  const T p = T(-0.5) * m.kappa * s.j2m1;
+  const T q = T(1.224744871391589) * m.mu * s.n;  // sqrt(3/2) mu |d|
+  NaccState<T> out{s.d, s.log_j, s.j2m1, alpha, false};
+  const YieldSurface<T> y = yield_surface(m, alpha);
+  T u, w;
+  normalized(m, y, p, q, u, w);
+  const T slack = sizeof(T) == 4 ? T(1e-6) : T(2e-15);  // scale free: a returned state is inside
+  if (!(u * u + w * w > T(1) + slack)) return out;
+  out.plastic = true;
+  NaccReturn<T> ret = nacc_project(m, o, y, p, q);
+  const T step = alpha_step(m, s, ret);
+  out.alpha = clamp(alpha + step, T(kAlphaMin), T(kAlphaMax));
+  if (o.implicit_alpha) {
+    out.alpha = clamp(solve_alpha(m, o, s, p, q, alpha, step), T(kAlphaMin), T(kAlphaMax));
+    ret = nacc_project(m, o, yield_surface(m, out.alpha), p, q);
   }
-  const ElasticState<T> s = elastic_state(e, !(det_identity_plus(increment) > T(0)));
-  out.guarded = s.guarded;
-  out.inverted = s.inverted;
-  Sym3<T> d = s.d;
-  T log_j = s.log_j, j2m1 = s.j2m1;
-  out.alpha = alpha;
-
-  if (law == 1) {
-    alpha = clamp(alpha, T(kAlphaMin), T(kAlphaMax));
-    out.alpha = alpha;
-    const T p = T(-0.5) * m.kappa * s.j2m1;
-    const T q = T(1.224744871391589) * m.mu * s.n;  // sqrt(3/2) mu |d|
-    YieldSurface<T> y = yield_surface(m, alpha);
-    T u, w;
-    normalized(m, y, p, q, u, w);
-    const T slack = sizeof(T) == 4 ? T(1e-6) : T(2e-15);  // scale free: a returned state is inside
-    if (u * u + w * w > T(1) + slack) {
-      out.plastic = true;
-      NaccReturn<T> ret = nacc_project(m, o, y, p, q);
-      const T step = alpha_step(m, s, ret);
-      out.alpha = clamp(alpha + step, T(kAlphaMin), T(kAlphaMax));
-      if (o.implicit_alpha) {
-        out.alpha = clamp(solve_alpha(m, o, s, p, q, alpha, step), T(kAlphaMin), T(kAlphaMax));
-        ret = nacc_project(m, o, yield_surface(m, out.alpha), p, q);
-      }
-      d = ret.r * d;
-      j2m1 = T(-2) * ret.p / m.kappa;
-      log_j = T(0.5) * log1p(j2m1);
-    }
-  }
-  // An elastic state keeps its strain bit for bit; only changed states are rebuilt.
-  out.strain = out.plastic || out.guarded ? strain_from_isochoric(d, log_j) : s.e;
-  out.stress = kirchhoff_stress(m.mu, m.kappa, d, j2m1);
+  out.d = ret.r * s.d;
+  out.j2m1 = T(-2) * ret.p / m.kappa;
+  out.log_j = T(0.5) * log1p(out.j2m1);
   return out;
+}
+
+// True only for states inside the surface, by a test without sinh, roots or divisions: the
+// surfaces are nested in p0, and x + x^3/6 + x^5/120 <= sinh x gives one inside the real one. What
+// fails it by little is decided by the exact test in nacc_plastic, so that results do not depend on
+// it.
+template <typename T>
+GSF_HOST_DEVICE bool nacc_clearly_elastic(const NaccMaterial<T>& m, const ElasticState<T>& s,
+                                          T alpha) {
+  const T beta = min(m.cohesion, T(kCohesionMax));
+  const T x = min(m.hardening * max(-alpha, T(0)), T(5));
+  const T x2 = x * x;
+  const T relative = T(kYieldPressureFloor) + x * (T(1) + x2 * (T(1.0 / 6.0) + x2 / T(120)));
+  const T p0 = m.kappa * min(relative, T(kYieldPressureCap));
+  const T p = T(-0.5) * m.kappa * s.j2m1;
+  const T q2 = T(1.5) * m.mu * m.mu * s.n * s.n;
+  const T room = m.friction * m.friction * (p + beta * p0) * (p0 - p);
+  return p < p0 && p > -beta * p0 && q2 * (T(1) + T(2) * beta) < T(0.9999) * room;
+}
+
+template <typename T>
+GSF_HOST_DEVICE NaccState<T> nacc_return(const NaccMaterial<T>& m, const NaccOptions<T>& o,
+                                         const ElasticState<T>& s, T alpha) {
+  alpha = clamp(alpha, T(kAlphaMin), T(kAlphaMax));
+  if (nacc_clearly_elastic(m, s, alpha)) return {s.d, s.log_j, s.j2m1, alpha, false};
+  return nacc_plastic(m, o, s, alpha);
 }
 
 }  // namespace gsf

@@ -2,6 +2,7 @@
 // between fields, colliders.
 #pragma once
 
+#include "core/collider.h"
 #include "core/solver_state.h"
 
 namespace gsf {
@@ -50,14 +51,11 @@ template <typename T>
 GSF_HOST_DEVICE void node_collide(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
                                   Vec3<T>& v, double* impulse) {
   const T* row = s.colliders + k * kColliderColumns;
-  Vec3<T> normal;
-  bool valid;
-  if (!collider_normal(row, x, s.dx, normal, valid)) return;
-  const Vec3<T> after = collide(row, normal, v);
-  for (int i = 0; i < 3; ++i) {
-    impulse[i] += mass * (double(after[i]) - double(v[i]));
-    v[i] = after[i];
-  }
+  if (!collider_valid(row, 0)) return;
+  double sums[6] = {};
+  if (!collide_with(row, static_cast<const float*>(nullptr), T(1), x, T(mass), s.dx, T(0), v, sums))
+    return;
+  for (int i = 0; i < 3; ++i) impulse[i] += sums[i];
 }
 
 }  // namespace gsf

@@ -1,5 +1,5 @@
 // Algebra of symmetric 3x3 tensors needed by the constitutive update: invariants of I + e without
-// cancellation, and the strain update. No decomposition.
+// cancellation, and the strain update. No decomposition (eigenvalues: core/spectral.h).
 #pragma once
 
 #include "core/vec.h"
@@ -9,6 +9,19 @@ namespace gsf {
 template <typename T>
 GSF_HOST_DEVICE Sym3<T> operator*(T s, const Sym3<T>& a) {
   return {s * a.xx, s * a.yy, s * a.zz, s * a.xy, s * a.xz, s * a.yz};
+}
+
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> operator+(const Sym3<T>& a, const Sym3<T>& b) {
+  return {a.xx + b.xx, a.yy + b.yy, a.zz + b.zz, a.xy + b.xy, a.xz + b.xz, a.yz + b.yz};
+}
+
+// a a, symmetric like a.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> square(const Sym3<T>& a) {
+  return {a.xx * a.xx + a.xy * a.xy + a.xz * a.xz, a.xy * a.xy + a.yy * a.yy + a.yz * a.yz,
+          a.xz * a.xz + a.yz * a.yz + a.zz * a.zz, a.xx * a.xy + a.xy * a.yy + a.xz * a.yz,
+          a.xx * a.xz + a.xy * a.yz + a.xz * a.zz, a.xy * a.xz + a.yy * a.yz + a.yz * a.zz};
 }
 
 template <typename T>

@@ -4,8 +4,8 @@
 
 #include <algorithm>
 #include <atomic>
-#include <numeric>
 
+#include "cpu/mpm_grid.h"
 #include "cpu/mpm_lanes.h"
 #include "cpu/mpm_tile.h"
 
@@ -316,28 +316,6 @@ void gather_all(const GatherArgs<T>& a) {
     skipped += mine;
   });
   *a.skipped += skipped;
-}
-
-template <typename T>
-void grid_update(const GridUpdateArgs<T>& a) {
-  const int64_t chunks = grid_update_chunks(a.count);
-  std::vector<int64_t> touched(chunks, 0);
-  parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t chunk = begin; chunk < end; ++chunk) {
-      double* partial = a.partial + 3 * chunk * a.collider_count;
-      std::fill(partial, partial + 3 * a.collider_count, 0.0);
-      const int64_t first = chunk * kChunkBlocks * kBlockNodes;
-      const int64_t last = std::min(first + kChunkBlocks * kBlockNodes, a.count * kBlockNodes);
-      for (int64_t node = first; node < last; ++node) touched[chunk] += update_node(a, node);
-      for (int64_t c = 0; c < a.collider_count; ++c)
-        for (int64_t node = first; node < last; ++node) collide_node(a, c, node, partial + 3 * c);
-    }
-  });
-  // Ordered sums: the same for any number of threads.
-  for (int64_t chunk = 0; chunk < chunks; ++chunk)
-    for (int64_t i = 0; i < 3 * a.collider_count; ++i)
-      a.impulse[i] += a.partial[3 * chunk * a.collider_count + i];
-  *a.contact_nodes = std::accumulate(touched.begin(), touched.end(), int64_t(0));
 }
 
 struct Cpu {

@@ -201,15 +201,39 @@ __device__ double warp_sum(double v) {
   return v;
 }
 
-// One CTA per chunk of nodes: velocities, then every collider with an ordered partial sum of its
-// impulse.
+// Sums kColumns numbers over the CTA into `out`, in a fixed order.
+template <int kColumns>
+__device__ void sum_cta(double (&value)[kColumns], double* out) {
+  __shared__ double sums[kThreads / 32][kColumns];
+  for (int i = 0; i < kColumns; ++i) value[i] = warp_sum(value[i]);
+  if ((threadIdx.x & 31) == 0)
+    for (int i = 0; i < kColumns; ++i) sums[threadIdx.x / 32][i] = value[i];
+  __syncthreads();
+  if (threadIdx.x < kColumns) {
+    double s = 0.0;
+    for (int w = 0; w < kThreads / 32; ++w) s += sums[w][threadIdx.x];
+    out[threadIdx.x] = s;
+  }
+  __syncthreads();
+}
+
+// The nodes of one chunk, which one CTA works on.
+struct Chunk {
+  int64_t first, last;
+  __device__ explicit Chunk(int64_t count) {
+    first = int64_t(blockIdx.x) * kChunkBlocks * kBlockNodes;
+    const int64_t end = first + kChunkBlocks * kBlockNodes, total = count * kBlockNodes;
+    last = end < total ? end : total;
+    first += threadIdx.x;
+  }
+};
+
+// Velocities and contact between fields, then the mass that each collider with mass touches.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) grid_update_kernel(GridUpdateArgs<T> a) {
-  const int64_t first = int64_t(blockIdx.x) * kChunkBlocks * kBlockNodes;
-  const int64_t end = first + kChunkBlocks * kBlockNodes, total = a.count * kBlockNodes;
-  const int64_t last = end < total ? end : total;
+__global__ void __launch_bounds__(kThreads) grid_velocity_kernel(GridUpdateArgs<T> a) {
+  const Chunk chunk(a.count);
   unsigned touched = 0;
-  for (int64_t node = first + threadIdx.x; node < last; node += kThreads)
+  for (int64_t node = chunk.first; node < chunk.last; node += kThreads)
     touched += update_node(a, node) ? 1u : 0u;
   if (a.moments != nullptr) {
     touched = __reduce_add_sync(kAll, touched);
@@ -217,33 +241,44 @@ __global__ void __launch_bounds__(kThreads) grid_update_kernel(GridUpdateArgs<T>
       atomicAdd(reinterpret_cast<unsigned long long*>(a.contact_nodes),
                 static_cast<unsigned long long>(touched));
   }
-  __shared__ double sums[kThreads / 32][3];
   for (int64_t c = 0; c < a.collider_count; ++c) {
-    double impulse[3] = {0.0, 0.0, 0.0};
-    for (int64_t node = first + threadIdx.x; node < last; node += kThreads)
-      collide_node(a, c, node, impulse);
-    for (int i = 0; i < 3; ++i) impulse[i] = warp_sum(impulse[i]);
-    if ((threadIdx.x & 31) == 0)
-      for (int i = 0; i < 3; ++i) sums[threadIdx.x / 32][i] = impulse[i];
-    __syncthreads();
-    if (threadIdx.x < 3) {
-      double s = 0.0;
-      for (int w = 0; w < kThreads / 32; ++w) s += sums[w][threadIdx.x];
-      a.partial[(int64_t(blockIdx.x) * a.collider_count + c) * 3 + threadIdx.x] = s;
-    }
-    __syncthreads();
+    const T* row = a.colliders + c * kColliderColumns;
+    double mass[1] = {0.0};
+    if (row[kMass] > T(0) && collider_valid(row, a.sdf_count))
+      for (int64_t node = chunk.first; node < chunk.last; node += kThreads)
+        mass[0] += touching_mass(a, row, node);
+    sum_cta(mass, a.partial + int64_t(blockIdx.x) * a.collider_count + c);
   }
 }
 
-// One warp per (collider, axis); lanes stride over the chunks, so the order of the sum is fixed.
-__global__ void sum_impulse_kernel(const double* partial, int64_t chunks, int64_t columns,
-                                   double* impulse) {
+// Every collider in row order, with an ordered partial sum of its impulse and torque.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) grid_collide_kernel(GridUpdateArgs<T> a) {
+  const Chunk chunk(a.count);
+  for (int64_t c = 0; c < a.collider_count; ++c) {
+    const T* row = a.colliders + c * kColliderColumns;
+    double sums[6] = {};
+    if (collider_valid(row, a.sdf_count)) {
+      const T give = collider_give(row, static_cast<T>(a.contact_mass[c]));
+      for (int64_t node = chunk.first; node < chunk.last; node += kThreads)
+        collide_node(a, row, give, node, sums);
+    } else {
+      // A row that is no collider must not be ignored quietly.
+      for (int i = 0; i < 6; ++i) sums[i] = double(NAN);
+    }
+    sum_cta(sums, a.partial + (int64_t(blockIdx.x) * a.collider_count + c) * 6);
+  }
+}
+
+// One warp per column; lanes stride over the chunks, so the order of the sum is fixed.
+__global__ void sum_chunks_kernel(const double* partial, int64_t chunks, int64_t columns,
+                                  double* sums) {
   const int64_t column = blockIdx.x;
   double s = 0.0;
   for (int64_t chunk = threadIdx.x; chunk < chunks; chunk += 32)
     s += partial[chunk * columns + column];
   s = warp_sum(s);
-  if (threadIdx.x == 0) impulse[column] = s;
+  if (threadIdx.x == 0) sums[column] = s;
 }
 
 int64_t ctas(int64_t n) { return (n + kThreads - 1) / kThreads; }
@@ -276,12 +311,14 @@ cudaError_t p2g_adjoint(const GatherArgs<T>& a, cudaStream_t stream) {
 
 template <typename T>
 cudaError_t grid_update(const GridUpdateArgs<T>& a, cudaStream_t stream) {
-  const int64_t chunks = grid_update_chunks(a.count);
+  const int64_t chunks = grid_update_chunks(a.count), rows = a.collider_count;
   if (chunks == 0) return cudaSuccess;
-  grid_update_kernel<T><<<chunks, kThreads, 0, stream>>>(a);
-  if (a.collider_count > 0)
-    sum_impulse_kernel<<<3 * a.collider_count, 32, 0, stream>>>(a.partial, chunks,
-                                                                3 * a.collider_count, a.impulse);
+  grid_velocity_kernel<T><<<chunks, kThreads, 0, stream>>>(a);
+  if (rows > 0) {
+    sum_chunks_kernel<<<rows, 32, 0, stream>>>(a.partial, chunks, rows, a.contact_mass);
+    grid_collide_kernel<T><<<chunks, kThreads, 0, stream>>>(a);
+    sum_chunks_kernel<<<6 * rows, 32, 0, stream>>>(a.partial, chunks, 6 * rows, a.impulse);
+  }
   return cudaGetLastError();
 }
 

@@ -234,12 +234,10 @@ struct MpmOps {
     return slope;
   }
 
-  static std::tuple<Tensor, Tensor, Tensor> grid_update(Tensor grid_in, OptTensor moments,
-                                                        OptTensor colliders, Tensor coords_in,
-                                                        double dx, double dt, double gravity_x,
-                                                        double gravity_y, double gravity_z,
-                                                        double friction, double restitution,
-                                                        double contact_gap) {
+  static std::tuple<Tensor, Tensor, Tensor, Tensor> grid_update(
+      Tensor grid_in, OptTensor moments, OptTensor colliders, OptTensor sdf, Tensor coords_in,
+      double dx, double dt, double gravity_x, double gravity_y, double gravity_z, double friction,
+      double restitution, double contact_gap) {
     const char* op = "grid_update";
     const int64_t fields = grid_in.dim() > 0 ? grid_in.size(0) : 0;
     check_fields(op, fields);
@@ -253,13 +251,15 @@ struct MpmOps {
     const OptTensor mom =
         ready(op, "moments", moments, grid, {fields, count, kBlockNodes, 6}, type);
     const OptTensor rows = ready(op, "colliders", colliders, grid, {-1, kColliderColumns}, type);
+    const OptTensor distances = ready(op, "sdf", sdf, grid, {-1}, ScalarType::Float);
     STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
     const int64_t rows_count = rows.has_value() ? rows->size(0) : 0;
     const typename Backend::Scope scope(grid);
     const Tensor velocity = new_empty(grid, {fields, count, kBlockNodes, 3}, type);
     const Tensor partial =
-        new_empty(grid, {grid_update_chunks(count), rows_count, 3}, ScalarType::Double);
-    const Tensor impulse = new_zeros(grid, {rows_count, 3}, ScalarType::Double);
+        new_empty(grid, {grid_update_chunks(count), rows_count, 6}, ScalarType::Double);
+    const Tensor contact_mass = new_zeros(grid, {rows_count}, ScalarType::Double);
+    const Tensor impulse = new_zeros(grid, {rows_count, 6}, ScalarType::Double);
     const Tensor contact_nodes = new_zeros(grid, {}, ScalarType::Long);
     dispatch_floating(op, grid, [&]<typename T>() {
       GridUpdateArgs<T> a{};
@@ -270,6 +270,8 @@ struct MpmOps {
       a.moments = pointer<T>(mom);
       a.colliders = pointer<T>(rows);
       a.collider_count = rows_count;
+      a.sdf = pointer<float>(distances);
+      a.sdf_count = distances.has_value() ? distances->size(0) : 0;
       a.dx = static_cast<T>(dx);
       a.dt = static_cast<T>(dt);
       a.gravity[0] = static_cast<T>(gravity_x);
@@ -278,11 +280,12 @@ struct MpmOps {
       a.law = {friction, restitution, contact_gap};
       a.velocity = mptr<T>(velocity);
       a.partial = mptr<double>(partial);
+      a.contact_mass = mptr<double>(contact_mass);
       a.impulse = mptr<double>(impulse);
       a.contact_nodes = mptr<int64_t>(contact_nodes);
       Backend::grid_update(a, scope);
     });
-    return {velocity, impulse, contact_nodes};
+    return {velocity, impulse, contact_mass, contact_nodes};
   }
 
   static void register_all(torch::stable::detail::StableLibrary& m) {

@@ -3,6 +3,7 @@
 // names. An empty tensor stands for a part the scene does not use.
 #pragma once
 
+#include "core/collider.h"
 #include "core/solver_state.h"
 #include "torch_api.h"
 

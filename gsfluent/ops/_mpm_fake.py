@@ -45,12 +45,13 @@ def _p2g_adjoint_fake(
 
 @torch.library.register_fake("gsfluent::grid_update")
 def _grid_update_fake(
-    grid: Tensor, moments: Tensor | None, colliders: Tensor | None, coords: Tensor, *rest: float
-) -> tuple[Tensor, Tensor, Tensor]:
+    grid: Tensor, moments: Tensor | None, colliders: Tensor | None, *rest: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     rows = 0 if colliders is None else colliders.shape[0]
     velocity = grid.new_empty((grid.shape[0], grid.shape[1], 64, 3))
-    impulse = grid.new_empty((rows, 3), dtype=torch.float64)
-    return velocity, impulse, grid.new_empty((), dtype=torch.int64)
+    impulse = grid.new_empty((rows, 6), dtype=torch.float64)
+    mass = grid.new_empty((rows,), dtype=torch.float64)
+    return velocity, impulse, mass, grid.new_empty((), dtype=torch.int64)
 
 
 @torch.library.register_fake("gsfluent::g2p")

@@ -136,21 +136,21 @@ def _g2p_backward(
 
 
 def _grid_update_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    grid, moments, colliders, coords = inputs[:4]
+    grid, moments, colliders, sdf, coords = inputs[:5]
     if colliders is not None and ctx.needs_input_grad[2]:
         raise NotImplementedError(
             "grid_update: no gradient with respect to colliders; detach the rows"
         )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(grid, moments, colliders, coords)
-    ctx.options = inputs[4:]
+    ctx.save_for_backward(grid, moments, colliders, sdf, coords)
+    ctx.options = inputs[5:]
 
 
 def _grid_update_backward(
-    ctx: Any, g_velocity: Tensor | None, g_impulse: Tensor | None, _: Tensor | None
+    ctx: Any, g_velocity: Tensor | None, g_impulse: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    grid, moments, colliders, coords = ctx.saved_tensors
-    rest: tuple[None, ...] = (None,) * 10
+    grid, moments, colliders, sdf, coords = ctx.saved_tensors
+    rest: tuple[None, ...] = (None,) * 11
     if g_velocity is None and g_impulse is None:
         return None, None, *rest
     if moments is None and (colliders is None or colliders.shape[0] == 0):
@@ -163,7 +163,7 @@ def _grid_update_backward(
         g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
         return torch.cat([g_momentum, g_mass], dim=-1), None, *rest
     g_grid, g_moments = torch.ops.gsfluent.grid_update_backward(
-        g_velocity, g_impulse, grid, moments, colliders, coords, *ctx.options
+        g_velocity, g_impulse, grid, moments, colliders, sdf, coords, *ctx.options
     )
     return g_grid, g_moments if moments is not None else None, *rest
 
@@ -175,6 +175,7 @@ def _grid_update_by_reference(
     grid: Tensor,
     moments: Tensor | None,
     colliders: Tensor | None,
+    sdf: Tensor | None,
     coords: Tensor,
     dx: float,
     dt: float,
@@ -191,23 +192,25 @@ def _grid_update_by_reference(
     blocks = Blocks(none.view(0, 0, 0), (0, 0, 0), coords, none, none)
 
     def forward(grid: Tensor, moments: Tensor | None) -> tuple[Tensor, Tensor]:
-        return reference.grid_update(
+        velocity, impulse, torque, _ = reference.grid_update(
             grid,
             dx=dx,
             dt=dt,
             blocks=blocks,
             gravity=(gravity_x, gravity_y, gravity_z),
             colliders=None if colliders is None else colliders.double(),
+            sdf=sdf,
             moments=moments,
             friction=friction,
             restitution=restitution,
             contact_gap=contact_gap,
-        )[:2]
+        )
+        return velocity, torch.cat([impulse, torque], dim=1)
 
     # torch.func works inside a custom op, where ordinary autograd is switched off.
     count = 0 if colliders is None else colliders.shape[0]
     g_v = grid.new_zeros((*grid.shape[:3], 3)) if g_velocity is None else g_velocity
-    g_i = grid.new_zeros(count, 3) if g_impulse is None else g_impulse
+    g_i = grid.new_zeros(count, 6) if g_impulse is None else g_impulse
     if moments is None:
         _, pull_back, *_ = torch.func.vjp(lambda g: forward(g, None), grid.double())
         (g_grid,) = pull_back((g_v.double(), g_i.double()))

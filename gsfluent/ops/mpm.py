@@ -16,11 +16,11 @@ from torch import Tensor
 from gsfluent._check import check_tensor
 from gsfluent.ops import _mpm_grad  # noqa: F401  (registers shape functions and gradients)
 from gsfluent.ops.blocks import Blocks, build_blocks, check_blocks, check_dx, check_order
+from gsfluent.ops.collider import check_rows
 
 __all__ = ["Blocks", "build_blocks", "g2p", "grid_update", "p2g"]
 
 MAX_FIELDS = 64
-COLLIDER_COLUMNS = 16
 
 
 def _check_dt(op: str, dt: float) -> float:
@@ -121,6 +121,42 @@ def p2g(
     return grid, moments if contact else None
 
 
+@overload
+def grid_update(
+    grid: Tensor,
+    *,
+    dx: float,
+    dt: float,
+    blocks: Blocks,
+    gravity: Sequence[float] = ...,
+    colliders: Tensor | None = ...,
+    sdf: Tensor | None = ...,
+    moments: Tensor | None = ...,
+    friction: float = ...,
+    restitution: float = ...,
+    contact_gap: float = ...,
+    return_torque: Literal[False] = ...,
+) -> tuple[Tensor, Tensor, Tensor]: ...
+
+
+@overload
+def grid_update(
+    grid: Tensor,
+    *,
+    dx: float,
+    dt: float,
+    blocks: Blocks,
+    gravity: Sequence[float] = ...,
+    colliders: Tensor | None = ...,
+    sdf: Tensor | None = ...,
+    moments: Tensor | None = ...,
+    friction: float = ...,
+    restitution: float = ...,
+    contact_gap: float = ...,
+    return_torque: Literal[True],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]: ...
+
+
 def grid_update(
     grid: Tensor,
     *,
@@ -129,17 +165,20 @@ def grid_update(
     blocks: Blocks,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     colliders: Tensor | None = None,
+    sdf: Tensor | None = None,
     moments: Tensor | None = None,
     friction: float = 0.3,
     restitution: float = 0.0,
     contact_gap: float = 1.0,
-) -> tuple[Tensor, Tensor, Tensor]:
+    return_torque: bool = False,
+) -> tuple[Tensor, ...]:
     """Turn nodal momentum into velocity: gravity, contact between fields, rigid colliders.
 
     Contact between every pair of fields that meet at a node uses the corrected Collision-MPM
     impulse: normal from the difference of unit mass gradients, active only while the centroids of
     the two masses overlap within ``contact_gap * dx`` and the bodies approach, Coulomb friction.
-    Momentum is exchanged exactly. Colliders act afterwards, in row order.
+    Momentum is exchanged exactly. Colliders act afterwards, in row order. A collider with mass
+    changes velocities as a plastic impact of its mass with that of the nodes it touches would.
 
     Args:
         grid: Momentum and mass from :func:`p2g`, shape [K, B, 64, 4].
@@ -147,25 +186,27 @@ def grid_update(
         dt: Time step [s].
         blocks: The blocks of ``grid``.
         gravity: Acceleration [m/s^2], three numbers.
-        colliders: Rows ``[type, mode, friction, px, py, pz, nx, ny, nz, radius, vx, vy, vz,
-            restitution, 0, 0]``, shape [M, 16]: type 0 plane through p with normal n out of the
-            collider, 1 sphere of ``radius`` around p; mode 0 sticky, 1 slip (no normal motion),
-            2 separate (may leave; Coulomb friction and restitution on approach); v its velocity.
+        colliders: Rows from :func:`gsfluent.ops.collider_row`, shape [M, 32]; also accepted are
+            [M, 16]: ``[type, mode, friction, px, py, pz, nx, ny, nz, radius, vx, vy, vz,
+            restitution, 0, 0]`` with type 0 plane, 1 sphere.
+        sdf: Values of the distance grids of mesh colliders [m], float32 [S].
         moments: From :func:`p2g` with ``contact=True``; None switches contact off.
         friction: Coulomb coefficient between fields, >= 0.
         restitution: Of contact between fields, in [0, 1].
         contact_gap: Centroid separation [dx] below which fields touch; 1.0 to 1.1 is right for
             8 particles per cell.
+        return_torque: Also return the torque of the colliders.
 
     Returns:
         ``velocity`` [K, B, 64, 3] in m/s, zero at nodes without mass; ``impulse`` float64 [M, 3]
-        given to the bodies by each collider [N s]; ``contact_nodes`` int64 [], nodes where fields
+        given to the bodies by each collider [N s]; with ``return_torque`` its ``torque`` about the
+        collider's point float64 [M, 3] [N m s]; ``contact_nodes`` int64 [], nodes where fields
         touched.
 
     Raises:
         TypeError: Wrong type or dtype.
-        ValueError: Wrong shape, device or range; on the CPU also a collider row of unknown type or
-            mode or without normal (on CUDA such a row does nothing and its impulse is NaN).
+        ValueError: Wrong shape, device or range; on the CPU also a row that is no collider (on
+            CUDA such a row does nothing and its impulse is NaN).
         NotImplementedError: A gradient with respect to ``colliders``.
 
     Gradient: ``grid`` and ``moments``, through velocity and impulse; on the piece (touching or not,
@@ -182,10 +223,7 @@ def grid_update(
     check_tensor(op, "grid", grid, shape=(fields, blocks.block_count, 64, 4))
     if moments is not None:
         check_tensor(op, "moments", moments, shape=(fields, count, 64, 6), like=grid)
-    if colliders is not None:
-        check_tensor(op, "colliders", colliders, shape=(None, COLLIDER_COLUMNS), like=grid)
-        if colliders.device.type == "cpu":
-            _check_colliders(op, colliders)
+    rows = None if colliders is None else check_rows(op, colliders, sdf, grid)
     if len(gravity) != 3:
         raise ValueError(f"{op}: gravity must have three numbers, got {len(gravity)}")
     if not friction >= 0.0:
@@ -194,10 +232,11 @@ def grid_update(
         raise ValueError(
             f"{op}: restitution must be in [0, 1] (more creates energy), got {restitution}"
         )
-    velocity, impulse, contact_nodes = torch.ops.gsfluent.grid_update(
+    velocity, impulse, _, contact_nodes = torch.ops.gsfluent.grid_update(
         grid,
         moments,
-        colliders,
+        rows,
+        sdf,
         blocks.coords,
         check_dx(op, dx),
         _check_dt(op, dt),
@@ -206,23 +245,10 @@ def grid_update(
         float(restitution),
         float(contact_gap),
     )
-    return velocity, impulse, contact_nodes
-
-
-def _check_colliders(op: str, rows: Tensor) -> None:
-    kind, mode = rows[:, 0], rows[:, 1]
-    wrong = ~(((kind == 0) | (kind == 1)) & ((mode == 0) | (mode == 1) | (mode == 2)))
-    wrong |= (kind == 0) & ~(rows[:, 6:9].norm(dim=1) > 0)
-    wrong |= (kind == 1) & ~(rows[:, 9] > 0)
-    wrong |= ~torch.isfinite(rows).all(dim=1) | (rows[:, 2] < 0)
-    wrong |= (rows[:, 13] < 0) | (rows[:, 13] > 1)
-    if bool(wrong.any()):
-        i = int(wrong.nonzero()[0])
-        raise ValueError(
-            f"{op}: colliders row {i} must be finite, with type 0 (plane, normal not zero) or 1 "
-            "(sphere, radius > 0), mode 0, 1 or 2, friction >= 0 and restitution in [0, 1], "
-            f"got {[round(v, 6) for v in rows[i].tolist()]}"
-        )
+    push, torque = impulse[:, :3].contiguous(), impulse[:, 3:].contiguous()
+    if return_torque:
+        return velocity, push, torque, contact_nodes
+    return velocity, push, contact_nodes
 
 
 @overload

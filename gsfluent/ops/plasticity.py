@@ -1,4 +1,4 @@
-"""Constitutive update of material points: elastic (neo-Hookean) and NACC, on strain e = b - I."""
+"""Constitutive update of material points, seven laws, on strain e = b - I."""
 
 from __future__ import annotations
 
@@ -13,22 +13,32 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from gsfluent._check import check_tensor
 from gsfluent.ops.reference import plasticity as reference
 
-LAW_ELASTIC, LAW_NACC = 0, 1
-LAWS = {"elastic": LAW_ELASTIC, "nacc": LAW_NACC}
+LAWS = {
+    "elastic": 0,
+    "nacc": 1,
+    "drucker_prager": 2,
+    "von_mises": 3,
+    "fluid": 4,
+    "rigid": 5,
+    "corotated": 6,
+}
+"""Constitutive laws and their numbers."""
+
 PARAM_COLUMNS = (
     "mu",
     "kappa",
-    "friction",
+    "strength",
     "cohesion",
     "hardening",
     "shear_damage",
     "density",
-    "reserved",
+    "exponent",
 )
 
 # Tables already read and found right: tensor -> (version, rows it was checked against). Reading a
 # table on a GPU waits for the device, so it happens once per table and not once per step.
 _checked: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+_viscous_tables: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def _is_new(tensor: Tensor, rows: int) -> bool:
@@ -44,27 +54,22 @@ def _is_new(tensor: Tensor, rows: int) -> bool:
 def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None) -> None:
     rows = int(law.shape[0])
     if law.numel() and _is_new(law, rows):
-        known = torch.zeros_like(law, dtype=torch.bool)
-        for value in LAWS.values():
-            known |= law == value
+        known = (law >= 0) & (law < len(LAWS))
         if not bool(known.all()):
             _checked.pop(law, None)
             names = ", ".join(f"{v} ({k})" for k, v in LAWS.items())
-            raise ValueError(
-                f"{op}: law must be one of {names}, got {int(law[~known][0])}; "
-                "other laws are not built yet"
-            )
+            raise ValueError(f"{op}: law must be one of {names}, got {int(law[~known][0])}")
     if params.numel() and _is_new(params, rows):
-        used = params[:, :6]
-        wrong = ~torch.isfinite(used) | (used < 0)
-        wrong[:, 1] |= used[:, 1] == 0  # without bulk stiffness there is no pressure
+        wrong = ~torch.isfinite(params) | (params < 0)
+        wrong[:, 1] |= params[:, 1] == 0  # without bulk stiffness there is no pressure
+        wrong[:, 7] |= (params[:, 7] > 0) & (params[:, 7] < 1)  # the energy needs gamma >= 1
         if bool(wrong.any()):
             _checked.pop(params, None)
             row, column = (int(i) for i in wrong.nonzero()[0])
-            need = "positive and finite" if column == 1 else "finite and not negative"
+            need = {1: "positive and finite", 7: "0 or at least 1"}
             raise ValueError(
-                f"{op}: params[{row}] {PARAM_COLUMNS[column]} must be {need}, "
-                f"got {float(params[row, column]):g}"
+                f"{op}: params[{row}] {PARAM_COLUMNS[column]} must be "
+                f"{need.get(column, 'finite and not negative')}, got {float(params[row, column]):g}"
             )
     if material is not None and material.numel() and _is_new(material, rows):
         low, high = (int(v) for v in torch.aminmax(material))
@@ -73,6 +78,20 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
             raise ValueError(
                 f"{op}: material must hold rows 0 to {rows - 1} of params, got {low} to {high}"
             )
+
+
+def _viscous(law: Tensor, params: Tensor) -> bool:
+    """Tell whether a row is a fluid with viscosity; reads the tables when they are new."""
+    versions = None
+    if not (law.is_inference() or params.is_inference()):
+        versions = (params._version, law.data_ptr(), law._version)
+        known = _viscous_tables.get(params)
+        if known is not None and known[0] == versions:
+            return bool(known[1])
+    found = bool(((law == LAWS["fluid"]) & (params[:, 2] > 0)).any())
+    if versions is not None:
+        _viscous_tables[params] = (versions, found)
+    return found
 
 
 def _check_material(
@@ -102,22 +121,37 @@ def return_mapping(
     k: float = 2.0,
     epsilon: float = 0.1,
     implicit: bool = True,
+    dt: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Advance elastic strain by one step and return it to the yield surface.
 
     The trial strain ``e + A + A^T + A A^T + A e + e A^T + A e A^T`` (b pushed forward by I + A) is
-    kept if elastic; under NACC it is projected to the surface
-    ``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0``,
-    ``p0 = kappa (1e-5 + sinh(xi max(-alpha, 0)))``, along the line to the dynamic centre, and alpha
-    follows. The stored energy never increases. See docs/return-mapping.md.
+    kept bit for bit if elastic and otherwise returned to the yield surface of its law:
+
+    * 0 ``elastic``: neo-Hookean (Borden); 6 ``corotated``: fixed corotated. Never yield.
+    * 1 ``nacc``: ``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0``,
+      ``p0 = kappa (1e-5 + sinh(xi max(-alpha, 0)))``, along the line to the dynamic centre.
+    * 2 ``drucker_prager``: Hencky elasticity, ``|dev tau| <= 3 alpha_DP (p + c)``, no tension
+      beyond ``p = -c``, with volume correction.
+    * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``.
+    * 4 ``fluid``: ``p = max(K/gamma (J^-gamma - 1), 0)`` and Newtonian viscosity; the strain is
+      ``(J^(2/3) - 1) I`` and J follows ``exp(tr A)``.
+    * 5 ``rigid``: no strain, no stress; how the body moves is the solver's matter.
+
+    The stored energy never increases. See docs/return-mapping.md and docs/materials.md.
 
     Args:
         strain: Elastic strain e = b - I of every particle, order xx, yy, zz, xy, xz, yz, [N, 6].
-        alpha: Log plastic volume ratio, [N]; negative is intact, >= 0 fully softened.
+        alpha: State of the law, [N]. nacc: log plastic volume ratio, negative is intact, >= 0 fully
+            softened. drucker_prager: log volume opened in tension, 0 to 0.5. von_mises: accumulated
+            plastic strain. Others: not used, kept.
         increment: A = dt grad v, [N, 3, 3].
-        law: int32 [M], 0 elastic (neo-Hookean of Borden), 1 nacc.
-        params: [M, 8]: shear modulus mu [Pa], bulk modulus kappa [Pa], friction M, cohesion beta,
-            hardening xi, shear damage eta, density (not used here), reserved.
+        law: int32 [M], number of the law, see above and :data:`LAWS`.
+        params: [M, 8]: shear modulus mu [Pa]; bulk modulus kappa [Pa]; strength (nacc: friction M,
+            drucker_prager: alpha_DP, von_mises: yield stress sigma_y [Pa], fluid: viscosity
+            [Pa s]); cohesion (nacc: beta, drucker_prager: tensile pressure c [Pa]); hardening
+            (nacc: xi, von_mises: modulus H [Pa]); shear damage (nacc: eta); density [kg/m^3], not
+            used here; exponent (fluid: gamma, 0 means 7).
         material: int32 [N], row of ``law`` and ``params`` per particle. None: row 0 for all if
             M = 1, row i for particle i if M = N.
         k: Exponent of the dynamic centre; 2 is GaussianFluent's, infinity the fixed centre of
@@ -125,21 +159,25 @@ def return_mapping(
         epsilon: Lipschitz regularisation of the dynamic centre, 0 (the paper's) to below 1.
         implicit: Solve alpha together with the surface it moves, so that the result lies on the
             *updated* surface; False takes the surface of the old alpha.
+        dt: Time step [s]; only viscosity reads it (grad v = A / dt).
 
     Returns:
         ``(strain, alpha, stress, info)``: the new strain [N, 6] and alpha [N], the Kirchhoff stress
         [Pa] [N, 6], and int32 [4] counts of plastic, guarded (volume ratio outside [0.05, 20] or
-        stretch beyond about 10: pulled back), inverted (det(I + A) <= 0) and invalid (non-finite,
-        reset to rest) particles.
+        stretch beyond about 10, fluid: J below 0.6 or a step beyond a factor 1.25: pulled back),
+        inverted (det(I + A) <= 0) and invalid (non-finite, reset to rest) particles.
 
     Raises:
         TypeError: A tensor has a wrong dtype.
-        ValueError: A shape, device, law, parameter or material row is wrong, k < 0, or epsilon is
-            outside [0, 1). Table contents are read once per table (again after in-place changes).
+        ValueError: A shape, device, law, parameter or material row is wrong, k < 0, epsilon is
+            outside [0, 1), dt is negative, or a viscous fluid comes without dt. Table contents are
+            read once per table (again after in-place changes).
 
     Gradient: with respect to strain, alpha, increment and params, by the differentiable reference
     recomputed in the backward pass. Not differentiable at the kinks of the map.
-    Source: Wolper et al. 2019 (NACC); GaussianFluent, Eq. 6 (dynamic centre, epsilon = 0).
+    Source: Wolper et al. 2019 (NACC); GaussianFluent, Eq. 6 (dynamic centre, epsilon = 0); Klar et
+    al. 2016 and Tampubolon et al. 2017 (sand); Simo and Hughes 1998, box 3.1 (metal); Tait's
+    equation after Monaghan 1994 (fluid); Stomakhin et al. 2012 (fixed corotated).
     """
     op = "return_mapping"
     check_tensor(op, "strain", strain, shape=("N", 6))
@@ -151,11 +189,24 @@ def return_mapping(
         raise ValueError(f"{op}: k must not be negative, got {k}")
     if not (0.0 <= epsilon < 1.0):
         raise ValueError(f"{op}: epsilon must be in [0, 1), got {epsilon}")
+    if not (0.0 <= dt < math.inf):
+        raise ValueError(f"{op}: dt must be finite and not negative, got {dt}")
+    if dt == 0.0 and not torch.compiler.is_compiling() and _viscous(law, params):
+        raise ValueError(f"{op}: a fluid with viscosity needs dt, the time step in seconds")
     wants_gradient = any(t.requires_grad for t in (strain, alpha, increment, params))
     if math.isinf(k) and wants_gradient and torch.is_grad_enabled():
         raise NotImplementedError(f"{op}: no gradient for the fixed centre (k = infinity)")
     result = torch.ops.gsfluent.return_mapping.default(
-        strain, alpha, increment, law, params, material, float(k), float(epsilon), bool(implicit)
+        strain,
+        alpha,
+        increment,
+        law,
+        params,
+        material,
+        float(k),
+        float(epsilon),
+        bool(implicit),
+        float(dt),
     )
     return result[0], result[1], result[2], result[3]
 
@@ -171,6 +222,7 @@ def _return_mapping_fake(
     k: float,
     epsilon: float,
     implicit: bool,
+    dt: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     n = strain.shape[0]
     return (
@@ -195,6 +247,7 @@ def _return_mapping_backward(
     k: float,
     epsilon: float,
     implicit: bool,
+    dt: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     def forward(e: Tensor, a: Tensor, inc: Tensor, par: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return reference.return_mapping(
@@ -207,6 +260,7 @@ def _return_mapping_backward(
             k=k,
             epsilon=epsilon,
             implicit=implicit,
+            dt=dt,
         )[:3]
 
     # torch.func works inside a custom op, where ordinary autograd is switched off.
@@ -230,6 +284,7 @@ def _(
     k: float,
     epsilon: float,
     implicit: bool,
+    dt: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return (
         torch.empty_like(strain),
@@ -252,7 +307,7 @@ def _backward(
     strain, alpha, increment, params = torch.ops.gsfluent.return_mapping_backward.default(
         grad_strain, grad_alpha, grad_stress, *saved, *ctx.options
     )
-    return strain, alpha, increment, None, params, None, None, None, None
+    return strain, alpha, increment, None, params, None, None, None, None, None
 
 
 torch.library.register_autograd("gsfluent::return_mapping", _backward, setup_context=_setup_context)

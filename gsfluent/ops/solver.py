@@ -23,6 +23,7 @@ from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
+from gsfluent.ops.collider import pad_colliders
 from gsfluent.ops.plasticity import return_mapping
 from gsfluent.ops.solver_buffers import INDEX
 
@@ -172,7 +173,7 @@ class Solver:
         b = layout.empty_buffers(velocity, n)
         b.law, b.rows = row_law, rows
         if colliders is not None and colliders.shape[0] > 0:
-            b.colliders = colliders.to(velocity).clone().contiguous()
+            b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
             count = colliders.shape[0]
             b.impulse_units = torch.zeros(count, 3, dtype=torch.int64, device=self.device)
             b.impulse = torch.zeros(count, 3, dtype=torch.float64, device=self.device)

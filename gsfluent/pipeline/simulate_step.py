@@ -333,7 +333,7 @@ class Stepper:
         )  # fmt: skip
         strain, alpha, stress, info = ops.return_mapping(
             active.strain, active.alpha, dt * affine,
-            law=self._law, params=self._params, material=self._fields, **self.return_map,
+            law=self._law, params=self._params, material=self._fields, dt=dt, **self.return_map,
         )  # fmt: skip
         moved = active.replace(
             position=position, velocity=velocity, affine=affine, deformation=deformation,

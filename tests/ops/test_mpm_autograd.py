@@ -247,7 +247,9 @@ def test_opcheck(grad: bool) -> None:
     grid = torch.rand(2, blocks.block_count, 64, 4, dtype=torch.float64, requires_grad=grad)
     moments = None if grad else torch.rand(2, blocks.block_count, 64, 6, dtype=torch.float64)
     rest = (DX, 0.1, 0.0, 0.0, -9.81, 0.3, 0.0, 1.0)
-    torch.library.opcheck(lib.grid_update.default, (grid, moments, None, blocks.coords, *rest))
+    torch.library.opcheck(
+        lib.grid_update.default, (grid, moments, None, None, blocks.coords, *rest)
+    )
     position = position.detach()
     torch.library.opcheck(lib.p2g_adjoint.default, (grid.detach(), position, body, *index, DX))
     slopes = (grid.detach(), torch.ones(N, 4).double(), torch.ones(N, 3, 3).double(), position)
@@ -344,7 +346,7 @@ def test_build_blocks_errors() -> None:
         ({"gravity": (0.0, 1.0)}, "gravity must have three numbers, got 2"),
         ({"friction": -1.0}, "friction must be >= 0"),
         ({"restitution": 1.5}, r"restitution must be in \[0, 1\]"),
-        ({"colliders": torch.zeros(1, 3).double()}, r"colliders must have shape \[\*, 16\]"),
+        ({"colliders": torch.zeros(1, 3).double()}, r"colliders must have shape \[\*, 32\]"),
         ({"colliders": torch.zeros(1, 16).double()}, "colliders row 0 must be finite, with type 0"),
         ({"colliders": torch.full((1, 16), 7.0).double()}, "colliders row 0"),
         ({"moments": torch.zeros(1, 1, 64, 6).double()}, "moments must have shape"),

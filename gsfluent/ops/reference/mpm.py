@@ -10,7 +10,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsfluent.ops.collider import pad_colliders
 from gsfluent.ops.mpm import Blocks
+from gsfluent.ops.reference.collider import collide
 
 
 def stencil(position: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -167,37 +169,6 @@ def _contact(
     return velocity[a] - impulse / ma, velocity[b] + impulse / mb, touch.squeeze(-1)
 
 
-def _collide(row: Sequence[float], x: Tensor, dx: float, velocity: Tensor) -> Tensor:
-    """Velocity after one collider; x [B, 64, 3], velocity [K, B, 64, 3]."""
-    kind, mode, friction = row[:3]
-    point, normal, own = (x.new_tensor(row[i : i + 3]) for i in (3, 6, 10))
-    radius, restitution = row[9], row[13]
-    offset = x - point
-    if kind == 0:
-        n = (normal / normal.norm()).expand_as(x)
-        inside = (offset * n).sum(-1, keepdim=True) <= 1e-4 * dx
-    else:
-        distance = offset.norm(dim=-1, keepdim=True)
-        up = x.new_tensor([0.0, 0.0, 1.0])
-        n = torch.where(distance > 0, offset / distance.clamp_min(1e-300), up)
-        inside = distance <= radius + 1e-4 * dx
-    relative = velocity - own
-    vn = (relative * n).sum(-1, keepdim=True)
-    slip = relative - vn * n
-    if mode == 0:
-        after = own.expand_as(velocity)
-    elif mode == 1:
-        after = own + slip
-    else:
-        speed = slip.norm(dim=-1, keepdim=True)
-        drag = -friction * (1 + restitution) * vn
-        sticks = (drag >= speed) & (drag > 0)
-        kept = torch.where(sticks, 0.0, 1.0 - drag / torch.where((speed > 0) & ~sticks, speed, 1.0))
-        bounced = own + kept * slip - restitution * vn * n
-        after = torch.where(vn < 0, bounced, velocity)
-    return torch.where(inside, after, velocity)
-
-
 def grid_update(
     grid: Tensor,
     *,
@@ -206,12 +177,13 @@ def grid_update(
     blocks: Blocks,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     colliders: Tensor | None = None,
+    sdf: Tensor | None = None,
     moments: Tensor | None = None,
     friction: float = 0.3,
     restitution: float = 0.0,
     contact_gap: float = 1.0,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Reference of :func:`gsfluent.ops.grid_update`."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Reference of :func:`gsfluent.ops.grid_update` with ``return_torque=True``."""
     mass = grid[..., 3:]
     heavy = mass > 1e-30
     velocity = grid[..., :3] / torch.where(heavy, mass, 1.0) + dt * grid.new_tensor(gravity)
@@ -225,11 +197,16 @@ def grid_update(
                 velocity = velocity.clone()
                 velocity[a], velocity[b] = va, vb
                 touched |= touch
-    impulses = []
+    impulses, torques = [], []
     x = blocks.node_positions(dx, grid.dtype)
-    for row in [] if colliders is None else colliders.tolist():
-        after = torch.where(heavy, _collide(row, x, dx, velocity), velocity)
-        impulses.append((mass * (after - velocity)).double().sum(dim=(0, 1, 2)))
+    for row in [] if colliders is None else pad_colliders(colliders):
+        after = collide(row, sdf, x, velocity, mass[..., 0], dx, dt)
+        given = (mass * (after - velocity)).double()
+        impulses.append(given.sum(dim=(0, 1, 2)))
+        arm = (x - row[3:6]).double().expand_as(given)
+        torques.append(torch.linalg.cross(arm, given).sum(dim=(0, 1, 2)))
         velocity = after
-    impulse = torch.stack(impulses) if impulses else grid.new_zeros(0, 3, dtype=torch.float64)
-    return velocity, impulse, touched.sum()
+    none = grid.new_zeros(0, 3, dtype=torch.float64)
+    impulse = torch.stack(impulses) if impulses else none
+    torque = torch.stack(torques) if torques else none
+    return velocity, impulse, torque, touched.sum()

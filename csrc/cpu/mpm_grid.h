@@ -1,0 +1,71 @@
+// CPU kernel of grid_update: chunks of blocks in parallel, sums over chunks in their order.
+#pragma once
+
+#include <algorithm>
+#include <numeric>
+#include <vector>
+
+#include "core/mpm_args.h"
+#include "torch_api.h"
+
+namespace gsf {
+namespace cpu {
+
+// Ordered sums over chunks of `columns` numbers: the same for any number of threads.
+inline void sum_chunks(const double* partial, int64_t chunks, int64_t columns, double* sums) {
+  for (int64_t chunk = 0; chunk < chunks; ++chunk)
+    for (int64_t i = 0; i < columns; ++i) sums[i] += partial[chunk * columns + i];
+}
+
+template <typename T>
+void grid_update(const GridUpdateArgs<T>& a) {
+  const int64_t chunks = grid_update_chunks(a.count), rows = a.collider_count;
+  std::vector<int64_t> touched(chunks, 0);
+  std::vector<char> valid(rows, 0);
+  bool any_mass = false;
+  for (int64_t c = 0; c < rows; ++c) {
+    const T* row = a.colliders + c * kColliderColumns;
+    valid[c] = collider_valid(row, a.sdf_count);
+    any_mass = any_mass || (valid[c] && row[kMass] > T(0));
+    // A row that is no collider must not be ignored quietly.
+    if (!valid[c]) std::fill(a.impulse + 6 * c, a.impulse + 6 * c + 6, double(NAN));
+  }
+  const auto for_nodes = [&](int64_t chunk, const auto& f) {
+    const int64_t first = chunk * kChunkBlocks * kBlockNodes;
+    const int64_t last = std::min(first + kChunkBlocks * kBlockNodes, a.count * kBlockNodes);
+    for (int64_t node = first; node < last; ++node) f(node);
+  };
+  parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
+    for (int64_t chunk = begin; chunk < end; ++chunk) {
+      for_nodes(chunk, [&](int64_t node) { touched[chunk] += update_node(a, node); });
+      double* mass = a.partial + chunk * rows;
+      for (int64_t c = 0; any_mass && c < rows; ++c) {
+        const T* row = a.colliders + c * kColliderColumns;
+        mass[c] = 0.0;
+        if (!valid[c] || !(row[kMass] > T(0))) continue;
+        for_nodes(chunk, [&](int64_t node) { mass[c] += touching_mass(a, row, node); });
+      }
+    }
+  });
+  if (any_mass) sum_chunks(a.partial, chunks, rows, a.contact_mass);
+  if (rows > 0) {
+    parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t chunk = begin; chunk < end; ++chunk) {
+        double* partial = a.partial + 6 * chunk * rows;
+        std::fill(partial, partial + 6 * rows, 0.0);
+        for (int64_t c = 0; c < rows; ++c) {
+          const T* row = a.colliders + c * kColliderColumns;
+          if (!valid[c]) continue;
+          const T give = collider_give(row, static_cast<T>(a.contact_mass[c]));
+          for_nodes(chunk,
+                    [&](int64_t node) { collide_node(a, row, give, node, partial + 6 * c); });
+        }
+      }
+    });
+    sum_chunks(a.partial, chunks, 6 * rows, a.impulse);
+  }
+  *a.contact_nodes = std::accumulate(touched.begin(), touched.end(), int64_t(0));
+}
+
+}  // namespace cpu
+}  // namespace gsf
