@@ -31,7 +31,7 @@ CLOCK = (
     "slots", "sites", "cursor", "arrived", "speed", "wave", "gradient", "bound",
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
-    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "spare0", "spare1",
+    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "spare",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}

@@ -83,7 +83,10 @@ def unit_det_shift(d: Tensor) -> Tensor:
     with torch.no_grad():
         y = 2.0 * (h / 3.0).sqrt()
         for _ in range(60):  # monotone from above
-            y = y - torch.where(slope(y, h) > 0, residual(y, h, c) / slope(y, h), 0.0)
+            step = torch.where(slope(y, h) > 0, residual(y, h, c) / slope(y, h), 0.0)
+            y = y - step
+            if not bool((step.abs() > 1e-15 * (1.0 + y.abs())).any()):
+                break
         safe_slope = torch.where(slope(y, h) > 0, slope(y, h), 1.0)
     return y - residual(y, h, c) / safe_slope
 
@@ -195,18 +198,29 @@ def _bracketed_root(
 
 
 def _solve_alpha(
-    m: Material, o: Options, log_j: Tensor, n: Tensor, p: Tensor, q: Tensor, alpha: Tensor
+    m: Material,
+    o: Options,
+    log_j: Tensor,
+    n: Tensor,
+    p: Tensor,
+    q: Tensor,
+    alpha: Tensor,
+    root: Tensor | None = None,
 ) -> Tensor:
-    """X = alpha + step(surface at x), with its derivative when a graph is wanted."""
+    """X = alpha + step(surface at x), with its derivative; ``root`` is x where it is known."""
 
     def residual(x: Tensor) -> Tensor:
         cross, _, r = project(m, o, x, p, q)
         return x - alpha - _alpha_step(m, log_j, n, cross, r)
 
     with torch.no_grad():
-        step = -residual(alpha)
-        eps = 4.0 * torch.finfo(alpha.dtype).eps
-        x = _bracketed_root(residual, alpha, step, eps * (alpha.abs() + step.abs() + log_j.abs()))
+        if root is None:
+            step = -residual(alpha)
+            eps = 4.0 * torch.finfo(alpha.dtype).eps
+            size = alpha.abs() + step.abs() + log_j.abs()
+            x = _bracketed_root(residual, alpha, step, eps * size)
+        else:
+            x = root
         # The residual of a particle depends on its own x only: one tangent gives every slope.
         slope = torch.func.jvp(residual, (x,), (torch.ones_like(x),))[1]
         slope = torch.where(slope.abs() > 1e-6, slope, 1.0)
@@ -233,8 +247,12 @@ def return_mapping(
     epsilon: float = 0.1,
     implicit: bool = True,
     dt: float = 0.0,
+    root: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One constitutive step; arguments and results as :func:`gsfluent.ops.return_mapping`."""
+    """One constitutive step; arguments and results as :func:`gsfluent.ops.return_mapping`.
+
+    ``root``, [N], is the implicit alpha when it is known already; only its derivative is computed.
+    """
     count = strain.shape[0]
     m = gather_material(params, material, count)
     laws = law[material.long()] if material is not None else law.expand(count)
@@ -279,7 +297,10 @@ def return_mapping(
     slack = 2e-15 if e.dtype == torch.float64 else 1e-6
     plastic = valid & nacc & (u**2 + w**2 > 1.0 + slack)
     if implicit:
-        new_alpha = _solve_alpha(m, o, log_j, n, p, q, alpha).clamp(ALPHA_MIN, ALPHA_MAX)
+        new_alpha = _solve_alpha(m, o, log_j, n, p, q, alpha, root)
+        if root is not None:  # at a limit it moves no further
+            new_alpha = torch.where((root > ALPHA_MIN) & (root < ALPHA_MAX), new_alpha, root)
+        new_alpha = new_alpha.clamp(ALPHA_MIN, ALPHA_MAX)
         _, p_new, r = project(m, o, new_alpha, p, q)
     else:
         cross, p_new, r = project(m, o, alpha, p, q)
