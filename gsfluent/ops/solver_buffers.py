@@ -136,9 +136,10 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
         values[name] = zeros(count, width)
     for name in ("meta", "id", "entry", "place"):
         values[name] = zeros(count, dtype=torch.int32)
-    for name in ("law", "home_coord0", "home_start0", "home_count0", "home_coord1", "home_start1",
-                 "home_count1"):  # fmt: skip
+    for name in ("law", "home_start0", "home_count0", "home_start1", "home_count1"):
         values[name] = zeros(0, dtype=torch.int32)
+    for name in ("home_coord0", "home_coord1"):
+        values[name] = zeros(0, 4, dtype=torch.int32)
     values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
     values["impulse_units"] = zeros(0, 3, dtype=torch.int64)
     values["impulse"] = zeros(0, 3, dtype=torch.float64)
