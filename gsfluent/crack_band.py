@@ -1,0 +1,139 @@
+"""Crack-band scaling: softening that dissipates the same energy per crack area on every grid.
+
+A crack in a local softening law is a band of cells, so what it dissipates per area is the energy
+density of the law times a few ``dx``: finer grids break more easily, without end. Stretching the
+softening by ``reference / dx`` at unchanged strength keeps the product (Bazant and Oh 1983, "Crack
+band theory for fracture of concrete"). For NACC, whose strength is
+``p0 = kappa sinh(xi max(-alpha, 0))`` and whose damage is a strain, that is
+``alpha0 -> alpha0 s``, ``xi -> xi / s`` with ``s = reference / dx``. docs/fracture.md has the
+measured slopes with and without.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["BAND_CELLS", "brittle_spacing", "crack_band", "fracture_energy", "softening_energy"]
+
+BAND_CELLS = 2.0
+"""Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
+the crack runs along a plane of nodes (measured, docs/fracture.md)."""
+_ALPHA_MIN = -10.0
+"""Smallest alpha the return map keeps."""
+
+
+def crack_band(
+    params: Tensor, alpha: Tensor, *, dx: float, reference: float
+) -> tuple[Tensor, Tensor]:
+    """Return NACC parameters and alpha that dissipate on ``dx`` what the given ones do elsewhere.
+
+    Args:
+        params: Rows of :func:`gsfluent.ops.return_mapping`, [M, 8] or [8]; only the hardening
+            (column 4) changes. Pass rows of NACC material only.
+        alpha: Log plastic volume ratio at the start, any shape; negative is intact.
+        dx: Node spacing of the simulation [m].
+        reference: Node spacing the parameters were chosen for [m].
+
+    Returns:
+        ``(params, alpha)``: new tensors; strength and stiffness are those of the input. Beyond
+        :func:`brittle_spacing` the strength is lost in one step, and the energy is no longer kept.
+
+    Raises:
+        ValueError: A spacing is not positive, or alpha leaves the range of the return map.
+    """
+    if not (0.0 < dx < math.inf and 0.0 < reference < math.inf):
+        raise ValueError(f"crack_band: dx and reference must be positive, got {dx} and {reference}")
+    scale = reference / dx
+    stretched = torch.where(alpha < 0, alpha * scale, alpha)
+    if bool((stretched < _ALPHA_MIN).any()):
+        raise ValueError(
+            f"crack_band: alpha becomes {float(stretched.min()):.3g}, below {_ALPHA_MIN:g}: "
+            f"dx = {dx:g} m is too far below the reference of {reference:g} m"
+        )
+    rows = params.clone()
+    rows[..., 4] = rows[..., 4] / scale
+    return rows, stretched
+
+
+def brittle_spacing(params: Tensor, *, reference: float) -> Tensor:
+    """Largest node spacing on which the softening is still slower than elastic unloading [m].
+
+    ``reference / (beta xi)``: above it ``cohesion * hardening > 1`` after :func:`crack_band`, a
+    point past the tensile tip has no neighbouring state to soften to, and loses its strength in one
+    step (docs/return-mapping.md).
+
+    Args:
+        params: [M, 8] or [8], as given to :func:`crack_band`.
+        reference: Node spacing they were chosen for [m].
+
+    Returns:
+        [M] or a scalar; infinite where the product is zero.
+    """
+    return reference / (params[..., 3] * params[..., 4])
+
+
+def softening_energy(params: Tensor, alpha: float, *, steps: int = 400) -> float:
+    """Energy per volume that uniaxial straining dissipates until the strength is gone [J/m^3].
+
+    The work of the stress along the path of one point, stretched along x with the other directions
+    held, less what is still stored at the end.
+
+    Args:
+        params: One NACC row, [8].
+        alpha: Log plastic volume ratio at the start, negative.
+        steps: Steps of the path up to a stretch of ``1.5 |alpha|`` beyond the elastic limit.
+
+    Returns:
+        The energy density. For softening slow against elastic unloading it grows linearly with
+        ``|alpha|`` at fixed strength.
+
+    Raises:
+        ValueError: alpha is not negative, or the strength is not lost on the path (the row is not
+            one of material that softens in tension).
+    """
+    from gsfluent import ops
+
+    if not alpha < 0.0:
+        raise ValueError(f"softening_energy: alpha must be negative, got {alpha}")
+    row = params.detach().double().cpu().reshape(1, 8)
+    kappa, beta, xi = (float(row[0, i]) for i in (1, 3, 4))
+    elastic = max(1.0, beta) * math.sinh(min(-xi * alpha, 5.0))
+    stretch = 1.5 * -alpha + 3.0 * min(elastic, 0.5)
+    law = torch.ones(1, dtype=torch.int32)
+    strain, a = torch.zeros(1, 6, dtype=torch.float64), torch.tensor([alpha], dtype=torch.float64)
+    stress = torch.zeros_like(strain)
+    increment = torch.zeros(1, 3, 3, dtype=torch.float64)
+    increment[0, 0, 0] = math.expm1(stretch / steps)
+    work = 0.0
+    for _ in range(steps):
+        before = float(stress[0, 0])
+        strain, a, stress, _ = ops.return_mapping(strain, a, increment, law=law, params=row)
+        work += 0.5 * (before + float(stress[0, 0])) * stretch / steps
+        if float(a) >= 0.0:
+            return work - float(ops.elastic_energy(strain, law=law, params=row))
+    raise ValueError(
+        f"softening_energy: alpha is still {float(a):.3g} at a strain of {stretch:.3g} "
+        f"(kappa {kappa:g}, cohesion {beta:g}, hardening {xi:g})"
+    )
+
+
+def fracture_energy(params: Tensor, alpha: float, *, dx: float) -> float:
+    """Energy per crack area of a NACC material on a grid of spacing ``dx`` [J/m^2].
+
+    :func:`softening_energy` times a band of ``BAND_CELLS`` cells, so a lower bound: measured cracks
+    are up to a half wider, depending on how they lie on the grid (docs/fracture.md).
+
+    Args:
+        params: One NACC row, [8], as used on that grid (after :func:`crack_band` if any).
+        alpha: Log plastic volume ratio at the start.
+        dx: Node spacing [m].
+
+    Raises:
+        ValueError: As :func:`softening_energy`, or ``dx`` is not positive.
+    """
+    if not 0.0 < dx < math.inf:
+        raise ValueError(f"fracture_energy: dx must be positive, got {dx}")
+    return BAND_CELLS * dx * softening_energy(params, alpha)

@@ -1,0 +1,95 @@
+"""Plastic and fracture problems with known answers (gsfluent.lab), the fast ones."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from gsfluent import crack_band
+from gsfluent.lab import registry, softening, spall
+from gsfluent.lab.paths import breaking_step
+from gsfluent.lab.slab import nacc
+
+FAST = ("plate_impact_spall", "return_map_paths", "softening_bar")
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_fast_problems_meet_their_tolerances(name: str) -> None:
+    (item,) = [p for p in registry.problems("fast") if p.name == name]
+    for result in registry.run(item):
+        assert result.passed, (
+            f"{result.quantity}: {result.value:.6g}, wanted {result.reference:.6g}"
+        )
+
+
+def test_a_weaker_impact_does_not_spall() -> None:
+    plane, strength = spall.plate_impact_spall(over=0.9)
+    assert math.isnan(plane.value) and not plane.passed
+    # the whole pulse comes out: the face stops, so the "strength" is the impact stress
+    assert strength.value == pytest.approx(0.9 * strength.reference, rel=0.05)
+
+
+def test_watermelon_of_cohesion_one_breaks_in_shear_only_with_shear_damage() -> None:
+    assert breaking_step("simple shear", cohesion=1.0, implicit=False)[0] is None
+    step, _, _ = breaking_step("simple shear", cohesion=1.0, shear_damage=0.3, implicit=False)
+    assert step is not None and abs(step - 293) <= 1  # equations.md 7.4
+    assert breaking_step("simple shear", cohesion=5.0, implicit=False)[1] <= -0.04  # it hardens
+
+
+def test_implicit_alpha_breaks_a_few_steps_earlier_than_explicit() -> None:
+    for path, most in (("simple shear", 8), ("uniaxial tension", 8), ("isotropic tension", 6)):
+        late, early = (breaking_step(path, shear_damage=0.3, implicit=i)[0] for i in (False, True))
+        assert late is not None and early is not None and 0 < late - early <= most
+
+
+def test_crack_band_keeps_strength_and_stretches_softening() -> None:
+    row = nacc(1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, hardening=0.4)
+    alpha = torch.tensor([-0.05, -0.02, 0.0, 0.3], dtype=torch.float64)
+    rows, stretched = crack_band.crack_band(row, alpha, dx=0.01, reference=0.04)
+    assert torch.allclose(stretched, torch.tensor([-0.2, -0.08, 0.0, 0.3], dtype=torch.float64))
+    before, after = row[4] * alpha[:2], rows[4] * stretched[:2]
+    assert torch.allclose(before, after, rtol=1e-14)  # p0 = kappa sinh(xi |alpha|) is the same
+    assert torch.equal(rows[torch.arange(8) != 4], row[torch.arange(8) != 4])
+    same = crack_band.fracture_energy(row, -0.05, dx=0.04)
+    assert crack_band.fracture_energy(rows, -0.2, dx=0.01) == pytest.approx(same, rel=0.03)
+    # without scaling the finer grid would take a quarter of the energy
+    assert crack_band.fracture_energy(row, -0.05, dx=0.01) == pytest.approx(0.25 * same)
+
+
+def test_crack_band_knows_the_grid_that_is_too_coarse() -> None:
+    row = nacc(1e9, 0.2, 1000.0, friction=2.0, cohesion=0.5, hardening=1.0)
+    limit = float(crack_band.brittle_spacing(row, reference=0.01))
+    assert limit == pytest.approx(0.02)
+    energy = []
+    for dx in (limit / 8.0, limit / 4.0, 2.0 * limit, 4.0 * limit):
+        scaled, alpha = crack_band.crack_band(row, torch.tensor(-0.02), dx=dx, reference=0.01)
+        energy.append(crack_band.fracture_energy(scaled, float(alpha), dx=dx))
+    assert energy[1] == pytest.approx(energy[0], rel=0.1)
+    assert energy[3] > 1.3 * energy[2]  # a one-step failure takes the stored energy of the band
+
+
+def test_crack_band_refuses_bad_numbers() -> None:
+    row = nacc(1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, hardening=0.4)
+    with pytest.raises(ValueError, match="positive"):
+        crack_band.crack_band(row, torch.tensor(-0.1), dx=0.0, reference=1.0)
+    with pytest.raises(ValueError, match="below"):
+        crack_band.crack_band(row, torch.tensor(-0.1), dx=1e-3, reference=1.0)
+    with pytest.raises(ValueError, match="negative"):
+        crack_band.softening_energy(row, 0.0)
+    with pytest.raises(ValueError, match="positive"):
+        crack_band.fracture_energy(row, -0.1, dx=-1.0)
+    with pytest.raises(ValueError, match="still"):  # alpha moves by 0.2 in a step at most
+        crack_band.softening_energy(row, -9.0, steps=10)
+
+
+def test_a_crack_of_two_grids_takes_the_same_energy_only_with_crack_band() -> None:
+    """The slow problem ``double_cantilever`` at its two smallest grids and one position."""
+    coarse, fine, plain = (
+        softening.open_cantilever(n, regularised=r, shift=0.25, reference=24, crossings=7.0)
+        for n, r in ((24, True), (36, True), (36, False))
+    )
+    assert min(coarse.tip, fine.tip, plain.tip) > 0.55
+    assert fine.energy == pytest.approx(coarse.energy, rel=0.15)
+    assert plain.energy < 0.8 * coarse.energy
