@@ -72,22 +72,16 @@ void scatter_momentum(const ParticleMomentum<T>& q, const Stencil<T>& s, Lanes<T
   }
 }
 
-// Mass gradient sum m dw/dx_p and first moment sum w m (x_p - x_node), two lanes-of-four per node.
+// First moment of the mass about the node, for contact.
 template <typename T>
-void scatter_moments(const Stencil<T>& s, T mass, T dx, Lanes<T>* node, int32_t edge) {
-  const T per_dx = mass / dx;
+void scatter_moments(const Stencil<T>& s, T mass, Lanes<T>* node, int32_t edge) {
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
-      const T w = s.w[0][i] * s.w[1][j];
-      const Lanes<T> lateral{per_dx * s.slope(0, i) * s.w[1][j], per_dx * s.w[0][i] * s.slope(1, j),
-                             T(0), T(0)};
-      const Lanes<T> vertical{T(0), T(0), per_dx * w, T(0)};
-      Lanes<T>* n = node + 2 * (i * edge + j) * edge;
+      const T w = mass * s.w[0][i] * s.w[1][j];
+      Lanes<T>* n = node + (i * edge + j) * edge;
       for (int k = 0; k < 3; ++k) {
-        const T m = mass * w * s.w[2][k] * dx;
-        const Lanes<T> offset{s.f[0] - T(i), s.f[1] - T(j), s.f[2] - T(k), T(0)};
-        n[2 * k] += s.w[2][k] * lateral + s.slope(2, k) * vertical;
-        n[2 * k + 1] += m * offset;
+        const Vec3<T> m = contact_moment(s, w * s.w[2][k], i, j, k);
+        n[k] += Lanes<T>{m.x, m.y, m.z, T(0)};
       }
     }
 }
@@ -103,15 +97,15 @@ bool scatter_stray(const P2GArgs<T>& a, int64_t p) {
   if (!make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s)) return false;
   if (!at.find(a.blocks, s)) return false;
   Lanes<T> tile[27] = {};
-  Lanes<T> moment[54] = {};
+  Lanes<T> moment[27] = {};
   scatter_momentum(momentum_of(a, s, p), s, tile, 3);
-  if (a.moments != nullptr) scatter_moments(s, a.mass[p], a.dx, moment, 3);
+  if (a.moments != nullptr) scatter_moments(s, a.mass[p], moment, 3);
   const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
   for (int n = 0; n < 27; ++n) {
     const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
     for (int c = 0; c < 4; ++c) a.grid[4 * node + c] += tile[n][c];
     if (a.moments == nullptr) continue;
-    for (int c = 0; c < 6; ++c) a.moments[6 * node + c] += moment[2 * n + c / 3][c % 3];
+    for (int c = 0; c < kContactMoments; ++c) a.moments[kContactMoments * node + c] += moment[n][c];
   }
   return true;
 }
@@ -132,7 +126,7 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
   for (uint64_t left = fields_in(view, range, a.body, a.fields); left != 0; left &= left - 1) {
     const int32_t field = __builtin_ctzll(left);
     tile.assign(window.nodes(), Lanes<T>{});
-    if (a.moments != nullptr) moment.assign(2 * window.nodes(), Lanes<T>{});
+    if (a.moments != nullptr) moment.assign(window.nodes(), Lanes<T>{});
     for (int64_t r = range.begin; r < range.end; ++r) {
       fetch_particle(a, r + kAhead, range.end);
       const int64_t p = view.order[r];
@@ -144,7 +138,7 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
       if (o < 0) continue;
       ++placed;
       scatter_momentum(momentum_of(a, s, p), s, tile.data() + o, edge);
-      if (a.moments != nullptr) scatter_moments(s, a.mass[p], a.dx, moment.data() + 2 * o, edge);
+      if (a.moments != nullptr) scatter_moments(s, a.mass[p], moment.data() + o, edge);
     }
     const int64_t base = int64_t(field) * view.count * kBlockNodes;
     window.for_each_run([&](int32_t t, int64_t node, int32_t run) {
@@ -152,9 +146,9 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
       for (int32_t n = 0; n < run; ++n)
         for (int c = 0; c < 4; ++c) out[4 * n + c] += tile[t + n][c];
       if (a.moments == nullptr) return;
-      T* mom = a.moments + 6 * (base + node);
+      T* mom = a.moments + kContactMoments * (base + node);
       for (int32_t n = 0; n < run; ++n)
-        for (int c = 0; c < 6; ++c) mom[6 * n + c] += moment[2 * (t + n) + c / 3][c % 3];
+        for (int c = 0; c < kContactMoments; ++c) mom[kContactMoments * n + c] += moment[t + n][c];
     });
   }
   return static_cast<int32_t>(range.end - range.begin - placed);
