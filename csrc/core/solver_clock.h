@@ -110,6 +110,8 @@ GSF_HOST_DEVICE void end_step(SolverClock& c, double dx, int64_t count) {
   c.contact_steps += c.shared_sites > 0 ? 1 : 0;
   c.touched = 0;
   if (c.lost > 0) c.reason = kTooFast;
+  if (c.leaving > 0) c.rebuild = 1;
+  c.leaving = 0;
   if (!check_largest(c)) return;
   const double before = c.time;
   const bool last = !(c.dt_next > 0.0);
