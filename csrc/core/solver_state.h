@@ -117,7 +117,8 @@ struct SolverClock {
   int64_t wanted_slots, homes_max, slots_max, particle_steps;  // 36..39
   int64_t touched, lost, unit_bits, shared_sites;              // 40..43
   double speed_seen, wave_seen;                                // 44, 45
-  int64_t leaving, spare;                                      // 46, 47
+  int64_t leaving;                                             // 46
+  double slack;                                                // 47 cells a point may move next
 };
 constexpr int kClockWords = 48;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
