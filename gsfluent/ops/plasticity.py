@@ -61,7 +61,8 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
     if params.numel() and _is_new(params, rows):
         given, params = params, params.detach()  # checking is not part of any graph
         wrong = ~torch.isfinite(params) | (params < 0)
-        wrong[:, 1] |= params[:, 1] == 0  # without bulk stiffness there is no pressure
+        # Without bulk stiffness there is no pressure; a rigid body needs none.
+        wrong[:, 1] |= (params[:, 1] == 0) & (law != LAWS["rigid"])
         wrong[:, 7] |= (params[:, 7] > 0) & (params[:, 7] < 1)  # the energy needs gamma >= 1
         if bool(wrong.any()):
             _checked.pop(given, None)

@@ -286,7 +286,7 @@ def _parameters(body: Body, points: Tensor, seed: int) -> tuple[Tensor, Tensor, 
         at = sampler(material, index)
         params[index] = material.parameters(at)
         law[index] = materials.LAWS[material.law]
-        alpha[index] = at(material.alpha0) * _weakness(material, points[index], body, seed)
+        alpha[index] = at(material.start_alpha) * _weakness(material, points[index], body, seed)
     return params, law, alpha
 
 

@@ -159,8 +159,6 @@ def test_unknown_keys_name_their_path_and_the_nearest(
         {"solve": {"seconds_per_frame": 0.5}},
         {"solve": {"deterministic": True}},
         {"output": {"what": ["usd"]}},
-        {"objects": {"melon": {"yield_stress": 1e4}}},
-        {"objects": {"melon": {"law": "drucker_prager"}}},
     ],
 )
 def test_what_would_do_nothing_yet_is_refused(folder: Path, keys: dict[str, Any]) -> None:
