@@ -42,6 +42,31 @@ GSF_HOST_DEVICE ParticleMomentum<T> momentum_given(const Stencil<T>& s, const T*
   return q;
 }
 
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> strain_of(const SolverView<T>& s, int64_t p) {
+  const T* e = s.strain;
+  return {e[s.at(6, p, 0)], e[s.at(6, p, 1)], e[s.at(6, p, 2)],
+          e[s.at(6, p, 3)], e[s.at(6, p, 4)], e[s.at(6, p, 5)]};
+}
+template <typename T>
+GSF_HOST_DEVICE void set_strain(const SolverView<T>& s, int64_t p, const Sym3<T>& e) {
+  const T values[6] = {e.xx, e.yy, e.zz, e.xy, e.xz, e.yz};
+  for (int c = 0; c < 6; ++c) s.strain[s.at(6, p, c)] = values[c];
+}
+// The nine components of a 3 x 3 array (slope or deformation) of particle p.
+template <typename T>
+GSF_HOST_DEVICE void load_nine(const SolverView<T>& s, const T* from, int64_t p, T* out) {
+  for (int c = 0; c < 9; ++c) out[c] = from[s.at(9, p, c)];
+}
+template <typename T>
+GSF_HOST_DEVICE void store_nine(const SolverView<T>& s, T* to, int64_t p, const T* values) {
+  for (int c = 0; c < 9; ++c) to[s.at(9, p, c)] = values[c];
+}
+template <typename T>
+GSF_HOST_DEVICE void load_three(const SolverView<T>& s, const T* from, int64_t p, T* out) {
+  for (int c = 0; c < 3; ++c) out[c] = from[s.at(3, p, c)];
+}
+
 // Largest momentum one particle can give along one axis to one node before the weight: nodes lie
 // within 1.5 dx of it.
 template <typename T>
@@ -69,21 +94,22 @@ struct StepFlags {
 };
 
 template <typename T>
-GSF_HOST_DEVICE NaccMaterial<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
-  NaccMaterial<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
+GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
+  MaterialRow<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
   if (s.irreversible) m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
   return m;
 }
 
-// Speed of the pressure wave in the present state, squared (equations.md 2.1, docs/simulation.md):
-// for a uniaxial state of the neo-Hookean law the acoustic modulus is kappa (1 + J^2) / 2 + (2 mu /
-// 9) (J^(4/3) + 5 J^(-2/3)).
+// wave_speed_squared of the neo-Hookean law where the state's invariants are at hand.
 template <typename T>
-GSF_HOST_DEVICE T wave_squared(T mu, T kappa, T density, T j2m1, T log_j) {
+GSF_HOST_DEVICE T elastic_wave_squared(const MaterialRow<T>& m, const ElasticState<T>& state) {
   using std::exp;
-  const T third = exp(T(2.0 / 3.0) * log_j);  // J^(2/3)
-  return (kappa * (T(1) + T(0.5) * j2m1) + T(2.0 / 9.0) * mu * (third * third + T(5) / third)) /
-         density;
+  const T mean = clamp(exp(T(-2.0 / 3.0) * state.log_j) * (T(1) + trace(state.e) * T(1.0 / 3.0)),
+                       T(1), T(kDeviatorMax));
+  const T along = m.mu * (T(4.0 / 3.0) * mean + T(0.272165526975909) * state.n) +
+                  T(0.5) * m.kappa * (T(2) + state.j2m1);
+  const T across = m.mu * (mean + T(0.816496580927726) * state.n);
+  return max(along, across) / m.density;
 }
 
 // m C - dt V0 (4 / dx^2) tau.
@@ -95,9 +121,10 @@ GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, T
   for (int i = 0; i < 9; ++i) out[i] = mass * c.m[i] - scale * t.m[i];
 }
 
-// Moves (l, o) of one axis by `step` cells. False when it left the window.
+// Moves (l, o) of one axis by `step` cells; `leaves` is set within `slack` cells of the end of the
+// window. False when it left the window.
 template <typename T>
-GSF_HOST_DEVICE bool move_axis(T step, int& l, T& o, bool& leaves) {
+GSF_HOST_DEVICE bool move_axis(T step, T slack, int& l, T& o, bool& leaves) {
   using std::floor;
   const T there = o + step;
   if (!(there > T(-8) && there < T(8))) return false;  // NaN too
@@ -111,7 +138,7 @@ GSF_HOST_DEVICE bool move_axis(T step, int& l, T& o, bool& leaves) {
   o = rest;
   l = cell < 0 ? 0 : (cell > kLastCell ? kLastCell : cell);
   const T reached = T(cell) + rest;
-  leaves = leaves || reached < T(0.5) || reached > T(kLastCell) + T(0.5);
+  leaves = leaves || reached < slack || reached > T(kLastCell + 1) - slack;
   return cell >= 0 && cell <= kLastCell;
 }
 
@@ -123,7 +150,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
                                           Largest& largest) {
   StepFlags flags{};
-  const T inv_dx = T(1) / s.dx;
+  const T inv_dx = T(1) / s.dx, slack = T(s.clock->slack);
   const uint32_t meta = s.meta[p];
   const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
   Mat3<T> c;
@@ -131,17 +158,19 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
 
   int l[3] = {meta_cell(meta, 0), meta_cell(meta, 1), meta_cell(meta, 2)};
   for (int axis = 0; axis < 3; ++axis) {
-    T o = s.offset[3 * p + axis];
-    if (!move_axis(dt * inv_dx * value[axis], l[axis], o, flags.leaves)) flags.lost = true;
+    T o = s.offset[s.at(3, p, axis)];
+    if (!move_axis(dt * inv_dx * value[axis], slack, l[axis], o, flags.leaves)) flags.lost = true;
     flags.leaves = flags.leaves || !cell_in_reach(reach, axis, l[axis]);
-    s.offset[3 * p + axis] = o;
-    s.velocity[3 * p + axis] = value[axis];
+    s.offset[s.at(3, p, axis)] = o;
+    s.velocity[s.at(3, p, axis)] = value[axis];
   }
   s.meta[p] = pack_meta(l[0], l[1], l[2], meta_row(meta));
 
   if constexpr (kTrack) {
-    const Mat3<T> f = load_mat3(s.deformation + 9 * p);
-    store_mat3(s.deformation + 9 * p, f + dt * matmul(c, f));
+    Mat3<T> f;
+    load_nine(s, s.deformation, p, f.m);
+    f = f + dt * matmul(c, f);
+    store_nine(s, s.deformation, p, f.m);
   }
 
   const T* r = s.rows + int64_t(row) * kRowColumns;
@@ -150,40 +179,39 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
   Sym3<T> stress;
   T wave2;
   if constexpr (kLaws == kElasticOnly) {
-    const Sym3<T> e = update_strain(load_sym3(s.strain + 6 * p), increment);
+    const Sym3<T> e = update_strain(strain_of(s, p), increment);
     const ElasticState<T> state = elastic_state(e, !(det_identity_plus(increment) > T(0)));
     flags.guarded = state.guarded;
     flags.inverted = state.inverted;
     flags.invalid = !finite(e);
-    store_sym3(s.strain + 6 * p,
-               state.guarded ? strain_from_isochoric(state.d, state.log_j) : state.e);
+    set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, state.log_j) : state.e);
     stress = kirchhoff_stress(r[0], r[1], state.d, state.j2m1);
-    wave2 = wave_squared(r[0], r[1], r[6], state.j2m1, state.log_j);
+    wave2 = elastic_wave_squared(load_material(r), state);
   } else {
     const T alpha = s.alpha[p], peak = s.peak[p];
-    const ReturnMapped<T> out = return_mapping(load_sym3(s.strain + 6 * p), alpha, increment,
-                                               s.law[row], material_now(s, row, peak), s.options);
+    const MaterialRow<T> material = material_now(s, row, peak);
+    const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
+    const ReturnMapped<T> out =
+        return_mapping(strain_of(s, p), alpha, increment, law, material, s.options, dt);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
     flags.invalid = out.invalid;
-    store_sym3(s.strain + 6 * p, out.strain);
+    set_strain(s, p, out.strain);
     s.alpha[p] = out.alpha;
     s.peak[p] = out.alpha > peak ? out.alpha : peak;
     stress = out.stress;
-    const T j2m1 = max(det_minus_one(out.strain), T(-0.9999));
-    using std::log1p;
-    wave2 = wave_squared(r[0], r[1], r[6], j2m1, T(0.5) * log1p(j2m1));
+    wave2 = wave_speed_squared(law, material, out.strain);
   }
   T slope[9];
   store_slope(slope, c, stress, mass, volume, s.dx, dt_next);
-  for (int i = 0; i < 9; ++i) s.slope[9 * p + i] = slope[i];
+  store_nine(s, s.slope, p, slope);
 
   T speed2 = T(0), gradient2 = T(0);
   for (int i = 0; i < 3; ++i) speed2 += value[i] * value[i];
   for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
   bool whole = true;  // broken points carry no stress: how fast they are torn does not matter
-  if constexpr (kLaws != kElasticOnly) whole = s.peak[p] < T(0) || s.law[row] != 1;
+  if constexpr (kLaws != kElasticOnly) whole = s.peak[p] < T(0) || s.law[row] != kNacc;
   largest.speed2 = larger(float(speed2), largest.speed2);
   largest.wave2 = larger(float(wave2), largest.wave2);
   if (whole) largest.gradient2 = larger(float(gradient2), largest.gradient2);
@@ -201,30 +229,29 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   const T mass = r[kMassColumn];
   const T alpha = s.alpha != nullptr ? s.alpha[p] : T(0),
           peak = s.peak != nullptr ? s.peak[p] : alpha;
-  Mat3<T> c = load_mat3(s.slope + 9 * p);
+  Mat3<T> c;
+  load_nine(s, s.slope, p, c.m);
   const T inverse = mass > T(0) ? T(1) / mass : T(0);
   for (int i = 0; i < 9; ++i) c.m[i] *= inverse;
-  const T* v = s.velocity + 3 * p;
+  T v[3];
+  load_three(s, s.velocity, p, v);
   if (measure) {
-    const Sym3<T> e = load_sym3(s.strain + 6 * p);
-    using std::log1p;
-    const T j2m1 = max(det_minus_one(e), T(-0.9999));
     T speed2 = T(0), gradient2 = T(0);
     for (int i = 0; i < 3; ++i) speed2 += v[i] * v[i];
     for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
-    const T wave2 = wave_squared(r[0], r[1], r[6], j2m1, T(0.5) * log1p(j2m1));
+    const T wave2 = wave_speed_squared(s.law[row], load_material(r), strain_of(s, p));
     largest.speed2 = larger(float(speed2), largest.speed2);
     largest.wave2 = larger(float(wave2), largest.wave2);
-    if (peak < T(0) || s.law[row] != 1)
+    if (peak < T(0) || s.law[row] != kNacc)
       largest.gradient2 = larger(float(gradient2), largest.gradient2);
     return;
   }
   const Mat3<T> none{};
-  const ReturnMapped<T> state = return_mapping(load_sym3(s.strain + 6 * p), alpha, none, s.law[row],
-                                               material_now(s, row, peak), s.options);
+  const ReturnMapped<T> state = return_mapping(strain_of(s, p), alpha, none, s.law[row],
+                                               material_now(s, row, peak), s.options, dt);
   T slope[9];
   store_slope(slope, c, state.stress, mass, r[kVolumeColumn], s.dx, dt);
-  for (int i = 0; i < 9; ++i) s.slope[9 * p + i] = slope[i];
+  store_nine(s, s.slope, p, slope);
   largest.bound = larger(float(momentum_bound(v, slope, mass, s.dx)), largest.bound);
 }
 

@@ -117,7 +117,9 @@ struct SolverClock {
   int64_t contact_nodes, contact_steps, builds, wanted_homes;  // 32..35
   int64_t wanted_slots, homes_max, slots_max, particle_steps;  // 36..39
   int64_t touched, lost, unit_bits, shared_sites;              // 40..43
-  double speed_seen, wave_seen, spare0, spare1;                // 44..47
+  double speed_seen, wave_seen;                                // 44, 45
+  int64_t leaving;                                             // 46
+  double slack;                                                // 47 cells a point may move next
 };
 constexpr int kClockWords = 48;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
@@ -139,7 +141,7 @@ struct SolverView {
   NaccOptions<T> options;
   bool irreversible;
   SolverClock* clock;
-  // particles, grouped by home
+  // particles, grouped by home; see `at` for the layout
   T* offset;       // [N, 3] o
   uint32_t* meta;  // [N]
   T* velocity;     // [N, 3] m/s
@@ -178,6 +180,15 @@ struct SolverView {
   int64_t* impulse_units;  // [K, 3] of this step, in momentum units (CUDA)
   double* impulse;         // [K, 3] N s since the load
 
+  // Index of component c of particle p in an array of `width` components: component by component on
+  // the GPU (neighbouring lanes read neighbouring words), particle by particle on the CPU.
+  GSF_HOST_DEVICE int64_t at(int width, int64_t p, int c) const {
+#ifdef __CUDA_ARCH__
+    return c * count + p;
+#else
+    return p * width + c;
+#endif
+  }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE HomeList<T>& next_homes() { return home[1 - (clock->parity & 1)]; }
 };

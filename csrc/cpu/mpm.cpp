@@ -6,6 +6,7 @@
 #include <atomic>
 
 #include "cpu/mpm_grid.h"
+#include "cpu/mpm_lanes.h"
 #include "cpu/mpm_tile.h"
 
 namespace gsf {
@@ -49,47 +50,6 @@ ParticleMomentum<T> momentum_of(const P2GArgs<T>& a, const Stencil<T>& s, int64_
   const T volume = a.stress != nullptr ? a.volume[p] : T(0);
   return particle_momentum(s, a.mass[p], a.velocity + 3 * p, a.affine + 9 * p, stress, volume, a.dx,
                            a.dt);
-}
-
-template <typename T>
-void scatter_momentum(const ParticleMomentum<T>& q, const Stencil<T>& s, Lanes<T>* node,
-                      int32_t edge) {
-  const Lanes<T> q0{q.constant.x, q.constant.y, q.constant.z, q.mass};
-  const Lanes<T> qx{q.slope(0, 0), q.slope(1, 0), q.slope(2, 0), T(0)};
-  const Lanes<T> qy{q.slope(0, 1), q.slope(1, 1), q.slope(2, 1), T(0)};
-  const Lanes<T> qz{q.slope(0, 2), q.slope(1, 2), q.slope(2, 2), T(0)};
-  Lanes<T> px = q0;
-  for (int i = 0; i < 3; ++i, px += qx, node += edge * edge) {
-    Lanes<T> pxy = px;
-    for (int j = 0; j < 3; ++j, pxy += qy) {
-      const T w = s.w[0][i] * s.w[1][j];
-      Lanes<T>* n = node + j * edge;
-      const Lanes<T> a = w * pxy, b = w * qz;
-      n[0] += s.w[2][0] * a;
-      n[1] += s.w[2][1] * (a + b);
-      n[2] += s.w[2][2] * (a + b + b);
-    }
-  }
-}
-
-// Mass gradient sum m dw/dx_p and first moment sum w m (x_p - x_node), two lanes-of-four per node.
-template <typename T>
-void scatter_moments(const Stencil<T>& s, T mass, T dx, Lanes<T>* node, int32_t edge) {
-  const T per_dx = mass / dx;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) {
-      const T w = s.w[0][i] * s.w[1][j];
-      const Lanes<T> lateral{per_dx * s.slope(0, i) * s.w[1][j], per_dx * s.w[0][i] * s.slope(1, j),
-                             T(0), T(0)};
-      const Lanes<T> vertical{T(0), T(0), per_dx * w, T(0)};
-      Lanes<T>* n = node + 2 * (i * edge + j) * edge;
-      for (int k = 0; k < 3; ++k) {
-        const T m = mass * w * s.w[2][k] * dx;
-        const Lanes<T> offset{s.f[0] - T(i), s.f[1] - T(j), s.f[2] - T(k), T(0)};
-        n[2 * k] += s.w[2][k] * lateral + s.slope(2, k) * vertical;
-        n[2 * k + 1] += m * offset;
-      }
-    }
 }
 
 // One particle straight to the grid, for those that left their block's window; called from one
@@ -202,35 +162,6 @@ void p2g(const P2GArgs<T>& a) {
       if (!placed && !scatter_stray(a, p)) ++*a.skipped;
     }
   }
-}
-
-// sum w g and sum w g (x_i - x_p)^T over a tile or over 27 loose nodes.
-template <typename T>
-Gathered<T> gather(const Stencil<T>& s, T dx, const Lanes<T>* node, int32_t edge) {
-  Lanes<T> sum{}, sx{}, sy{}, sz{};
-  for (int i = 0; i < 3; ++i) {
-    Lanes<T> plane{};
-    for (int j = 0; j < 3; ++j) {
-      const Lanes<T>* n = node + (i * edge + j) * edge;
-      const Lanes<T> b = s.w[2][1] * n[1], c = s.w[2][2] * n[2];
-      const Lanes<T> row = s.w[2][0] * n[0] + b + c;
-      const T w = s.w[1][j];
-      plane += w * row;
-      sy += (s.w[0][i] * w * (T(j) - s.f[1])) * row;
-      sz += (s.w[0][i] * w) * (b + c + c);
-    }
-    sum += s.w[0][i] * plane;
-    sx += (s.w[0][i] * (T(i) - s.f[0])) * plane;
-  }
-  sz -= s.f[2] * sum;
-  Gathered<T> g;
-  for (int c = 0; c < 4; ++c) g.value[c] = sum[c];
-  for (int c = 0; c < 3; ++c) {
-    g.first(c, 0) = dx * sx[c];
-    g.first(c, 1) = dx * sy[c];
-    g.first(c, 2) = dx * sz[c];
-  }
-  return g;
 }
 
 template <typename T>

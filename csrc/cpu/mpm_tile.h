@@ -10,20 +10,6 @@
 
 namespace gsf::cpu {
 
-// Four lanes, one node: (px, py, pz, m). gcc and clang turn it into one SSE / AVX register.
-template <typename T>
-struct LanesOf;
-template <>
-struct LanesOf<float> {
-  typedef float type __attribute__((vector_size(16)));
-};
-template <>
-struct LanesOf<double> {
-  typedef double type __attribute__((vector_size(32)));
-};
-template <typename T>
-using Lanes = typename LanesOf<T>::type;
-
 constexpr int32_t kMaxMargin = 2;
 constexpr int32_t kMaxTileEdge = 6 + 2 * kMaxMargin;
 

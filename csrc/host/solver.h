@@ -81,7 +81,7 @@ struct SolverOps {
                             const std::vector<double>& floats) {
     SolverView<T> s{};
     const Tensor& like = b[kOffset];
-    s.count = like.size(0);
+    s.count = b[kMeta].numel();
     s.home_capacity = b[kHomeStart0].size(0);
     s.slot_capacity = b[kSlotNext].size(0);
     s.table_size = b[kKey].size(0);

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsfluent._check import check_tensor
+from gsfluent.ops import _plasticity_grad  # noqa: F401  (registers the gradient)
 from gsfluent.ops.reference import plasticity as reference
 
 LAWS = {
@@ -60,11 +59,13 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
             names = ", ".join(f"{v} ({k})" for k, v in LAWS.items())
             raise ValueError(f"{op}: law must be one of {names}, got {int(law[~known][0])}")
     if params.numel() and _is_new(params, rows):
+        given, params = params, params.detach()  # checking is not part of any graph
         wrong = ~torch.isfinite(params) | (params < 0)
-        wrong[:, 1] |= params[:, 1] == 0  # without bulk stiffness there is no pressure
+        # Without bulk stiffness there is no pressure; a rigid body needs none.
+        wrong[:, 1] |= (params[:, 1] == 0) & (law != LAWS["rigid"])
         wrong[:, 7] |= (params[:, 7] > 0) & (params[:, 7] < 1)  # the energy needs gamma >= 1
         if bool(wrong.any()):
-            _checked.pop(params, None)
+            _checked.pop(given, None)
             row, column = (int(i) for i in wrong.nonzero()[0])
             need = {1: "positive and finite", 7: "0 or at least 1"}
             raise ValueError(
@@ -173,8 +174,8 @@ def return_mapping(
             outside [0, 1), dt is negative, or a viscous fluid comes without dt. Table contents are
             read once per table (again after in-place changes).
 
-    Gradient: with respect to strain, alpha, increment and params, by the differentiable reference
-    recomputed in the backward pass. Not differentiable at the kinks of the map.
+    Gradient: with respect to strain, alpha, increment and params; in closed form where the map is
+    elastic, by the differentiable reference elsewhere. Not differentiable at the kinks of the map.
     Source: Wolper et al. 2019 (NACC); GaussianFluent, Eq. 6 (dynamic centre, epsilon = 0); Klar et
     al. 2016 and Tampubolon et al. 2017 (sand); Simo and Hughes 1998, box 3.1 (metal); Tait's
     equation after Monaghan 1994 (fluid); Stomakhin et al. 2012 (fixed corotated).
@@ -233,93 +234,15 @@ def _return_mapping_fake(
     )
 
 
-@torch.library.custom_op("gsfluent::return_mapping_backward", mutates_args=())
-def _return_mapping_backward(
-    grad_strain: Tensor,
-    grad_alpha: Tensor,
-    grad_stress: Tensor,
-    strain: Tensor,
-    alpha: Tensor,
-    increment: Tensor,
-    law: Tensor,
-    params: Tensor,
-    material: Tensor | None,
-    k: float,
-    epsilon: float,
-    implicit: bool,
-    dt: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    def forward(e: Tensor, a: Tensor, inc: Tensor, par: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return reference.return_mapping(
-            e,
-            a,
-            inc,
-            law=law,
-            params=par,
-            material=material,
-            k=k,
-            epsilon=epsilon,
-            implicit=implicit,
-            dt=dt,
-        )[:3]
-
-    # torch.func works inside a custom op, where ordinary autograd is switched off.
-    pull_back: Callable[..., tuple[Tensor, ...]]
-    _, pull_back, *_ = torch.func.vjp(forward, strain, alpha, increment, params)
-    full = [g.clone() for g in pull_back((grad_strain, grad_alpha, grad_stress))]
-    return full[0], full[1], full[2], full[3]
-
-
-@_return_mapping_backward.register_fake
-def _(
-    grad_strain: Tensor,
-    grad_alpha: Tensor,
-    grad_stress: Tensor,
-    strain: Tensor,
-    alpha: Tensor,
-    increment: Tensor,
-    law: Tensor,
-    params: Tensor,
-    material: Tensor | None,
-    k: float,
-    epsilon: float,
-    implicit: bool,
-    dt: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        torch.empty_like(strain),
-        torch.empty_like(alpha),
-        torch.empty_like(increment),
-        torch.empty_like(params),
-    )
-
-
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    strain, alpha, increment, law, params, material, *options = inputs
-    ctx.save_for_backward(strain, alpha, increment, law, params, material)
-    ctx.options = options
-
-
-def _backward(
-    ctx: Any, grad_strain: Tensor, grad_alpha: Tensor, grad_stress: Tensor, _info: Tensor
-) -> tuple[Tensor | None, ...]:
-    saved = ctx.saved_tensors
-    strain, alpha, increment, params = torch.ops.gsfluent.return_mapping_backward.default(
-        grad_strain, grad_alpha, grad_stress, *saved, *ctx.options
-    )
-    return strain, alpha, increment, None, params, None, None, None, None, None
-
-
-torch.library.register_autograd("gsfluent::return_mapping", _backward, setup_context=_setup_context)
-
-
 def elastic_energy(
     strain: Tensor, *, law: Tensor, params: Tensor, material: Tensor | None = None
 ) -> Tensor:
     """Stored elastic energy per initial volume.
 
-    ``mu/2 (J^(-2/3) tr b - 3) + kappa/2 ((J^2 - 1)/2 - ln J)`` with b = I + e, evaluated in float64
-    (both laws store energy the same way).
+    Evaluated in float64. With b = I + e = V V: elastic and nacc
+    ``mu/2 (J^(-2/3) tr b - 3) + kappa/2 ((J^2 - 1)/2 - ln J)``; drucker_prager and von_mises
+    ``mu |dev ln V|^2 + kappa/2 (ln J)^2``; corotated ``mu |V - I|^2 + lambda/2 (J - 1)^2``; fluid
+    ``K/gamma (J^(1-gamma)/(gamma-1) + J - gamma/(gamma-1))`` below J = 1 and 0 above; rigid 0.
 
     Args:
         strain: Elastic strain e = b - I, [N, 6].
@@ -340,4 +263,35 @@ def elastic_energy(
     count = strain.shape[0]
     _check_material("elastic_energy", count, strain, law, params, material)
     columns = reference.gather_material(params.double(), material, count)
-    return reference.elastic_energy(strain.double(), columns).to(strain.dtype)
+    laws = law[material.long()] if material is not None else law.expand(count)
+    return reference.elastic_energy(strain.double(), columns, laws).to(strain.dtype)
+
+
+def wave_speed(
+    strain: Tensor, *, law: Tensor, params: Tensor, material: Tensor | None = None
+) -> Tensor:
+    """Speed of the fastest small wave in the present state: what bounds an explicit time step.
+
+    Args:
+        strain: Elastic strain e = b - I, [N, 6].
+        law: int32 [M], see :func:`return_mapping`.
+        params: [M, 8], see :func:`return_mapping`; density must be positive.
+        material: int32 [N] or None, see :func:`return_mapping`.
+
+    Returns:
+        Wave speed [m/s], [N]: exact at rest, an upper bound (by a few percent at moderate strain)
+        of the speed along any direction elsewhere; 0 for rigid particles and lost states.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape, device, law, parameter or material row is wrong.
+
+    Gradient: with respect to strain and params (plain PyTorch).
+    Source: csrc/core/wave_speed.h, which the solver's kernels use.
+    """
+    check_tensor("wave_speed", "strain", strain, shape=("N", 6))
+    count = strain.shape[0]
+    _check_material("wave_speed", count, strain, law, params, material)
+    columns = reference.gather_material(params, material, count)
+    laws = law[material.long()] if material is not None else law.expand(count)
+    return reference.wave_speed_squared(strain, columns, laws).sqrt()

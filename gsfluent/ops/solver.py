@@ -27,7 +27,7 @@ from gsfluent.ops.collider import pad_colliders
 from gsfluent.ops.plasticity import return_mapping
 from gsfluent.ops.solver_buffers import INDEX
 
-ELASTIC, NACC = 0, 1
+ELASTIC, NACC, LAWS = 0, 1, 7
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -160,9 +160,9 @@ class Solver:
         if dt is not None and not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"{op}: dt must be positive, got {dt}")
         laws = set(law.tolist())
-        if not laws <= {ELASTIC, NACC}:
-            raise ValueError(f"{op}: law must be 0 (elastic) or 1 (nacc), got {sorted(laws)}")
-        self._law_set = 0 if laws <= {ELASTIC} else 1
+        if not laws <= set(range(LAWS)):
+            raise ValueError(f"{op}: law must lie in 0 to {LAWS - 1}, got {sorted(laws)}")
+        self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
         self._fixed = dt
@@ -196,7 +196,7 @@ class Solver:
         bits = min(52, 62 - max(0, math.ceil(math.log2(0.43 * n))))
         self._write(
             cfl=cfl, gradient_limit=gradient_limit, dt_scale=1.0, dt_fixed=dt or 0.0,
-            mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] - bits), unit_bits=bits,
+            mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
 
     # --- loading ---
@@ -260,10 +260,10 @@ class Solver:
         word = local[:, 0] | local[:, 1] << 3 | local[:, 2] << 6 | row[order] << 9
         # The word is unsigned on the device; wrap it into the signed type torch has.
         b.meta = torch.where(word >= 2**31, word - 2**32, word).to(torch.int32)
-        b.offset = offset[order].contiguous()
+        b.offset = self._stored(offset[order])
         b.id = order.to(torch.int32)
         for name, value in values.items():
-            setattr(b, name, value[order].to(self.dtype).clone().contiguous())
+            setattr(b, name, self._stored(value[order].to(self.dtype)))
         coord = self._unkey(unique)
         homes, reach = unique.shape[0], self._reach(coord)
         b.reserve_blocks(homes + homes // 2 + 64, reach + reach // 3 + 64, self.fields)
@@ -380,8 +380,15 @@ class Solver:
         if steps == 0 or (until is not None and until <= now["time"]):
             return
         left = -1 if steps is None else steps
+        # Every call starts from new blocks, so that nothing depends on what was built before it.
         self._write(
-            until=1e300 if until is None else until, steps_left=left, done=0, reason=0, lost=0
+            until=1e300 if until is None else until,
+            steps_left=left,
+            done=0,
+            reason=0,
+            lost=0,
+            leaving=0,
+            rebuild=1,
         )
         ints, floats = self._settings()
         with torch.no_grad():
@@ -435,9 +442,19 @@ class Solver:
             .repeat_interleave(counts, dim=0, output_size=self.count)
         )
 
+    def _stored(self, values: Tensor) -> Tensor:
+        """Values as the device has them: component by component on a GPU."""
+        planar = self.device.type == "cuda" and values.dim() == 2
+        return (values.T if planar else values).clone(memory_format=torch.contiguous_format)
+
+    def _rowwise(self, name: str) -> Tensor:
+        """Stored values with one row per point."""
+        value = getattr(self._buffers, name)
+        return value.T if self.device.type == "cuda" and value.dim() == 2 else value
+
     def _restored(self, values: Tensor) -> Tensor:
         """Bring stored values into the order of loading."""
-        out = torch.empty_like(values)
+        out = torch.empty_like(values, memory_format=torch.contiguous_format)
         out[self._buffers.id.long()] = values
         return out
 
@@ -448,7 +465,7 @@ class Solver:
         word = b.meta.long() & 0x1FF
         local = torch.stack([word & 7, word >> 3 & 7, word >> 6 & 7], dim=1)
         cell = 4 * self._owners()[:, :3] - 1 + local
-        return self._restored((cell.double() + 0.5 + b.offset.double()) * self.dx)
+        return self._restored((cell.double() + 0.5 + self._rowwise("offset").double()) * self.dx)
 
     @property
     def body(self) -> Tensor:
@@ -458,19 +475,19 @@ class Solver:
     @property
     def velocity(self) -> Tensor:
         """Velocities [m/s], [N, 3]."""
-        return self._restored(self._buffers.velocity)
+        return self._restored(self._rowwise("velocity"))
 
     @property
     def affine(self) -> Tensor:
         """APIC matrix C [1/s], [N, 3, 3]."""
         b = self._buffers
         row = b.meta.long() >> 9 & (layout.MAX_ROWS - 1)
-        return self._restored((b.slope / b.rows[row, 8, None]).view(-1, 3, 3))
+        return self._restored(self._rowwise("slope") / b.rows[row, 8, None]).view(-1, 3, 3)
 
     @property
     def strain(self) -> Tensor:
         """Strain ``b - I``, [N, 6]."""
-        return self._restored(self._buffers.strain)
+        return self._restored(self._rowwise("strain"))
 
     @property
     def alpha(self) -> Tensor:
@@ -491,18 +508,20 @@ class Solver:
     @property
     def deformation(self) -> Tensor | None:
         """Total deformation gradient, [N, 3, 3], or None when it is not tracked."""
-        value = self._buffers.deformation
-        return None if value.numel() == 0 else self._restored(value).view(-1, 3, 3)
+        if self._buffers.deformation.numel() == 0:
+            return None
+        return self._restored(self._rowwise("deformation")).view(-1, 3, 3)
 
     @property
     def stress(self) -> Tensor:
         """Kirchhoff stress of the present state [Pa], [N, 6]."""
         b = self._buffers
         row = (b.meta.long() >> 9 & (layout.MAX_ROWS - 1)).to(torch.int32)
-        alpha = b.alpha if b.alpha.numel() else b.strain.new_zeros(self.count)
+        strain = self._rowwise("strain").contiguous()
+        alpha = b.alpha if b.alpha.numel() else strain.new_zeros(self.count)
         params = b.rows[:, :8].contiguous()
         _, _, stress, _ = return_mapping(
-            b.strain, alpha, b.strain.new_zeros(self.count, 3, 3), law=b.law, params=params,
+            strain, alpha, strain.new_zeros(self.count, 3, 3), law=b.law, params=params,
             material=row, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
         )  # fmt: skip
         return self._restored(stress)
@@ -545,4 +564,4 @@ class Solver:
         b.sums.zero_()
         b.moments.zero_()
         b.impulse_units.zero_()
-        self._write(rebuild=1, done=1, grow=0, reason=0, touched=0, lost=0)
+        self._write(rebuild=1, done=1, grow=0, reason=0, touched=0, lost=0, leaving=0)

@@ -21,7 +21,7 @@ MAX_PARTICLES = 2**26
 
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
-    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen",
+    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen", "slack",
 )  # fmt: skip
 """Members of the clock that are doubles; the others are integers."""
 CLOCK = (
@@ -31,7 +31,7 @@ CLOCK = (
     "slots", "sites", "cursor", "arrived", "speed", "wave", "gradient", "bound",
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
-    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "spare0", "spare1",
+    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "slack",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}
@@ -103,7 +103,8 @@ class Buffers:
                 key = f"home_{name}{side}"
                 old, new = getattr(self, key), whole(homes, width) if width > 1 else whole(homes)
                 kept = min(old.shape[0], homes)
-                new[:kept] = old[:kept]
+                if kept > 0:  # before the first homes, the old list has no columns
+                    new[:kept] = old[:kept]
                 setattr(self, key, new)
         self.neighbour = whole(homes, NEIGHBOURS)
         self.home_bound = torch.zeros(homes, dtype=real, device=device)
@@ -135,9 +136,10 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
         values[name] = zeros(count, width)
     for name in ("meta", "id", "entry", "place"):
         values[name] = zeros(count, dtype=torch.int32)
-    for name in ("law", "home_coord0", "home_start0", "home_count0", "home_coord1", "home_start1",
-                 "home_count1"):  # fmt: skip
+    for name in ("law", "home_start0", "home_count0", "home_start1", "home_count1"):
         values[name] = zeros(0, dtype=torch.int32)
+    for name in ("home_coord0", "home_coord1"):
+        values[name] = zeros(0, 4, dtype=torch.int32)
     values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
     values["impulse_units"] = zeros(0, 3, dtype=torch.int64)
     values["impulse"] = zeros(0, 3, dtype=torch.float64)

@@ -1,0 +1,91 @@
+// Sums and maxima over a CTA of the resident solver's kernels.
+#pragma once
+
+#include "cuda/launch_solver.h"
+
+namespace gsf::cuda {
+
+constexpr unsigned kAllLanes = 0xffffffffu;
+
+// Bits of a non-negative value, so that NaN sorts above all others.
+__device__ inline unsigned sortable(float value) {
+  return value >= 0.0f ? __float_as_uint(value) : (value < 0.0f ? 0u : 0x7fffffffu);
+}
+
+// Largest of each of the kValues values over the CTA, as sortable bits; valid in thread 0.
+template <int kThreadsHere, int kValues>
+__device__ inline void block_largest(const float (&values)[kValues], unsigned (&out)[kValues]) {
+  __shared__ unsigned warps[kValues][kThreadsHere / 32];
+  for (int i = 0; i < kValues; ++i) {
+    const unsigned largest = __reduce_max_sync(kAllLanes, sortable(values[i]));
+    if ((threadIdx.x & 31) == 0) warps[i][threadIdx.x / 32] = largest;
+  }
+  __syncthreads();
+  if (threadIdx.x != 0) return;
+  for (int i = 0; i < kValues; ++i) {
+    out[i] = 0;
+    for (int w = 0; w < kThreadsHere / 32; ++w)
+      out[i] = out[i] > warps[i][w] ? out[i] : warps[i][w];
+  }
+}
+
+__device__ inline void raise_to(uint64_t* word, unsigned bits) {
+  if (bits > 0u && *reinterpret_cast<volatile unsigned long long*>(word) < bits)
+    atomicMax(reinterpret_cast<unsigned long long*>(word), static_cast<unsigned long long>(bits));
+}
+
+// Bits of sqrt(x) rounded up a little, for values that were compared as squares.
+__device__ inline unsigned root_up(unsigned bits) {
+  if (bits >= 0x7f800000u) return 0x7fffffffu;
+  return __float_as_uint(sqrtf(__uint_as_float(bits)) * 1.0000003f);
+}
+
+// Adds the lanes that say yes to a counter.
+__device__ inline void count_lanes(bool yes, int64_t* counter) {
+  const unsigned mask = __ballot_sync(kAllLanes, yes);
+  if (mask != 0u && (threadIdx.x & 31) == 0)
+    atomicAdd(reinterpret_cast<unsigned long long*>(counter),
+              static_cast<unsigned long long>(__popc(mask)));
+}
+
+// True in every thread of the CTA that is the last of `total` to arrive; what the others wrote
+// before is visible to it.
+__device__ inline bool last_to_arrive(int64_t* arrived, int64_t total) {
+  __shared__ bool last;
+  __threadfence();
+  __syncthreads();
+  if (threadIdx.x == 0) {
+    const unsigned long long before =
+        atomicAdd(reinterpret_cast<unsigned long long*>(arrived), 1ull);
+    last = before + 1 == static_cast<unsigned long long>(total);
+    if (last) *arrived = 0;
+  }
+  __syncthreads();
+  if (last) __threadfence();
+  return last;
+}
+
+// Largest momentum bound and mass of the particles of one home.
+template <typename T>
+__device__ void home_bounds(const SolverView<T>& s, int64_t home, int64_t first, int64_t count) {
+  float bound = 0.0f, mass = 0.0f;
+  for (int64_t r = threadIdx.x; r < count; r += kSolverThreads) {
+    const int64_t p = first + r;
+    const uint32_t row = meta_row(s.meta[p]) < uint64_t(s.row_count) ? meta_row(s.meta[p]) : 0;
+    const T m = s.rows[int64_t(row) * kRowColumns + kMassColumn];
+    T velocity[3], slope[9];
+    load_three(s, s.velocity, p, velocity);
+    load_nine(s, s.slope, p, slope);
+    bound = larger(float(momentum_bound(velocity, slope, m, s.dx)), bound);
+    mass = larger(float(m), mass);
+  }
+  const float values[2] = {bound, mass};
+  unsigned largest[2];
+  block_largest<kSolverThreads>(values, largest);
+  if (threadIdx.x == 0) {
+    s.home_bound[home] = T(__uint_as_float(largest[0])) * T(1.000001);
+    s.home_mass[home] = T(__uint_as_float(largest[1])) * T(1.000001);
+  }
+}
+
+}  // namespace gsf::cuda

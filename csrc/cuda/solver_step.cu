@@ -1,0 +1,471 @@
+// One step of the resident solver on the GPU. p2g and g2p: one CTA per home, its window of 8^3
+// nodes in shared memory. Sums are integers: in the window 32 bits (float state) in a unit of the
+// home, between windows 64 bits in a unit of the step, so that no order of additions changes a bit.
+// The units leave room for every particle at one node (csrc/core/solver_clock.h), so nothing
+// overflows.
+#include "cuda/solver_reduce.h"
+
+namespace gsf::cuda {
+namespace {
+
+constexpr int kThreads = kSolverThreads;
+#ifndef GSF_P2G_THREADS
+#define GSF_P2G_THREADS 256
+#define GSF_G2P_THREADS 256
+#define GSF_G2P_CTAS 2
+#endif
+constexpr int kP2GThreads = GSF_P2G_THREADS;
+constexpr int kG2PThreads = GSF_G2P_THREADS;
+// Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.
+constexpr int kStrideX = 68, kStrideY = 8;
+constexpr int kTile = kWindowEdge * kStrideX;
+
+template <typename T>
+struct Fixed;
+template <>
+struct Fixed<float> {
+  using Word = int;
+  static constexpr int kBits = 30;
+  static __device__ Word round(float v) { return __float2int_rn(v); }
+  static __device__ void add(Word* p, Word v) { atomicAdd(p, v); }
+};
+template <>
+struct Fixed<double> {
+  using Word = long long;
+  static constexpr int kBits = 61;
+  static __device__ Word round(double v) { return __double2ll_rn(v); }
+  static __device__ void add(Word* p, Word v) {
+    atomicAdd(reinterpret_cast<unsigned long long*>(p), static_cast<unsigned long long>(v));
+  }
+};
+
+// Unit of a window: `count` contributions of at most `bound` fit into 2^kBits of it. The double
+// window uses the unit of the step itself.
+template <typename T>
+__device__ double window_unit(double bound, double share, int64_t count, double step_unit) {
+  if (sizeof(T) == 8) return step_unit;
+  return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
+}
+
+__device__ int window_node(int index, int& i, int& j, int& k) {
+  i = index >> 6;
+  j = index >> 3 & 7;
+  k = index & 7;
+  return i * kStrideX + j * kStrideY + k;
+}
+
+__device__ int neighbour_of(int i, int j, int k) {
+  return (window_block(i) * 3 + window_block(j)) * 3 + window_block(k);
+}
+
+// Slot and node inside it of window node (i, j, k); -1 when no slot is there.
+__device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
+  const int32_t slot = neighbour[neighbour_of(i, j, k)];
+  if (slot < 0) return -1;
+  return int64_t(slot) * kBlockNodes +
+         local_index(window_local(i), window_local(j), window_local(k));
+}
+
+template <typename T, bool kMoments>
+__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
+  using Word = typename Fixed<T>::Word;
+  constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
+  __shared__ Word tile[kChannels][kTile];
+  __shared__ int32_t neighbour[kNeighbours];
+  __shared__ bool slot_shared[kMoments ? kNeighbours : 1];
+  __shared__ int shared_home;
+  const HomeList<T>& homes = s.homes();
+  const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
+  if (threadIdx.x == 0) shared_home = 0;
+  for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
+  __syncthreads();
+  if (threadIdx.x < kNeighbours) {
+    const int32_t slot = s.neighbour[int64_t(blockIdx.x) * kNeighbours + threadIdx.x];
+    neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
+    if constexpr (kMoments) {
+      slot_shared[threadIdx.x] = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
+      if (slot_shared[threadIdx.x]) shared_home = 1;
+    }
+  }
+  __syncthreads();
+  const bool with_moments = kMoments && shared_home != 0;
+  const double unit = window_unit<T>(s.home_bound[blockIdx.x], 0.43, count, clock.momentum_unit);
+  const double mass_unit = window_unit<T>(s.home_mass[blockIdx.x], 1.0, count, clock.mass_unit);
+  const T per_unit = T(1.0 / unit), per_mass = T(1.0 / mass_unit);
+  for (int64_t r = threadIdx.x; r < count; r += kP2GThreads) {
+    const int64_t p = first + r;
+    if (p < 0 || p >= s.count) continue;
+    const uint32_t meta = s.meta[p];
+    const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
+    const T mass = s.rows[int64_t(row) * kRowColumns + kMassColumn];
+    T offset[3], velocity[3], slope[9];
+    load_three(s, s.offset, p, offset);
+    load_three(s, s.velocity, p, velocity);
+    load_nine(s, s.slope, p, slope);
+    const Stencil<T> st = stencil_at(offset);
+    ParticleMomentum<T> q = momentum_given(st, velocity, slope, mass, s.dx);
+    for (int i = 0; i < 3; ++i) q.constant[i] *= per_unit;
+    for (int i = 0; i < 9; ++i) q.slope.m[i] *= per_unit;
+    const T weight_unit = mass * per_mass;
+    // Cells are at most kLastCell by construction; garbage cells stay inside the window too.
+    const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
+                     min(meta_cell(meta, 1), kLastCell) * kStrideY +
+                     min(meta_cell(meta, 2), kLastCell);
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+      for (int j = 0; j < 3; ++j)
+#pragma unroll
+        for (int k = 0; k < 3; ++k) {
+          const T w = st.w[0][i] * st.w[1][j] * st.w[2][k];
+          const int at = base + i * kStrideX + j * kStrideY + k;
+#pragma unroll
+          for (int c = 0; c < 3; ++c)
+            Fixed<T>::add(&tile[c][at],
+                          Fixed<T>::round(w * (q.constant[c] + q.slope(c, 0) * T(i) +
+                                               q.slope(c, 1) * T(j) + q.slope(c, 2) * T(k))));
+          Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
+          if constexpr (kMoments) {
+            if (with_moments) {
+              const T g[6] = {st.slope(0, i) * st.w[1][j] * st.w[2][k],
+                              st.w[0][i] * st.slope(1, j) * st.w[2][k],
+                              st.w[0][i] * st.w[1][j] * st.slope(2, k),
+                              w * (st.f[0] - T(i)),
+                              w * (st.f[1] - T(j)),
+                              w * (st.f[2] - T(k))};
+              for (int c = 0; c < 6; ++c)
+                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(weight_unit * g[c]));
+            }
+          }
+        }
+  }
+  __syncthreads();
+  const double to_step = unit / clock.momentum_unit, to_mass = mass_unit / clock.mass_unit;
+  int64_t* sums = static_cast<int64_t*>(s.sums);
+  int64_t* moments = static_cast<int64_t*>(s.moments);
+  for (int index = threadIdx.x; index < kWindowNodes; index += kP2GThreads) {
+    int i, j, k;
+    const int at = window_node(index, i, j, k);
+    if (tile[3][at] == 0) continue;
+    const int64_t node = slot_node(neighbour, i, j, k);
+    if (node < 0) continue;
+    for (int c = 0; c < 4; ++c) {
+      const Word word = tile[c][at];
+      const long long v =
+          sizeof(T) == 8 ? word : __double2ll_rn(double(word) * (c < 3 ? to_step : to_mass));
+      if (v != 0)
+        atomicAdd(reinterpret_cast<unsigned long long*>(sums + 4 * node + c),
+                  static_cast<unsigned long long>(v));
+    }
+    if constexpr (kMoments) {
+      // Only shared slots: nobody would clear the moments of the others.
+      if (with_moments && slot_shared[neighbour_of(i, j, k)])
+        for (int c = 0; c < kContactMoments; ++c) {
+          const Word word = tile[4 + c][at];
+          const long long v = sizeof(T) == 8 ? word : __double2ll_rn(double(word) * to_mass);
+          if (v != 0)
+            atomicAdd(reinterpret_cast<unsigned long long*>(moments + kContactMoments * node + c),
+                      static_cast<unsigned long long>(v));
+        }
+    }
+  }
+}
+
+// Reads the sums of one node and clears them for the next step.
+template <typename T>
+__device__ NodeSums<T> take_sums(const SolverView<T>& s, int64_t node, bool shared) {
+  NodeSums<T> out;
+  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
+  const longlong2 a = words[0], b = words[1];
+  words[0] = words[1] = longlong2{0, 0};
+  const double unit = s.clock->momentum_unit, mass_unit = s.clock->mass_unit;
+  out.momentum[0] = double(a.x) * unit;
+  out.momentum[1] = double(a.y) * unit;
+  out.momentum[2] = double(b.x) * unit;
+  out.mass = double(b.y) * mass_unit;
+  if (shared) {
+    int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
+    for (int c = 0; c < kContactMoments; ++c) {
+      const double value = double(m[c]) * mass_unit;
+      out.moments[c] = T(c < 3 ? value / double(s.dx) : value * double(s.dx));
+      m[c] = 0;
+    }
+  }
+  return out;
+}
+
+// Colliders that can touch a node of the block, as bits; the lanes of a warp look at one each. A
+// sweeping or moving collider reaches as far as anything can move in the step. More than 64
+// colliders: the last bit stands for all the others.
+template <typename T>
+__device__ uint64_t colliders_near(const SolverView<T>& s, const Vec3<T>& middle) {
+  if (s.collider_count == 0) return 0;
+  const T reach = T(2.7) * s.dx + T(s.clock->dt) * T(s.clock->speed_seen);
+  uint64_t near = 0;
+  for (int first = 0; first < 64 && first < s.collider_count; first += 32) {
+    const int k = first + (threadIdx.x & 31);
+    bool touches = false;
+    if (k < s.collider_count && k < 63) {
+      const T* row = s.colliders + int64_t(k) * kColliderColumns;
+      Vec3<T> normal;
+      const T own = norm(load_vec3(row + kVelocity)) * T(s.clock->dt);
+      touches = collider_valid(row, 0) &&
+                collider_signed_distance(row, static_cast<const float*>(nullptr), middle, normal) <=
+                    reach + own;
+    }
+    near |= uint64_t(__ballot_sync(kAllLanes, touches)) << first;
+  }
+  if (s.collider_count > 63) near |= uint64_t(1) << 63;
+  return near;
+}
+
+template <typename T>
+__device__ void collide_one(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
+                            Vec3<T>& v) {
+  double impulse[3] = {0.0, 0.0, 0.0};
+  node_collide(s, k, x, mass, v, impulse);
+  const double per_unit = 1.0 / s.clock->momentum_unit;
+  for (int i = 0; i < 3; ++i) {
+    const long long units = __double2ll_rn(impulse[i] * per_unit);
+    if (units != 0)
+      atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
+                static_cast<unsigned long long>(units));
+  }
+}
+
+template <typename T>
+__device__ __noinline__ void collide_near(const SolverView<T>& s, uint64_t near, const Vec3<T>& x,
+                                          double mass, Vec3<T>& v) {
+  for (; near != 0; near &= near - 1) {
+    const int64_t k = __ffsll(static_cast<long long>(near)) - 1;
+    const int64_t last = k == 63 ? s.collider_count : k + 1;
+    for (int64_t i = k; i < last; ++i) collide_one(s, i, x, mass, v);
+  }
+}
+
+template <typename T>
+__device__ void store_velocity(const SolverView<T>& s, int64_t node, const Vec3<T>& v) {
+  T* out = s.node_velocity + 4 * node;
+  out[0] = v.x;
+  out[1] = v.y;
+  out[2] = v.z;
+}
+
+// A node that several fields may share: kept out of line, most scenes never come here.
+template <typename T>
+__device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* slots, int local,
+                                        const Vec3<T>& x, uint64_t near, T dt) {
+  NodeSums<T> sums[kSiteFields];
+  Vec3<T> velocity[kSiteFields];
+  bool heavy[kSiteFields];
+  int count = 0;
+  for (; count < kSiteFields && slots[count] >= 0; ++count) {
+    const int64_t node = int64_t(slots[count]) * kBlockNodes + local;
+    sums[count] = take_sums(s, node, true);
+    heavy[count] = node_velocity(s, sums[count], dt, velocity[count]);
+  }
+  const int touched = node_contact(s, count, sums, heavy, velocity);
+  for (int f = 0; f < count; ++f) {
+    if (heavy[f] && near != 0) collide_near(s, near, x, sums[f].mass, velocity[f]);
+    store_velocity(s, int64_t(slots[f]) * kBlockNodes + local, velocity[f]);
+  }
+  return touched;
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kThreads) grid_kernel(SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
+  if (site >= clock.sites) return;
+  const int local = threadIdx.x % kBlockNodes;
+  const int32_t* slots = s.site_slots + site * kSiteFields;
+  const int32_t slot = slots[0];
+  if (slot < 0 || slot >= s.slot_capacity) return;
+  const int32_t* block = s.slot_coord + 4 * int64_t(slot);
+  const T dt = T(clock.dt);
+  const Vec3<T> x{(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
+                  (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
+                  (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
+  const Vec3<T> middle{(T(block[0]) * T(kBlockEdge) + T(1.5)) * s.dx,
+                       (T(block[1]) * T(kBlockEdge) + T(1.5)) * s.dx,
+                       (T(block[2]) * T(kBlockEdge) + T(1.5)) * s.dx};
+  const uint64_t near = colliders_near(s, middle);
+  int touched = 0;
+  if (slots[1] < 0) {
+    const int64_t node = int64_t(slot) * kBlockNodes + local;
+    const NodeSums<T> sums = take_sums(s, node, false);
+    Vec3<T> v;
+    if (node_velocity(s, sums, dt, v) && near != 0) collide_near(s, near, x, sums.mass, v);
+    store_velocity(s, node, v);
+  } else {
+    touched = shared_node(s, slots, local, x, near, dt);
+  }
+  if (touched > 0)
+    atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched),
+              static_cast<unsigned long long>(touched));
+}
+
+template <int kThreadsHere, typename T>
+__device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_t home,
+                          bool moving) {
+  const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
+  unsigned bits[4];
+  block_largest<kThreadsHere>(values, bits);
+  if (threadIdx.x != 0) return;
+  SolverClock& c = *s.clock;
+  if (moving) {
+    raise_to(&c.speed, root_up(bits[0]));
+    raise_to(&c.wave, root_up(bits[1]));
+    raise_to(&c.gradient, root_up(bits[2]));
+  }
+  if (home >= 0) {
+    s.home_bound[home] = T(__uint_as_float(bits[3])) * T(1.000001);
+    raise_to(&c.bound, __float_as_uint(__uint_as_float(bits[3]) * 1.000001f));
+  }
+}
+
+template <typename T, int kLaws, bool kTrack>
+__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
+  __shared__ T tile[3][kTile];
+  const HomeList<T>& homes = s.homes();
+  const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
+  const T dt = T(clock.dt), dt_next = T(clock.dt_next);
+  const int64_t home_total = clock.homes;
+  const uint32_t reach = reach_of_row(s.neighbour + int64_t(blockIdx.x) * kNeighbours);
+  for (int index = threadIdx.x; index < kWindowNodes; index += kG2PThreads) {
+    int i, j, k;
+    const int at = window_node(index, i, j, k);
+    const int64_t node = slot_node(s.neighbour + int64_t(blockIdx.x) * kNeighbours, i, j, k);
+    const T* v = s.node_velocity + 4 * (node < 0 ? 0 : node);
+    for (int c = 0; c < 3; ++c) tile[c][at] = node < 0 ? T(0) : v[c];
+  }
+  __syncthreads();
+  Largest largest{};
+  bool leaves = false, lost = false;
+  const int64_t rounds = (count + kG2PThreads - 1) / kG2PThreads;
+  for (int64_t round = 0; round < rounds; ++round) {
+    const int64_t r = round * kG2PThreads + threadIdx.x, p = first + r;
+    StepFlags flags{};
+    if (r < count && p >= 0 && p < s.count) {
+      const uint32_t meta = s.meta[p];
+      T offset[3];
+      load_three(s, s.offset, p, offset);
+      const Stencil<T> st = stencil_at(offset);
+      const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
+                       min(meta_cell(meta, 1), kLastCell) * kStrideY +
+                       min(meta_cell(meta, 2), kLastCell);
+      T value[3] = {T(0), T(0), T(0)};
+      Mat3<T> moment{};
+#pragma unroll
+      for (int i = 0; i < 3; ++i)
+#pragma unroll
+        for (int j = 0; j < 3; ++j)
+#pragma unroll
+          for (int k = 0; k < 3; ++k) {
+            const T w = st.w[0][i] * st.w[1][j] * st.w[2][k];
+            const int at = base + i * kStrideX + j * kStrideY + k;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {
+              const T v = w * tile[c][at];
+              value[c] += v;
+              if (i > 0) moment(c, 0) += T(i) * v;
+              if (j > 0) moment(c, 1) += T(j) * v;
+              if (k > 0) moment(c, 2) += T(k) * v;
+            }
+          }
+      for (int c = 0; c < 3; ++c)
+        for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
+      flags = finish_particle<T, kLaws, kTrack>(s, p, reach, value, moment, dt, dt_next, largest);
+    }
+    if constexpr (kLaws != kElasticOnly) count_lanes(flags.plastic, &s.clock->plastic);
+    if (__any_sync(kAllLanes, flags.guarded || flags.inverted || flags.invalid)) {
+      count_lanes(flags.guarded, &s.clock->guarded);
+      count_lanes(flags.inverted, &s.clock->inverted);
+      count_lanes(flags.invalid, &s.clock->invalid);
+    }
+    leaves = leaves || flags.leaves;
+    lost = lost || flags.lost;
+  }
+  count_lanes(leaves, &s.clock->leaving);
+  count_lanes(lost, &s.clock->lost);
+  hand_over<kG2PThreads>(s, largest, blockIdx.x, true);
+  if (!last_to_arrive(&s.clock->arrived, home_total)) return;
+  for (int64_t i = threadIdx.x; i < 3 * s.collider_count; i += kG2PThreads) {
+    s.impulse[i] += double(s.impulse_units[i]) * clock.momentum_unit;
+    s.impulse_units[i] = 0;
+  }
+  __syncthreads();
+  if (threadIdx.x == 0) {
+    end_step(*s.clock, double(s.dx), s.count);
+    choose_unit(*s.clock);
+  }
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kThreads) prime_kernel(SolverView<T> s, bool measure) {
+  const SolverClock& clock = *s.clock;
+  if (int64_t(blockIdx.x) >= clock.homes) return;
+  const HomeList<T>& homes = s.homes();
+  const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
+  const int64_t home_total = clock.homes;
+  const T dt = T(clock.dt);
+  Largest largest{};
+  for (int64_t r = threadIdx.x; r < count; r += kThreads)
+    if (first + r >= 0 && first + r < s.count) prime_particle(s, first + r, measure, dt, largest);
+  hand_over<kThreads>(s, largest, measure ? -1 : int64_t(blockIdx.x), measure);
+  if (!last_to_arrive(&s.clock->arrived, home_total) || threadIdx.x != 0) return;
+  if (measure)
+    start_clock(*s.clock, double(s.dx));
+  else
+    choose_unit(*s.clock);
+}
+
+}  // namespace
+
+template <typename T>
+cudaError_t solver_prime(const SolverView<T>& s, cudaStream_t stream) {
+  const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  prime_kernel<T><<<homes, kThreads, 0, stream>>>(s, true);
+  prime_kernel<T><<<homes, kThreads, 0, stream>>>(s, false);
+  return cudaGetLastError();
+}
+
+template <typename T>
+cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream) {
+  const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  constexpr int kSitesPerCta = kThreads / kBlockNodes;
+  const unsigned sites = static_cast<unsigned>((s.slot_capacity + kSitesPerCta - 1) / kSitesPerCta);
+  if (s.moments != nullptr)
+    p2g_kernel<T, true><<<homes, kP2GThreads, 0, stream>>>(s);
+  else
+    p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
+  grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
+  const bool track = s.deformation != nullptr;
+  if (law_set == kElasticOnly && !track)
+    g2p_kernel<T, kElasticOnly, false><<<homes, kG2PThreads, 0, stream>>>(s);
+  else if (law_set == kElasticOnly)
+    g2p_kernel<T, kElasticOnly, true><<<homes, kG2PThreads, 0, stream>>>(s);
+  else if (law_set == kBrittle && !track)
+    g2p_kernel<T, kBrittle, false><<<homes, kG2PThreads, 0, stream>>>(s);
+  else if (law_set == kBrittle)
+    g2p_kernel<T, kBrittle, true><<<homes, kG2PThreads, 0, stream>>>(s);
+  else if (!track)
+    g2p_kernel<T, kAnyLaw, false><<<homes, kG2PThreads, 0, stream>>>(s);
+  else
+    g2p_kernel<T, kAnyLaw, true><<<homes, kG2PThreads, 0, stream>>>(s);
+  return cudaGetLastError();
+}
+
+#define GSF_INSTANTIATE(T)                                                  \
+  template cudaError_t solver_prime<T>(const SolverView<T>&, cudaStream_t); \
+  template cudaError_t solver_step<T>(const SolverView<T>&, int, cudaStream_t);
+GSF_INSTANTIATE(float)
+GSF_INSTANTIATE(double)
+#undef GSF_INSTANTIATE
+
+}  // namespace gsf::cuda
