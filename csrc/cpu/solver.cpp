@@ -184,11 +184,11 @@ class Stepper {
     sort_home(h, r);
     const bool contact = shared(h);
     Lanes<T> tile[kWindowNodes];
-    Lanes<T> moment[2 * kWindowNodes];
+    Lanes<T> moment[kWindowNodes];
     for_each_run(h, [&](int t, int64_t, int run) {
       for (int n = t; n < t + run; ++n) tile[n] = Lanes<T>{};
       if (contact)
-        for (int n = 2 * t; n < 2 * (t + run); ++n) moment[n] = Lanes<T>{};
+        for (int n = t; n < t + run; ++n) moment[n] = Lanes<T>{};
     });
     for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
       const Packet<T> packet(s_, s_.entry + at, r.end - at);
@@ -204,8 +204,8 @@ class Stepper {
       for (int64_t at = r.begin; at < r.end; ++at) {
         const int64_t p = s_.entry[at];
         const T mass = s_.rows[row(s_.meta[p]) * kRowColumns + kMassColumn];
-        scatter_moments(stencil_at(s_.offset + 3 * p), mass, s_.dx,
-                        moment + 2 * window_node(s_.meta[p]), kWindowEdge);
+        scatter_moments(stencil_at(s_.offset + 3 * p), mass, moment + window_node(s_.meta[p]),
+                        kWindowEdge);
       }
     T* sums = static_cast<T*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
@@ -216,7 +216,7 @@ class Stepper {
       if (!contact) return;
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < kContactMoments; ++c)
-          moments[kContactMoments * (node + n) + c] += moment[2 * (t + n) + c / 3][c % 3];
+          moments[kContactMoments * (node + n) + c] += moment[t + n][c];
     });
   }
 
@@ -257,7 +257,7 @@ class Stepper {
     }
     int64_t contacts = 0;
     if (present > 1 && moments != nullptr)
-      contacts = node_contact(s_, fields, sum, heavy, velocity) > 0 ? 1 : 0;
+      contacts = node_contact(s_, fields, heavy, OwnNode<T>{sum}, velocity) > 0 ? 1 : 0;
     if (s_.collider_count > 0 && present > 0) {
       const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
       const Vec3<T> x{(T(b[0]) * kBlockEdge + T(local / 16)) * s_.dx,
