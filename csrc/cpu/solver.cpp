@@ -9,6 +9,7 @@
 #include "core/solver_clock.h"
 #include "core/solver_node.h"
 #include "cpu/solver_cpu.h"
+#include "cpu/solver_near.h"
 #include "cpu/solver_packet.h"
 
 namespace gsf::cpu {
@@ -76,6 +77,7 @@ class Stepper {
     }
     box_.assign(c.homes, Box{});
     touched_.assign(c.slots, 0);
+    around_.find(s_);
     const int64_t chunks = (c.sites + kSiteChunk - 1) / kSiteChunk;
     impulse_.assign(chunks * s_.collider_count * 3, 0.0);
     contacts_.assign(chunks, 0);
@@ -213,7 +215,7 @@ class Stepper {
       std::atomic_ref<uint8_t>(touched_[node / kBlockNodes]).store(1, std::memory_order_relaxed);
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < 4; ++c) sums[4 * (node + n) + c] += tile[t + n][c];
-      if (!contact) return;
+      if (!contact || s_.slot_shared[node / kBlockNodes] == 0) return;
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < kContactMoments; ++c)
           moments[kContactMoments * (node + n) + c] += moment[t + n][c];
@@ -235,8 +237,7 @@ class Stepper {
 
   // One node of a site whose slots are `slots`: velocities, contact, colliders.
   int64_t node(const int32_t* slots, int fields, int local, T dt, double* impulse) {
-    T* sums = static_cast<T*>(s_.sums);
-    T* moments = static_cast<T*>(s_.moments);
+    const T* sums = static_cast<const T*>(s_.sums);
     NodeSums<T> sum[kSiteFields];
     Vec3<T> velocity[kSiteFields];
     bool heavy[kSiteFields];
@@ -247,17 +248,12 @@ class Stepper {
       for (int i = 0; i < 3; ++i) sum[a].momentum[i] = double(sums[4 * n + i]);
       heavy[a] = node_velocity(s_, sum[a], dt, velocity[a]);
       present += heavy[a] ? 1 : 0;
-      for (int i = 0; i < 4; ++i) sums[4 * n + i] = T(0);
-      if (fields < 2 || moments == nullptr) continue;
-      T* m = moments + kContactMoments * n;
-      for (int i = 0; i < kContactMoments; ++i) {
-        sum[a].moments[i] = m[i];
-        m[i] = T(0);
-      }
     }
     int64_t contacts = 0;
-    if (present > 1 && moments != nullptr)
-      contacts = node_contact(s_, fields, heavy, OwnNode<T>{sum}, velocity) > 0 ? 1 : 0;
+    if (present > 1 && s_.moments != nullptr)
+      contacts =
+          node_contact(s_, fields, heavy, SlotNear<T>{s_, around_, slots, local}, velocity) > 0 ? 1
+                                                                                                : 0;
     if (s_.collider_count > 0 && present > 0) {
       const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
       const Vec3<T> x{(T(b[0]) * kBlockEdge + T(local / 16)) * s_.dx,
@@ -295,13 +291,29 @@ class Stepper {
           if (fields == 0) continue;
           for (int local = 0; local < kBlockNodes; ++local)
             contacts_[chunk] += node(slots, fields, local, dt, impulse);
+          if (s_.moments == nullptr) clear(slots[0]);
         }
       }
     });
+    // Contact reads the sums of neighbours: with several fields they are cleared once all are done.
+    if (s_.moments != nullptr)
+      parallel_for(c.slots, kHomeGrain, [&](int64_t begin, int64_t end) {
+        for (int64_t b = begin; b < end; ++b)
+          if (touched_[b] != 0) clear(b);
+      });
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
       for (int64_t i = 0; i < terms; ++i) s_.impulse[i] += impulse_[chunk * terms + i];
       c.touched += contacts_[chunk];
     }
+  }
+
+  // Sums of one slot, for the next step.
+  void clear(int64_t slot) {
+    T* sums = static_cast<T*>(s_.sums) + 4 * kBlockNodes * slot;
+    std::fill(sums, sums + 4 * kBlockNodes, T(0));
+    if (s_.moments == nullptr || s_.slot_shared[slot] == 0) return;
+    T* moments = static_cast<T*>(s_.moments) + kContactMoments * kBlockNodes * slot;
+    std::fill(moments, moments + kContactMoments * kBlockNodes, T(0));
   }
 
   template <int kLaws, bool kTrack>
@@ -354,9 +366,10 @@ class Stepper {
   const int laws_;
   std::vector<int32_t> colors_[kColors];  // homes, those of one colour at once
   std::vector<Box> box_;                  // [homes]
-  std::vector<uint8_t> touched_;          // [slots] whether any home adds to it in this step
-  std::vector<double> impulse_;           // [chunks, colliders, 3]
-  std::vector<int64_t> contacts_;         // [chunks] nodes at which fields touched
+  SlotsAround around_;
+  std::vector<uint8_t> touched_;   // [slots] whether any home adds to it in this step
+  std::vector<double> impulse_;    // [chunks, colliders, 3]
+  std::vector<int64_t> contacts_;  // [chunks] nodes at which fields touched
 };
 
 template <typename T>
