@@ -17,7 +17,25 @@ namespace {
 constexpr int64_t kParticleGrain = 2048;
 constexpr int64_t kHomeGrain = 4;
 constexpr int64_t kSiteChunk = 16;  // sites per ordered partial sum; fixed, so that sums are too
-constexpr int kColors = 8;          // windows of homes two blocks apart share no node
+constexpr int64_t kNearColliders = 64;  // with more, every site looks at all of them
+constexpr int kColors = 8;              // windows of homes two blocks apart share no node
+
+// Cells of a window in order, by the nine bits of l in a meta word.
+constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
+struct CellTable {
+  uint8_t at[512];
+  constexpr CellTable() : at{} {
+    for (uint32_t word = 0; word < 512; ++word) {
+      int cell = 0;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int l = static_cast<int>(word >> (3 * axis) & 7u);
+        cell = cell * (kLastCell + 1) + (l < kLastCell ? l : kLastCell);
+      }
+      at[word] = static_cast<uint8_t>(cell);
+    }
+  }
+};
+constexpr CellTable kCellOf;
 
 // Nodes [lo, hi) of a window that a home's particles touch.
 struct Box {
@@ -140,13 +158,7 @@ class Stepper {
 
   // Box of home h, and its particles in the order of their cells (stable) in `entry`.
   void sort_home(int64_t h, const Range& r) {
-    constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
-    const auto cell = [&](int64_t p) {
-      int at = 0;
-      for (int axis = 0; axis < 3; ++axis)
-        at = at * (kLastCell + 1) + std::min(meta_cell(s_.meta[p], axis), kLastCell);
-      return at;
-    };
+    const auto cell = [&](int64_t p) { return kCellOf.at[s_.meta[p] & 511u]; };
     int32_t next[kCells + 1] = {};
     for (int64_t p = r.begin; p < r.end; ++p) ++next[cell(p) + 1];
     int lo[3] = {kLastCell, kLastCell, kLastCell}, hi[3] = {0, 0, 0};
@@ -233,16 +245,57 @@ class Stepper {
     return counts;
   }
 
-  // One node of a site whose slots are `slots`: velocities, contact, colliders.
-  int64_t node(const int32_t* slots, int fields, int local, T dt, double* impulse) {
+  // One site: its slots that got anything in this step, and the colliders that can touch it.
+  struct Site {
+    int32_t slots[kSiteFields];
+    int fields = 0;
+    int32_t near[kNearColliders];
+    int64_t colliders = 0;
+
+    int32_t collider(int64_t i) const {
+      return colliders <= kNearColliders ? near[i] : static_cast<int32_t>(i);
+    }
+  };
+  Site site(int64_t index) const {
+    Site site;
+    for (int i = 0; i < kSiteFields; ++i) {
+      const int32_t b = s_.site_slots[kSiteFields * index + i];
+      if (b >= 0 && b < s_.clock->slots && touched_[b] != 0) site.slots[site.fields++] = b;
+    }
+    if (site.fields == 0 || s_.collider_count == 0) return site;
+    if (s_.collider_count > kNearColliders) {
+      site.colliders = s_.collider_count;
+      return site;
+    }
+    const Vec3<T> center = node_position(site.slots[0], T(1.5), T(1.5), T(1.5));
+    for (int64_t k = 0; k < s_.collider_count; ++k) {
+      const T* row = s_.colliders + k * kColliderColumns;
+      if (!collider_valid(row, 0)) continue;
+      Vec3<T> normal;
+      // Nodes lie within sqrt(27) / 2 of the centre; what sweeps may come from anywhere.
+      const bool far = collider_signed_distance(row, static_cast<const float*>(nullptr), center,
+                                                normal) > T(2.8) * s_.dx;
+      if (!far || row[kSweep] != T(0)) site.near[site.colliders++] = static_cast<int32_t>(k);
+    }
+    return site;
+  }
+  Vec3<T> node_position(int64_t slot, T i, T j, T k) const {
+    const int32_t* b = s_.slot_coord + 4 * slot;
+    return {(T(b[0]) * kBlockEdge + i) * s_.dx, (T(b[1]) * kBlockEdge + j) * s_.dx,
+            (T(b[2]) * kBlockEdge + k) * s_.dx};
+  }
+
+  // One node of a site: velocities, contact, colliders. Returns whether fields touched.
+  int64_t node(const Site& site, int local, T dt, double* impulse) {
     T* sums = static_cast<T*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
+    const int fields = site.fields;
     NodeSums<T> sum[kSiteFields];
     Vec3<T> velocity[kSiteFields];
     bool heavy[kSiteFields];
     int present = 0;
     for (int a = 0; a < fields; ++a) {
-      const int64_t n = int64_t(slots[a]) * kBlockNodes + local;
+      const int64_t n = int64_t(site.slots[a]) * kBlockNodes + local;
       sum[a].mass = double(sums[4 * n + 3]);
       for (int i = 0; i < 3; ++i) sum[a].momentum[i] = double(sums[4 * n + i]);
       heavy[a] = node_velocity(s_, sum[a], dt, velocity[a]);
@@ -258,17 +311,16 @@ class Stepper {
     int64_t contacts = 0;
     if (present > 1 && moments != nullptr)
       contacts = node_contact(s_, fields, sum, heavy, velocity) > 0 ? 1 : 0;
-    if (s_.collider_count > 0 && present > 0) {
-      const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
-      const Vec3<T> x{(T(b[0]) * kBlockEdge + T(local / 16)) * s_.dx,
-                      (T(b[1]) * kBlockEdge + T(local / 4 % 4)) * s_.dx,
-                      (T(b[2]) * kBlockEdge + T(local % 4)) * s_.dx};
-      for (int64_t k = 0; k < s_.collider_count; ++k)
+    if (site.colliders > 0 && present > 0) {
+      const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
+      for (int64_t i = 0; i < site.colliders; ++i) {
+        const int32_t k = site.collider(i);
         for (int a = 0; a < fields; ++a)
           if (heavy[a]) node_collide(s_, k, x, sum[a].mass, velocity[a], impulse + 3 * k);
+      }
     }
     for (int a = 0; a < fields; ++a) {
-      T* out = s_.node_velocity + 4 * (int64_t(slots[a]) * kBlockNodes + local);
+      T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
       for (int i = 0; i < 3; ++i) out[i] = velocity[a][i];
       out[3] = T(0);
     }
@@ -285,16 +337,11 @@ class Stepper {
         std::fill(impulse, impulse + terms, 0.0);
         contacts_[chunk] = 0;
         const int64_t last = std::min((chunk + 1) * kSiteChunk, c.sites);
-        for (int64_t site = chunk * kSiteChunk; site < last; ++site) {
-          int32_t slots[kSiteFields];
-          int fields = 0;
-          for (int i = 0; i < kSiteFields; ++i) {
-            const int32_t b = s_.site_slots[kSiteFields * site + i];
-            if (b >= 0 && b < c.slots && touched_[b] != 0) slots[fields++] = b;
-          }
-          if (fields == 0) continue;
+        for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
+          const Site here = site(index);
+          if (here.fields == 0) continue;
           for (int local = 0; local < kBlockNodes; ++local)
-            contacts_[chunk] += node(slots, fields, local, dt, impulse);
+            contacts_[chunk] += node(here, local, dt, impulse);
         }
       }
     });
