@@ -21,10 +21,9 @@ namespace gsf {
 
 constexpr int kWindowEdge = 8;
 constexpr int kWindowNodes = 512;
-constexpr int kNeighbours = 27;     // blocks a window can touch
-constexpr int kContactMoments = 6;  // mass gradient and first moment
-constexpr int kLastCell = 5;        // largest l
-constexpr int kRowColumns = 10;     // eight material parameters, particle mass, particle volume
+constexpr int kNeighbours = 27;  // blocks a window can touch
+constexpr int kLastCell = 5;     // largest l
+constexpr int kRowColumns = 10;  // eight material parameters, particle mass, particle volume
 constexpr int kMassColumn = 8;
 constexpr int kVolumeColumn = 9;
 constexpr int kSiteFields = 16;  // fields that may share one block

@@ -129,14 +129,9 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
           Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
           if constexpr (kMoments) {
             if (with_moments) {
-              const T g[6] = {st.slope(0, i) * st.w[1][j] * st.w[2][k],
-                              st.w[0][i] * st.slope(1, j) * st.w[2][k],
-                              st.w[0][i] * st.w[1][j] * st.slope(2, k),
-                              w * (st.f[0] - T(i)),
-                              w * (st.f[1] - T(j)),
-                              w * (st.f[2] - T(k))};
-              for (int c = 0; c < 6; ++c)
-                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(weight_unit * g[c]));
+              const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
+              for (int c = 0; c < kContactMoments; ++c)
+                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
             }
           }
         }
@@ -188,8 +183,7 @@ __device__ NodeSums<T> take_sums(const SolverView<T>& s, int64_t node, bool shar
   if (shared) {
     int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
     for (int c = 0; c < kContactMoments; ++c) {
-      const double value = double(m[c]) * mass_unit;
-      out.moments[c] = T(c < 3 ? value / double(s.dx) : value * double(s.dx));
+      out.moments[c] = T(double(m[c]) * mass_unit);
       m[c] = 0;
     }
   }
@@ -266,7 +260,7 @@ __device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* s
     sums[count] = take_sums(s, node, true);
     heavy[count] = node_velocity(s, sums[count], dt, velocity[count]);
   }
-  const int touched = node_contact(s, count, sums, heavy, velocity);
+  const int touched = node_contact(s, count, heavy, OwnNode<T>{sums}, velocity);
   for (int f = 0; f < count; ++f) {
     if (heavy[f] && near != 0) collide_near(s, near, x, sums[f].mass, velocity[f]);
     store_velocity(s, int64_t(slots[f]) * kBlockNodes + local, velocity[f]);

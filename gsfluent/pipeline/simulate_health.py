@@ -150,7 +150,8 @@ class Ledger:
         self.start = torch.tensor(start.momentum, dtype=torch.float64)
         self.gravity = torch.tensor(gravity, dtype=torch.float64)
         self.worst = 0.0
-        self.scale = float(self.start.norm())
+        # Two bodies thrown at each other have no momentum together, but a scale of it.
+        self.scale = max(float(self.start.norm()), (2.0 * self.mass * start.kinetic) ** 0.5)
 
     def error(self, state: State, now: Figures) -> float:
         """Return the relative error of the balance at this moment.
