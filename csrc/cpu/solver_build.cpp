@@ -272,7 +272,6 @@ class Builder {
       clock_.sites += 1;
       clock_.shared_sites += end - first > 1 ? 1 : 0;
     }
-    mark_edges();
     clock_.homes = static_cast<int64_t>(next_.size());
     clock_.slots = static_cast<int64_t>(slots_.size());
     clock_.homes_max = std::max(clock_.homes_max, clock_.homes);
@@ -280,21 +279,6 @@ class Builder {
     clock_.parity = 1 - (clock_.parity & 1);
     clock_.rebuild = 0;
     clock_.builds += 1;
-  }
-
-  // Contact reads one node beyond the blocks that fields share.
-  void mark_edges() {
-    if (clock_.shared_sites == 0) return;
-    for (size_t slot = 0; slot < slots_.size(); ++slot) {
-      if (s_.slot_shared[slot] != 1) continue;
-      for (int n = 0; n < kNeighbours; ++n) {
-        const uint64_t key = neighbour_key(slots_[slot], n);
-        const auto found = std::lower_bound(slots_.begin(), slots_.end(), key);
-        if (found == slots_.end() || *found != key) continue;
-        int32_t& mark = s_.slot_shared[found - slots_.begin()];
-        if (mark == 0) mark = 2;
-      }
-    }
   }
 
   const SolverView<T>& s_;
