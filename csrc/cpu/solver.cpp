@@ -77,7 +77,7 @@ class Stepper {
     box_.assign(c.homes, Box{});
     touched_.assign(c.slots, 0);
     const int64_t chunks = (c.sites + kSiteChunk - 1) / kSiteChunk;
-    impulse_.assign(chunks * s_.collider_count * 3, 0.0);
+    impulse_.assign(chunks * s_.collider_count * kImpulseSums, 0.0);
     contacts_.assign(chunks, 0);
   }
 
@@ -265,7 +265,8 @@ class Stepper {
                       (T(b[2]) * kBlockEdge + T(local % 4)) * s_.dx};
       for (int64_t k = 0; k < s_.collider_count; ++k)
         for (int a = 0; a < fields; ++a)
-          if (heavy[a]) node_collide(s_, k, x, sum[a].mass, velocity[a], impulse + 3 * k);
+          if (heavy[a])
+            node_collide(s_, k, x, sum[a].mass, dt, velocity[a], impulse + kImpulseSums * k);
     }
     for (int a = 0; a < fields; ++a) {
       T* out = s_.node_velocity + 4 * (int64_t(slots[a]) * kBlockNodes + local);
@@ -278,7 +279,8 @@ class Stepper {
   // All nodes that got anything this step.
   void nodes(T dt) {
     SolverClock& c = *s_.clock;
-    const int64_t chunks = static_cast<int64_t>(contacts_.size()), terms = 3 * s_.collider_count;
+    const int64_t chunks = static_cast<int64_t>(contacts_.size()),
+                  terms = kImpulseSums * s_.collider_count;
     parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
       for (int64_t chunk = begin; chunk < end; ++chunk) {
         double* impulse = impulse_.data() + chunk * terms;
@@ -298,9 +300,13 @@ class Stepper {
         }
       }
     });
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-      for (int64_t i = 0; i < terms; ++i) s_.impulse[i] += impulse_[chunk * terms + i];
-      c.touched += contacts_[chunk];
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) c.touched += contacts_[chunk];
+    for (int64_t k = 0; k < s_.collider_count; ++k) {
+      double sums[kImpulseSums] = {};
+      for (int64_t chunk = 0; chunk < chunks; ++chunk)
+        for (int i = 0; i < kImpulseSums; ++i)
+          sums[i] += impulse_[chunk * terms + k * kImpulseSums + i];
+      end_collider(s_, k, sums, c.dt);
     }
   }
 
@@ -355,7 +361,7 @@ class Stepper {
   std::vector<int32_t> colors_[kColors];  // homes, those of one colour at once
   std::vector<Box> box_;                  // [homes]
   std::vector<uint8_t> touched_;          // [slots] whether any home adds to it in this step
-  std::vector<double> impulse_;           // [chunks, colliders, 3]
+  std::vector<double> impulse_;           // [chunks, colliders, kImpulseSums]
   std::vector<int64_t> contacts_;         // [chunks] nodes at which fields touched
 };
 

@@ -178,6 +178,41 @@ __global__ void __launch_bounds__(kThreads) sites_kernel(SolverView<T> s) {
     s.site_slots[site * kSiteFields + i] = i < count ? slots[i] : -1;
   for (int i = 0; i < count; ++i) s.slot_shared[slots[i]] = count > 1 ? 1 : 0;
   if (count > 1) add(&s.clock->shared_sites, 1);
+  uint64_t near = 0;
+  const Vec3<T> middle = block_middle(s, s.slot_coord + 4 * int64_t(slots[0]));
+  for (int64_t k = 0; k < s.collider_count; ++k)
+    if (k >= 63 || collider_near(s, k, middle)) near |= uint64_t(1) << min(k, int64_t(63));
+  s.site_near[site] = near;
+}
+
+// Moments are stored in shared slots and in those around them, where the normals of contact look.
+// A slot that stores them for its neighbours only is marked with 2.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) around_kernel(SolverView<T> s) {
+  if (!may_build(*s.clock)) return;
+  const int64_t slot = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (slot >= s.clock->wanted_slots || s.slot_shared[slot] == 1) return;
+  const int32_t* c = s.slot_coord + 4 * slot;
+  for (int n = 0; n < kNeighbours; ++n) {
+    const int32_t e =
+        find(s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, c[3]));
+    if (e >= 0 && s.table_slot[e] >= 0 && s.slot_shared[s.table_slot[e]] == 1) {
+      s.slot_shared[slot] = 2;
+      return;
+    }
+  }
+}
+template <typename T>
+__global__ void __launch_bounds__(kThreads) link_kernel(SolverView<T> s) {
+  if (!may_build(*s.clock)) return;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, slot = i / kNeighbours;
+  if (slot >= s.clock->wanted_slots || s.slot_shared[slot] != 1) return;
+  const int n = static_cast<int>(i % kNeighbours);
+  const int32_t* c = s.slot_coord + 4 * slot;
+  const int32_t e =
+      find(s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, c[3]));
+  const int32_t other = e >= 0 ? s.table_slot[e] : -1;
+  s.slot_around[slot * kNeighbours + n] = other >= 0 && s.slot_shared[other] != 0 ? other : -1;
 }
 
 // Slots under the window of each home.
@@ -333,6 +368,7 @@ __global__ void finish_kernel(SolverView<T> s) {
   c.slots_max = max(c.slots_max, c.slots);
   c.builds += 1;
   c.rebuild = 0;
+  c.travel = 0.0;
 }
 
 unsigned ctas(int64_t n) { return static_cast<unsigned>((n + kThreads - 1) / kThreads); }
@@ -348,6 +384,10 @@ cudaError_t solver_build(const SolverView<T>& s, cudaStream_t stream) {
   slots_kernel<T><<<table, kThreads, 0, stream>>>(s);
   verdict_kernel<T><<<1, 1, 0, stream>>>(s);
   sites_kernel<T><<<table, kThreads, 0, stream>>>(s);
+  if (s.fields > 1) {
+    around_kernel<T><<<ctas(s.slot_capacity), kThreads, 0, stream>>>(s);
+    link_kernel<T><<<ctas(s.slot_capacity * kNeighbours), kThreads, 0, stream>>>(s);
+  }
   neighbours_kernel<T><<<ctas(s.home_capacity * kNeighbours), kThreads, 0, stream>>>(s);
   place_kernel<T><<<homes, kThreads, 0, stream>>>(s);
   invert_kernel<T><<<ctas(s.count), kThreads, 0, stream>>>(s);

@@ -12,7 +12,7 @@ constexpr int kThreads = kSolverThreads;
 #ifndef GSF_P2G_THREADS
 #define GSF_P2G_THREADS 256
 #define GSF_G2P_THREADS 256
-#define GSF_G2P_CTAS 2
+#define GSF_G2P_CTAS 3
 #endif
 constexpr int kP2GThreads = GSF_P2G_THREADS;
 constexpr int kG2PThreads = GSF_G2P_THREADS;
@@ -168,75 +168,53 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
   }
 }
 
-// Reads the sums of one node and clears them for the next step.
+// Mass and momentum of one node in natural units.
 template <typename T>
-__device__ NodeSums<T> take_sums(const SolverView<T>& s, int64_t node, bool shared) {
+__device__ NodeSums<T> read_sums(const SolverView<T>& s, int64_t node, double unit,
+                                 double mass_unit) {
   NodeSums<T> out;
-  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
+  const longlong2* words =
+      reinterpret_cast<const longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
   const longlong2 a = words[0], b = words[1];
-  words[0] = words[1] = longlong2{0, 0};
-  const double unit = s.clock->momentum_unit, mass_unit = s.clock->mass_unit;
   out.momentum[0] = double(a.x) * unit;
   out.momentum[1] = double(a.y) * unit;
   out.momentum[2] = double(b.x) * unit;
   out.mass = double(b.y) * mass_unit;
-  if (shared) {
-    int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
-    for (int c = 0; c < kContactMoments; ++c) {
-      out.moments[c] = T(double(m[c]) * mass_unit);
-      m[c] = 0;
-    }
-  }
   return out;
 }
-
-// Colliders that can touch a node of the block, as bits; the lanes of a warp look at one each. A
-// sweeping or moving collider reaches as far as anything can move in the step. More than 64
-// colliders: the last bit stands for all the others.
 template <typename T>
-__device__ uint64_t colliders_near(const SolverView<T>& s, const Vec3<T>& middle) {
-  if (s.collider_count == 0) return 0;
-  const T reach = T(2.7) * s.dx + T(s.clock->dt) * T(s.clock->speed_seen);
-  uint64_t near = 0;
-  for (int first = 0; first < 64 && first < s.collider_count; first += 32) {
-    const int k = first + (threadIdx.x & 31);
-    bool touches = false;
-    if (k < s.collider_count && k < 63) {
-      const T* row = s.colliders + int64_t(k) * kColliderColumns;
-      Vec3<T> normal;
-      const T own = norm(load_vec3(row + kVelocity)) * T(s.clock->dt);
-      touches = collider_valid(row, 0) &&
-                collider_signed_distance(row, static_cast<const float*>(nullptr), middle, normal) <=
-                    reach + own;
-    }
-    near |= uint64_t(__ballot_sync(kAllLanes, touches)) << first;
-  }
-  if (s.collider_count > 63) near |= uint64_t(1) << 63;
-  return near;
+__device__ void clear_sums(const SolverView<T>& s, int64_t node) {
+  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
+  words[0] = words[1] = longlong2{0, 0};
 }
 
+// Units of the sums over nodes that colliders get: torque is counted per 4096 dx of lever, so that
+// it stays in the range of the momentum it comes from.
 template <typename T>
-__device__ void collide_one(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
-                            Vec3<T>& v) {
-  double impulse[3] = {0.0, 0.0, 0.0};
-  node_collide(s, k, x, mass, v, impulse);
-  const double per_unit = 1.0 / s.clock->momentum_unit;
-  for (int i = 0; i < 3; ++i) {
-    const long long units = __double2ll_rn(impulse[i] * per_unit);
-    if (units != 0)
-      atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
-                static_cast<unsigned long long>(units));
-  }
+__device__ double sum_unit(const SolverView<T>& s, int i) {
+  const double unit = s.clock->momentum_unit;
+  return i < 3 ? unit : (i < 6 ? unit * double(s.dx) * 4096.0 : s.clock->mass_unit);
 }
 
+// Velocity after the colliders in `near`. Out of line: few nodes come here.
 template <typename T>
-__device__ __noinline__ void collide_near(const SolverView<T>& s, uint64_t near, const Vec3<T>& x,
-                                          double mass, Vec3<T>& v) {
+__device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, uint64_t near, Vec3<T> x,
+                                             double mass, Vec3<T> v, T dt) {
   for (; near != 0; near &= near - 1) {
-    const int64_t k = __ffsll(static_cast<long long>(near)) - 1;
-    const int64_t last = k == 63 ? s.collider_count : k + 1;
-    for (int64_t i = k; i < last; ++i) collide_one(s, i, x, mass, v);
+    const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
+    const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
+    for (int64_t k = first; k < end; ++k) {
+      double sums[kImpulseSums] = {};
+      node_collide(s, k, x, mass, dt, v, sums);
+      for (int i = 0; i < kImpulseSums; ++i) {
+        const long long units = __double2ll_rn(sums[i] / sum_unit(s, i));
+        if (units != 0)
+          atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + kImpulseSums * k + i),
+                    static_cast<unsigned long long>(units));
+      }
+    }
   }
+  return v;
 }
 
 template <typename T>
@@ -247,59 +225,112 @@ __device__ void store_velocity(const SolverView<T>& s, int64_t node, const Vec3<
   out[2] = v.z;
 }
 
-// A node that several fields may share: kept out of line, most scenes never come here.
 template <typename T>
-__device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* slots, int local,
-                                        const Vec3<T>& x, uint64_t near, T dt) {
-  NodeSums<T> sums[kSiteFields];
-  Vec3<T> velocity[kSiteFields];
-  bool heavy[kSiteFields];
-  int count = 0;
-  for (; count < kSiteFields && slots[count] >= 0; ++count) {
-    const int64_t node = int64_t(slots[count]) * kBlockNodes + local;
-    sums[count] = take_sums(s, node, true);
-    heavy[count] = node_velocity(s, sums[count], dt, velocity[count]);
-  }
-  const int touched = node_contact(s, count, heavy, OwnNode<T>{sums}, velocity);
-  for (int f = 0; f < count; ++f) {
-    if (heavy[f] && near != 0) collide_near(s, near, x, sums[f].mass, velocity[f]);
-    store_velocity(s, int64_t(slots[f]) * kBlockNodes + local, velocity[f]);
-  }
-  return touched;
+__device__ Vec3<T> node_position(const SolverView<T>& s, const int32_t* block, int local) {
+  return {(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
+          (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
+          (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
 }
 
+// One thread per node of a site. Sums are cleared here, except where contact still needs them.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) grid_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads, 6) grid_kernel(SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;
   const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
   if (site >= clock.sites) return;
   const int local = threadIdx.x % kBlockNodes;
   const int32_t* slots = s.site_slots + site * kSiteFields;
-  const int32_t slot = slots[0];
-  if (slot < 0 || slot >= s.slot_capacity) return;
-  const int32_t* block = s.slot_coord + 4 * int64_t(slot);
+  const uint64_t near = s.collider_count > 0 && slots[1] < 0 ? s.site_near[site] : 0;
   const T dt = T(clock.dt);
-  const Vec3<T> x{(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
-                  (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
-                  (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
-  const Vec3<T> middle{(T(block[0]) * T(kBlockEdge) + T(1.5)) * s.dx,
-                       (T(block[1]) * T(kBlockEdge) + T(1.5)) * s.dx,
-                       (T(block[2]) * T(kBlockEdge) + T(1.5)) * s.dx};
-  const uint64_t near = colliders_near(s, middle);
-  int touched = 0;
-  if (slots[1] < 0) {
-    const int64_t node = int64_t(slot) * kBlockNodes + local;
-    const NodeSums<T> sums = take_sums(s, node, false);
+  const double unit = clock.momentum_unit, mass_unit = clock.mass_unit;
+  for (int f = 0; f < kSiteFields && slots[f] >= 0 && slots[f] < s.slot_capacity; ++f) {
+    const int64_t slot = slots[f], node = slot * kBlockNodes + local;
+    const NodeSums<T> sums = read_sums(s, node, unit, mass_unit);
+    if (s.fields == 1 || s.slot_shared[slot] == 0) clear_sums(s, node);
     Vec3<T> v;
-    if (node_velocity(s, sums, dt, v) && near != 0) collide_near(s, near, x, sums.mass, v);
+    if (node_velocity(s, sums, dt, v) && near != 0)
+      v = collide_near(s, near, node_position(s, s.slot_coord + 4 * slot, local), sums.mass, v, dt);
     store_velocity(s, node, v);
-  } else {
-    touched = shared_node(s, slots, local, x, near, dt);
   }
-  if (touched > 0)
-    atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched),
-              static_cast<unsigned long long>(touched));
+}
+
+// Mass and first moment of a field at a node or one of its 26 neighbours, for contact_pair.
+template <typename T>
+struct NearSums {
+  const SolverView<T>& s;
+  const int32_t* slots;  // of the site
+  int local;
+  double mass_unit;
+
+  __device__ ContactSample<T> operator()(int field, int o) const {
+    const int x = local / 16 + neighbour_step(o, 0), y = local / 4 % 4 + neighbour_step(o, 1),
+              z = local % 4 + neighbour_step(o, 2);
+    int64_t slot = slots[field];
+    const int at = (((x + 4) >> 2) * 3 + ((y + 4) >> 2)) * 3 + ((z + 4) >> 2);
+    if (at != 13) slot = s.slot_around[slot * kNeighbours + at];
+    if (slot < 0) return {T(0), {T(0), T(0), T(0)}};
+    const int64_t node = slot * kBlockNodes + local_index(x & 3, y & 3, z & 3);
+    const int64_t* sums = static_cast<const int64_t*>(s.sums) + 4 * node;
+    const int64_t* m = static_cast<const int64_t*>(s.moments) + kContactMoments * node;
+    return {
+        T(double(sums[3]) * mass_unit),
+        {T(double(m[0]) * mass_unit), T(double(m[1]) * mass_unit), T(double(m[2]) * mass_unit)}};
+  }
+};
+
+// Contact and colliders at the nodes of shared sites. It reads the sums of neighbours, which no one
+// changes meanwhile, and changes the velocities of its own node only.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) contact_kernel(SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
+  if (site >= clock.sites) return;
+  const int local = threadIdx.x % kBlockNodes;
+  const int32_t* slots = s.site_slots + site * kSiteFields;
+  if (slots[1] < 0) return;
+  const T dt = T(clock.dt);
+  const double mass_unit = clock.mass_unit;
+  Vec3<T> velocity[kSiteFields];
+  bool heavy[kSiteFields];
+  int count = 0, present = 0;
+  for (; count < kSiteFields && slots[count] >= 0; ++count) {
+    const int64_t node = int64_t(slots[count]) * kBlockNodes + local;
+    const double mass = double(static_cast<const int64_t*>(s.sums)[4 * node + 3]) * mass_unit;
+    heavy[count] = mass > double(mass_floor<T>());
+    const T* v = s.node_velocity + 4 * node;
+    velocity[count] = {v[0], v[1], v[2]};
+    present += heavy[count] ? 1 : 0;
+  }
+  if (present == 0) return;
+  int touched = 0;
+  if (present > 1)
+    touched = node_contact(s, count, heavy, NearSums<T>{s, slots, local, mass_unit}, velocity);
+  const uint64_t near = s.collider_count > 0 ? s.site_near[site] : 0;
+  for (int f = 0; f < count; ++f) {
+    if (!heavy[f]) continue;
+    const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
+    if (near != 0) {
+      const double mass = double(static_cast<const int64_t*>(s.sums)[4 * node + 3]) * mass_unit;
+      const Vec3<T> x = node_position(s, s.slot_coord + 4 * int64_t(slots[f]), local);
+      velocity[f] = collide_near(s, near, x, mass, velocity[f], dt);
+    }
+    store_velocity(s, node, velocity[f]);
+  }
+  if (touched > 0) atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched), 1ull);
+}
+
+// Clears what grid_kernel left for contact_kernel.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) clear_kernel(SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x, slot = node / kBlockNodes;
+  if (slot >= clock.slots || s.slot_shared[slot] == 0) return;
+  clear_sums(s, node);
+  int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
+  for (int c = 0; c < kContactMoments; ++c) m[c] = 0;
 }
 
 template <int kThreadsHere, typename T>
@@ -319,6 +350,27 @@ __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_
     s.home_bound[home] = T(__uint_as_float(bits[3])) * T(1.000001);
     raise_to(&c.bound, __float_as_uint(__uint_as_float(bits[3]) * 1.000001f));
   }
+}
+
+// What the last CTA of a step does: colliders move on, then time. Out of line, so that g2p does not
+// hold its registers.
+template <int kThreadsHere, typename T>
+__device__ __noinline__ void end_of_step(const SolverView<T>& s) {
+  for (int64_t k = threadIdx.x; k < s.collider_count; k += kThreadsHere) {
+    double sums[kImpulseSums];
+    for (int i = 0; i < kImpulseSums; ++i) {
+      sums[i] = double(s.impulse_units[kImpulseSums * k + i]) * sum_unit(s, i);
+      s.impulse_units[kImpulseSums * k + i] = 0;
+    }
+    const double moved = end_collider(s, k, sums, s.clock->dt);
+    if (moved > 0.0) raise_to(&s.clock->moved, sortable(float(moved) * 1.000001f));
+  }
+  __syncthreads();
+  if (threadIdx.x != 0) return;
+  s.clock->travel += float_of_bits(s.clock->moved);
+  s.clock->moved = 0;
+  end_step(*s.clock, double(s.dx), s.count);
+  choose_unit(*s.clock);
 }
 
 template <typename T, int kLaws, bool kTrack>
@@ -355,23 +407,33 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
                        min(meta_cell(meta, 2), kLastCell);
       T value[3] = {T(0), T(0), T(0)};
       Mat3<T> moment{};
+      // Along z first, then y, then x: each sum and its first moment in cells.
 #pragma unroll
-      for (int i = 0; i < 3; ++i)
+      for (int i = 0; i < 3; ++i) {
+        T plane[3] = {}, plane_y[3] = {}, plane_z[3] = {};
 #pragma unroll
-        for (int j = 0; j < 3; ++j)
+        for (int j = 0; j < 3; ++j) {
+          const int at = base + i * kStrideX + j * kStrideY;
 #pragma unroll
-          for (int k = 0; k < 3; ++k) {
-            const T w = st.w[0][i] * st.w[1][j] * st.w[2][k];
-            const int at = base + i * kStrideX + j * kStrideY + k;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-              const T v = w * tile[c][at];
-              value[c] += v;
-              if (i > 0) moment(c, 0) += T(i) * v;
-              if (j > 0) moment(c, 1) += T(j) * v;
-              if (k > 0) moment(c, 2) += T(k) * v;
-            }
+          for (int c = 0; c < 3; ++c) {
+            const T one = st.w[2][1] * tile[c][at + 1], two = st.w[2][2] * tile[c][at + 2];
+            const T row = st.w[1][j] * (st.w[2][0] * tile[c][at] + one + two);
+            plane[c] += row;
+            if (j == 1) plane_y[c] += row;
+            if (j == 2) plane_y[c] += row + row;
+            plane_z[c] += st.w[1][j] * (one + two + two);
           }
+        }
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+          const T w = st.w[0][i];
+          value[c] += w * plane[c];
+          if (i == 1) moment(c, 0) += w * plane[c];
+          if (i == 2) moment(c, 0) += w * (plane[c] + plane[c]);
+          moment(c, 1) += w * plane_y[c];
+          moment(c, 2) += w * plane_z[c];
+        }
+      }
       for (int c = 0; c < 3; ++c)
         for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
       flags = finish_particle<T, kLaws, kTrack>(s, p, reach, value, moment, dt, dt_next, largest);
@@ -389,15 +451,7 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
   count_lanes(lost, &s.clock->lost);
   hand_over<kG2PThreads>(s, largest, blockIdx.x, true);
   if (!last_to_arrive(&s.clock->arrived, home_total)) return;
-  for (int64_t i = threadIdx.x; i < 3 * s.collider_count; i += kG2PThreads) {
-    s.impulse[i] += double(s.impulse_units[i]) * clock.momentum_unit;
-    s.impulse_units[i] = 0;
-  }
-  __syncthreads();
-  if (threadIdx.x == 0) {
-    end_step(*s.clock, double(s.dx), s.count);
-    choose_unit(*s.clock);
-  }
+  end_of_step<kG2PThreads>(s);
 }
 
 template <typename T>
@@ -439,6 +493,10 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   else
     p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
+  if (s.fields > 1) {
+    contact_kernel<T><<<sites, kThreads, 0, stream>>>(s);
+    clear_kernel<T><<<sites, kThreads, 0, stream>>>(s);
+  }
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)
     g2p_kernel<T, kElasticOnly, false><<<homes, kG2PThreads, 0, stream>>>(s);
