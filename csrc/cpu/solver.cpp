@@ -16,8 +16,27 @@ namespace {
 
 constexpr int64_t kParticleGrain = 2048;
 constexpr int64_t kHomeGrain = 4;
+constexpr int64_t kSlotGrain = 64;
 constexpr int64_t kSiteChunk = 16;  // sites per ordered partial sum; fixed, so that sums are too
-constexpr int kColors = 8;          // windows of homes two blocks apart share no node
+constexpr int64_t kNearColliders = 64;  // with more, every site looks at all of them
+constexpr int kColors = 8;              // windows of homes two blocks apart share no node
+
+// Cells of a window in order, by the nine bits of l in a meta word.
+constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
+struct CellTable {
+  uint8_t at[512];
+  constexpr CellTable() : at{} {
+    for (uint32_t word = 0; word < 512; ++word) {
+      int cell = 0;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int l = static_cast<int>(word >> (3 * axis) & 7u);
+        cell = cell * (kLastCell + 1) + (l < kLastCell ? l : kLastCell);
+      }
+      at[word] = static_cast<uint8_t>(cell);
+    }
+  }
+};
+constexpr CellTable kCellOf;
 
 // Nodes [lo, hi) of a window that a home's particles touch.
 struct Box {
@@ -76,8 +95,9 @@ class Stepper {
     }
     box_.assign(c.homes, Box{});
     touched_.assign(c.slots, 0);
+    plan_contact();
     const int64_t chunks = (c.sites + kSiteChunk - 1) / kSiteChunk;
-    impulse_.assign(chunks * s_.collider_count * kImpulseSums, 0.0);
+    impulse_.assign(chunks * s_.collider_count * 3, 0.0);
     contacts_.assign(chunks, 0);
   }
 
@@ -117,6 +137,52 @@ class Stepper {
     return meta_row(meta) < uint64_t(s_.row_count) ? meta_row(meta) : 0;
   }
 
+  // Where fields meet: the slots of a field around each of its shared ones, and for each home which
+  // of the 27 blocks around it are shared by its field. Slots lie in the order of their keys.
+  void plan_contact() {
+    const SolverClock& c = *s_.clock;
+    contact_row_.assign(s_.moments != nullptr && c.shared_sites > 0 ? c.slots : 0, -1);
+    contact_around_.clear();
+    home_contact_.assign(contact_row_.empty() ? 0 : c.homes, 0);
+    if (contact_row_.empty()) return;
+    const auto key = [&](const int32_t* b) { return block_key(b[0], b[1], b[2], b[3]); };
+    keys_.resize(c.slots);
+    for (int64_t i = 0; i < c.slots; ++i) keys_[i] = key(s_.slot_coord + 4 * i);
+    const auto around = [&](const int32_t* b, int n) {
+      const uint64_t wanted =
+          block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
+      const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
+      return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
+    };
+    for (int64_t i = 0; i < c.slots; ++i) {
+      if (s_.slot_shared[i] == 0) continue;
+      contact_row_[i] = static_cast<int32_t>(contact_around_.size() / kNeighbours);
+      for (int n = 0; n < kNeighbours; ++n)
+        contact_around_.push_back(around(s_.slot_coord + 4 * i, n));
+    }
+    for (int64_t h = 0; h < c.homes; ++h)
+      for (int n = 0; n < kNeighbours; ++n) {
+        const int32_t b = around(s_.homes().coord + 4 * h, n);
+        if (b >= 0 && s_.slot_shared[b] != 0) home_contact_[h] |= 1u << n;
+      }
+  }
+
+  // Whether nodes of the stencil at this cell lie in one of these blocks or next to it: those nodes
+  // are read where fields meet.
+  static bool near_contact(uint32_t blocks, uint32_t meta) {
+    for (uint32_t left = blocks; left != 0; left &= left - 1) {
+      const int n = __builtin_ctz(left);
+      const int step[3] = {n / 9, n / 3 % 3, n % 3};
+      bool meets = true;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int l = meta_cell(meta, axis);
+        meets = meets && (step[axis] == 1 || (step[axis] == 0 ? l <= 1 : l >= 2));
+      }
+      if (meets) return true;
+    }
+    return false;
+  }
+
   // f(tile index, node index in `sums`, nodes in a row) for the nodes of the box of home h. False
   // when a part of it has no slot.
   template <typename F>
@@ -140,13 +206,7 @@ class Stepper {
 
   // Box of home h, and its particles in the order of their cells (stable) in `entry`.
   void sort_home(int64_t h, const Range& r) {
-    constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
-    const auto cell = [&](int64_t p) {
-      int at = 0;
-      for (int axis = 0; axis < 3; ++axis)
-        at = at * (kLastCell + 1) + std::min(meta_cell(s_.meta[p], axis), kLastCell);
-      return at;
-    };
+    const auto cell = [&](int64_t p) { return kCellOf.at[s_.meta[p] & 511u]; };
     int32_t next[kCells + 1] = {};
     for (int64_t p = r.begin; p < r.end; ++p) ++next[cell(p) + 1];
     int lo[3] = {kLastCell, kLastCell, kLastCell}, hi[3] = {0, 0, 0};
@@ -168,52 +228,40 @@ class Stepper {
     }
   }
 
-  bool shared(int64_t h) const {
-    if (s_.moments == nullptr) return false;
-    for (int n = 0; n < kNeighbours; ++n) {
-      const int32_t b = s_.neighbour[kNeighbours * h + n];
-      if (b >= 0 && b < s_.clock->slots && s_.slot_shared[b] != 0) return true;
-    }
-    return false;
-  }
-
   // Sums of one home's particles, added to the slots. Returns whether every node had one.
   bool home_to_nodes(int64_t h) {
     const Range r = range(h);
     if (r.begin == r.end) return true;
     sort_home(h, r);
-    const bool contact = shared(h);
+    const uint32_t contact = home_contact_.empty() ? 0 : home_contact_[h];
     Lanes<T> tile[kWindowNodes];
     Lanes<T> moment[kWindowNodes];
     for_each_run(h, [&](int t, int64_t, int run) {
-      for (int n = t; n < t + run; ++n) tile[n] = Lanes<T>{};
-      if (contact)
-        for (int n = t; n < t + run; ++n) moment[n] = Lanes<T>{};
+      std::fill(tile + t, tile + t + run, Lanes<T>{});
+      if (contact != 0) std::fill(moment + t, moment + t + run, Lanes<T>{});
     });
     for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
       const Packet<T> packet(s_, s_.entry + at, r.end - at);
-      const PacketMomentum<T> given(s_, packet, packet.same_rows());
+      const PacketMomentum<T> given(s_, packet);
       const int used = static_cast<int>(std::min<int64_t>(r.end - at, Pack<T>::kLanes));
       for (int lane = 0; lane < used;) {
         const int end = std::min(packet.run(lane), used);
-        given.scatter(lane, end, tile + window_node(packet.meta[lane]));
+        const int base = window_node(packet.meta[lane]);
+        given.scatter(lane, end, tile + base);
+        if (contact != 0 && near_contact(contact, packet.meta[lane]))
+          given.scatter_moment(lane, end, moment + base);
         lane = end;
       }
     }
-    if (contact)
-      for (int64_t at = r.begin; at < r.end; ++at) {
-        const int64_t p = s_.entry[at];
-        const T mass = s_.rows[row(s_.meta[p]) * kRowColumns + kMassColumn];
-        scatter_moments(stencil_at(s_.offset + 3 * p), mass, moment + window_node(s_.meta[p]),
-                        kWindowEdge);
-      }
     T* sums = static_cast<T*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
+    const uint8_t mark = contact != 0 ? 3 : 1;
     return for_each_run(h, [&](int t, int64_t node, int run) {
-      std::atomic_ref<uint8_t>(touched_[node / kBlockNodes]).store(1, std::memory_order_relaxed);
+      std::atomic_ref<uint8_t>(touched_[node / kBlockNodes])
+          .fetch_or(mark, std::memory_order_relaxed);
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < 4; ++c) sums[4 * (node + n) + c] += tile[t + n][c];
-      if (!contact) return;
+      if (contact == 0) return;
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < kContactMoments; ++c)
           moments[kContactMoments * (node + n) + c] += moment[t + n][c];
@@ -221,7 +269,6 @@ class Stepper {
   }
 
   Counts to_nodes() {
-    std::fill(touched_.begin(), touched_.end(), uint8_t(0));
     std::atomic<int64_t> uncovered{0};
     for (const std::vector<int32_t>& homes : colors_)
       parallel_for(static_cast<int64_t>(homes.size()), kHomeGrain, [&](int64_t begin, int64_t end) {
@@ -233,43 +280,93 @@ class Stepper {
     return counts;
   }
 
-  // One node of a site whose slots are `slots`: velocities, contact, colliders.
-  int64_t node(const int32_t* slots, int fields, int local, T dt, double* impulse) {
-    T* sums = static_cast<T*>(s_.sums);
-    T* moments = static_cast<T*>(s_.moments);
-    NodeSums<T> sum[kSiteFields];
+  // One site: its slots that got anything in this step, and the colliders that can touch it.
+  struct Site {
+    int32_t slots[kSiteFields];
+    int fields = 0;
+    int32_t near[kNearColliders];
+    int64_t colliders = 0;
+
+    int32_t collider(int64_t i) const {
+      return colliders <= kNearColliders ? near[i] : static_cast<int32_t>(i);
+    }
+  };
+  Site site(int64_t index) const {
+    Site site;
+    for (int i = 0; i < kSiteFields; ++i) {
+      const int32_t b = s_.site_slots[kSiteFields * index + i];
+      if (b >= 0 && b < s_.clock->slots && touched_[b] != 0) site.slots[site.fields++] = b;
+    }
+    if (site.fields == 0 || s_.collider_count == 0) return site;
+    if (s_.collider_count > kNearColliders) {
+      site.colliders = s_.collider_count;
+      return site;
+    }
+    const Vec3<T> center = node_position(site.slots[0], T(1.5), T(1.5), T(1.5));
+    for (int64_t k = 0; k < s_.collider_count; ++k) {
+      const T* row = s_.colliders + k * kColliderColumns;
+      if (!collider_valid(row, 0)) continue;
+      Vec3<T> normal;
+      // Nodes lie within sqrt(27) / 2 of the centre; what sweeps may come from anywhere.
+      const bool far = collider_signed_distance(row, static_cast<const float*>(nullptr), center,
+                                                normal) > T(2.8) * s_.dx;
+      if (!far || row[kSweep] != T(0)) site.near[site.colliders++] = static_cast<int32_t>(k);
+    }
+    return site;
+  }
+  Vec3<T> node_position(int64_t slot, T i, T j, T k) const {
+    const int32_t* b = s_.slot_coord + 4 * slot;
+    return {(T(b[0]) * kBlockEdge + i) * s_.dx, (T(b[1]) * kBlockEdge + j) * s_.dx,
+            (T(b[2]) * kBlockEdge + k) * s_.dx};
+  }
+
+  // Mass and moment of a field at a neighbour of node `local`, for core/contact.h.
+  ContactSample<T> sample(int32_t slot, int local, int o) const {
+    const int32_t row = contact_row_[slot];
+    if (row < 0) return {T(0), {T(0), T(0), T(0)}};
+    int block = 0, at = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const int node = (local >> (4 - 2 * axis) & 3) + neighbour_step(o, axis);
+      block = 3 * block + (node >> 2) + 1;
+      at = 4 * at + (node & 3);
+    }
+    const int32_t other = contact_around_[int64_t(row) * kNeighbours + block];
+    if (other < 0) return {T(0), {T(0), T(0), T(0)}};
+    const int64_t n = int64_t(other) * kBlockNodes + at;
+    const T* m = static_cast<const T*>(s_.moments) + kContactMoments * n;
+    return {static_cast<const T*>(s_.sums)[4 * n + 3], {m[0], m[1], m[2]}};
+  }
+
+  // One node of a site: velocities, contact, colliders. Returns whether fields touched.
+  int64_t node(const Site& site, int local, T dt, double* impulse) {
+    const T* sums = static_cast<const T*>(s_.sums);
+    const int fields = site.fields;
+    double mass[kSiteFields];
     Vec3<T> velocity[kSiteFields];
     bool heavy[kSiteFields];
     int present = 0;
     for (int a = 0; a < fields; ++a) {
-      const int64_t n = int64_t(slots[a]) * kBlockNodes + local;
-      sum[a].mass = double(sums[4 * n + 3]);
-      for (int i = 0; i < 3; ++i) sum[a].momentum[i] = double(sums[4 * n + i]);
-      heavy[a] = node_velocity(s_, sum[a], dt, velocity[a]);
+      const T* n = sums + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
+      const NodeSums<T> sum{double(n[3]), {double(n[0]), double(n[1]), double(n[2])}, {}};
+      heavy[a] = node_velocity(s_, sum, dt, velocity[a]);
+      mass[a] = sum.mass;
       present += heavy[a] ? 1 : 0;
-      for (int i = 0; i < 4; ++i) sums[4 * n + i] = T(0);
-      if (fields < 2 || moments == nullptr) continue;
-      T* m = moments + kContactMoments * n;
-      for (int i = 0; i < kContactMoments; ++i) {
-        sum[a].moments[i] = m[i];
-        m[i] = T(0);
-      }
     }
     int64_t contacts = 0;
-    if (present > 1 && moments != nullptr)
-      contacts = node_contact(s_, fields, heavy, OwnNode<T>{sum}, velocity) > 0 ? 1 : 0;
-    if (s_.collider_count > 0 && present > 0) {
-      const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
-      const Vec3<T> x{(T(b[0]) * kBlockEdge + T(local / 16)) * s_.dx,
-                      (T(b[1]) * kBlockEdge + T(local / 4 % 4)) * s_.dx,
-                      (T(b[2]) * kBlockEdge + T(local % 4)) * s_.dx};
-      for (int64_t k = 0; k < s_.collider_count; ++k)
+    if (present > 1 && !contact_row_.empty()) {
+      const auto near = [&](int field, int o) { return sample(site.slots[field], local, o); };
+      contacts = node_contact(s_, fields, heavy, near, velocity) > 0 ? 1 : 0;
+    }
+    if (site.colliders > 0 && present > 0) {
+      const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
+      for (int64_t i = 0; i < site.colliders; ++i) {
+        const int32_t k = site.collider(i);
         for (int a = 0; a < fields; ++a)
-          if (heavy[a])
-            node_collide(s_, k, x, sum[a].mass, dt, velocity[a], impulse + kImpulseSums * k);
+          if (heavy[a]) node_collide(s_, k, x, mass[a], velocity[a], impulse + 3 * k);
+      }
     }
     for (int a = 0; a < fields; ++a) {
-      T* out = s_.node_velocity + 4 * (int64_t(slots[a]) * kBlockNodes + local);
+      T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
       for (int i = 0; i < 3; ++i) out[i] = velocity[a][i];
       out[3] = T(0);
     }
@@ -279,34 +376,34 @@ class Stepper {
   // All nodes that got anything this step.
   void nodes(T dt) {
     SolverClock& c = *s_.clock;
-    const int64_t chunks = static_cast<int64_t>(contacts_.size()),
-                  terms = kImpulseSums * s_.collider_count;
+    const int64_t chunks = static_cast<int64_t>(contacts_.size()), terms = 3 * s_.collider_count;
     parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
       for (int64_t chunk = begin; chunk < end; ++chunk) {
         double* impulse = impulse_.data() + chunk * terms;
         std::fill(impulse, impulse + terms, 0.0);
         contacts_[chunk] = 0;
         const int64_t last = std::min((chunk + 1) * kSiteChunk, c.sites);
-        for (int64_t site = chunk * kSiteChunk; site < last; ++site) {
-          int32_t slots[kSiteFields];
-          int fields = 0;
-          for (int i = 0; i < kSiteFields; ++i) {
-            const int32_t b = s_.site_slots[kSiteFields * site + i];
-            if (b >= 0 && b < c.slots && touched_[b] != 0) slots[fields++] = b;
-          }
-          if (fields == 0) continue;
+        for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
+          const Site here = site(index);
+          if (here.fields == 0) continue;
           for (int local = 0; local < kBlockNodes; ++local)
-            contacts_[chunk] += node(slots, fields, local, dt, impulse);
+            contacts_[chunk] += node(here, local, dt, impulse);
         }
       }
     });
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) c.touched += contacts_[chunk];
-    for (int64_t k = 0; k < s_.collider_count; ++k) {
-      double sums[kImpulseSums] = {};
-      for (int64_t chunk = 0; chunk < chunks; ++chunk)
-        for (int i = 0; i < kImpulseSums; ++i)
-          sums[i] += impulse_[chunk * terms + k * kImpulseSums + i];
-      end_collider(s_, k, sums, c.dt);
+    parallel_for(c.slots, kSlotGrain, [&](int64_t begin, int64_t end) {
+      for (int64_t b = begin; b < end; ++b) {
+        if (touched_[b] & 1)
+          std::fill_n(static_cast<T*>(s_.sums) + 4 * kBlockNodes * b, 4 * kBlockNodes, T(0));
+        constexpr int64_t kMoments = kBlockNodes * kContactMoments;
+        if (touched_[b] & 2)
+          std::fill_n(static_cast<T*>(s_.moments) + kMoments * b, kMoments, T(0));
+        touched_[b] = 0;
+      }
+    });
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+      for (int64_t i = 0; i < terms; ++i) s_.impulse[i] += impulse_[chunk * terms + i];
+      c.touched += contacts_[chunk];
     }
   }
 
@@ -360,8 +457,12 @@ class Stepper {
   const int laws_;
   std::vector<int32_t> colors_[kColors];  // homes, those of one colour at once
   std::vector<Box> box_;                  // [homes]
-  std::vector<uint8_t> touched_;          // [slots] whether any home adds to it in this step
-  std::vector<double> impulse_;           // [chunks, colliders, kImpulseSums]
+  std::vector<uint8_t> touched_;          // [slots] bit 0: got sums in this step, bit 1: moments
+  std::vector<uint64_t> keys_;            // [slots]
+  std::vector<int32_t> contact_row_;      // [slots] row in contact_around_, or -1; empty: one field
+  std::vector<int32_t> contact_around_;   // [shared slots, 27] slots of the same field
+  std::vector<uint32_t> home_contact_;    // [homes] bits of the 27 blocks around that are shared
+  std::vector<double> impulse_;           // [chunks, colliders, 3]
   std::vector<int64_t> contacts_;         // [chunks] nodes at which fields touched
 };
 

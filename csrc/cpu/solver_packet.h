@@ -145,7 +145,9 @@ struct PacketMomentum {
   // Momentum and mass at the nodes: (start[i] + j y + k z) of lane l.
   Quad<T> start[3][kLanes], y[kLanes], z[kLanes];
 
-  PacketMomentum(const SolverView<T>& s, const Packet<T>& p, bool same_rows) {
+  Quad<T> moment[kLanes];  // m f, m
+
+  PacketMomentum(const SolverView<T>& s, const Packet<T>& p) {
     Pack<T> offset[3], velocity[3];
     Mat3<Pack<T>> slope;
     p.load3(s, s.offset, offset);
@@ -157,8 +159,9 @@ struct PacketMomentum {
              (meta_row(p.meta[lane]) < uint64_t(s.row_count) ? meta_row(p.meta[lane]) : 0) *
                  int64_t(kRowColumns);
     };
-    const Pack<T> mass = same_rows ? Pack<T>(row(0)[kMassColumn])
-                                   : pack_of<T>([&](int lane) { return row(lane)[kMassColumn]; });
+    const Pack<T> mass = p.same_rows()
+                             ? Pack<T>(row(0)[kMassColumn])
+                             : pack_of<T>([&](int lane) { return row(lane)[kMassColumn]; });
     for (int i = 0; i < 9; ++i) slope.m[i] *= Pack<T>(s.dx);
     Pack<T> a[4], b[4];
     for (int c = 0; c < 3; ++c)
@@ -175,6 +178,11 @@ struct PacketMomentum {
     transpose(b, y);
     for (int c = 0; c < 3; ++c) b[c] = slope(c, 2);
     transpose(b, z);
+    if (s.moments != nullptr) {
+      for (int c = 0; c < 3; ++c) b[c] = mass * stencil.f[c];
+      b[3] = mass;
+      transpose(b, moment);
+    }
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j) {
         const Pack<T> w = stencil.w[0][i] * stencil.w[1][j];
@@ -201,6 +209,17 @@ struct PacketMomentum {
       }
       for (int j = 0; j < 3; ++j)
         for (int k = 0; k < 3; ++k) node[j * kWindowEdge + k] = sum[j][k];
+    }
+  }
+
+  // The same for the first moment of the mass about each node, in cells (core/contact.h).
+  void scatter_moment(int first, int end, Lanes<T>* node) const {
+    for (int n = 0; n < 27; ++n) {
+      Lanes<T> sum{};
+      for (int lane = first; lane < end; ++lane) sum += weight[n][lane] * moment[lane];
+      const int i = n / 9, j = n / 3 % 3, k = n % 3;
+      node[(i * kWindowEdge + j) * kWindowEdge + k] +=
+          sum - sum[3] * Lanes<T>{T(i), T(j), T(k), T(0)};
     }
   }
 };
