@@ -1,74 +1,13 @@
-// The resident solver on the CPU: particles of a home to its window and back, nodes, the loop over
-// steps. Every sum is taken in an order that depends on neither the number of threads nor the order
-// in which the particles were loaded.
+// The resident solver on the CPU: priming and the loop over steps. See cpu/solver_cpu.h.
 #include "host/solver.h"
 
-#include <algorithm>
-#include <atomic>
-
-#include "core/solver_clock.h"
-#include "core/solver_node.h"
-#include "cpu/solver_cpu.h"
-#include "cpu/solver_packet.h"
+#include "cpu/solver_homes.h"
+#include "cpu/solver_nodes.h"
 
 namespace gsf::cpu {
 namespace {
 
 constexpr int64_t kParticleGrain = 2048;
-constexpr int64_t kHomeGrain = 4;
-constexpr int64_t kSlotGrain = 64;
-constexpr int64_t kSiteChunk = 16;  // sites per ordered partial sum; fixed, so that sums are too
-constexpr int64_t kNearColliders = 64;  // with more, every site looks at all of them
-constexpr int kColors = 8;              // windows of homes two blocks apart share no node
-
-// Cells of a window in order, by the nine bits of l in a meta word.
-constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
-struct CellTable {
-  uint8_t at[512];
-  constexpr CellTable() : at{} {
-    for (uint32_t word = 0; word < 512; ++word) {
-      int cell = 0;
-      for (int axis = 0; axis < 3; ++axis) {
-        const int l = static_cast<int>(word >> (3 * axis) & 7u);
-        cell = cell * (kLastCell + 1) + (l < kLastCell ? l : kLastCell);
-      }
-      at[word] = static_cast<uint8_t>(cell);
-    }
-  }
-};
-constexpr CellTable kCellOf;
-
-// Nodes [lo, hi) of a window that a home's particles touch.
-struct Box {
-  int8_t lo[3], hi[3];
-};
-
-struct Counts {
-  int64_t plastic = 0, guarded = 0, inverted = 0, invalid = 0, lost = 0;
-  bool leaves = false;
-  Largest largest{};
-
-  void add(const StepFlags& f) {
-    plastic += f.plastic;
-    guarded += f.guarded;
-    inverted += f.inverted;
-    invalid += f.invalid;
-    lost += f.lost;
-    leaves = leaves || f.leaves;
-  }
-  void add(const Counts& o) {
-    plastic += o.plastic;
-    guarded += o.guarded;
-    inverted += o.inverted;
-    invalid += o.invalid;
-    lost += o.lost;
-    leaves = leaves || o.leaves;
-    largest.speed2 = larger(o.largest.speed2, largest.speed2);
-    largest.wave2 = larger(o.largest.wave2, largest.wave2);
-    largest.gradient2 = larger(o.largest.gradient2, largest.gradient2);
-    largest.bound = larger(o.largest.bound, largest.bound);
-  }
-};
 
 void give_largest(const Largest& l, SolverClock& c) {
   c.speed = bits_of(std::sqrt(l.speed2));
@@ -79,7 +18,8 @@ void give_largest(const Largest& l, SolverClock& c) {
 template <typename T>
 class Stepper {
  public:
-  Stepper(const SolverView<T>& s, int laws) : s_(s), laws_(laws) {}
+  Stepper(const SolverView<T>& s, int laws)
+      : s_(s), laws_(laws), contact_(s), homes_(s, contact_), nodes_(s, contact_) {}
 
   // Everything that follows from the blocks; again after each build.
   void plan() {
@@ -87,399 +27,44 @@ class Stepper {
     STD_TORCH_CHECK(c.homes >= 0 && c.homes <= s_.home_capacity && c.slots >= 0 &&
                         c.slots <= s_.slot_capacity && c.sites >= 0 && c.sites <= c.slots,
                     "solver: the clock counts more blocks than there is room for");
-    const HomeList<T>& list = s_.homes();
-    for (auto& color : colors_) color.clear();
-    for (int64_t h = 0; h < c.homes; ++h) {
-      const int32_t* b = list.coord + 4 * h;
-      colors_[(b[0] & 1) * 4 + (b[1] & 1) * 2 + (b[2] & 1)].push_back(static_cast<int32_t>(h));
-    }
-    box_.assign(c.homes, Box{});
     touched_.assign(c.slots, 0);
-    plan_contact();
-    const int64_t chunks = (c.sites + kSiteChunk - 1) / kSiteChunk;
-    impulse_.assign(chunks * s_.collider_count * 3, 0.0);
-    contacts_.assign(chunks, 0);
+    contact_.make();
+    homes_.plan();
+    nodes_.plan();
   }
 
   void step() {
     SolverClock& c = *s_.clock;
-    Counts all = to_nodes();
-    nodes(static_cast<T>(c.dt));
-    all.add(laws_ == kElasticOnly
-                ? from_nodes<kElasticOnly>()
-                : (laws_ == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>()));
+    Counts all = homes_.to_nodes(touched_);
+    nodes_.run(static_cast<T>(c.dt), touched_);
+    all.add(homes_.from_nodes(laws_));
     c.plastic += all.plastic;
     c.guarded += all.guarded;
     c.inverted += all.inverted;
     c.invalid += all.invalid;
     c.lost += all.lost;
-    if (all.leaves) c.rebuild = 1;
+    if (all.leaves) c.leaving += 1;
     give_largest(all.largest, c);
     end_step(c, double(s_.dx), s_.count);
   }
 
  private:
-  // Particles of home h, clamped to those there are.
-  struct Range {
-    int64_t begin, end;
-  };
-  Range range(int64_t h) const {
-    const HomeList<T>& list = s_.homes();
-    const int64_t begin = std::clamp<int64_t>(list.start[h], 0, s_.count);
-    return {begin, begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin)};
-  }
-  int32_t slot(int64_t h, int i, int j, int k) const {
-    const int32_t n = s_.neighbour[kNeighbours * h + (window_block(i) * 3 + window_block(j)) * 3 +
-                                   window_block(k)];
-    return n < s_.clock->slots ? n : -1;
-  }
-  int64_t row(uint32_t meta) const {
-    return meta_row(meta) < uint64_t(s_.row_count) ? meta_row(meta) : 0;
-  }
-
-  // Where fields meet: the slots of a field around each of its shared ones, and for each home which
-  // of the 27 blocks around it are shared by its field. Slots lie in the order of their keys.
-  void plan_contact() {
-    const SolverClock& c = *s_.clock;
-    contact_row_.assign(s_.moments != nullptr && c.shared_sites > 0 ? c.slots : 0, -1);
-    contact_around_.clear();
-    home_contact_.assign(contact_row_.empty() ? 0 : c.homes, 0);
-    if (contact_row_.empty()) return;
-    const auto key = [&](const int32_t* b) { return block_key(b[0], b[1], b[2], b[3]); };
-    keys_.resize(c.slots);
-    for (int64_t i = 0; i < c.slots; ++i) keys_[i] = key(s_.slot_coord + 4 * i);
-    const auto around = [&](const int32_t* b, int n) {
-      const uint64_t wanted =
-          block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
-      const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
-      return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
-    };
-    for (int64_t i = 0; i < c.slots; ++i) {
-      if (s_.slot_shared[i] == 0) continue;
-      contact_row_[i] = static_cast<int32_t>(contact_around_.size() / kNeighbours);
-      for (int n = 0; n < kNeighbours; ++n)
-        contact_around_.push_back(around(s_.slot_coord + 4 * i, n));
-    }
-    for (int64_t h = 0; h < c.homes; ++h)
-      for (int n = 0; n < kNeighbours; ++n) {
-        const int32_t b = around(s_.homes().coord + 4 * h, n);
-        if (b >= 0 && s_.slot_shared[b] != 0) home_contact_[h] |= 1u << n;
-      }
-  }
-
-  // Whether nodes of the stencil at this cell lie in one of these blocks or next to it: those nodes
-  // are read where fields meet.
-  static bool near_contact(uint32_t blocks, uint32_t meta) {
-    for (uint32_t left = blocks; left != 0; left &= left - 1) {
-      const int n = __builtin_ctz(left);
-      const int step[3] = {n / 9, n / 3 % 3, n % 3};
-      bool meets = true;
-      for (int axis = 0; axis < 3; ++axis) {
-        const int l = meta_cell(meta, axis);
-        meets = meets && (step[axis] == 1 || (step[axis] == 0 ? l <= 1 : l >= 2));
-      }
-      if (meets) return true;
-    }
-    return false;
-  }
-
-  // f(tile index, node index in `sums`, nodes in a row) for the nodes of the box of home h. False
-  // when a part of it has no slot.
-  template <typename F>
-  bool for_each_run(int64_t h, const F& f) {
-    const Box& box = box_[h];
-    bool whole = true;
-    for (int i = box.lo[0]; i < box.hi[0]; ++i)
-      for (int j = box.lo[1]; j < box.hi[1]; ++j)
-        for (int k = box.lo[2]; k < box.hi[2];) {
-          const int local = window_local(k);
-          const int run = std::min(kBlockEdge - local, box.hi[2] - k);
-          const int32_t b = slot(h, i, j, k);
-          whole = whole && b >= 0;
-          if (b >= 0)
-            f((i * kWindowEdge + j) * kWindowEdge + k,
-              int64_t(b) * kBlockNodes + local_index(window_local(i), window_local(j), local), run);
-          k += run;
-        }
-    return whole;
-  }
-
-  // Box of home h, and its particles in the order of their cells (stable) in `entry`.
-  void sort_home(int64_t h, const Range& r) {
-    const auto cell = [&](int64_t p) { return kCellOf.at[s_.meta[p] & 511u]; };
-    int32_t next[kCells + 1] = {};
-    for (int64_t p = r.begin; p < r.end; ++p) ++next[cell(p) + 1];
-    int lo[3] = {kLastCell, kLastCell, kLastCell}, hi[3] = {0, 0, 0};
-    for (int c = 0; c < kCells; ++c) {
-      if (next[c + 1] > 0) {
-        const int l[3] = {c / 36, c / 6 % 6, c % 6};
-        for (int axis = 0; axis < 3; ++axis) {
-          lo[axis] = std::min(lo[axis], l[axis]);
-          hi[axis] = std::max(hi[axis], l[axis] + 3);
-        }
-      }
-      next[c + 1] += next[c];
-    }
-    for (int64_t p = r.begin; p < r.end; ++p)
-      s_.entry[r.begin + next[cell(p)]++] = static_cast<int32_t>(p);
-    for (int axis = 0; axis < 3; ++axis) {
-      box_[h].lo[axis] = static_cast<int8_t>(lo[axis]);
-      box_[h].hi[axis] = static_cast<int8_t>(hi[axis]);
-    }
-  }
-
-  // Sums of one home's particles, added to the slots. Returns whether every node had one.
-  bool home_to_nodes(int64_t h) {
-    const Range r = range(h);
-    if (r.begin == r.end) return true;
-    sort_home(h, r);
-    const uint32_t contact = home_contact_.empty() ? 0 : home_contact_[h];
-    Lanes<T> tile[kWindowNodes];
-    Lanes<T> moment[kWindowNodes];
-    for_each_run(h, [&](int t, int64_t, int run) {
-      std::fill(tile + t, tile + t + run, Lanes<T>{});
-      if (contact != 0) std::fill(moment + t, moment + t + run, Lanes<T>{});
-    });
-    for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
-      const Packet<T> packet(s_, s_.entry + at, r.end - at);
-      const PacketMomentum<T> given(s_, packet);
-      const int used = static_cast<int>(std::min<int64_t>(r.end - at, Pack<T>::kLanes));
-      for (int lane = 0; lane < used;) {
-        const int end = std::min(packet.run(lane), used);
-        const int base = window_node(packet.meta[lane]);
-        given.scatter(lane, end, tile + base);
-        if (contact != 0 && near_contact(contact, packet.meta[lane]))
-          given.scatter_moment(lane, end, moment + base);
-        lane = end;
-      }
-    }
-    T* sums = static_cast<T*>(s_.sums);
-    T* moments = static_cast<T*>(s_.moments);
-    const uint8_t mark = contact != 0 ? 3 : 1;
-    return for_each_run(h, [&](int t, int64_t node, int run) {
-      std::atomic_ref<uint8_t>(touched_[node / kBlockNodes])
-          .fetch_or(mark, std::memory_order_relaxed);
-      for (int n = 0; n < run; ++n)
-        for (int c = 0; c < 4; ++c) sums[4 * (node + n) + c] += tile[t + n][c];
-      if (contact == 0) return;
-      for (int n = 0; n < run; ++n)
-        for (int c = 0; c < kContactMoments; ++c)
-          moments[kContactMoments * (node + n) + c] += moment[t + n][c];
-    });
-  }
-
-  Counts to_nodes() {
-    std::atomic<int64_t> uncovered{0};
-    for (const std::vector<int32_t>& homes : colors_)
-      parallel_for(static_cast<int64_t>(homes.size()), kHomeGrain, [&](int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; ++i)
-          if (!home_to_nodes(homes[i])) ++uncovered;
-      });
-    Counts counts;
-    counts.lost = uncovered;
-    return counts;
-  }
-
-  // One site: its slots that got anything in this step, and the colliders that can touch it.
-  struct Site {
-    int32_t slots[kSiteFields];
-    int fields = 0;
-    int32_t near[kNearColliders];
-    int64_t colliders = 0;
-
-    int32_t collider(int64_t i) const {
-      return colliders <= kNearColliders ? near[i] : static_cast<int32_t>(i);
-    }
-  };
-  Site site(int64_t index) const {
-    Site site;
-    for (int i = 0; i < kSiteFields; ++i) {
-      const int32_t b = s_.site_slots[kSiteFields * index + i];
-      if (b >= 0 && b < s_.clock->slots && touched_[b] != 0) site.slots[site.fields++] = b;
-    }
-    if (site.fields == 0 || s_.collider_count == 0) return site;
-    if (s_.collider_count > kNearColliders) {
-      site.colliders = s_.collider_count;
-      return site;
-    }
-    const Vec3<T> center = node_position(site.slots[0], T(1.5), T(1.5), T(1.5));
-    for (int64_t k = 0; k < s_.collider_count; ++k) {
-      const T* row = s_.colliders + k * kColliderColumns;
-      if (!collider_valid(row, 0)) continue;
-      Vec3<T> normal;
-      // Nodes lie within sqrt(27) / 2 of the centre; what sweeps may come from anywhere.
-      const bool far = collider_signed_distance(row, static_cast<const float*>(nullptr), center,
-                                                normal) > T(2.8) * s_.dx;
-      if (!far || row[kSweep] != T(0)) site.near[site.colliders++] = static_cast<int32_t>(k);
-    }
-    return site;
-  }
-  Vec3<T> node_position(int64_t slot, T i, T j, T k) const {
-    const int32_t* b = s_.slot_coord + 4 * slot;
-    return {(T(b[0]) * kBlockEdge + i) * s_.dx, (T(b[1]) * kBlockEdge + j) * s_.dx,
-            (T(b[2]) * kBlockEdge + k) * s_.dx};
-  }
-
-  // Mass and moment of a field at a neighbour of node `local`, for core/contact.h.
-  ContactSample<T> sample(int32_t slot, int local, int o) const {
-    const int32_t row = contact_row_[slot];
-    if (row < 0) return {T(0), {T(0), T(0), T(0)}};
-    int block = 0, at = 0;
-    for (int axis = 0; axis < 3; ++axis) {
-      const int node = (local >> (4 - 2 * axis) & 3) + neighbour_step(o, axis);
-      block = 3 * block + (node >> 2) + 1;
-      at = 4 * at + (node & 3);
-    }
-    const int32_t other = contact_around_[int64_t(row) * kNeighbours + block];
-    if (other < 0) return {T(0), {T(0), T(0), T(0)}};
-    const int64_t n = int64_t(other) * kBlockNodes + at;
-    const T* m = static_cast<const T*>(s_.moments) + kContactMoments * n;
-    return {static_cast<const T*>(s_.sums)[4 * n + 3], {m[0], m[1], m[2]}};
-  }
-
-  // One node of a site: velocities, contact, colliders. Returns whether fields touched.
-  int64_t node(const Site& site, int local, T dt, double* impulse) {
-    const T* sums = static_cast<const T*>(s_.sums);
-    const int fields = site.fields;
-    double mass[kSiteFields];
-    Vec3<T> velocity[kSiteFields];
-    bool heavy[kSiteFields];
-    int present = 0;
-    for (int a = 0; a < fields; ++a) {
-      const T* n = sums + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
-      const NodeSums<T> sum{double(n[3]), {double(n[0]), double(n[1]), double(n[2])}, {}};
-      heavy[a] = node_velocity(s_, sum, dt, velocity[a]);
-      mass[a] = sum.mass;
-      present += heavy[a] ? 1 : 0;
-    }
-    int64_t contacts = 0;
-    if (present > 1 && !contact_row_.empty()) {
-      const auto near = [&](int field, int o) { return sample(site.slots[field], local, o); };
-      contacts = node_contact(s_, fields, heavy, near, velocity) > 0 ? 1 : 0;
-    }
-    if (site.colliders > 0 && present > 0) {
-      const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
-      for (int64_t i = 0; i < site.colliders; ++i) {
-        const int32_t k = site.collider(i);
-        for (int a = 0; a < fields; ++a)
-          if (heavy[a]) node_collide(s_, k, x, mass[a], velocity[a], impulse + 3 * k);
-      }
-    }
-    for (int a = 0; a < fields; ++a) {
-      T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
-      for (int i = 0; i < 3; ++i) out[i] = velocity[a][i];
-      out[3] = T(0);
-    }
-    return contacts;
-  }
-
-  // All nodes that got anything this step.
-  void nodes(T dt) {
-    SolverClock& c = *s_.clock;
-    const int64_t chunks = static_cast<int64_t>(contacts_.size()), terms = 3 * s_.collider_count;
-    parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
-      for (int64_t chunk = begin; chunk < end; ++chunk) {
-        double* impulse = impulse_.data() + chunk * terms;
-        std::fill(impulse, impulse + terms, 0.0);
-        contacts_[chunk] = 0;
-        const int64_t last = std::min((chunk + 1) * kSiteChunk, c.sites);
-        for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
-          const Site here = site(index);
-          if (here.fields == 0) continue;
-          for (int local = 0; local < kBlockNodes; ++local)
-            contacts_[chunk] += node(here, local, dt, impulse);
-        }
-      }
-    });
-    parallel_for(c.slots, kSlotGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t b = begin; b < end; ++b) {
-        if (touched_[b] & 1)
-          std::fill_n(static_cast<T*>(s_.sums) + 4 * kBlockNodes * b, 4 * kBlockNodes, T(0));
-        constexpr int64_t kMoments = kBlockNodes * kContactMoments;
-        if (touched_[b] & 2)
-          std::fill_n(static_cast<T*>(s_.moments) + kMoments * b, kMoments, T(0));
-        touched_[b] = 0;
-      }
-    });
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-      for (int64_t i = 0; i < terms; ++i) s_.impulse[i] += impulse_[chunk * terms + i];
-      c.touched += contacts_[chunk];
-    }
-  }
-
-  template <int kLaws, bool kTrack>
-  void home_from_nodes(int64_t h, T dt, T dt_next, Counts& counts) {
-    const Range r = range(h);
-    if (r.begin == r.end) return;
-    Lanes<T> tile[kWindowNodes];
-    for_each_run(h, [&](int t, int64_t node, int run) {
-      const T* in = s_.node_velocity + 4 * node;
-      for (int n = 0; n < run; ++n)
-        tile[t + n] = Lanes<T>{in[4 * n], in[4 * n + 1], in[4 * n + 2], T(0)};
-    });
-    const uint32_t reach = reach_of_row(s_.neighbour + kNeighbours * h);
-    PacketLargest<T> largest;
-    for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
-      const Packet<T> packet(s_, s_.entry + at, r.end - at);
-      Pack<T> offset[3], value[3];
-      Mat3<Pack<T>> first;
-      packet.load3(s_, s_.offset, offset);
-      packet_gather_tile(packet, offset, tile, value, first);
-      finish_packet<T, kLaws, kTrack>(s_, packet, reach, offset, value, first, dt, dt_next, largest,
-                                      counts);
-    }
-    largest.give(counts.largest);
-  }
-
-  template <int kLaws>
-  Counts from_nodes() {
-    return s_.deformation != nullptr ? from_nodes<kLaws, true>() : from_nodes<kLaws, false>();
-  }
-  template <int kLaws, bool kTrack>
-  Counts from_nodes() {
-    const SolverClock& c = *s_.clock;
-    const T dt = static_cast<T>(c.dt), dt_next = static_cast<T>(c.dt_next);
-    Counts all;
-    std::atomic_flag busy;
-    parallel_for(c.homes, kHomeGrain, [&](int64_t begin, int64_t end) {
-      Counts mine;
-      for (int64_t h = begin; h < end; ++h) home_from_nodes<kLaws, kTrack>(h, dt, dt_next, mine);
-      // Counts and maxima do not depend on the order in which they meet.
-      while (busy.test_and_set(std::memory_order_acquire)) busy.wait(true);
-      all.add(mine);
-      busy.clear(std::memory_order_release);
-      busy.notify_one();
-    });
-    return all;
-  }
-
   const SolverView<T>& s_;
   const int laws_;
-  std::vector<int32_t> colors_[kColors];  // homes, those of one colour at once
-  std::vector<Box> box_;                  // [homes]
-  std::vector<uint8_t> touched_;          // [slots] bit 0: got sums in this step, bit 1: moments
-  std::vector<uint64_t> keys_;            // [slots]
-  std::vector<int32_t> contact_row_;      // [slots] row in contact_around_, or -1; empty: one field
-  std::vector<int32_t> contact_around_;   // [shared slots, 27] slots of the same field
-  std::vector<uint32_t> home_contact_;    // [homes] bits of the 27 blocks around that are shared
-  std::vector<double> impulse_;           // [chunks, colliders, 3]
-  std::vector<int64_t> contacts_;         // [chunks] nodes at which fields touched
+  ContactPlan<T> contact_;
+  HomePass<T> homes_;
+  NodePass<T> nodes_;
+  std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
 };
 
 template <typename T>
 void prime_particles(const SolverView<T>& s, bool measure) {
   SolverClock& c = *s.clock;
   const T dt = static_cast<T>(c.dt);
-  Counts all;
-  std::atomic_flag busy;
-  parallel_for(s.count, kParticleGrain, [&](int64_t begin, int64_t end) {
-    Counts mine;
-    for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, mine.largest);
-    while (busy.test_and_set(std::memory_order_acquire)) busy.wait(true);
-    all.add(mine);
-    busy.clear(std::memory_order_release);
-    busy.notify_one();
-  });
+  const Counts all =
+      parallel_counts(s.count, kParticleGrain, [&](int64_t begin, int64_t end, Counts& counts) {
+        for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, counts.largest);
+      });
   if (measure)
     give_largest(all.largest, c);
   else
