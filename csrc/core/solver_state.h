@@ -165,10 +165,10 @@ struct SolverView {
   T* home_bound;         // [H] largest momentum one particle can give to one node [kg m/s]
   T* home_mass;          // [H] largest particle mass [kg]
   int32_t* slot_coord;   // [S, 4] block and field
-  int32_t* slot_shared;  // [S] whether its site holds several fields
+  int32_t* slot_shared;  // [S] 1: its site holds several fields; 2 (CUDA): next to such; 0
   int32_t* site_slots;   // [S, kSiteFields] slots of a site in ascending field, -1 after the last
   void* sums;            // [S, 64, 4] momentum and mass: int64 units on CUDA, T on the CPU
-  void* moments;         // [S, 64, kContactMoments] likewise, or null with one field
+  void* moments;         // [S, 64, kContactMoments] likewise, where slot_shared; null: one field
   T* node_velocity;      // [S, 64, 4]
   // hash table
   uint64_t* key;         // [table_size]
@@ -177,7 +177,6 @@ struct SolverView {
   int32_t* table_home;   // [table_size]
   int32_t* table_slot;   // [table_size] slot, or head of the slot list of a site
   int32_t* slot_next;    // [S] chain of the slots of a site
-  int32_t* slot_around;  // [S, 27] slots around a slot that stores moments, -1 for none; or null
   uint64_t* site_near;   // [S] colliders that can touch the block before the next build, as bits
   // colliders
   T* colliders;            // [K, kColliderColumns] as nodes see them
@@ -198,7 +197,7 @@ struct SolverView {
 #endif
   }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
-  GSF_HOST_DEVICE HomeList<T>& next_homes() { return home[1 - (clock->parity & 1)]; }
+  GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }
 };
 
 // True while a step may run: nothing has ended, failed or asked for new blocks.

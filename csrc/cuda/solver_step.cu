@@ -3,7 +3,7 @@
 // home, between windows 64 bits in a unit of the step, so that no order of additions changes a bit.
 // The units leave room for every particle at one node (csrc/core/solver_clock.h), so nothing
 // overflows.
-#include "cuda/solver_reduce.h"
+#include "cuda/solver_grid.h"
 
 namespace gsf::cuda {
 namespace {
@@ -67,7 +67,7 @@ __device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
 }
 
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(const __grid_constant__ SolverView<T> s) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
   const SolverClock& clock = *s.clock;
@@ -168,171 +168,6 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
   }
 }
 
-// Mass and momentum of one node in natural units.
-template <typename T>
-__device__ NodeSums<T> read_sums(const SolverView<T>& s, int64_t node, double unit,
-                                 double mass_unit) {
-  NodeSums<T> out;
-  const longlong2* words =
-      reinterpret_cast<const longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
-  const longlong2 a = words[0], b = words[1];
-  out.momentum[0] = double(a.x) * unit;
-  out.momentum[1] = double(a.y) * unit;
-  out.momentum[2] = double(b.x) * unit;
-  out.mass = double(b.y) * mass_unit;
-  return out;
-}
-template <typename T>
-__device__ void clear_sums(const SolverView<T>& s, int64_t node) {
-  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
-  words[0] = words[1] = longlong2{0, 0};
-}
-
-// Units of the sums over nodes that colliders get: torque is counted per 4096 dx of lever, so that
-// it stays in the range of the momentum it comes from.
-template <typename T>
-__device__ double sum_unit(const SolverView<T>& s, int i) {
-  const double unit = s.clock->momentum_unit;
-  return i < 3 ? unit : (i < 6 ? unit * double(s.dx) * 4096.0 : s.clock->mass_unit);
-}
-
-// Velocity after the colliders in `near`. Out of line: few nodes come here.
-template <typename T>
-__device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, uint64_t near, Vec3<T> x,
-                                             double mass, Vec3<T> v, T dt) {
-  for (; near != 0; near &= near - 1) {
-    const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
-    const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
-    for (int64_t k = first; k < end; ++k) {
-      double sums[kImpulseSums] = {};
-      node_collide(s, k, x, mass, dt, v, sums);
-      for (int i = 0; i < kImpulseSums; ++i) {
-        const long long units = __double2ll_rn(sums[i] / sum_unit(s, i));
-        if (units != 0)
-          atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + kImpulseSums * k + i),
-                    static_cast<unsigned long long>(units));
-      }
-    }
-  }
-  return v;
-}
-
-template <typename T>
-__device__ void store_velocity(const SolverView<T>& s, int64_t node, const Vec3<T>& v) {
-  T* out = s.node_velocity + 4 * node;
-  out[0] = v.x;
-  out[1] = v.y;
-  out[2] = v.z;
-}
-
-template <typename T>
-__device__ Vec3<T> node_position(const SolverView<T>& s, const int32_t* block, int local) {
-  return {(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
-          (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
-          (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
-}
-
-// One thread per node of a site. Sums are cleared here, except where contact still needs them.
-template <typename T>
-__global__ void __launch_bounds__(kThreads, 6) grid_kernel(SolverView<T> s) {
-  const SolverClock& clock = *s.clock;
-  if (!may_step(clock)) return;
-  const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
-  if (site >= clock.sites) return;
-  const int local = threadIdx.x % kBlockNodes;
-  const int32_t* slots = s.site_slots + site * kSiteFields;
-  const uint64_t near = s.collider_count > 0 && slots[1] < 0 ? s.site_near[site] : 0;
-  const T dt = T(clock.dt);
-  const double unit = clock.momentum_unit, mass_unit = clock.mass_unit;
-  for (int f = 0; f < kSiteFields && slots[f] >= 0 && slots[f] < s.slot_capacity; ++f) {
-    const int64_t slot = slots[f], node = slot * kBlockNodes + local;
-    const NodeSums<T> sums = read_sums(s, node, unit, mass_unit);
-    if (s.fields == 1 || s.slot_shared[slot] == 0) clear_sums(s, node);
-    Vec3<T> v;
-    if (node_velocity(s, sums, dt, v) && near != 0)
-      v = collide_near(s, near, node_position(s, s.slot_coord + 4 * slot, local), sums.mass, v, dt);
-    store_velocity(s, node, v);
-  }
-}
-
-// Mass and first moment of a field at a node or one of its 26 neighbours, for contact_pair.
-template <typename T>
-struct NearSums {
-  const SolverView<T>& s;
-  const int32_t* slots;  // of the site
-  int local;
-  double mass_unit;
-
-  __device__ ContactSample<T> operator()(int field, int o) const {
-    const int x = local / 16 + neighbour_step(o, 0), y = local / 4 % 4 + neighbour_step(o, 1),
-              z = local % 4 + neighbour_step(o, 2);
-    int64_t slot = slots[field];
-    const int at = (((x + 4) >> 2) * 3 + ((y + 4) >> 2)) * 3 + ((z + 4) >> 2);
-    if (at != 13) slot = s.slot_around[slot * kNeighbours + at];
-    if (slot < 0) return {T(0), {T(0), T(0), T(0)}};
-    const int64_t node = slot * kBlockNodes + local_index(x & 3, y & 3, z & 3);
-    const int64_t* sums = static_cast<const int64_t*>(s.sums) + 4 * node;
-    const int64_t* m = static_cast<const int64_t*>(s.moments) + kContactMoments * node;
-    return {
-        T(double(sums[3]) * mass_unit),
-        {T(double(m[0]) * mass_unit), T(double(m[1]) * mass_unit), T(double(m[2]) * mass_unit)}};
-  }
-};
-
-// Contact and colliders at the nodes of shared sites. It reads the sums of neighbours, which no one
-// changes meanwhile, and changes the velocities of its own node only.
-template <typename T>
-__global__ void __launch_bounds__(kThreads) contact_kernel(SolverView<T> s) {
-  const SolverClock& clock = *s.clock;
-  if (!may_step(clock)) return;
-  const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
-  if (site >= clock.sites) return;
-  const int local = threadIdx.x % kBlockNodes;
-  const int32_t* slots = s.site_slots + site * kSiteFields;
-  if (slots[1] < 0) return;
-  const T dt = T(clock.dt);
-  const double mass_unit = clock.mass_unit;
-  Vec3<T> velocity[kSiteFields];
-  bool heavy[kSiteFields];
-  int count = 0, present = 0;
-  for (; count < kSiteFields && slots[count] >= 0; ++count) {
-    const int64_t node = int64_t(slots[count]) * kBlockNodes + local;
-    const double mass = double(static_cast<const int64_t*>(s.sums)[4 * node + 3]) * mass_unit;
-    heavy[count] = mass > double(mass_floor<T>());
-    const T* v = s.node_velocity + 4 * node;
-    velocity[count] = {v[0], v[1], v[2]};
-    present += heavy[count] ? 1 : 0;
-  }
-  if (present == 0) return;
-  int touched = 0;
-  if (present > 1)
-    touched = node_contact(s, count, heavy, NearSums<T>{s, slots, local, mass_unit}, velocity);
-  const uint64_t near = s.collider_count > 0 ? s.site_near[site] : 0;
-  for (int f = 0; f < count; ++f) {
-    if (!heavy[f]) continue;
-    const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
-    if (near != 0) {
-      const double mass = double(static_cast<const int64_t*>(s.sums)[4 * node + 3]) * mass_unit;
-      const Vec3<T> x = node_position(s, s.slot_coord + 4 * int64_t(slots[f]), local);
-      velocity[f] = collide_near(s, near, x, mass, velocity[f], dt);
-    }
-    store_velocity(s, node, velocity[f]);
-  }
-  if (touched > 0) atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched), 1ull);
-}
-
-// Clears what grid_kernel left for contact_kernel.
-template <typename T>
-__global__ void __launch_bounds__(kThreads) clear_kernel(SolverView<T> s) {
-  const SolverClock& clock = *s.clock;
-  if (!may_step(clock)) return;
-  const int64_t node = int64_t(blockIdx.x) * kThreads + threadIdx.x, slot = node / kBlockNodes;
-  if (slot >= clock.slots || s.slot_shared[slot] == 0) return;
-  clear_sums(s, node);
-  int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
-  for (int c = 0; c < kContactMoments; ++c) m[c] = 0;
-}
-
 template <int kThreadsHere, typename T>
 __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_t home,
                           bool moving) {
@@ -374,7 +209,8 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
 }
 
 template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
+    g2p_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   __shared__ T tile[3][kTile];
@@ -455,7 +291,8 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kThreads) prime_kernel(SolverView<T> s, bool measure) {
+__global__ void __launch_bounds__(kThreads)
+    prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   const SolverClock& clock = *s.clock;
   if (int64_t(blockIdx.x) >= clock.homes) return;
   const HomeList<T>& homes = s.homes();
@@ -492,11 +329,11 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     p2g_kernel<T, true><<<homes, kP2GThreads, 0, stream>>>(s);
   else
     p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
+  if (s.moments != nullptr)
+    contact_kernel<T>
+        <<<static_cast<unsigned>((s.slot_capacity + kContactSites - 1) / kContactSites),
+           kBlockNodes, 0, stream>>>(s);
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
-  if (s.fields > 1) {
-    contact_kernel<T><<<sites, kThreads, 0, stream>>>(s);
-    clear_kernel<T><<<sites, kThreads, 0, stream>>>(s);
-  }
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)
     g2p_kernel<T, kElasticOnly, false><<<homes, kG2PThreads, 0, stream>>>(s);

@@ -46,7 +46,6 @@ enum SolverBuffer : int {
   kTableHome,
   kTableSlot,
   kSlotNext,
-  kSlotAround,
   kSiteNear,
   kColliders,
   kColliderRows,
@@ -139,7 +138,6 @@ struct SolverOps {
         {"table_home", t, 1, i32, false},
         {"table_slot", t, 1, i32, false},
         {"slot_next", c, 1, i32, false},
-        {"slot_around", c, kNeighbours, i32, true},
         {"site_near", c, 1, i64, false},
         {"colliders", s.collider_count, kColliderColumns, real, true},
         {"collider_state", s.collider_count, kColliderColumns, ScalarType::Double, true},
@@ -164,7 +162,7 @@ struct SolverOps {
     s.fields = static_cast<int32_t>(ints[kFields]);
     STD_TORCH_CHECK(s.fields >= 1 && s.fields < kMaxSolverFields, "solver: fields must be 1 to ",
                     kMaxSolverFields - 1);
-    STD_TORCH_CHECK(s.fields == 1 || (b[kMoments].numel() > 0 && b[kSlotAround].numel() > 0),
+    STD_TORCH_CHECK(s.fields == 1 || b[kMoments].numel() > 0,
                     "solver: several fields need moments");
     STD_TORCH_CHECK(b[kColliderRows].numel() == b[kColliders].numel() &&
                         b[kImpulse].numel() == s.collider_count * kImpulseSums &&
@@ -211,7 +209,6 @@ struct SolverOps {
     s.table_home = int_at(kTableHome);
     s.table_slot = int_at(kTableSlot);
     s.slot_next = int_at(kSlotNext);
-    s.slot_around = int_at(kSlotAround);
     s.site_near = static_cast<uint64_t*>(any_at(kSiteNear));
     s.colliders = real_at(kColliders);
     s.collider_state = static_cast<double*>(any_at(kColliderRows));

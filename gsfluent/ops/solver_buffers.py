@@ -79,7 +79,6 @@ class Buffers:
     table_home: Tensor
     table_slot: Tensor
     slot_next: Tensor
-    slot_around: Tensor
     site_near: Tensor
     colliders: Tensor
     collider_state: Tensor
@@ -120,7 +119,6 @@ class Buffers:
         self.sums = torch.zeros(slots, BLOCK_NODES, 4, dtype=sums, device=device)
         many = slots if fields > 1 else 0
         self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=sums, device=device)
-        self.slot_around = whole(many, NEIGHBOURS)
         self.site_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         # Homes and slots share the table with one entry per site; half full at most.
