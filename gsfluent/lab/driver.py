@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -12,9 +13,21 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.lab.stepper import Scene, Stepper
 
-__all__ = ["World"]
+__all__ = ["World", "running_on"]
 
 Force = Callable[["World", float], None]
+
+_place: list[torch.device] = []
+
+
+@contextlib.contextmanager
+def running_on(device: str | torch.device) -> Iterator[None]:
+    """Make ``device`` the place of every World built inside the block that names none."""
+    _place.append(torch.device(device))
+    try:
+        yield
+    finally:
+        _place.pop()
 
 
 class World:
@@ -45,7 +58,7 @@ class World:
         force: ``force(world, dt)``, called before every step; adds to ``world.velocity``.
         period: Length of the domain on each axis [m], a whole number of ``dx`` from 0, or None
             where it is not periodic.
-        device: Where to run.
+        device: Where to run; default that of :func:`running_on`, else of ``position``.
         irreversible: Broken NACC material does not regain its cohesion.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
@@ -89,7 +102,9 @@ class World:
             raise ValueError(f"World: cfl must be in (0, 2], got {cfl}")
         if any(p is not None and abs(p / dx - round(p / dx)) > 1e-9 for p in period):
             raise ValueError(f"World: period must be a whole number of dx = {dx}, got {period}")
-        device = torch.device(device) if device is not None else position.device
+        if device is None:
+            device = _place[-1] if _place else position.device
+        device = torch.device(device)
         count = position.shape[0]
 
         def number(value: Tensor | Sequence[float] | float | None, *shape: int) -> Tensor:

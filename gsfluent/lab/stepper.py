@@ -100,8 +100,9 @@ class Stepper:
         self.info = torch.zeros(4, dtype=torch.int64, device=position.device)
         self._blocks: ops.Blocks | None = None
         self._travelled = 0.0
-        # the stress of the first step belongs to the strain given: a step without motion
-        self.stress = self._map(torch.zeros_like(affine), 0.0)[2]
+        # the stress of the first step belongs to the strain given: a step without motion, of a
+        # length that only viscosity reads
+        self.stress = self._map(torch.zeros_like(affine), 1.0)[2]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
@@ -118,7 +119,7 @@ class Stepper:
         law, params, material = self._rows()
         return ops.return_mapping(
             self.strain, self.alpha, increment,
-            law=law, params=params, material=material, **self.scene.return_map,
+            law=law, params=params, material=material, dt=dt, **self.scene.return_map,
         )  # fmt: skip
 
     def limit(self) -> float:
