@@ -21,8 +21,9 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor table, Tensor coords, Tensor order, Tensor start, int[3] origin, int margin, "
       "float dx) -> Tensor");
   m.def(
-      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor? sdf, Tensor coords, "
-      "float dx, float dt, float gravity_x, float gravity_y, float gravity_z, float friction, "
+      "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor? sdf, "
+      "Tensor? merged, Tensor table, Tensor coords, int[3] origin, float dx, float dt, float "
+      "gravity_x, float gravity_y, float gravity_z, float friction, "
       "float restitution, float contact_gap) -> "
       "(Tensor velocity, Tensor impulse, Tensor contact_mass, Tensor contact_nodes)");
   m.def(

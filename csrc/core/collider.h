@@ -127,7 +127,7 @@ GSF_HOST_DEVICE void turn_further(T* q, const Vec3<T>& w) {
 }
 
 // Angular velocity from angular momentum (`up` false) or back, both in the world frame. An axis
-// without a moment of inertia keeps what the angular velocity says (momentum 0).
+// without a moment of inertia does not turn.
 template <typename T>
 GSF_HOST_DEVICE Vec3<T> spin(const T* row, const Vec3<T>& value, bool up) {
   Vec3<T> local = turn(row + kOrientation, value, true);
@@ -139,8 +139,8 @@ GSF_HOST_DEVICE Vec3<T> spin(const T* row, const Vec3<T>& value, bool up) {
 }
 
 // Moves a collider over dt. One with mass first loses the impulse [N s] and torque [N m s] that it
-// gave to the bodies and falls with `gravity`; it then turns freely with that angular momentum
-// (midpoint rule on the rotation, as pipeline.simulate_flight). Call it with T = double where the
+// gave to the bodies; it falls along its parabola and turns freely with that angular momentum
+// (midpoint rule on the rotation). Call it with T = double where the
 // row is kept: one step is a small change of a large number.
 template <typename T>
 GSF_HOST_DEVICE void advance_collider(T* row, T dt, const Vec3<T>& impulse, const Vec3<T>& torque,
@@ -152,7 +152,7 @@ GSF_HOST_DEVICE void advance_collider(T* row, T dt, const Vec3<T>& impulse, cons
   const bool turns =
       free && (row[kInertia] > T(0) || row[kInertia + 1] > T(0) || row[kInertia + 2] > T(0));
   Vec3<T> momentum{T(0), T(0), T(0)};
-  if (free) velocity = velocity - (T(1) / row[kMass]) * impulse + dt * gravity;
+  if (free) velocity = velocity - (T(1) / row[kMass]) * impulse + (T(0.5) * dt) * gravity;
   if (turns) {
     momentum = spin(row, omega, true) - torque;
     omega = spin(row, momentum, false);
@@ -164,9 +164,9 @@ GSF_HOST_DEVICE void advance_collider(T* row, T dt, const Vec3<T>& impulse, cons
   if (dot(omega, omega) > T(0)) turn_further(q, dt * omega);
   if (turns) omega = spin(row, momentum, false);
   for (int i = 0; i < 3; ++i) {
-    row[kVelocity + i] = velocity[i];
-    row[kAngularVelocity + i] = omega[i];
     row[kPoint + i] += dt * velocity[i];
+    row[kVelocity + i] = velocity[i] + (free ? T(0.5) * dt * gravity[i] : T(0));
+    row[kAngularVelocity + i] = omega[i];
   }
 }
 

@@ -27,8 +27,7 @@ enum ColliderColumn {
   kSdfStart = 29          // distance grid: its first value in the buffer, in units of 64 values
 };
 constexpr int kColliderColumns = 32;
-constexpr int kColliderColumnsBefore = 16;  // the columns up to kSweep, with the last two 0
-constexpr int64_t kSdfAlign = 64;           // so that offsets are exact in float32 up to 2^30
+constexpr int64_t kSdfAlign = 64;  // so that offsets are exact in float32 up to 2^30
 
 enum ColliderType {
   kNothing = -1,  // an empty row

@@ -58,7 +58,12 @@ GSF_HOST_DEVICE double choose_step(const SolverClock& c, double from, double dx)
   return 2.0 * step > left ? 0.5 * left : step;
 }
 
-GSF_HOST_DEVICE void reset_largest(SolverClock& c) { c.speed = c.wave = c.gradient = 0; }
+// Largest values of the step just done have been used; how far a point may move in the next one
+// (twice what it would at the present speed) is kept for the particles near the end of a window.
+GSF_HOST_DEVICE void reset_largest(SolverClock& c, double dx) {
+  c.slack = min(0.5, 0.01 + 2.0 * float_of_bits(c.speed) * max(c.dt, c.dt_next) / dx);
+  c.speed = c.wave = c.gradient = 0;
+}
 
 GSF_HOST_DEVICE bool check_largest(SolverClock& c) {
   const double speed = float_of_bits(c.speed), wave = float_of_bits(c.wave);
@@ -97,7 +102,7 @@ GSF_HOST_DEVICE void start_clock(SolverClock& c, double dx) {
   c.dt = choose_step(c, c.time, dx);
   c.dt_next = c.steps_left == 1 ? 0.0 : choose_step(c, c.time + c.dt, dx);
   if (!(c.dt > 0.0)) c.done = 1;
-  reset_largest(c);
+  reset_largest(c, dx);
 }
 
 // End of a step: time moves on by dt; dt_next, chosen one step ago, becomes current.
@@ -121,12 +126,12 @@ GSF_HOST_DEVICE void end_step(SolverClock& c, double dx, int64_t count) {
   if (c.steps_left > 0) c.steps_left -= 1;
   if (last || c.steps_left == 0) {
     c.done = 1;
-    reset_largest(c);
+    reset_largest(c, dx);
     return;
   }
   c.dt = c.dt_next;
   c.dt_next = c.steps_left == 1 ? 0.0 : choose_step(c, c.time + c.dt, dx);
-  reset_largest(c);
+  reset_largest(c, dx);
 }
 
 }  // namespace gsf

@@ -27,20 +27,30 @@ GSF_HOST_DEVICE bool node_velocity(const SolverView<T>& s, const NodeSums<T>& su
   return true;
 }
 
-// Contact between every pair of the fields at one node, in ascending field (Gauss-Seidel); returns
-// how many pairs touched.
+// The sums of a node itself for node_contact, for a grid without access to neighbouring nodes; the
+// normals are then those of a single node.
 template <typename T>
-GSF_HOST_DEVICE int node_contact(const SolverView<T>& s, int fields, const NodeSums<T>* sums,
-                                 const bool* heavy, Vec3<T>* velocity) {
+struct OwnNode {
+  const NodeSums<T>* sums;  // [fields]
+  GSF_HOST_DEVICE ContactSample<T> operator()(int field, int o) const {
+    if (o != 13) return {T(0), {T(0), T(0), T(0)}};
+    const NodeSums<T>& n = sums[field];
+    return {T(n.mass), {n.moments[0], n.moments[1], n.moments[2]}};
+  }
+};
+
+// Contact between every pair of the fields at one node, in ascending field (Gauss-Seidel); returns
+// how many pairs touched. near(field, o) = ContactSample of neighbour o, see core/contact.h.
+template <typename T, typename Near>
+GSF_HOST_DEVICE int node_contact(const SolverView<T>& s, int fields, const bool* heavy,
+                                 const Near& near, Vec3<T>* velocity) {
   int touched = 0;
   for (int a = 0; a < fields; ++a) {
     if (!heavy[a]) continue;
     for (int b = a + 1; b < fields; ++b) {
       if (!heavy[b]) continue;
-      touched += contact_pair(T(sums[a].mass), T(sums[b].mass), sums[a].moments, sums[b].moments,
-                              s.dx, s.contact, velocity[a], velocity[b])
-                     ? 1
-                     : 0;
+      const auto pair = [&](int side, int o) { return near(side == 0 ? a : b, o); };
+      touched += contact_pair<T>(pair, s.contact, velocity[a], velocity[b]) ? 1 : 0;
     }
   }
   return touched;

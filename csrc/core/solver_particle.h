@@ -121,9 +121,10 @@ GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, T
   for (int i = 0; i < 9; ++i) out[i] = mass * c.m[i] - scale * t.m[i];
 }
 
-// Moves (l, o) of one axis by `step` cells. False when it left the window.
+// Moves (l, o) of one axis by `step` cells; `leaves` is set within `slack` cells of the end of the
+// window. False when it left the window.
 template <typename T>
-GSF_HOST_DEVICE bool move_axis(T step, int& l, T& o, bool& leaves) {
+GSF_HOST_DEVICE bool move_axis(T step, T slack, int& l, T& o, bool& leaves) {
   using std::floor;
   const T there = o + step;
   if (!(there > T(-8) && there < T(8))) return false;  // NaN too
@@ -137,7 +138,7 @@ GSF_HOST_DEVICE bool move_axis(T step, int& l, T& o, bool& leaves) {
   o = rest;
   l = cell < 0 ? 0 : (cell > kLastCell ? kLastCell : cell);
   const T reached = T(cell) + rest;
-  leaves = leaves || reached < T(0.5) || reached > T(kLastCell) + T(0.5);
+  leaves = leaves || reached < slack || reached > T(kLastCell + 1) - slack;
   return cell >= 0 && cell <= kLastCell;
 }
 
@@ -149,7 +150,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
                                           Largest& largest) {
   StepFlags flags{};
-  const T inv_dx = T(1) / s.dx;
+  const T inv_dx = T(1) / s.dx, slack = T(s.clock->slack);
   const uint32_t meta = s.meta[p];
   const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
   Mat3<T> c;
@@ -158,7 +159,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
   int l[3] = {meta_cell(meta, 0), meta_cell(meta, 1), meta_cell(meta, 2)};
   for (int axis = 0; axis < 3; ++axis) {
     T o = s.offset[s.at(3, p, axis)];
-    if (!move_axis(dt * inv_dx * value[axis], l[axis], o, flags.leaves)) flags.lost = true;
+    if (!move_axis(dt * inv_dx * value[axis], slack, l[axis], o, flags.leaves)) flags.lost = true;
     flags.leaves = flags.leaves || !cell_in_reach(reach, axis, l[axis]);
     s.offset[s.at(3, p, axis)] = o;
     s.velocity[s.at(3, p, axis)] = value[axis];

@@ -21,10 +21,9 @@ namespace gsf {
 
 constexpr int kWindowEdge = 8;
 constexpr int kWindowNodes = 512;
-constexpr int kNeighbours = 27;     // blocks a window can touch
-constexpr int kContactMoments = 6;  // mass gradient and first moment
-constexpr int kLastCell = 5;        // largest l
-constexpr int kRowColumns = 10;     // eight material parameters, particle mass, particle volume
+constexpr int kNeighbours = 27;  // blocks a window can touch
+constexpr int kLastCell = 5;     // largest l
+constexpr int kRowColumns = 10;  // eight material parameters, particle mass, particle volume
 constexpr int kMassColumn = 8;
 constexpr int kVolumeColumn = 9;
 constexpr int kSiteFields = 16;  // fields that may share one block
@@ -118,7 +117,8 @@ struct SolverClock {
   int64_t wanted_slots, homes_max, slots_max, particle_steps;  // 36..39
   int64_t touched, lost, unit_bits, shared_sites;              // 40..43
   double speed_seen, wave_seen;                                // 44, 45
-  int64_t leaving, spare;                                      // 46, 47
+  int64_t leaving;                                             // 46
+  double slack;                                                // 47 cells a point may move next
 };
 constexpr int kClockWords = 48;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");

@@ -8,9 +8,8 @@
 
 #include "core/solver_clock.h"
 #include "core/solver_node.h"
-#include "core/solver_particle.h"
-#include "cpu/mpm_lanes.h"
 #include "cpu/solver_cpu.h"
+#include "cpu/solver_packet.h"
 
 namespace gsf::cpu {
 namespace {
@@ -114,12 +113,6 @@ class Stepper {
                                    window_block(k)];
     return n < s_.clock->slots ? n : -1;
   }
-  static int tile_base(uint32_t meta) {
-    int at = 0;
-    for (int axis = 0; axis < 3; ++axis)
-      at = at * kWindowEdge + std::min(meta_cell(meta, axis), kLastCell);
-    return at;
-  }
   int64_t row(uint32_t meta) const {
     return meta_row(meta) < uint64_t(s_.row_count) ? meta_row(meta) : 0;
   }
@@ -145,14 +138,30 @@ class Stepper {
     return whole;
   }
 
-  void find_box(int64_t h, const Range& r) {
+  // Box of home h, and its particles in the order of their cells (stable) in `entry`.
+  void sort_home(int64_t h, const Range& r) {
+    constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
+    const auto cell = [&](int64_t p) {
+      int at = 0;
+      for (int axis = 0; axis < 3; ++axis)
+        at = at * (kLastCell + 1) + std::min(meta_cell(s_.meta[p], axis), kLastCell);
+      return at;
+    };
+    int32_t next[kCells + 1] = {};
+    for (int64_t p = r.begin; p < r.end; ++p) ++next[cell(p) + 1];
     int lo[3] = {kLastCell, kLastCell, kLastCell}, hi[3] = {0, 0, 0};
-    for (int64_t p = r.begin; p < r.end; ++p)
-      for (int axis = 0; axis < 3; ++axis) {
-        const int l = std::min(meta_cell(s_.meta[p], axis), kLastCell);
-        lo[axis] = std::min(lo[axis], l);
-        hi[axis] = std::max(hi[axis], l + 3);
+    for (int c = 0; c < kCells; ++c) {
+      if (next[c + 1] > 0) {
+        const int l[3] = {c / 36, c / 6 % 6, c % 6};
+        for (int axis = 0; axis < 3; ++axis) {
+          lo[axis] = std::min(lo[axis], l[axis]);
+          hi[axis] = std::max(hi[axis], l[axis] + 3);
+        }
       }
+      next[c + 1] += next[c];
+    }
+    for (int64_t p = r.begin; p < r.end; ++p)
+      s_.entry[r.begin + next[cell(p)]++] = static_cast<int32_t>(p);
     for (int axis = 0; axis < 3; ++axis) {
       box_[h].lo[axis] = static_cast<int8_t>(lo[axis]);
       box_[h].hi[axis] = static_cast<int8_t>(hi[axis]);
@@ -172,23 +181,32 @@ class Stepper {
   bool home_to_nodes(int64_t h) {
     const Range r = range(h);
     if (r.begin == r.end) return true;
-    find_box(h, r);
+    sort_home(h, r);
     const bool contact = shared(h);
     Lanes<T> tile[kWindowNodes];
-    Lanes<T> moment[2 * kWindowNodes];
+    Lanes<T> moment[kWindowNodes];
     for_each_run(h, [&](int t, int64_t, int run) {
       for (int n = t; n < t + run; ++n) tile[n] = Lanes<T>{};
       if (contact)
-        for (int n = 2 * t; n < 2 * (t + run); ++n) moment[n] = Lanes<T>{};
+        for (int n = t; n < t + run; ++n) moment[n] = Lanes<T>{};
     });
-    for (int64_t p = r.begin; p < r.end; ++p) {
-      const int at = tile_base(s_.meta[p]);
-      const T mass = s_.rows[row(s_.meta[p]) * kRowColumns + kMassColumn];
-      const Stencil<T> stencil = stencil_at(s_.offset + 3 * p);
-      scatter_momentum(momentum_given(stencil, s_.velocity + 3 * p, s_.slope + 9 * p, mass, s_.dx),
-                       stencil, tile + at, kWindowEdge);
-      if (contact) scatter_moments(stencil, mass, s_.dx, moment + 2 * at, kWindowEdge);
+    for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
+      const Packet<T> packet(s_, s_.entry + at, r.end - at);
+      const PacketMomentum<T> given(s_, packet, packet.same_rows());
+      const int used = static_cast<int>(std::min<int64_t>(r.end - at, Pack<T>::kLanes));
+      for (int lane = 0; lane < used;) {
+        const int end = std::min(packet.run(lane), used);
+        given.scatter(lane, end, tile + window_node(packet.meta[lane]));
+        lane = end;
+      }
     }
+    if (contact)
+      for (int64_t at = r.begin; at < r.end; ++at) {
+        const int64_t p = s_.entry[at];
+        const T mass = s_.rows[row(s_.meta[p]) * kRowColumns + kMassColumn];
+        scatter_moments(stencil_at(s_.offset + 3 * p), mass, moment + window_node(s_.meta[p]),
+                        kWindowEdge);
+      }
     T* sums = static_cast<T*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
     return for_each_run(h, [&](int t, int64_t node, int run) {
@@ -198,7 +216,7 @@ class Stepper {
       if (!contact) return;
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < kContactMoments; ++c)
-          moments[kContactMoments * (node + n) + c] += moment[2 * (t + n) + c / 3][c % 3];
+          moments[kContactMoments * (node + n) + c] += moment[t + n][c];
     });
   }
 
@@ -239,7 +257,7 @@ class Stepper {
     }
     int64_t contacts = 0;
     if (present > 1 && moments != nullptr)
-      contacts = node_contact(s_, fields, sum, heavy, velocity) > 0 ? 1 : 0;
+      contacts = node_contact(s_, fields, heavy, OwnNode<T>{sum}, velocity) > 0 ? 1 : 0;
     if (s_.collider_count > 0 && present > 0) {
       const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
       const Vec3<T> x{(T(b[0]) * kBlockEdge + T(local / 16)) * s_.dx,
@@ -297,12 +315,17 @@ class Stepper {
         tile[t + n] = Lanes<T>{in[4 * n], in[4 * n + 1], in[4 * n + 2], T(0)};
     });
     const uint32_t reach = reach_of_row(s_.neighbour + kNeighbours * h);
-    for (int64_t p = r.begin; p < r.end; ++p) {
-      const int at = tile_base(s_.meta[p]);
-      const Gathered<T> g = gather(stencil_at(s_.offset + 3 * p), T(1), tile + at, kWindowEdge);
-      counts.add(finish_particle<T, kLaws, kTrack>(s_, p, reach, g.value, g.first, dt, dt_next,
-                                                   counts.largest));
+    PacketLargest<T> largest;
+    for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
+      const Packet<T> packet(s_, s_.entry + at, r.end - at);
+      Pack<T> offset[3], value[3];
+      Mat3<Pack<T>> first;
+      packet.load3(s_, s_.offset, offset);
+      packet_gather_tile(packet, offset, tile, value, first);
+      finish_packet<T, kLaws, kTrack>(s_, packet, reach, offset, value, first, dt, dt_next, largest,
+                                      counts);
     }
+    largest.give(counts.largest);
   }
 
   template <int kLaws>

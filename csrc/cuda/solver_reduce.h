@@ -7,18 +7,26 @@ namespace gsf::cuda {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
 
-// Largest of the non-negative values (as bits, so that NaN wins) over the CTA; valid in thread 0.
-__device__ inline unsigned block_largest(float value) {
-  __shared__ unsigned warps[kSolverThreads / 32];
-  const unsigned bits = value >= 0.0f ? __float_as_uint(value) : (value < 0.0f ? 0u : 0x7fffffffu);
-  const unsigned largest = __reduce_max_sync(kAllLanes, bits);
+// Bits of a non-negative value, so that NaN sorts above all others.
+__device__ inline unsigned sortable(float value) {
+  return value >= 0.0f ? __float_as_uint(value) : (value < 0.0f ? 0u : 0x7fffffffu);
+}
+
+// Largest of each of the kValues values over the CTA, as sortable bits; valid in thread 0.
+template <int kThreadsHere, int kValues>
+__device__ inline void block_largest(const float (&values)[kValues], unsigned (&out)[kValues]) {
+  __shared__ unsigned warps[kValues][kThreadsHere / 32];
+  for (int i = 0; i < kValues; ++i) {
+    const unsigned largest = __reduce_max_sync(kAllLanes, sortable(values[i]));
+    if ((threadIdx.x & 31) == 0) warps[i][threadIdx.x / 32] = largest;
+  }
   __syncthreads();
-  if ((threadIdx.x & 31) == 0) warps[threadIdx.x / 32] = largest;
-  __syncthreads();
-  unsigned all = 0;
-  if (threadIdx.x == 0)
-    for (int w = 0; w < kSolverThreads / 32; ++w) all = all > warps[w] ? all : warps[w];
-  return all;
+  if (threadIdx.x != 0) return;
+  for (int i = 0; i < kValues; ++i) {
+    out[i] = 0;
+    for (int w = 0; w < kThreadsHere / 32; ++w)
+      out[i] = out[i] > warps[i][w] ? out[i] : warps[i][w];
+  }
 }
 
 __device__ inline void raise_to(uint64_t* word, unsigned bits) {
@@ -71,10 +79,12 @@ __device__ void home_bounds(const SolverView<T>& s, int64_t home, int64_t first,
     bound = larger(float(momentum_bound(velocity, slope, m, s.dx)), bound);
     mass = larger(float(m), mass);
   }
-  const unsigned b = block_largest(bound), m = block_largest(mass);
+  const float values[2] = {bound, mass};
+  unsigned largest[2];
+  block_largest<kSolverThreads>(values, largest);
   if (threadIdx.x == 0) {
-    s.home_bound[home] = T(__uint_as_float(b)) * T(1.000001);
-    s.home_mass[home] = T(__uint_as_float(m)) * T(1.000001);
+    s.home_bound[home] = T(__uint_as_float(largest[0])) * T(1.000001);
+    s.home_mass[home] = T(__uint_as_float(largest[1])) * T(1.000001);
   }
 }
 

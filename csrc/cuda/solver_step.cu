@@ -9,6 +9,13 @@ namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = kSolverThreads;
+#ifndef GSF_P2G_THREADS
+#define GSF_P2G_THREADS 256
+#define GSF_G2P_THREADS 256
+#define GSF_G2P_CTAS 2
+#endif
+constexpr int kP2GThreads = GSF_P2G_THREADS;
+constexpr int kG2PThreads = GSF_G2P_THREADS;
 // Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.
 constexpr int kStrideX = 68, kStrideY = 8;
 constexpr int kTile = kWindowEdge * kStrideX;
@@ -47,39 +54,47 @@ __device__ int window_node(int index, int& i, int& j, int& k) {
   return i * kStrideX + j * kStrideY + k;
 }
 
+__device__ int neighbour_of(int i, int j, int k) {
+  return (window_block(i) * 3 + window_block(j)) * 3 + window_block(k);
+}
+
 // Slot and node inside it of window node (i, j, k); -1 when no slot is there.
 __device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
-  const int32_t slot = neighbour[(window_block(i) * 3 + window_block(j)) * 3 + window_block(k)];
+  const int32_t slot = neighbour[neighbour_of(i, j, k)];
   if (slot < 0) return -1;
   return int64_t(slot) * kBlockNodes +
          local_index(window_local(i), window_local(j), window_local(k));
 }
 
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kThreads) p2g_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
   const SolverClock& clock = *s.clock;
   if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   __shared__ Word tile[kChannels][kTile];
   __shared__ int32_t neighbour[kNeighbours];
+  __shared__ bool slot_shared[kMoments ? kNeighbours : 1];
   __shared__ int shared_home;
   const HomeList<T>& homes = s.homes();
   const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
   if (threadIdx.x == 0) shared_home = 0;
-  for (int i = threadIdx.x; i < kChannels * kTile; i += kThreads) (&tile[0][0])[i] = 0;
+  for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
   __syncthreads();
   if (threadIdx.x < kNeighbours) {
     const int32_t slot = s.neighbour[int64_t(blockIdx.x) * kNeighbours + threadIdx.x];
     neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
-    if (kMoments && slot >= 0 && s.slot_shared[slot] != 0) shared_home = 1;
+    if constexpr (kMoments) {
+      slot_shared[threadIdx.x] = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
+      if (slot_shared[threadIdx.x]) shared_home = 1;
+    }
   }
   __syncthreads();
   const bool with_moments = kMoments && shared_home != 0;
   const double unit = window_unit<T>(s.home_bound[blockIdx.x], 0.43, count, clock.momentum_unit);
   const double mass_unit = window_unit<T>(s.home_mass[blockIdx.x], 1.0, count, clock.mass_unit);
   const T per_unit = T(1.0 / unit), per_mass = T(1.0 / mass_unit);
-  for (int64_t r = threadIdx.x; r < count; r += kThreads) {
+  for (int64_t r = threadIdx.x; r < count; r += kP2GThreads) {
     const int64_t p = first + r;
     if (p < 0 || p >= s.count) continue;
     const uint32_t meta = s.meta[p];
@@ -114,14 +129,9 @@ __global__ void __launch_bounds__(kThreads) p2g_kernel(SolverView<T> s) {
           Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
           if constexpr (kMoments) {
             if (with_moments) {
-              const T g[6] = {st.slope(0, i) * st.w[1][j] * st.w[2][k],
-                              st.w[0][i] * st.slope(1, j) * st.w[2][k],
-                              st.w[0][i] * st.w[1][j] * st.slope(2, k),
-                              w * (st.f[0] - T(i)),
-                              w * (st.f[1] - T(j)),
-                              w * (st.f[2] - T(k))};
-              for (int c = 0; c < 6; ++c)
-                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(weight_unit * g[c]));
+              const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
+              for (int c = 0; c < kContactMoments; ++c)
+                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
             }
           }
         }
@@ -130,7 +140,7 @@ __global__ void __launch_bounds__(kThreads) p2g_kernel(SolverView<T> s) {
   const double to_step = unit / clock.momentum_unit, to_mass = mass_unit / clock.mass_unit;
   int64_t* sums = static_cast<int64_t*>(s.sums);
   int64_t* moments = static_cast<int64_t*>(s.moments);
-  for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
+  for (int index = threadIdx.x; index < kWindowNodes; index += kP2GThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
     if (tile[3][at] == 0) continue;
@@ -145,7 +155,8 @@ __global__ void __launch_bounds__(kThreads) p2g_kernel(SolverView<T> s) {
                   static_cast<unsigned long long>(v));
     }
     if constexpr (kMoments) {
-      if (with_moments)
+      // Only shared slots: nobody would clear the moments of the others.
+      if (with_moments && slot_shared[neighbour_of(i, j, k)])
         for (int c = 0; c < kContactMoments; ++c) {
           const Word word = tile[4 + c][at];
           const long long v = sizeof(T) == 8 ? word : __double2ll_rn(double(word) * to_mass);
@@ -172,26 +183,59 @@ __device__ NodeSums<T> take_sums(const SolverView<T>& s, int64_t node, bool shar
   if (shared) {
     int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
     for (int c = 0; c < kContactMoments; ++c) {
-      const double value = double(m[c]) * mass_unit;
-      out.moments[c] = T(c < 3 ? value / double(s.dx) : value * double(s.dx));
+      out.moments[c] = T(double(m[c]) * mass_unit);
       m[c] = 0;
     }
   }
   return out;
 }
 
+// Colliders that can touch a node of the block, as bits; the lanes of a warp look at one each. A
+// sweeping or moving collider reaches as far as anything can move in the step. More than 64
+// colliders: the last bit stands for all the others.
 template <typename T>
-__device__ void collide_all(const SolverView<T>& s, const Vec3<T>& x, double mass, Vec3<T>& v) {
-  for (int64_t k = 0; k < s.collider_count; ++k) {
-    double impulse[3] = {0.0, 0.0, 0.0};
-    node_collide(s, k, x, mass, v, impulse);
-    const double per_unit = 1.0 / s.clock->momentum_unit;
-    for (int i = 0; i < 3; ++i) {
-      const long long units = __double2ll_rn(impulse[i] * per_unit);
-      if (units != 0)
-        atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
-                  static_cast<unsigned long long>(units));
+__device__ uint64_t colliders_near(const SolverView<T>& s, const Vec3<T>& middle) {
+  if (s.collider_count == 0) return 0;
+  const T reach = T(2.7) * s.dx + T(s.clock->dt) * T(s.clock->speed_seen);
+  uint64_t near = 0;
+  for (int first = 0; first < 64 && first < s.collider_count; first += 32) {
+    const int k = first + (threadIdx.x & 31);
+    bool touches = false;
+    if (k < s.collider_count && k < 63) {
+      const T* row = s.colliders + int64_t(k) * kColliderColumns;
+      Vec3<T> normal;
+      const T own = norm(load_vec3(row + kVelocity)) * T(s.clock->dt);
+      touches = collider_valid(row, 0) &&
+                collider_signed_distance(row, static_cast<const float*>(nullptr), middle, normal) <=
+                    reach + own;
     }
+    near |= uint64_t(__ballot_sync(kAllLanes, touches)) << first;
+  }
+  if (s.collider_count > 63) near |= uint64_t(1) << 63;
+  return near;
+}
+
+template <typename T>
+__device__ void collide_one(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
+                            Vec3<T>& v) {
+  double impulse[3] = {0.0, 0.0, 0.0};
+  node_collide(s, k, x, mass, v, impulse);
+  const double per_unit = 1.0 / s.clock->momentum_unit;
+  for (int i = 0; i < 3; ++i) {
+    const long long units = __double2ll_rn(impulse[i] * per_unit);
+    if (units != 0)
+      atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
+                static_cast<unsigned long long>(units));
+  }
+}
+
+template <typename T>
+__device__ __noinline__ void collide_near(const SolverView<T>& s, uint64_t near, const Vec3<T>& x,
+                                          double mass, Vec3<T>& v) {
+  for (; near != 0; near &= near - 1) {
+    const int64_t k = __ffsll(static_cast<long long>(near)) - 1;
+    const int64_t last = k == 63 ? s.collider_count : k + 1;
+    for (int64_t i = k; i < last; ++i) collide_one(s, i, x, mass, v);
   }
 }
 
@@ -206,7 +250,7 @@ __device__ void store_velocity(const SolverView<T>& s, int64_t node, const Vec3<
 // A node that several fields may share: kept out of line, most scenes never come here.
 template <typename T>
 __device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* slots, int local,
-                                        const Vec3<T>& x, T dt) {
+                                        const Vec3<T>& x, uint64_t near, T dt) {
   NodeSums<T> sums[kSiteFields];
   Vec3<T> velocity[kSiteFields];
   bool heavy[kSiteFields];
@@ -216,9 +260,9 @@ __device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* s
     sums[count] = take_sums(s, node, true);
     heavy[count] = node_velocity(s, sums[count], dt, velocity[count]);
   }
-  const int touched = node_contact(s, count, sums, heavy, velocity);
+  const int touched = node_contact(s, count, heavy, OwnNode<T>{sums}, velocity);
   for (int f = 0; f < count; ++f) {
-    if (heavy[f]) collide_all(s, x, sums[f].mass, velocity[f]);
+    if (heavy[f] && near != 0) collide_near(s, near, x, sums[f].mass, velocity[f]);
     store_velocity(s, int64_t(slots[f]) * kBlockNodes + local, velocity[f]);
   }
   return touched;
@@ -239,41 +283,46 @@ __global__ void __launch_bounds__(kThreads) grid_kernel(SolverView<T> s) {
   const Vec3<T> x{(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
                   (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
                   (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
+  const Vec3<T> middle{(T(block[0]) * T(kBlockEdge) + T(1.5)) * s.dx,
+                       (T(block[1]) * T(kBlockEdge) + T(1.5)) * s.dx,
+                       (T(block[2]) * T(kBlockEdge) + T(1.5)) * s.dx};
+  const uint64_t near = colliders_near(s, middle);
   int touched = 0;
   if (slots[1] < 0) {
     const int64_t node = int64_t(slot) * kBlockNodes + local;
     const NodeSums<T> sums = take_sums(s, node, false);
     Vec3<T> v;
-    if (node_velocity(s, sums, dt, v)) collide_all(s, x, sums.mass, v);
+    if (node_velocity(s, sums, dt, v) && near != 0) collide_near(s, near, x, sums.mass, v);
     store_velocity(s, node, v);
   } else {
-    touched = shared_node(s, slots, local, x, dt);
+    touched = shared_node(s, slots, local, x, near, dt);
   }
   if (touched > 0)
     atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched),
               static_cast<unsigned long long>(touched));
 }
 
-template <typename T>
+template <int kThreadsHere, typename T>
 __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_t home,
                           bool moving) {
-  const unsigned speed = block_largest(largest.speed2), wave = block_largest(largest.wave2);
-  const unsigned gradient = block_largest(largest.gradient2), bound = block_largest(largest.bound);
+  const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
+  unsigned bits[4];
+  block_largest<kThreadsHere>(values, bits);
   if (threadIdx.x != 0) return;
   SolverClock& c = *s.clock;
   if (moving) {
-    raise_to(&c.speed, root_up(speed));
-    raise_to(&c.wave, root_up(wave));
-    raise_to(&c.gradient, root_up(gradient));
+    raise_to(&c.speed, root_up(bits[0]));
+    raise_to(&c.wave, root_up(bits[1]));
+    raise_to(&c.gradient, root_up(bits[2]));
   }
   if (home >= 0) {
-    s.home_bound[home] = T(__uint_as_float(bound)) * T(1.000001);
-    raise_to(&c.bound, __float_as_uint(__uint_as_float(bound) * 1.000001f));
+    s.home_bound[home] = T(__uint_as_float(bits[3])) * T(1.000001);
+    raise_to(&c.bound, __float_as_uint(__uint_as_float(bits[3]) * 1.000001f));
   }
 }
 
 template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kThreads, 2) g2p_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   __shared__ T tile[3][kTile];
@@ -282,7 +331,7 @@ __global__ void __launch_bounds__(kThreads, 2) g2p_kernel(SolverView<T> s) {
   const T dt = T(clock.dt), dt_next = T(clock.dt_next);
   const int64_t home_total = clock.homes;
   const uint32_t reach = reach_of_row(s.neighbour + int64_t(blockIdx.x) * kNeighbours);
-  for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
+  for (int index = threadIdx.x; index < kWindowNodes; index += kG2PThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
     const int64_t node = slot_node(s.neighbour + int64_t(blockIdx.x) * kNeighbours, i, j, k);
@@ -292,9 +341,9 @@ __global__ void __launch_bounds__(kThreads, 2) g2p_kernel(SolverView<T> s) {
   __syncthreads();
   Largest largest{};
   bool leaves = false, lost = false;
-  const int64_t rounds = (count + kThreads - 1) / kThreads;
+  const int64_t rounds = (count + kG2PThreads - 1) / kG2PThreads;
   for (int64_t round = 0; round < rounds; ++round) {
-    const int64_t r = round * kThreads + threadIdx.x, p = first + r;
+    const int64_t r = round * kG2PThreads + threadIdx.x, p = first + r;
     StepFlags flags{};
     if (r < count && p >= 0 && p < s.count) {
       const uint32_t meta = s.meta[p];
@@ -338,9 +387,9 @@ __global__ void __launch_bounds__(kThreads, 2) g2p_kernel(SolverView<T> s) {
   }
   count_lanes(leaves, &s.clock->leaving);
   count_lanes(lost, &s.clock->lost);
-  hand_over(s, largest, blockIdx.x, true);
+  hand_over<kG2PThreads>(s, largest, blockIdx.x, true);
   if (!last_to_arrive(&s.clock->arrived, home_total)) return;
-  for (int64_t i = threadIdx.x; i < 3 * s.collider_count; i += kThreads) {
+  for (int64_t i = threadIdx.x; i < 3 * s.collider_count; i += kG2PThreads) {
     s.impulse[i] += double(s.impulse_units[i]) * clock.momentum_unit;
     s.impulse_units[i] = 0;
   }
@@ -362,7 +411,7 @@ __global__ void __launch_bounds__(kThreads) prime_kernel(SolverView<T> s, bool m
   Largest largest{};
   for (int64_t r = threadIdx.x; r < count; r += kThreads)
     if (first + r >= 0 && first + r < s.count) prime_particle(s, first + r, measure, dt, largest);
-  hand_over(s, largest, measure ? -1 : int64_t(blockIdx.x), measure);
+  hand_over<kThreads>(s, largest, measure ? -1 : int64_t(blockIdx.x), measure);
   if (!last_to_arrive(&s.clock->arrived, home_total) || threadIdx.x != 0) return;
   if (measure)
     start_clock(*s.clock, double(s.dx));
@@ -386,23 +435,23 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   constexpr int kSitesPerCta = kThreads / kBlockNodes;
   const unsigned sites = static_cast<unsigned>((s.slot_capacity + kSitesPerCta - 1) / kSitesPerCta);
   if (s.moments != nullptr)
-    p2g_kernel<T, true><<<homes, kThreads, 0, stream>>>(s);
+    p2g_kernel<T, true><<<homes, kP2GThreads, 0, stream>>>(s);
   else
-    p2g_kernel<T, false><<<homes, kThreads, 0, stream>>>(s);
+    p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)
-    g2p_kernel<T, kElasticOnly, false><<<homes, kThreads, 0, stream>>>(s);
+    g2p_kernel<T, kElasticOnly, false><<<homes, kG2PThreads, 0, stream>>>(s);
   else if (law_set == kElasticOnly)
-    g2p_kernel<T, kElasticOnly, true><<<homes, kThreads, 0, stream>>>(s);
+    g2p_kernel<T, kElasticOnly, true><<<homes, kG2PThreads, 0, stream>>>(s);
   else if (law_set == kBrittle && !track)
-    g2p_kernel<T, kBrittle, false><<<homes, kThreads, 0, stream>>>(s);
+    g2p_kernel<T, kBrittle, false><<<homes, kG2PThreads, 0, stream>>>(s);
   else if (law_set == kBrittle)
-    g2p_kernel<T, kBrittle, true><<<homes, kThreads, 0, stream>>>(s);
+    g2p_kernel<T, kBrittle, true><<<homes, kG2PThreads, 0, stream>>>(s);
   else if (!track)
-    g2p_kernel<T, kAnyLaw, false><<<homes, kThreads, 0, stream>>>(s);
+    g2p_kernel<T, kAnyLaw, false><<<homes, kG2PThreads, 0, stream>>>(s);
   else
-    g2p_kernel<T, kAnyLaw, true><<<homes, kThreads, 0, stream>>>(s);
+    g2p_kernel<T, kAnyLaw, true><<<homes, kG2PThreads, 0, stream>>>(s);
   return cudaGetLastError();
 }
 

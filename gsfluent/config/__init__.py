@@ -4,7 +4,19 @@ A key that is unknown, or that would do nothing, is an error that names its full
 nearest known key.
 """
 
-from gsfluent.config.events import EVENTS, Bullet, Drop, Event, Throw, event_dict
+from gsfluent.config.colliders import COLLIDERS, ColliderSettings, collider_dict
+from gsfluent.config.events import (
+    EVENTS,
+    Blade,
+    Bullet,
+    Collide,
+    Drop,
+    Event,
+    Pour,
+    Press,
+    Throw,
+    event_dict,
+)
 from gsfluent.config.objects import ObjectSettings, Part, Select, Where
 from gsfluent.config.settings import (
     FillSettings,
@@ -18,8 +30,12 @@ from gsfluent.config.settings import (
 from gsfluent.config.shot import Shot, load_shot
 
 __all__ = [
+    "COLLIDERS",
     "EVENTS",
+    "Blade",
     "Bullet",
+    "Collide",
+    "ColliderSettings",
     "Drop",
     "Event",
     "FillSettings",
@@ -28,6 +44,8 @@ __all__ = [
     "ObjectSettings",
     "OutputSettings",
     "Part",
+    "Pour",
+    "Press",
     "ReconstructSettings",
     "Select",
     "Shot",
@@ -35,6 +53,7 @@ __all__ = [
     "TextureSettings",
     "Throw",
     "Where",
+    "collider_dict",
     "event_dict",
     "load_shot",
 ]

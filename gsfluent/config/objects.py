@@ -248,8 +248,7 @@ def _parts(material: str, base: Mapping[str, Any], value: Any, place: Place) -> 
 def _refuse_parameters(settings: Mapping[str, Any], extra: tuple[str, ...], place: Place) -> None:
     from gsfluent import materials
 
-    later = dict.fromkeys(materials.LATER_FIELDS, "the law that reads it")
-    refuse_unknown(settings, [*extra, "law", *materials.PARAMETERS], place, later)
+    refuse_unknown(settings, [*extra, "law", *materials.PARAMETERS], place)
 
 
 def _parameters(
@@ -267,9 +266,9 @@ def _parameters(
         preset = materials.get(material).override(**dict(base or {}))
     except InputError as error:
         raise InputError(f"{place.inside('material').path}: {error.what}", error.mend) from error
-    for name, value in read.items():
-        try:
-            preset.override(**{name: value})
-        except InputError as error:
-            raise InputError(f"{place.inside(name).path}: {error.what}", error.mend) from error
+    try:
+        preset.override(**read)  # together: a law is chosen with the parameters that it needs
+    except InputError as error:
+        blamed = next((name for name in read if f": {name} " in error.what), "law")
+        raise InputError(f"{place.inside(blamed).path}: {error.what}", error.mend) from error
     return read

@@ -161,7 +161,8 @@ def choice(*known: str, later: Iterable[str] = ()) -> Reader:
     """Reader of one of ``known``; words in ``later`` are refused as coming with a later issue."""
 
     def read(value: Any, place: Place) -> str:
-        value = {True: "yes", False: "no", None: "none"}.get(value, value) if not value else value
+        if value is None or value is False:
+            value = "no" if value is False else "none"
         if value in later:
             raise InputError(
                 f"{place.path}: {value} arrives with a later issue", nearest("", known)
@@ -196,6 +197,58 @@ def several(read_one: Reader) -> Reader:
         )
 
     return read
+
+
+def several_of(read_one: Reader, low: int, high: int = 1000) -> Reader:
+    """Reader of a list of ``low`` to ``high`` values as a tuple."""
+
+    def read(value: Any, place: Place) -> tuple[Any, ...]:
+        if not isinstance(value, list | tuple) or not low <= len(value) <= high:
+            count = str(low) if low == high else f"{low} or more"
+            raise place.error(f"be a list of {count}", value)
+        return tuple(several(read_one)(value, place))
+
+    return read
+
+
+def typed(value: Any, place: Place, known: Mapping[str, type[Any]], noun: str) -> tuple[Any, ...]:
+    """Read a list of sections whose key ``type`` names a dataclass of ``known``."""
+    if value is None:
+        return ()
+    if not isinstance(value, list | tuple):
+        raise place.error(f"be a list of {noun}s", value)
+    found = []
+    for index, item in enumerate(value):
+        where = Place(f"{place.path}[{index}]", place.folder)
+        settings = mapping(item, where)
+        kind = settings.pop("type", None)
+        if kind not in known:
+            raise InputError(f"{where.path}.type: unknown {noun} {kind!r}", nearest(kind, known))
+        found.append(section(known[kind], settings, where))
+    return tuple(found)
+
+
+def either_of(settings: Any, names: tuple[str, str], place: Place) -> None:
+    """Refuse a section that has both or neither of two keys."""
+    first, second = (getattr(settings, name) is not None for name in names)
+    if first == second:
+        got = "both" if first else "neither"
+        raise InputError(
+            f"{place.path} must have either {names[0]!r} or {names[1]!r}, got {got}",
+            "keep one of them",
+        )
+
+
+def preset(value: Any, place: Place) -> str:
+    """Read the name of a material preset."""
+    from gsfluent import materials
+
+    name = text(value, place)
+    try:
+        materials.get(name)
+    except InputError as error:
+        raise InputError(f"{place.path}: {error.what}", error.mend) from None
+    return name
 
 
 def either(words: Reader, other: Reader) -> Reader:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from gsfluent import materials
+from gsfluent.config.colliders import COLLIDERS
 from gsfluent.config.events import EVENTS
 from gsfluent.config.objects import Select, Where
 from gsfluent.config.read import key_name, plain
@@ -29,6 +30,7 @@ SECTIONS: dict[str, type[Any]] = {
     "objects.NAME.select": Select,
     "objects.NAME.parts[].where": Where,
     **{f"events[] with type: {name}": cls for name, cls in EVENTS.items()},
+    **{f"colliders[] with type: {name}": cls for name, cls in COLLIDERS.items()},
     "solve": SolveSettings,
     "light": LightSettings,
     "light.key": KeyLight,

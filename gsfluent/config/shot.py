@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gsfluent.config.colliders import ColliderSettings, collider_dict, read_colliders
 from gsfluent.config.events import Event, event_dict, read_events
 from gsfluent.config.objects import ObjectSettings, read_objects
 from gsfluent.config.read import (
@@ -88,6 +89,14 @@ class Shot:
         doc="Floor: auto, none, or its height along up: input coordinate times scale [m].",
         example="auto",
     )  # fmt: skip
+    floor_mode: str = key(
+        choice("separate", "slip", "sticky"), default="separate",
+        doc="Whether matter may leave the floor, may only slide on it, or sticks.",
+        example="sticky",
+    )  # fmt: skip
+    floor_friction: float = key(
+        number(0.0), default=0.4, doc="Coulomb friction of the floor.", example="0.6"
+    )
     reconstruct: ReconstructSettings = key(
         nested(ReconstructSettings),
         default=ReconstructSettings(),
@@ -113,6 +122,12 @@ class Shot:
     )  # fmt: skip
     events: tuple[Event, ...] = key(
         read_events, default=(), doc="What happens.", example="[{type: drop, height: 1.0}]"
+    )
+    colliders: tuple[ColliderSettings, ...] = key(
+        read_colliders,
+        default=(),
+        doc="Rigid things that matter cannot enter.",
+        example="[{type: sphere, at: [0, 0, 0.1], radius: 0.1}]",
     )
     solve: SolveSettings = key(
         nested(SolveSettings),
@@ -158,13 +173,18 @@ class Shot:
             )
         if not shot.objects:
             shot = dataclasses.replace(shot, objects={"object": ObjectSettings("object")})
+        if shot.floor == "none" and (shot.floor_mode, shot.floor_friction) != ("separate", 0.4):
+            raise InputError(
+                "floor_mode and floor_friction do nothing without a floor", "drop them"
+            )
         for index, event in enumerate(shot.events):
-            name = getattr(event, "object", None)
-            if name is not None and name not in shot.objects:
-                raise InputError(
-                    f"events[{index}].object: no object is called {name!r}",
-                    nearest(name, shot.objects),
-                )
+            one = getattr(event, "object", None)
+            for name in [one] if one is not None else getattr(event, "objects", ()):
+                if name not in shot.objects:
+                    raise InputError(
+                        f"events[{index}]: no object is called {name!r}",
+                        nearest(name, shot.objects),
+                    )
         return shot
 
     def resolved(self) -> dict[str, Any]:
@@ -172,6 +192,7 @@ class Shot:
         values: dict[str, Any] = plain(self)
         values["objects"] = {name: item.to_dict() for name, item in self.objects.items()}
         values["events"] = [event_dict(event) for event in self.events]
+        values["colliders"] = [collider_dict(settings) for settings in self.colliders]
         return without_none(values)
 
 

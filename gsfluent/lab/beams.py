@@ -135,19 +135,22 @@ def elastica(load: float) -> tuple[float, float]:
     return y, 1.0 - x
 
 
-def bend(load: float, cells: int = 4, slenderness: float = 20.0) -> tuple[float, float, int]:
+def bend(
+    load: float, cells: int = 4, slenderness: float = 12.0, per_cell: int = 4
+) -> tuple[float, float, int]:
     """Bend a slab (nu = 0, plane) by a dead load on its end and let it come to rest.
 
     Args:
         load: P L^2 / (E I).
         cells: Cells across its height.
         slenderness: Length over height.
+        per_cell: Points per cell and axis.
 
     Returns:
         Deflection across and shortening along over the length, and the steps taken.
     """
     dx, young, density = 1.0 / cells, 1.0, 1.0
-    spacing, length = 0.5 * dx, slenderness
+    spacing, length = dx / per_cell, slenderness
     points = box([-1.5 * dx, 0.0, 0.0], [length + 1.5 * dx, 1.0, spacing], spacing)
     free = length + FACE * dx
     volume = spacing**3
@@ -172,7 +175,7 @@ def bend(load: float, cells: int = 4, slenderness: float = 20.0) -> tuple[float,
         points, [0.0, 0.0, 0.0], mass=density * volume, volume=volume, dx=dx, law=0,
         params=parameters(young, 0.0, density), force=pull, cfl=0.8,
         colliders=torch.cat([plane(0, 0.0, 1, STICK)[None], plane_strain()]),
-    ).run(2.0 * period)  # fmt: skip
+    ).run(1.5 * period)  # fmt: skip
     moved = (world.position.double().cpu() - points)[end].mean(0)
     return float(moved[1]) / arm, -float(moved[0]) / arm, world.steps
 

@@ -21,6 +21,7 @@ _PUBLIC: dict[str, str] = {
     "advance_colliders": "gsfluent.ops.collider",
     "return_mapping": "gsfluent.ops.plasticity",
     "elastic_energy": "gsfluent.ops.plasticity",
+    "wave_speed": "gsfluent.ops.plasticity",
     "MpmState": "gsfluent.ops.differentiable",
     "material_params": "gsfluent.ops.differentiable",
     "mpm_state": "gsfluent.ops.differentiable",

@@ -98,7 +98,7 @@ class _Trial:
         if bool(nacc.any()):
             p, q = -0.5 * m.kappa * self.j2m1, 1.5**0.5 * m.mu * n
             limited = alpha.clamp(reference.ALPHA_MIN, reference.ALPHA_MAX)
-            u, w = reference._normalized(m, limited, p, q)
+            u, w = reference.normalized(m, limited, p, q)
             slack = 2e-15 if n.dtype == torch.float64 else 1e-6
             within = (u**2 + w**2 <= 1.0 + slack) & (limited == alpha)
             simple &= (laws == LAW_ELASTIC) | (nacc & within)
@@ -147,7 +147,7 @@ def _return_mapping_backward(
         row = torch.arange(count, device=params.device)
     else:
         row = torch.zeros(count, dtype=torch.int64, device=params.device)
-    m = reference.Material(*params[row].unbind(1)[:6])
+    m = reference.Material(*params[row].unbind(1))
     trial = _Trial(strain, alpha, increment)
     simple = trial.untouched(m, law[row], alpha)
     g_strain, g_increment, g_mu, g_kappa = trial.pull_back(grad_strain, grad_stress, m)

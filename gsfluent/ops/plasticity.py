@@ -61,7 +61,8 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
     if params.numel() and _is_new(params, rows):
         given, params = params, params.detach()  # checking is not part of any graph
         wrong = ~torch.isfinite(params) | (params < 0)
-        wrong[:, 1] |= params[:, 1] == 0  # without bulk stiffness there is no pressure
+        # Without bulk stiffness there is no pressure; a rigid body needs none.
+        wrong[:, 1] |= (params[:, 1] == 0) & (law != LAWS["rigid"])
         wrong[:, 7] |= (params[:, 7] > 0) & (params[:, 7] < 1)  # the energy needs gamma >= 1
         if bool(wrong.any()):
             _checked.pop(given, None)
@@ -135,7 +136,7 @@ def return_mapping(
       beyond ``p = -c``, with volume correction.
     * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``.
     * 4 ``fluid``: ``p = max(K/gamma (J^-gamma - 1), 0)`` and Newtonian viscosity; the strain is
-      ``(J^(2/3) - 1) I`` and J follows ``exp(tr A)``.
+      ``(J^(2/3) - 1) I`` and J follows ``det(I + A)``.
     * 5 ``rigid``: no strain, no stress; how the body moves is the solver's matter.
 
     The stored energy never increases. See docs/return-mapping.md and docs/materials.md.
@@ -238,8 +239,10 @@ def elastic_energy(
 ) -> Tensor:
     """Stored elastic energy per initial volume.
 
-    ``mu/2 (J^(-2/3) tr b - 3) + kappa/2 ((J^2 - 1)/2 - ln J)`` with b = I + e, evaluated in float64
-    (both laws store energy the same way).
+    Evaluated in float64. With b = I + e = V V: elastic and nacc
+    ``mu/2 (J^(-2/3) tr b - 3) + kappa/2 ((J^2 - 1)/2 - ln J)``; drucker_prager and von_mises
+    ``mu |dev ln V|^2 + kappa/2 (ln J)^2``; corotated ``mu |V - I|^2 + lambda/2 (J - 1)^2``; fluid
+    ``K/gamma (J^(1-gamma)/(gamma-1) + J - gamma/(gamma-1))`` below J = 1 and 0 above; rigid 0.
 
     Args:
         strain: Elastic strain e = b - I, [N, 6].
@@ -260,4 +263,35 @@ def elastic_energy(
     count = strain.shape[0]
     _check_material("elastic_energy", count, strain, law, params, material)
     columns = reference.gather_material(params.double(), material, count)
-    return reference.elastic_energy(strain.double(), columns).to(strain.dtype)
+    laws = law[material.long()] if material is not None else law.expand(count)
+    return reference.elastic_energy(strain.double(), columns, laws).to(strain.dtype)
+
+
+def wave_speed(
+    strain: Tensor, *, law: Tensor, params: Tensor, material: Tensor | None = None
+) -> Tensor:
+    """Speed of the fastest small wave in the present state: what bounds an explicit time step.
+
+    Args:
+        strain: Elastic strain e = b - I, [N, 6].
+        law: int32 [M], see :func:`return_mapping`.
+        params: [M, 8], see :func:`return_mapping`; density must be positive.
+        material: int32 [N] or None, see :func:`return_mapping`.
+
+    Returns:
+        Wave speed [m/s], [N]: exact at rest, an upper bound (by a few percent at moderate strain)
+        of the speed along any direction elsewhere; 0 for rigid particles and lost states.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape, device, law, parameter or material row is wrong.
+
+    Gradient: with respect to strain and params (plain PyTorch).
+    Source: csrc/core/wave_speed.h, which the solver's kernels use.
+    """
+    check_tensor("wave_speed", "strain", strain, shape=("N", 6))
+    count = strain.shape[0]
+    _check_material("wave_speed", count, strain, law, params, material)
+    columns = reference.gather_material(params, material, count)
+    laws = law[material.long()] if material is not None else law.expand(count)
+    return reference.wave_speed_squared(strain, columns, laws).sqrt()

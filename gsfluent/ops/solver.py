@@ -380,6 +380,7 @@ class Solver:
         if steps == 0 or (until is not None and until <= now["time"]):
             return
         left = -1 if steps is None else steps
+        # Every call starts from new blocks, so that nothing depends on what was built before it.
         self._write(
             until=1e300 if until is None else until,
             steps_left=left,
@@ -387,6 +388,7 @@ class Solver:
             reason=0,
             lost=0,
             leaving=0,
+            rebuild=1,
         )
         ints, floats = self._settings()
         with torch.no_grad():

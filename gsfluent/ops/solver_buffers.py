@@ -21,7 +21,7 @@ MAX_PARTICLES = 2**26
 
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
-    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen",
+    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen", "slack",
 )  # fmt: skip
 """Members of the clock that are doubles; the others are integers."""
 CLOCK = (
@@ -31,7 +31,7 @@ CLOCK = (
     "slots", "sites", "cursor", "arrived", "speed", "wave", "gradient", "bound",
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
-    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "spare",
+    "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "slack",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}

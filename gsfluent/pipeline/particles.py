@@ -20,6 +20,7 @@ from gsfluent.data import Frame, Particles, Solid
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
 from gsfluent.scene import Body, Part, Scene
+from gsfluent.scene_parts import quaternion_to, turned
 
 _log = logging.getLogger(__name__)
 
@@ -137,7 +138,7 @@ def build_matter(
                 mend="add a drop event, or give a frame that puts it on the floor",
             )
     step = dx / POINTS_PER_CELL ** (1 / 3)
-    expected = sum(_volume(body) for body in scene.bodies) / step**3
+    expected = sum(body.volume for body in scene.bodies) / step**3
     if expected > max_particles:
         raise InputError(
             f"simulate: about {expected:.3g} material points at dx = {dx:.3g} m, "
@@ -211,16 +212,9 @@ def grid_spacing(scene: Scene, cells: int) -> float:
     return max(extents)[1] / cells
 
 
-def _volume(body: Body) -> float:
-    """Volume of a body [m^3]."""
-    if body.solid is None:
-        return 4.0 / 3.0 * math.pi * body.radius**3
-    return body.solid.volume * body.frame.scale**3
-
-
 def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
     """Return points in the body's own coordinates, float64 [N, 3], and the volume [m^3]."""
-    volume = _volume(body)
+    volume = body.volume
     if body.solid is not None:
         return sample_points(body.solid, step / body.frame.scale, seed=seed), volume
     # A ball is never coarser than four points across, so that even a bullet smaller than a cell
@@ -228,8 +222,15 @@ def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
     step = min(step, 0.5 * body.radius)
     side = math.ceil(body.radius / step)
     axis = (torch.arange(-side, side, dtype=torch.float64) + 0.5) * step
-    lattice = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
-    return lattice[lattice.norm(dim=1) <= body.radius], volume
+    if body.length == 0.0:
+        lattice = torch.cartesian_prod(axis, axis, axis)
+        return lattice[lattice.norm(dim=1) <= body.radius], volume
+    layers = max(1, round(body.length / step))
+    along = ((torch.arange(layers, dtype=torch.float64) + 0.5) / layers - 0.5) * body.length
+    lattice = torch.cartesian_prod(axis, axis, along)
+    lattice = lattice[lattice[:, :2].norm(dim=1) <= body.radius]
+    turn = [turned(quaternion_to(body.axis), e) for e in torch.eye(3).tolist()]
+    return lattice @ torch.tensor(turn, dtype=torch.float64), volume
 
 
 def _cell_order(points: Tensor, edge: float) -> Tensor:
@@ -285,7 +286,7 @@ def _parameters(body: Body, points: Tensor, seed: int) -> tuple[Tensor, Tensor, 
         at = sampler(material, index)
         params[index] = material.parameters(at)
         law[index] = materials.LAWS[material.law]
-        alpha[index] = at(material.alpha0) * _weakness(material, points[index], body, seed)
+        alpha[index] = at(material.start_alpha) * _weakness(material, points[index], body, seed)
     return params, law, alpha
 
 
@@ -353,6 +354,8 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
 
 def _approach(body: Body, scene: Scene) -> tuple[Tensor, Tensor]:
     """Shift and velocity at time 0 so that free flight passes ``offset`` at ``start``."""
+    if body.held:
+        return torch.zeros(3, dtype=torch.float64), torch.tensor(body.velocity, dtype=torch.float64)
     gravity = torch.tensor(scene.gravity, dtype=torch.float64)
     velocity = torch.tensor(body.velocity, dtype=torch.float64) - gravity * body.start
     shift = -(velocity * body.start + 0.5 * gravity * body.start**2)

@@ -177,6 +177,7 @@ def _time_step(matter: Matter, blocks: ops.Blocks, dt: float) -> float:
             law=matter.law,
             params=matter.params,
             material=p.material,
+            dt=dt,
         )
         if p.device.type == "cuda":
             torch.cuda.synchronize(p.device)
@@ -192,11 +193,12 @@ def _memory(matter: Matter, active: int) -> int:
 
 def _passes(shot: Shot, scene: Scene) -> list[dict[str, Any]]:
     """Which passes the shot needs, and why."""
-    breaks = any(
-        material.law != "elastic"
+    laws = {
+        material.law
         for body in scene.bodies
         for material in [body.material, *(part.material(body.material) for part in body.parts)]
-    )
+    }
+    breaks, yields = "nacc" in laws, bool(laws - {"elastic", "corotated", "rigid"})
     several = len(scene.bodies) > 1
     drops = any(isinstance(event, Drop) for event in shot.events)
     exports = [kind for kind in shot.output.what if kind != "mp4"]
@@ -207,7 +209,7 @@ def _passes(shot: Shot, scene: Scene) -> list[dict[str, Any]]:
         ("texture", True, f"the inside has no colours yet ({method})", ""),
         ("free flight", drops, "closed form until something is touched", "nothing falls"),
         ("contact", several, f"{len(scene.bodies)} bodies", "one body: no second velocity field"),
-        ("return map", breaks, "a material that yields and breaks", "all materials are elastic"),
+        ("return map", yields, "a material that yields", "no material yields"),
         ("repair", breaks, "cracks open", "nothing can crack"),
         ("export", bool(exports), ", ".join(exports), "only the video is asked for"),
     ]

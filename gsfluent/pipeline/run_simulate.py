@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from gsfluent import materials
-from gsfluent.config import ObjectSettings, Shot, event_dict
+from gsfluent.config import ObjectSettings, Shot, collider_dict, event_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Particles, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.run_context import RunContext
@@ -33,10 +33,17 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     Raises:
         InputError: A material, part or event that cannot be.
     """
-    scene = Scene(floor=None if shot.floor == "none" else 0.0)
+    scene = Scene(
+        floor=None if shot.floor == "none" else 0.0,
+        floor_mode=shot.floor_mode,
+        floor_friction=shot.floor_friction,
+    )
     for name, settings in shot.objects.items():
         parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
         scene.add(solids[name], _material(settings), frame=frame, parts=parts, name=name)
+    for collider in shot.colliders:
+        keys = collider_dict(collider)
+        scene.add_collider(keys.pop("type"), **keys)
     for event in shot.events:
         scene.add_event(event_dict(event))
     return scene
@@ -72,11 +79,11 @@ def simulate_stage(context: RunContext) -> None:
         name: [settings.to_dict(), repr(_material(settings))]
         for name, settings in shot.objects.items()
     }
-    events = [event_dict(event) for event in shot.events]
     settings = [
         objects,
-        events,
-        shot.floor,
+        [event_dict(event) for event in shot.events],
+        [collider_dict(collider) for collider in shot.colliders],
+        [shot.floor, shot.floor_mode, shot.floor_friction],
         shot.solve.quality,
         shot.output.fps,
         shot.output.seconds,

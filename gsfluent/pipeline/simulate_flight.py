@@ -28,16 +28,20 @@ class Flight:
         gravity: Acceleration [m/s^2], float64 [3].
         time: Time of the given state [s].
         dx: Grid spacing [m]; an APIC point turns like a blob with second moment dx^2 / 4.
+        held: Time [s] until which the body waits where it is, its velocity kept for later.
     """
 
-    def __init__(self, particles: Particles, gravity: Tensor, time: float, dx: float) -> None:
+    def __init__(
+        self, particles: Particles, gravity: Tensor, time: float, dx: float, *, held: float = 0.0
+    ) -> None:
         position, velocity = (
             part.to("cpu", torch.float64) for part in (particles.position, particles.velocity)
         )
         mass = particles.mass.to("cpu", torch.float64)[:, None]
         self.particles = particles
         self.gravity = gravity
-        self.start = time
+        self.held = held
+        self.start = max(time, held)
         total = mass.sum()
         self.center = (mass * position).sum(dim=0) / total
         self.velocity = (mass * velocity).sum(dim=0) / total
@@ -71,6 +75,7 @@ class Flight:
         """
         if not self.spins:
             return self._turned
+        time = max(time, self.start)
         whole = max(0, math.floor((time - self.start) / self._span))
         if whole < self._whole:
             self._whole, self._turned = 0, torch.eye(3, dtype=torch.float64)
@@ -85,7 +90,7 @@ class Flight:
 
     def center_at(self, time: float) -> tuple[Tensor, Tensor]:
         """Return the centre of mass and its velocity at ``time``, float64 [3] each."""
-        t = time - self.start
+        t = max(time - self.start, 0.0)
         return (
             self.center + t * self.velocity + 0.5 * t * t * self.gravity,
             self.velocity + t * self.gravity,

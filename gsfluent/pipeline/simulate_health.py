@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import logging
+from collections.abc import Sequence
 
 import torch
 
@@ -89,15 +90,12 @@ class Watch:
         if not (low >= VOLUME_RATIO[0] and high <= VOLUME_RATIO[1]):
             return f"volume ratio between {low:.3g} and {high:.3g}"
         # Height at which gravity's energy is counted is arbitrary, so only its change matters.
-        self.scale = max(self.scale, min(now.kinetic + now.elastic, self._budget(now)))
-        excess = now.total - self.energy
+        given = self.energy + float(state.work)
+        self.scale = max(self.scale, min(now.kinetic + now.elastic, max(given - now.gravity, 0.0)))
+        excess = now.total - given
         if not excess <= ENERGY_SLACK * self.scale + 1e-9:
-            return f"energy rose by {excess:.3g} J over {self.energy:.3g} J at the start"
+            return f"energy rose by {excess:.3g} J over the {given:.3g} J it had and was given"
         return ""
-
-    def _budget(self, now: Figures) -> float:
-        """Kinetic plus elastic energy that the start can have given at most."""
-        return max(self.energy - now.gravity, 0.0)
 
     def roll_back(self, reason: str, state: State, stepper: Stepper) -> State | None:
         """Return the state to go on from with half the time step, or None to give up."""
@@ -133,21 +131,35 @@ class Ledger:
         matter: The points at time 0.
         gravity: Acceleration [m/s^2].
         start: Figures at time 0.
+        held: Time [s] until which each body waits, outside gravity's reach.
     """
 
-    def __init__(self, matter: Matter, gravity: tuple[float, float, float], start: Figures) -> None:
+    def __init__(
+        self,
+        matter: Matter,
+        gravity: tuple[float, float, float],
+        start: Figures,
+        held: Sequence[float] = (),
+    ) -> None:
+        self.held = [
+            (float(matter.particles.mass[a:b].to(torch.float64).sum()), time)
+            for (a, b), time in zip(matter.ranges, held, strict=False)
+            if time > 0.0
+        ]
         self.mass = float(matter.particles.mass.to(torch.float64).sum())
         self.start = torch.tensor(start.momentum, dtype=torch.float64)
         self.gravity = torch.tensor(gravity, dtype=torch.float64)
         self.worst = 0.0
-        self.scale = float(self.start.norm())
+        # Two bodies thrown at each other have no momentum together, but a scale of it.
+        self.scale = max(float(self.start.norm()), (2.0 * self.mass * start.kinetic) ** 0.5)
 
     def error(self, state: State, now: Figures) -> float:
         """Return the relative error of the balance at this moment.
 
         It is relative to the largest momentum or impulse that the run has seen so far.
         """
-        pull = self.mass * self.gravity * state.time
+        waited = sum(mass * min(time, state.time) for mass, time in self.held)
+        pull = self.gravity * (self.mass * state.time - waited)
         push = state.impulse.cpu()
         momentum = torch.tensor(now.momentum, dtype=torch.float64)
         self.scale = max(self.scale, *(float(v.norm()) for v in (momentum, pull, push)))

@@ -48,7 +48,8 @@ class Run:
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
         self.watch = Watch(matter, scene.gravity, self.start, max_rollbacks=max_rollbacks)
-        self.ledger = Ledger(matter, scene.gravity, self.start)
+        held = [body.start if body.held else 0.0 for body in scene.bodies]
+        self.ledger = Ledger(matter, scene.gravity, self.start, held)
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""

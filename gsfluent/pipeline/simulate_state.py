@@ -14,7 +14,7 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.simulate_step import State
 
-VERSION = 1
+VERSION = 2
 _MOVING = ("position", "velocity", "affine", "strain", "alpha", "deformation")
 
 
@@ -35,6 +35,8 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "stress": state.stress.cpu(),
         "impulse": state.impulse.cpu(),
         "stray": state.stray.cpu(),
+        "colliders": state.colliders.cpu(),
+        "work": state.work.cpu(),
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
@@ -79,6 +81,8 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
         landed=tuple(bool(v) for v in values["landed"]),
         impulse=values["impulse"],
         stray=values["stray"],
+        colliders=values["colliders"],
+        work=values["work"],
     )
     return state, values["extra"]
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.data import Particles
 from gsfluent.pipeline.particles import Matter
+from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_flight import Flight
 from gsfluent.pipeline.simulate_strays import drift, find_strays, reach_of
 from gsfluent.scene import Scene
@@ -47,6 +48,8 @@ class State(NamedTuple):
         step: Grid steps so far.
         landed: Which bodies are on the grid.
         impulse: Sum of collider impulses on the bodies [N s], float64 [3].
+        colliders: Rows of the rigid colliders as of ``time``, float64 [M, 32].
+        work: Most energy that colliders can have given to the bodies [J], float64 [].
         stray: Crumbs that left the grid for good, bool [N] (see
             :mod:`gsfluent.pipeline.simulate_strays`).
     """
@@ -59,6 +62,8 @@ class State(NamedTuple):
     landed: tuple[bool, ...]
     impulse: Tensor
     stray: Tensor
+    colliders: Tensor
+    work: Tensor
 
 
 @dataclasses.dataclass
@@ -112,14 +117,12 @@ class Stepper:
         """Points that were not finite or not covered since the last :meth:`reset`."""
         device = matter.particles.device
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
-        self._colliders = None
-        if scene.floor is not None:
-            plane = [0.0, 2.0, scene.floor_friction, 0.0, 0.0, scene.floor, 0.0, 0.0, 1.0]
-            self._colliders = torch.tensor([plane + [0.0] * 7], device=device)
+        self.rigid = RigidSet(scene, matter.dx, device)
         self.flights = []
-        for a, b in matter.ranges:
+        for body, (a, b) in zip(scene.bodies, matter.ranges, strict=True):
             points = matter.particles.select(torch.arange(a, b, device=device))
-            self.flights.append(Flight(points, self._gravity, 0.0, matter.dx))
+            held = body.start if body.held else 0.0
+            self.flights.append(Flight(points, self._gravity, 0.0, matter.dx, held=held))
         self.reset()
 
     def reset(self) -> None:
@@ -146,11 +149,11 @@ class Stepper:
             stress=particles.position.new_zeros(particles.count, 6),
             time=0.0,
             step=0,
-            landed=(False,) * len(self.flights)
-            if self.free_flight
-            else (True,) * len(self.flights),
+            landed=(not self.free_flight,) * len(self.flights),
             impulse=torch.zeros(3, dtype=torch.float64, device=particles.device),
             stray=torch.zeros(particles.count, dtype=torch.bool, device=particles.device),
+            colliders=self.rigid.start,
+            work=torch.zeros((), dtype=torch.float64, device=particles.device),
         )
         return self._land(state)
 
@@ -175,6 +178,7 @@ class Stepper:
         Raises:
             Unhealthy: A number is not finite or a point left the grid.
         """
+        until = min(until, self.rigid.next_change(state.time))
         if not any(state.landed):
             return self._fly(state, until)
         if self._refresh <= 0:
@@ -191,27 +195,30 @@ class Stepper:
 
     def _fly(self, state: State, until: float) -> State:
         """Move in closed form until a frame is due or a body comes close to something."""
-        dx = self.matter.dx
-        time = state.time
+        dx, time, rows = self.matter.dx, state.time, state.colliders
         while time < until:
             speed = max(self._flight_speed(flight, time) for flight in self.flights)
+            speed = max(speed, float(self.rigid.speed(rows)))
             pull = float(self._gravity.norm())
             # Time to move half a cell at most, also when starting from rest.
             step = 0.5 * dx / max(speed + pull * 0.5 * (dx / max(pull, 1e-9)) ** 0.5, 1e-9)
-            time = min(until, time + step)
-            now = self._land(state._replace(time=time))
+            before, time = time, min(until, time + step)
+            rows = self.rigid.advance(rows, before, time - before)
+            now = self._land(state._replace(time=time, colliders=rows))
             if any(now.landed):
                 self.counters.flight_seconds += time - state.time
                 return now
         self.counters.flight_seconds += until - state.time
-        return state._replace(time=until)
+        return state._replace(time=until, colliders=rows)
 
     def _flight_speed(self, flight: Flight, time: float) -> float:
         return float(flight.center_at(time)[1].norm()) + flight.speed_limit
 
     def _land(self, state: State) -> State:
-        """Put on the grid every flying body that is close to the floor or to another body."""
-        flying = [i for i, landed in enumerate(state.landed) if not landed]
+        """Put on the grid every flying body that is close to a collider or to another body."""
+        flying = [
+            i for i, f in enumerate(self.flights) if not state.landed[i] and state.time >= f.held
+        ]
         if not flying:
             return state
         pad = LANDING * self.matter.dx
@@ -225,12 +232,11 @@ class Stepper:
                 boxes.append(self.flights[i].bounds_at(state.time))
         touched = set()
         for i in flying:
-            floor = self.scene.floor
-            if floor is not None and float(boxes[i][0][2]) <= floor + pad:
+            if self.rigid.gap(state.colliders, *boxes[i]) <= pad:
                 touched.add(i)
             for j in range(len(boxes)):
                 if j != i and _boxes_meet(boxes[i], boxes[j], pad):
-                    touched.update(k for k in (i, j) if not state.landed[k])
+                    touched.update(k for k in (i, j) if k in flying)
         if not touched:
             return state
         state = state._replace(
@@ -285,7 +291,9 @@ class Stepper:
         # Broken points carry no stress, so how fast they are torn does not matter.
         turn = torch.linalg.matrix_norm(particles.affine)
         gradient = torch.where(peak < 0, turn, torch.zeros_like(turn)).max()
-        self._speed, fastest, steepest = torch.stack([speed, wave, gradient]).tolist()
+        driven = self.rigid.speed(state.colliders).to(speed)
+        looked = torch.stack([torch.maximum(speed, driven), wave, gradient])
+        self._speed, fastest, steepest = looked.tolist()
         if not (self._speed < 1e6 and fastest < 1e6):
             raise Unhealthy(f"speed {self._speed:.3g} m/s, wave speed {fastest:.3g} m/s")
         for flight, landed in zip(self.flights, state.landed, strict=True):
@@ -322,10 +330,10 @@ class Stepper:
             dx=dx, blocks=blocks, dt=dt, stress=stress, volume=active.volume,
             body=body, fields=fields, contact=self._contact,
         )  # fmt: skip
-        velocity_grid, impulse, _ = ops.grid_update(
+        velocity_grid, impulse, torque, _ = ops.grid_update(
             grid, dx=dx, dt=dt, blocks=blocks, gravity=self.scene.gravity,
-            colliders=self._colliders, moments=moments,
-            friction=self.scene.friction, restitution=self.scene.restitution,
+            colliders=state.colliders.to(grid.dtype), sdf=self.rigid.sdf, moments=moments,
+            friction=self.scene.friction, restitution=self.scene.restitution, return_torque=True,
         )  # fmt: skip
         position, velocity, affine, deformation, skipped = ops.g2p(
             velocity_grid, active.position, dx=dx, dt=dt, blocks=blocks, body=body,
@@ -357,6 +365,8 @@ class Stepper:
             time=until if last else state.time + dt,
             step=state.step + 1,
             impulse=total,
+            colliders=self.rigid.advance(state.colliders, state.time, dt, impulse, torque),
+            work=state.work + self.rigid.work(state.colliders, impulse, torque),
         )
 
     def _build(self, state: State, active: Particles) -> ops.Blocks:

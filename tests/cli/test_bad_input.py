@@ -118,7 +118,7 @@ def test_wrong_key_names_the_nearest(
         ("quality: preview", "quality: best", "quality"),
         ("height: 0.3", "height: -1", "height"),
         ("type: drop", "type: dropp", "drop"),
-        ("type: drop", "type: blade", "later issue"),
+        ("type: drop", "type: blade", "path"),
         ("material: bread", "material: brad", "bread"),
         ("- 96", "- 95", "size"),
     ],

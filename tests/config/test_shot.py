@@ -102,7 +102,7 @@ def test_shot_is_frozen(folder: Path) -> None:
 def test_events_go_to_the_scene_as_written(folder: Path) -> None:
     event = {"type": "bullet", "from": [2.0, 0.0, 0.2], "toward": [0.0, 0.0, 0.1], "speed": 60.0}
     shown = event_dict(read(folder, events=[event]).events[0])
-    assert shown == {**event, "radius": 0.008, "density": 7800.0, "at": 0.0}
+    assert shown == {**event, "radius": 0.008, "density": 7800.0, "at": 0.0, "rigid": False}
     drop = {"type": "drop", "height": 1.0}
     assert event_dict(read(folder, events=[drop]).events[0]) == drop
 
@@ -152,14 +152,6 @@ def test_unknown_keys_name_their_path_and_the_nearest(
     assert mend in caught.value.mend
 
 
-@pytest.mark.parametrize("kind", ["blade", "press", "pour", "collide"])
-def test_later_events_are_refused(folder: Path, kind: str) -> None:
-    with pytest.raises(
-        InputError, match=rf"events\[0\]: event '{kind}' arrives with a later issue"
-    ):
-        read(folder, events=[{"type": kind, "at": 0.1}])
-
-
 @pytest.mark.parametrize(
     "keys",
     [
@@ -167,8 +159,6 @@ def test_later_events_are_refused(folder: Path, kind: str) -> None:
         {"solve": {"seconds_per_frame": 0.5}},
         {"solve": {"deterministic": True}},
         {"output": {"what": ["usd"]}},
-        {"objects": {"melon": {"yield_stress": 1e4}}},
-        {"objects": {"melon": {"law": "drucker_prager"}}},
     ],
 )
 def test_what_would_do_nothing_yet_is_refused(folder: Path, keys: dict[str, Any]) -> None:

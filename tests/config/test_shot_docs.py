@@ -22,7 +22,7 @@ CASES = [
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name in ("melon.ply", "cut.jpg", "labels.npy"):
+    for name in ("melon.ply", "cut.jpg", "labels.npy", "bowl.obj"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "captures/apple").mkdir(parents=True)
     return tmp_path

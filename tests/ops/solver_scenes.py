@@ -79,9 +79,15 @@ def composed(arguments: dict[str, Any], dt: float, steps: int) -> dict[str, Tens
     dx, body, law, params = a["dx"], a["body"], a["law"], a["params"]
     x, v = a["position"].to(a["velocity"]), a["velocity"]
     n, fields = x.shape[0], int(body.max()) + 1
-    c, e, alpha = v.new_zeros(n, 3, 3), v.new_zeros(n, 6), a["alpha"]
-    peak, f = alpha, a["deformation"]
-    stress = v.new_zeros(n, 6)
+    c, e, alpha = v.new_zeros(n, 3, 3), a.get("strain", v.new_zeros(n, 6)), a["alpha"]
+    peak, f, kind = alpha, a["deformation"], law[a["material"].long()]
+
+    def rows() -> Tensor:
+        table = params[a["material"].long()].clone()
+        table[:, 3] *= 1.0 - (peak / 0.02).clamp(0.0, 1.0)
+        return table
+
+    _, _, stress, _ = ops.return_mapping(e, alpha, 0.0 * c, law=kind, params=rows())
     total = torch.zeros(3, dtype=torch.float64, device=v.device)
     for _ in range(steps):
         blocks = ops.build_blocks(x, dx)
@@ -95,10 +101,7 @@ def composed(arguments: dict[str, Any], dt: float, steps: int) -> dict[str, Tens
         x, v, c, f = ops.g2p(
             nodes, x, dx=dx, dt=dt, blocks=blocks, body=body if fields > 1 else None, deformation=f
         )
-        rows = params[a["material"].long()].clone()
-        rows[:, 3] *= 1.0 - (peak / 0.02).clamp(0.0, 1.0)
-        kind = law[a["material"].long()]
-        e, alpha, stress, _ = ops.return_mapping(e, alpha, dt * c, law=kind, params=rows)
+        e, alpha, stress, _ = ops.return_mapping(e, alpha, dt * c, law=kind, params=rows())
         peak = torch.maximum(peak, alpha)
         total += impulse.sum(dim=0)
     return {

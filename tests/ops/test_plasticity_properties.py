@@ -11,6 +11,7 @@ from torch import Tensor
 from gsfluent.ops import return_mapping
 from gsfluent.ops.reference import plasticity as reference
 from gsfluent.ops.reference.plasticity_svd import return_mapping_svd
+from gsfluent.ops.reference.tensors import diagonal
 
 NACC = torch.tensor([1], dtype=torch.int32)
 EYE = torch.eye(3, dtype=torch.float64)
@@ -230,9 +231,9 @@ def yield_value(strain: Tensor, alpha: Tensor, params: Tensor) -> Tensor:
     """u^2 + w^2 of the state on the surface of alpha; 1 on the surface."""
     m = reference.gather_material(params, None, len(alpha))
     x = torch.linalg.det(reference.to_matrix(strain) + EYE)
-    d = x[:, None] ** (-1 / 3) * (strain - reference._diagonal(strain[:, :3].mean(1)))
+    d = x[:, None] ** (-1 / 3) * (strain - diagonal(strain[:, :3].mean(1)))
     norm = ((d[:, :3] ** 2).sum(1) + 2.0 * (d[:, 3:] ** 2).sum(1)).sqrt()
-    u, w = reference._normalized(m, alpha, -0.5 * m.kappa * (x - 1.0), 1.5**0.5 * m.mu * norm)
+    u, w = reference.normalized(m, alpha, -0.5 * m.kappa * (x - 1.0), 1.5**0.5 * m.mu * norm)
     return u * u + w * w
 
 
@@ -273,8 +274,8 @@ def test_small_strains_keep_their_digits_in_float32() -> None:
     assert (strain.double() - want).abs().max() < 1e-6 * want.abs().max()
     mu, kappa = float(params[0, 0]), float(params[0, 1])
     mean = want[:, :3].mean(1)
-    hooke = 2 * mu * 0.5 * (want - reference._diagonal(mean))
-    hooke = hooke + reference._diagonal(1.5 * kappa * mean)
+    hooke = 2 * mu * 0.5 * (want - diagonal(mean))
+    hooke = hooke + diagonal(1.5 * kappa * mean)
     assert (stress.double() - hooke).abs().max() < 1e-5 * hooke.abs().max()
 
 

@@ -1,0 +1,422 @@
+// Eight (or, in double, four) particles of one home at a time, one per lane: their stencils, what
+// they give to the nodes and gather from them, and their update as long as it is elastic. Whatever
+// a lane's particle does beyond that is left to finish_particle (core/solver_particle.h), which
+// this file repeats without branches; tests/ops/test_solver_cpu.py holds the two together.
+#pragma once
+
+#include "core/solver_particle.h"
+#include "cpu/mpm_lanes.h"
+#include "cpu/pack.h"
+
+namespace gsf::cpu {
+
+// Node of the window at the base of a particle's stencil.
+inline int window_node(uint32_t meta) {
+  int at = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const int l = meta_cell(meta, axis);
+    at = at * kWindowEdge + (l < kLastCell ? l : kLastCell);
+  }
+  return at;
+}
+
+// Particles of a packet; unused lanes repeat the last one.
+template <typename T>
+struct Packet {
+  static constexpr int kLanes = Pack<T>::kLanes;
+  static constexpr uint32_t kAll = (1u << kLanes) - 1u;
+
+  int32_t index[kLanes];
+  uint32_t meta[kLanes];
+  uint32_t active;  // bit per lane
+
+  Packet(const SolverView<T>& s, const int32_t* order, int64_t count) {
+    const int used = count < kLanes ? static_cast<int>(count) : kLanes;
+    active = (1u << used) - 1u;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      index[lane] = order[lane < used ? lane : used - 1];
+      meta[lane] = s.meta[index[lane]];
+    }
+  }
+
+  // Lanes [first, end) whose particles share the cell of lane `first`.
+  int run(int first) const {
+    int end = first + 1;
+    while (end < kLanes && (meta[end] & 511u) == (meta[first] & 511u)) ++end;
+    return end;
+  }
+  bool same_rows() const {
+    bool same = true;
+    for (int lane = 1; lane < kLanes; ++lane)
+      same = same && meta_row(meta[lane]) == meta_row(meta[0]);
+    return same;
+  }
+
+  // Columns of an array with one row per particle.
+  void load3(const SolverView<T>& s, const T* array, Pack<T>* out) const {
+    Quad<T> rows[kLanes];
+    const T* end = array + 3 * s.count;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const T* row = array + 3 * int64_t(index[lane]);
+      rows[lane] = row + 4 <= end ? load_quad(row) : Quad<T>{row[0], row[1], row[2], T(0)};
+    }
+    Pack<T> four[4];
+    transpose(rows, four);
+    for (int c = 0; c < 3; ++c) out[c] = four[c];
+  }
+  void load4(const T* array, int width, int first, Pack<T>* out) const {
+    Quad<T> rows[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane)
+      rows[lane] = load_quad(array + width * int64_t(index[lane]) + first);
+    transpose(rows, out);
+  }
+  Pack<T> load1(const T* array, int width = 1, int column = 0) const {
+    return pack_of<T>([&](int lane) { return array[width * int64_t(index[lane]) + column]; });
+  }
+  void load9(const T* array, Pack<T>* out) const {
+    load4(array, 9, 0, out);
+    load4(array, 9, 4, out + 4);
+    out[8] = load1(array, 9, 8);
+  }
+  Sym3<Pack<T>> load6(const T* array) const {
+    Pack<T> a[4], b[4];
+    load4(array, 6, 0, a);
+    load4(array, 6, 2, b);
+    return {a[0], a[1], a[2], a[3], b[2], b[3]};
+  }
+
+  // The same the other way, for the lanes in `lanes`.
+  template <int kBytes>
+  void store_rows(const Quad<T>* rows, T* array, int width, int first, uint32_t lanes) const {
+    const auto put = [&](int lane) {
+      std::memcpy(array + width * int64_t(index[lane]) + first, rows + lane, kBytes);
+    };
+    if (lanes == kAll)
+      for (int lane = 0; lane < kLanes; ++lane) put(lane);
+    else
+      for (; lanes != 0; lanes &= lanes - 1) put(__builtin_ctz(lanes));
+  }
+  void store3(const Pack<T>* values, T* array, uint32_t lanes) const {
+    const Pack<T> four[4] = {values[0], values[1], values[2], values[2]};
+    Quad<T> rows[kLanes];
+    transpose(four, rows);
+    store_rows<3 * sizeof(T)>(rows, array, 3, 0, lanes);
+  }
+  void store4(const Pack<T>* values, T* array, int width, int first, uint32_t lanes) const {
+    Quad<T> rows[kLanes];
+    transpose(values, rows);
+    store_rows<4 * sizeof(T)>(rows, array, width, first, lanes);
+  }
+  void store6(const Sym3<Pack<T>>& e, T* array, uint32_t lanes) const {
+    const Pack<T> a[4] = {e.xx, e.yy, e.zz, e.xy}, b[4] = {e.zz, e.xy, e.xz, e.yz};
+    store4(a, array, 6, 0, lanes);
+    store4(b, array, 6, 2, lanes);
+  }
+  void store9(const Pack<T>* values, T* array, uint32_t lanes) const {
+    store4(values, array, 9, 0, lanes);
+    store4(values + 4, array, 9, 4, lanes);
+    for (; lanes != 0; lanes &= lanes - 1) {
+      const int lane = __builtin_ctz(lanes);
+      array[9 * int64_t(index[lane]) + 8] = values[8][lane];
+    }
+  }
+};
+
+// Stencils of a packet: stencil_at of every lane. `slope` weights are w (node - f).
+template <typename T>
+Stencil<Pack<T>> packet_stencil(const Pack<T>* offset) {
+  Stencil<Pack<T>> s;
+  for (int axis = 0; axis < 3; ++axis) {
+    const Pack<T> o = offset[axis];
+    const Pack<T> a = Pack<T>(1) - o, b = o - Pack<T>(0.5);
+    s.f[axis] = o + Pack<T>(0.5);
+    s.w[axis][0] = Pack<T>(0.5) * a * a;
+    s.w[axis][1] = Pack<T>(0.75) - b * b;
+    s.w[axis][2] = Pack<T>(0.5) * o * o;
+  }
+  return s;
+}
+
+// What the lanes of a packet give to nodes, laid out for one lane at a time.
+template <typename T>
+struct PacketMomentum {
+  static constexpr int kLanes = Pack<T>::kLanes;
+  Pack<T> weight[27];
+  // Momentum and mass at the nodes: (start[i] + j y + k z) of lane l.
+  Quad<T> start[3][kLanes], y[kLanes], z[kLanes];
+
+  PacketMomentum(const SolverView<T>& s, const Packet<T>& p, bool same_rows) {
+    Pack<T> offset[3], velocity[3];
+    Mat3<Pack<T>> slope;
+    p.load3(s, s.offset, offset);
+    p.load3(s, s.velocity, velocity);
+    p.load9(s.slope, slope.m);
+    const Stencil<Pack<T>> stencil = packet_stencil(offset);
+    const auto row = [&](int lane) {
+      return s.rows +
+             (meta_row(p.meta[lane]) < uint64_t(s.row_count) ? meta_row(p.meta[lane]) : 0) *
+                 int64_t(kRowColumns);
+    };
+    const Pack<T> mass = same_rows ? Pack<T>(row(0)[kMassColumn])
+                                   : pack_of<T>([&](int lane) { return row(lane)[kMassColumn]; });
+    for (int i = 0; i < 9; ++i) slope.m[i] *= Pack<T>(s.dx);
+    Pack<T> a[4], b[4];
+    for (int c = 0; c < 3; ++c)
+      a[c] = mass * velocity[c] -
+             (slope(c, 0) * stencil.f[0] + slope(c, 1) * stencil.f[1] + slope(c, 2) * stencil.f[2]);
+    a[3] = mass;
+    transpose(a, start[0]);
+    for (int i = 1; i < 3; ++i) {
+      for (int c = 0; c < 3; ++c) a[c] += slope(c, 0);
+      transpose(a, start[i]);
+    }
+    b[3] = Pack<T>(0);
+    for (int c = 0; c < 3; ++c) b[c] = slope(c, 1);
+    transpose(b, y);
+    for (int c = 0; c < 3; ++c) b[c] = slope(c, 2);
+    transpose(b, z);
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        const Pack<T> w = stencil.w[0][i] * stencil.w[1][j];
+        for (int k = 0; k < 3; ++k) weight[9 * i + 3 * j + k] = w * stencil.w[2][k];
+      }
+  }
+
+  // Adds lanes [first, end), all of one cell, to the tile at the base of their stencil.
+  void scatter(int first, int end, Lanes<T>* node) const {
+    for (int i = 0; i < 3; ++i, node += kWindowEdge * kWindowEdge) {
+      Lanes<T> sum[3][3];
+      for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) sum[j][k] = node[j * kWindowEdge + k];
+      for (int lane = first; lane < end; ++lane) {
+        Lanes<T> q = start[i][lane];
+        const Lanes<T> up = z[lane];
+        for (int j = 0; j < 3; ++j, q += y[lane]) {
+          const Pack<T>* w = weight + 9 * i + 3 * j;
+          const Lanes<T> middle = q + up;
+          sum[j][0] += w[0][lane] * q;
+          sum[j][1] += w[1][lane] * middle;
+          sum[j][2] += w[2][lane] * (middle + up);
+        }
+      }
+      for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) node[j * kWindowEdge + k] = sum[j][k];
+    }
+  }
+};
+
+// sum w v and sum w v (node - f) of lanes that share a cell; others get what they would gather
+// there.
+template <typename T>
+void packet_gather(const Stencil<Pack<T>>& s, const Pack<T> (*first_weight)[3],
+                   const Lanes<T>* node, Pack<T>* value, Mat3<Pack<T>>& first) {
+  const T* at = reinterpret_cast<const T*>(node);
+  for (int c = 0; c < 3; ++c) value[c] = Pack<T>(0);
+  for (int i = 0; i < 9; ++i) first.m[i] = Pack<T>(0);
+  for (int i = 0; i < 3; ++i) {
+    Pack<T> plane[3], plane_y[3], plane_z[3];
+    for (int c = 0; c < 3; ++c) plane[c] = plane_y[c] = plane_z[c] = Pack<T>(0);
+    for (int j = 0; j < 3; ++j) {
+      const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
+      for (int c = 0; c < 3; ++c) {
+        const Pack<T> v0(n[c]), v1(n[4 + c]), v2(n[8 + c]);
+        const Pack<T> row = s.w[2][0] * v0 + s.w[2][1] * v1 + s.w[2][2] * v2;
+        const Pack<T> row_z =
+            first_weight[2][0] * v0 + first_weight[2][1] * v1 + first_weight[2][2] * v2;
+        plane[c] += s.w[1][j] * row;
+        plane_y[c] += first_weight[1][j] * row;
+        plane_z[c] += s.w[1][j] * row_z;
+      }
+    }
+    for (int c = 0; c < 3; ++c) {
+      value[c] += s.w[0][i] * plane[c];
+      first(c, 0) += first_weight[0][i] * plane[c];
+      first(c, 1) += s.w[0][i] * plane_y[c];
+      first(c, 2) += s.w[0][i] * plane_z[c];
+    }
+  }
+}
+
+// packet_gather from a window tile, whatever cells the lanes lie in: run by run.
+template <typename T>
+void packet_gather_tile(const Packet<T>& packet, const Pack<T>* offset, const Lanes<T>* tile,
+                        Pack<T>* value, Mat3<Pack<T>>& first) {
+  using Int = typename Pack<T>::Int;
+  constexpr int kLanes = Pack<T>::kLanes;
+  const Stencil<Pack<T>> stencil = packet_stencil(offset);
+  Pack<T> first_weight[3][3];
+  for (int axis = 0; axis < 3; ++axis)
+    for (int n = 0; n < 3; ++n)
+      first_weight[axis][n] = stencil.w[axis][n] * (Pack<T>(n) - stencil.f[axis]);
+  const Int lanes = int_pack_of<T>([](int lane) { return lane; });
+  for (int lane = 0; lane < kLanes;) {
+    const int end = packet.run(lane);
+    Pack<T> v[3];
+    Mat3<Pack<T>> m;
+    packet_gather(stencil, first_weight, tile + window_node(packet.meta[lane]), v, m);
+    const Int mine = (lanes >= lane) & (lanes < end);
+    for (int c = 0; c < 3; ++c) value[c] = lane == 0 ? v[c] : select<T>(mine, v[c], value[c]);
+    for (int i = 0; i < 9; ++i)
+      first.m[i] = lane == 0 ? m.m[i] : select<T>(mine, m.m[i], first.m[i]);
+    lane = end;
+  }
+}
+
+// Largest squares of the particles done in packets.
+template <typename T>
+struct PacketLargest {
+  Pack<T> speed2{0}, wave2{0}, gradient2{0};
+
+  void give(Largest& l) const {
+    l.speed2 = larger(float(largest_lane(speed2)), l.speed2);
+    l.wave2 = larger(float(largest_lane(wave2)), l.wave2);
+    l.gradient2 = larger(float(largest_lane(gradient2)), l.gradient2);
+  }
+};
+
+// Elastic trial state inside the NACC yield surface for certain: in units of kappa, with the lower
+// bound x + x^3/6 + x^5/120 for sinh x (the surface grows with p0 and contains the origin).
+template <typename T>
+typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<T> alpha,
+                                     Pack<T> j2m1, Pack<T> n2) {
+  using P = Pack<T>;
+  const P mu = row[0] / row[1];
+  const P beta = min(cohesion, P(kCohesionMax));
+  const P x = min(row[4] * max(P(0) - alpha, P(0)), P(5));
+  const P x2 = x * x;
+  const P below = x * (P(1) + x2 * (P(1.0 / 6.0) + x2 * P(1.0 / 120.0)));
+  const P p0 = min(P(kYieldPressureFloor) + below, P(kYieldPressureCap));
+  const P center = P(0.5) * (P(1) - beta) * p0, a = P(0.5) * (P(1) + beta) * p0;
+  const P b = row[2] * a;
+  const P b2 = b * b / (P(1) + P(2) * beta);
+  const P p = P(-0.5) * j2m1 - center, q2 = P(1.5) * mu * mu * n2;
+  // Written so that NaN means no; alpha out of its bounds is for the full map to clamp.
+  return (p * p * b2 + q2 * a * a <= P(0.9999) * (a * a * b2)) & (alpha >= P(kAlphaMin)) &
+         (alpha <= P(kAlphaMax)) & (b > P(1e-8));
+}
+
+// finish_particle for every active lane.
+template <typename T, int kLaws, bool kTrack, typename Count>
+void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t reach,
+                   const Pack<T>* offset, const Pack<T>* value, const Mat3<Pack<T>>& first, T dt,
+                   T dt_next, PacketLargest<T>& largest, Count& counts) {
+  using P = Pack<T>;
+  using Int = typename P::Int;
+  const T inv_dx = T(1) / s.dx;
+  Mat3<P> c;
+  for (int i = 0; i < 9; ++i) c.m[i] = P(T(4) * inv_dx) * first.m[i];
+
+  const Int meta = int_pack_of<T>([&](int lane) {
+    return static_cast<std::conditional_t<sizeof(T) == 4, int32_t, int64_t>>(packet.meta[lane]);
+  });
+  Int plain = Int{} - 1, leaves{}, moved = meta & ~(Int{} + 511);
+  P rest[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const P there = offset[axis] + P(dt * inv_dx) * value[axis];
+    plain &= (there > P(-8)) & (there < P(8));
+    Int whole;
+    const P below = floor(there, whole);
+    const P part = there - below;
+    const Int up = part >= P(1);  // rounding of a tiny negative number
+    rest[axis] = select<T>(up, P(0), part);
+    const Int cell = ((meta >> (3 * axis)) & 7) + whole - up;
+    plain &= (cell >= 0) & (cell <= kLastCell);
+    const P reached = P(__builtin_convertvector(cell, typename P::Raw)) + rest[axis];
+    leaves |= (reached < P(0.5)) | (reached > P(kLastCell + 0.5));
+    if ((reach >> axis & 1u) == 0) leaves |= cell < 1;
+    if ((reach >> (3 + axis) & 1u) == 0) leaves |= cell > 2;
+    moved |= cell << (3 * axis);
+  }
+
+  const auto row_of = [&](int lane) {
+    return meta_row(packet.meta[lane]) < uint64_t(s.row_count)
+               ? int64_t(meta_row(packet.meta[lane]))
+               : int64_t(0);
+  };
+  P row[kRowColumns];
+  if (packet.same_rows()) {
+    for (int i = 0; i < kRowColumns; ++i) row[i] = P(s.rows[row_of(0) * kRowColumns + i]);
+  } else {
+    for (int i = 0; i < kRowColumns; ++i)
+      row[i] = pack_of<T>([&](int lane) { return s.rows[row_of(lane) * kRowColumns + i]; });
+  }
+
+  Mat3<P> increment;
+  for (int i = 0; i < 9; ++i) increment.m[i] = P(dt) * c.m[i];
+  const Sym3<P> e = update_strain(packet.load6(s.strain), increment);
+  const P j2m1 = det_minus_one(e);
+  const P isochoric = inverse_cube_root(P(1) + j2m1);
+  const Sym3<P> d = isochoric * deviator(e);
+  const P n2 = norm2(d);
+  plain &= (max_abs(e) <= P(kStrainMax)) & (j2m1 >= P(kJMin * kJMin - 1.0)) &
+           (j2m1 <= P(kJMax * kJMax - 1.0)) & (n2 <= P(kDeviatorMax * kDeviatorMax)) &
+           (det_identity_plus(increment) > P(0));
+  Int whole = Int{} - 1;  // not broken
+  if constexpr (kLaws != kElasticOnly) {
+    const Int law = int_pack_of<T>([&](int lane) {
+      return static_cast<std::conditional_t<sizeof(T) == 4, int32_t, int64_t>>(s.law[row_of(lane)]);
+    });
+    const Int nacc = law == int(kNacc);
+    plain &= nacc | (law == int(kElastic));
+    if (mask_bits(nacc) != 0) {
+      const P alpha = packet.load1(s.alpha), peak = packet.load1(s.peak);
+      P cohesion = row[3];
+      if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
+      plain &= ~nacc | (surely_elastic(row, cohesion, alpha, j2m1, n2) & (alpha <= peak));
+      whole = ~nacc | (peak < P(0));
+    }
+  }
+
+  const Sym3<P> stress = add_diagonal(row[0] * d, P(0.5) * row[1] * j2m1);
+  P slope[9];
+  const P scale = P(dt_next * T(4) / (s.dx * s.dx)) * row[kVolumeColumn];
+  const Mat3<P> tau = to_mat3(stress);
+  for (int i = 0; i < 9; ++i) slope[i] = row[kMassColumn] * c.m[i] - scale * tau.m[i];
+
+  P speed2(0), gradient2(0);
+  for (int i = 0; i < 3; ++i) speed2 += value[i] * value[i];
+  for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
+  // elastic_wave_squared
+  const P n = sqrt(n2);
+  const P mean = clamp(isochoric * (P(1) + trace(e) * P(1.0 / 3.0)), P(1), P(kDeviatorMax));
+  const P along =
+      row[0] * (P(4.0 / 3.0) * mean + P(0.272165526975909) * n) + P(0.5) * row[1] * (P(2) + j2m1);
+  const P across = row[0] * (mean + P(0.816496580927726) * n);
+  const P wave2 = max(along, across) / row[6];
+
+  const uint32_t done = mask_bits(plain) & packet.active;
+  if (done != 0) {
+    const auto keep = [&](P& most, Int mask, P x) {
+      most = max(most, select<T>(plain & mask, x, P(0)));
+    };
+    keep(largest.speed2, plain, speed2);
+    keep(largest.wave2, plain, wave2);
+    keep(largest.gradient2, whole, gradient2);
+    counts.leaves = counts.leaves || (mask_bits(leaves) & done) != 0;
+    packet.store3(rest, s.offset, done);
+    packet.store3(value, s.velocity, done);
+    packet.store6(e, s.strain, done);
+    packet.store9(slope, s.slope, done);
+    for (uint32_t left = done; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      s.meta[packet.index[lane]] = static_cast<uint32_t>(moved[lane]);
+    }
+    if constexpr (kTrack) {
+      Mat3<P> f;
+      packet.load9(s.deformation, f.m);
+      f = f + P(dt) * matmul(c, f);
+      packet.store9(f.m, s.deformation, done);
+    }
+  }
+  for (uint32_t left = packet.active & ~done; left != 0; left &= left - 1) {
+    const int lane = __builtin_ctz(left);
+    T one[3];
+    Mat3<T> moment;
+    for (int i = 0; i < 3; ++i) one[i] = value[i][lane];
+    for (int i = 0; i < 9; ++i) moment.m[i] = first.m[i][lane];
+    counts.add(finish_particle<T, kLaws, kTrack>(s, packet.index[lane], reach, one, moment, dt,
+                                                 dt_next, counts.largest));
+  }
+}
+
+}  // namespace gsf::cpu

@@ -1,0 +1,79 @@
+"""Materials: a constitutive law and its parameters, and presets by name.
+
+``gsfluent.materials.fruit.watermelon``, ``gsfluent.materials.glass`` and so on are
+:class:`Material` objects; :func:`get` finds them by name and :meth:`Material.override` changes
+single parameters. Each preset says of every number whether it is measured, derived or chosen by
+eye (:meth:`Material.source`, docs/materials.md).
+
+Strength of ``nacc`` material is set by strain, not by stress: the compressive yield pressure is
+``kappa * sinh(hardening * max(-alpha, 0))`` and tension fails at ``cohesion * p0``. ``alpha`` is
+the log plastic volume ratio: negative is intact, zero and above is broken. The volumetric strain at
+which a material fails in tension is :attr:`Material.failure_strain`; a body starts to break when it
+lands faster than about ``wave_speed * failure_strain``.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from gsfluent.errors import InputError
+from gsfluent.materials.brittle import BRITTLE
+from gsfluent.materials.flows import GRAINS, LIQUIDS, METALS
+from gsfluent.materials.hard import HARD
+from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, RANGES, READS
+from gsfluent.materials.material import SCATTER, UNBROKEN, Field, Material, nearest
+
+__all__ = [
+    "DEFAULTS",
+    "LAWS",
+    "PARAMETERS",
+    "RANGES",
+    "READS",
+    "SCATTER",
+    "UNBROKEN",
+    "Field",
+    "Material",
+    "fruit",
+    "get",
+    "names",
+]
+
+LATER_FIELDS: tuple[str, ...] = ()
+"""Parameters of laws that do not run yet: none are left."""
+
+_PRESETS: dict[str, Material] = {m.name: m for m in (*BRITTLE, *HARD, *GRAINS, *METALS, *LIQUIDS)}
+
+fruit = SimpleNamespace(
+    **{
+        name.split(".", 1)[1]: value
+        for name, value in _PRESETS.items()
+        if name.startswith("fruit.")
+    }
+)
+
+
+def __getattr__(name: str) -> Material:
+    """Return the preset of that name: ``materials.glass``, ``materials.water``, ..."""
+    try:
+        return _PRESETS[name]
+    except KeyError:
+        raise AttributeError(f"module 'gsfluent.materials' has no attribute {name!r}") from None
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all presets."""
+    return tuple(sorted(_PRESETS))
+
+
+def get(name: str) -> Material:
+    """Return the preset called ``name``; the group may be left out (``"watermelon"``).
+
+    Raises:
+        InputError: No preset has that name; the message gives the nearest one and all names.
+    """
+    if name in _PRESETS:
+        return _PRESETS[name]
+    short = {key.split(".")[-1]: value for key, value in _PRESETS.items()}
+    if name in short:
+        return short[name]
+    raise InputError(f"unknown material {name!r}", mend=nearest(name, _PRESETS))

@@ -1,0 +1,102 @@
+"""Which parameters a law reads, their ranges and defaults, and the row it hands to the ops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+LAWS = {
+    "elastic": 0,
+    "nacc": 1,
+    "drucker_prager": 2,
+    "von_mises": 3,
+    "fluid": 4,
+    "rigid": 5,
+    "corotated": 6,
+}
+"""Constitutive laws and their numbers in :func:`gsfluent.ops.return_mapping`."""
+
+RANGES: dict[str, tuple[float, float, str]] = {
+    "young_modulus": (0.0, math.inf, "Pa"),
+    "poisson_ratio": (-0.99, 0.495, "no unit"),
+    "density": (0.0, math.inf, "kg/m^3"),
+    "cohesion": (0.0, 1e3, "no unit"),
+    "hardening": (0.0, 1e3, "no unit"),
+    "friction_angle": (0.0, 89.0, "degrees"),
+    "alpha0": (-10.0, 0.5, "no unit"),
+    "shear_damage": (0.0, 10.0, "no unit"),
+    "yield_stress": (0.0, math.inf, "Pa"),
+    "hardening_modulus": (0.0, math.inf, "Pa"),
+    "cohesion_pressure": (0.0, math.inf, "Pa"),
+    "bulk_modulus": (0.0, math.inf, "Pa"),
+    "viscosity": (0.0, math.inf, "Pa s"),
+    "tait_exponent": (1.0, 20.0, "no unit"),
+}
+"""Parameter -> lowest value, highest value, unit."""
+
+POSITIVE = ("young_modulus", "density", "grain", "bulk_modulus")
+"""Parameters that must be above their lowest value."""
+
+PARAMETERS = tuple(RANGES)
+"""The fields of a material that may vary in space."""
+
+_SOLID = ("young_modulus", "poisson_ratio", "density")
+READS: dict[str, tuple[str, ...]] = {
+    "elastic": _SOLID,
+    "corotated": _SOLID,
+    "nacc": (*_SOLID, "cohesion", "hardening", "friction_angle", "alpha0", "shear_damage"),
+    "drucker_prager": (*_SOLID, "friction_angle", "cohesion_pressure"),
+    "von_mises": (*_SOLID, "yield_stress", "hardening_modulus"),
+    "fluid": ("bulk_modulus", "density", "viscosity", "tait_exponent"),
+    "rigid": ("density",),
+}
+"""Law -> the parameters it reads; any other is refused, because it would do nothing."""
+
+DEFAULTS: dict[str, dict[str, float]] = {
+    "nacc": {
+        "cohesion": 0.6,
+        "hardening": 3.0,
+        "friction_angle": 45.0,
+        "alpha0": -0.04,
+        "shear_damage": 0.0,
+    },
+    "drucker_prager": {"friction_angle": 35.0, "cohesion_pressure": 0.0},
+    "von_mises": {"hardening_modulus": 0.0},
+    "fluid": {"viscosity": 0.0, "tait_exponent": 7.0},
+}
+"""Law -> parameters that may be left out, and their values then."""
+
+
+def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
+    """Return the columns of ``params`` for a law, [..., 8], float64.
+
+    Args:
+        law: Name of the law.
+        at: Parameter name -> its values (any shape that broadcasts).
+
+    Columns: see :func:`gsfluent.ops.return_mapping`.
+    """
+    density = at("density")
+    zero = torch.zeros_like(density)
+    mu, kappa, strength, cohesion, hardening, damage, exponent = (zero,) * 7
+    if law == "fluid":
+        kappa, strength, exponent = at("bulk_modulus"), at("viscosity"), at("tait_exponent")
+    elif law != "rigid":
+        young, nu = at("young_modulus"), at("poisson_ratio")
+        mu, kappa = young / (2.0 * (1.0 + nu)), young / (3.0 * (1.0 - 2.0 * nu))
+    if law in ("nacc", "drucker_prager"):
+        sine = torch.sin(torch.deg2rad(at("friction_angle")))
+        slope = 6.0 * sine / (3.0 - sine)  # q = M p
+    if law == "nacc":
+        strength, cohesion = slope, at("cohesion")
+        hardening, damage = at("hardening"), at("shear_damage")
+    elif law == "drucker_prager":
+        # |dev tau| = sqrt(2/3) q = 3 alpha_DP p
+        strength, cohesion = math.sqrt(2.0 / 27.0) * slope, at("cohesion_pressure")
+    elif law == "von_mises":
+        strength, hardening = at("yield_stress"), at("hardening_modulus")
+    columns = (mu, kappa, strength, cohesion, hardening, damage, density, exponent)
+    return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
