@@ -93,7 +93,7 @@ def table(record: dict[str, Any]) -> str:
     for item in items:
         if item["error"]:
             lines.append(
-                f"| {item['name']} | {item['summary']} | | | | | **did not run**: {item['error']} "
+                f"| {item['name']} | {item['summary']} | | | | | **did not run**: {cell(item['error'])} "
                 f"| | {item['seconds']:.1f} |"
             )
         for r in item["results"]:
@@ -101,12 +101,17 @@ def table(record: dict[str, Any]) -> str:
             unit = f" {result.unit}" if result.unit else ""
             note = f"; {result.note}" if result.note else ""
             lines.append(
-                f"| {result.name} | {result.quantity} | {number(result.value)}{unit} "
+                f"| {result.name} | {cell(result.quantity)} | {number(result.value)}{unit} "
                 f"| {number(result.reference)}{unit} | {number(result.error)} "
                 f"| {number(result.tolerance)} | {'pass' if result.passed else '**MISS**'} "
-                f"| {result.source}{note} | {result.seconds:.1f} |"
+                f"| {cell(result.source + note)} | {result.seconds:.1f} |"
             )
     return "\n".join(line.replace("\n", " ") for line in lines)
+
+
+def cell(text: str) -> str:
+    """Text that does not end a cell of the table."""
+    return text.replace("|", "\\|")
 
 
 def enter(text: str, part: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -72,7 +73,7 @@ def swing(cells: int, periods: float) -> tuple[float, float, float, int]:
     frequency = 0.5 * halves / crossings[-1] if halves else 0.0
     peaks = [
         max(abs(h) for t, h in zip(times, heights, strict=True) if a <= t <= b)
-        for a, b in zip(crossings, crossings[1:], strict=False)
+        for a, b in itertools.pairwise(crossings)
     ]
     ratio = 0.0
     if len(peaks) > 1:

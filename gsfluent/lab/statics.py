@@ -22,7 +22,9 @@ are straight lines and the decaying (-2 + sqrt 3)^i; with c = 0 at the nodes 0 a
 zero at -1 / (3 + sqrt 3)."""
 
 
-def plane(axis: int, at: float, side: int, mode: int, speed: tuple[float, ...] = (0, 0, 0)) -> Tensor:
+def plane(
+    axis: int, at: float, side: int, mode: int, speed: tuple[float, ...] = (0, 0, 0)
+) -> Tensor:
     """Collider row: the half space below (side 1) or above (side -1) ``at`` on an axis.
 
     Args:
@@ -133,7 +135,13 @@ def two_material_bar() -> Iterator[Result]:
     """Bar of a soft and a stiff half in series: strains 4 to 1, equal traction."""
     cases = (
         ("free of Poisson's effect, slip ends", 0.0, (0, 0), SLIP, "exact in one dimension"),
-        ("nu 0.3, corotated and neo-Hookean", 0.3, (6, 0), STICK, "GaussianBench B1, which allows 15 %"),
+        (
+            "nu 0.3, corotated and neo-Hookean",
+            0.3,
+            (6, 0),
+            STICK,
+            "GaussianBench B1 allows 15 %",
+        ),
     )
     young = (5e4, 2e5)
     for name, poisson, laws, mode, source in cases:

@@ -27,8 +27,8 @@ class Vortex:
     """Every ring of radius R turns by ``alpha(R, t) = A sin(pi t / T) (1 - 16 (R - 1)^2)^2``.
 
     Rings outside [0.75, 1.25] rest, and are held at rest: a free ring would be turned as a whole by
-    the sum of the small errors of a large force. The body force for the neo-Hookean law of gsfluent is derived
-    in solver.md, row 5 (checked there to 1e-10). Motion: Kamojjala et al. 2015.
+    the sum of the small errors of a large force. The body force for the neo-Hookean law of gsfluent
+    is derived in solver.md, row 5 (checked there to 1e-10). Motion: Kamojjala et al. 2015.
     """
 
     young, poisson, density = 1000.0, 0.3, 1000.0

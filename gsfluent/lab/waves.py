@@ -153,8 +153,9 @@ def bar_wave() -> Iterator[Result]:
     exact = math.sqrt(BAR_YOUNG / BAR_DENSITY)
     travel, times, moved = push_bar(0.002)
     yield compare(
-        "bar_wave", "speed of the first arrival, push of 2 ms", travel / crossing(times, moved, 1e-5),
-        exact, tolerance=0.15, unit="m/s", source="sqrt(E / rho); GaussianBench A3 and its measure",
+        "bar_wave", "speed of the first arrival, push of 2 ms",
+        travel / crossing(times, moved, 1e-5), exact, tolerance=0.15, unit="m/s",
+        source="sqrt(E / rho); GaussianBench A3 and its measure",
         note="1 % of the push; a forerunner at 25.9 m/s, the wave of the bulk, is physical",
     )  # fmt: skip
     width = 0.01
