@@ -92,9 +92,10 @@ def table(record: dict[str, Any]) -> str:
     ]
     for item in items:
         if item["error"]:
+            error = f"**did not run**: {cell(item['error'])}"
             lines.append(
-                f"| {item['name']} | {item['summary']} | | | | | **did not run**: {cell(item['error'])} "
-                f"| | {item['seconds']:.1f} |"
+                f"| {item['name']} | {cell(item['summary'])} | | | | | {error} | "
+                f"| {item['seconds']:.1f} |"
             )
         for r in item["results"]:
             result = Result(**r)
