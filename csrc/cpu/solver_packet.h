@@ -227,30 +227,31 @@ struct PacketMomentum {
 template <typename T>
 void packet_gather(const Stencil<Pack<T>>& s, const Pack<T> (*first_weight)[3],
                    const Lanes<T>* node, Pack<T>* value, Mat3<Pack<T>>& first) {
+  // One component at a time: its sums and the weights along z stay in registers.
   const T* at = reinterpret_cast<const T*>(node);
-  for (int c = 0; c < 3; ++c) value[c] = Pack<T>(0);
-  for (int i = 0; i < 9; ++i) first.m[i] = Pack<T>(0);
-  for (int i = 0; i < 3; ++i) {
-    Pack<T> plane[3], plane_y[3], plane_z[3];
-    for (int c = 0; c < 3; ++c) plane[c] = plane_y[c] = plane_z[c] = Pack<T>(0);
-    for (int j = 0; j < 3; ++j) {
-      const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
-      for (int c = 0; c < 3; ++c) {
-        const Pack<T> v0(n[c]), v1(n[4 + c]), v2(n[8 + c]);
+  for (int c = 0; c < 3; ++c, ++at) {
+    Pack<T> sum(0), x(0), y(0), z(0);
+    for (int i = 0; i < 3; ++i) {
+      Pack<T> plane(0), plane_y(0), plane_z(0);
+      for (int j = 0; j < 3; ++j) {
+        const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
+        const Pack<T> v0(n[0]), v1(n[4]), v2(n[8]);
         const Pack<T> row = s.w[2][0] * v0 + s.w[2][1] * v1 + s.w[2][2] * v2;
         const Pack<T> row_z =
             first_weight[2][0] * v0 + first_weight[2][1] * v1 + first_weight[2][2] * v2;
-        plane[c] += s.w[1][j] * row;
-        plane_y[c] += first_weight[1][j] * row;
-        plane_z[c] += s.w[1][j] * row_z;
+        plane += s.w[1][j] * row;
+        plane_y += first_weight[1][j] * row;
+        plane_z += s.w[1][j] * row_z;
       }
+      sum += s.w[0][i] * plane;
+      x += first_weight[0][i] * plane;
+      y += s.w[0][i] * plane_y;
+      z += s.w[0][i] * plane_z;
     }
-    for (int c = 0; c < 3; ++c) {
-      value[c] += s.w[0][i] * plane[c];
-      first(c, 0) += first_weight[0][i] * plane[c];
-      first(c, 1) += s.w[0][i] * plane_y[c];
-      first(c, 2) += s.w[0][i] * plane_z[c];
-    }
+    value[c] = sum;
+    first(c, 0) = x;
+    first(c, 1) = y;
+    first(c, 2) = z;
   }
 }
 
