@@ -106,7 +106,7 @@ class NodePass {
     int present = 0;
     for (int a = 0; a < fields; ++a) {
       const T* n = sums + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
-      const NodeSums<T> sum{double(n[3]), {double(n[0]), double(n[1]), double(n[2])}, {}};
+      const NodeSums<T> sum{double(n[3]), {double(n[0]), double(n[1]), double(n[2])}};
       heavy[a] = node_velocity(s_, sum, dt, velocity[a]);
       mass[a] = sum.mass;
       present += heavy[a] ? 1 : 0;

@@ -26,8 +26,8 @@ SMALLEST = 0.9
 THINNEST = 2.0
 """Cells below which the grid does not hold matter out of a box reliably."""
 BACKED = 6.0
-"""Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what it
-sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
+"""Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
+it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -269,7 +269,7 @@ class RigidSet:
         axes = torch.from_numpy(body.axes.copy())
         extra = {
             "point": (turn @ torch.from_numpy(body.center.copy())).tolist(),
-            "orientation": _quaternion(turn @ axes),
+            "orientation": quaternion_of(turn @ axes),
             "normal": body.corner.tolist(),
             "radius": body.spacing,
             "extent": list(body.values.shape),
@@ -312,7 +312,7 @@ def _matrix(q: tuple[float, float, float, float]) -> Tensor:
     )
 
 
-def _quaternion(matrix: Tensor) -> list[float]:
+def quaternion_of(matrix: Tensor) -> list[float]:
     """Unit quaternion w, x, y, z of a rotation matrix."""
     from scipy.spatial.transform import Rotation
 
