@@ -93,8 +93,7 @@ def _p2g_contact(op: Any, p: dict[str, Any]) -> Results:
     args = [p[k] for k in ("position", "velocity", "affine", "mass")]
     options = {k: p[k] for k in ("stress", "volume", "body", "blocks")}
     grid, moments = op.p2g(*args, dx=DX, dt=DT, fields=2, contact=True, **options)
-    out = {"momentum": grid[..., :3], "mass gradient": moments[..., :3]}
-    return {**out, "first moment": moments[..., 3:]}
+    return {"momentum": grid[..., :3], "first moment": moments}
 
 
 def _grid_update(op: Any, p: dict[str, Any]) -> Results:

@@ -1,11 +1,39 @@
-// What happens at one grid node: momentum to velocity, contact between two bodies. No torch, no
-// loops over nodes. Source: equations.md 11.3 (corrected Collision-MPM force); Bardenhagen et al.
-// 2001. Rigid colliders: core/collider.h.
+// What happens at one grid node where two bodies meet: the normal they share, whether they touch,
+// the impulse between them. No torch, no loops over nodes. Rigid colliders: core/collider.h.
+//
+// LAYOUT. Per node and body the transfer accumulates mass, momentum and kContactMoments sums, the
+// first moment of the mass about the node in cells [kg], each an order-independent sum over
+// particles:
+//
+//   moment[k] = sum_p w m (x_p - x_node)[k] / dx        (contact_moment; |moment[k]| <= 1.5 mass)
+//
+// A node reads these of itself and of its 26 neighbours, of two bodies, through an accessor
+//
+//   ContactSample<T> near(int side, int o)      side 0 = body a, 1 = body b
+//                                               o = 0..26: node + (o / 9 - 1, o / 3 % 3 - 1, o % 3
+//                                               - 1); 13 is the node itself
+//
+// with mass 0 where the body has no mass or its moments are not stored (a grid that stores moments
+// only in blocks where two bodies meet should also store them in the blocks around those: a sample
+// left out costs accuracy of the normal, never safety). Pairs of fields that are parts of one
+// unbroken body are not contacts: merge_pair / merge_group after all contacts of the node.
+//
+// NORMAL. The centroid x_node + dx moment / mass of a neighbour's sum lies inside the body, as far
+// out as the body reaches there. Two bodies that do not overlap can be parted by a plane, and so
+// can these centroids: a normal is as good as the gap it leaves between them. Three normals are
+// tried: the outward direction of either body, from moments smoothed over the neighbours, and their
+// mean. The mean is best where both surfaces are smooth, so it wins ties; one body's own direction
+// is taken where it parts the bodies clearly better (at the edge of a footprint, where the other
+// body's direction leans). docs/contact.md compares this with other normals.
+// Source of the force: equations.md 11.3 (corrected Collision-MPM); Bardenhagen et al. 2001. Idea
+// of a separating plane: Nairn et al. 2020.
 #pragma once
 
 #include "core/grid.h"
 
 namespace gsf {
+
+constexpr int kContactMoments = 3;
 
 // Nodes lighter than this carry no velocity. B-spline nodal mass and momentum shrink together, so
 // the quotient is accurate down to the smallest normal numbers; the floor only keeps 0 / 0 and
@@ -21,54 +49,141 @@ struct ContactLaw {
   double gap;          // s_c: centroid separation, in dx, up to which bodies touch
 };
 
-// Unit normal pointing out of body a (into b); false when neither mass gradient says anything.
+// Sums of one body at one node.
 template <typename T>
-GSF_HOST_DEVICE bool contact_normal(T mass_a, T mass_b, const Vec3<T>& grad_a,
-                                    const Vec3<T>& grad_b, T dx, Vec3<T>& normal) {
-  const T len_a = norm(grad_a), len_b = norm(grad_b);
-  const T sharp_a = len_a * dx / mass_a, sharp_b = len_b * dx / mass_b;
-  const T floor = T(1e-6);
-  // Written so that NaN in the moments means "no contact".
-  if (!(sharp_a >= floor || sharp_b >= floor)) return false;
-  const Vec3<T> unit_a = (sharp_a >= floor ? T(1) / len_a : T(0)) * grad_a;
-  const Vec3<T> unit_b = (sharp_b >= floor ? T(1) / len_b : T(0)) * grad_b;
-  const Vec3<T> d = unit_a - unit_b;
-  const T len = norm(d);
-  if (len >= T(0.1)) {
-    normal = (T(1) / len) * d;
-  } else {  // gradients agree (a thin body wrapped by the other): trust the sharper one
-    normal = sharp_a >= sharp_b ? unit_a : T(-1) * unit_b;
+struct ContactSample {
+  T mass;          // kg
+  Vec3<T> moment;  // sum w m (x_p - x_node) / dx [kg]
+};
+
+// What a particle adds to stencil node (i, j, k): `weighted` = w m.
+template <typename T>
+GSF_HOST_DEVICE Vec3<T> contact_moment(const Stencil<T>& s, T weighted, int i, int j, int k) {
+  return {weighted * (s.f[0] - T(i)), weighted * (s.f[1] - T(j)), weighted * (s.f[2] - T(k))};
+}
+
+GSF_HOST_DEVICE int neighbour_step(int o, int axis) {
+  return (axis == 0 ? o / 9 : (axis == 1 ? o / 3 % 3 : o % 3)) - 1;
+}
+
+// Outward direction of one body, smoothed over the neighbours; `largest` = the heaviest of them.
+template <typename T, typename Near>
+GSF_HOST_DEVICE bool contact_direction(const Near& near, int side, Vec3<T>& out, T& largest) {
+  Vec3<T> sum{T(0), T(0), T(0)};
+  largest = T(0);
+  for (int o = 0; o < 27; ++o) {
+    const ContactSample<T> s = near(side, o);
+    T weight = T(1);
+    for (int axis = 0; axis < 3; ++axis) weight *= neighbour_step(o, axis) == 0 ? T(1) : T(0.5);
+    sum = sum - weight * s.moment;
+    largest = max(largest, s.mass);
   }
+  const T length = norm(sum);
+  // Also false for NaN.
+  if (!(length > T(1e-6) * largest)) return false;
+  out = (T(1) / length) * sum;
   return true;
 }
 
-// Impulse between bodies a and b at one node; returns whether they touch. `first` = sum w m (x_p -
-// x_node). Momentum is exchanged, never made: v_a -= j / m_a, v_b += j / m_b with one j.
-template <typename T>
-GSF_HOST_DEVICE bool contact_pair(T mass_a, T mass_b, const T* moments_a, const T* moments_b, T dx,
-                                  const ContactLaw& law, Vec3<T>& v_a, Vec3<T>& v_b) {
-  Vec3<T> n;
-  const Vec3<T> grad_a{moments_a[0], moments_a[1], moments_a[2]};
-  const Vec3<T> grad_b{moments_b[0], moments_b[1], moments_b[2]};
-  if (!contact_normal(mass_a, mass_b, grad_a, grad_b, dx, n)) return false;
-  const Vec3<T> separation{moments_b[3] / mass_b - moments_a[3] / mass_a,
-                           moments_b[4] / mass_b - moments_a[4] / mass_a,
-                           moments_b[5] / mass_b - moments_a[5] / mass_a};
-  if (!(dot(separation, n) <= T(law.gap) * dx)) return false;
+// Unit normal out of body a (into b); false when the moments say nothing.
+template <typename T, typename Near>
+GSF_HOST_DEVICE bool contact_normal(const Near& near, Vec3<T>& normal) {
+  Vec3<T> direction[2];
+  T largest[2];
+  const bool known_a = contact_direction(near, 0, direction[0], largest[0]);
+  const bool known_b = contact_direction(near, 1, direction[1], largest[1]);
+  if (!known_a && !known_b) return false;
+  if (!known_a || !known_b) {
+    normal = known_a ? direction[0] : T(-1) * direction[1];
+    return true;
+  }
+  Vec3<T> candidate[3] = {direction[0] - direction[1], direction[0], T(-1) * direction[1]};
+  const T length = norm(candidate[0]);
+  // The directions agree: one body wraps a thin part of the other; let the gap choose.
+  const bool opposed = length >= T(0.1);
+  candidate[0] = opposed ? (T(1) / length) * candidate[0] : direction[0];
+  // Width of the gap each candidate leaves between the centroids of the two bodies, in cells.
+  constexpr T kFar = T(16);
+  T reach[3] = {-kFar, -kFar, -kFar}, start[3] = {kFar, kFar, kFar};
+  for (int side = 0; side < 2; ++side)
+    for (int o = 0; o < 27; ++o) {
+      const ContactSample<T> s = near(side, o);
+      // Far lighter nodes may have a centroid of round-off.
+      if (!(s.mass > T(1e-4) * largest[side])) continue;
+      const T inverse = T(1) / s.mass;
+      const Vec3<T> x{T(neighbour_step(o, 0)) + inverse * s.moment.x,
+                      T(neighbour_step(o, 1)) + inverse * s.moment.y,
+                      T(neighbour_step(o, 2)) + inverse * s.moment.z};
+      for (int c = 0; c < 3; ++c) {
+        const T along = dot(x, candidate[c]);
+        if (side == 0)
+          reach[c] = max(reach[c], along);
+        else
+          start[c] = min(start[c], along);
+      }
+    }
+  const T gap[3] = {start[0] - reach[0], start[1] - reach[1], start[2] - reach[2]};
+  const bool second = gap[2] > gap[1];
+  const T better = (second ? gap[2] : gap[1]) - gap[0];
+  // From 0.1 to 0.2 cells, the roughness of a surface of 8 particles per cell, the mean gives way.
+  const T share = opposed ? clamp((better - T(0.1)) * T(10), T(0), T(1)) : T(better > T(0));
+  const Vec3<T> mixed =
+      candidate[0] + share * ((second ? candidate[2] : candidate[1]) - candidate[0]);
+  const T size = norm(mixed);
+  if (!(size > T(0.1))) return false;
+  normal = (T(1) / size) * mixed;
+  return true;
+}
+
+// Impulse between bodies a and b at one node; returns whether they touch. Momentum is exchanged,
+// never made: v_a -= j / m_a, v_b += j / m_b with one j.
+template <typename T, typename Near>
+GSF_HOST_DEVICE bool contact_pair(const Near& near, const ContactLaw& law, Vec3<T>& v_a,
+                                  Vec3<T>& v_b) {
+  const ContactSample<T> a = near(0, 13), b = near(1, 13);
   const Vec3<T> relative = v_a - v_b;
+  if (!(dot(relative, relative) > T(0))) return false;
+  Vec3<T> n;
+  if (!contact_normal(near, n)) return false;
+  const Vec3<T> separation = (T(1) / b.mass) * b.moment - (T(1) / a.mass) * a.moment;
+  if (!(dot(separation, n) <= T(law.gap))) return false;
   const T approach = dot(relative, n);
   if (!(approach > T(0))) return false;
   // m_a m_b / (m_a + m_b) without the product, which underflows for light nodes.
-  const T reduced = mass_a / (mass_a + mass_b) * mass_b;
+  const T reduced = a.mass / (a.mass + b.mass) * b.mass;
   const T normal_impulse = (T(1) + T(law.restitution)) * reduced * approach;
   const Vec3<T> slip = relative - approach * n;
   const T slip_speed = norm(slip);
   const T slip_impulse = min(T(law.friction) * normal_impulse, reduced * slip_speed);
   Vec3<T> impulse = normal_impulse * n;
   if (slip_speed > T(0)) impulse = impulse + (slip_impulse / slip_speed) * slip;
-  v_a = v_a - (T(1) / mass_a) * impulse;
-  v_b = v_b + (T(1) / mass_b) * impulse;
+  v_a = v_a - (T(1) / a.mass) * impulse;
+  v_b = v_b + (T(1) / b.mass) * impulse;
   return true;
+}
+
+// Fields that are parts of one body (the set bits of `members`): the velocity they would have as
+// one field. mass(f), velocity(f), store(f, v).
+template <typename T, typename Mass, typename Velocity, typename Store>
+GSF_HOST_DEVICE void merge_group(uint64_t members, const Mass& mass, const Velocity& velocity,
+                                 const Store& store) {
+  if ((members & (members - 1)) == 0) return;
+  T total = T(0);
+  for (int f = 0; f < 64; ++f)
+    if (members >> f & 1u) total += mass(f);
+  if (!(total > T(0))) return;
+  Vec3<T> common{T(0), T(0), T(0)};
+  for (int f = 0; f < 64; ++f)
+    if (members >> f & 1u) common = common + (mass(f) / total) * velocity(f);
+  for (int f = 0; f < 64; ++f)
+    if (members >> f & 1u) store(f, common);
+}
+
+// The same for two.
+template <typename T>
+GSF_HOST_DEVICE void merge_pair(T mass_a, T mass_b, Vec3<T>& v_a, Vec3<T>& v_b) {
+  const T share = mass_a / (mass_a + mass_b);
+  v_a = v_b = v_b + share * (v_a - v_b);
 }
 
 }  // namespace gsf

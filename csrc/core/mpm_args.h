@@ -27,7 +27,7 @@ struct P2GArgs {
   T dx, dt;
   int32_t fields;
   T* grid;           // [fields, count, 64, 4] momentum and mass, zeroed
-  T* moments;        // [fields, count, 64, 6] mass gradient, first moment, zeroed; or null
+  T* moments;        // [fields, count, 64, kContactMoments] zeroed; or null
   int64_t* skipped;  // [] particles given to no node, zeroed
 };
 
@@ -60,12 +60,15 @@ struct GatherArgs {
 
 template <typename T>
 struct GridUpdateArgs {
+  BlockView blocks;       // order, start: not used
   const int32_t* coords;  // [count, 3]
   int64_t count;
   int32_t fields;
-  const T* grid;       // [fields, count, 64, 4]
-  const T* moments;    // [fields, count, 64, 6] or null
-  const T* colliders;  // [collider_count, kColliderColumns] or null
+  const T* grid;           // [fields, count, 64, 4]
+  const T* moments;        // [fields, count, 64, kContactMoments] or null
+  const uint64_t* merged;  // [fields] bit g of word f: f and g move as one; or null
+  const int32_t* cut;      // [fields] sides of blades (core/blade.h), or null: none
+  const T* colliders;      // [collider_count, kColliderColumns] or null
   int64_t collider_count;
   const float* sdf;  // [sdf_count] distance grids of all colliders, or null
   int64_t sdf_count;
@@ -84,40 +87,92 @@ struct GridUpdateArgs {
   GSF_HOST_DEVICE T* out(int32_t field, int64_t node) const {
     return velocity + 3 * (int64_t(field) * count * kBlockNodes + node);
   }
+  GSF_HOST_DEVICE int32_t cut_of(int32_t field) const { return cut != nullptr ? cut[field] : 0; }
+  GSF_HOST_DEVICE void set(int32_t field, int64_t node, const Vec3<T>& v) const {
+    for (int i = 0; i < 3; ++i) out(field, node)[i] = v[i];
+  }
 };
 
-// Momentum to velocity with gravity, then contact between every pair of fields (Gauss-Seidel);
-// returns whether any touched.
+// What contact reads around one node of a pair of fields.
+template <typename T>
+struct ContactNear {
+  const GridUpdateArgs<T>& a;
+  int32_t field[2];
+  int32_t block[3], local[3];
+
+  GSF_HOST_DEVICE ContactNear(const GridUpdateArgs<T>& args, int64_t node)
+      : a(args),
+        field{0, 0},
+        local{int32_t(node % kBlockNodes / 16), int32_t(node / 4 % 4), int32_t(node % 4)} {
+    for (int axis = 0; axis < 3; ++axis) block[axis] = a.coords[3 * (node / kBlockNodes) + axis];
+  }
+
+  GSF_HOST_DEVICE ContactSample<T> operator()(int side, int o) const {
+    const int32_t x = local[0] + neighbour_step(o, 0), y = local[1] + neighbour_step(o, 1),
+                  z = local[2] + neighbour_step(o, 2);
+    const int32_t b =
+        a.blocks.at(block[0] + block_of(x), block[1] + block_of(y), block[2] + block_of(z));
+    if (b < 0) return {T(0), {T(0), T(0), T(0)}};
+    const int64_t n = int64_t(b) * kBlockNodes + local_index(local_of(x), local_of(y), local_of(z));
+    const T mass = a.node(field[side], n)[3];
+    if (!(mass > mass_floor<T>())) return {T(0), {T(0), T(0), T(0)}};
+    const T* m = a.moments + kContactMoments * (int64_t(field[side]) * a.count * kBlockNodes + n);
+    return {mass, {m[0], m[1], m[2]}};
+  }
+};
+
+// Fields that move with field f at this node: its group of merged fields, transitively.
+template <typename T>
+GSF_HOST_DEVICE uint64_t merged_group(const GridUpdateArgs<T>& a, uint64_t present, int32_t f) {
+  uint64_t group = uint64_t(1) << f, before = 0;
+  while (group != before) {
+    before = group;
+    for (int32_t g = 0; g < a.fields; ++g)
+      if (before >> g & 1u) group |= a.merged[g] & present;
+  }
+  return group;
+}
+
+// Momentum to velocity with gravity, then contact between every pair of fields (Gauss-Seidel), then
+// fields that are merged to their common velocity; returns whether any touched.
 template <typename T>
 GSF_HOST_DEVICE bool update_node(const GridUpdateArgs<T>& a, int64_t node) {
-  int present = 0;
+  uint64_t present = 0;
   for (int32_t f = 0; f < a.fields; ++f) {
     const T* g = a.node(f, node);
     T* v = a.out(f, node);
     const bool heavy = g[3] > mass_floor<T>();
     for (int i = 0; i < 3; ++i) v[i] = heavy ? g[i] / g[3] + a.dt * a.gravity[i] : T(0);
-    present += heavy ? 1 : 0;
+    present |= uint64_t(heavy ? 1 : 0) << f;
   }
-  if (a.moments == nullptr || present < 2) return false;
+  if ((present & (present - 1)) == 0) return false;  // fewer than two
   bool touched = false;
-  for (int32_t fa = 0; fa < a.fields; ++fa) {
-    const T mass_a = a.node(fa, node)[3];
-    if (!(mass_a > mass_floor<T>())) continue;
-    for (int32_t fb = fa + 1; fb < a.fields; ++fb) {
-      const T mass_b = a.node(fb, node)[3];
-      if (!(mass_b > mass_floor<T>())) continue;
-      T* pa = a.out(fa, node);
-      T* pb = a.out(fb, node);
-      Vec3<T> va{pa[0], pa[1], pa[2]}, vb{pb[0], pb[1], pb[2]};
-      const T* ma = a.moments + 6 * (int64_t(fa) * a.count * kBlockNodes + node);
-      const T* mb = a.moments + 6 * (int64_t(fb) * a.count * kBlockNodes + node);
-      if (!contact_pair(mass_a, mass_b, ma, mb, a.dx, a.law, va, vb)) continue;
-      touched = true;
-      for (int i = 0; i < 3; ++i) {
-        pa[i] = va[i];
-        pb[i] = vb[i];
+  if (a.moments != nullptr) {
+    ContactNear<T> near(a, node);
+    for (int32_t fa = 0; fa < a.fields; ++fa) {
+      if ((present >> fa & 1u) == 0) continue;
+      const uint64_t with_a = a.merged != nullptr ? merged_group(a, present, fa) : 0;
+      for (int32_t fb = fa + 1; fb < a.fields; ++fb) {
+        if ((present >> fb & 1u) == 0 || (with_a >> fb & 1u) != 0) continue;
+        Vec3<T> va = load_vec3(a.out(fa, node)), vb = load_vec3(a.out(fb, node));
+        near.field[0] = fa;
+        near.field[1] = fb;
+        if (!contact_pair(near, a.law, va, vb)) continue;
+        touched = true;
+        a.set(fa, node, va);
+        a.set(fb, node, vb);
       }
     }
+  }
+  for (uint64_t left = a.merged != nullptr ? present : 0; left != 0;) {
+    int32_t first = 0;
+    while ((left >> first & 1u) == 0) ++first;
+    const uint64_t group = merged_group(a, present, first);
+    left &= ~group;
+    merge_group<T>(
+        group, [&](int32_t f) { return a.node(f, node)[3]; },
+        [&](int32_t f) { return load_vec3(a.out(f, node)); },
+        [&](int32_t f, const Vec3<T>& v) { a.set(f, node, v); });
   }
   return touched;
 }
@@ -138,7 +193,7 @@ GSF_HOST_DEVICE double touching_mass(const GridUpdateArgs<T>& a, const T* row, i
   double total = 0.0;
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
-    if (!(mass > mass_floor<T>())) continue;
+    if (!(mass > mass_floor<T>()) || !collider_acts_on(row, a.cut_of(f))) continue;
     Vec3<T> normal;
     T share;
     if (collider_touch(row, a.sdf, x, load_vec3(a.out(f, node)), a.dx, a.dt, normal, share))
@@ -155,7 +210,7 @@ GSF_HOST_DEVICE void collide_node(const GridUpdateArgs<T>& a, const T* row, T gi
   const Vec3<T> x = node_position(a, node);
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
-    if (!(mass > mass_floor<T>())) continue;
+    if (!(mass > mass_floor<T>()) || !collider_acts_on(row, a.cut_of(f))) continue;
     T* p = a.out(f, node);
     Vec3<T> v = load_vec3(p);
     if (!collide_with(row, a.sdf, give, x, mass, a.dx, a.dt, v, sums)) continue;

@@ -63,15 +63,15 @@ bool scatter_stray(const P2GArgs<T>& a, int64_t p) {
   if (!make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s)) return false;
   if (!at.find(a.blocks, s)) return false;
   Lanes<T> tile[27] = {};
-  Lanes<T> moment[54] = {};
+  Lanes<T> moment[27] = {};
   scatter_momentum(momentum_of(a, s, p), s, tile, 3);
-  if (a.moments != nullptr) scatter_moments(s, a.mass[p], a.dx, moment, 3);
+  if (a.moments != nullptr) scatter_moments(s, a.mass[p], moment, 3);
   const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
   for (int n = 0; n < 27; ++n) {
     const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
     for (int c = 0; c < 4; ++c) a.grid[4 * node + c] += tile[n][c];
     if (a.moments == nullptr) continue;
-    for (int c = 0; c < 6; ++c) a.moments[6 * node + c] += moment[2 * n + c / 3][c % 3];
+    for (int c = 0; c < kContactMoments; ++c) a.moments[kContactMoments * node + c] += moment[n][c];
   }
   return true;
 }
@@ -92,7 +92,7 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
   for (uint64_t left = fields_in(view, range, a.body, a.fields); left != 0; left &= left - 1) {
     const int32_t field = __builtin_ctzll(left);
     tile.assign(window.nodes(), Lanes<T>{});
-    if (a.moments != nullptr) moment.assign(2 * window.nodes(), Lanes<T>{});
+    if (a.moments != nullptr) moment.assign(window.nodes(), Lanes<T>{});
     for (int64_t r = range.begin; r < range.end; ++r) {
       fetch_particle(a, r + kAhead, range.end);
       const int64_t p = view.order[r];
@@ -104,7 +104,7 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
       if (o < 0) continue;
       ++placed;
       scatter_momentum(momentum_of(a, s, p), s, tile.data() + o, edge);
-      if (a.moments != nullptr) scatter_moments(s, a.mass[p], a.dx, moment.data() + 2 * o, edge);
+      if (a.moments != nullptr) scatter_moments(s, a.mass[p], moment.data() + o, edge);
     }
     const int64_t base = int64_t(field) * view.count * kBlockNodes;
     window.for_each_run([&](int32_t t, int64_t node, int32_t run) {
@@ -112,9 +112,9 @@ int32_t p2g_block(const P2GArgs<T>& a, int64_t block, std::vector<Lanes<T>>& til
       for (int32_t n = 0; n < run; ++n)
         for (int c = 0; c < 4; ++c) out[4 * n + c] += tile[t + n][c];
       if (a.moments == nullptr) return;
-      T* mom = a.moments + 6 * (base + node);
+      T* mom = a.moments + kContactMoments * (base + node);
       for (int32_t n = 0; n < run; ++n)
-        for (int c = 0; c < 6; ++c) mom[6 * n + c] += moment[2 * (t + n) + c / 3][c % 3];
+        for (int c = 0; c < kContactMoments; ++c) mom[kContactMoments * n + c] += moment[t + n][c];
     });
   }
   return static_cast<int32_t>(range.end - range.begin - placed);

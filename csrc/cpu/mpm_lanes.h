@@ -42,22 +42,16 @@ void scatter_momentum(const ParticleMomentum<T>& q, const Stencil<T>& s, Lanes<T
   }
 }
 
-// Mass gradient sum m dw/dx_p and first moment sum w m (x_p - x_node), two lanes-of-four per node.
+// First moment of the mass about the node, for contact.
 template <typename T>
-void scatter_moments(const Stencil<T>& s, T mass, T dx, Lanes<T>* node, int32_t edge) {
-  const T per_dx = mass / dx;
+void scatter_moments(const Stencil<T>& s, T mass, Lanes<T>* node, int32_t edge) {
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) {
-      const T w = s.w[0][i] * s.w[1][j];
-      const Lanes<T> lateral{per_dx * s.slope(0, i) * s.w[1][j], per_dx * s.w[0][i] * s.slope(1, j),
-                             T(0), T(0)};
-      const Lanes<T> vertical{T(0), T(0), per_dx * w, T(0)};
-      Lanes<T>* n = node + 2 * (i * edge + j) * edge;
+      const T w = mass * s.w[0][i] * s.w[1][j];
+      Lanes<T>* n = node + (i * edge + j) * edge;
       for (int k = 0; k < 3; ++k) {
-        const T m = mass * w * s.w[2][k] * dx;
-        const Lanes<T> offset{s.f[0] - T(i), s.f[1] - T(j), s.f[2] - T(k), T(0)};
-        n[2 * k] += s.w[2][k] * lateral + s.slope(2, k) * vertical;
-        n[2 * k + 1] += m * offset;
+        const Vec3<T> m = contact_moment(s, w * s.w[2][k], i, j, k);
+        n[k] += Lanes<T>{m.x, m.y, m.z, T(0)};
       }
     }
 }

@@ -21,21 +21,6 @@ __device__ void add4<float>(float* p, const float (&v)[4]) {
   for (int c = 0; c < 4; ++c) atomicAdd(p + c, v[c]);
 #endif
 }
-template <typename T>
-__device__ void add2(T* p, T x, T y) {
-  atomicAdd(p, x);
-  atomicAdd(p + 1, y);
-}
-template <>
-__device__ void add2<float>(float* p, float x, float y) {
-#if __CUDA_ARCH__ >= 900
-  atomicAdd(reinterpret_cast<float2*>(p), make_float2(x, y));
-#else
-  atomicAdd(p, x);
-  atomicAdd(p + 1, y);
-#endif
-}
-
 // A maximal run of neighbouring lanes that share base node and field.
 struct Run {
   bool head;
@@ -103,7 +88,6 @@ __global__ void __launch_bounds__(kThreads) p2g_kernel(P2GArgs<T> a) {
   const Run run(s.base, field, active);
   const bool writes = run.head && active;
   const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
-  const T per_dx = mass / a.dx;
   // Every lane goes through every shuffle; only heads of active runs write.
 #pragma unroll
   for (int i = 0; i < 3; ++i)
@@ -120,19 +104,12 @@ __global__ void __launch_bounds__(kThreads) p2g_kernel(P2GArgs<T> a) {
         const int64_t node = writes ? base + at.node(s, i, j, k) : 0;
         if (writes) add4<T>(a.grid + 4 * node, give);
         if constexpr (kMoments) {
-          const T gx = run.sum(per_dx * s.slope(0, i) * s.w[1][j] * s.w[2][k]);
-          const T gy = run.sum(per_dx * s.w[0][i] * s.slope(1, j) * s.w[2][k]);
-          const T gz = run.sum(per_dx * s.w[0][i] * s.w[1][j] * s.slope(2, k));
-          const T m = mass * w * a.dx;
-          const T mx = run.sum(m * (s.f[0] - T(i)));
-          const T my = run.sum(m * (s.f[1] - T(j)));
-          const T mz = run.sum(m * (s.f[2] - T(k)));
-          if (writes) {
-            T* out = a.moments + 6 * node;
-            add2<T>(out, gx, gy);
-            add2<T>(out + 2, gz, mx);
-            add2<T>(out + 4, my, mz);
-          }
+          const Vec3<T> m = contact_moment(s, mass * w, i, j, k);
+          T sum[kContactMoments];
+          for (int c = 0; c < kContactMoments; ++c) sum[c] = run.sum(m[c]);
+          if (writes)
+            for (int c = 0; c < kContactMoments; ++c)
+              atomicAdd(a.moments + kContactMoments * node + c, sum[c]);
         }
       }
 }

@@ -3,7 +3,7 @@
 // home, between windows 64 bits in a unit of the step, so that no order of additions changes a bit.
 // The units leave room for every particle at one node (csrc/core/solver_clock.h), so nothing
 // overflows.
-#include "cuda/solver_reduce.h"
+#include "cuda/solver_grid.h"
 
 namespace gsf::cuda {
 namespace {
@@ -12,7 +12,7 @@ constexpr int kThreads = kSolverThreads;
 #ifndef GSF_P2G_THREADS
 #define GSF_P2G_THREADS 256
 #define GSF_G2P_THREADS 256
-#define GSF_G2P_CTAS 2
+#define GSF_G2P_CTAS 3
 #endif
 constexpr int kP2GThreads = GSF_P2G_THREADS;
 constexpr int kG2PThreads = GSF_G2P_THREADS;
@@ -67,7 +67,7 @@ __device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
 }
 
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(const __grid_constant__ SolverView<T> s) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
   const SolverClock& clock = *s.clock;
@@ -129,14 +129,9 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
           Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
           if constexpr (kMoments) {
             if (with_moments) {
-              const T g[6] = {st.slope(0, i) * st.w[1][j] * st.w[2][k],
-                              st.w[0][i] * st.slope(1, j) * st.w[2][k],
-                              st.w[0][i] * st.w[1][j] * st.slope(2, k),
-                              w * (st.f[0] - T(i)),
-                              w * (st.f[1] - T(j)),
-                              w * (st.f[2] - T(k))};
-              for (int c = 0; c < 6; ++c)
-                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(weight_unit * g[c]));
+              const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
+              for (int c = 0; c < kContactMoments; ++c)
+                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
             }
           }
         }
@@ -173,141 +168,6 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
   }
 }
 
-// Reads the sums of one node and clears them for the next step.
-template <typename T>
-__device__ NodeSums<T> take_sums(const SolverView<T>& s, int64_t node, bool shared) {
-  NodeSums<T> out;
-  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
-  const longlong2 a = words[0], b = words[1];
-  words[0] = words[1] = longlong2{0, 0};
-  const double unit = s.clock->momentum_unit, mass_unit = s.clock->mass_unit;
-  out.momentum[0] = double(a.x) * unit;
-  out.momentum[1] = double(a.y) * unit;
-  out.momentum[2] = double(b.x) * unit;
-  out.mass = double(b.y) * mass_unit;
-  if (shared) {
-    int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
-    for (int c = 0; c < kContactMoments; ++c) {
-      const double value = double(m[c]) * mass_unit;
-      out.moments[c] = T(c < 3 ? value / double(s.dx) : value * double(s.dx));
-      m[c] = 0;
-    }
-  }
-  return out;
-}
-
-// Colliders that can touch a node of the block, as bits; the lanes of a warp look at one each. A
-// sweeping or moving collider reaches as far as anything can move in the step. More than 64
-// colliders: the last bit stands for all the others.
-template <typename T>
-__device__ uint64_t colliders_near(const SolverView<T>& s, const Vec3<T>& middle) {
-  if (s.collider_count == 0) return 0;
-  const T reach = T(2.7) * s.dx + T(s.clock->dt) * T(s.clock->speed_seen);
-  uint64_t near = 0;
-  for (int first = 0; first < 64 && first < s.collider_count; first += 32) {
-    const int k = first + (threadIdx.x & 31);
-    bool touches = false;
-    if (k < s.collider_count && k < 63) {
-      const T* row = s.colliders + int64_t(k) * kColliderColumns;
-      Vec3<T> normal;
-      const T own = norm(load_vec3(row + kVelocity)) * T(s.clock->dt);
-      touches = collider_valid(row, 0) &&
-                collider_signed_distance(row, static_cast<const float*>(nullptr), middle, normal) <=
-                    reach + own;
-    }
-    near |= uint64_t(__ballot_sync(kAllLanes, touches)) << first;
-  }
-  if (s.collider_count > 63) near |= uint64_t(1) << 63;
-  return near;
-}
-
-template <typename T>
-__device__ void collide_one(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
-                            Vec3<T>& v) {
-  double impulse[3] = {0.0, 0.0, 0.0};
-  node_collide(s, k, x, mass, v, impulse);
-  const double per_unit = 1.0 / s.clock->momentum_unit;
-  for (int i = 0; i < 3; ++i) {
-    const long long units = __double2ll_rn(impulse[i] * per_unit);
-    if (units != 0)
-      atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
-                static_cast<unsigned long long>(units));
-  }
-}
-
-template <typename T>
-__device__ __noinline__ void collide_near(const SolverView<T>& s, uint64_t near, const Vec3<T>& x,
-                                          double mass, Vec3<T>& v) {
-  for (; near != 0; near &= near - 1) {
-    const int64_t k = __ffsll(static_cast<long long>(near)) - 1;
-    const int64_t last = k == 63 ? s.collider_count : k + 1;
-    for (int64_t i = k; i < last; ++i) collide_one(s, i, x, mass, v);
-  }
-}
-
-template <typename T>
-__device__ void store_velocity(const SolverView<T>& s, int64_t node, const Vec3<T>& v) {
-  T* out = s.node_velocity + 4 * node;
-  out[0] = v.x;
-  out[1] = v.y;
-  out[2] = v.z;
-}
-
-// A node that several fields may share: kept out of line, most scenes never come here.
-template <typename T>
-__device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* slots, int local,
-                                        const Vec3<T>& x, uint64_t near, T dt) {
-  NodeSums<T> sums[kSiteFields];
-  Vec3<T> velocity[kSiteFields];
-  bool heavy[kSiteFields];
-  int count = 0;
-  for (; count < kSiteFields && slots[count] >= 0; ++count) {
-    const int64_t node = int64_t(slots[count]) * kBlockNodes + local;
-    sums[count] = take_sums(s, node, true);
-    heavy[count] = node_velocity(s, sums[count], dt, velocity[count]);
-  }
-  const int touched = node_contact(s, count, sums, heavy, velocity);
-  for (int f = 0; f < count; ++f) {
-    if (heavy[f] && near != 0) collide_near(s, near, x, sums[f].mass, velocity[f]);
-    store_velocity(s, int64_t(slots[f]) * kBlockNodes + local, velocity[f]);
-  }
-  return touched;
-}
-
-template <typename T>
-__global__ void __launch_bounds__(kThreads) grid_kernel(SolverView<T> s) {
-  const SolverClock& clock = *s.clock;
-  if (!may_step(clock)) return;
-  const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
-  if (site >= clock.sites) return;
-  const int local = threadIdx.x % kBlockNodes;
-  const int32_t* slots = s.site_slots + site * kSiteFields;
-  const int32_t slot = slots[0];
-  if (slot < 0 || slot >= s.slot_capacity) return;
-  const int32_t* block = s.slot_coord + 4 * int64_t(slot);
-  const T dt = T(clock.dt);
-  const Vec3<T> x{(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
-                  (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
-                  (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
-  const Vec3<T> middle{(T(block[0]) * T(kBlockEdge) + T(1.5)) * s.dx,
-                       (T(block[1]) * T(kBlockEdge) + T(1.5)) * s.dx,
-                       (T(block[2]) * T(kBlockEdge) + T(1.5)) * s.dx};
-  const uint64_t near = colliders_near(s, middle);
-  int touched = 0;
-  if (slots[1] < 0) {
-    const int64_t node = int64_t(slot) * kBlockNodes + local;
-    const NodeSums<T> sums = take_sums(s, node, false);
-    Vec3<T> v;
-    if (node_velocity(s, sums, dt, v) && near != 0) collide_near(s, near, x, sums.mass, v);
-    store_velocity(s, node, v);
-  } else {
-    touched = shared_node(s, slots, local, x, near, dt);
-  }
-  if (touched > 0)
-    atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched),
-              static_cast<unsigned long long>(touched));
-}
-
 template <int kThreadsHere, typename T>
 __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_t home,
                           bool moving) {
@@ -327,8 +187,30 @@ __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_
   }
 }
 
+// What the last CTA of a step does: colliders move on, then time. Out of line, so that g2p does not
+// hold its registers.
+template <int kThreadsHere, typename T>
+__device__ __noinline__ void end_of_step(const SolverView<T>& s) {
+  for (int64_t k = threadIdx.x; k < s.collider_count; k += kThreadsHere) {
+    double sums[kImpulseSums];
+    for (int i = 0; i < kImpulseSums; ++i) {
+      sums[i] = double(s.impulse_units[kImpulseSums * k + i]) * sum_unit(s, i);
+      s.impulse_units[kImpulseSums * k + i] = 0;
+    }
+    const double moved = end_collider(s, k, sums, s.clock->dt);
+    if (moved > 0.0) raise_to(&s.clock->moved, sortable(float(moved) * 1.000001f));
+  }
+  __syncthreads();
+  if (threadIdx.x != 0) return;
+  s.clock->travel += float_of_bits(s.clock->moved);
+  s.clock->moved = 0;
+  end_step(*s.clock, double(s.dx), s.count);
+  choose_unit(*s.clock);
+}
+
 template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
+    g2p_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   __shared__ T tile[3][kTile];
@@ -361,23 +243,33 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
                        min(meta_cell(meta, 2), kLastCell);
       T value[3] = {T(0), T(0), T(0)};
       Mat3<T> moment{};
+      // Along z first, then y, then x: each sum and its first moment in cells.
 #pragma unroll
-      for (int i = 0; i < 3; ++i)
+      for (int i = 0; i < 3; ++i) {
+        T plane[3] = {}, plane_y[3] = {}, plane_z[3] = {};
 #pragma unroll
-        for (int j = 0; j < 3; ++j)
+        for (int j = 0; j < 3; ++j) {
+          const int at = base + i * kStrideX + j * kStrideY;
 #pragma unroll
-          for (int k = 0; k < 3; ++k) {
-            const T w = st.w[0][i] * st.w[1][j] * st.w[2][k];
-            const int at = base + i * kStrideX + j * kStrideY + k;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-              const T v = w * tile[c][at];
-              value[c] += v;
-              if (i > 0) moment(c, 0) += T(i) * v;
-              if (j > 0) moment(c, 1) += T(j) * v;
-              if (k > 0) moment(c, 2) += T(k) * v;
-            }
+          for (int c = 0; c < 3; ++c) {
+            const T one = st.w[2][1] * tile[c][at + 1], two = st.w[2][2] * tile[c][at + 2];
+            const T row = st.w[1][j] * (st.w[2][0] * tile[c][at] + one + two);
+            plane[c] += row;
+            if (j == 1) plane_y[c] += row;
+            if (j == 2) plane_y[c] += row + row;
+            plane_z[c] += st.w[1][j] * (one + two + two);
           }
+        }
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+          const T w = st.w[0][i];
+          value[c] += w * plane[c];
+          if (i == 1) moment(c, 0) += w * plane[c];
+          if (i == 2) moment(c, 0) += w * (plane[c] + plane[c]);
+          moment(c, 1) += w * plane_y[c];
+          moment(c, 2) += w * plane_z[c];
+        }
+      }
       for (int c = 0; c < 3; ++c)
         for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
       flags = finish_particle<T, kLaws, kTrack>(s, p, reach, value, moment, dt, dt_next, largest);
@@ -395,19 +287,12 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
   count_lanes(lost, &s.clock->lost);
   hand_over<kG2PThreads>(s, largest, blockIdx.x, true);
   if (!last_to_arrive(&s.clock->arrived, home_total)) return;
-  for (int64_t i = threadIdx.x; i < 3 * s.collider_count; i += kG2PThreads) {
-    s.impulse[i] += double(s.impulse_units[i]) * clock.momentum_unit;
-    s.impulse_units[i] = 0;
-  }
-  __syncthreads();
-  if (threadIdx.x == 0) {
-    end_step(*s.clock, double(s.dx), s.count);
-    choose_unit(*s.clock);
-  }
+  end_of_step<kG2PThreads>(s);
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kThreads) prime_kernel(SolverView<T> s, bool measure) {
+__global__ void __launch_bounds__(kThreads)
+    prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   const SolverClock& clock = *s.clock;
   if (int64_t(blockIdx.x) >= clock.homes) return;
   const HomeList<T>& homes = s.homes();
@@ -444,6 +329,10 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     p2g_kernel<T, true><<<homes, kP2GThreads, 0, stream>>>(s);
   else
     p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
+  if (s.moments != nullptr)
+    contact_kernel<T>
+        <<<static_cast<unsigned>((s.slot_capacity + kContactSites - 1) / kContactSites),
+           kBlockNodes, 0, stream>>>(s);
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)

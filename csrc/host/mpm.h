@@ -15,28 +15,34 @@ struct MpmOps {
   // the pointers.
   struct BlockTensors {
     Tensor table, coords, order, start;
-    BlockView view;
+    BlockView view{};
 
     BlockTensors(const char* op, const Tensor& like, const Tensor& table_in,
                  const Tensor& coords_in, const Tensor& order_in, const Tensor& start_in,
                  const Ints& origin, int64_t margin, int64_t particles)
-        : table(gsf::contiguous(table_in)),
-          coords(gsf::contiguous(coords_in)),
-          order(gsf::contiguous(order_in)),
-          start(gsf::contiguous(start_in)) {
-      check_shape(op, "blocks.table", table, {-1, -1, -1});
-      check_shape(op, "blocks.coords", coords, {-1, 3});
+        : BlockTensors(op, like, table_in, coords_in, origin) {
+      order = gsf::contiguous(order_in);
+      start = gsf::contiguous(start_in);
       check_shape(op, "blocks.order", order, {particles});
       check_shape(op, "blocks.start", start, {coords.size(0) + 1});
-      const Tensor* all[] = {&table, &coords, &order, &start};
-      for (const Tensor* t : all) {
-        check_dtype(op, "blocks", *t, ScalarType::Int);
-        check_same_device(op, "blocks", *t, like);
-      }
-      STD_TORCH_CHECK(origin.size() == 3, op, ": blocks.origin must have 3 numbers, got ",
-                      origin.size());
+      check(op, {&order, &start}, like);
       STD_TORCH_CHECK(margin >= 0 && margin <= 2, op, ": blocks.margin must be 0, 1 or 2, got ",
                       margin);
+      view.order = cptr<int32_t>(order);
+      view.start = cptr<int32_t>(start);
+      view.particles = particles;
+      view.margin = static_cast<int32_t>(margin);
+    }
+
+    // Nodes alone, without the particles.
+    BlockTensors(const char* op, const Tensor& like, const Tensor& table_in,
+                 const Tensor& coords_in, const Ints& origin)
+        : table(gsf::contiguous(table_in)), coords(gsf::contiguous(coords_in)) {
+      check_shape(op, "blocks.table", table, {-1, -1, -1});
+      check_shape(op, "blocks.coords", coords, {-1, 3});
+      check(op, {&table, &coords}, like);
+      STD_TORCH_CHECK(origin.size() == 3, op, ": blocks.origin must have 3 numbers, got ",
+                      origin.size());
       constexpr int64_t kFar = int64_t(1) << 28;  // block coordinates times 4 stay in int32
       for (int axis = 0; axis < 3; ++axis) {
         const int64_t size = table.size(axis);
@@ -47,11 +53,16 @@ struct MpmOps {
       }
       view.table = cptr<int32_t>(table);
       view.coords = cptr<int32_t>(coords);
-      view.order = cptr<int32_t>(order);
-      view.start = cptr<int32_t>(start);
       view.count = coords.size(0);
-      view.particles = particles;
-      view.margin = static_cast<int32_t>(margin);
+    }
+
+   private:
+    static void check(const char* op, std::initializer_list<const Tensor*> all,
+                      const Tensor& like) {
+      for (const Tensor* t : all) {
+        check_dtype(op, "blocks", *t, ScalarType::Int);
+        check_same_device(op, "blocks", *t, like);
+      }
     }
   };
 
@@ -99,7 +110,8 @@ struct MpmOps {
     const BlockTensors b(op, x, table, coords, order, start, origin, margin, n);
     const typename Backend::Scope scope(x);
     const Tensor grid = new_zeros(x, {fields, b.view.count, kBlockNodes, 4}, type);
-    const Tensor moments = new_zeros(x, {contact ? fields : 0, b.view.count, kBlockNodes, 6}, type);
+    const Tensor moments =
+        new_zeros(x, {contact ? fields : 0, b.view.count, kBlockNodes, kContactMoments}, type);
     const Tensor skipped = new_zeros(x, {}, ScalarType::Long);
     dispatch_floating(op, x, [&]<typename T>() {
       P2GArgs<T> a{};
@@ -235,22 +247,22 @@ struct MpmOps {
   }
 
   static std::tuple<Tensor, Tensor, Tensor, Tensor> grid_update(
-      Tensor grid_in, OptTensor moments, OptTensor colliders, OptTensor sdf, Tensor coords_in,
-      double dx, double dt, double gravity_x, double gravity_y, double gravity_z, double friction,
-      double restitution, double contact_gap) {
+      Tensor grid_in, OptTensor moments, OptTensor colliders, OptTensor sdf, OptTensor merged,
+      OptTensor cut, Tensor table, Tensor coords, Ints origin, double dx, double dt,
+      double gravity_x, double gravity_y, double gravity_z, double friction, double restitution,
+      double contact_gap) {
     const char* op = "grid_update";
     const int64_t fields = grid_in.dim() > 0 ? grid_in.size(0) : 0;
     check_fields(op, fields);
-    check_shape(op, "blocks.coords", coords_in, {-1, 3});
-    check_dtype(op, "blocks.coords", coords_in, ScalarType::Int);
-    check_same_device(op, "blocks.coords", coords_in, grid_in);
-    const Tensor coords = gsf::contiguous(coords_in);
-    const int64_t count = coords.size(0);
+    const BlockTensors b(op, grid_in, table, coords, origin);
+    const int64_t count = b.view.count;
     const ScalarType type = grid_in.scalar_type();
     const Tensor grid = ready(op, "grid", grid_in, grid_in, {fields, count, kBlockNodes, 4});
     const OptTensor mom =
-        ready(op, "moments", moments, grid, {fields, count, kBlockNodes, 6}, type);
+        ready(op, "moments", moments, grid, {fields, count, kBlockNodes, kContactMoments}, type);
     const OptTensor rows = ready(op, "colliders", colliders, grid, {-1, kColliderColumns}, type);
+    const OptTensor groups = ready(op, "merged", merged, grid, {fields}, ScalarType::Long);
+    const OptTensor sides = ready(op, "cut", cut, grid, {fields}, ScalarType::Int);
     const OptTensor distances = ready(op, "sdf", sdf, grid, {-1}, ScalarType::Float);
     STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
     const int64_t rows_count = rows.has_value() ? rows->size(0) : 0;
@@ -263,9 +275,12 @@ struct MpmOps {
     const Tensor contact_nodes = new_zeros(grid, {}, ScalarType::Long);
     dispatch_floating(op, grid, [&]<typename T>() {
       GridUpdateArgs<T> a{};
-      a.coords = cptr<int32_t>(coords);
+      a.blocks = b.view;
+      a.coords = b.view.coords;
       a.count = count;
       a.fields = static_cast<int32_t>(fields);
+      a.merged = reinterpret_cast<const uint64_t*>(pointer<int64_t>(groups));
+      a.cut = pointer<int32_t>(sides);
       a.grid = cptr<T>(grid);
       a.moments = pointer<T>(mom);
       a.colliders = pointer<T>(rows);

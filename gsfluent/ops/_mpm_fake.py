@@ -31,7 +31,7 @@ def _p2g_fake(
 ) -> tuple[Tensor, Tensor, Tensor]:
     count = coords.shape[0]
     grid = position.new_empty((fields, count, 64, 4))
-    moments = position.new_empty((fields if contact else 0, count, 64, 6))
+    moments = position.new_empty((fields if contact else 0, count, 64, 3))
     return grid, moments, position.new_empty((), dtype=torch.int64)
 
 

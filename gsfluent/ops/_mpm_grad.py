@@ -9,6 +9,7 @@ colliders are piecewise smooth; their gradient is that of the reference
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -136,24 +137,25 @@ def _g2p_backward(
 
 
 def _grid_update_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    grid, moments, colliders, sdf, coords = inputs[:5]
+    grid, moments, colliders, sdf, merged, cut, table, coords = inputs[:8]
     if colliders is not None and ctx.needs_input_grad[2]:
         raise NotImplementedError(
             "grid_update: no gradient with respect to colliders; detach the rows"
         )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(grid, moments, colliders, sdf, coords)
-    ctx.options = inputs[5:]
+    ctx.save_for_backward(grid, moments, colliders, sdf, merged, cut, table, coords)
+    ctx.options = inputs[8:]
 
 
 def _grid_update_backward(
     ctx: Any, g_velocity: Tensor | None, g_impulse: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    grid, moments, colliders, sdf, coords = ctx.saved_tensors
-    rest: tuple[None, ...] = (None,) * 11
+    grid, moments, colliders, sdf, merged, cut, table, coords = ctx.saved_tensors
+    rest: tuple[None, ...] = (None,) * 15
     if g_velocity is None and g_impulse is None:
         return None, None, *rest
-    if moments is None and (colliders is None or colliders.shape[0] == 0):
+    free = moments is None and merged is None
+    if free and (colliders is None or colliders.shape[0] == 0):
         if g_velocity is None:
             return None, None, *rest
         mass = grid[..., 3:]
@@ -163,7 +165,17 @@ def _grid_update_backward(
         g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
         return torch.cat([g_momentum, g_mass], dim=-1), None, *rest
     g_grid, g_moments = torch.ops.gsfluent.grid_update_backward(
-        g_velocity, g_impulse, grid, moments, colliders, sdf, coords, *ctx.options
+        g_velocity,
+        g_impulse,
+        grid,
+        moments,
+        colliders,
+        sdf,
+        merged,
+        cut,
+        table,
+        coords,
+        *ctx.options,
     )
     return g_grid, g_moments if moments is not None else None, *rest
 
@@ -176,7 +188,11 @@ def _grid_update_by_reference(
     moments: Tensor | None,
     colliders: Tensor | None,
     sdf: Tensor | None,
+    merged: Tensor | None,
+    cut: Tensor | None,
+    table: Tensor,
     coords: Tensor,
+    origin: Sequence[int],
     dx: float,
     dt: float,
     gravity_x: float,
@@ -187,9 +203,10 @@ def _grid_update_by_reference(
     contact_gap: float,
 ) -> tuple[Tensor, Tensor]:
     from gsfluent.ops.reference import mpm as reference
+    from gsfluent.ops.reference.contact import pairs
 
     none = coords.new_empty(0)
-    blocks = Blocks(none.view(0, 0, 0), (0, 0, 0), coords, none, none)
+    blocks = Blocks(table, (origin[0], origin[1], origin[2]), coords, none, none)
 
     def forward(grid: Tensor, moments: Tensor | None) -> tuple[Tensor, Tensor]:
         velocity, impulse, torque, _ = reference.grid_update(
@@ -201,6 +218,8 @@ def _grid_update_by_reference(
             colliders=None if colliders is None else colliders.double(),
             sdf=sdf,
             moments=moments,
+            merged=None if merged is None else pairs(merged),
+            cut=cut,
             friction=friction,
             restitution=restitution,
             contact_gap=contact_gap,

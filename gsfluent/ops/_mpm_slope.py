@@ -36,12 +36,12 @@ def _gathered(
         yield rows, x, grid.reshape(-1, channels)[flat]
 
 
-def _offsets(x: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights [N, 27], their gradients [N, 27, 3] and x_i - x_p [N, 27, 3], differentiable in x."""
+def _offsets(x: Tensor, dx: float) -> tuple[Tensor, Tensor]:
+    """Weights [N, 27] and x_i - x_p [N, 27, 3], differentiable in x."""
     from gsfluent.ops.reference import mpm as reference
 
-    node, weight, gradient = reference.stencil(x, dx)
-    return weight, gradient, node.to(x.dtype) * dx - x[:, None]
+    node, weight, _ = reference.stencil(x, dx)
+    return weight, node.to(x.dtype) * dx - x[:, None]
 
 
 def transfer_slope(
@@ -83,7 +83,7 @@ def transfer_slope(
         c, s = constant[rows], linear[rows]
 
         def total(x: Tensor, g: Tensor = g, c: Tensor = c, s: Tensor = s) -> Tensor:
-            weight, _, d = _offsets(x, dx)
+            weight, d = _offsets(x, dx)
             pushed = torch.einsum("nia,nab,nib->ni", g[..., :3], s, d)
             return (weight * ((g * c[:, None]).sum(-1) + pushed)).sum()
 
@@ -114,9 +114,8 @@ def _moments_backward(
     for rows, x, h in _gathered(g_moments, position, body, blocks, dx):
 
         def total(x: Tensor, m: Tensor, h: Tensor = h) -> Tensor:
-            weight, gradient, d = _offsets(x, dx)
-            first = weight * (h[..., 3:] * d).sum(-1)
-            return (m * ((gradient * h[..., :3]).sum(-1) - first).sum(1)).sum()
+            weight, d = _offsets(x, dx)
+            return -(m * (weight * (h * d).sum(-1)).sum(1)).sum() / dx
 
         slope: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
         slope = torch.func.grad(total, argnums=(0, 1))

@@ -70,8 +70,8 @@ def p2g(
 
     Returns:
         ``grid`` [K, B, 64, 4]: momentum [kg m/s] and mass [kg] per node; ``moments``
-        [K, B, 64, 6] or None: mass gradient ``sum m dw/dx_p`` [kg/m] (points out of the body) and
-        first moment ``sum w m (x_p - x_i)`` [kg m].
+        [K, B, 64, 3] or None: first moment of the mass about the node in cells,
+        ``sum w m (x_p - x_i) / dx`` [kg].
 
     Raises:
         TypeError: Wrong type or dtype.
@@ -121,6 +121,13 @@ def p2g(
     return grid, moments if contact else None
 
 
+def _pair_bits(merged: Tensor) -> Tensor:
+    """Bit g of word f says that f and g, or g and f, are a pair: bool [K, K] -> int64 [K]."""
+    bit = torch.ones(len(merged), dtype=torch.int64, device=merged.device)
+    bit = bit << torch.arange(len(merged), device=merged.device)
+    return torch.where(merged | merged.mT, bit, 0).sum(1)
+
+
 @overload
 def grid_update(
     grid: Tensor,
@@ -132,6 +139,8 @@ def grid_update(
     colliders: Tensor | None = ...,
     sdf: Tensor | None = ...,
     moments: Tensor | None = ...,
+    merged: Tensor | None = ...,
+    cut: Tensor | None = ...,
     friction: float = ...,
     restitution: float = ...,
     contact_gap: float = ...,
@@ -150,6 +159,8 @@ def grid_update(
     colliders: Tensor | None = ...,
     sdf: Tensor | None = ...,
     moments: Tensor | None = ...,
+    merged: Tensor | None = ...,
+    cut: Tensor | None = ...,
     friction: float = ...,
     restitution: float = ...,
     contact_gap: float = ...,
@@ -167,6 +178,8 @@ def grid_update(
     colliders: Tensor | None = None,
     sdf: Tensor | None = None,
     moments: Tensor | None = None,
+    merged: Tensor | None = None,
+    cut: Tensor | None = None,
     friction: float = 0.3,
     restitution: float = 0.0,
     contact_gap: float = 1.0,
@@ -175,8 +188,9 @@ def grid_update(
     """Turn nodal momentum into velocity: gravity, contact between fields, rigid colliders.
 
     Contact between every pair of fields that meet at a node uses the corrected Collision-MPM
-    impulse: normal from the difference of unit mass gradients, active only while the centroids of
-    the two masses overlap within ``contact_gap * dx`` and the bodies approach, Coulomb friction.
+    impulse: normal from the moments of the node and its neighbours (docs/contact.md), active only
+    while the centroids of the two masses overlap within ``contact_gap * dx`` and the bodies
+    approach, Coulomb friction.
     Momentum is exchanged exactly. Colliders act afterwards, in row order. A collider with mass
     changes velocities as a plastic impact of its mass with that of the nodes it touches would.
 
@@ -191,6 +205,10 @@ def grid_update(
             restitution, 0, 0]`` with type 0 plane, 1 sphere.
         sdf: Values of the distance grids of mesh colliders [m], float32 [S].
         moments: From :func:`p2g` with ``contact=True``; None switches contact off.
+        merged: Pairs of fields that are parts of one body and move as one (at shared nodes: one
+            velocity, no contact), bool [K, K], taken as symmetric and transitive.
+        cut: Sides of blades that each field lies on (:func:`gsfluent.ops.blade_sides`), int32
+            [K]; colliders with ``only_cut`` act on those fields only.
         friction: Coulomb coefficient between fields, >= 0.
         restitution: Of contact between fields, in [0, 1].
         contact_gap: Centroid separation [dx] below which fields touch; 1.0 to 1.1 is right for
@@ -222,7 +240,12 @@ def grid_update(
         raise ValueError(f"{op}: grid must have 1 to {MAX_FIELDS} fields, got {fields}")
     check_tensor(op, "grid", grid, shape=(fields, blocks.block_count, 64, 4))
     if moments is not None:
-        check_tensor(op, "moments", moments, shape=(fields, count, 64, 6), like=grid)
+        check_tensor(op, "moments", moments, shape=(fields, count, 64, 3), like=grid)
+    if merged is not None:
+        check_tensor(op, "merged", merged, shape=(fields, fields), dtype=torch.bool, like=grid)
+        merged = _pair_bits(merged)
+    if cut is not None:
+        check_tensor(op, "cut", cut, shape=(fields,), dtype=torch.int32, like=grid)
     rows = None if colliders is None else check_rows(op, colliders, sdf, grid)
     if len(gravity) != 3:
         raise ValueError(f"{op}: gravity must have three numbers, got {len(gravity)}")
@@ -237,7 +260,11 @@ def grid_update(
         moments,
         rows,
         sdf,
+        merged,
+        cut,
+        blocks.table,
         blocks.coords,
+        blocks.origin,
         check_dx(op, dx),
         _check_dt(op, dt),
         *(float(g) for g in gravity),

@@ -245,11 +245,14 @@ def test_opcheck(grad: bool) -> None:
         lib.g2p.default, (field, position, inputs[0], inputs[1], body, *index, DX, 0.1)
     )
     grid = torch.rand(2, blocks.block_count, 64, 4, dtype=torch.float64, requires_grad=grad)
-    moments = None if grad else torch.rand(2, blocks.block_count, 64, 6, dtype=torch.float64)
+    moments = None if grad else torch.rand(2, blocks.block_count, 64, 3, dtype=torch.float64)
     rest = (DX, 0.1, 0.0, 0.0, -9.81, 0.3, 0.0, 1.0)
-    torch.library.opcheck(
-        lib.grid_update.default, (grid, moments, None, None, blocks.coords, *rest)
-    )
+    pairs = torch.tensor([2, 1])  # fields 0 and 1 move as one
+    where = (blocks.table, blocks.coords, blocks.origin)
+    for merged in (None, pairs):
+        torch.library.opcheck(
+            lib.grid_update.default, (grid, moments, None, None, merged, None, *where, *rest)
+        )
     position = position.detach()
     torch.library.opcheck(lib.p2g_adjoint.default, (grid.detach(), position, body, *index, DX))
     slopes = (grid.detach(), torch.ones(N, 4).double(), torch.ones(N, 3, 3).double(), position)
@@ -350,6 +353,7 @@ def test_build_blocks_errors() -> None:
         ({"colliders": torch.zeros(1, 16).double()}, "colliders row 0 must be finite, with type 0"),
         ({"colliders": torch.full((1, 16), 7.0).double()}, "colliders row 0"),
         ({"moments": torch.zeros(1, 1, 64, 6).double()}, "moments must have shape"),
+        ({"merged": torch.zeros(2, 2, dtype=torch.bool)}, "merged must have shape"),
     ],
 )
 def test_grid_update_errors(kw: dict[str, Any], match: str) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.ops.reference import mpm as reference
+from gsfluent.ops.reference.contact import contact_normal
 
 DX = 0.1
 ZERO = (0.0, 0.0, 0.0)
@@ -101,11 +102,14 @@ def before(pair: Pair) -> Tensor:
 
 
 def normal_of_contact(pair: Pair) -> tuple[Tensor, Tensor]:
-    """Nodes the two fields share and the normal out of field 0, as 11.3 defines them."""
+    """Nodes the two fields share and the normal out of field 0, by the reference."""
     assert pair.moments is not None
     shared = (pair.grid[..., 3] > 0).all(0)
-    unit = torch.nn.functional.normalize(pair.moments[..., :3], dim=-1)
-    return shared, torch.nn.functional.normalize(unit[0] - unit[1], dim=-1)
+    near = reference.neighbours(torch.cat([pair.grid[..., 3:], pair.moments], -1), pair.blocks)
+    normal, _ = contact_normal(
+        (near[0, ..., 0], near[1, ..., 0]), (near[0, ..., 1:], near[1, ..., 1:])
+    )
+    return shared, normal
 
 
 # --- reference ---

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gsfluent.ops.collider import pad_colliders
 from gsfluent.ops.mpm import Blocks
-from gsfluent.ops.reference.collider import collide
+from gsfluent.ops.reference.collider import acting_mass, collide
+from gsfluent.ops.reference.contact import STEPS, contact, groups, merge
 
 
 def stencil(position: Tensor, dx: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -82,7 +83,7 @@ def p2g(
     good = covered(position, dx, blocks, body, fields)
     x, v, c, m = position[good], velocity[good], affine[good], mass[good]
     field = torch.zeros_like(m, dtype=torch.long) if body is None else body[good].long()
-    node, w, gradient = stencil(x, dx)
+    node, w, _ = stencil(x, dx)
     d = node.to(x.dtype) * dx - x[:, None]
     momentum = m[:, None, None] * (v[:, None] + torch.einsum("nab,nib->nia", c, d))
     if stress is not None and volume is not None:
@@ -95,9 +96,9 @@ def p2g(
     grid = position.new_zeros(fields * total, 4).index_add(0, where, given.reshape(-1, 4))
     moments = None
     if contact:
-        both = torch.cat([gradient, -d * w[..., None]], dim=2) * m[:, None, None]
-        moments = position.new_zeros(fields * total, 6).index_add(0, where, both.reshape(-1, 6))
-        moments = moments.view(fields, -1, 64, 6)
+        first = -d / dx * (m[:, None] * w)[..., None]
+        moments = position.new_zeros(fields * total, 3).index_add(0, where, first.reshape(-1, 3))
+        moments = moments.view(fields, -1, 64, 3)
     return grid.view(fields, -1, 64, 4), moments
 
 
@@ -129,44 +130,17 @@ def g2p(
     return position + dt * v_new, v_new, c_new, f_new, (~good).sum()
 
 
-def _contact(
-    grid: Tensor,
-    velocity: Tensor,
-    moments: Tensor,
-    a: int,
-    b: int,
-    law: tuple[float, float, float],
-    dx: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """One pair of fields at every node: new velocities of both and where they touched."""
-    friction, restitution, gap = law
-    ma, mb = grid[a, ..., 3:], grid[b, ..., 3:]
-    shared = (ma > 0) & (mb > 0)
-    ma, mb = torch.where(shared, ma, 1.0), torch.where(shared, mb, 1.0)
-    ga, gb = moments[a, ..., :3], moments[b, ..., :3]
-    la, lb = ga.norm(dim=-1, keepdim=True), gb.norm(dim=-1, keepdim=True)
-    sharp_a, sharp_b = la * dx / ma, lb * dx / mb
-    ua = torch.where(sharp_a >= 1e-6, ga / la.clamp_min(1e-300), 0.0)
-    ub = torch.where(sharp_b >= 1e-6, gb / lb.clamp_min(1e-300), 0.0)
-    n = ua - ub
-    length = n.norm(dim=-1, keepdim=True)
-    n = torch.where(
-        length >= 0.1, n / length.clamp_min(1e-300), torch.where(sharp_a >= sharp_b, ua, -ub)
+def neighbours(channels: Tensor, blocks: Blocks) -> Tensor:
+    """Values of every node and its neighbours, 0 without one: [K, B, 64, C] -> [..., 27, C]."""
+    fields, _, _, width = channels.shape
+    axis = torch.arange(4, device=channels.device)
+    local = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(64, 1, 3)
+    step = torch.tensor(STEPS, device=channels.device)
+    flat = node_index(blocks.coords[:, None, None].long() * 4 + local + step, blocks)
+    padded = torch.cat(
+        [channels.reshape(fields, -1, width), channels.new_zeros(fields, 1, width)], 1
     )
-    apart = ((moments[b, ..., 3:] / mb - moments[a, ..., 3:] / ma) * n).sum(-1, keepdim=True)
-    relative = velocity[a] - velocity[b]
-    approach = (relative * n).sum(-1, keepdim=True)
-    touch = shared & (torch.maximum(sharp_a, sharp_b) >= 1e-6)
-    touch &= (apart <= gap * dx) & (approach > 0)
-    reduced = ma * mb / (ma + mb)
-    jn = (1 + restitution) * reduced * approach
-    slip = relative - approach * n
-    speed = slip.norm(dim=-1, keepdim=True)
-    # min(friction j_n, m_r |slip|) slip / |slip|, without the 0 / 0 of a node that does not slide.
-    slides = (friction * jn < reduced * speed) & (speed > 0)
-    drag = torch.where(slides, friction * jn / torch.where(slides, speed, 1.0), reduced)
-    impulse = torch.where(touch, jn * n + drag * slip, 0.0)
-    return velocity[a] - impulse / ma, velocity[b] + impulse / mb, touch.squeeze(-1)
+    return padded[:, flat]  # -1 is the zero at the end
 
 
 def grid_update(
@@ -179,6 +153,8 @@ def grid_update(
     colliders: Tensor | None = None,
     sdf: Tensor | None = None,
     moments: Tensor | None = None,
+    merged: Tensor | None = None,
+    cut: Tensor | None = None,
     friction: float = 0.3,
     restitution: float = 0.0,
     contact_gap: float = 1.0,
@@ -189,18 +165,30 @@ def grid_update(
     velocity = grid[..., :3] / torch.where(heavy, mass, 1.0) + dt * grid.new_tensor(gravity)
     velocity = torch.where(heavy, velocity, 0.0)
     touched = torch.zeros(grid.shape[1:3], dtype=torch.bool, device=grid.device)
+    group = None if merged is None else groups(merged, heavy[..., 0])
     if moments is not None:
         law = (friction, restitution, contact_gap)
+        near = neighbours(torch.cat([torch.where(heavy, mass, 0.0), moments], -1), blocks)
         for a in range(grid.shape[0]):
             for b in range(a + 1, grid.shape[0]):
-                va, vb, touch = _contact(grid, velocity, moments, a, b, law, dx)
+                va, vb, touch = contact(
+                    (velocity[a], velocity[b]),
+                    (near[a, ..., 0], near[b, ..., 0]),
+                    (near[a, ..., 1:], near[b, ..., 1:]),
+                    law,
+                )
+                if group is not None:
+                    touch = touch & ~group[..., a, b]
                 velocity = velocity.clone()
-                velocity[a], velocity[b] = va, vb
+                velocity[a] = torch.where(touch[..., None], va, velocity[a])
+                velocity[b] = torch.where(touch[..., None], vb, velocity[b])
                 touched |= touch
+    if group is not None:
+        velocity = merge(velocity, mass, group)
     impulses, torques = [], []
     x = blocks.node_positions(dx, grid.dtype)
     for row in [] if colliders is None else pad_colliders(colliders):
-        after = collide(row, sdf, x, velocity, mass[..., 0], dx, dt)
+        after = collide(row, sdf, x, velocity, acting_mass(row, mass[..., 0], cut), dx, dt)
         given = (mass * (after - velocity)).double()
         impulses.append(given.sum(dim=(0, 1, 2)))
         arm = (x - row[3:6]).double().expand_as(given)
