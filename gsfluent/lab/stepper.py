@@ -118,7 +118,9 @@ class Stepper:
         law, params, material = self._rows()
         return ops.return_mapping(
             self.strain, self.alpha, increment,
-            law=law, params=params, material=material, **self.scene.return_map,
+            law=law, params=params, material=material,
+            dt=dt if dt > 0.0 else 1.0,  # without a step there is no increment either
+            **self.scene.return_map,
         )  # fmt: skip
 
     def limit(self) -> float:
