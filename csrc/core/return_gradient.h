@@ -72,12 +72,10 @@ GSF_HOST_DEVICE NaccSlopes<T> nacc_slopes(const MaterialRow<T>& row, const NaccO
                           D::variable(row.strength, 5),  D::variable(row.cohesion, 6),
                           D::variable(row.hardening, 7), D::variable(row.damage, 8)};
   const NaccOptions<D> options{D(o.k), D(o.epsilon), o.implicit_alpha};
-  ElasticState<D> trial;
-  trial.j2m1 = D::variable(s.j2m1, 0);
-  trial.log_j = D(T(0.5)) * log1p(trial.j2m1);
-  trial.n = D::variable(s.n, 1);
-  const D p = D(T(-0.5)) * m.kappa * trial.j2m1;
-  const D q = D(T(1.224744871391589)) * m.mu * trial.n;
+  const D volume = D::variable(s.j2m1, 0), n = D::variable(s.n, 1);
+  const D p = D(T(-0.5)) * m.kappa * volume;
+  const D q = D(T(1.224744871391589)) * m.mu * n;
+  const NaccTrial<D> trial{p, q, n, D(T(0.5)) * log1p(volume)};
   const D before = D::variable(alpha, 2);
   D after;
   NaccReturn<D> ret;
@@ -86,7 +84,7 @@ GSF_HOST_DEVICE NaccSlopes<T> nacc_slopes(const MaterialRow<T>& row, const NaccO
     // At a limit of alpha the surface moves no further.
     if (new_alpha > T(kAlphaMin) && new_alpha < T(kAlphaMax)) {
       const D x = D::variable(new_alpha, kNaccInputs);
-      const D f = alpha_residual(m, options, trial, p, q, before, x);
+      const D f = alpha_residual(m, options, trial, before, x);
       const T slope = f.d[kNaccInputs];
       const T inverse = slope > T(1e-6) || slope < T(-1e-6) ? T(1) / slope : T(1);
       for (int i = 0; i < kNaccInputs; ++i) after.d[i] = -inverse * f.d[i];
@@ -177,11 +175,10 @@ GSF_HOST_DEVICE bool return_mapping_gradient(const Sym3<T>& strain, T alpha,
     out.params[0] = dot6(g_stress, s.d);
     out.params[1] = pressed * s.j2m1;
   }
-  // d = (J^2)^(-1/3) dev e, J^2 = det(I + e)
+  // d = J^(-2/3) dev e, J^2 = det(I + e)
   const T j2 = T(1) + s.j2m1;
-  const T scale = T(1) / std::cbrt(j2);
   g_j2m1 -= dot6(g_d, s.d) / (T(3) * j2);
-  g_e = g_e + scale * deviator(g_d) + g_j2m1 * doubled(cofactors(add_diagonal(e, T(1))));
+  g_e = g_e + s.isochoric * deviator(g_d) + g_j2m1 * doubled(cofactors(add_diagonal(e, T(1))));
   pull_back_strain(g_e, strain, increment, out);
   return true;
 }
