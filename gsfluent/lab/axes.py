@@ -46,7 +46,7 @@ class Axes:
     def push(self, start: Tensor, time: float) -> Tensor:
         """Body force per mass: acceleration less the divergence of the first Piola stress.
 
-        ``P_ii = tau_i / F_i`` with ``tau_i = mu J^(-2/3) (F_i^2 - tr/3) + kappa/2 (J^2 - 1)``; along
+        ``P_ii = tau_i / F_i``, ``tau_i = mu J^(-2/3) (F_i^2 - tr/3) + kappa/2 (J^2 - 1)``; along
         axis i only F_i varies.
         """
         mu, kappa = moduli(YOUNG, POISSON)
