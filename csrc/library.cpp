@@ -22,7 +22,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "float dx) -> Tensor");
   m.def(
       "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor? sdf, "
-      "Tensor? merged, Tensor table, Tensor coords, int[3] origin, float dx, float dt, float "
+      "Tensor? merged, Tensor? cut, Tensor table, Tensor coords, int[3] origin, float dx, float "
+      "dt, float "
       "gravity_x, float gravity_y, float gravity_z, float friction, "
       "float restitution, float contact_gap) -> "
       "(Tensor velocity, Tensor impulse, Tensor contact_mass, Tensor contact_nodes)");
@@ -44,11 +45,20 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def(
       "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
 
+  m.def("blade_sides(Tensor position, Tensor blades, Tensor cut, float reach) -> Tensor");
+
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
       "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0) -> "
       "(Tensor, Tensor, Tensor, Tensor)");
+  // Gradients of strain, alpha, increment, of six material columns per particle, and 1 where they
+  // were computed (laws elastic and nacc, no guard).
+  m.def(
+      "return_mapping_adjoint(Tensor grad_strain, Tensor grad_alpha, Tensor grad_stress, "
+      "Tensor new_alpha, Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
+      "Tensor? material, float k, float epsilon, bool implicit) -> "
+      "(Tensor, Tensor, Tensor, Tensor, Tensor)");
 
   // --- deform: polar decomposition, clamped deformation ---
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");

@@ -73,9 +73,9 @@ GSF_HOST_DEVICE HenckyState<T> hencky_state(const Sym3<T>& e, bool inverted) {
   } else {
     const ElasticState<T> s = elastic_state(e, inverted);
     h.guarded = s.guarded;
-    if (s.guarded) h.e = strain_from_isochoric(s.d, s.log_j);
+    if (s.guarded) h.e = strain_from_isochoric(s.d, log_volume(s));
     h.dev = log_deviator_large(h.e);
-    h.log_j = s.log_j;
+    h.log_j = log_volume(s);
   }
   h.n = sqrt(norm2(h.dev));
   return h;
@@ -153,7 +153,7 @@ GSF_HOST_DEVICE LawResult<T> corotated(const MaterialRow<T>& m, const Sym3<T>& e
   } else {
     const ElasticState<T> s = elastic_state(e, inverted);
     out.guarded = s.guarded;
-    if (s.guarded) out.strain = strain_from_isochoric(s.d, s.log_j);
+    if (s.guarded) out.strain = strain_from_isochoric(s.d, log_volume(s));
     j2m1 = s.j2m1;
   }
   const T j = sqrt(T(1) + j2m1);
@@ -172,9 +172,9 @@ GSF_HOST_DEVICE LawResult<T> corotated(const MaterialRow<T>& m, const Sym3<T>& e
 template <typename T>
 GSF_HOST_DEVICE LawResult<T> fluid(const MaterialRow<T>& m, const Sym3<T>& strain, T alpha,
                                    const Mat3<T>& increment, T dt) {
-  using std::exp;
   using std::expm1;
   using std::log1p;
+  using std::sqrt;
   LawResult<T> out{strain, strain, alpha, false, false};
   T x = strain.xx;
   const bool isotropic = strain.yy == x && strain.zz == x && strain.xy == T(0) &&
@@ -185,17 +185,21 @@ GSF_HOST_DEVICE LawResult<T> fluid(const MaterialRow<T>& m, const Sym3<T>& strai
   }
   const T growth = det_minus_one(increment);
   const T step = clamp(growth, T(kFluidStepMin - 1.0), T(kFluidStepMax - 1.0));
-  x += (T(1) + x) * expm1(T(2.0 / 3.0) * log1p(step));
+  // (1 + step)^(2/3) - 1
+  const T stretch = step + (T(1) + step) * inverse_cube_root_minus_one(step);
+  x += (T(1) + x) * stretch;
   const T lo = T(-0.2886213391019874), hi = T(0.12924323465723409);  // J^(2/3) - 1 at the bounds
   out.guarded = step != growth || x < lo;
   out.plastic = x > hi;
   x = clamp(x, lo, hi);
   out.strain = {x, x, x, T(0), T(0), T(0)};
 
-  const T log_j = T(1.5) * log1p(x);
-  const T j = exp(log_j);
-  const T gamma = m.exponent > T(0) ? m.exponent : T(kFluidExponent);
-  const T pressure = x < T(0) ? m.kappa / gamma * expm1(-gamma * log_j) : T(0);
+  const T j = (T(1) + x) * sqrt(T(1) + x);
+  T pressure = T(0);
+  if (x < T(0)) {
+    const T gamma = m.exponent > T(0) ? m.exponent : T(kFluidExponent);
+    pressure = m.kappa / gamma * expm1(T(-1.5) * gamma * log1p(x));
+  }
   out.stress = {-j * pressure, -j * pressure, -j * pressure, T(0), T(0), T(0)};
   if (m.strength > T(0) && dt > T(0)) {
     const Mat3<T>& a = increment;

@@ -222,7 +222,7 @@ def typed(value: Any, place: Place, known: Mapping[str, type[Any]], noun: str) -
         where = Place(f"{place.path}[{index}]", place.folder)
         settings = mapping(item, where)
         kind = settings.pop("type", None)
-        if kind not in known:
+        if not isinstance(kind, str) or kind not in known:
             raise InputError(f"{where.path}.type: unknown {noun} {kind!r}", nearest(kind, known))
         found.append(section(known[kind], settings, where))
     return tuple(found)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.errors import InputError
 from gsfluent.ops import collider as columns
 from gsfluent.scene import Collider, Scene
 from gsfluent.scene_parts import turned
@@ -26,8 +27,8 @@ SMALLEST = 0.9
 THINNEST = 2.0
 """Cells below which the grid does not hold matter out of a box reliably."""
 BACKED = 6.0
-"""Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what it
-sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
+"""Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
+it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -47,6 +48,11 @@ class RigidSet:
     """
 
     def __init__(self, scene: Scene, dx: float, device: torch.device | str = "cpu") -> None:
+        if scene.blades:
+            raise InputError(
+                "simulate: blades are not part of the simulation stage yet",
+                mend="leave the blade out, or use gsfluent.pipeline.blades with the operators",
+            )
         self.dx = dx
         self.floor = scene.floor
         self._gravity = scene.gravity
@@ -269,7 +275,7 @@ class RigidSet:
         axes = torch.from_numpy(body.axes.copy())
         extra = {
             "point": (turn @ torch.from_numpy(body.center.copy())).tolist(),
-            "orientation": _quaternion(turn @ axes),
+            "orientation": quaternion_of(turn @ axes),
             "normal": body.corner.tolist(),
             "radius": body.spacing,
             "extent": list(body.values.shape),
@@ -312,7 +318,7 @@ def _matrix(q: tuple[float, float, float, float]) -> Tensor:
     )
 
 
-def _quaternion(matrix: Tensor) -> list[float]:
+def quaternion_of(matrix: Tensor) -> list[float]:
     """Unit quaternion w, x, y, z of a rotation matrix."""
     from scipy.spatial.transform import Rotation
 
