@@ -143,21 +143,24 @@ def drop(
     return world.run(steps=round(80 / scale))
 
 
-def test_row_8_the_order_of_the_points_does_not_matter() -> None:
+def order_spread(**options: Any) -> float:
+    """RMS distance of two breaking balls whose points are numbered differently [dx]."""
     points = len(ball([0.0, 0.0, 0.0], 0.12, 0.5 * SPACING))
     shuffled = torch.randperm(points, generator=torch.Generator().manual_seed(5))
     back = torch.argsort(shuffled)
-    spread = {}
-    options: dict[str, dict[str, Any]] = {
-        "default": {},
-        "paper": {"epsilon": 0.0, "implicit": False},
-    }
-    for name, chosen in options.items():
-        one, other = drop(**chosen), drop(order=shuffled, **chosen)
-        assert float((one.alpha >= 0.0).double().mean()) > 0.5  # it broke
-        apart = (one.position - other.position[back]).double().square().sum(1).mean().sqrt()
-        spread[name] = float(apart) / SPACING
-    assert spread["default"] < 1e-5 and spread["paper"] > 30.0 * spread["default"]
+    one, other = drop(**options), drop(order=shuffled, **options)
+    assert float((one.alpha >= 0.0).double().mean()) > 0.5  # it broke
+    apart = (one.position - other.position[back]).double().square().sum(1).mean().sqrt()
+    return float(apart) / SPACING
+
+
+def test_row_8_the_order_of_the_points_does_not_matter() -> None:
+    paper: dict[str, Any] = {"epsilon": 0.0, "implicit": False}
+    # the resident solver sums exactly, so the order changes no bit, whatever the map
+    assert order_spread(engine="solver") == 0.0 and order_spread(engine="solver", **paper) == 0.0
+    # with ordinary sums it is the map that decides how round-off grows
+    default = order_spread(engine="ops")
+    assert 0.0 < default < 1e-5 and order_spread(engine="ops", **paper) > 30.0 * default
 
 
 def test_row_9_damage_hardly_depends_on_the_step_where_a_ball_breaks() -> None:
