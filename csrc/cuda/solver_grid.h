@@ -41,20 +41,27 @@ __device__ double sum_unit(const SolverView<T>& s, int i) {
   return i < 3 ? unit : (i < 6 ? unit * double(s.dx) * 4096.0 : s.clock->mass_unit);
 }
 
-// Velocity after the colliders in `near`. Out of line: few nodes come here.
+__device__ inline long long warp_sum(long long v) {
+  for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
+  return v;
+}
+
+// Velocity after the colliders in `near`, for all lanes of a warp together (`near` is the same in
+// all): their sums are added up before one lane adds them to the collider's, because all nodes of a
+// scene would meet at those few words. Out of line: few nodes come here.
 template <typename T>
-__device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, uint64_t near, Vec3<T> x,
-                                             double mass, Vec3<T> v, T dt) {
+__device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, uint64_t near, bool active,
+                                             Vec3<T> x, double mass, Vec3<T> v, T dt) {
   for (; near != 0; near &= near - 1) {
     const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
     const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
     for (int64_t k = first; k < end; ++k) {
       double sums[kImpulseSums] = {};
-      node_collide(s, k, x, mass, dt, v, sums);
-      if (sums[6] == 0.0) continue;  // not touched
+      if (active) node_collide(s, k, x, mass, dt, v, sums);
+      if (!__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
       for (int i = 0; i < kImpulseSums; ++i) {
-        const long long units = __double2ll_rn(sums[i] / sum_unit(s, i));
-        if (units != 0)
+        const long long units = warp_sum(__double2ll_rn(sums[i] / sum_unit(s, i)));
+        if (units != 0 && (threadIdx.x & 31) == 0)
           atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + kImpulseSums * k + i),
                     static_cast<unsigned long long>(units));
       }
@@ -142,8 +149,8 @@ __global__ void __launch_bounds__(kBlockNodes)
           node_contact(s, count, heavy, SlotNear<T>{s, around, local, clock.mass_unit}, velocity);
     for (int f = 0; f < count; ++f) {
       const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
-      if (heavy[f] && near != 0)
-        velocity[f] = collide_near(s, near, x, read_sums(s, node).mass, velocity[f], dt);
+      if (near != 0)
+        velocity[f] = collide_near(s, near, heavy[f], x, read_sums(s, node).mass, velocity[f], dt);
       store_velocity(s, node, velocity[f]);
     }
     if (touched > 0)
@@ -180,10 +187,11 @@ __global__ void __launch_bounds__(kSolverThreads, 6)
   clear_sums(s, node);
   Vec3<T> v;
   const T dt = T(clock.dt);
-  if (node_velocity(s, sums, dt, v) && near != 0)
-    v = collide_near(s, near,
-                     node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx),
-                     sums.mass, v, dt);
+  const bool heavy = node_velocity(s, sums, dt, v);
+  if (near != 0) {
+    const Vec3<T> x = node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
+    v = collide_near(s, near, heavy, x, sums.mass, v, dt);
+  }
   store_velocity(s, node, v);
 }
 

@@ -213,10 +213,13 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   }
   __syncthreads();
   if (threadIdx.x != 0) return;
-  s.clock->travel += float_of_bits(s.clock->moved);
-  s.clock->moved = 0;
-  end_step(*s.clock, double(s.dx), s.count);
-  choose_unit(*s.clock);
+  // On a copy: all loads at once, then all stores.
+  SolverClock clock = *s.clock;
+  clock.travel += float_of_bits(clock.moved);
+  clock.moved = 0;
+  end_step(clock, double(s.dx), s.count);
+  choose_unit(clock);
+  *s.clock = clock;
 }
 
 template <typename T, int kLaws, bool kTrack>

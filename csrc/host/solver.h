@@ -3,6 +3,8 @@
 // names. An empty tensor stands for a part the scene does not use.
 #pragma once
 
+#include <cstring>
+
 #include "core/collider.h"
 #include "core/solver_state.h"
 #include "torch_api.h"
@@ -82,7 +84,9 @@ struct SolverOps {
   template <typename T>
   static SolverView<T> view(const Buffers& b, const std::vector<int64_t>& ints,
                             const std::vector<double>& floats) {
-    SolverView<T> s{};
+    SolverView<T> s;
+    // Every byte, also between members: back ends compare views to see whether anything moved.
+    std::memset(static_cast<void*>(&s), 0, sizeof s);
     const Tensor& like = b[kOffset];
     s.count = b[kMeta].numel();
     s.home_capacity = b[kHomeStart0].size(0);
