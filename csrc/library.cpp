@@ -22,7 +22,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "float dx) -> Tensor");
   m.def(
       "grid_update(Tensor grid, Tensor? moments, Tensor? colliders, Tensor? sdf, "
-      "Tensor? merged, Tensor table, Tensor coords, int[3] origin, float dx, float dt, float "
+      "Tensor? merged, Tensor? cut, Tensor table, Tensor coords, int[3] origin, float dx, float "
+      "dt, float "
       "gravity_x, float gravity_y, float gravity_z, float friction, "
       "float restitution, float contact_gap) -> "
       "(Tensor velocity, Tensor impulse, Tensor contact_mass, Tensor contact_nodes)");
@@ -43,6 +44,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("solver_prime(Tensor(a!)[] buffers, int[] ints, float[] floats) -> ()");
   m.def(
       "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
+
+  m.def("blade_sides(Tensor position, Tensor blades, Tensor cut, float reach) -> Tensor");
 
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(

@@ -105,6 +105,7 @@ class RigidThings:
             velocity=scaled(speed, way),
             start=at,
             stop=at + stroke / speed,
+            backed=True,
         )
         self.colliders.append(plate)
         return plate.name

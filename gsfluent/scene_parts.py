@@ -166,6 +166,8 @@ class Collider:
             it hits [kg]; it passes ``point`` at ``start`` and is in free flight before.
         start: When it begins to move [s].
         stop: When it stands still [s].
+        backed: A box that meets matter with its face (own +z) only: the grid may see it thicker
+            behind.
     """
 
     name: str
@@ -186,6 +188,7 @@ class Collider:
     mass: float | None = None
     start: float = 0.0
     stop: float = math.inf
+    backed: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

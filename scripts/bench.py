@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import has_cuda, ops
+from gsfluent.materials import LAWS
 
 DX = 0.01
 DT = 1e-4
@@ -92,6 +93,27 @@ def yield_(device: torch.device, dtype: torch.dtype, count: int) -> Callable[[],
     return lambda: ops.return_mapping(strain, alpha, increment, law=law, params=params)[0]
 
 
+def law_case(name: str, columns: tuple[float, ...]) -> Case:
+    """One law on strains of a percent; ``columns`` are its numbers after the two moduli."""
+    kind = name.split(",")[0]
+
+    def build(device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+        strain = (random((count, 6), 6, device, dtype) - 0.5) * 0.02
+        strain[:, :3] -= 0.02  # pressed together, so that sand holds
+        if kind == "fluid":
+            strain[:, 1], strain[:, 2], strain[:, 3:] = strain[:, 0], strain[:, 0], 0.0
+        alpha = torch.full((count,), -0.1 if kind == "nacc" else 0.0, device=device, dtype=dtype)
+        increment = (random((count, 3, 3), 8, device, dtype) - 0.5) * 0.002
+        row = [3.6e4, 1.2e5, *columns, 0.0, 0.0, 0.0, 0.0, 0.0][:6]
+        params = torch.tensor([[*row, 1000.0, 0.0]], device=device, dtype=dtype)
+        law = torch.tensor([LAWS[kind]], dtype=torch.int32, device=device)
+        return lambda: ops.return_mapping(strain, alpha, increment, law=law, params=params, dt=DT)[
+            0
+        ]
+
+    return Case(f"return_mapping: {name}", "particles", 200_000, build)
+
+
 def splats(device: torch.device, dtype: torch.dtype, count: int) -> tuple[tuple, dict[str, Tensor]]:
     means = (random((count, 3), 9, device, dtype) - 0.5) * 0.3
     means[:, 2] += 1.0
@@ -132,21 +154,38 @@ CASES = [
     Case("grid_update", "particles", 200_000, update),
     Case("g2p", "particles", 200_000, gather),
     Case("return_mapping", "particles", 1_000_000, yield_),
+    law_case("elastic", ()),
+    law_case("corotated", ()),
+    law_case("nacc, inside", (1.85, 0.6, 3.0)),
+    law_case("nacc, yielding", (0.05, 0.6, 3.0)),
+    law_case("von_mises, inside", (1e6,)),
+    law_case("von_mises, yielding", (100.0,)),
+    law_case("drucker_prager, inside", (10.0,)),
+    law_case("drucker_prager, sliding", (0.01,)),
+    law_case("fluid", (1.0,)),
+    law_case("rigid", ()),
     Case("rasterize", "splats", 60_000, draw),
     Case("rasterize + backward", "splats", 60_000, draw_backward),
     Case("mvee", "fits", 20_000, enclose),
 ]
 
 
+def clock_of(device: torch.device) -> Callable[[], float]:
+    """Process time on one CPU thread, where other processes do not count; else wall time."""
+    one = device.type == "cpu" and torch.get_num_threads() == 1
+    return time.process_time if one else time.perf_counter
+
+
 def seconds(call: Callable[[], Any], device: torch.device, budget: float) -> float:
     """Median of as many calls as fit the budget, at least three, after one warm-up."""
+    clock = clock_of(device)
 
     def timed() -> float:
-        start = time.perf_counter()
+        start = clock()
         call()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        return time.perf_counter() - start
+        return clock() - start
 
     timed()
     times: list[float] = []
@@ -155,9 +194,11 @@ def seconds(call: Callable[[], Any], device: torch.device, budget: float) -> flo
     return sorted(times)[len(times) // 2]
 
 
-def measure(device: torch.device, *, quick: bool, budget: float) -> dict[str, Any]:
+def measure(device: torch.device, *, quick: bool, budget: float, only: str) -> dict[str, Any]:
     rows = []
     for case in CASES:
+        if only not in case.name:
+            continue
         count = case.count // 10 if quick else case.count
         time_s = seconds(case.build(device, torch.float32, count), device, budget)
         rows.append(
@@ -175,6 +216,7 @@ def measure(device: torch.device, *, quick: bool, budget: float) -> dict[str, An
         "device": device.type,
         "name": name or platform.machine(),
         "threads": torch.get_num_threads(),
+        "clock": clock_of(device).__name__,
         "load": os.getloadavg()[0],
         "torch": torch.__version__,
         "rows": rows,
@@ -186,15 +228,15 @@ def markdown(results: list[dict[str, Any]], before: dict[str, float]) -> str:
     for result in results:
         lines += [
             f"### {result['device']}: {result['name']} (torch {result['torch']}, "
-            f"{result['threads']} threads, load {result['load']:.1f})",
+            f"{result['threads']} threads, {result['clock']}, load {result['load']:.1f})",
             "",
-            "| op | size | ms | million/s |" + (" before, ms |" if before else ""),
-            "| --- | --- | --- | --- |" + (" --- |" if before else ""),
+            "| op | size | ms | ns each | million/s |" + (" before, ms |" if before else ""),
+            "| --- | --- | --- | --- | --- |" + (" --- |" if before else ""),
         ]
         for row in result["rows"]:
             size = f"{row['count']:,} {row['unit']}"
             line = f"| {row['op']} | {size} | {1e3 * row['seconds']:.3f} | "
-            line += f"{row['per_second'] / 1e6:.2f} |"
+            line += f"{1e9 / row['per_second']:.1f} | {row['per_second'] / 1e6:.2f} |"
             if before:
                 line += f" {1e3 * before.get(result['device'] + row['op'], float('nan')):.3f} |"
             lines.append(line)
@@ -207,6 +249,7 @@ def main() -> int:
     parser.add_argument("--device", choices=["all", "cpu", "cuda"], default="all")
     parser.add_argument("--quick", action="store_true", help="a tenth of the size")
     parser.add_argument("--budget", type=float, default=2.0, help="seconds per op")
+    parser.add_argument("--only", default="", help="ops whose name holds this")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--markdown", type=Path, help="write the tables here")
     parser.add_argument("--compare", type=Path, help="an earlier --json file")
@@ -217,7 +260,8 @@ def main() -> int:
     if options.device != "cpu" and has_cuda():
         names.append("cuda")
     budget = 0.3 if options.quick else options.budget
-    results = [measure(torch.device(n), quick=options.quick, budget=budget) for n in names]
+    shared = {"quick": options.quick, "budget": budget, "only": options.only}
+    results = [measure(torch.device(n), **shared) for n in names]
     before = {}
     if options.compare:
         old = json.loads(options.compare.read_text())

@@ -33,6 +33,12 @@ GSF_HOST_DEVICE Vec3<T> collide(const T* row, const Vec3<T>& normal, const Vec3<
   return own + tangential + (-rebound * vn) * normal;
 }
 
+// Whether a collider acts on a field with this `cut` (core/blade.h).
+template <typename T>
+GSF_HOST_DEVICE bool collider_acts_on(const T* row, int32_t cut) {
+  return row[kOnlyCut] == T(0) || (cut >> (static_cast<int>(row[kOnlyCut]) - 1) & 1) != 0;
+}
+
 // Whether a node at x, moving with v for dt, touches the collider; 1e-4 dx of tolerance keeps a
 // node that lies on the surface inside whatever the rounding. A sweeping collider also touches what
 // it would meet during the step: `share` is then the part of the step after the first touch, found

@@ -1,6 +1,7 @@
 // One plain struct per collider kernel: pointers, sizes, and the work of one thread.
 #pragma once
 
+#include "core/blade.h"
 #include "core/collider.h"
 
 namespace gsf {
@@ -41,6 +42,20 @@ struct AdvanceCollidersArgs {
     advance_collider(row, dt, load_vec3(impulse + 6 * c), load_vec3(impulse + 6 * c + 3),
                      load_vec3(gravity));
     for (int i = 0; i < kColliderColumns; ++i) kept[i] = T(row[i]);
+  }
+};
+
+template <typename T>
+struct BladeSidesArgs {
+  const T* position;   // [points, 3] m
+  const T* blades;     // [rows, kBladeColumns], legs of one blade in a row
+  const int32_t* cut;  // [points]
+  int64_t points, rows;
+  T reach;       // m
+  int32_t* out;  // [points]
+
+  GSF_HOST_DEVICE void compute(int64_t i) const {
+    out[i] = blade_cut(blades, rows, load_vec3(position + 3 * i), reach, cut[i]);
   }
 };
 

@@ -24,7 +24,8 @@ enum ColliderColumn {
   kInertia = 23,          // principal moments in the body frame [kg m^2]; 0: no turning by impulse
   kExtent = 26,           // box: half edges; capsule, cylinder: half length in z (third) [m];
                           // distance grid: number of values along x, y, z
-  kSdfStart = 29          // distance grid: its first value in the buffer, in units of 64 values
+  kSdfStart = 29,         // distance grid: its first value in the buffer, in units of 64 values
+  kOnlyCut = 30           // 0: acts on all matter; n > 0: only on fields whose `cut` has bit n - 1
 };
 constexpr int kColliderColumns = 32;
 constexpr int64_t kSdfAlign = 64;  // so that offsets are exact in float32 up to 2^30
@@ -36,7 +37,9 @@ enum ColliderType {
   kBox = 2,
   kCapsule = 3,   // axis along z of the body frame
   kCylinder = 4,  // axis along z of the body frame
-  kSdf = 5        // signed distances at the nodes of a grid, z fastest
+  kSdf = 5,       // signed distances at the nodes of a grid, z fastest
+  kFace = 6       // half space under a rectangle in the plane z = 0 of the body frame, as deep as
+                  // the third half edge; it holds nothing beyond its rim: a blade's face
 };
 
 template <typename T>
@@ -159,7 +162,8 @@ GSF_HOST_DEVICE bool collider_valid(const T* row, int64_t sdf_count) {
   const T *e = row + kExtent, r = row[kRadius];
   if (type == T(kPlane)) return norm(load_vec3(row + kNormal)) > T(0) && row[kMass] == T(0);
   if (type == T(kSphere)) return r > T(0);
-  if (type == T(kBox)) return e[0] > T(0) && e[1] > T(0) && e[2] > T(0);
+  if (!(row[kOnlyCut] >= T(0) && row[kOnlyCut] <= T(30))) return false;
+  if (type == T(kBox) || type == T(kFace)) return e[0] > T(0) && e[1] > T(0) && e[2] > T(0);
   if (type == T(kCapsule)) return r > T(0);
   if (type == T(kCylinder)) return r > T(0) && e[2] > T(0);
   if (type != T(kSdf) || !(r > T(0)) || !(row[kSdfStart] >= T(0))) return false;
@@ -211,6 +215,9 @@ GSF_HOST_DEVICE T collider_signed_distance(const T* row, const float* sdf, const
     const T length = norm(side);
     d = corner_distance(up * p.z - row[kExtent + 2], Vec3<T>{T(0), T(0), up}, length - r,
                         direction(side, length, Vec3<T>{T(1), T(0), T(0)}), n);
+  } else if (type == kFace) {
+    const T* e = row + kExtent;
+    if (p.x >= -e[0] && p.x <= e[0] && p.y >= -e[1] && p.y <= e[1] && p.z >= -e[2]) d = p.z;
   } else if (type == kSdf) {
     d = sdf_distance(row, sdf, p, n);
   }
@@ -226,7 +233,7 @@ GSF_HOST_DEVICE T collider_bound(const T* row) {
   const T r = row[kRadius], z = row[kExtent + 2];
   if (type == kNothing) return T(0);
   if (type == kSphere) return r;
-  if (type == kBox) return norm(load_vec3(row + kExtent));
+  if (type == kBox || type == kFace) return norm(load_vec3(row + kExtent));
   if (type == kCapsule) return r + z;
   if (type == kCylinder) return sqrt(r * r + z * z);
   if (type != kSdf) return T(INFINITY);

@@ -37,7 +37,7 @@ inline constexpr double kFluidJMin = 0.6;
 // Beyond this a liquid has parted: the excess is forgotten, so that spray is not denser than the
 // pool when it comes back.
 inline constexpr double kFluidJMax = 1.2;
-inline constexpr double kFluidStepMax = 0.2231435513142098;  // ln 1.25, per step
+inline constexpr double kFluidStepMin = 0.8, kFluidStepMax = 1.25;  // growth of J per step
 inline constexpr double kGapMax = 0.5;  // log volume that parted sand remembers
 
 // What a law makes of a trial state.
@@ -73,9 +73,9 @@ GSF_HOST_DEVICE HenckyState<T> hencky_state(const Sym3<T>& e, bool inverted) {
   } else {
     const ElasticState<T> s = elastic_state(e, inverted);
     h.guarded = s.guarded;
-    if (s.guarded) h.e = strain_from_isochoric(s.d, s.log_j);
+    if (s.guarded) h.e = strain_from_isochoric(s.d, log_volume(s));
     h.dev = log_deviator_large(h.e);
-    h.log_j = s.log_j;
+    h.log_j = log_volume(s);
   }
   h.n = sqrt(norm2(h.dev));
   return h;
@@ -153,7 +153,7 @@ GSF_HOST_DEVICE LawResult<T> corotated(const MaterialRow<T>& m, const Sym3<T>& e
   } else {
     const ElasticState<T> s = elastic_state(e, inverted);
     out.guarded = s.guarded;
-    if (s.guarded) out.strain = strain_from_isochoric(s.d, s.log_j);
+    if (s.guarded) out.strain = strain_from_isochoric(s.d, log_volume(s));
     j2m1 = s.j2m1;
   }
   const T j = sqrt(T(1) + j2m1);
@@ -165,16 +165,16 @@ GSF_HOST_DEVICE LawResult<T> corotated(const MaterialRow<T>& m, const Sym3<T>& e
 }
 
 // --- weakly compressible fluid: p = K/gamma (J^-gamma - 1), no tension, Newtonian viscosity ---
-// The strain stays isotropic, e = (J^(2/3) - 1) I. J follows exp(tr A), which unlike det(I + A)
-// does not grow under rotation. No elastic early-out: a resting fluid keeps its strain bit for bit
-// because it advances by a product with exp(tr A) - 1.
+// The strain stays isotropic, e = (J^(2/3) - 1) I. J follows det(I + A), as the positions do that
+// are moved by the same velocities; 1 + tr A would lose the difference at every step, and the pool
+// would grow or shrink. What is added to e vanishes with A, so that a resting fluid keeps its bits.
 
 template <typename T>
 GSF_HOST_DEVICE LawResult<T> fluid(const MaterialRow<T>& m, const Sym3<T>& strain, T alpha,
                                    const Mat3<T>& increment, T dt) {
-  using std::exp;
   using std::expm1;
   using std::log1p;
+  using std::sqrt;
   LawResult<T> out{strain, strain, alpha, false, false};
   T x = strain.xx;
   const bool isotropic = strain.yy == x && strain.zz == x && strain.xy == T(0) &&
@@ -183,24 +183,28 @@ GSF_HOST_DEVICE LawResult<T> fluid(const MaterialRow<T>& m, const Sym3<T>& strai
     const T j2m1 = det_minus_one(strain);
     x = j2m1 > T(-0.9999) ? expm1(log1p(j2m1) * T(1.0 / 3.0)) : T(-1);
   }
-  const T growth = increment.m[0] + increment.m[4] + increment.m[8];
-  const T step = clamp(growth, T(-kFluidStepMax), T(kFluidStepMax));
-  x += (T(1) + x) * expm1(T(2.0 / 3.0) * step);
+  const T growth = det_minus_one(increment);
+  const T step = clamp(growth, T(kFluidStepMin - 1.0), T(kFluidStepMax - 1.0));
+  // (1 + step)^(2/3) - 1
+  const T stretch = step + (T(1) + step) * inverse_cube_root_minus_one(step);
+  x += (T(1) + x) * stretch;
   const T lo = T(-0.2886213391019874), hi = T(0.12924323465723409);  // J^(2/3) - 1 at the bounds
   out.guarded = step != growth || x < lo;
   out.plastic = x > hi;
   x = clamp(x, lo, hi);
   out.strain = {x, x, x, T(0), T(0), T(0)};
 
-  const T log_j = T(1.5) * log1p(x);
-  const T j = exp(log_j);
-  const T gamma = m.exponent > T(0) ? m.exponent : T(kFluidExponent);
-  const T pressure = x < T(0) ? m.kappa / gamma * expm1(-gamma * log_j) : T(0);
+  const T j = (T(1) + x) * sqrt(T(1) + x);
+  T pressure = T(0);
+  if (x < T(0)) {
+    const T gamma = m.exponent > T(0) ? m.exponent : T(kFluidExponent);
+    pressure = m.kappa / gamma * expm1(T(-1.5) * gamma * log1p(x));
+  }
   out.stress = {-j * pressure, -j * pressure, -j * pressure, T(0), T(0), T(0)};
   if (m.strength > T(0) && dt > T(0)) {
     const Mat3<T>& a = increment;
     const T scale = j * m.strength / dt;
-    const T mean = T(2.0 / 3.0) * growth;
+    const T mean = T(2.0 / 3.0) * (a.m[0] + a.m[4] + a.m[8]);
     const Sym3<T> rate = {T(2) * a.m[0] - mean, T(2) * a.m[4] - mean, T(2) * a.m[8] - mean,
                           a.m[1] + a.m[3],      a.m[2] + a.m[6],      a.m[5] + a.m[7]};
     out.stress = out.stress + scale * rate;

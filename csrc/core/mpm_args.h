@@ -67,6 +67,7 @@ struct GridUpdateArgs {
   const T* grid;           // [fields, count, 64, 4]
   const T* moments;        // [fields, count, 64, kContactMoments] or null
   const uint64_t* merged;  // [fields] bit g of word f: f and g move as one; or null
+  const int32_t* cut;      // [fields] sides of blades (core/blade.h), or null: none
   const T* colliders;      // [collider_count, kColliderColumns] or null
   int64_t collider_count;
   const float* sdf;  // [sdf_count] distance grids of all colliders, or null
@@ -86,6 +87,7 @@ struct GridUpdateArgs {
   GSF_HOST_DEVICE T* out(int32_t field, int64_t node) const {
     return velocity + 3 * (int64_t(field) * count * kBlockNodes + node);
   }
+  GSF_HOST_DEVICE int32_t cut_of(int32_t field) const { return cut != nullptr ? cut[field] : 0; }
   GSF_HOST_DEVICE void set(int32_t field, int64_t node, const Vec3<T>& v) const {
     for (int i = 0; i < 3; ++i) out(field, node)[i] = v[i];
   }
@@ -191,7 +193,7 @@ GSF_HOST_DEVICE double touching_mass(const GridUpdateArgs<T>& a, const T* row, i
   double total = 0.0;
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
-    if (!(mass > mass_floor<T>())) continue;
+    if (!(mass > mass_floor<T>()) || !collider_acts_on(row, a.cut_of(f))) continue;
     Vec3<T> normal;
     T share;
     if (collider_touch(row, a.sdf, x, load_vec3(a.out(f, node)), a.dx, a.dt, normal, share))
@@ -208,7 +210,7 @@ GSF_HOST_DEVICE void collide_node(const GridUpdateArgs<T>& a, const T* row, T gi
   const Vec3<T> x = node_position(a, node);
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
-    if (!(mass > mass_floor<T>())) continue;
+    if (!(mass > mass_floor<T>()) || !collider_acts_on(row, a.cut_of(f))) continue;
     T* p = a.out(f, node);
     Vec3<T> v = load_vec3(p);
     if (!collide_with(row, a.sdf, give, x, mass, a.dx, a.dt, v, sums)) continue;

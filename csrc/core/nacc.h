@@ -111,9 +111,17 @@ GSF_HOST_DEVICE NaccReturn<T> nacc_project(const NaccMaterial<T>& m, const NaccO
   return out;
 }
 
+// What the search for alpha needs of a trial state.
+template <typename T>
+struct NaccTrial {
+  T p, q;   // pressure, deviatoric stress [Pa]
+  T n;      // |d|
+  T log_j;  // ln J
+};
+
 // ln(J_trial / J_cross) plus shear damage eta (1 - r) q / (3 mu), with q / (3 mu) = |d| / sqrt(6).
 template <typename T>
-GSF_HOST_DEVICE T alpha_step(const NaccMaterial<T>& m, const ElasticState<T>& trial,
+GSF_HOST_DEVICE T alpha_step(const NaccMaterial<T>& m, const NaccTrial<T>& trial,
                              const NaccReturn<T>& ret) {
   using std::log1p;
   const T volume = trial.log_j - T(0.5) * log1p(T(-2) * ret.cross / m.kappa);
@@ -124,8 +132,8 @@ GSF_HOST_DEVICE T alpha_step(const NaccMaterial<T>& m, const ElasticState<T>& tr
 // Residual of the implicit update: x - alpha_n - step(surface at x).
 template <typename T>
 GSF_HOST_DEVICE T alpha_residual(const NaccMaterial<T>& m, const NaccOptions<T>& o,
-                                 const ElasticState<T>& trial, T p, T q, T alpha, T x) {
-  const NaccReturn<T> ret = nacc_project(m, o, yield_surface(m, x), p, q);
+                                 const NaccTrial<T>& trial, T alpha, T x) {
+  const NaccReturn<T> ret = nacc_project(m, o, yield_surface(m, x), trial.p, trial.q);
   return (x - alpha) - alpha_step(m, trial, ret);
 }
 
@@ -143,7 +151,7 @@ GSF_HOST_DEVICE T alpha_residual(const NaccMaterial<T>& m, const NaccOptions<T>&
 // found is then a property of this algorithm, which the reference repeats.
 template <typename T>
 GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
-                              const ElasticState<T>& trial, T p, T q, T alpha, T first_step) {
+                              const NaccTrial<T>& trial, T alpha, T first_step) {
   using std::abs;
   const T eps = sizeof(T) == 4 ? T(1.2e-7) : T(2.2e-16);
   // The step is a difference of logarithms of this size: below it there is only rounding to solve.
@@ -152,7 +160,7 @@ GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
   const T far = alpha + (first_step > T(0) ? T(kAlphaStepMax) : T(-kAlphaStepMax));
   T x0 = alpha, f0 = -first_step;
   T x1 = alpha + first_step;
-  T f1 = alpha_residual(m, o, trial, p, q, alpha, x1);
+  T f1 = alpha_residual(m, o, trial, alpha, x1);
   for (int i = 0; i < 40 && f0 * f1 > T(0) && abs(f1) > tolerance && x1 != far; ++i) {
     const T last = x1 - x0;
     const T ratio = f0 - f1 != T(0) ? f1 / (f0 - f1) : T(4);  // secant step in units of the last
@@ -160,7 +168,7 @@ GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
     x0 = x1;
     f0 = f1;
     x1 = abs(x1 + step - alpha) < T(kAlphaStepMax) ? x1 + step : far;
-    f1 = alpha_residual(m, o, trial, p, q, alpha, x1);
+    f1 = alpha_residual(m, o, trial, alpha, x1);
   }
   T before = abs(f1);
   for (int i = 0; i < 60; ++i) {
@@ -172,7 +180,7 @@ GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
     const bool check = (i & 7) == 7;
     if (!(x > lo && x < hi) || (check && abs(f1) > T(0.1) * before)) x = T(0.5) * (lo + hi);
     if (check) before = abs(f1);
-    const T f = alpha_residual(m, o, trial, p, q, alpha, x);
+    const T f = alpha_residual(m, o, trial, alpha, x);
     if (f * f1 < T(0)) {
       x0 = x1;
       f0 = f1;
@@ -190,7 +198,7 @@ GSF_HOST_DEVICE T solve_alpha(const NaccMaterial<T>& m, const NaccOptions<T>& o,
 template <typename T>
 struct NaccState {
   Sym3<T> d;
-  T log_j, j2m1, alpha;
+  T j2m1, alpha;
   bool plastic;
 };
 
@@ -198,26 +206,25 @@ struct NaccState {
 template <typename T>
 GSF_HOST_DEVICE_COLD NaccState<T> nacc_plastic(const NaccMaterial<T>& m, const NaccOptions<T>& o,
                                                const ElasticState<T>& s, T alpha) {
-  using std::log1p;
   const T p = T(-0.5) * m.kappa * s.j2m1;
   const T q = T(1.224744871391589) * m.mu * s.n;  // sqrt(3/2) mu |d|
-  NaccState<T> out{s.d, s.log_j, s.j2m1, alpha, false};
+  NaccState<T> out{s.d, s.j2m1, alpha, false};
   const YieldSurface<T> y = yield_surface(m, alpha);
   T u, w;
   normalized(m, y, p, q, u, w);
   const T slack = sizeof(T) == 4 ? T(1e-6) : T(2e-15);  // scale free: a returned state is inside
   if (!(u * u + w * w > T(1) + slack)) return out;
   out.plastic = true;
+  const NaccTrial<T> trial{p, q, s.n, log_volume(s)};
   NaccReturn<T> ret = nacc_project(m, o, y, p, q);
-  const T step = alpha_step(m, s, ret);
+  const T step = alpha_step(m, trial, ret);
   out.alpha = clamp(alpha + step, T(kAlphaMin), T(kAlphaMax));
   if (o.implicit_alpha) {
-    out.alpha = clamp(solve_alpha(m, o, s, p, q, alpha, step), T(kAlphaMin), T(kAlphaMax));
+    out.alpha = clamp(solve_alpha(m, o, trial, alpha, step), T(kAlphaMin), T(kAlphaMax));
     ret = nacc_project(m, o, yield_surface(m, out.alpha), p, q);
   }
   out.d = ret.r * s.d;
   out.j2m1 = T(-2) * ret.p / m.kappa;
-  out.log_j = T(0.5) * log1p(out.j2m1);
   return out;
 }
 
@@ -243,7 +250,7 @@ template <typename T>
 GSF_HOST_DEVICE NaccState<T> nacc_return(const NaccMaterial<T>& m, const NaccOptions<T>& o,
                                          const ElasticState<T>& s, T alpha) {
   alpha = clamp(alpha, T(kAlphaMin), T(kAlphaMax));
-  if (nacc_clearly_elastic(m, s, alpha)) return {s.d, s.log_j, s.j2m1, alpha, false};
+  if (nacc_clearly_elastic(m, s, alpha)) return {s.d, s.j2m1, alpha, false};
   return nacc_plastic(m, o, s, alpha);
 }
 

@@ -31,6 +31,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
                                                const Mat3<T>& increment, int law,
                                                const MaterialRow<T>& m, const NaccOptions<T>& o,
                                                T dt) {
+  using std::log1p;
   const Sym3<T> zero = {T(0), T(0), T(0), T(0), T(0), T(0)};
   ReturnMapped<T> out{zero, zero, alpha, false, false, false, false};
   const Sym3<T> e = update_strain(strain, increment);
@@ -45,7 +46,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
   if (law == kElastic || law == kNacc) {
     const ElasticState<T> s = elastic_state(e, out.inverted);
     out.guarded = s.guarded;
-    NaccState<T> r{s.d, s.log_j, s.j2m1, alpha, false};
+    NaccState<T> r{s.d, s.j2m1, alpha, false};
     if (law == kNacc) {
       const NaccMaterial<T> nacc{m.mu, m.kappa, m.strength, m.cohesion, m.hardening, m.damage};
       r = nacc_return(nacc, o, s, alpha);
@@ -53,7 +54,8 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
     out.alpha = r.alpha;
     out.plastic = r.plastic;
     // An elastic state keeps its strain bit for bit; only changed states are rebuilt.
-    out.strain = r.plastic || s.guarded ? strain_from_isochoric(r.d, r.log_j) : s.e;
+    out.strain = s.e;
+    if (r.plastic || s.guarded) out.strain = strain_from_isochoric(r.d, T(0.5) * log1p(r.j2m1));
     out.stress = kirchhoff_stress(m.mu, m.kappa, r.d, r.j2m1);
     return out;
   }

@@ -10,9 +10,8 @@ namespace gsf {
 // Sums of one node in natural units, as both back ends hand them over.
 template <typename T>
 struct NodeSums {
-  double mass;                 // kg
-  double momentum[3];          // kg m/s
-  T moments[kContactMoments];  // only when the site is shared
+  double mass;         // kg
+  double momentum[3];  // kg m/s
 };
 
 // Velocity of a node [m/s]; false when it is too light to have one.
@@ -27,20 +26,22 @@ GSF_HOST_DEVICE bool node_velocity(const SolverView<T>& s, const NodeSums<T>& su
   return true;
 }
 
-// The sums of a node itself for node_contact, for a grid without access to neighbouring nodes; the
-// normals are then those of a single node.
-template <typename T>
-struct OwnNode {
-  const NodeSums<T>* sums;  // [fields]
-  GSF_HOST_DEVICE ContactSample<T> operator()(int field, int o) const {
-    if (o != 13) return {T(0), {T(0), T(0), T(0)}};
-    const NodeSums<T>& n = sums[field];
-    return {T(n.mass), {n.moments[0], n.moments[1], n.moments[2]}};
+// Neighbour o of node `local` (flat index) of a block: which of the 27 blocks around it holds it,
+// and its flat index there.
+GSF_HOST_DEVICE int near_block(int local, int o, int& there) {
+  int block = 0;
+  there = 0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const int at = (local >> (4 - 2 * axis) & 3) + neighbour_step(o, axis);
+    block = 3 * block + block_of(at) + 1;
+    there = 4 * there + local_of(at);
   }
-};
+  return block;
+}
 
 // Contact between every pair of the fields at one node, in ascending field (Gauss-Seidel); returns
-// how many pairs touched. near(field, o) = ContactSample of neighbour o, see core/contact.h.
+// how many pairs touched. near(field, o) = ContactSample of neighbour o, see core/contact.h: sums
+// of other nodes, which must not be cleared before all contacts of the step are done.
 template <typename T, typename Near>
 GSF_HOST_DEVICE int node_contact(const SolverView<T>& s, int fields, const bool* heavy,
                                  const Near& near, Vec3<T>* velocity) {

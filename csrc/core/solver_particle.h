@@ -103,9 +103,8 @@ GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row
 // wave_speed_squared of the neo-Hookean law where the state's invariants are at hand.
 template <typename T>
 GSF_HOST_DEVICE T elastic_wave_squared(const MaterialRow<T>& m, const ElasticState<T>& state) {
-  using std::exp;
-  const T mean = clamp(exp(T(-2.0 / 3.0) * state.log_j) * (T(1) + trace(state.e) * T(1.0 / 3.0)),
-                       T(1), T(kDeviatorMax));
+  const T mean =
+      clamp(state.isochoric * (T(1) + trace(state.e) * T(1.0 / 3.0)), T(1), T(kDeviatorMax));
   const T along = m.mu * (T(4.0 / 3.0) * mean + T(0.272165526975909) * state.n) +
                   T(0.5) * m.kappa * (T(2) + state.j2m1);
   const T across = m.mu * (mean + T(0.816496580927726) * state.n);
@@ -184,7 +183,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
     flags.guarded = state.guarded;
     flags.inverted = state.inverted;
     flags.invalid = !finite(e);
-    set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, state.log_j) : state.e);
+    set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, log_volume(state)) : state.e);
     stress = kirchhoff_stress(r[0], r[1], state.d, state.j2m1);
     wave2 = elastic_wave_squared(load_material(r), state);
   } else {

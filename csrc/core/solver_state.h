@@ -162,10 +162,10 @@ struct SolverView {
   T* home_bound;         // [H] largest momentum one particle can give to one node [kg m/s]
   T* home_mass;          // [H] largest particle mass [kg]
   int32_t* slot_coord;   // [S, 4] block and field
-  int32_t* slot_shared;  // [S] whether its site holds several fields
+  int32_t* slot_shared;  // [S] 1: its site holds several fields; 2 (CUDA): next to such; 0
   int32_t* site_slots;   // [S, kSiteFields] slots of a site in ascending field, -1 after the last
   void* sums;            // [S, 64, 4] momentum and mass: int64 units on CUDA, T on the CPU
-  void* moments;         // [S, 64, kContactMoments] likewise, or null with one field
+  void* moments;         // [S, 64, kContactMoments] likewise, where slot_shared; null: one field
   T* node_velocity;      // [S, 64, 4]
   // hash table
   uint64_t* key;         // [table_size]

@@ -68,13 +68,18 @@ GSF_HOST_DEVICE T det_minus_one(const Sym3<T>& e) {
   return trace(e) + second + det(e);
 }
 
-// det(I + A) for a general A.
+// det(I + A) - 1 for a general A, exact to rounding of A.
 template <typename T>
-GSF_HOST_DEVICE T det_identity_plus(const Mat3<T>& a) {
+GSF_HOST_DEVICE T det_minus_one(const Mat3<T>& a) {
   const T second = (a(0, 0) * a(1, 1) - a(0, 1) * a(1, 0)) +
                    (a(0, 0) * a(2, 2) - a(0, 2) * a(2, 0)) +
                    (a(1, 1) * a(2, 2) - a(1, 2) * a(2, 1));
-  return T(1) + (a(0, 0) + a(1, 1) + a(2, 2) + second + det(a));
+  return a(0, 0) + a(1, 1) + a(2, 2) + second + det(a);
+}
+
+template <typename T>
+GSF_HOST_DEVICE T det_identity_plus(const Mat3<T>& a) {
+  return T(1) + det_minus_one(a);
 }
 
 // (I + A)(I + e)(I + A)^T - I = e + H + H^T + H A^T with H = A (I + e).

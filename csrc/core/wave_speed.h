@@ -21,10 +21,10 @@ GSF_HOST_DEVICE T wave_speed_squared(int law, const MaterialRow<T>& m, const Sym
   const T j2_lo = T(kJMin * kJMin - 1.0), j2_hi = T(kJMax * kJMax - 1.0);
   const T raw = det_minus_one(strain);
   const T j2m1 = raw >= j2_lo ? min(raw, j2_hi) : j2_lo;
-  const T log_j = T(0.5) * log1p(j2m1);
   if (law == kFluid) {
     const T gamma = m.exponent > T(0) ? m.exponent : T(kFluidExponent);
-    return m.kappa * exp((T(1) - gamma) * clamp(log_j, T(-0.5108256237659907), T(0))) / m.density;
+    const T log_j = clamp(T(0.5) * log1p(j2m1), T(-0.5108256237659907), T(0));  // ln 0.6
+    return m.kappa * exp((T(1) - gamma) * log_j) / m.density;
   }
   const T third = trace(strain) * T(1.0 / 3.0);
   const T size = min(sqrt(norm2(deviator(strain))), T(kStrainMax));
@@ -33,10 +33,11 @@ GSF_HOST_DEVICE T wave_speed_squared(int law, const MaterialRow<T>& m, const Sym
     const T largest = max(T(1) + third + T(0.816496580927726) * size, T(0));
     return (T(2) * m.mu * largest + (m.kappa - T(2.0 / 3.0) * m.mu) * (T(1) + j2m1)) / m.density;
   }
-  const T isochoric = exp(T(-2.0 / 3.0) * log_j);
+  const T isochoric = inverse_cube_root(j2m1);
   const T n = min(isochoric * size, T(kDeviatorMax));
   if (law == kDruckerPrager || law == kVonMises) {
     // kappa + 4/3 mu - tau_i, and |dev ln V| <= 0.6 n.
+    const T log_j = T(0.5) * log1p(j2m1);
     return (m.kappa * max(T(1) - log_j, T(0)) + m.mu * (T(4.0 / 3.0) + n)) / m.density;
   }
   // mu (5/3 mean - 1/3 b_i) + kappa/2 (J^2 + 1) along i, mu b_i across, of the isochoric b.

@@ -18,6 +18,12 @@ struct Cpu {
   static void advance(const AdvanceCollidersArgs<T>& a, const Scope&) {
     for (int64_t c = 0; c < a.rows; ++c) a.compute(c);
   }
+  template <typename T>
+  static void blade_sides(const BladeSidesArgs<T>& a, const Scope&) {
+    parallel_for(a.points, 1024, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) a.compute(i);
+    });
+  }
 };
 
 }  // namespace

@@ -2,14 +2,11 @@
 // brings the particles into their order. Everything is sorted by what it is (block, field, cell,
 // state), never by where it lay before, so that the order in which particles were loaded leaves no
 // trace in any sum.
-#include <algorithm>
-#include <atomic>
 #include <bit>
 #include <cstring>
 #include <type_traits>
 
 #include "cpu/solver_cpu.h"
-#include "torch_api.h"
 
 namespace gsf::cpu {
 namespace {

@@ -1,4 +1,5 @@
-// CUDA kernels of the collider operators: one thread per (point, collider), one per collider.
+// CUDA kernels of the collider operators: one thread per (point, collider), one per collider,
+// one per point.
 #include "cuda/launch_collider.h"
 
 namespace gsf::cuda {
@@ -32,9 +33,15 @@ cudaError_t advance_colliders(const AdvanceCollidersArgs<T>& a, cudaStream_t str
   return compute(a, a.rows, stream);
 }
 
+template <typename T>
+cudaError_t blade_sides(const BladeSidesArgs<T>& a, cudaStream_t stream) {
+  return compute(a, a.points, stream);
+}
+
 #define GSF_INSTANTIATE(T)                                                                 \
   template cudaError_t collider_distance<T>(const ColliderDistanceArgs<T>&, cudaStream_t); \
-  template cudaError_t advance_colliders<T>(const AdvanceCollidersArgs<T>&, cudaStream_t);
+  template cudaError_t advance_colliders<T>(const AdvanceCollidersArgs<T>&, cudaStream_t); \
+  template cudaError_t blade_sides<T>(const BladeSidesArgs<T>&, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)
 #undef GSF_INSTANTIATE

@@ -16,6 +16,10 @@ struct ColliderCuda {
   static void advance(const AdvanceCollidersArgs<T>& a, const Scope& scope) {
     STD_CUDA_CHECK(cuda::advance_colliders(a, scope.stream()));
   }
+  template <typename T>
+  static void blade_sides(const BladeSidesArgs<T>& a, const Scope& scope) {
+    STD_CUDA_CHECK(cuda::blade_sides(a, scope.stream()));
+  }
 };
 
 }  // namespace

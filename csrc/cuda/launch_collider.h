@@ -11,5 +11,7 @@ template <typename T>
 cudaError_t collider_distance(const ColliderDistanceArgs<T>& a, cudaStream_t stream);
 template <typename T>
 cudaError_t advance_colliders(const AdvanceCollidersArgs<T>& a, cudaStream_t stream);
+template <typename T>
+cudaError_t blade_sides(const BladeSidesArgs<T>& a, cudaStream_t stream);
 
 }  // namespace gsf::cuda

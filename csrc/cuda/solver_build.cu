@@ -23,16 +23,6 @@ __device__ int32_t insert(const SolverView<T>& s, uint64_t key) {
   }
   return -1;
 }
-template <typename T>
-__device__ int32_t find(const SolverView<T>& s, uint64_t key) {
-  const uint64_t mask = uint64_t(s.table_size) - 1;
-  uint64_t at = hash_key(key) & mask;
-  for (int64_t tries = 0; tries < s.table_size; ++tries, at = (at + 1) & mask) {
-    if (s.key[at] == key) return static_cast<int32_t>(at);
-    if (s.key[at] == kNoKey) return -1;
-  }
-  return -1;
-}
 __device__ unsigned long long add(int64_t* p, int64_t v) {
   return atomicAdd(reinterpret_cast<unsigned long long*>(p), static_cast<unsigned long long>(v));
 }
@@ -180,6 +170,17 @@ __global__ void __launch_bounds__(kThreads) sites_kernel(SolverView<T> s) {
   if (count > 1) add(&s.clock->shared_sites, 1);
 }
 
+// Contact reads one node beyond the blocks that fields share: marks the slots around those.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) edges_kernel(SolverView<T> s) {
+  if (!may_build(*s.clock) || s.clock->shared_sites == 0) return;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t slot = i / kNeighbours;
+  if (slot >= s.clock->wanted_slots || s.slot_shared[slot] != 1) return;
+  const int32_t other = slot_around(s, s.slot_coord + 4 * slot, static_cast<int>(i % kNeighbours));
+  if (other >= 0 && s.slot_shared[other] == 0) s.slot_shared[other] = 2;
+}
+
 // Slots under the window of each home.
 template <typename T>
 __global__ void __launch_bounds__(kThreads) neighbours_kernel(SolverView<T> s) {
@@ -188,10 +189,7 @@ __global__ void __launch_bounds__(kThreads) neighbours_kernel(SolverView<T> s) {
   const int64_t h = i / kNeighbours;
   if (h >= s.clock->wanted_homes) return;
   const int n = static_cast<int>(i % kNeighbours);
-  const int32_t* c = s.next_homes().coord + 4 * h;
-  const int32_t e =
-      find(s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, c[3]));
-  s.neighbour[h * kNeighbours + n] = e >= 0 && s.table_slot[e] >= 0 ? s.table_slot[e] : -1;
+  s.neighbour[h * kNeighbours + n] = slot_around(s, s.next_homes().coord + 4 * h, n);
 }
 
 // Destination of every particle; its cell is counted from the new home from now on.
@@ -348,6 +346,8 @@ cudaError_t solver_build(const SolverView<T>& s, cudaStream_t stream) {
   slots_kernel<T><<<table, kThreads, 0, stream>>>(s);
   verdict_kernel<T><<<1, 1, 0, stream>>>(s);
   sites_kernel<T><<<table, kThreads, 0, stream>>>(s);
+  if (s.moments != nullptr)
+    edges_kernel<T><<<ctas(s.slot_capacity * kNeighbours), kThreads, 0, stream>>>(s);
   neighbours_kernel<T><<<ctas(s.home_capacity * kNeighbours), kThreads, 0, stream>>>(s);
   place_kernel<T><<<homes, kThreads, 0, stream>>>(s);
   invert_kernel<T><<<ctas(s.count), kThreads, 0, stream>>>(s);

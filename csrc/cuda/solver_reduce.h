@@ -1,4 +1,4 @@
-// Sums and maxima over a CTA of the resident solver's kernels.
+// Sums and maxima over a CTA of the resident solver's kernels; look-ups in its hash table.
 #pragma once
 
 #include "cuda/launch_solver.h"
@@ -63,6 +63,27 @@ __device__ inline bool last_to_arrive(int64_t* arrived, int64_t total) {
   __syncthreads();
   if (last) __threadfence();
   return last;
+}
+
+// Entry of a key in the hash table, -1 when it has none.
+template <typename T>
+__device__ int32_t find(const SolverView<T>& s, uint64_t key) {
+  const uint64_t mask = uint64_t(s.table_size) - 1;
+  uint64_t at = hash_key(key) & mask;
+  for (int64_t tries = 0; tries < s.table_size; ++tries, at = (at + 1) & mask) {
+    if (s.key[at] == key) return static_cast<int32_t>(at);
+    if (s.key[at] == kNoKey) return -1;
+  }
+  return -1;
+}
+
+// Slot of the field of block `c` (three coordinates, field) in block n of the 27 around it, or -1.
+// The table keeps its slots until the blocks are built anew.
+template <typename T>
+__device__ int32_t slot_around(const SolverView<T>& s, const int32_t* c, int n) {
+  const int32_t e =
+      find(s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, c[3]));
+  return e >= 0 && s.table_slot[e] >= 0 ? s.table_slot[e] : -1;
 }
 
 // Largest momentum bound and mass of the particles of one home.

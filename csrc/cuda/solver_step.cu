@@ -3,7 +3,7 @@
 // home, between windows 64 bits in a unit of the step, so that no order of additions changes a bit.
 // The units leave room for every particle at one node (csrc/core/solver_clock.h), so nothing
 // overflows.
-#include "cuda/solver_reduce.h"
+#include "cuda/solver_grid.h"
 
 namespace gsf::cuda {
 namespace {
@@ -168,140 +168,6 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
   }
 }
 
-// Reads the sums of one node and clears them for the next step.
-template <typename T>
-__device__ NodeSums<T> take_sums(const SolverView<T>& s, int64_t node, bool shared) {
-  NodeSums<T> out;
-  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
-  const longlong2 a = words[0], b = words[1];
-  words[0] = words[1] = longlong2{0, 0};
-  const double unit = s.clock->momentum_unit, mass_unit = s.clock->mass_unit;
-  out.momentum[0] = double(a.x) * unit;
-  out.momentum[1] = double(a.y) * unit;
-  out.momentum[2] = double(b.x) * unit;
-  out.mass = double(b.y) * mass_unit;
-  if (shared) {
-    int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
-    for (int c = 0; c < kContactMoments; ++c) {
-      out.moments[c] = T(double(m[c]) * mass_unit);
-      m[c] = 0;
-    }
-  }
-  return out;
-}
-
-// Colliders that can touch a node of the block, as bits; the lanes of a warp look at one each. A
-// sweeping or moving collider reaches as far as anything can move in the step. More than 64
-// colliders: the last bit stands for all the others.
-template <typename T>
-__device__ uint64_t colliders_near(const SolverView<T>& s, const Vec3<T>& middle) {
-  if (s.collider_count == 0) return 0;
-  const T reach = T(2.7) * s.dx + T(s.clock->dt) * T(s.clock->speed_seen);
-  uint64_t near = 0;
-  for (int first = 0; first < 64 && first < s.collider_count; first += 32) {
-    const int k = first + (threadIdx.x & 31);
-    bool touches = false;
-    if (k < s.collider_count && k < 63) {
-      const T* row = s.colliders + int64_t(k) * kColliderColumns;
-      Vec3<T> normal;
-      const T own = norm(load_vec3(row + kVelocity)) * T(s.clock->dt);
-      touches = collider_valid(row, 0) &&
-                collider_signed_distance(row, static_cast<const float*>(nullptr), middle, normal) <=
-                    reach + own;
-    }
-    near |= uint64_t(__ballot_sync(kAllLanes, touches)) << first;
-  }
-  if (s.collider_count > 63) near |= uint64_t(1) << 63;
-  return near;
-}
-
-template <typename T>
-__device__ void collide_one(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
-                            Vec3<T>& v) {
-  double impulse[3] = {0.0, 0.0, 0.0};
-  node_collide(s, k, x, mass, v, impulse);
-  const double per_unit = 1.0 / s.clock->momentum_unit;
-  for (int i = 0; i < 3; ++i) {
-    const long long units = __double2ll_rn(impulse[i] * per_unit);
-    if (units != 0)
-      atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
-                static_cast<unsigned long long>(units));
-  }
-}
-
-template <typename T>
-__device__ __noinline__ void collide_near(const SolverView<T>& s, uint64_t near, const Vec3<T>& x,
-                                          double mass, Vec3<T>& v) {
-  for (; near != 0; near &= near - 1) {
-    const int64_t k = __ffsll(static_cast<long long>(near)) - 1;
-    const int64_t last = k == 63 ? s.collider_count : k + 1;
-    for (int64_t i = k; i < last; ++i) collide_one(s, i, x, mass, v);
-  }
-}
-
-template <typename T>
-__device__ void store_velocity(const SolverView<T>& s, int64_t node, const Vec3<T>& v) {
-  T* out = s.node_velocity + 4 * node;
-  out[0] = v.x;
-  out[1] = v.y;
-  out[2] = v.z;
-}
-
-// A node that several fields may share: kept out of line, most scenes never come here.
-template <typename T>
-__device__ __noinline__ int shared_node(const SolverView<T>& s, const int32_t* slots, int local,
-                                        const Vec3<T>& x, uint64_t near, T dt) {
-  NodeSums<T> sums[kSiteFields];
-  Vec3<T> velocity[kSiteFields];
-  bool heavy[kSiteFields];
-  int count = 0;
-  for (; count < kSiteFields && slots[count] >= 0; ++count) {
-    const int64_t node = int64_t(slots[count]) * kBlockNodes + local;
-    sums[count] = take_sums(s, node, true);
-    heavy[count] = node_velocity(s, sums[count], dt, velocity[count]);
-  }
-  const int touched = node_contact(s, count, heavy, OwnNode<T>{sums}, velocity);
-  for (int f = 0; f < count; ++f) {
-    if (heavy[f] && near != 0) collide_near(s, near, x, sums[f].mass, velocity[f]);
-    store_velocity(s, int64_t(slots[f]) * kBlockNodes + local, velocity[f]);
-  }
-  return touched;
-}
-
-template <typename T>
-__global__ void __launch_bounds__(kThreads) grid_kernel(SolverView<T> s) {
-  const SolverClock& clock = *s.clock;
-  if (!may_step(clock)) return;
-  const int64_t site = int64_t(blockIdx.x) * (kThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
-  if (site >= clock.sites) return;
-  const int local = threadIdx.x % kBlockNodes;
-  const int32_t* slots = s.site_slots + site * kSiteFields;
-  const int32_t slot = slots[0];
-  if (slot < 0 || slot >= s.slot_capacity) return;
-  const int32_t* block = s.slot_coord + 4 * int64_t(slot);
-  const T dt = T(clock.dt);
-  const Vec3<T> x{(T(block[0]) * T(kBlockEdge) + T(local / 16)) * s.dx,
-                  (T(block[1]) * T(kBlockEdge) + T(local / 4 % 4)) * s.dx,
-                  (T(block[2]) * T(kBlockEdge) + T(local % 4)) * s.dx};
-  const Vec3<T> middle{(T(block[0]) * T(kBlockEdge) + T(1.5)) * s.dx,
-                       (T(block[1]) * T(kBlockEdge) + T(1.5)) * s.dx,
-                       (T(block[2]) * T(kBlockEdge) + T(1.5)) * s.dx};
-  const uint64_t near = colliders_near(s, middle);
-  int touched = 0;
-  if (slots[1] < 0) {
-    const int64_t node = int64_t(slot) * kBlockNodes + local;
-    const NodeSums<T> sums = take_sums(s, node, false);
-    Vec3<T> v;
-    if (node_velocity(s, sums, dt, v) && near != 0) collide_near(s, near, x, sums.mass, v);
-    store_velocity(s, node, v);
-  } else {
-    touched = shared_node(s, slots, local, x, near, dt);
-  }
-  if (touched > 0)
-    atomicAdd(reinterpret_cast<unsigned long long*>(&s.clock->touched),
-              static_cast<unsigned long long>(touched));
-}
-
 template <int kThreadsHere, typename T>
 __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_t home,
                           bool moving) {
@@ -438,6 +304,10 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     p2g_kernel<T, true><<<homes, kP2GThreads, 0, stream>>>(s);
   else
     p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
+  if (s.moments != nullptr)
+    contact_kernel<T>
+        <<<static_cast<unsigned>((s.slot_capacity + kContactSites - 1) / kContactSites),
+           kBlockNodes, 0, stream>>>(s);
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)

@@ -61,9 +61,33 @@ struct ColliderOps {
     return out;
   }
 
+  static Tensor blade_sides(Tensor position_in, Tensor blades_in, Tensor cut_in, double reach) {
+    const char* op = "blade_sides";
+    check_shape(op, "position", position_in, {-1, 3});
+    const int64_t points = position_in.size(0);
+    check_shape(op, "blades", blades_in, {-1, kBladeColumns});
+    check_dtype(op, "blades", blades_in, position_in.scalar_type());
+    check_same_device(op, "blades", blades_in, position_in);
+    check_shape(op, "cut", cut_in, {points});
+    check_dtype(op, "cut", cut_in, ScalarType::Int);
+    check_same_device(op, "cut", cut_in, position_in);
+    const Tensor position = gsf::contiguous(position_in), blades = gsf::contiguous(blades_in);
+    const Tensor cut = gsf::contiguous(cut_in);
+    const typename Backend::Scope scope(position);
+    const Tensor out = new_empty(position, {points}, ScalarType::Int);
+    dispatch_floating(op, position, [&]<typename T>() {
+      const BladeSidesArgs<T> a{
+          cptr<T>(position), cptr<T>(blades),       cptr<int32_t>(cut), points,
+          blades.size(0),    static_cast<T>(reach), mptr<int32_t>(out)};
+      Backend::blade_sides(a, scope);
+    });
+    return out;
+  }
+
   static void register_all(torch::stable::detail::StableLibrary& m) {
     m.impl("collider_distance", TORCH_BOX(&ColliderOps::distance));
     m.impl("advance_colliders", TORCH_BOX(&ColliderOps::advance));
+    m.impl("blade_sides", TORCH_BOX(&ColliderOps::blade_sides));
   }
 };
 

@@ -248,8 +248,9 @@ struct MpmOps {
 
   static std::tuple<Tensor, Tensor, Tensor, Tensor> grid_update(
       Tensor grid_in, OptTensor moments, OptTensor colliders, OptTensor sdf, OptTensor merged,
-      Tensor table, Tensor coords, Ints origin, double dx, double dt, double gravity_x,
-      double gravity_y, double gravity_z, double friction, double restitution, double contact_gap) {
+      OptTensor cut, Tensor table, Tensor coords, Ints origin, double dx, double dt,
+      double gravity_x, double gravity_y, double gravity_z, double friction, double restitution,
+      double contact_gap) {
     const char* op = "grid_update";
     const int64_t fields = grid_in.dim() > 0 ? grid_in.size(0) : 0;
     check_fields(op, fields);
@@ -261,6 +262,7 @@ struct MpmOps {
         ready(op, "moments", moments, grid, {fields, count, kBlockNodes, kContactMoments}, type);
     const OptTensor rows = ready(op, "colliders", colliders, grid, {-1, kColliderColumns}, type);
     const OptTensor groups = ready(op, "merged", merged, grid, {fields}, ScalarType::Long);
+    const OptTensor sides = ready(op, "cut", cut, grid, {fields}, ScalarType::Int);
     const OptTensor distances = ready(op, "sdf", sdf, grid, {-1}, ScalarType::Float);
     STD_TORCH_CHECK(dx > 0, op, ": dx must be positive, got ", dx);
     const int64_t rows_count = rows.has_value() ? rows->size(0) : 0;
@@ -278,6 +280,7 @@ struct MpmOps {
       a.count = count;
       a.fields = static_cast<int32_t>(fields);
       a.merged = reinterpret_cast<const uint64_t*>(pointer<int64_t>(groups));
+      a.cut = pointer<int32_t>(sides);
       a.grid = cptr<T>(grid);
       a.moments = pointer<T>(mom);
       a.colliders = pointer<T>(rows);

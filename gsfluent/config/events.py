@@ -168,7 +168,7 @@ class Pour:
         doc="How long it flows at that speed [s]; this or volume.",
         example="0.4",
     )
-    material: str = key(preset, default="water", doc="What flows: a preset.", example="jelly")
+    material: str = key(preset, default="water", doc="What flows: a preset.", example="milk")
     at: float = key(number(0.0), default=0.0, doc="When it begins to flow [s].", example="0.2")
 
 

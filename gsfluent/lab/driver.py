@@ -2,19 +2,43 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.lab.stepper import Scene, Stepper
+from gsfluent.lab.resident import Resident, why_not
+from gsfluent.lab.stepper import Scene, Stepper, automatic_dt
 
-__all__ = ["World"]
+__all__ = ["World", "running_on"]
 
 Force = Callable[["World", float], None]
+
+_place: list[torch.device] = []
+_engine: list[Literal["solver", "ops"] | None] = []
+
+
+@contextlib.contextmanager
+def running_on(
+    device: str | torch.device, engine: Literal["solver", "ops"] | None = None
+) -> Iterator[None]:
+    """Choose where, and by what, every World built inside the block runs that does not say.
+
+    Args:
+        device: Where its tensors are.
+        engine: ``"ops"`` to keep the resident solver out.
+    """
+    _place.append(torch.device(device))
+    _engine.append(engine)
+    try:
+        yield
+    finally:
+        _place.pop()
+        _engine.pop()
 
 
 class World:
@@ -45,7 +69,10 @@ class World:
         force: ``force(world, dt)``, called before every step; adds to ``world.velocity``.
         period: Length of the domain on each axis [m], a whole number of ``dx`` from 0, or None
             where it is not periodic.
-        device: Where to run.
+        device: Where to run; default that of :func:`running_on`, else of ``position``.
+        engine: ``"solver"``: :class:`gsfluent.ops.Solver`, the state stays on the device;
+            ``"ops"``: p2g, grid_update, g2p and return_mapping step by step. None: the solver
+            where it can do the job, which is without ``force`` and ``period``.
         irreversible: Broken NACC material does not regain its cohesion.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
@@ -80,6 +107,7 @@ class World:
         force: Force | None = None,
         period: Sequence[float | None] = (None, None, None),
         device: str | torch.device | None = None,
+        engine: Literal["solver", "ops"] | None = None,
         irreversible: bool = True,
         **return_map: Any,
     ):
@@ -89,7 +117,9 @@ class World:
             raise ValueError(f"World: cfl must be in (0, 2], got {cfl}")
         if any(p is not None and abs(p / dx - round(p / dx)) > 1e-9 for p in period):
             raise ValueError(f"World: period must be a whole number of dx = {dx}, got {period}")
-        device = torch.device(device) if device is not None else position.device
+        if device is None:
+            device = _place[-1] if _place else position.device
+        device = torch.device(device)
         count = position.shape[0]
 
         def number(value: Tensor | Sequence[float] | float | None, *shape: int) -> Tensor:
@@ -124,9 +154,19 @@ class World:
             return_map=return_map,
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()
-        self.stepper = Stepper(
+        obstacle = why_not(self.scene, force is not None)
+        if engine not in ("solver", "ops", None):
+            raise ValueError(f"World: engine must be 'solver', 'ops' or None, got {engine!r}")
+        if engine == "solver" and obstacle:
+            raise ValueError(f"World: engine 'solver' cannot run this: {obstacle}")
+        if engine is None and _engine:
+            engine = _engine[-1]
+        self.engine: str = "ops" if engine == "ops" or obstacle else "solver"
+        """What runs it, ``"solver"`` or ``"ops"``."""
+        wide = torch.float64 if self.engine == "solver" else dtype  # it keeps cell and offset
+        self.stepper: Stepper | Resident = (Resident if self.engine == "solver" else Stepper)(
             self.scene,
-            number(position, count, 3),
+            torch.as_tensor(position, dtype=wide, device=device).clone().contiguous(),
             number(velocity, count, 3),
             number(affine, count, 3, 3),
             number(strain, count, 6),
@@ -134,7 +174,7 @@ class World:
             one if deformation else None,
         )
         self.force = force
-        self.dt = self.stepper.limit()
+        self.dt = automatic_dt(self.scene, self.strain, self.velocity, self.affine)
         """The latest time step [s]; before the first one, its size."""
 
     def run(
@@ -160,6 +200,10 @@ class World:
         if (seconds is None) == (steps is None):
             raise ValueError("World.run: give either seconds or steps")
         end = self.time + (seconds or 0.0)
+        if isinstance(self.stepper, Resident):
+            self.stepper.run(end if steps is None else None, steps, self._told(each))
+            self.dt = self.stepper.solver.dt or self.dt
+            return self
         first = self.steps
         while self.time < end if steps is None else self.steps - first < steps:
             dt = self.stepper.limit()
@@ -178,6 +222,24 @@ class World:
             if each is not None:
                 each(self)
         return self
+
+    def _told(self, each: Callable[[World], None] | None) -> Callable[[float], None] | None:
+        if each is None:
+            return None
+
+        def tell(dt: float) -> None:
+            self.dt = dt
+            each(self)
+
+        return tell
+
+    def _stepwise(self, what: str) -> Stepper:
+        if isinstance(self.stepper, Resident):
+            raise ValueError(
+                f"World: {what} can be set only while the state is outside the solver; "
+                "set it in a force, or build the world with engine='ops'"
+            )
+        return self.stepper
 
     @property
     def time(self) -> float:
@@ -201,7 +263,7 @@ class World:
 
     @velocity.setter
     def velocity(self, value: Tensor) -> None:
-        self.stepper.velocity = value
+        self._stepwise("velocity").velocity = value
 
     @property
     def affine(self) -> Tensor:
@@ -210,7 +272,7 @@ class World:
 
     @affine.setter
     def affine(self, value: Tensor) -> None:
-        self.stepper.affine = value
+        self._stepwise("affine").affine = value
 
     @property
     def strain(self) -> Tensor:

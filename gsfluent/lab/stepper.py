@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsfluent import ops
 
-__all__ = ["Scene", "Stepper", "wave_speed"]
+__all__ = ["Scene", "Stepper", "automatic_dt", "wave_speed"]
 
 REACH = 3.0
 """Width of the layer that is repeated behind a periodic face [dx]: a point reads nodes up to 1.5
@@ -77,6 +77,29 @@ def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
     return torch.sqrt(torch.where(law == LAW_FLUID, fluid, solid) / density)
 
 
+def automatic_dt(scene: Scene, strain: Tensor, velocity: Tensor, affine: Tensor) -> float:
+    """Time step [s] of a scene in a state: the fixed one, or cfl * dx / (wave speed + speed).
+
+    Raises:
+        FloatingPointError: The state allows none.
+    """
+    if scene.fixed_dt is not None:
+        return scene.fixed_dt
+    rows = scene.material.long()
+    speed = wave_speed(strain, scene.law[rows], scene.params[rows]).max()
+    fastest = float(speed + velocity.norm(dim=1).max())
+    dt = scene.cfl * scene.dx / fastest if fastest > 0 else float("inf")
+    steepest = float(torch.linalg.matrix_norm(affine).max())
+    if steepest > 0:
+        dt = max(min(dt, GRADIENT_LIMIT / steepest), 0.25 * dt)
+    if not 0.0 < dt < float("inf"):
+        raise FloatingPointError(
+            f"no time step: fastest wave and point {fastest:.3g} m/s, "
+            f"velocity gradient {steepest:.3g} 1/s"
+        )
+    return dt
+
+
 class Stepper:
     """State of the points and the step that advances it; precision is that of the tensors."""
 
@@ -100,8 +123,9 @@ class Stepper:
         self.info = torch.zeros(4, dtype=torch.int64, device=position.device)
         self._blocks: ops.Blocks | None = None
         self._travelled = 0.0
-        # the stress of the first step belongs to the strain given: a step without motion
-        self.stress = self._map(torch.zeros_like(affine), 0.0)[2]
+        # the stress of the first step belongs to the strain given: a step without motion, of a
+        # length that only viscosity reads
+        self.stress = self._map(torch.zeros_like(affine), 1.0)[2]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
@@ -118,27 +142,12 @@ class Stepper:
         law, params, material = self._rows()
         return ops.return_mapping(
             self.strain, self.alpha, increment,
-            law=law, params=params, material=material, **self.scene.return_map,
+            law=law, params=params, material=material, dt=dt, **self.scene.return_map,
         )  # fmt: skip
 
     def limit(self) -> float:
         """Time step [s]: the fixed one, or the automatic one of the current state."""
-        scene = self.scene
-        if scene.fixed_dt is not None:
-            return scene.fixed_dt
-        rows = scene.material.long()
-        speed = wave_speed(self.strain, scene.law[rows], scene.params[rows]).max()
-        fastest = float(speed + self.velocity.norm(dim=1).max())
-        dt = scene.cfl * scene.dx / fastest if fastest > 0 else float("inf")
-        steepest = float(torch.linalg.matrix_norm(self.affine).max())
-        if steepest > 0:
-            dt = max(min(dt, GRADIENT_LIMIT / steepest), 0.25 * dt)
-        if not 0.0 < dt < float("inf"):
-            raise FloatingPointError(
-                f"no time step: fastest wave and point {fastest:.3g} m/s, "
-                f"velocity gradient {steepest:.3g} 1/s, after {self.steps} steps"
-            )
-        return dt
+        return automatic_dt(self.scene, self.strain, self.velocity, self.affine)
 
     def advance(self, dt: float) -> None:
         """Advance by one step of ``dt`` seconds."""

@@ -137,21 +137,21 @@ def _g2p_backward(
 
 
 def _grid_update_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    grid, moments, colliders, sdf, merged, table, coords = inputs[:7]
+    grid, moments, colliders, sdf, merged, cut, table, coords = inputs[:8]
     if colliders is not None and ctx.needs_input_grad[2]:
         raise NotImplementedError(
             "grid_update: no gradient with respect to colliders; detach the rows"
         )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(grid, moments, colliders, sdf, merged, table, coords)
-    ctx.options = inputs[7:]
+    ctx.save_for_backward(grid, moments, colliders, sdf, merged, cut, table, coords)
+    ctx.options = inputs[8:]
 
 
 def _grid_update_backward(
     ctx: Any, g_velocity: Tensor | None, g_impulse: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    grid, moments, colliders, sdf, merged, table, coords = ctx.saved_tensors
-    rest: tuple[None, ...] = (None,) * 14
+    grid, moments, colliders, sdf, merged, cut, table, coords = ctx.saved_tensors
+    rest: tuple[None, ...] = (None,) * 15
     if g_velocity is None and g_impulse is None:
         return None, None, *rest
     free = moments is None and merged is None
@@ -165,7 +165,17 @@ def _grid_update_backward(
         g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
         return torch.cat([g_momentum, g_mass], dim=-1), None, *rest
     g_grid, g_moments = torch.ops.gsfluent.grid_update_backward(
-        g_velocity, g_impulse, grid, moments, colliders, sdf, merged, table, coords, *ctx.options
+        g_velocity,
+        g_impulse,
+        grid,
+        moments,
+        colliders,
+        sdf,
+        merged,
+        cut,
+        table,
+        coords,
+        *ctx.options,
     )
     return g_grid, g_moments if moments is not None else None, *rest
 
@@ -179,6 +189,7 @@ def _grid_update_by_reference(
     colliders: Tensor | None,
     sdf: Tensor | None,
     merged: Tensor | None,
+    cut: Tensor | None,
     table: Tensor,
     coords: Tensor,
     origin: Sequence[int],
@@ -208,6 +219,7 @@ def _grid_update_by_reference(
             sdf=sdf,
             moments=moments,
             merged=None if merged is None else pairs(merged),
+            cut=cut,
             friction=friction,
             restitution=restitution,
             contact_gap=contact_gap,

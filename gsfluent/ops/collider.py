@@ -27,12 +27,14 @@ COLUMNS_BEFORE = 16
 SDF_ALIGN = 64
 """Distance grids start at multiples of this in their common buffer."""
 
-TYPES = {"nothing": -1, "plane": 0, "sphere": 1, "box": 2, "capsule": 3, "cylinder": 4, "sdf": 5}
+TYPES = {"nothing": -1, "plane": 0, "sphere": 1, "box": 2, "capsule": 3, "cylinder": 4, "sdf": 5,
+         "face": 6}  # fmt: skip
 MODES = {"sticky": 0, "slip": 1, "separate": 2}
 
 # Columns, as in csrc/core/collider_shape.h.
 TYPE, MODE, FRICTION, POINT, NORMAL, RADIUS, VELOCITY, RESTITUTION = 0, 1, 2, 3, 6, 9, 10, 13
 MASS, SWEEP, ORIENTATION, ANGULAR_VELOCITY, INERTIA, EXTENT, OFFSET = 14, 15, 16, 20, 23, 26, 29
+ONLY_CUT = 30
 
 
 def collider_row(
@@ -52,18 +54,21 @@ def collider_row(
     inertia: Sequence[float] = (0.0, 0.0, 0.0),
     sweep: bool = False,
     offset: int = 0,
+    only_cut: int = 0,
 ) -> Tensor:
     """One collider as a row.
 
     Args:
         kind: ``plane`` (the half space behind it, or the round bar behind its disc of ``radius``),
             ``sphere``, ``box``, ``capsule`` and ``cylinder`` (axis along z of the body frame),
-            ``sdf`` (signed distances on a grid), ``nothing`` (an empty row).
+            ``sdf`` (signed distances on a grid), ``face`` (the half space under a rectangle in the
+            plane z = 0 of the body frame, nothing beyond its rim), ``nothing`` (an empty row).
         point: Plane point or centre [m]; the collider turns about it.
         normal: Plane: normal out of it. ``sdf``: position of the first value in the body frame [m].
         radius: Of sphere, capsule, cylinder, disc [m]; ``sdf``: distance between values [m].
-        extent: Box: half edges; capsule and cylinder: half length as third number [m]; ``sdf``:
-            number of values along x, y, z, each 2 to 4096.
+        extent: Box, face: half edges (of a face the third is its depth); capsule and cylinder:
+            half length as third number [m]; ``sdf``: number of values along x, y, z, each 2 to
+            4096.
         mode: ``sticky``, ``slip`` (no normal motion) or ``separate`` (may leave; friction and
             restitution on approach).
         friction: Coulomb coefficient, >= 0.
@@ -76,6 +81,8 @@ def collider_row(
         sweep: Also hit what lies on its way during a step; for bodies that move more than about
             half their thickness per step.
         offset: ``sdf``: index of the first value in the buffer, a multiple of 64.
+        only_cut: 0, or bit number + 1 of ``cut``: acts only on fields that have this bit
+            (:func:`gsfluent.ops.blade_sides`).
 
     Returns:
         float64 [32]. Stack rows and cast them to the dtype of the grid for
@@ -94,7 +101,7 @@ def collider_row(
     row = torch.zeros(COLLIDER_COLUMNS, dtype=torch.float64)
     row[TYPE], row[MODE], row[FRICTION] = TYPES[kind], MODES[mode], friction
     row[RADIUS], row[RESTITUTION], row[MASS], row[SWEEP] = radius, restitution, mass, float(sweep)
-    row[OFFSET] = offset // SDF_ALIGN
+    row[OFFSET], row[ONLY_CUT] = offset // SDF_ALIGN, only_cut
     for name, column, value, count in (
         ("point", POINT, point, 3),
         ("normal", NORMAL, normal, 3),
@@ -140,9 +147,11 @@ def check_colliders(op: str, rows: Tensor, sdf_count: int) -> None:
             (kind == 3) & (radius > 0),
             (kind == 4) & (radius > 0) & (extent[:, 2] > 0),
             (kind == 5) & (radius > 0) & whole,
+            (kind == 6) & (extent > 0).all(dim=1),
         ]
     ).any(dim=0)
     right = shape & ((mode == 0) | (mode == 1) | (mode == 2))
+    right &= (rows[:, ONLY_CUT] >= 0) & (rows[:, ONLY_CUT] <= 30)
     right &= (rows[:, FRICTION] >= 0) & (rows[:, MASS] >= 0) & (radius >= 0)
     right &= (rows[:, RESTITUTION] >= 0) & (rows[:, RESTITUTION] <= 1)
     right &= (rows[:, INERTIA:OFFSET] >= 0).all(dim=1)
@@ -150,12 +159,13 @@ def check_colliders(op: str, rows: Tensor, sdf_count: int) -> None:
     right &= torch.isfinite(rows).all(dim=1)
     if not bool(right.all()):
         i = int((~right).nonzero()[0])
+        got = [round(v, 6) for v in rows[i].tolist()]
         raise ValueError(
             f"{op}: colliders row {i} must be finite, with type 0 (plane: normal not zero, no "
             "mass), 1 (sphere: radius > 0), 2 (box: half edges > 0), 3 (capsule: radius > 0), "
             "4 (cylinder: radius and half length > 0), 5 (sdf: spacing > 0, its values inside the "
-            "buffer) or -1 (nothing), mode 0, 1 or 2, friction >= 0, mass and inertia >= 0 and "
-            f"restitution in [0, 1], got {[round(v, 6) for v in rows[i].tolist()]}"
+            "buffer), 6 (face: half edges > 0) or -1 (nothing), mode 0, 1, 2, friction >= 0, mass "
+            f"and inertia >= 0 and restitution in [0, 1], got {got}"
         )
 
 

@@ -140,6 +140,7 @@ def grid_update(
     sdf: Tensor | None = ...,
     moments: Tensor | None = ...,
     merged: Tensor | None = ...,
+    cut: Tensor | None = ...,
     friction: float = ...,
     restitution: float = ...,
     contact_gap: float = ...,
@@ -159,6 +160,7 @@ def grid_update(
     sdf: Tensor | None = ...,
     moments: Tensor | None = ...,
     merged: Tensor | None = ...,
+    cut: Tensor | None = ...,
     friction: float = ...,
     restitution: float = ...,
     contact_gap: float = ...,
@@ -177,6 +179,7 @@ def grid_update(
     sdf: Tensor | None = None,
     moments: Tensor | None = None,
     merged: Tensor | None = None,
+    cut: Tensor | None = None,
     friction: float = 0.3,
     restitution: float = 0.0,
     contact_gap: float = 1.0,
@@ -204,6 +207,8 @@ def grid_update(
         moments: From :func:`p2g` with ``contact=True``; None switches contact off.
         merged: Pairs of fields that are parts of one body and move as one (at shared nodes: one
             velocity, no contact), bool [K, K], taken as symmetric and transitive.
+        cut: Sides of blades that each field lies on (:func:`gsfluent.ops.blade_sides`), int32
+            [K]; colliders with ``only_cut`` act on those fields only.
         friction: Coulomb coefficient between fields, >= 0.
         restitution: Of contact between fields, in [0, 1].
         contact_gap: Centroid separation [dx] below which fields touch; 1.0 to 1.1 is right for
@@ -239,6 +244,8 @@ def grid_update(
     if merged is not None:
         check_tensor(op, "merged", merged, shape=(fields, fields), dtype=torch.bool, like=grid)
         merged = _pair_bits(merged)
+    if cut is not None:
+        check_tensor(op, "cut", cut, shape=(fields,), dtype=torch.int32, like=grid)
     rows = None if colliders is None else check_rows(op, colliders, sdf, grid)
     if len(gravity) != 3:
         raise ValueError(f"{op}: gravity must have three numbers, got {len(gravity)}")
@@ -254,6 +261,7 @@ def grid_update(
         rows,
         sdf,
         merged,
+        cut,
         blocks.table,
         blocks.coords,
         blocks.origin,

@@ -136,7 +136,7 @@ def return_mapping(
       beyond ``p = -c``, with volume correction.
     * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``.
     * 4 ``fluid``: ``p = max(K/gamma (J^-gamma - 1), 0)`` and Newtonian viscosity; the strain is
-      ``(J^(2/3) - 1) I`` and J follows ``exp(tr A)``.
+      ``(J^(2/3) - 1) I`` and J follows ``det(I + A)``.
     * 5 ``rigid``: no strain, no stress; how the body moves is the solver's matter.
 
     The stored energy never increases. See docs/return-mapping.md and docs/materials.md.

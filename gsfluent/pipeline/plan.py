@@ -177,6 +177,7 @@ def _time_step(matter: Matter, blocks: ops.Blocks, dt: float) -> float:
             law=matter.law,
             params=matter.params,
             material=p.material,
+            dt=dt,
         )
         if p.device.type == "cuda":
             torch.cuda.synchronize(p.device)

@@ -7,6 +7,7 @@ float64, rolled back with the matter, and never written in place.
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any
 
@@ -16,9 +17,17 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.ops import collider as columns
 from gsfluent.scene import Collider, Scene
+from gsfluent.scene_parts import turned
+
+_log = logging.getLogger(__name__)
 
 SMALLEST = 0.9
 """A free ball is never smaller than this many cells for the grid, or it could lie between nodes."""
+THINNEST = 2.0
+"""Cells below which the grid does not hold matter out of a box reliably."""
+BACKED = 6.0
+"""Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
+it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -197,6 +206,16 @@ class RigidSet:
                 for x, v, g in zip(point, velocity, self._gravity, strict=True)
             ]
         shape: dict[str, Any] = {"point": point, "orientation": c.orientation} | extra
+        if c.backed:
+            half = 0.5 * max(c.size[2], BACKED * self.dx)
+            back = turned(c.orientation, (0.0, 0.0, 0.5 * c.size[2] - half))
+            shape["point"] = [a + b for a, b in zip(point, back, strict=True)]
+            shape["extent"] = [0.5 * c.size[0], 0.5 * c.size[1], half]
+        elif c.kind == "box" and min(c.size) < THINNEST * self.dx:
+            _log.warning(
+                "%s is %.3g m thin, under %g cells of %.3g m: matter may pass through it",
+                c.name, min(c.size), THINNEST, self.dx,
+            )  # fmt: skip
         if c.kind == "mesh":
             shape["point"] = [a + b for a, b in zip(point, extra["point"], strict=True)]
         return ops.collider_row(
@@ -250,7 +269,7 @@ class RigidSet:
         axes = torch.from_numpy(body.axes.copy())
         extra = {
             "point": (turn @ torch.from_numpy(body.center.copy())).tolist(),
-            "orientation": _quaternion(turn @ axes),
+            "orientation": quaternion_of(turn @ axes),
             "normal": body.corner.tolist(),
             "radius": body.spacing,
             "extent": list(body.values.shape),
@@ -293,7 +312,7 @@ def _matrix(q: tuple[float, float, float, float]) -> Tensor:
     )
 
 
-def _quaternion(matrix: Tensor) -> list[float]:
+def quaternion_of(matrix: Tensor) -> list[float]:
     """Unit quaternion w, x, y, z of a rotation matrix."""
     from scipy.spatial.transform import Rotation
 

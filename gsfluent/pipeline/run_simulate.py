@@ -8,12 +8,12 @@ from typing import Any
 import torch
 
 from gsfluent import materials
-from gsfluent.config import ObjectSettings, Shot, collider_dict, event_dict
+from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Particles, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
-from gsfluent.pipeline.run_store import fingerprint
+from gsfluent.pipeline.run_store import content_digest, fingerprint
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.scene import Scene
 
@@ -61,6 +61,14 @@ def bullet_splats(particles: Particles, scene: Scene) -> Gaussians | None:
     return Gaussians.from_colors(position, scales, grey, opacities=0.95, label=SURFACE)
 
 
+def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
+    """What a collider depends on: its settings, and the content of its mesh instead of its path."""
+    keys = collider_dict(collider)
+    if "mesh" in keys:
+        keys["mesh"] = content_digest(Path(keys["mesh"]))
+    return keys
+
+
 def _material(settings: ObjectSettings) -> Material:
     return materials.get(settings.material).override(**dict(settings.overrides))
 
@@ -82,7 +90,7 @@ def simulate_stage(context: RunContext) -> None:
     settings = [
         objects,
         [event_dict(event) for event in shot.events],
-        [collider_dict(collider) for collider in shot.colliders],
+        [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction],
         shot.solve.quality,
         shot.output.fps,

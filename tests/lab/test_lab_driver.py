@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsfluent.lab import registry
-from gsfluent.lab.driver import World
+from gsfluent.lab.driver import World, running_on
 from gsfluent.lab.registry import Result, compare
 from gsfluent.lab.shapes import ball, box, parameters, rotation
 
@@ -27,16 +27,18 @@ def cube(**changes: object) -> World:
     return World(points, [0.3, -0.2, 0.1], **{**given, **changes})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("engine", ["solver", "ops"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_a_run_ends_exactly_on_time_and_keeps_momentum(dtype: torch.dtype) -> None:
-    world = cube(dtype=dtype)
+def test_a_run_ends_exactly_on_time_and_keeps_momentum(dtype: torch.dtype, engine: str) -> None:
+    world = cube(dtype=dtype, engine=engine)
+    assert world.engine == engine
     before = world.momentum()
     calls = []
     world.run(0.0123, each=lambda w: calls.append(w.time))
     assert world.time == 0.0123 == calls[-1] and len(calls) == world.steps > 5
     bound = 1e-14 if dtype == torch.float64 else 1e-6
     assert torch.allclose(world.momentum(), before, rtol=bound, atol=0.0)
-    assert world.position.dtype == dtype
+    assert world.velocity.dtype == dtype
 
 
 def test_a_fixed_step_is_kept_and_the_force_acts_once_a_step() -> None:
@@ -101,10 +103,34 @@ def test_bad_requests_are_refused() -> None:
         cube(period=(0.03, None, None))
     with pytest.raises(ValueError, match="either seconds or steps"):
         cube().run()
-    broken = cube(dt=1e-4)
+    with pytest.raises(ValueError, match="a force changes velocities"):
+        cube(engine="solver", force=lambda world, dt: None)
+    with pytest.raises(ValueError, match="outside the solver"):
+        cube().velocity = torch.zeros(192, 3)
+    broken = cube(dt=1e-4, engine="ops")
     broken.velocity = broken.velocity * float("nan")
     with pytest.raises((FloatingPointError, ValueError)):
         broken.run(steps=2)
+
+
+def test_both_engines_do_the_same_and_the_default_is_the_solver_where_it_can() -> None:
+    assert cube().engine == "solver" and cube(force=lambda world, dt: None).engine == "ops"
+    with running_on("cpu", "ops"):
+        assert cube().engine == "ops"
+    floor = torch.zeros(1, 16, dtype=torch.float64)
+    floor[0, 1], floor[0, 2], floor[0, 5], floor[0, 8] = 2.0, 0.4, 0.045, 1.0
+    body = (torch.arange(192) % 4 >= 2).to(torch.int32)
+    ends = [
+        cube(
+            engine=engine, gravity=(0.0, 0.0, -9.81), colliders=floor, body=body, friction=0.2,
+            deformation=True, dt=4e-4,
+        ).run(steps=60)
+        for engine in ("solver", "ops")
+    ]  # fmt: skip
+    for name in ("position", "velocity", "affine", "strain", "stress", "impulse", "deformation"):
+        a, b = (getattr(world, name).double() for world in ends)
+        assert float((a - b).abs().max()) <= 1e-9 * float(b.abs().max()), name
+    assert ends[0].time == pytest.approx(ends[1].time) and ends[0].steps == ends[1].steps
 
 
 def test_a_result_is_judged_by_its_error() -> None:

@@ -251,7 +251,7 @@ def test_opcheck(grad: bool) -> None:
     where = (blocks.table, blocks.coords, blocks.origin)
     for merged in (None, pairs):
         torch.library.opcheck(
-            lib.grid_update.default, (grid, moments, None, None, merged, *where, *rest)
+            lib.grid_update.default, (grid, moments, None, None, merged, None, *where, *rest)
         )
     position = position.detach()
     torch.library.opcheck(lib.p2g_adjoint.default, (grid.detach(), position, body, *index, DX))

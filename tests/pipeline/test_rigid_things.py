@@ -146,9 +146,10 @@ def test_a_press_squeezes_and_does_work() -> None:
     run = run_of(scene)
     go(run, 4)
     top = float(run.state.particles.position[:, 2].max())
-    face = float(run.state.colliders[1, 5]) - 0.5 * scene.colliders[0].size[2]
+    face = float(run.state.colliders[1, 5] - run.state.colliders[1, 28])
     assert face == pytest.approx(0.2 - 0.06, abs=1e-6)
-    assert face - 1.2 * DX < top < face + 0.3 * DX
+    # The grid holds nodes, not points: matter sinks in by a fraction of a cell.
+    assert face - 1.2 * DX < top < face + 0.5 * DX
     # The work of the plate is what the ball now stores, at least.
     assert float(run.state.work) > run.figures.elastic > 0.1
 

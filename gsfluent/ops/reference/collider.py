@@ -99,6 +99,9 @@ def signed_distance(row: Tensor, sdf: Tensor | None, x: Tensor) -> tuple[Tensor,
         top = torch.where(p[..., 2:] < 0, -up, up)
         side = flat.norm(dim=-1) - radius
         d, normal = _corner(p[..., 2].abs() - half, top, side, _unit(flat, (1.0, 0.0, 0.0)))
+    elif kind == 6:
+        over = (p[..., :2].abs() <= row[26:28]).all(dim=-1) & (p[..., 2] >= -half)
+        d, normal = torch.where(over, p[..., 2], torch.inf), up.expand_as(p)
     else:
         assert sdf is not None
         d, normal = _grid(row, sdf, p)
@@ -114,6 +117,7 @@ def give(row: Tensor, contact_mass: Tensor) -> Tensor:
     bounds = {
         1: r,
         2: e.norm(),
+        6: e.norm(),
         3: r + e[2],
         4: torch.hypot(r, e[2]),
         5: torch.maximum(-row[6:9], row[6:9] + (e - 1) * r).norm(),
@@ -123,6 +127,15 @@ def give(row: Tensor, contact_mass: Tensor) -> Tensor:
     if kind == 1:
         turning = turning * (mode == 0) + turning * (mode == 2) * mu**2 / (1 + mu**2)
     return 1 / (1 + contact_mass / mass * (1 + turning))
+
+
+def acting_mass(row: Tensor, mass: Tensor, cut: Tensor | None) -> Tensor:
+    """Masses [K, ...] of the fields that a collider acts on; 0 for the others."""
+    if row[30] == 0:
+        return mass
+    sides = torch.zeros(mass.shape[0], dtype=torch.int32) if cut is None else cut
+    acts = (sides.to(mass.device) >> (int(row[30]) - 1)) & 1
+    return torch.where(acts.view(-1, *(1,) * (mass.ndim - 1)) != 0, mass, 0.0)
 
 
 def first_touch(

@@ -21,7 +21,7 @@ from gsfluent.ops.reference.tensors import (
 
 SAND, METAL, FLUID, RIGID, COROTATED = 2, 3, 4, 5, 6
 FLUID_EXPONENT, GAP_MAX = 7.0, 0.5
-FLUID_J_MIN, FLUID_J_MAX, FLUID_STEP_MAX = 0.6, 1.2, math.log(1.25)
+FLUID_J_MIN, FLUID_J_MAX, FLUID_STEPS = 0.6, 1.2, (0.8, 1.25)
 LOG_J_MIN = math.log(FLUID_J_MIN)
 _ROOT = (2.0 / 3.0) ** 0.5
 
@@ -109,9 +109,9 @@ def fluid(strain: Tensor, alpha: Tensor, increment: Tensor, m: Material, dt: flo
     by_volume = torch.expm1(torch.log1p(j2m1) / 3.0)
     # The value of an isotropic strain is x itself; its derivative is that of the volume.
     x = by_volume + torch.where(same, x - by_volume, 0.0).detach()
-    growth = increment.diagonal(dim1=1, dim2=2).sum(1)
-    step = growth.clamp(-FLUID_STEP_MAX, FLUID_STEP_MAX)
-    x = x + (1.0 + x) * torch.expm1(2.0 / 3.0 * step)
+    growth = det_minus_one(increment)
+    step = growth.clamp(FLUID_STEPS[0] - 1.0, FLUID_STEPS[1] - 1.0)
+    x = x + (1.0 + x) * torch.expm1(2.0 / 3.0 * torch.log1p(step))
     lo, hi = FLUID_J_MIN ** (2.0 / 3.0) - 1.0, FLUID_J_MAX ** (2.0 / 3.0) - 1.0
     guarded, plastic = (step != growth) | (x < lo), x > hi
     x = x.clamp(lo, hi)
@@ -121,7 +121,8 @@ def fluid(strain: Tensor, alpha: Tensor, increment: Tensor, m: Material, dt: flo
     pressure = torch.where(x < 0, m.kappa / gamma * torch.expm1(-gamma * log_j), 0.0)
     stress = diagonal(-j * pressure)
     if dt > 0:
-        rate = to_sym(increment + increment.mT) - diagonal(2.0 / 3.0 * growth)
+        spread = increment.diagonal(dim1=1, dim2=2).sum(1)
+        rate = to_sym(increment + increment.mT) - diagonal(2.0 / 3.0 * spread)
         stress = stress + (j * m.friction / dt)[:, None] * rate
     return Returned(diagonal(x), alpha, stress, plastic, guarded)
 

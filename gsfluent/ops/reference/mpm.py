@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsfluent.ops.collider import pad_colliders
 from gsfluent.ops.mpm import Blocks
-from gsfluent.ops.reference.collider import collide
+from gsfluent.ops.reference.collider import acting_mass, collide
 from gsfluent.ops.reference.contact import STEPS, contact, groups, merge
 
 
@@ -154,6 +154,7 @@ def grid_update(
     sdf: Tensor | None = None,
     moments: Tensor | None = None,
     merged: Tensor | None = None,
+    cut: Tensor | None = None,
     friction: float = 0.3,
     restitution: float = 0.0,
     contact_gap: float = 1.0,
@@ -187,7 +188,7 @@ def grid_update(
     impulses, torques = [], []
     x = blocks.node_positions(dx, grid.dtype)
     for row in [] if colliders is None else pad_colliders(colliders):
-        after = collide(row, sdf, x, velocity, mass[..., 0], dx, dt)
+        after = collide(row, sdf, x, velocity, acting_mass(row, mass[..., 0], cut), dx, dt)
         given = (mass * (after - velocity)).double()
         impulses.append(given.sum(dim=(0, 1, 2)))
         arm = (x - row[3:6]).double().expand_as(given)
