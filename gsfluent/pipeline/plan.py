@@ -25,7 +25,7 @@ from gsfluent.pipeline.orient import DEFAULT_SIZE, make_frame
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.run_simulate import build_scene
 from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_step import CFL
+from gsfluent.pipeline.simulate_solver import CFL
 from gsfluent.scene import Body, Scene
 
 _STAND_IN_VOXELS = 48
