@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.errors import InputError
 from gsfluent.ops import collider as columns
 from gsfluent.scene import Collider, Scene
 from gsfluent.scene_parts import turned
@@ -48,11 +47,6 @@ class RigidSet:
     """
 
     def __init__(self, scene: Scene, dx: float, device: torch.device | str = "cpu") -> None:
-        if scene.blades:
-            raise InputError(
-                "simulate: blades are not part of the simulation stage yet",
-                mend="leave the blade out, or use gsfluent.pipeline.blades with the operators",
-            )
         self.dx = dx
         self.floor = scene.floor
         self._gravity = scene.gravity

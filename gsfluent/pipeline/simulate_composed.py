@@ -1,9 +1,9 @@
 """The grid step by step, by the composable operators: the other engine of the simulation.
 
 For what the resident solver does not know (free rigid bodies, distance grids, colliders that turn
-or sweep), and to compare it with. A step is p2g, grid update, g2p and the return map; the contact
-pass is left out while no two fields meet, and the search for blocks while the old ones hold every
-point.
+or sweep, blades at work), and to compare it with. A step is p2g, grid update, g2p and the return
+map; the contact pass is left out while no two fields meet, and the search for blocks while the old
+ones hold every point.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Particles
+from gsfluent.pipeline.blades import BladeSet
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_near import near_pairs
@@ -48,11 +49,13 @@ class Composed:
         self._map = dict(settings.return_map or {})
         self.points = state.particles if rows is None else state.particles.select(rows)
         self.peak = state.peak if rows is None else state.peak[rows]
-        used, field = torch.unique(
+        field = torch.unique(
             state.field if rows is None else state.field[rows], return_inverse=True
-        )
-        self._body, self._fields = field.to(torch.int32), used.shape[0]
-        counters.fields_max = max(counters.fields_max, self._fields)
+        )[1]
+        self._unit = field.to(torch.int32)
+        self._blades = BladeSet(scene, matter.dx)
+        self.cut = state.cut if rows is None else state.cut[rows]
+        self._divide()
         self.time = state.time
         self.colliders = state.colliders
         device = self.peak.device
@@ -61,7 +64,7 @@ class Composed:
         self._blocks: ops.Blocks | None = None
         self._travelled = self._speed = self._limit = 0.0
         self._refresh = 0
-        self._contact = False
+        self._near = False
         self._lost: Tensor | int = 0
         self._info = torch.zeros(4, dtype=torch.int64, device=device)
         p = self.points
@@ -117,6 +120,7 @@ class Composed:
         turn = torch.linalg.matrix_norm(p.affine)
         gradient = torch.where(peak < 0, turn, torch.zeros_like(turn)).max()
         driven = self.rigid.speed(self.colliders).to(speed)
+        driven = driven.clamp(min=self._blades.speed(self.time))
         looked = torch.stack([torch.maximum(speed, driven), wave, gradient])
         self._speed, fastest, steepest = looked.tolist()
         if not (self._speed < 1e6 and fastest < 1e6):
@@ -145,15 +149,18 @@ class Composed:
         if blocks is None or blocks.expired(self._travelled + reach, dx):
             blocks = self._build()
         self._travelled += reach
-        body = self._body if self._contact else None
+        rows = self._cut(dt)
+        several = self._near or self._merged is not None
+        body = self._body if several else None
         grid, moments = ops.p2g(
             p.position, p.velocity, p.affine, p.mass,
             dx=dx, blocks=blocks, dt=dt, stress=self.stress, volume=p.volume,
-            body=body, fields=self._fields if self._contact else 1, contact=self._contact,
+            body=body, fields=self._fields if several else 1, contact=several,
         )  # fmt: skip
         velocity_grid, impulse, torque, nodes = ops.grid_update(
             grid, dx=dx, dt=dt, blocks=blocks, gravity=self.scene.gravity,
-            colliders=self.colliders.to(grid.dtype), sdf=self.rigid.sdf, moments=moments,
+            colliders=rows.to(grid.dtype), sdf=self.rigid.sdf, moments=moments,
+            merged=self._merged if several else None, cut=self._sides if several else None,
             friction=self.scene.friction, restitution=self.scene.restitution, return_torque=True,
         )  # fmt: skip
         position, velocity, affine, deformation, skipped = ops.g2p(
@@ -171,16 +178,19 @@ class Composed:
         self.peak = torch.maximum(self.peak, alpha)
         if impulse.numel():
             self.impulse = self.impulse + impulse.sum(dim=0)
-        self.work = self.work + self.rigid.work(self.colliders, impulse, torque)
-        self.colliders = self.rigid.advance(self.colliders, self.time, dt, impulse, torque)
+        self.work = self.work + self.rigid.work(rows, impulse, torque)
+        count = self.rigid.count
+        self.colliders = self.rigid.advance(
+            self.colliders, self.time, dt, impulse[:count], torque[:count]
+        )
         self._info += info.to(torch.int64)
         self._lost = self._lost + skipped + info[3]
         c = self.counters
         c.steps += 1
         c.particle_steps += p.count
         c.dt_min, c.dt_max = min(c.dt_min, dt), max(c.dt_max, dt)
-        c.contact_steps += self._contact
-        c.contact_nodes += int(nodes) if self._contact else 0
+        c.contact_steps += several
+        c.contact_nodes += int(nodes) if several else 0
 
     def _build(self) -> ops.Blocks:
         """Find the active blocks anew and decide whether the contact pass is needed."""
@@ -193,8 +203,30 @@ class Composed:
         self.counters.block_builds += 1
         self.counters.blocks_max = max(self.counters.blocks_max, blocks.block_count)
         # Kernel reach of both (2 x 1.5) plus the slack of the blocks on both sides.
-        self._contact = (
+        self._near = (
             self._fields > 1
-            and near_pairs(p.position, self._body, 4.0 * self.matter.dx).shape[0] > 0
+            and near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
         )
         return blocks
+
+    def _cut(self, dt: float) -> Tensor:
+        """Let the blades part what they pass in a step; return all collider rows."""
+        blades, now = self._blades, self.time + dt
+        if not blades.moving(self.time, now):
+            return self.colliders
+        cut = blades.look(self.points.position, self.cut, self.time, now)
+        if not torch.equal(cut, self.cut):
+            self.cut = cut
+            self._divide()
+        return torch.cat([self.colliders, blades.faces(now).to(self.colliders)])
+
+    def _divide(self) -> None:
+        """Number the fields: pieces, and in a piece that is being cut its sides."""
+        self._body, self._merged, self._sides = self._unit, None, None
+        self._fields = int(self._unit.max()) + 1
+        if len(self._blades):
+            fields = self._blades.fields(self._unit, self.cut)
+            if fields.total > self._fields:
+                self._body, self._fields = fields.field, fields.total
+                self._merged, self._sides = fields.merged, fields.cut
+        self.counters.fields_max = max(self.counters.fields_max, self._fields)

@@ -28,6 +28,13 @@ def breakable(matter: Matter) -> Tensor:
     return torch.stack([brittle[a:b].any() for a, b in matter.ranges])
 
 
+def cut_bodies(matter: Matter, cut: Tensor) -> Tensor:
+    """Bodies that a blade has touched, bool [bodies]; liquids run together again."""
+    liquid = matter.law[matter.particles.material.long()] == LAWS["fluid"]
+    mark = (cut != 0) & ~liquid
+    return torch.stack([mark[a:b].any() for a, b in matter.ranges])
+
+
 def units(matter: Matter, links: Tensor, pieces: Fragments, may_break: Tensor) -> Tensor:
     """What each point hangs together with: int64 [N], the first row of a body or piece.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsfluent.pipeline.fragments import Fragments, find_fragments, rest_links
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
-from gsfluent.pipeline.simulate_fields import breakable, units
+from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
 from gsfluent.pipeline.simulate_figures import Figures
 from gsfluent.pipeline.simulate_health import CHECK_EVERY, Ledger, Watch, figures_of
 from gsfluent.pipeline.simulate_solver import Counters, Unhealthy
@@ -118,13 +118,17 @@ class Run:
                 state.particles.position,
                 state.peak >= 0,
                 self.matter.particles.mass,
+                cut=state.cut if self.scene.blades else None,
             )
             self._pieces = state, found
         return self._pieces[1]
 
     def _regroup(self, state: State, *, at_frame: bool = True) -> State:
         """Let the stepper know what hangs together."""
-        unit = units(self.matter, self._links, self._fragments(state), self._breakable)
+        may_break = self._breakable
+        if self.scene.blades:
+            may_break = may_break | cut_bodies(self.matter, state.cut)
+        unit = units(self.matter, self._links, self._fragments(state), may_break)
         return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
 
     def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:

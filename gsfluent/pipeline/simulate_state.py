@@ -15,9 +15,9 @@ from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
 from gsfluent.pipeline.particles import Matter
 
-VERSION = 3
+VERSION = 4
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
-_POINTS = ("position", "peak", "stray", "field", "group", "asleep", "calm")
+_POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm")
 _WHOLE = ("impulse", "colliders", "work", "dissipated")
 
 
@@ -37,6 +37,7 @@ class State(NamedTuple):
         stray: Crumbs that left the grid for good, bool [N] (see
             :mod:`gsfluent.pipeline.simulate_strays`).
         field: Velocity field of each point, int32 [N]: its body, or its piece of a broken one.
+        cut: Sides of blades each point lies on, int32 [N] (:func:`gsfluent.ops.blade_sides`).
         group: First row of the group that moves without the grid and holds the point, int32 [N];
             -1 for points on the grid and for bodies in their first flight.
         asleep: Whether that group rests (else it flies), bool [N].
@@ -56,6 +57,7 @@ class State(NamedTuple):
     work: Tensor
     stray: Tensor
     field: Tensor
+    cut: Tensor
     group: Tensor
     asleep: Tensor
     calm: Tensor
@@ -79,6 +81,7 @@ class State(NamedTuple):
             work=zero,
             stray=none,
             field=p.body,
+            cut=torch.zeros_like(p.body),
             group=torch.full_like(p.body, -1),
             asleep=none,
             calm=torch.zeros(p.count, dtype=torch.int16, device=p.device),

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsfluent.pipeline.blades import BladeSet
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_composed import FIELDS, Composed
@@ -85,6 +86,7 @@ class Stepper:
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         self._pull = float(self._gravity.norm())
         self.rigid = RigidSet(scene, matter.dx, device)
+        self.blades = BladeSet(scene, matter.dx)
         self.leaving = Leaving(
             matter, self.rigid, self._gravity, sleep=sleep, fly=piece_flight and free_flight
         )
@@ -146,10 +148,9 @@ class Stepper:
     def _renumber(self, state: State, on_grid: Tensor) -> State:
         if not self.separate_fragments or not bool(on_grid.any()):
             return state
-        resident = self._resident and resident_can(state.colliders)
         field = number_fields(
             self._unit, state.position, self.matter.particles.mass, on_grid, self.matter.dx,
-            self.field_limit, MOST if resident else FIELDS,
+            self.field_limit, MOST if self._resident_now(state) else FIELDS,
         )  # fmt: skip
         return state if torch.equal(field, state.field) else state._replace(field=field)
 
@@ -164,15 +165,15 @@ class Stepper:
         Raises:
             Unhealthy: A number is not finite or a point left the grid.
         """
-        until = min(until, self.rigid.next_change(state.time))
+        until = min(until, self.rigid.next_change(state.time), self.blades.next_change(state.time))
         if state is not self._last:
             self._take(state)
         state, clear = self._land(state)
         if self._empty:
             state = self._without_grid(state, until)
         else:
-            if self._engine is None:
-                make = Composed if not self._resident_now(state) else Resident
+            make = Resident if self._resident_now(state) else Composed
+            if not isinstance(self._engine, make):
                 settings = self._settings._replace(dt_scale=self.dt_scale)
                 self._engine = make(
                     self.scene, self.matter, self.rigid, state, self._rows, settings, self.counters
@@ -188,7 +189,14 @@ class Stepper:
         return torch.zeros_like(state.stray).index_copy(0, self._rows, wrong)
 
     def _resident_now(self, state: State) -> bool:
-        return self._resident and resident_can(state.colliders)
+        """Whether the resident solver can go on from here: with no blade at work."""
+        if not (self._resident and resident_can(state.colliders)):
+            return False
+        if len(self.blades) == 0:
+            return True
+        if self.blades.speed(state.time) > 0.0:
+            return False
+        return self.blades.splits(state.field, state.cut).numel() == 0
 
     def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:
         pushed, worked = engine.impulse, engine.work
@@ -204,6 +212,10 @@ class Stepper:
             engine.time,
             engine.read(),
         )
+        if isinstance(engine, Composed) and len(self.blades):
+            rows = self._rows
+            cut = engine.cut if rows is None else state.cut.index_copy(0, rows, engine.cut)
+            state = state._replace(cut=cut)
         return self._retire(state)
 
     def _without_grid(self, state: State, until: float) -> State:
@@ -291,7 +303,8 @@ class Stepper:
                 clear = min(clear, group.flight.held if group.flight is not None else clear)
                 continue
             sleeps = group.flight is None
-            near: list[tuple[float, float]] = []  # gap, speed of the other
+            # Gap to what is near, and how fast that is.
+            near: list[tuple[float, float]] = [(self.blades.gap(low[i], high[i], time), 0.0)]
             rows = moving if sleeps else colliders
             if rows.shape[0]:
                 near.append((self.rigid.gap(rows, low[i], high[i]), driven))
