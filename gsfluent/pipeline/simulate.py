@@ -25,6 +25,7 @@ from gsfluent.pipeline.carry import Carry, Motion
 from gsfluent.pipeline.fragments import Fragments
 from gsfluent.pipeline.particles import ALPHA_JITTER, Matter, build_matter, grid_spacing
 from gsfluent.pipeline.repair import Repair, Repaired
+from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_run import Run
 from gsfluent.pipeline.simulate_solver import CFL
 from gsfluent.pipeline.simulate_state import State
@@ -51,6 +52,8 @@ class SimulationFrame:
         stats: The figures of run.json's ``per_frame`` for this frame.
         pieces: Sizes of the pieces.
         broken: Broken points, bool [N].
+        rigid: The rigid colliders of the scene.
+        colliders: Their rows now, float64 [M, 32].
     """
 
     index: int
@@ -62,6 +65,8 @@ class SimulationFrame:
     stats: dict[str, Any]
     pieces: Fragments
     broken: Tensor
+    rigid: RigidSet
+    colliders: Tensor
     _carry: Carry | None = None
     _repair: Repair | None = None
 
@@ -303,6 +308,8 @@ def _frame(run: Run, index: int, carry: Carry | None, repair: Repair | None) -> 
         stats=stats,
         pieces=pieces,
         broken=peak >= 0,
+        rigid=run.stepper.rigid,
+        colliders=run.state.colliders,
         _carry=carry,
         _repair=repair,
     )
