@@ -52,6 +52,13 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
       "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0) -> "
       "(Tensor, Tensor, Tensor, Tensor)");
+  // Gradients of strain, alpha, increment, of six material columns per particle, and 1 where they
+  // were computed (laws elastic and nacc, no guard).
+  m.def(
+      "return_mapping_adjoint(Tensor grad_strain, Tensor grad_alpha, Tensor grad_stress, "
+      "Tensor new_alpha, Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
+      "Tensor? material, float k, float epsilon, bool implicit) -> "
+      "(Tensor, Tensor, Tensor, Tensor, Tensor)");
 
   // --- deform: polar decomposition, clamped deformation ---
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");

@@ -66,7 +66,6 @@ class Part:
                 key,
                 [
                     *materials.PARAMETERS,
-                    *materials.LATER_FIELDS,
                     "variation",
                     "grain",
                     "material",

@@ -35,6 +35,7 @@ CENTRES = {
     "k = 2, epsilon = 0.05": (2.0, 0.05),
     "k = 2, epsilon = 0.1": (2.0, 0.1),
     "k = 2, epsilon = 0.2": (2.0, 0.2),
+    "k = 8, epsilon = 0.1": (8.0, 0.1),
 }
 ELASTIC = Variant("elastic, no yielding", law=0)
 VARIANTS = [
@@ -42,6 +43,7 @@ VARIANTS = [
     for implicit in (False, True)
     for name, (k, epsilon) in CENTRES.items()
 ]
+DEFAULT = next(v for v in VARIANTS if v[1:4] == (2.0, 0.1, True))
 
 
 class Scene(NamedTuple):
@@ -103,14 +105,15 @@ def throw(
     dtype: torch.dtype,
     *,
     seed: int | None = None,
+    place: int = 0,
     refine: int = 1,
     part: float = 1.0,
 ) -> Run:
     """Throw a solid at the floor; ``seed`` shuffles the particles, ``refine`` divides dt.
 
-    ``part`` < 1 stops after that part of the time.
+    ``place`` moves the solid against the grid; ``part`` < 1 stops after that part of the time.
     """
-    x = points(scene.shape)
+    x = points(scene.shape) + place * DX * torch.tensor([0.37, 0.21, 0.13], dtype=torch.float64)
     n = len(x)
     order = torch.arange(n)
     if seed is not None:

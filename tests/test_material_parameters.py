@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +14,7 @@ from torch import Tensor
 from gsfluent import materials, ops
 from gsfluent.errors import InputError
 from gsfluent.lab.driver import World
-from gsfluent.materials import LAWS, READS, Material
+from gsfluent.materials import LAWS, READS, Material, table
 
 DX = 0.05
 SOLID = {"young_modulus": 1e5, "poisson_ratio": 0.3, "density": 1000.0}
@@ -163,3 +165,13 @@ def test_sand_slope_is_the_published_one() -> None:
     """alpha_DP = sqrt(2/3) 2 sin / (3 - sin) (Klar et al. 2016)."""
     row = materials.sand.override(friction_angle=30.0).parameters()
     assert float(row[2]) == pytest.approx((2.0 / 3.0) ** 0.5 * 1.0 / 2.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("block", ["numbers", "sources"])
+def test_the_page_holds_what_the_presets_are(block: str) -> None:
+    """Renewed by scripts/material_tables.py."""
+    page = Path(__file__).resolve().parents[1] / "docs" / "materials.md"
+    found = re.search(
+        rf"<!-- {block}: [^\n]*-->\n(.*?)<!-- end -->", page.read_text("utf-8"), re.DOTALL
+    )
+    assert found is not None and found.group(1) == getattr(table, block)()

@@ -98,7 +98,7 @@ def test_events_of_a_shot_are_checked():
     scene.add(ellipsoid(), "apple")
     scene.add_event({"type": "throw", "velocity": [1, 0, 0], "spin": [0, 0, 3]})
     assert scene.bodies[0].velocity == (1.0, 0.0, 0.0)
-    with pytest.raises(InputError, match="later issue"):
+    with pytest.raises(InputError, match="'path' is missing"):
         scene.add_event({"type": "blade"})
     with pytest.raises(InputError, match="'drop'"):
         scene.add_event({"type": "dorp", "height": 1})

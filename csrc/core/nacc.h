@@ -238,7 +238,8 @@ GSF_HOST_DEVICE bool nacc_clearly_elastic(const NaccMaterial<T>& m, const Elasti
   const T beta = min(m.cohesion, T(kCohesionMax));
   const T x = min(m.hardening * max(-alpha, T(0)), T(5));
   const T x2 = x * x;
-  const T relative = T(kYieldPressureFloor) + x * (T(1) + x2 * (T(1.0 / 6.0) + x2 / T(120)));
+  const T relative =
+      T(kYieldPressureFloor) + x * (T(1) + x2 * (T(1.0 / 6.0) + x2 * T(1.0 / 120.0)));
   const T p0 = m.kappa * min(relative, T(kYieldPressureCap));
   const T p = T(-0.5) * m.kappa * s.j2m1;
   const T q2 = T(1.5) * m.mu * m.mu * s.n * s.n;
@@ -251,7 +252,10 @@ GSF_HOST_DEVICE NaccState<T> nacc_return(const NaccMaterial<T>& m, const NaccOpt
                                          const ElasticState<T>& s, T alpha) {
   alpha = clamp(alpha, T(kAlphaMin), T(kAlphaMax));
   if (nacc_clearly_elastic(m, s, alpha)) return {s.d, s.j2m1, alpha, false};
-  return nacc_plastic(m, o, s, alpha);
+  // A copy, so that the state of an elastic particle need not be in memory.
+  const ElasticState<T> yielding = s;
+  const NaccMaterial<T> of = m;
+  return nacc_plastic(of, o, yielding, alpha);
 }
 
 }  // namespace gsf

@@ -117,6 +117,7 @@ GSF_HOST_DEVICE void end_step(SolverClock& c, double dx, int64_t count) {
   if (c.lost > 0) c.reason = kTooFast;
   if (c.leaving > 0) c.rebuild = 1;
   c.leaving = 0;
+  if (c.travel > dx) c.rebuild = 1;
   if (!check_largest(c)) return;
   const double before = c.time;
   const bool last = !(c.dt_next > 0.0);

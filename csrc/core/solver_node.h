@@ -57,16 +57,56 @@ GSF_HOST_DEVICE int node_contact(const SolverView<T>& s, int fields, const bool*
   return touched;
 }
 
-// Applies every collider to one node of one field; adds the impulse given to the matter [N s].
+// Applies collider k to one node of one field; adds to sums what the matter got: impulse [N s],
+// torque about the collider's point [N m s], touched mass [kg].
 template <typename T>
 GSF_HOST_DEVICE void node_collide(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
-                                  Vec3<T>& v, double* impulse) {
+                                  T dt, Vec3<T>& v, double* sums) {
   const T* row = s.colliders + k * kColliderColumns;
-  if (!collider_valid(row, 0)) return;
-  double sums[6] = {};
-  if (!collide_with(row, static_cast<const float*>(nullptr), T(1), x, T(mass), s.dx, T(0), v, sums))
-    return;
-  for (int i = 0; i < 3; ++i) impulse[i] += sums[i];
+  if (!collider_valid(row, s.sdf_count)) return;
+  // The mass a free collider touched a step ago stands for what it touches now.
+  const T give = collider_give(row, T(s.impulse[k * kImpulseSums + 6]));
+  if (collide_with(row, s.sdf, give, x, T(mass), s.dx, dt, v, sums)) sums[6] += mass;
+}
+
+// Whether collider k can touch a node of a block before the next build: nodes lie within 2.6 dx of
+// the middle; the collider itself may travel one dx meanwhile, and a sweeping one is looked for one
+// step ahead.
+template <typename T>
+GSF_HOST_DEVICE bool collider_near(const SolverView<T>& s, int64_t k, const Vec3<T>& middle) {
+  const T* row = s.colliders + k * kColliderColumns;
+  if (!collider_valid(row, s.sdf_count)) return false;
+  const Vec3<T> omega = load_vec3(row + kAngularVelocity);
+  if (!(collider_bound(row) < T(1e30)) && dot(omega, omega) > T(0)) return true;
+  Vec3<T> normal;
+  return collider_signed_distance(row, s.sdf, middle, normal) <= T(5) * s.dx;
+}
+
+// Middle of a block.
+template <typename T>
+GSF_HOST_DEVICE Vec3<T> block_middle(const SolverView<T>& s, const int32_t* block) {
+  return {(T(block[0]) * T(kBlockEdge) + T(1.5)) * s.dx,
+          (T(block[1]) * T(kBlockEdge) + T(1.5)) * s.dx,
+          (T(block[2]) * T(kBlockEdge) + T(1.5)) * s.dx};
+}
+
+// End of a step for collider k: what it gave is booked, it moves on; returns how far its fastest
+// point moved [m].
+template <typename T>
+GSF_HOST_DEVICE double end_collider(const SolverView<T>& s, int64_t k, const double* sums,
+                                    double dt) {
+  double* total = s.impulse + k * kImpulseSums;
+  for (int i = 0; i < 6; ++i) total[i] += sums[i];
+  total[6] = sums[6];
+  double* row = s.collider_state + k * kColliderColumns;
+  const Vec3<double> gravity{double(s.gravity[0]), double(s.gravity[1]), double(s.gravity[2])};
+  const Vec3<double> v = load_vec3(row + kVelocity), w = load_vec3(row + kAngularVelocity);
+  if (!(row[kMass] > 0.0) && dot(v, v) == 0.0 && dot(w, w) == 0.0) return 0.0;
+  advance_collider(row, dt, load_vec3(sums), load_vec3(sums + 3), gravity);
+  for (int i = 0; i < kColliderColumns; ++i) s.colliders[k * kColliderColumns + i] = T(row[i]);
+  const double bound = collider_bound(row), turning = norm(load_vec3(row + kAngularVelocity));
+  const double edge = bound < 1e30 ? bound * turning : 0.0;
+  return dt * (norm(load_vec3(row + kVelocity)) + edge);
 }
 
 }  // namespace gsf

@@ -22,6 +22,7 @@ namespace gsf {
 constexpr int kWindowEdge = 8;
 constexpr int kWindowNodes = 512;
 constexpr int kNeighbours = 27;  // blocks a window can touch
+constexpr int kImpulseSums = 7;
 constexpr int kLastCell = 5;     // largest l
 constexpr int kRowColumns = 10;  // eight material parameters, particle mass, particle volume
 constexpr int kMassColumn = 8;
@@ -119,8 +120,10 @@ struct SolverClock {
   double speed_seen, wave_seen;                                // 44, 45
   int64_t leaving;                                             // 46
   double slack;                                                // 47 cells a point may move next
+  double travel;   // 48 how far a collider may have moved since the last build [m]
+  uint64_t moved;  // 49 bits: furthest a collider moved in this step
 };
-constexpr int kClockWords = 48;
+constexpr int kClockWords = 50;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>
@@ -174,10 +177,15 @@ struct SolverView {
   int32_t* table_home;   // [table_size]
   int32_t* table_slot;   // [table_size] slot, or head of the slot list of a site
   int32_t* slot_next;    // [S] chain of the slots of a site
+  uint64_t* site_near;   // [S] colliders that can touch the block before the next build, as bits
   // colliders
-  T* colliders;            // [K, kColliderColumns]
-  int64_t* impulse_units;  // [K, 3] of this step, in momentum units (CUDA)
-  double* impulse;         // [K, 3] N s since the load
+  T* colliders;            // [K, kColliderColumns] as nodes see them
+  double* collider_state;  // [K, kColliderColumns] as they move
+  const float* sdf;        // distance grids, or null
+  int64_t sdf_count;
+  int64_t* impulse_units;  // [K, kImpulseSums] of this step, in units (CUDA)
+  double* impulse;  // [K, kImpulseSums] impulse [N s] and torque [N m s] since the load, then
+                    // the mass touched in the last step [kg]
 
   // Index of component c of particle p in an array of `width` components: component by component on
   // the GPU (neighbouring lanes read neighbouring words), particle by particle on the CPU.
@@ -189,7 +197,7 @@ struct SolverView {
 #endif
   }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
-  GSF_HOST_DEVICE HomeList<T>& next_homes() { return home[1 - (clock->parity & 1)]; }
+  GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }
 };
 
 // True while a step may run: nothing has ended, failed or asked for new blocks.

@@ -149,14 +149,14 @@ Pack<T> floor(Pack<T> x, typename Pack<T>::Int& whole) {
 
 // x^(-1/3) for normal positive x: a guess from the exponent (a float's bits are its logarithm, near
 // enough), then third-order corrections y (1 + h/3 + 2 h^2/9) with h = 1 - x y^3.
-inline Pack<float> inverse_cube_root_guess(Pack<float> x) {
+inline Pack<float> reciprocal_cube_root_guess(Pack<float> x) {
   const PackTypes<float>::Int bits = reinterpret_cast<PackTypes<float>::Int>(x.v);
   const PackTypes<float>::Raw scaled =
       1419967116.0f - __builtin_convertvector(bits, PackTypes<float>::Raw) * (1.0f / 3.0f);
   return reinterpret_cast<PackTypes<float>::Raw>(
       __builtin_convertvector(scaled, PackTypes<float>::Int));
 }
-inline Pack<double> inverse_cube_root_guess(Pack<double> x) {
+inline Pack<double> reciprocal_cube_root_guess(Pack<double> x) {
   const PackTypes<double>::Int bits = reinterpret_cast<PackTypes<double>::Int>(x.v);
   PackTypes<double>::Int guess;
   for (int lane = 0; lane < 4; ++lane)
@@ -165,8 +165,8 @@ inline Pack<double> inverse_cube_root_guess(Pack<double> x) {
   return reinterpret_cast<PackTypes<double>::Raw>(guess);
 }
 template <typename T>
-Pack<T> inverse_cube_root(Pack<T> x) {
-  Pack<T> y = inverse_cube_root_guess(x);
+Pack<T> reciprocal_cube_root(Pack<T> x) {
+  Pack<T> y = reciprocal_cube_root_guess(x);
   for (int i = 0; i < (sizeof(T) == 4 ? 2 : 3); ++i) {
     const Pack<T> h = Pack<T>(1) - x * y * (y * y);
     y += y * h * (Pack<T>(1.0 / 3.0) + Pack<T>(2.0 / 9.0) * h);
@@ -184,6 +184,17 @@ Quad<T> load_quad(const T* p) {
   Quad<T> q;
   std::memcpy(&q, p, sizeof q);
   return q;
+}
+
+template <typename T>
+Pack<T> load_pack(const T* p) {
+  typename Pack<T>::Raw raw;
+  std::memcpy(&raw, p, sizeof raw);
+  return raw;
+}
+template <typename T>
+void store_pack(T* p, Pack<T> x) {
+  std::memcpy(p, &x.v, sizeof x.v);
 }
 
 // Four columns of the rows whose quads are `q`, one per lane.

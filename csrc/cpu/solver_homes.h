@@ -177,17 +177,55 @@ class HomePass {
     });
     const uint32_t reach = reach_of_row(s_.neighbour + kNeighbours * h);
     PacketLargest<T> largest;
-    for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
-      const Packet<T> packet(s_, s_.entry + at, r.end - at);
-      Pack<T> offset[3], value[3];
-      Mat3<Pack<T>> first;
-      packet.load3(s_, s_.offset, offset);
-      packet_gather_tile(packet, offset, tile, value, first);
-      finish_packet<T, kLaws, kTrack>(s_, packet, reach, offset, value, first, dt, dt_next, largest,
-                                      counts);
+    Chunk chunk;
+    for (int64_t at = r.begin; at < r.end; at += kChunk) {
+      chunk.gather(s_, at, std::min(at + kChunk, r.end), tile);
+      for (int64_t first = at; first < std::min(at + kChunk, r.end); first += kLanes) {
+        const Packet<T> packet(s_, s_.entry + first, r.end - first);
+        Pack<T> offset[3];
+        const PacketGathered<T> gathered = chunk.gathered(first - at, offset);
+        finish_packet<T, kLaws, kTrack>(s_, packet, reach, offset, gathered, dt, dt_next, largest,
+                                        counts);
+      }
     }
     largest.give(counts.largest);
   }
+
+  // What a stretch of a home's particles gathers: cell by cell, so that each cell is read once,
+  // then handed out in full packets.
+  static constexpr int kLanes = Pack<T>::kLanes;
+  static constexpr int64_t kChunk = 256;
+  struct Chunk {
+    static constexpr int kRows = 15;  // offset, value, first
+    alignas(32) T row[kRows][kChunk + kLanes] = {};
+
+    void gather(const SolverView<T>& s, int64_t begin, int64_t end, const Lanes<T>* tile) {
+      for (int64_t at = begin; at < end; at += kLanes) {
+        Pack<T> offset[3];
+        Packet<T>(s, s.entry + at, end - at).load3(s.offset, offset);
+        for (int c = 0; c < 3; ++c) store_pack(row[c] + (at - begin), offset[c]);
+      }
+      for (int64_t at = begin; at < end;) {
+        const uint32_t cell = s.meta[s.entry[at]] & 511u;
+        int64_t last = at + 1;
+        while (last < end && last < at + kLanes && (s.meta[s.entry[last]] & 511u) == cell) ++last;
+        Pack<T> offset[3];
+        for (int c = 0; c < 3; ++c) offset[c] = load_pack(row[c] + (at - begin));
+        const PacketGathered<T> g = packet_gather(offset, tile + window_node(cell));
+        // Lanes beyond `last` are written again by the next cell.
+        for (int c = 0; c < 3; ++c) store_pack(row[3 + c] + (at - begin), g.value[c]);
+        for (int c = 0; c < 9; ++c) store_pack(row[6 + c] + (at - begin), g.first.m[c]);
+        at = last;
+      }
+    }
+    PacketGathered<T> gathered(int64_t at, Pack<T>* offset) const {
+      PacketGathered<T> g;
+      for (int c = 0; c < 3; ++c) offset[c] = load_pack(row[c] + at);
+      for (int c = 0; c < 3; ++c) g.value[c] = load_pack(row[3 + c] + at);
+      for (int c = 0; c < 9; ++c) g.first.m[c] = load_pack(row[6 + c] + at);
+      return g;
+    }
+  };
 
   template <int kLaws>
   Counts from_nodes() const {

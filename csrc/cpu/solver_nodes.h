@@ -17,14 +17,15 @@ class NodePass {
 
   void plan() {
     const int64_t chunks = (s_.clock->sites + kSiteChunk - 1) / kSiteChunk;
-    impulse_.assign(chunks * s_.collider_count * 3, 0.0);
+    impulse_.assign(chunks * s_.collider_count * kImpulseSums, 0.0);
     contacts_.assign(chunks, 0);
   }
 
   // All nodes of touched slots; clears their sums and the marks.
   void run(T dt, std::vector<uint8_t>& touched) {
     SolverClock& c = *s_.clock;
-    const int64_t chunks = static_cast<int64_t>(contacts_.size()), terms = 3 * s_.collider_count;
+    const int64_t chunks = static_cast<int64_t>(contacts_.size()),
+                  terms = kImpulseSums * s_.collider_count;
     parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
       for (int64_t chunk = begin; chunk < end; ++chunk) {
         double* impulse = impulse_.data() + chunk * terms;
@@ -50,8 +51,14 @@ class NodePass {
       }
     });
     for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-      for (int64_t i = 0; i < terms; ++i) s_.impulse[i] += impulse_[chunk * terms + i];
       c.touched += contacts_[chunk];
+    }
+    for (int64_t k = 0; k < s_.collider_count; ++k) {
+      double sums[kImpulseSums] = {};
+      for (int64_t chunk = 0; chunk < chunks; ++chunk)
+        for (int i = 0; i < kImpulseSums; ++i)
+          sums[i] += impulse_[chunk * terms + k * kImpulseSums + i];
+      end_collider(s_, k, sums, c.dt);
     }
   }
 
@@ -81,11 +88,10 @@ class NodePass {
     const Vec3<T> center = node_position(site.slots[0], T(1.5), T(1.5), T(1.5));
     for (int64_t k = 0; k < s_.collider_count; ++k) {
       const T* row = s_.colliders + k * kColliderColumns;
-      if (!collider_valid(row, 0)) continue;
+      if (!collider_valid(row, s_.sdf_count)) continue;
       Vec3<T> normal;
       // Nodes lie within sqrt(27) / 2 of the centre; what sweeps may come from anywhere.
-      const bool far = collider_signed_distance(row, static_cast<const float*>(nullptr), center,
-                                                normal) > T(2.8) * s_.dx;
+      const bool far = collider_signed_distance(row, s_.sdf, center, normal) > T(2.8) * s_.dx;
       if (!far || row[kSweep] != T(0)) site.near[site.colliders++] = static_cast<int32_t>(k);
     }
     return site;
@@ -123,7 +129,8 @@ class NodePass {
       for (int64_t i = 0; i < site.colliders; ++i) {
         const int32_t k = site.collider(i);
         for (int a = 0; a < fields; ++a)
-          if (heavy[a]) node_collide(s_, k, x, mass[a], velocity[a], impulse + 3 * k);
+          if (heavy[a])
+            node_collide(s_, k, x, mass[a], dt, velocity[a], impulse + kImpulseSums * k);
       }
     }
     for (int a = 0; a < fields; ++a) {
@@ -136,7 +143,7 @@ class NodePass {
 
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
-  std::vector<double> impulse_;    // [chunks, colliders, 3]
+  std::vector<double> impulse_;    // [chunks, colliders, kImpulseSums]
   std::vector<int64_t> contacts_;  // [chunks] nodes at which fields touched
 };
 

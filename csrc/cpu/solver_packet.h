@@ -27,14 +27,19 @@ struct Packet {
   int32_t index[kLanes];
   uint32_t meta[kLanes];
   uint32_t active;  // bit per lane
+  bool inner;  // none of them is the last particle of all: four values of a row of three may be
+               // read
 
   Packet(const SolverView<T>& s, const int32_t* order, int64_t count) {
     const int used = count < kLanes ? static_cast<int>(count) : kLanes;
     active = (1u << used) - 1u;
+    int32_t furthest = 0;
     for (int lane = 0; lane < kLanes; ++lane) {
       index[lane] = order[lane < used ? lane : used - 1];
+      furthest = std::max(furthest, index[lane]);
       meta[lane] = s.meta[index[lane]];
     }
+    inner = furthest + 1 < s.count;
   }
 
   // Lanes [first, end) whose particles share the cell of lane `first`.
@@ -51,32 +56,33 @@ struct Packet {
   }
 
   // Columns of an array with one row per particle.
-  void load3(const SolverView<T>& s, const T* array, Pack<T>* out) const {
+  [[gnu::always_inline]] void load3(const T* array, Pack<T>* out) const {
     Quad<T> rows[kLanes];
-    const T* end = array + 3 * s.count;
-    for (int lane = 0; lane < kLanes; ++lane) {
-      const T* row = array + 3 * int64_t(index[lane]);
-      rows[lane] = row + 4 <= end ? load_quad(row) : Quad<T>{row[0], row[1], row[2], T(0)};
-    }
+    const auto row = [&](int lane) { return array + 3 * int64_t(index[lane]); };
+    if (inner)
+      for (int lane = 0; lane < kLanes; ++lane) rows[lane] = load_quad(row(lane));
+    else
+      for (int lane = 0; lane < kLanes; ++lane)
+        rows[lane] = Quad<T>{row(lane)[0], row(lane)[1], row(lane)[2], T(0)};
     Pack<T> four[4];
     transpose(rows, four);
     for (int c = 0; c < 3; ++c) out[c] = four[c];
   }
-  void load4(const T* array, int width, int first, Pack<T>* out) const {
+  [[gnu::always_inline]] void load4(const T* array, int width, int first, Pack<T>* out) const {
     Quad<T> rows[kLanes];
     for (int lane = 0; lane < kLanes; ++lane)
       rows[lane] = load_quad(array + width * int64_t(index[lane]) + first);
     transpose(rows, out);
   }
-  Pack<T> load1(const T* array, int width = 1, int column = 0) const {
+  [[gnu::always_inline]] Pack<T> load1(const T* array, int width = 1, int column = 0) const {
     return pack_of<T>([&](int lane) { return array[width * int64_t(index[lane]) + column]; });
   }
-  void load9(const T* array, Pack<T>* out) const {
+  [[gnu::always_inline]] void load9(const T* array, Pack<T>* out) const {
     load4(array, 9, 0, out);
     load4(array, 9, 4, out + 4);
     out[8] = load1(array, 9, 8);
   }
-  Sym3<Pack<T>> load6(const T* array) const {
+  [[gnu::always_inline]] Sym3<Pack<T>> load6(const T* array) const {
     Pack<T> a[4], b[4];
     load4(array, 6, 0, a);
     load4(array, 6, 2, b);
@@ -85,7 +91,8 @@ struct Packet {
 
   // The same the other way, for the lanes in `lanes`.
   template <int kBytes>
-  void store_rows(const Quad<T>* rows, T* array, int width, int first, uint32_t lanes) const {
+  [[gnu::always_inline]] void store_rows(const Quad<T>* rows, T* array, int width, int first,
+                                         uint32_t lanes) const {
     const auto put = [&](int lane) {
       std::memcpy(array + width * int64_t(index[lane]) + first, rows + lane, kBytes);
     };
@@ -94,23 +101,24 @@ struct Packet {
     else
       for (; lanes != 0; lanes &= lanes - 1) put(__builtin_ctz(lanes));
   }
-  void store3(const Pack<T>* values, T* array, uint32_t lanes) const {
+  [[gnu::always_inline]] void store3(const Pack<T>* values, T* array, uint32_t lanes) const {
     const Pack<T> four[4] = {values[0], values[1], values[2], values[2]};
     Quad<T> rows[kLanes];
     transpose(four, rows);
     store_rows<3 * sizeof(T)>(rows, array, 3, 0, lanes);
   }
-  void store4(const Pack<T>* values, T* array, int width, int first, uint32_t lanes) const {
+  [[gnu::always_inline]] void store4(const Pack<T>* values, T* array, int width, int first,
+                                     uint32_t lanes) const {
     Quad<T> rows[kLanes];
     transpose(values, rows);
     store_rows<4 * sizeof(T)>(rows, array, width, first, lanes);
   }
-  void store6(const Sym3<Pack<T>>& e, T* array, uint32_t lanes) const {
+  [[gnu::always_inline]] void store6(const Sym3<Pack<T>>& e, T* array, uint32_t lanes) const {
     const Pack<T> a[4] = {e.xx, e.yy, e.zz, e.xy}, b[4] = {e.zz, e.xy, e.xz, e.yz};
     store4(a, array, 6, 0, lanes);
     store4(b, array, 6, 2, lanes);
   }
-  void store9(const Pack<T>* values, T* array, uint32_t lanes) const {
+  [[gnu::always_inline]] void store9(const Pack<T>* values, T* array, uint32_t lanes) const {
     store4(values, array, 9, 0, lanes);
     store4(values + 4, array, 9, 4, lanes);
     for (; lanes != 0; lanes &= lanes - 1) {
@@ -148,8 +156,8 @@ struct PacketMomentum {
   PacketMomentum(const SolverView<T>& s, const Packet<T>& p) {
     Pack<T> offset[3], velocity[3];
     Mat3<Pack<T>> slope;
-    p.load3(s, s.offset, offset);
-    p.load3(s, s.velocity, velocity);
+    p.load3(s.offset, offset);
+    p.load3(s.velocity, velocity);
     p.load9(s.slope, slope.m);
     const Stencil<Pack<T>> stencil = packet_stencil(offset);
     const auto row = [&](int lane) {
@@ -188,25 +196,24 @@ struct PacketMomentum {
       }
   }
 
-  // Adds lanes [first, end), all of one cell, to the tile at the base of their stencil.
+  // Adds lanes [first, end), all of one cell, to the tile at the base of their stencil; in single
+  // precision two lanes at once.
   void scatter(int first, int end, Lanes<T>* node) const {
     for (int i = 0; i < 3; ++i, node += kWindowEdge * kWindowEdge) {
-      Lanes<T> sum[3][3];
-      for (int j = 0; j < 3; ++j)
-        for (int k = 0; k < 3; ++k) sum[j][k] = node[j * kWindowEdge + k];
-      for (int lane = first; lane < end; ++lane) {
-        Lanes<T> q = start[i][lane];
-        const Lanes<T> up = z[lane];
-        for (int j = 0; j < 3; ++j, q += y[lane]) {
-          const Pack<T>* w = weight + 9 * i + 3 * j;
-          const Lanes<T> middle = q + up;
-          sum[j][0] += w[0][lane] * q;
-          sum[j][1] += w[1][lane] * middle;
-          sum[j][2] += w[2][lane] * (middle + up);
-        }
+      const Pack<T>* w = weight + 9 * i;
+      Raw sum[9] = {};
+      int lane = first;
+      if constexpr (sizeof(T) == 4) {
+        for (; lane + 1 < end; lane += 2)
+          add_plane(w, sum, load_pack(reinterpret_cast<const T*>(start[i] + lane)).v,
+                    load_pack(reinterpret_cast<const T*>(y + lane)).v,
+                    load_pack(reinterpret_cast<const T*>(z + lane)).v,
+                    [&](const Pack<T>& weights) { return two_lanes(weights, lane); });
       }
-      for (int j = 0; j < 3; ++j)
-        for (int k = 0; k < 3; ++k) node[j * kWindowEdge + k] = sum[j][k];
+      for (; lane < end; ++lane)
+        add_plane(w, sum, one_lane(start[i][lane]), one_lane(y[lane]), one_lane(z[lane]),
+                  [&](const Pack<T>& weights) { return Pack<T>(weights[lane]).v; });
+      for (int n = 0; n < 9; ++n) node[n / 3 * kWindowEdge + n % 3] += both_lanes(sum[n]);
     }
   }
 
@@ -220,63 +227,85 @@ struct PacketMomentum {
           sum - sum[3] * Lanes<T>{T(i), T(j), T(k), T(0)};
     }
   }
+
+ private:
+  using Raw = typename Pack<T>::Raw;
+
+  // Nine nodes of one plane of the stencil: momentum q + j y + k z.
+  template <typename Weight>
+  [[gnu::always_inline]] static void add_plane(const Pack<T>* w, Raw* sum, Raw q, Raw y, Raw z,
+                                               const Weight& weight_of) {
+    for (int j = 0; j < 3; ++j, q += y) {
+      const Raw middle = q + z;
+      sum[3 * j] += weight_of(w[3 * j]) * q;
+      sum[3 * j + 1] += weight_of(w[3 * j + 1]) * middle;
+      sum[3 * j + 2] += weight_of(w[3 * j + 2]) * (middle + z);
+    }
+  }
+  // Weights of this lane and the next, each over half a register.
+  static Raw two_lanes(const Pack<T>& weights, int lane) {
+    double two;
+    std::memcpy(&two, reinterpret_cast<const T*>(&weights) + lane, sizeof two);
+    const Raw pairs = reinterpret_cast<Raw>(Pack<double>(two).v);
+    return __builtin_shufflevector(pairs, pairs, 0, 0, 0, 0, 5, 5, 5, 5);
+  }
+  static Raw one_lane(Quad<T> q) {
+    if constexpr (sizeof(T) == 4)
+      return __builtin_shufflevector(q, Quad<T>{}, 0, 1, 2, 3, 4, 5, 6, 7);
+    else
+      return q;
+  }
+  static Lanes<T> both_lanes(Raw sum) {
+    if constexpr (sizeof(T) == 4)
+      return __builtin_shufflevector(sum, sum, 0, 1, 2, 3) +
+             __builtin_shufflevector(sum, sum, 4, 5, 6, 7);
+    else
+      return sum;
+  }
 };
 
-// sum w v and sum w v (node - f) of lanes that share a cell; others get what they would gather
-// there.
+// What one packet of particles gathers: value = sum w v, first = sum w v (node - f) in cells.
 template <typename T>
-void packet_gather(const Stencil<Pack<T>>& s, const Pack<T> (*first_weight)[3],
-                   const Lanes<T>* node, Pack<T>* value, Mat3<Pack<T>>& first) {
+struct PacketGathered {
+  Pack<T> value[3];
+  Mat3<Pack<T>> first;
+};
+
+// Gathers for lanes that share the cell whose stencil begins at `node`.
+template <typename T>
+PacketGathered<T> packet_gather(const Pack<T>* offset, const Lanes<T>* node) {
+  const Stencil<Pack<T>> s = packet_stencil(offset);
+  Pack<T> first_weight[3][3];
+  for (int axis = 0; axis < 3; ++axis)
+    for (int n = 0; n < 3; ++n) first_weight[axis][n] = s.w[axis][n] * (Pack<T>(n) - s.f[axis]);
+  // One component at a time: its sums and the weights along z stay in registers.
+  PacketGathered<T> g;
   const T* at = reinterpret_cast<const T*>(node);
-  for (int c = 0; c < 3; ++c) value[c] = Pack<T>(0);
-  for (int i = 0; i < 9; ++i) first.m[i] = Pack<T>(0);
-  for (int i = 0; i < 3; ++i) {
-    Pack<T> plane[3], plane_y[3], plane_z[3];
-    for (int c = 0; c < 3; ++c) plane[c] = plane_y[c] = plane_z[c] = Pack<T>(0);
-    for (int j = 0; j < 3; ++j) {
-      const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
-      for (int c = 0; c < 3; ++c) {
-        const Pack<T> v0(n[c]), v1(n[4 + c]), v2(n[8 + c]);
+  for (int c = 0; c < 3; ++c, ++at) {
+    Pack<T> sum(0), x(0), y(0), z(0);
+    for (int i = 0; i < 3; ++i) {
+      Pack<T> plane(0), plane_y(0), plane_z(0);
+      for (int j = 0; j < 3; ++j) {
+        const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
+        const Pack<T> v0(n[0]), v1(n[4]), v2(n[8]);
         const Pack<T> row = s.w[2][0] * v0 + s.w[2][1] * v1 + s.w[2][2] * v2;
         const Pack<T> row_z =
             first_weight[2][0] * v0 + first_weight[2][1] * v1 + first_weight[2][2] * v2;
-        plane[c] += s.w[1][j] * row;
-        plane_y[c] += first_weight[1][j] * row;
-        plane_z[c] += s.w[1][j] * row_z;
+        plane += s.w[1][j] * row;
+        plane_y += first_weight[1][j] * row;
+        plane_z += s.w[1][j] * row_z;
       }
+      sum += s.w[0][i] * plane;
+      x += first_weight[0][i] * plane;
+      y += s.w[0][i] * plane_y;
+      z += s.w[0][i] * plane_z;
     }
-    for (int c = 0; c < 3; ++c) {
-      value[c] += s.w[0][i] * plane[c];
-      first(c, 0) += first_weight[0][i] * plane[c];
-      first(c, 1) += s.w[0][i] * plane_y[c];
-      first(c, 2) += s.w[0][i] * plane_z[c];
-    }
+    g.value[c] = sum;
+    g.first(c, 0) = x;
+    g.first(c, 1) = y;
+    g.first(c, 2) = z;
   }
-}
-
-// packet_gather from a window tile, whatever cells the lanes lie in: run by run.
-template <typename T>
-void packet_gather_tile(const Packet<T>& packet, const Pack<T>* offset, const Lanes<T>* tile,
-                        Pack<T>* value, Mat3<Pack<T>>& first) {
-  using Int = typename Pack<T>::Int;
-  constexpr int kLanes = Pack<T>::kLanes;
-  const Stencil<Pack<T>> stencil = packet_stencil(offset);
-  Pack<T> first_weight[3][3];
-  for (int axis = 0; axis < 3; ++axis)
-    for (int n = 0; n < 3; ++n)
-      first_weight[axis][n] = stencil.w[axis][n] * (Pack<T>(n) - stencil.f[axis]);
-  const Int lanes = int_pack_of<T>([](int lane) { return lane; });
-  for (int lane = 0; lane < kLanes;) {
-    const int end = packet.run(lane);
-    Pack<T> v[3];
-    Mat3<Pack<T>> m;
-    packet_gather(stencil, first_weight, tile + window_node(packet.meta[lane]), v, m);
-    const Int mine = (lanes >= lane) & (lanes < end);
-    for (int c = 0; c < 3; ++c) value[c] = lane == 0 ? v[c] : select<T>(mine, v[c], value[c]);
-    for (int i = 0; i < 9; ++i)
-      first.m[i] = lane == 0 ? m.m[i] : select<T>(mine, m.m[i], first.m[i]);
-    lane = end;
-  }
+  return g;
 }
 
 }  // namespace gsf::cpu

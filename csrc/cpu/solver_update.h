@@ -43,8 +43,10 @@ typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<
 // finish_particle for every active lane.
 template <typename T, int kLaws, bool kTrack, typename Count>
 void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t reach,
-                   const Pack<T>* offset, const Pack<T>* value, const Mat3<Pack<T>>& first, T dt,
-                   T dt_next, PacketLargest<T>& largest, Count& counts) {
+                   const Pack<T>* offset, const PacketGathered<T>& gathered, T dt, T dt_next,
+                   PacketLargest<T>& largest, Count& counts) {
+  const Pack<T>* value = gathered.value;
+  const Mat3<Pack<T>>& first = gathered.first;
   using P = Pack<T>;
   using Int = typename P::Int;
   const T inv_dx = T(1) / s.dx;
@@ -90,7 +92,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   for (int i = 0; i < 9; ++i) increment.m[i] = P(dt) * c.m[i];
   const Sym3<P> e = update_strain(packet.load6(s.strain), increment);
   const P j2m1 = det_minus_one(e);
-  const P isochoric = inverse_cube_root(P(1) + j2m1);
+  const P isochoric = reciprocal_cube_root(P(1) + j2m1);
   const Sym3<P> d = isochoric * deviator(e);
   const P n2 = norm2(d);
   plain &= (max_abs(e) <= P(kStrainMax)) & (j2m1 >= P(kJMin * kJMin - 1.0)) &

@@ -28,7 +28,7 @@ __device__ unsigned long long add(int64_t* p, int64_t v) {
 }
 
 template <typename T>
-__global__ void clear_kernel(SolverView<T> s) {
+__global__ void clear_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock)) return;
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i < s.table_size) {
@@ -46,7 +46,7 @@ __global__ void clear_kernel(SolverView<T> s) {
 
 // Home of every particle: counts, masks, and the particle's rank among those of its home.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) insert_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) insert_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   const HomeList<T>& homes = s.homes();
@@ -86,7 +86,7 @@ __global__ void __launch_bounds__(kThreads) insert_kernel(SolverView<T> s) {
 // Numbers the homes, gives each its range of particles, and makes entries for all blocks they
 // reach. Each entry of the table is looked at by one thread.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) homes_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) homes_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock)) return;
   const int64_t e = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (e >= s.table_size || s.table_count[e] == 0) return;
@@ -94,7 +94,7 @@ __global__ void __launch_bounds__(kThreads) homes_kernel(SolverView<T> s) {
   const int64_t h = static_cast<int64_t>(add(&s.clock->wanted_homes, 1));
   const int64_t start = static_cast<int64_t>(add(&s.clock->cursor, s.table_count[e]));
   if (h < s.home_capacity) {
-    HomeList<T>& homes = s.next_homes();
+    const HomeList<T>& homes = s.next_homes();
     for (int axis = 0; axis < 3; ++axis) homes.coord[4 * h + axis] = key_block(key, axis);
     homes.coord[4 * h + 3] = key_field(key);
     homes.start[h] = static_cast<int32_t>(start);
@@ -117,7 +117,7 @@ __global__ void __launch_bounds__(kThreads) homes_kernel(SolverView<T> s) {
 
 // Slots of all reached blocks, chained by site.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) slots_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) slots_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock)) return;
   const int64_t e = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (e >= s.table_size || s.table_slot[e] != -2) return;
@@ -139,7 +139,7 @@ __global__ void __launch_bounds__(kThreads) slots_kernel(SolverView<T> s) {
 
 // Nothing has been written yet that a smaller table could not hold: here is where a build gives up.
 template <typename T>
-__global__ void verdict_kernel(SolverView<T> s) {
+__global__ void verdict_kernel(const __grid_constant__ SolverView<T> s) {
   SolverClock& c = *s.clock;
   if (!may_build(c)) return;
   if (c.wanted_homes > s.home_capacity || c.wanted_slots > s.slot_capacity) c.grow = 1;
@@ -147,7 +147,7 @@ __global__ void verdict_kernel(SolverView<T> s) {
 
 // Slots of each site in ascending field; which slots are shared.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) sites_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) sites_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock)) return;
   const int64_t e = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (e >= s.table_size || s.key[e] == kNoKey || key_field(s.key[e]) != kMaxSolverFields) return;
@@ -168,11 +168,16 @@ __global__ void __launch_bounds__(kThreads) sites_kernel(SolverView<T> s) {
     s.site_slots[site * kSiteFields + i] = i < count ? slots[i] : -1;
   for (int i = 0; i < count; ++i) s.slot_shared[slots[i]] = count > 1 ? 1 : 0;
   if (count > 1) add(&s.clock->shared_sites, 1);
+  uint64_t near = 0;
+  const Vec3<T> middle = block_middle(s, s.slot_coord + 4 * int64_t(slots[0]));
+  for (int64_t k = 0; k < s.collider_count; ++k)
+    if (k >= 63 || collider_near(s, k, middle)) near |= uint64_t(1) << min(k, int64_t(63));
+  s.site_near[site] = near;
 }
 
 // Contact reads one node beyond the blocks that fields share: marks the slots around those.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) edges_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) edges_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock) || s.clock->shared_sites == 0) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t slot = i / kNeighbours;
@@ -183,7 +188,8 @@ __global__ void __launch_bounds__(kThreads) edges_kernel(SolverView<T> s) {
 
 // Slots under the window of each home.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) neighbours_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads)
+    neighbours_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t h = i / kNeighbours;
@@ -194,7 +200,7 @@ __global__ void __launch_bounds__(kThreads) neighbours_kernel(SolverView<T> s) {
 
 // Destination of every particle; its cell is counted from the new home from now on.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) place_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) place_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   const HomeList<T>& homes = s.homes();
@@ -217,7 +223,7 @@ __global__ void __launch_bounds__(kThreads) place_kernel(SolverView<T> s) {
 
 // source[at] = p, from entry (destination of p).
 template <typename T>
-__global__ void __launch_bounds__(kThreads) invert_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) invert_kernel(const __grid_constant__ SolverView<T> s) {
   if (!may_build(*s.clock)) return;
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p < s.count) s.place[s.entry[p]] = static_cast<int32_t>(p);
@@ -227,7 +233,7 @@ __global__ void __launch_bounds__(kThreads) invert_kernel(SolverView<T> s) {
 // different nodes. Cells with more than kRanks particles put the rest at the end. Leaves the
 // present place of the particle that belongs at i in entry[i].
 template <typename T>
-__global__ void __launch_bounds__(kThreads) stripe_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) stripe_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.wanted_homes) return;
   const HomeList<T>& homes = s.next_homes();
@@ -293,7 +299,8 @@ __device__ void for_group(const SolverView<T>& s, int group, F&& f) {
 }
 
 template <typename T, bool kBack>
-__global__ void __launch_bounds__(kThreads) carry_kernel(SolverView<T> s, int group) {
+__global__ void __launch_bounds__(kThreads)
+    carry_kernel(const __grid_constant__ SolverView<T> s, int group) {
   if (!may_build(*s.clock)) return;
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p >= s.count) return;
@@ -313,7 +320,7 @@ __global__ void __launch_bounds__(kThreads) carry_kernel(SolverView<T> s, int gr
 
 // Largest contribution and mass of each home, for the units of its window.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) bound_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kThreads) bound_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.wanted_homes) return;
   const HomeList<T>& homes = s.next_homes();
@@ -321,7 +328,7 @@ __global__ void __launch_bounds__(kThreads) bound_kernel(SolverView<T> s) {
 }
 
 template <typename T>
-__global__ void finish_kernel(SolverView<T> s) {
+__global__ void finish_kernel(const __grid_constant__ SolverView<T> s) {
   SolverClock& c = *s.clock;
   if (!may_build(c)) return;
   c.parity = 1 - (c.parity & 1);
@@ -331,6 +338,7 @@ __global__ void finish_kernel(SolverView<T> s) {
   c.slots_max = max(c.slots_max, c.slots);
   c.builds += 1;
   c.rebuild = 0;
+  c.travel = 0.0;
 }
 
 unsigned ctas(int64_t n) { return static_cast<unsigned>((n + kThreads - 1) / kThreads); }

@@ -33,53 +33,33 @@ __device__ void clear_sums(const SolverView<T>& s, int64_t node) {
   for (int c = 0; c < kContactMoments; ++c) m[c] = 0;
 }
 
-// Colliders that can touch a node of the block, as bits; the lanes of a warp look at one each. A
-// sweeping or moving collider reaches as far as anything can move in the step. More than 64
-// colliders: the last bit stands for all the others.
+// Units of the sums over nodes that colliders get: torque is counted per 4096 dx of lever, so that
+// it stays in the range of the momentum it comes from.
 template <typename T>
-__device__ uint64_t colliders_near(const SolverView<T>& s, const Vec3<T>& middle) {
-  if (s.collider_count == 0) return 0;
-  const T reach = T(2.7) * s.dx + T(s.clock->dt) * T(s.clock->speed_seen);
-  uint64_t near = 0;
-  for (int first = 0; first < 64 && first < s.collider_count; first += 32) {
-    const int k = first + (threadIdx.x & 31);
-    bool touches = false;
-    if (k < s.collider_count && k < 63) {
-      const T* row = s.colliders + int64_t(k) * kColliderColumns;
-      Vec3<T> normal;
-      const T own = norm(load_vec3(row + kVelocity)) * T(s.clock->dt);
-      touches = collider_valid(row, 0) &&
-                collider_signed_distance(row, static_cast<const float*>(nullptr), middle, normal) <=
-                    reach + own;
-    }
-    near |= uint64_t(__ballot_sync(kAllLanes, touches)) << first;
-  }
-  if (s.collider_count > 63) near |= uint64_t(1) << 63;
-  return near;
+__device__ double sum_unit(const SolverView<T>& s, int i) {
+  const double unit = s.clock->momentum_unit;
+  return i < 3 ? unit : (i < 6 ? unit * double(s.dx) * 4096.0 : s.clock->mass_unit);
 }
 
+// Velocity after the colliders in `near`. Out of line: few nodes come here.
 template <typename T>
-__device__ void collide_one(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
-                            Vec3<T>& v) {
-  double impulse[3] = {0.0, 0.0, 0.0};
-  node_collide(s, k, x, mass, v, impulse);
-  const double per_unit = 1.0 / s.clock->momentum_unit;
-  for (int i = 0; i < 3; ++i) {
-    const long long units = __double2ll_rn(impulse[i] * per_unit);
-    if (units != 0)
-      atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + 3 * k + i),
-                static_cast<unsigned long long>(units));
-  }
-}
-
-template <typename T>
-__device__ __noinline__ void collide_near(const SolverView<T>& s, uint64_t near, const Vec3<T>& x,
-                                          double mass, Vec3<T>& v) {
+__device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, uint64_t near, Vec3<T> x,
+                                             double mass, Vec3<T> v, T dt) {
   for (; near != 0; near &= near - 1) {
-    const int64_t k = __ffsll(static_cast<long long>(near)) - 1;
-    const int64_t last = k == 63 ? s.collider_count : k + 1;
-    for (int64_t i = k; i < last; ++i) collide_one(s, i, x, mass, v);
+    const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
+    const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
+    for (int64_t k = first; k < end; ++k) {
+      double sums[kImpulseSums] = {};
+      node_collide(s, k, x, mass, dt, v, sums);
+      for (int i = 0; i < kImpulseSums; ++i) {
+        const long long units = __double2ll_rn(sums[i] / sum_unit(s, i));
+        if (units != 0)
+          atomicAdd(reinterpret_cast<unsigned long long*>(s.impulse_units + kImpulseSums * k + i),
+                    static_cast<unsigned long long>(units));
+      }
+    }
   }
+  return v;
 }
 
 template <typename T>
@@ -123,7 +103,8 @@ struct SlotNear {
 // Velocities of the sites that several fields share. Before grid_kernel, which clears the sums that
 // this one reads, its own and those of the nodes around.
 template <typename T>
-__global__ void __launch_bounds__(kBlockNodes) contact_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kBlockNodes)
+    contact_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock) || clock.shared_sites == 0) return;
   __shared__ int32_t around[kSiteFields][kNeighbours];
@@ -145,7 +126,7 @@ __global__ void __launch_bounds__(kBlockNodes) contact_kernel(SolverView<T> s) {
     __syncthreads();
     const int32_t* block = s.slot_coord + 4 * int64_t(slots[0]);
     const Vec3<T> x = node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
-    const uint64_t near = colliders_near(s, node_place(block, T(1.5), T(1.5), T(1.5), s.dx));
+    const uint64_t near = s.collider_count > 0 ? s.site_near[site] : 0;
     Vec3<T> velocity[kSiteFields];
     bool heavy[kSiteFields];
     int present = 0;
@@ -160,7 +141,8 @@ __global__ void __launch_bounds__(kBlockNodes) contact_kernel(SolverView<T> s) {
           node_contact(s, count, heavy, SlotNear<T>{s, around, local, clock.mass_unit}, velocity);
     for (int f = 0; f < count; ++f) {
       const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
-      if (heavy[f] && near != 0) collide_near(s, near, x, read_sums(s, node).mass, velocity[f]);
+      if (heavy[f] && near != 0)
+        velocity[f] = collide_near(s, near, x, read_sums(s, node).mass, velocity[f], dt);
       store_velocity(s, node, velocity[f]);
     }
     if (touched > 0)
@@ -170,7 +152,8 @@ __global__ void __launch_bounds__(kBlockNodes) contact_kernel(SolverView<T> s) {
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kSolverThreads) grid_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kSolverThreads, 6)
+    grid_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;
   const int64_t site =
@@ -186,14 +169,16 @@ __global__ void __launch_bounds__(kSolverThreads) grid_kernel(SolverView<T> s) {
     return;
   }
   const int32_t* block = s.slot_coord + 4 * int64_t(slot);
-  const uint64_t near = colliders_near(s, node_place(block, T(1.5), T(1.5), T(1.5), s.dx));
+  const uint64_t near = s.collider_count > 0 ? s.site_near[site] : 0;
   const int64_t node = int64_t(slot) * kBlockNodes + local;
   const NodeSums<T> sums = read_sums(s, node);
   clear_sums(s, node);
   Vec3<T> v;
-  if (node_velocity(s, sums, T(clock.dt), v) && near != 0)
-    collide_near(s, near, node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx),
-                 sums.mass, v);
+  const T dt = T(clock.dt);
+  if (node_velocity(s, sums, dt, v) && near != 0)
+    v = collide_near(s, near,
+                     node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx),
+                     sums.mass, v, dt);
   store_velocity(s, node, v);
 }
 

@@ -12,7 +12,7 @@ constexpr int kThreads = kSolverThreads;
 #ifndef GSF_P2G_THREADS
 #define GSF_P2G_THREADS 256
 #define GSF_G2P_THREADS 256
-#define GSF_G2P_CTAS 2
+#define GSF_G2P_CTAS 3
 #endif
 constexpr int kP2GThreads = GSF_P2G_THREADS;
 constexpr int kG2PThreads = GSF_G2P_THREADS;
@@ -67,7 +67,7 @@ __device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
 }
 
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(const __grid_constant__ SolverView<T> s) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
   const SolverClock& clock = *s.clock;
@@ -187,8 +187,30 @@ __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_
   }
 }
 
+// What the last CTA of a step does: colliders move on, then time. Out of line, so that g2p does not
+// hold its registers.
+template <int kThreadsHere, typename T>
+__device__ __noinline__ void end_of_step(const SolverView<T>& s) {
+  for (int64_t k = threadIdx.x; k < s.collider_count; k += kThreadsHere) {
+    double sums[kImpulseSums];
+    for (int i = 0; i < kImpulseSums; ++i) {
+      sums[i] = double(s.impulse_units[kImpulseSums * k + i]) * sum_unit(s, i);
+      s.impulse_units[kImpulseSums * k + i] = 0;
+    }
+    const double moved = end_collider(s, k, sums, s.clock->dt);
+    if (moved > 0.0) raise_to(&s.clock->moved, sortable(float(moved) * 1.000001f));
+  }
+  __syncthreads();
+  if (threadIdx.x != 0) return;
+  s.clock->travel += float_of_bits(s.clock->moved);
+  s.clock->moved = 0;
+  end_step(*s.clock, double(s.dx), s.count);
+  choose_unit(*s.clock);
+}
+
 template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverView<T> s) {
+__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
+    g2p_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   __shared__ T tile[3][kTile];
@@ -221,23 +243,33 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
                        min(meta_cell(meta, 2), kLastCell);
       T value[3] = {T(0), T(0), T(0)};
       Mat3<T> moment{};
+      // Along z first, then y, then x: each sum and its first moment in cells.
 #pragma unroll
-      for (int i = 0; i < 3; ++i)
+      for (int i = 0; i < 3; ++i) {
+        T plane[3] = {}, plane_y[3] = {}, plane_z[3] = {};
 #pragma unroll
-        for (int j = 0; j < 3; ++j)
+        for (int j = 0; j < 3; ++j) {
+          const int at = base + i * kStrideX + j * kStrideY;
 #pragma unroll
-          for (int k = 0; k < 3; ++k) {
-            const T w = st.w[0][i] * st.w[1][j] * st.w[2][k];
-            const int at = base + i * kStrideX + j * kStrideY + k;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {
-              const T v = w * tile[c][at];
-              value[c] += v;
-              if (i > 0) moment(c, 0) += T(i) * v;
-              if (j > 0) moment(c, 1) += T(j) * v;
-              if (k > 0) moment(c, 2) += T(k) * v;
-            }
+          for (int c = 0; c < 3; ++c) {
+            const T one = st.w[2][1] * tile[c][at + 1], two = st.w[2][2] * tile[c][at + 2];
+            const T row = st.w[1][j] * (st.w[2][0] * tile[c][at] + one + two);
+            plane[c] += row;
+            if (j == 1) plane_y[c] += row;
+            if (j == 2) plane_y[c] += row + row;
+            plane_z[c] += st.w[1][j] * (one + two + two);
           }
+        }
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+          const T w = st.w[0][i];
+          value[c] += w * plane[c];
+          if (i == 1) moment(c, 0) += w * plane[c];
+          if (i == 2) moment(c, 0) += w * (plane[c] + plane[c]);
+          moment(c, 1) += w * plane_y[c];
+          moment(c, 2) += w * plane_z[c];
+        }
+      }
       for (int c = 0; c < 3; ++c)
         for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
       flags = finish_particle<T, kLaws, kTrack>(s, p, reach, value, moment, dt, dt_next, largest);
@@ -255,19 +287,12 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS) g2p_kernel(SolverVi
   count_lanes(lost, &s.clock->lost);
   hand_over<kG2PThreads>(s, largest, blockIdx.x, true);
   if (!last_to_arrive(&s.clock->arrived, home_total)) return;
-  for (int64_t i = threadIdx.x; i < 3 * s.collider_count; i += kG2PThreads) {
-    s.impulse[i] += double(s.impulse_units[i]) * clock.momentum_unit;
-    s.impulse_units[i] = 0;
-  }
-  __syncthreads();
-  if (threadIdx.x == 0) {
-    end_step(*s.clock, double(s.dx), s.count);
-    choose_unit(*s.clock);
-  }
+  end_of_step<kG2PThreads>(s);
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kThreads) prime_kernel(SolverView<T> s, bool measure) {
+__global__ void __launch_bounds__(kThreads)
+    prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   const SolverClock& clock = *s.clock;
   if (int64_t(blockIdx.x) >= clock.homes) return;
   const HomeList<T>& homes = s.homes();

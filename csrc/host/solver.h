@@ -46,7 +46,10 @@ enum SolverBuffer : int {
   kTableHome,
   kTableSlot,
   kSlotNext,
+  kSiteNear,
   kColliders,
+  kColliderRows,
+  kSdfBuffer,
   kImpulseUnits,
   kImpulse,
   kSolverBuffers
@@ -135,9 +138,12 @@ struct SolverOps {
         {"table_home", t, 1, i32, false},
         {"table_slot", t, 1, i32, false},
         {"slot_next", c, 1, i32, false},
+        {"site_near", c, 1, i64, false},
         {"colliders", s.collider_count, kColliderColumns, real, true},
-        {"impulse_units", s.collider_count, 3, i64, true},
-        {"impulse", s.collider_count, 3, ScalarType::Double, true},
+        {"collider_state", s.collider_count, kColliderColumns, ScalarType::Double, true},
+        {"sdf", b[kSdfBuffer].numel(), 1, ScalarType::Float, true},
+        {"impulse_units", s.collider_count, kImpulseSums, i64, true},
+        {"impulse", s.collider_count, kImpulseSums, ScalarType::Double, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -158,6 +164,10 @@ struct SolverOps {
                     kMaxSolverFields - 1);
     STD_TORCH_CHECK(s.fields == 1 || b[kMoments].numel() > 0,
                     "solver: several fields need moments");
+    STD_TORCH_CHECK(b[kColliderRows].numel() == b[kColliders].numel() &&
+                        b[kImpulse].numel() == s.collider_count * kImpulseSums &&
+                        b[kImpulseUnits].numel() == s.collider_count * kImpulseSums,
+                    "solver: colliders, collider_state and impulse must have the same rows");
     const bool any_law = ints[kLawSet] != 0;
     STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),
                     "solver: these laws need alpha and peak");
@@ -199,7 +209,11 @@ struct SolverOps {
     s.table_home = int_at(kTableHome);
     s.table_slot = int_at(kTableSlot);
     s.slot_next = int_at(kSlotNext);
+    s.site_near = static_cast<uint64_t*>(any_at(kSiteNear));
     s.colliders = real_at(kColliders);
+    s.collider_state = static_cast<double*>(any_at(kColliderRows));
+    s.sdf = static_cast<const float*>(any_at(kSdfBuffer));
+    s.sdf_count = b[kSdfBuffer].numel();
     s.impulse_units = static_cast<int64_t*>(any_at(kImpulseUnits));
     s.impulse = static_cast<double*>(any_at(kImpulse));
     return s;

@@ -104,32 +104,40 @@ def cantilever_coarse() -> Result:
     )  # fmt: skip
 
 
-def elastica(load: float) -> tuple[float, float]:
-    """Deflection of the end of an inextensible cantilever under a dead load across it.
+def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
+    """Deflection of the end of a cantilever under a dead load across it, by shooting.
 
-    Solves theta'' = -load cos(theta), theta(0) = 0, theta'(1) = 0 by shooting (Bisshopp and
-    Drucker 1945 give the same by elliptic integrals).
+    A thin beam is Euler's elastica (Bisshopp and Drucker 1945 give the same by elliptic
+    integrals); one of finite slenderness also shears and stretches (Reissner 1972; nu = 0, shear
+    factor 5/6).
 
     Args:
         load: P L^2 / (E I).
+        slenderness: Length over height.
 
     Returns:
         Deflection across and shortening along, over the length.
     """
-    count = 2000
+    count = 1000
+    stretch, shear = load / (12.0 * slenderness**2), load / (5.0 * slenderness**2)
 
-    def shoot(curvature: float) -> tuple[float, float, float]:
-        theta, rate, x, y, step = 0.0, curvature, 0.0, 0.0, 1.0 / count
+    def rates(theta: float, moment: float) -> tuple[float, float, float, float]:
+        c, s = math.cos(theta), math.sin(theta)
+        along, across = 1.0 + stretch * s, shear * c
+        x, y = along * c - across * s, along * s + across * c
+        return moment, -load * x, x, y
+
+    def shoot(moment: float) -> tuple[float, float, float]:
+        theta, x, y, step = 0.0, 0.0, 0.0, 1.0 / count
         for _ in range(count):  # midpoint rule
-            middle, bend = theta + 0.5 * step * rate, rate - 0.5 * step * load * math.cos(theta)
-            rate -= step * load * math.cos(middle)
-            theta += step * bend
-            x += step * math.cos(middle)
-            y += step * math.sin(middle)
-        return rate, x, y
+            turn, drop, _, _ = rates(theta, moment)
+            turn, drop, dx, dy = rates(theta + 0.5 * step * turn, moment + 0.5 * step * drop)
+            theta, moment = theta + step * turn, moment + step * drop
+            x, y = x + step * dx, y + step * dy
+        return moment, x, y
 
     low, high = 0.0, 2.0 * load
-    for _ in range(60):
+    for _ in range(50):
         guess = 0.5 * (low + high)
         low, high = (guess, high) if shoot(guess)[0] < 0.0 else (low, guess)
     _, x, y = shoot(0.5 * (low + high))
@@ -137,7 +145,7 @@ def elastica(load: float) -> tuple[float, float]:
 
 
 def bend(
-    load: float, cells: int = 4, slenderness: float = 12.0, per_cell: int = 4
+    load: float, cells: int = 4, slenderness: float = 12.0, per_cell: int = 6
 ) -> tuple[float, float, int]:
     """Bend a slab (nu = 0, plane) by a dead load on its end and let it come to rest.
 
@@ -183,12 +191,17 @@ def bend(
 
 @problem(tier="slow")
 def cantilever_large() -> Iterator[Result]:
-    """Large deflection of a slender cantilever under a dead load: the elastica."""
+    """Large deflection of a slender cantilever under a dead load.
+
+    Points that cross cells under stress creep: the deflection keeps growing slowly while the strain
+    does not. With 2, 4, 6 points per cell and axis it ends 12, 5, 3 % too large.
+    """
     for load in (1.0, 2.0, 5.0):
-        across, along = elastica(load)
+        across, along = elastica(load, 12.0)
         got, shortened, steps = bend(load)
         yield compare(
             "cantilever_large", f"deflection over length, P L^2 / E I = {load:g}", got, across,
-            tolerance=0.03, source="elastica", note=f"4 cells thick, L / h 20, {steps} steps; "
-            f"shortening {shortened:.3f} against {along:.3f}",
+            tolerance=0.03, source="elastica with shear (Reissner 1972)",
+            note=f"thin elastica {elastica(load)[0]:.4f}; 4 cells thick, L / h 12, 6 points per "
+            f"cell and axis, {steps} steps; shortening {shortened:.3f} against {along:.3f}",
         )  # fmt: skip

@@ -38,9 +38,6 @@ __all__ = [
     "names",
 ]
 
-LATER_FIELDS: tuple[str, ...] = ()
-"""Parameters of laws that do not run yet: none are left."""
-
 _PRESETS: dict[str, Material] = {m.name: m for m in (*BRITTLE, *HARD, *GRAINS, *METALS, *LIQUIDS)}
 
 fruit = SimpleNamespace(

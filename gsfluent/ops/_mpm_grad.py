@@ -156,14 +156,7 @@ def _grid_update_backward(
         return None, None, *rest
     free = moments is None and merged is None
     if free and (colliders is None or colliders.shape[0] == 0):
-        if g_velocity is None:
-            return None, None, *rest
-        mass = grid[..., 3:]
-        heavy = mass > MASS_FLOOR
-        inverse = torch.where(heavy, 1.0 / torch.where(heavy, mass, torch.ones_like(mass)), 0.0)
-        g_momentum = g_velocity * inverse
-        g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
-        return torch.cat([g_momentum, g_mass], dim=-1), None, *rest
+        return None if g_velocity is None else _divided(g_velocity, grid), None, *rest
     g_grid, g_moments = torch.ops.gsfluent.grid_update_backward(
         g_velocity,
         g_impulse,
@@ -178,6 +171,30 @@ def _grid_update_backward(
         *ctx.options,
     )
     return g_grid, g_moments if moments is not None else None, *rest
+
+
+def _divided(g_velocity: Tensor, grid: Tensor) -> Tensor:
+    """Gradient of the grid through ``momentum / mass``."""
+    mass = grid[..., 3:]
+    heavy = mass > MASS_FLOOR
+    inverse = torch.where(heavy, 1.0 / torch.where(heavy, mass, torch.ones_like(mass)), 0.0)
+    g_momentum = g_velocity * inverse
+    g_mass = -(g_momentum * grid[..., :3]).sum(-1, keepdim=True) * inverse
+    return torch.cat([g_momentum, g_mass], dim=-1)
+
+
+def _touched(rows: Tensor, sdf: Tensor | None, blocks: Blocks, dx: float) -> Tensor | None:
+    """Blocks with nodes in a collider, bool [B]; None where one acts beyond what lies in it."""
+    from gsfluent.ops.collider import pad_colliders
+    from gsfluent.ops.reference.collider import signed_distance
+
+    x = blocks.node_positions(dx)
+    found = torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+    for row in pad_colliders(rows.double()):
+        if bool(row[15] != 0):  # swept: acts on what would pass through
+            return None
+        found |= (signed_distance(row, sdf, x)[0] <= 1e-3 * dx).any(dim=1)
+    return found
 
 
 @torch.library.custom_op("gsfluent::grid_update_backward", mutates_args=())
@@ -231,9 +248,19 @@ def _grid_update_by_reference(
     g_v = grid.new_zeros((*grid.shape[:3], 3)) if g_velocity is None else g_velocity
     g_i = grid.new_zeros(count, 6) if g_impulse is None else g_impulse
     if moments is None:
-        _, pull_back, *_ = torch.func.vjp(lambda g: forward(g, None), grid.double())
-        (g_grid,) = pull_back((g_v.double(), g_i.double()))
-        return g_grid.to(grid.dtype), grid.new_empty(0)
+        near = None
+        if merged is None and colliders is not None:
+            near = _touched(colliders, sdf, blocks, dx)
+        if near is None:
+            near = torch.ones(coords.shape[0], dtype=torch.bool, device=coords.device)
+        g_grid = _divided(g_v, grid)
+        if not bool(near.any()):
+            return g_grid, grid.new_empty(0)
+        blocks = blocks._replace(coords=coords[near])
+        _, pull_back, *_ = torch.func.vjp(lambda g: forward(g, None), grid[:, near].double())
+        (part,) = pull_back((g_v[:, near].double(), g_i.double()))
+        g_grid[:, near] = part.to(grid.dtype)
+        return g_grid, grid.new_empty(0)
     _, pull_back, *_ = torch.func.vjp(forward, grid.double(), moments.double())
     g_grid, g_moments = pull_back((g_v.double(), g_i.double()))
     return g_grid.to(grid.dtype), g_moments.to(grid.dtype)

@@ -1,8 +1,9 @@
-"""Gradient of ``return_mapping``: closed form where the map is elastic, the reference elsewhere.
+"""Gradient of ``return_mapping``.
 
-Most particles of most steps are elastic and unguarded; their adjoint is a page of algebra. The
-others go through :mod:`gsfluent.ops.reference.plasticity`, with the alpha the kernel found: the
-implicit function theorem needs the root and not the search.
+On the CPU a kernel (csrc/core/return_gradient.h) does the laws elastic and nacc; on CUDA elastic
+particles, which most particles of most steps are, have their page of algebra here. What is left
+(other laws, guarded states) goes through :mod:`gsfluent.ops.reference.plasticity`, with the alpha
+the forward pass found: the implicit function theorem needs the root and not the search.
 """
 
 from __future__ import annotations
@@ -123,6 +124,49 @@ class _Trial:
         return g_before, g_push.permute(2, 0, 1), pulled, pressed * self.j2m1
 
 
+def adjoint_of_elastic(
+    grad_strain: Tensor,
+    grad_alpha: Tensor,
+    grad_stress: Tensor,
+    strain: Tensor,
+    alpha: Tensor,
+    increment: Tensor,
+    laws: Tensor,
+    params: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of the particles the map leaves elastic, in PyTorch.
+
+    Args:
+        grad_strain: [N, 6].
+        grad_alpha: [N].
+        grad_stress: [N, 6].
+        strain: [N, 6].
+        alpha: [N].
+        increment: [N, 3, 3].
+        laws: Law of each particle, [N].
+        params: Material row of each particle, [N, 8].
+
+    Returns:
+        Gradients of strain, alpha, increment and of the first six columns of each particle's row
+        [N, 6], zero elsewhere; and where they were computed, bool [N].
+    """
+    m = reference.Material(*params.unbind(1)[: len(reference.Material._fields)])
+    trial = _Trial(strain, alpha, increment)
+    done = trial.untouched(m, laws, alpha)
+    g_strain, g_increment, g_mu, g_kappa = trial.pull_back(grad_strain, grad_stress, m)
+    keep = done[:, None]
+    # `where` and not a product: a particle that is not elastic may hold anything.
+    g_rows = strain.new_zeros(len(strain), 6)
+    g_rows[:, :2] = torch.where(keep, torch.stack([g_mu, g_kappa], dim=1), 0.0)
+    return (
+        torch.where(keep, g_strain, 0.0),
+        torch.where(done, grad_alpha, 0.0),
+        torch.where(keep[:, None], g_increment, 0.0),
+        g_rows,
+        done,
+    )
+
+
 @torch.library.custom_op("gsfluent::return_mapping_backward", mutates_args=())
 def _return_mapping_backward(
     grad_strain: Tensor,
@@ -147,23 +191,23 @@ def _return_mapping_backward(
         row = torch.arange(count, device=params.device)
     else:
         row = torch.zeros(count, dtype=torch.int64, device=params.device)
-    m = reference.Material(*params[row].unbind(1))
-    trial = _Trial(strain, alpha, increment)
-    simple = trial.untouched(m, law[row], alpha)
-    g_strain, g_increment, g_mu, g_kappa = trial.pull_back(grad_strain, grad_stress, m)
-    keep = simple[:, None]
-    # `where` and not a product: a particle that is not simple may hold anything.
-    g_strain = torch.where(keep, g_strain, 0.0)
-    g_increment = torch.where(keep[:, None], g_increment, 0.0)
-    g_alpha = torch.where(simple, grad_alpha, 0.0)
-    g_moduli = torch.where(keep, torch.stack([g_mu, g_kappa], dim=1), 0.0)
+    grads, state = (grad_strain, grad_alpha, grad_stress), (strain, alpha, increment)
+    if strain.device.type == "cpu":
+        g_strain, g_alpha, g_increment, g_rows, done = torch.ops.gsfluent.return_mapping_adjoint(
+            *grads, new_alpha, *state, law, params, material, k, epsilon, implicit
+        )
+        done = done > 0
+    else:
+        g_strain, g_alpha, g_increment, g_rows, done = adjoint_of_elastic(
+            *grads, *state, law[row], params[row]
+        )
     g_params = torch.zeros_like(params)
     if rows == 1:
-        g_params[0, :2] = g_moduli.sum(0)
+        g_params[0, :6] = g_rows.sum(0)
     else:
-        g_params[:, :2] = torch.zeros_like(params[:, :2]).index_add(0, row, g_moduli)
+        g_params[:, :6] = torch.zeros_like(params[:, :6]).index_add(0, row, g_rows)
 
-    rest = (~simple).nonzero().squeeze(1)
+    rest = (~done).nonzero().squeeze(1)
     if rest.numel():
         of = row[rest]
 

@@ -84,6 +84,7 @@ class Solver:
             contact only. Default: one field.
         gravity: Acceleration [m/s^2].
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
+        sdf: Values of all distance grids that ``colliders`` name, float32 [M].
         friction: Coulomb friction between fields.
         restitution: Restitution of node contact between fields.
         contact_gap: Distance of the centroids, in cells, up to which fields touch.
@@ -119,6 +120,7 @@ class Solver:
         body: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         colliders: Tensor | None = None,
+        sdf: Tensor | None = None,
         friction: float = 0.3,
         restitution: float = 0.0,
         contact_gap: float = 1.0,
@@ -174,9 +176,13 @@ class Solver:
         b.law, b.rows = row_law, rows
         if colliders is not None and colliders.shape[0] > 0:
             b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
-            count = colliders.shape[0]
-            b.impulse_units = torch.zeros(count, 3, dtype=torch.int64, device=self.device)
-            b.impulse = torch.zeros(count, 3, dtype=torch.float64, device=self.device)
+            b.collider_state = pad_colliders(colliders).to(self.device, torch.float64).clone()
+            shape = (colliders.shape[0], layout.IMPULSE_SUMS)
+            b.impulse_units = torch.zeros(shape, dtype=torch.int64, device=self.device)
+            b.impulse = torch.zeros(shape, dtype=torch.float64, device=self.device)
+            if sdf is not None:
+                check_tensor(op, "sdf", sdf, shape=(None,), dtype=torch.float32)
+                b.sdf = sdf.to(self.device).contiguous()
         self._buffers = b
         zero = velocity.new_zeros
         start = alpha if alpha is not None else zero(n)
@@ -546,7 +552,17 @@ class Solver:
     @property
     def impulse(self) -> Tensor:
         """Impulse given to the matter by each collider since the start [N s], float64 [K, 3]."""
-        return self._buffers.impulse.clone()
+        return self._buffers.impulse[:, :3].clone()
+
+    @property
+    def torque(self) -> Tensor:
+        """Angular impulse on the matter by each collider about its point [N m s], [K, 3]."""
+        return self._buffers.impulse[:, 3:6].clone()
+
+    @property
+    def colliders(self) -> Tensor:
+        """The colliders where they are now, float64 [K, columns]."""
+        return self._buffers.collider_state.clone()
 
     def counters(self) -> dict[str, float]:
         """Return what was done: steps, builds, blocks, plastic, guarded and inverted points, ..."""
@@ -561,8 +577,9 @@ class Solver:
     # --- going back ---
 
     _MOVING = ("clock", "offset", "meta", "velocity", "slope", "strain", "alpha", "peak",
-               "deformation", "id", "impulse", "colliders", "home_coord0", "home_start0",
-               "home_count0", "home_coord1", "home_start1", "home_count1")  # fmt: skip
+               "deformation", "id", "impulse", "colliders", "collider_state", "home_coord0",
+               "home_start0", "home_count0", "home_coord1", "home_start1",
+               "home_count1")  # fmt: skip
 
     def snapshot(self) -> dict[str, Any]:
         """Copy everything that changes, for :meth:`restore`."""

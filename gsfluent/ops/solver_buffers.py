@@ -7,12 +7,13 @@ import dataclasses
 import torch
 from torch import Tensor
 
-CLOCK_WORDS = 48
+CLOCK_WORDS = 50
 BLOCK_NODES = 64
 NEIGHBOURS = 27
 SITE_FIELDS = 16
 CONTACT_MOMENTS = 3
 ROW_COLUMNS = 10
+IMPULSE_SUMS = 7
 BLOCK_RANGE = 2**16
 MAX_FIELDS = 2**12 - 1
 MAX_ROWS = 2**23
@@ -21,7 +22,7 @@ MAX_PARTICLES = 2**26
 
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
-    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen", "slack",
+    "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen", "slack", "travel",
 )  # fmt: skip
 """Members of the clock that are doubles; the others are integers."""
 CLOCK = (
@@ -32,6 +33,7 @@ CLOCK = (
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
     "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "slack",
+    "travel", "moved",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}
@@ -77,7 +79,10 @@ class Buffers:
     table_home: Tensor
     table_slot: Tensor
     slot_next: Tensor
+    site_near: Tensor
     colliders: Tensor
+    collider_state: Tensor
+    sdf: Tensor
     impulse_units: Tensor
     impulse: Tensor
 
@@ -114,6 +119,7 @@ class Buffers:
         self.sums = torch.zeros(slots, BLOCK_NODES, 4, dtype=sums, device=device)
         many = slots if fields > 1 else 0
         self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=sums, device=device)
+        self.site_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())
@@ -141,6 +147,8 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
     for name in ("home_coord0", "home_coord1"):
         values[name] = zeros(0, 4, dtype=torch.int32)
     values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
-    values["impulse_units"] = zeros(0, 3, dtype=torch.int64)
-    values["impulse"] = zeros(0, 3, dtype=torch.float64)
+    values["impulse_units"] = zeros(0, IMPULSE_SUMS, dtype=torch.int64)
+    values["impulse"] = zeros(0, IMPULSE_SUMS, dtype=torch.float64)
+    values["collider_state"] = zeros(0, dtype=torch.float64)
+    values["sdf"] = zeros(0, dtype=torch.float32)
     return Buffers(**values)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsfluent import crack_band
-from gsfluent.lab import granular, liquid, notch, registry, softening, spall
+from gsfluent.lab import granular, liquid, notch, registry, spall
 from gsfluent.lab.paths import breaking_step
 from gsfluent.lab.slab import nacc
 
@@ -87,17 +87,6 @@ def test_crack_band_refuses_bad_numbers() -> None:
         crack_band.fracture_energy(row, -0.1, dx=-1.0)
     with pytest.raises(ValueError, match="still"):  # alpha moves by 0.2 in a step at most
         crack_band.softening_energy(row, -9.0, steps=10)
-
-
-def test_a_crack_of_two_grids_takes_the_same_energy_only_with_crack_band() -> None:
-    """The slow problem ``double_cantilever`` at its two smallest grids and one position."""
-    coarse, fine, plain = (
-        softening.open_cantilever(n, regularised=r, shift=0.25, reference=24, crossings=7.0)
-        for n, r in ((24, True), (36, True), (36, False))
-    )
-    assert min(coarse.tip, fine.tip, plain.tip) > 0.55
-    assert fine.energy == pytest.approx(coarse.energy, rel=0.15)
-    assert plain.energy < 0.8 * coarse.energy
 
 
 def test_a_strip_torn_too_fast_fails_everywhere_and_that_is_no_crack() -> None:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from gsfluent.lab import beams, discs, registry, statics, transfer, vortex, waves
+from gsfluent.lab import axes, beams, discs, registry, statics, transfer, vortex, waves
 from gsfluent.lab.driver import World, running_on
 from gsfluent.lab.shapes import ball, parameters
 
@@ -15,7 +15,7 @@ FAST = [
     p.name
     for p in registry.problems("fast")
     if p.function.__module__
-    in {m.__name__ for m in (transfer, waves, statics, beams, discs, vortex)}
+    in {m.__name__ for m in (axes, transfer, waves, statics, beams, discs, vortex)}
 ]
 
 

@@ -13,6 +13,7 @@ from torch.autograd import gradcheck
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsfluent import ops
+from gsfluent.ops.plasticity import LAWS
 
 DX = 0.125
 F64 = torch.float64
@@ -102,6 +103,33 @@ def test_nacc_steps_while_yielding(implicit: bool) -> None:
     assert gradcheck(crush, inputs, fast_mode=True, atol=1e-5, eps=1e-7)
 
 
+ROWS = {  # mu, kappa, strength, cohesion, hardening, eta, density, exponent
+    "drucker_prager": [4e4, 8e4, 0.2, 300.0, 0.0, 0.0, 1000.0, 0.0],
+    "von_mises": [4e4, 8e4, 2e3, 0.0, 1e4, 0.0, 1000.0, 0.0],
+    "fluid": [0.0, 8e4, 20.0, 0.0, 0.0, 0.0, 1000.0, 7.0],
+    "corotated": [4e4, 8e4, 0.0, 0.0, 0.0, 0.0, 1000.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_steps_of_other_laws(name: str) -> None:
+    x = block()
+    v = 6.0 * (x - x.mean(0)) + 2.0 * torch.randn(len(x), 3, dtype=F64)
+    laws = law(LAWS[name])
+    row = torch.tensor([ROWS[name]], dtype=F64)
+
+    def deform(v: Tensor, scale: Tensor) -> tuple[Tensor, ...]:
+        params = row * scale
+        state = ops.mpm_state(x, v, law=laws, params=params, alpha=torch.zeros(27, dtype=F64))
+        state = ops.rollout(state, 3, **common(x, params, laws, 2e-3))
+        return state.position, state.velocity, state.alpha, state.stress / 1e3
+
+    inputs = (v.requires_grad_(), torch.ones(8, dtype=F64, requires_grad=True))
+    if name in ("drucker_prager", "von_mises"):
+        assert deform(*inputs)[2].detach().abs().max() > 1e-3  # it yields
+    assert gradcheck(deform, inputs, fast_mode=True, atol=1e-5, eps=1e-7)
+
+
 def test_two_fields_in_contact() -> None:
     x = torch.cat([block(), block() + torch.tensor([0.0, 0.0, 1.6 * DX], dtype=F64)])
     body = (torch.arange(len(x)) >= len(x) // 2).int()
@@ -138,6 +166,25 @@ def test_rows_per_particle_and_by_index_agree() -> None:
 
     assert (gradient(True) != 0).all()
     torch.testing.assert_close(gradient(True), gradient(False), rtol=1e-10, atol=0.0)
+
+
+def test_float32_gradient_is_the_float64_one() -> None:
+    x, kick = block(), torch.randn(27, 3, dtype=F64)
+
+    def gradients(dtype: torch.dtype) -> list[Tensor]:
+        v = kick.to(dtype).requires_grad_()
+        young = torch.tensor(1e5, dtype=dtype, requires_grad=True)
+        params = ops.material_params(young, 0.3, friction=1.85, cohesion=0.6, hardening=3.0)
+        alpha = torch.full((27,), -0.01, dtype=dtype)
+        state = ops.mpm_state(x.to(dtype), v, law=law(1), params=params, alpha=alpha)
+        options = common(x, params, law(1), 2e-3, colliders=floor(0.34).to(dtype))
+        options |= {name: options[name].to(dtype) for name in ("mass", "volume")}
+        end = ops.rollout(state, 6, **options)
+        loss = end.position.square().sum() + end.alpha.sum()
+        return [g.double() for g in torch.autograd.grad(loss, (v, young))]
+
+    for single, double in zip(gradients(torch.float32), gradients(F64), strict=True):
+        assert (single - double).norm() < 1e-3 * double.norm()
 
 
 # --- checkpointing ---
