@@ -70,7 +70,7 @@ class Composed:
         p = self.points
         _, _, self.stress, _ = ops.return_mapping(
             p.strain, p.alpha, torch.zeros_like(p.affine), law=matter.law, params=matter.params,
-            material=p.material, **self._map,
+            material=p.material, dt=1.0, **self._map,
         )  # fmt: skip
 
     def advance(self, until: float, steps: int) -> int:
