@@ -26,9 +26,9 @@ struct Packet {
 
   int32_t index[kLanes];
   uint32_t meta[kLanes];
-  uint32_t active;  // bit per lane
-  bool inner;  // none of them is the last particle of all: four values of a row of three may be
-               // read
+  uint32_t active;   // bit per lane
+  bool consecutive;  // particles index[0], index[0] + 1, ...
+  bool inner;        // without the last particle of all: four values of a row of three may be read
 
   Packet(const SolverView<T>& s, const int32_t* order, int64_t count) {
     const int used = count < kLanes ? static_cast<int>(count) : kLanes;
@@ -40,6 +40,9 @@ struct Packet {
       meta[lane] = s.meta[index[lane]];
     }
     inner = furthest + 1 < s.count;
+    consecutive = true;
+    for (int lane = 1; lane < kLanes; ++lane)
+      consecutive = consecutive && index[lane] == index[0] + lane;
   }
 
   // Lanes [first, end) whose particles share the cell of lane `first`.
@@ -75,6 +78,7 @@ struct Packet {
     transpose(rows, out);
   }
   [[gnu::always_inline]] Pack<T> load1(const T* array, int width = 1, int column = 0) const {
+    if (width == 1 && consecutive) return load_pack(array + index[0]);
     return pack_of<T>([&](int lane) { return array[width * int64_t(index[lane]) + column]; });
   }
   [[gnu::always_inline]] void load9(const T* array, Pack<T>* out) const {

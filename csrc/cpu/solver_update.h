@@ -25,19 +25,18 @@ template <typename T>
 typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<T> alpha,
                                      Pack<T> j2m1, Pack<T> n2) {
   using P = Pack<T>;
-  const P mu = row[0] / row[1];
   const P beta = min(cohesion, P(kCohesionMax));
   const P x = min(row[4] * max(P(0) - alpha, P(0)), P(5));
   const P x2 = x * x;
   const P below = x * (P(1) + x2 * (P(1.0 / 6.0) + x2 * P(1.0 / 120.0)));
   const P p0 = min(P(kYieldPressureFloor) + below, P(kYieldPressureCap));
-  const P center = P(0.5) * (P(1) - beta) * p0, a = P(0.5) * (P(1) + beta) * p0;
-  const P b = row[2] * a;
-  const P b2 = b * b / (P(1) + P(2) * beta);
-  const P p = P(-0.5) * j2m1 - center, q2 = P(1.5) * mu * mu * n2;
-  // Written so that NaN means no; alpha out of its bounds is for the full map to clamp.
-  return (p * p * b2 + q2 * a * a <= P(0.9999) * (a * a * b2)) & (alpha >= P(kAlphaMin)) &
-         (alpha <= P(kAlphaMax)) & (b > P(1e-8));
+  const P p = P(-0.5) * j2m1 - P(0.5) * (P(1) - beta) * p0, a = P(0.5) * (P(1) + beta) * p0;
+  const P m2 = row[2] * row[2], b2 = m2 * a * a, flat = P(1) + P(2) * beta;
+  const P mu = row[0] / row[1], q2 = P(1.5) * mu * mu * n2;
+  // u^2 + w^2 < 1 times (M A)^2. Written so that NaN means no; alpha out of its bounds is for the
+  // full map to clamp, and so is a surface without height.
+  return (m2 * p * p + flat * q2 <= P(0.9999) * b2) & (alpha >= P(kAlphaMin)) &
+         (alpha <= P(kAlphaMax)) & (b2 > P(1e-16) * flat);
 }
 
 // finish_particle for every active lane.
@@ -53,9 +52,8 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   Mat3<P> c;
   for (int i = 0; i < 9; ++i) c.m[i] = P(T(4) * inv_dx) * first.m[i];
 
-  const Int meta = int_pack_of<T>([&](int lane) {
-    return static_cast<std::conditional_t<sizeof(T) == 4, int32_t, int64_t>>(packet.meta[lane]);
-  });
+  using Word = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
+  const Int meta = int_pack_of<T>([&](int lane) { return Word(packet.meta[lane]); });
   Int plain = Int{} - 1, leaves{}, moved = meta & ~(Int{} + 511);
   P rest[3];
   for (int axis = 0; axis < 3; ++axis) {
@@ -100,11 +98,16 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
            (det_identity_plus(increment) > P(0));
   Int whole = Int{} - 1;  // not broken
   if constexpr (kLaws != kElasticOnly) {
-    const Int law = int_pack_of<T>([&](int lane) {
-      return static_cast<std::conditional_t<sizeof(T) == 4, int32_t, int64_t>>(s.law[row_of(lane)]);
-    });
-    const Int nacc = law == int(kNacc);
-    plain &= nacc | (law == int(kElastic));
+    Int nacc{}, elastic{};
+    if (packet.same_rows()) {
+      nacc -= s.law[row_of(0)] == int(kNacc) ? 1 : 0;
+      elastic -= s.law[row_of(0)] == int(kElastic) ? 1 : 0;
+    } else {
+      nacc = -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kNacc)); });
+      elastic =
+          -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kElastic)); });
+    }
+    plain &= nacc | elastic;
     if (mask_bits(nacc) != 0) {
       const P alpha = packet.load1(s.alpha), peak = packet.load1(s.peak);
       P cohesion = row[3];

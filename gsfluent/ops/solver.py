@@ -225,7 +225,10 @@ class Solver:
                 f"{layout.MAX_ROWS}; give points of one material the same mass and volume"
             )
         which = unique[:, 0].long()
-        rows = torch.cat([self._params[which], unique[:, 1:].to(self._params)], dim=1)
+        density = self._params[which, 6:7].double().clamp(min=1e-30)
+        derived = torch.cat([1.0 / density, 4.0 * unique[:, 2:] / self.dx**2], dim=1)
+        numbers = torch.cat([unique[:, 1:], derived], dim=1)
+        rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
         return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
 
     def _load(
