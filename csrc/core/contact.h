@@ -16,7 +16,7 @@
 // with mass 0 where the body has no mass or its moments are not stored (a grid that stores moments
 // only in blocks where two bodies meet should also store them in the blocks around those: a sample
 // left out costs accuracy of the normal, never safety). Pairs of fields that are parts of one
-// unbroken body are not contacts: merge_pair / merge_group after all contacts of the node.
+// unbroken body are not contacts: merge_group after all contacts of the node.
 //
 // NORMAL. The centroid x_node + dx moment / mass of a neighbour's sum lies inside the body, as far
 // out as the body reaches there. Two bodies that do not overlap can be parted by a plane, and so
@@ -177,13 +177,6 @@ GSF_HOST_DEVICE void merge_group(uint64_t members, const Mass& mass, const Veloc
     if (members >> f & 1u) common = common + (mass(f) / total) * velocity(f);
   for (int f = 0; f < 64; ++f)
     if (members >> f & 1u) store(f, common);
-}
-
-// The same for two.
-template <typename T>
-GSF_HOST_DEVICE void merge_pair(T mass_a, T mass_b, Vec3<T>& v_a, Vec3<T>& v_b) {
-  const T share = mass_a / (mass_a + mass_b);
-  v_a = v_b = v_b + share * (v_a - v_b);
 }
 
 }  // namespace gsf

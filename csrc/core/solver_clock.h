@@ -62,7 +62,8 @@ GSF_HOST_DEVICE double choose_step(const SolverClock& c, double from, double dx)
 // (twice what it would at the present speed) is kept for the particles near the end of a window.
 GSF_HOST_DEVICE void reset_largest(SolverClock& c, double dx) {
   c.slack = min(0.5, 0.01 + 2.0 * float_of_bits(c.speed) * max(c.dt, c.dt_next) / dx);
-  c.speed = c.wave = c.gradient = 0;
+  c.speed = 0;
+  if (c.step % 4 == 0) c.wave = c.gradient = 0;  // kWaveSteps: measured anew in the coming step
 }
 
 GSF_HOST_DEVICE bool check_largest(SolverClock& c) {

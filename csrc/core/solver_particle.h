@@ -102,22 +102,21 @@ GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row
 
 // wave_speed_squared of the neo-Hookean law where the state's invariants are at hand.
 template <typename T>
-GSF_HOST_DEVICE T elastic_wave_squared(const MaterialRow<T>& m, const ElasticState<T>& state) {
+GSF_HOST_DEVICE T elastic_wave_squared(const T* row, const ElasticState<T>& state) {
   const T mean =
       clamp(state.isochoric * (T(1) + trace(state.e) * T(1.0 / 3.0)), T(1), T(kDeviatorMax));
-  const T along = m.mu * (T(4.0 / 3.0) * mean + T(0.272165526975909) * state.n) +
-                  T(0.5) * m.kappa * (T(2) + state.j2m1);
-  const T across = m.mu * (mean + T(0.816496580927726) * state.n);
-  return max(along, across) / m.density;
+  const T along = row[0] * (T(4.0 / 3.0) * mean + T(0.272165526975909) * state.n) +
+                  T(0.5) * row[1] * (T(2) + state.j2m1);
+  const T across = row[0] * (mean + T(0.816496580927726) * state.n);
+  return max(along, across) * row[kInverseDensityColumn];
 }
 
-// m C - dt V0 (4 / dx^2) tau.
+// m C - dt V0 (4 / dx^2) tau, from the row of the particle.
 template <typename T>
-GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, T mass, T volume,
-                                 T dx, T dt) {
-  const T scale = dt * volume * T(4) / (dx * dx);
+GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, const T* row, T dt) {
+  const T scale = dt * row[kStressColumn];
   const Mat3<T> t = to_mat3(tau);
-  for (int i = 0; i < 9; ++i) out[i] = mass * c.m[i] - scale * t.m[i];
+  for (int i = 0; i < 9; ++i) out[i] = row[kMassColumn] * c.m[i] - scale * t.m[i];
 }
 
 // Moves (l, o) of one axis by `step` cells; `leaves` is set within `slack` cells of the end of the
@@ -141,23 +140,51 @@ GSF_HOST_DEVICE bool move_axis(T step, T slack, int& l, T& o, bool& leaves) {
   return cell >= 0 && cell <= kLastCell;
 }
 
+// What a particle brings into its update; read before the gather, so that memory works meanwhile.
+template <typename T>
+struct ParticleBefore {
+  T offset[3];
+  Sym3<T> strain;
+  T alpha, peak;
+  uint32_t meta, row;
+};
+
+template <typename T, int kLaws>
+GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_t p) {
+  ParticleBefore<T> b;
+  load_three(s, s.offset, p, b.offset);
+  b.meta = s.meta[p];
+  b.strain = strain_of(s, p);
+  b.row = meta_row(b.meta) < uint64_t(s.row_count) ? meta_row(b.meta) : 0;
+  if constexpr (kLaws != kElasticOnly) {
+    b.alpha = s.alpha[p];
+    b.peak = s.peak[p];
+  }
+  return b;
+}
+
+// Steps between two looks at wave speeds and gradients: they change over many steps, and the step
+// leaves room (CFL 0.5 of a limit of 1).
+constexpr int64_t kWaveSteps = 4;
+GSF_HOST_DEVICE bool measures_waves(const SolverClock& c) { return c.step % kWaveSteps == 0; }
+
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
 // `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
 template <typename T, int kLaws, bool kTrack>
-GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uint32_t reach,
+GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
+                                          const ParticleBefore<T>& before, uint32_t reach,
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
-                                          Largest& largest) {
+                                          bool waves, T slack, Largest& largest) {
   StepFlags flags{};
-  const T inv_dx = T(1) / s.dx, slack = T(s.clock->slack);
-  const uint32_t meta = s.meta[p];
-  const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
+  const T inv_dx = s.inv_dx;
+  const uint32_t meta = before.meta, row = before.row;
   Mat3<T> c;
   for (int i = 0; i < 9; ++i) c.m[i] = T(4) * inv_dx * first.m[i];
 
   int l[3] = {meta_cell(meta, 0), meta_cell(meta, 1), meta_cell(meta, 2)};
   for (int axis = 0; axis < 3; ++axis) {
-    T o = s.offset[s.at(3, p, axis)];
+    T o = before.offset[axis];
     if (!move_axis(dt * inv_dx * value[axis], slack, l[axis], o, flags.leaves)) flags.lost = true;
     flags.leaves = flags.leaves || !cell_in_reach(reach, axis, l[axis]);
     s.offset[s.at(3, p, axis)] = o;
@@ -173,49 +200,62 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
   }
 
   const T* r = s.rows + int64_t(row) * kRowColumns;
-  const T mass = r[kMassColumn], volume = r[kVolumeColumn];
   const Mat3<T> increment = dt * c;
   Sym3<T> stress;
-  T wave2;
+  T wave2 = T(0);
+  bool whole = true;  // broken points carry no stress: how fast they are torn does not matter
   if constexpr (kLaws == kElasticOnly) {
-    const Sym3<T> e = update_strain(strain_of(s, p), increment);
+    const Sym3<T> e = update_strain(before.strain, increment);
     const ElasticState<T> state = elastic_state(e, !(det_identity_plus(increment) > T(0)));
     flags.guarded = state.guarded;
     flags.inverted = state.inverted;
     flags.invalid = !finite(e);
     set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, log_volume(state)) : state.e);
     stress = kirchhoff_stress(r[0], r[1], state.d, state.j2m1);
-    wave2 = elastic_wave_squared(load_material(r), state);
+    if (waves) wave2 = elastic_wave_squared(r, state);
   } else {
-    const T alpha = s.alpha[p], peak = s.peak[p];
+    const T alpha = before.alpha, peak = before.peak;
     const MaterialRow<T> material = material_now(s, row, peak);
     const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
     const ReturnMapped<T> out =
-        return_mapping(strain_of(s, p), alpha, increment, law, material, s.options, dt);
+        return_mapping(before.strain, alpha, increment, law, material, s.options, dt);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
     flags.invalid = out.invalid;
     set_strain(s, p, out.strain);
-    s.alpha[p] = out.alpha;
-    s.peak[p] = out.alpha > peak ? out.alpha : peak;
+    if (out.alpha != alpha) {
+      s.alpha[p] = out.alpha;
+      if (out.alpha > peak) s.peak[p] = out.alpha;
+    }
+    whole = max(out.alpha, peak) < T(0) || law != kNacc;
     stress = out.stress;
-    wave2 = wave_speed_squared(law, material, out.strain);
+    if (waves) wave2 = wave_speed_squared(law, material, out.strain);
   }
   T slope[9];
-  store_slope(slope, c, stress, mass, volume, s.dx, dt_next);
+  store_slope(slope, c, stress, r, dt_next);
   store_nine(s, s.slope, p, slope);
 
-  T speed2 = T(0), gradient2 = T(0);
-  for (int i = 0; i < 3; ++i) speed2 += value[i] * value[i];
-  for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
-  bool whole = true;  // broken points carry no stress: how fast they are torn does not matter
-  if constexpr (kLaws != kElasticOnly) whole = s.peak[p] < T(0) || s.law[row] != kNacc;
+  const T speed2 = value[0] * value[0] + value[1] * value[1] + value[2] * value[2];
   largest.speed2 = larger(float(speed2), largest.speed2);
-  largest.wave2 = larger(float(wave2), largest.wave2);
-  if (whole) largest.gradient2 = larger(float(gradient2), largest.gradient2);
-  largest.bound = larger(float(momentum_bound(value, slope, mass, s.dx)), largest.bound);
+  if (waves) {
+    T gradient2 = T(0);
+    for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
+    largest.wave2 = larger(float(wave2), largest.wave2);
+    if (whole) largest.gradient2 = larger(float(gradient2), largest.gradient2);
+  }
+  largest.bound = larger(float(momentum_bound(value, slope, r[kMassColumn], s.dx)), largest.bound);
   return flags;
+}
+
+// The same with everything read here.
+template <typename T, int kLaws, bool kTrack>
+GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uint32_t reach,
+                                          const T* value, const Mat3<T>& first, T dt, T dt_next,
+                                          Largest& largest) {
+  return finish_particle<T, kLaws, kTrack>(s, p, particle_before<T, kLaws>(s, p), reach, value,
+                                           first, dt, dt_next, measures_waves(*s.clock),
+                                           T(s.clock->slack), largest);
 }
 
 // Start of a call: the slope holds m C (the last step of the call before wrote it with dt_next =
@@ -249,7 +289,7 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   const ReturnMapped<T> state = return_mapping(strain_of(s, p), alpha, none, s.law[row],
                                                material_now(s, row, peak), s.options, dt);
   T slope[9];
-  store_slope(slope, c, state.stress, mass, r[kVolumeColumn], s.dx, dt);
+  store_slope(slope, c, state.stress, r, dt);
   store_nine(s, s.slope, p, slope);
   largest.bound = larger(float(momentum_bound(v, slope, mass, s.dx)), largest.bound);
 }

@@ -24,11 +24,13 @@ constexpr int kWindowNodes = 512;
 constexpr int kNeighbours = 27;  // blocks a window can touch
 constexpr int kImpulseSums = 7;
 constexpr int kLastCell = 5;     // largest l
-constexpr int kRowColumns = 10;  // eight material parameters, particle mass, particle volume
+constexpr int kRowColumns = 12;  // eight material parameters, then those below
 constexpr int kMassColumn = 8;
 constexpr int kVolumeColumn = 9;
-constexpr int kSiteFields = 16;  // fields that may share one block
-constexpr int kFieldBits = 12;   // fields of a scene
+constexpr int kInverseDensityColumn = 10;
+constexpr int kStressColumn = 11;  // 4 V0 / dx^2
+constexpr int kSiteFields = 16;    // fields that may share one block
+constexpr int kFieldBits = 12;     // fields of a scene
 constexpr int kMaxSolverFields = (1 << kFieldBits) - 1;
 constexpr int kBlockBits = 17;  // block coordinates lie in [-2^16, 2^16)
 constexpr int32_t kBlockRange = 1 << (kBlockBits - 1);
@@ -137,7 +139,7 @@ template <typename T>
 struct SolverView {
   int64_t count, home_capacity, slot_capacity, table_size, row_count, collider_count;
   int32_t fields;
-  T dx;
+  T dx, inv_dx;
   T gravity[3];
   ContactLaw contact;
   NaccOptions<T> options;

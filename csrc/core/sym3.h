@@ -31,7 +31,7 @@ GSF_HOST_DEVICE Sym3<T> add_diagonal(const Sym3<T>& a, T c) {
 
 template <typename T>
 GSF_HOST_DEVICE Sym3<T> deviator(const Sym3<T>& a) {
-  return add_diagonal(a, -trace(a) / T(3));
+  return add_diagonal(a, trace(a) * T(-1.0 / 3.0));
 }
 
 template <typename T>

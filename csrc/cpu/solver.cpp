@@ -11,8 +11,10 @@ constexpr int64_t kParticleGrain = 2048;
 
 void give_largest(const Largest& l, SolverClock& c) {
   c.speed = bits_of(std::sqrt(l.speed2));
-  c.wave = bits_of(std::sqrt(l.wave2));
-  c.gradient = bits_of(std::sqrt(l.gradient2));
+  // Not every step looks at these: what an earlier one saw stays until the clock forgets it. The
+  // bits of floats that are not negative are ordered as the floats are.
+  c.wave = std::max<uint64_t>(c.wave, bits_of(std::sqrt(l.wave2)));
+  c.gradient = std::max<uint64_t>(c.gradient, bits_of(std::sqrt(l.gradient2)));
 }
 
 template <typename T>

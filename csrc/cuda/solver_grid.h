@@ -51,6 +51,7 @@ __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, uint64_t ne
     for (int64_t k = first; k < end; ++k) {
       double sums[kImpulseSums] = {};
       node_collide(s, k, x, mass, dt, v, sums);
+      if (sums[6] == 0.0) continue;  // not touched
       for (int i = 0; i < kImpulseSums; ++i) {
         const long long units = __double2ll_rn(sums[i] / sum_unit(s, i));
         if (units != 0)
@@ -158,6 +159,10 @@ __global__ void __launch_bounds__(kSolverThreads, 6)
   if (!may_step(clock)) return;
   const int64_t site =
       int64_t(blockIdx.x) * (kSolverThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
+  // p2g has read the bounds of this step; g2p raises those of the next one from nothing.
+  for (int64_t h = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x; h < clock.homes;
+       h += int64_t(gridDim.x) * kSolverThreads)
+    s.home_bound[h] = T(0);
   if (site >= clock.sites) return;
   const int local = threadIdx.x % kBlockNodes;
   const int32_t* slots = s.site_slots + site * kSiteFields;

@@ -34,6 +34,15 @@ __device__ inline void raise_to(uint64_t* word, unsigned bits) {
     atomicMax(reinterpret_cast<unsigned long long*>(word), static_cast<unsigned long long>(bits));
 }
 
+// Maximum of non-negative reals: their bits sort like integers.
+__device__ inline void raise_real(float* p, float v) {
+  atomicMax(reinterpret_cast<unsigned*>(p), __float_as_uint(v));
+}
+__device__ inline void raise_real(double* p, double v) {
+  atomicMax(reinterpret_cast<unsigned long long*>(p),
+            static_cast<unsigned long long>(__double_as_longlong(v)));
+}
+
 // Bits of sqrt(x) rounded up a little, for values that were compared as squares.
 __device__ inline unsigned root_up(unsigned bits) {
   if (bits >= 0x7f800000u) return 0x7fffffffu;

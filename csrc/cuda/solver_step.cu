@@ -66,23 +66,33 @@ __device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
          local_index(window_local(i), window_local(j), window_local(k));
 }
 
+// Small scenes give a home to several CTAs, so that each does less in a row.
+constexpr int kMaxSplit = 2;
+template <typename T>
+int split_of(const SolverView<T>& s) {
+  return s.count < 600000 ? kMaxSplit : 1;
+}
+
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads) p2g_kernel(const __grid_constant__ SolverView<T> s) {
+__global__ void __launch_bounds__(kP2GThreads)
+    p2g_kernel(const __grid_constant__ SolverView<T> s, int split) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
   const SolverClock& clock = *s.clock;
-  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
+  if (!may_step(clock) || int64_t(blockIdx.x / split) >= clock.homes) return;
+  const int64_t home = blockIdx.x / split;
+  const int part = blockIdx.x % split;
   __shared__ Word tile[kChannels][kTile];
   __shared__ int32_t neighbour[kNeighbours];
   __shared__ bool slot_shared[kMoments ? kNeighbours : 1];
   __shared__ int shared_home;
   const HomeList<T>& homes = s.homes();
-  const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
+  const int64_t first = homes.start[home], count = homes.count[home];
   if (threadIdx.x == 0) shared_home = 0;
   for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
   __syncthreads();
   if (threadIdx.x < kNeighbours) {
-    const int32_t slot = s.neighbour[int64_t(blockIdx.x) * kNeighbours + threadIdx.x];
+    const int32_t slot = s.neighbour[home * kNeighbours + threadIdx.x];
     neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
     if constexpr (kMoments) {
       slot_shared[threadIdx.x] = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
@@ -91,10 +101,10 @@ __global__ void __launch_bounds__(kP2GThreads) p2g_kernel(const __grid_constant_
   }
   __syncthreads();
   const bool with_moments = kMoments && shared_home != 0;
-  const double unit = window_unit<T>(s.home_bound[blockIdx.x], 0.43, count, clock.momentum_unit);
-  const double mass_unit = window_unit<T>(s.home_mass[blockIdx.x], 1.0, count, clock.mass_unit);
+  const double unit = window_unit<T>(s.home_bound[home], 0.43, count, clock.momentum_unit);
+  const double mass_unit = window_unit<T>(s.home_mass[home], 1.0, count, clock.mass_unit);
   const T per_unit = T(1.0 / unit), per_mass = T(1.0 / mass_unit);
-  for (int64_t r = threadIdx.x; r < count; r += kP2GThreads) {
+  for (int64_t r = part * kP2GThreads + threadIdx.x; r < count; r += split * kP2GThreads) {
     const int64_t p = first + r;
     if (p < 0 || p >= s.count) continue;
     const uint32_t meta = s.meta[p];
@@ -182,8 +192,9 @@ __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_
     raise_to(&c.gradient, root_up(bits[2]));
   }
   if (home >= 0) {
-    s.home_bound[home] = T(__uint_as_float(bits[3])) * T(1.000001);
-    raise_to(&c.bound, __float_as_uint(__uint_as_float(bits[3]) * 1.000001f));
+    const float bound = __uint_as_float(bits[3]) * 1.000002f;
+    raise_real(s.home_bound + home, T(bound));
+    raise_to(&c.bound, __float_as_uint(bound));
   }
 }
 
@@ -210,34 +221,37 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
 
 template <typename T, int kLaws, bool kTrack>
 __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
-    g2p_kernel(const __grid_constant__ SolverView<T> s) {
+    g2p_kernel(const __grid_constant__ SolverView<T> s, int split) {
   const SolverClock& clock = *s.clock;
-  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.homes) return;
+  if (!may_step(clock) || int64_t(blockIdx.x / split) >= clock.homes) return;
+  const int64_t home = blockIdx.x / split;
+  const int part = blockIdx.x % split;
   __shared__ T tile[3][kTile];
   const HomeList<T>& homes = s.homes();
-  const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
+  const int64_t first = homes.start[home], count = homes.count[home];
   const T dt = T(clock.dt), dt_next = T(clock.dt_next);
-  const int64_t home_total = clock.homes;
-  const uint32_t reach = reach_of_row(s.neighbour + int64_t(blockIdx.x) * kNeighbours);
+  const int64_t arrivals = clock.homes * split;
+  const bool waves = measures_waves(clock);
+  const T slack = T(clock.slack);
+  const uint32_t reach = reach_of_row(s.neighbour + home * kNeighbours);
   for (int index = threadIdx.x; index < kWindowNodes; index += kG2PThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
-    const int64_t node = slot_node(s.neighbour + int64_t(blockIdx.x) * kNeighbours, i, j, k);
+    const int64_t node = slot_node(s.neighbour + home * kNeighbours, i, j, k);
     const T* v = s.node_velocity + 4 * (node < 0 ? 0 : node);
     for (int c = 0; c < 3; ++c) tile[c][at] = node < 0 ? T(0) : v[c];
   }
   __syncthreads();
   Largest largest{};
   bool leaves = false, lost = false;
-  const int64_t rounds = (count + kG2PThreads - 1) / kG2PThreads;
+  const int64_t stride = int64_t(split) * kG2PThreads, rounds = (count + stride - 1) / stride;
   for (int64_t round = 0; round < rounds; ++round) {
-    const int64_t r = round * kG2PThreads + threadIdx.x, p = first + r;
+    const int64_t r = round * stride + part * kG2PThreads + threadIdx.x, p = first + r;
     StepFlags flags{};
     if (r < count && p >= 0 && p < s.count) {
-      const uint32_t meta = s.meta[p];
-      T offset[3];
-      load_three(s, s.offset, p, offset);
-      const Stencil<T> st = stencil_at(offset);
+      const ParticleBefore<T> before = particle_before<T, kLaws>(s, p);
+      const uint32_t meta = before.meta;
+      const Stencil<T> st = stencil_at(before.offset);
       const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
                        min(meta_cell(meta, 1), kLastCell) * kStrideY +
                        min(meta_cell(meta, 2), kLastCell);
@@ -272,7 +286,8 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
       }
       for (int c = 0; c < 3; ++c)
         for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
-      flags = finish_particle<T, kLaws, kTrack>(s, p, reach, value, moment, dt, dt_next, largest);
+      flags = finish_particle<T, kLaws, kTrack>(s, p, before, reach, value, moment, dt, dt_next,
+                                                waves, slack, largest);
     }
     if constexpr (kLaws != kElasticOnly) count_lanes(flags.plastic, &s.clock->plastic);
     if (__any_sync(kAllLanes, flags.guarded || flags.inverted || flags.invalid)) {
@@ -285,8 +300,8 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
   }
   count_lanes(leaves, &s.clock->leaving);
   count_lanes(lost, &s.clock->lost);
-  hand_over<kG2PThreads>(s, largest, blockIdx.x, true);
-  if (!last_to_arrive(&s.clock->arrived, home_total)) return;
+  hand_over<kG2PThreads>(s, largest, home, true);
+  if (!last_to_arrive(&s.clock->arrived, arrivals)) return;
   end_of_step<kG2PThreads>(s);
 }
 
@@ -323,12 +338,13 @@ cudaError_t solver_prime(const SolverView<T>& s, cudaStream_t stream) {
 template <typename T>
 cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  const int split = split_of(s);
   constexpr int kSitesPerCta = kThreads / kBlockNodes;
   const unsigned sites = static_cast<unsigned>((s.slot_capacity + kSitesPerCta - 1) / kSitesPerCta);
   if (s.moments != nullptr)
-    p2g_kernel<T, true><<<homes, kP2GThreads, 0, stream>>>(s);
+    p2g_kernel<T, true><<<homes * split, kP2GThreads, 0, stream>>>(s, split);
   else
-    p2g_kernel<T, false><<<homes, kP2GThreads, 0, stream>>>(s);
+    p2g_kernel<T, false><<<homes * split, kP2GThreads, 0, stream>>>(s, split);
   if (s.moments != nullptr)
     contact_kernel<T>
         <<<static_cast<unsigned>((s.slot_capacity + kContactSites - 1) / kContactSites),
@@ -336,17 +352,17 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)
-    g2p_kernel<T, kElasticOnly, false><<<homes, kG2PThreads, 0, stream>>>(s);
+    g2p_kernel<T, kElasticOnly, false><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
   else if (law_set == kElasticOnly)
-    g2p_kernel<T, kElasticOnly, true><<<homes, kG2PThreads, 0, stream>>>(s);
+    g2p_kernel<T, kElasticOnly, true><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
   else if (law_set == kBrittle && !track)
-    g2p_kernel<T, kBrittle, false><<<homes, kG2PThreads, 0, stream>>>(s);
+    g2p_kernel<T, kBrittle, false><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
   else if (law_set == kBrittle)
-    g2p_kernel<T, kBrittle, true><<<homes, kG2PThreads, 0, stream>>>(s);
+    g2p_kernel<T, kBrittle, true><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
   else if (!track)
-    g2p_kernel<T, kAnyLaw, false><<<homes, kG2PThreads, 0, stream>>>(s);
+    g2p_kernel<T, kAnyLaw, false><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
   else
-    g2p_kernel<T, kAnyLaw, true><<<homes, kG2PThreads, 0, stream>>>(s);
+    g2p_kernel<T, kAnyLaw, true><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
   return cudaGetLastError();
 }
 

@@ -172,6 +172,7 @@ struct SolverOps {
     STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),
                     "solver: these laws need alpha and peak");
     s.dx = static_cast<T>(floats[kDx]);
+    s.inv_dx = static_cast<T>(1.0 / floats[kDx]);
     for (int i = 0; i < 3; ++i) s.gravity[i] = static_cast<T>(floats[kGravityX + i]);
     s.contact = {floats[kFrictionBetween], floats[kRestitutionBetween], floats[kGap]};
     s.options = {static_cast<T>(floats[kPower]), static_cast<T>(floats[kEpsilon]),

@@ -201,12 +201,12 @@ def colliding_discs(dx: float = 0.025) -> list[Result]:
         dx: Node spacing [m].
     """
     spacing = dx / 2.0
-    parts = [disc((c, c, 0.0), 0.2, dx, spacing) for c in (0.3, 0.7)]
-    parts = [p - torch.tensor([0.0, 0.0, float(p[:, 2].min()) - 0.5 * spacing]) for p in parts]
+    thick = 4.0 * dx  # as deep as the period: plane strain
+    parts = [disc((c, c, 0.5 * thick), 0.2, thick, spacing) for c in (0.3, 0.7)]
     push = torch.tensor([0.1, 0.1, 0.0], dtype=torch.float64)
     world = bodies(
         parts, [push, -push], dx=dx, mass=1000.0 * spacing**3, volume=spacing**3,
-        params=parameters(1000.0, 0.3, 1000.0), period=(None, None, dx * 4),
+        params=parameters(1000.0, 0.3, 1000.0), period=(None, None, thick),
     )  # fmt: skip
     start, lowest = world.kinetic(), [world.kinetic()]
     total = [start]

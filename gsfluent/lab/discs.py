@@ -15,7 +15,7 @@ from gsfluent.lab.vortex import plane_strain
 SOURCE = "elastic; Sulsky et al. 1994, solver.md 3, row 7"
 
 
-def collide(cells: int, fields: int) -> tuple[float, float, float, str]:
+def collide(cells: int, fields: int) -> tuple[float, float, float, float, str]:
     """Let two discs (r 0.2 m, E 1000, nu 0.3, rho 1000, 0.14 m/s each) meet head-on and part.
 
     Args:
@@ -23,7 +23,7 @@ def collide(cells: int, fields: int) -> tuple[float, float, float, str]:
         fields: 1: they meet in one velocity field; 2: by contact of two.
 
     Returns:
-        Kinetic energy after over before, largest gain of energy, largest momentum over
+        Kinetic and whole energy after over before, largest gain of energy, largest momentum over
         sum m |v|, and what else was seen.
     """
     radius, speed = 0.2, 0.1
@@ -55,39 +55,42 @@ def collide(cells: int, fields: int) -> tuple[float, float, float, str]:
         f"dx = r / {cells}, CFL 0.5, {world.steps} steps; kinetic energy down to {lowest:.3f}, "
         f"elastic energy left {world.elastic() / start:.3f}; centres {gap:.2f} m apart at the end"
     )
-    return world.kinetic() / start, gain, drift, note
+    kept = (world.kinetic() + world.elastic()) / start
+    return world.kinetic() / start, kept, gain, drift, note
 
 
 @problem(tier="fast")
-def colliding_discs() -> Iterator[Result]:
+def discs_one_field() -> Iterator[Result]:
     """Two elastic discs in a head-on collision, in one field: energy returned and momentum."""
-    back, gain, drift, note = collide(16, 1)
+    back, _, gain, drift, note = collide(16, 1)
     yield Result(
-        "colliding_discs", "kinetic energy after over before, one field", back, 1.0, 1.0 - back,
+        "discs_one_field", "kinetic energy after over before, one field", back, 1.0, 1.0 - back,
         0.1, "", SOURCE, note=note,
     )  # fmt: skip
     yield Result(
-        "colliding_discs", "largest energy gained", gain, 0.0, gain, 1e-3, "", "no work is done"
+        "discs_one_field", "largest energy gained", gain, 0.0, gain, 1e-3, "", "no work is done"
     )
     yield Result(
-        "colliding_discs", "momentum over sum m |v|", drift, 0.0, drift, 1e-12, "",
+        "discs_one_field", "momentum over sum m |v|", drift, 0.0, drift, 1e-12, "",
         "equal and opposite",
     )  # fmt: skip
 
 
 @problem(tier="slow")
-def colliding_discs_two_fields() -> Iterator[Result]:
+def discs_two_fields() -> Iterator[Result]:
     """Two elastic discs that meet by contact of two fields: energy returned at two cell sizes."""
     losses = []
     for cells in (16, 32):
-        back, _, _, note = collide(cells, 2)
-        losses.append(1.0 - back)
+        back, kept, _, _, note = collide(cells, 2)
+        losses.append(1.0 - kept)
         yield Result(
-            "colliding_discs_two_fields", f"kinetic energy after over before, dx = r / {cells}",
+            "discs_two_fields", f"kinetic energy after over before, dx = r / {cells}",
             back, 1.0, 1.0 - back, 0.1, "", SOURCE, note=note,
         )  # fmt: skip
     order = math.log2(losses[0] / losses[1])
     yield Result(
-        "colliding_discs_two_fields", "order of the loss in dx", order, 1.0, max(0.0, 1.0 - order),
-        0.3, "", SOURCE, note="every node loses its approach when it first touches",
+        "discs_two_fields", "order of the loss of energy in dx", order, 1.0,
+        max(0.0, 1.0 - order), 0.4, "", SOURCE,
+        note=f"lost {losses[0]:.3f}, {losses[1]:.3f}: every node loses its approach when it first "
+        "touches; the rest of what is missing above is vibration",
     )  # fmt: skip

@@ -26,7 +26,7 @@ REST = (0.0, 0.0, 0.0)
 
 def _on_slab(
     top: Tensor, length: float, width: float, angle: float, friction: float, speed: float = 0.0,
-    **options: Any,
+    pull: float = PULL, **options: Any,
 ) -> tuple[World, Tensor]:  # fmt: skip
     """A body on a slab whose surface is z = 0, gravity at ``angle`` to it; the body's mask."""
     slab = box((-2.0, -0.5 * width, -3.0), (length, width, 3.0), SPACING)
@@ -34,7 +34,7 @@ def _on_slab(
     along = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
     world = bodies(
         [top, slab], [along, torch.zeros(3, dtype=torch.float64)], friction=friction,
-        gravity=(PULL * math.sin(slope), 0.0, -PULL * math.cos(slope)),
+        gravity=(pull * math.sin(slope), 0.0, -pull * math.cos(slope)),
         colliders=plane((0.0, 0.0, -2.0), (0.0, 0.0, 1.0), mode=STICKY)[None], **options,
     )  # fmt: skip
     return world, torch.arange(len(world.position)) < len(top)
@@ -151,18 +151,21 @@ def ball_rolls(radius: float = 6.0, angle: float = 20.0, friction: float = 0.5) 
     points = points + torch.tensor([radius, 0.0, radius], dtype=torch.float64)
     slab = torch.full((round(24 / SPACING) * round(12 / SPACING) * round(3 / SPACING),), SPACING**3)
     volume = torch.cat([volume, slab.double()])
-    world, ball = _on_slab(points, 24.0, 12.0, 0.0, friction, mass=volume, volume=volume)
+    slope, calm = math.radians(angle), 150.0
+    level = PULL * torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    tilted = PULL * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)], dtype=torch.float64)
 
-    def calm(now: World, dt: float) -> None:
-        now.velocity = now.velocity * (1.0 - 0.05 * dt)
+    def gravity(now: World, dt: float) -> None:
+        # Lower the ball gently, then tilt: a ball that hops is in contact half of the time.
+        if now.time < calm:
+            now.velocity = now.velocity * (1.0 - 0.05 * dt) + dt * level
+        else:
+            now.velocity = now.velocity + dt * tilted
 
-    # Lower the ball gently, then tilt: a ball that hops is not in contact half of the time.
-    world.force = calm
-    world.run(150.0)
-    world.force = None
-    slope = math.radians(angle)
-    world.scene.gravity = (PULL * math.sin(slope), 0.0, -PULL * math.cos(slope))
-    world.run(40.0)
+    world, ball = _on_slab(
+        points, 24.0, 12.0, 0.0, friction, pull=0.0, force=gravity, mass=volume, volume=volume
+    )  # fmt: skip
+    world.run(calm + 40.0)
     first = _speed(world, ball)
     world.run(60.0)
     last = _speed(world, ball)

@@ -219,8 +219,9 @@ def free_ball() -> Iterator[Result]:
 def free_ball_single() -> Iterator[Result]:
     """Free ball turning for 10 s (GaussianBench A1a) in float32, at the edge of its digits.
 
-    With a power of two for dx the factors dx and 4 / dx round nowhere (with 0.02 the affine part
-    grows by 1e-8 a step), and steps are long, as rounding goes by the step.
+    In steady rotation all points have the same affine velocity, whose products with dx and mass are
+    rounded the same way in every step: 1e-8 a step with dx 0.02, next to nothing with a power of
+    two. Steps are long, as rounding goes by the step.
     """
     return free_results("free_ball_single", torch.float32, 2.0**-6, 0.8)
 

@@ -225,7 +225,10 @@ class Solver:
                 f"{layout.MAX_ROWS}; give points of one material the same mass and volume"
             )
         which = unique[:, 0].long()
-        rows = torch.cat([self._params[which], unique[:, 1:].to(self._params)], dim=1)
+        density = self._params[which, 6:7].double().clamp(min=1e-30)
+        derived = torch.cat([1.0 / density, 4.0 * unique[:, 2:] / self.dx**2], dim=1)
+        numbers = torch.cat([unique[:, 1:], derived], dim=1)
+        rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
         return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
 
     def _load(
@@ -531,6 +534,23 @@ class Solver:
             material=row, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
         )  # fmt: skip
         return self._restored(stress)
+
+    def set_colliders(self, colliders: Tensor) -> None:
+        """Replace the rows of the colliders, as many as there were; impulses go on adding up.
+
+        Args:
+            colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
+
+        Raises:
+            ValueError: Another number of rows.
+        """
+        rows, have = pad_colliders(colliders), self._buffers.colliders
+        if rows.shape != have.shape:
+            raise ValueError(
+                f"Solver.set_colliders: colliders must have shape {list(have.shape)}, "
+                f"got {list(rows.shape)}"
+            )
+        have.copy_(rows)
 
     @property
     def impulse(self) -> Tensor:
