@@ -137,7 +137,7 @@ def mpm_cases(count: int) -> Iterator[Case]:
 def _return_mapping(op: Any, p: dict[str, Any]) -> Results:
     args = [p[k] for k in ("strain", "alpha", "increment")]
     options = {k: p[k] for k in ("law", "params", "material")}
-    strain, alpha, stress, _ = op.return_mapping(*args, **options)
+    strain, alpha, stress, _ = op.return_mapping(*args, **options, dt=DT)
     return {"strain": strain, "alpha": alpha, "stress": stress}
 
 
@@ -169,6 +169,17 @@ def material_cases(count: int) -> Iterator[Case]:
     yield Case("return_mapping, elastic", elastic, _return_mapping, plasticity)
     yield Case("return_mapping, nacc", soft, _return_mapping, plasticity, ROOT)
     yield Case("return_mapping, nacc, violent step", hard, _return_mapping, plasticity, ROOT)
+    for name in ("sand", "plasticine", "honey"):
+        preset = materials.get(name)
+        flowing = {
+            "strain": uniform(18, count, 6, low=-0.05, high=0.03),
+            "alpha": 0.01 * uniform(19, count),
+            "increment": 0.01 * normal(20, count, 3, 3),
+            "law": torch.tensor([materials.LAWS[preset.law]], dtype=torch.int32),
+            "params": preset.parameters()[None].float(),
+            "material": torch.zeros(count, dtype=torch.int32),
+        }
+        yield Case(f"return_mapping, {preset.law}", flowing, _return_mapping, plasticity, ROOT)
     turn = torch.linalg.qr(normal(16, 2, count, 3, 3))[0]
     turn *= torch.linalg.det(turn).sign()[..., None, None]
     stretch = torch.diag_embed(uniform(17, count, 3, low=0.2, high=2.5))

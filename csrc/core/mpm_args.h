@@ -186,6 +186,19 @@ GSF_HOST_DEVICE Vec3<T> node_position(const GridUpdateArgs<T>& a, int64_t node) 
           (T(block[2]) * kBlockEdge + T(local % 4)) * a.dx};
 }
 
+// Whether no node of a block can touch a valid collider: distances change by at most 1 per metre,
+// and no node is further than sqrt(3) 1.5 dx from the middle. Not for sweeping colliders, which
+// reach as far as nodes move, nor for faces, which end at their rim.
+template <typename T>
+GSF_HOST_DEVICE bool block_clear(const GridUpdateArgs<T>& a, const T* row, int64_t block) {
+  if (row[kSweep] != T(0) || row[kType] == T(kFace)) return false;
+  const Vec3<T> low = node_position(a, block * kBlockNodes);
+  const T half = T(1.5) * a.dx;
+  Vec3<T> normal;
+  return collider_signed_distance(row, a.sdf, low + Vec3<T>{half, half, half}, normal) >
+         T(2.61) * a.dx;
+}
+
 // Mass of the fields at one node that touch a valid collider `row` [kg].
 template <typename T>
 GSF_HOST_DEVICE double touching_mass(const GridUpdateArgs<T>& a, const T* row, int64_t node) {

@@ -30,20 +30,24 @@ void grid_update(const GridUpdateArgs<T>& a) {
     // A row that is no collider must not be ignored quietly.
     if (!valid[c]) std::fill(a.impulse + 6 * c, a.impulse + 6 * c + 6, double(NAN));
   }
-  const auto for_nodes = [&](int64_t chunk, const auto& f) {
-    const int64_t first = chunk * kChunkBlocks * kBlockNodes;
-    const int64_t last = std::min(first + kChunkBlocks * kBlockNodes, a.count * kBlockNodes);
-    for (int64_t node = first; node < last; ++node) f(node);
+  // Nodes of a chunk; with a collider only of blocks it may reach.
+  const auto for_nodes = [&](int64_t chunk, const T* row, const auto& f) {
+    const int64_t last = std::min((chunk + 1) * kChunkBlocks, a.count);
+    for (int64_t block = chunk * kChunkBlocks; block < last; ++block) {
+      if (row != nullptr && block_clear(a, row, block)) continue;
+      for (int64_t n = 0; n < kBlockNodes; ++n) f(block * kBlockNodes + n);
+    }
   };
+  const T* no_collider = nullptr;
   parallel_for(chunks, 1, [&](int64_t begin, int64_t end) {
     for (int64_t chunk = begin; chunk < end; ++chunk) {
-      for_nodes(chunk, [&](int64_t node) { touched[chunk] += update_node(a, node); });
+      for_nodes(chunk, no_collider, [&](int64_t node) { touched[chunk] += update_node(a, node); });
       double* mass = a.partial + chunk * rows;
       for (int64_t c = 0; any_mass && c < rows; ++c) {
         const T* row = a.colliders + c * kColliderColumns;
         mass[c] = 0.0;
         if (!valid[c] || !(row[kMass] > T(0))) continue;
-        for_nodes(chunk, [&](int64_t node) { mass[c] += touching_mass(a, row, node); });
+        for_nodes(chunk, row, [&](int64_t node) { mass[c] += touching_mass(a, row, node); });
       }
     }
   });
@@ -57,7 +61,7 @@ void grid_update(const GridUpdateArgs<T>& a) {
           const T* row = a.colliders + c * kColliderColumns;
           if (!valid[c]) continue;
           const T give = collider_give(row, static_cast<T>(a.contact_mass[c]));
-          for_nodes(chunk,
+          for_nodes(chunk, row,
                     [&](int64_t node) { collide_node(a, row, give, node, partial + 6 * c); });
         }
       }

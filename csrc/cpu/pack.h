@@ -137,9 +137,10 @@ inline uint32_t mask_bits(PackTypes<double>::Int mask) {
 #endif
 }
 
-// Whole part towards minus infinity, for |x| far below 2^31.
+// Whole part towards minus infinity; values beyond +-2^20 are taken as that, NaN as -2^20.
 template <typename T>
 Pack<T> floor(Pack<T> x, typename Pack<T>::Int& whole) {
+  x = clamp(x, Pack<T>(-1048576), Pack<T>(1048576));
   whole = __builtin_convertvector(x.v, typename Pack<T>::Int);
   const Pack<T> toward_zero = __builtin_convertvector(whole, typename Pack<T>::Raw);
   const typename Pack<T>::Int above = toward_zero > x;  // -1 where it is

@@ -45,6 +45,11 @@ struct Packet {
       consecutive = consecutive && index[lane] == index[0] + lane;
   }
 
+  // Mask of the lanes that hold a particle of their own.
+  typename Pack<T>::Int used_lanes() const {
+    const typename Pack<T>::Int bits = int_pack_of<T>([](int lane) { return 1 << lane; });
+    return (bits & static_cast<int>(active)) != 0;
+  }
   // Lanes [first, end) whose particles share the cell of lane `first`.
   int run(int first) const {
     int end = first + 1;

@@ -48,13 +48,13 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   const Mat3<Pack<T>>& first = gathered.first;
   using P = Pack<T>;
   using Int = typename P::Int;
-  const T inv_dx = T(1) / s.dx;
+  const T inv_dx = s.inv_dx, slack = T(s.clock->slack);
   Mat3<P> c;
   for (int i = 0; i < 9; ++i) c.m[i] = P(T(4) * inv_dx) * first.m[i];
 
   using Word = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
   const Int meta = int_pack_of<T>([&](int lane) { return Word(packet.meta[lane]); });
-  Int plain = Int{} - 1, leaves{}, moved = meta & ~(Int{} + 511);
+  Int plain = packet.used_lanes(), leaves{}, moved = meta & ~(Int{} + 511);
   P rest[3];
   for (int axis = 0; axis < 3; ++axis) {
     const P there = offset[axis] + P(dt * inv_dx) * value[axis];
@@ -67,7 +67,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     const Int cell = ((meta >> (3 * axis)) & 7) + whole - up;
     plain &= (cell >= 0) & (cell <= kLastCell);
     const P reached = P(__builtin_convertvector(cell, typename P::Raw)) + rest[axis];
-    leaves |= (reached < P(0.5)) | (reached > P(kLastCell + 0.5));
+    leaves |= (reached < P(slack)) | (reached > P(T(kLastCell + 1) - slack));
     if ((reach >> axis & 1u) == 0) leaves |= cell < 1;
     if ((reach >> (3 + axis) & 1u) == 0) leaves |= cell > 2;
     moved |= cell << (3 * axis);
@@ -119,29 +119,30 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
 
   const Sym3<P> stress = add_diagonal(row[0] * d, P(0.5) * row[1] * j2m1);
   P slope[9];
-  const P scale = P(dt_next * T(4) / (s.dx * s.dx)) * row[kVolumeColumn];
+  const P scale = P(dt_next) * row[kStressColumn];
   const Mat3<P> tau = to_mat3(stress);
   for (int i = 0; i < 9; ++i) slope[i] = row[kMassColumn] * c.m[i] - scale * tau.m[i];
 
-  P speed2(0), gradient2(0);
-  for (int i = 0; i < 3; ++i) speed2 += value[i] * value[i];
-  for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
-  // elastic_wave_squared
-  const P n = sqrt(n2);
-  const P mean = clamp(isochoric * (P(1) + trace(e) * P(1.0 / 3.0)), P(1), P(kDeviatorMax));
-  const P along =
-      row[0] * (P(4.0 / 3.0) * mean + P(0.272165526975909) * n) + P(0.5) * row[1] * (P(2) + j2m1);
-  const P across = row[0] * (mean + P(0.816496580927726) * n);
-  const P wave2 = max(along, across) / row[6];
-
-  const uint32_t done = mask_bits(plain) & packet.active;
-  if (done != 0) {
-    const auto keep = [&](P& most, Int mask, P x) {
-      most = max(most, select<T>(plain & mask, x, P(0)));
-    };
-    keep(largest.speed2, plain, speed2);
-    keep(largest.wave2, plain, wave2);
+  const P speed2 = value[0] * value[0] + value[1] * value[1] + value[2] * value[2];
+  const auto keep = [&](P& most, Int mask, P x) {
+    most = max(most, select<T>(plain & mask, x, P(0)));
+  };
+  keep(largest.speed2, plain, speed2);
+  if (measures_waves(*s.clock)) {
+    P gradient2(0);
+    for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
+    // elastic_wave_squared
+    const P n = sqrt(n2);
+    const P mean = clamp(isochoric * (P(1) + trace(e) * P(1.0 / 3.0)), P(1), P(kDeviatorMax));
+    const P along =
+        row[0] * (P(4.0 / 3.0) * mean + P(0.272165526975909) * n) + P(0.5) * row[1] * (P(2) + j2m1);
+    const P across = row[0] * (mean + P(0.816496580927726) * n);
+    keep(largest.wave2, plain, max(along, across) * row[kInverseDensityColumn]);
     keep(largest.gradient2, whole, gradient2);
+  }
+
+  const uint32_t done = mask_bits(plain);
+  if (done != 0) {
     counts.leaves = counts.leaves || (mask_bits(leaves) & done) != 0;
     packet.store3(rest, s.offset, done);
     packet.store3(value, s.velocity, done);

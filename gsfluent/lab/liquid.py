@@ -98,13 +98,15 @@ def dam_break(
     Args:
         cells: Cells along the base.
         until: Last ``t sqrt(2 g / a)`` that is compared.
-        data: Folder with ``reference/dam_break``; default is the environment's GSFLUENT_DATA.
+        data: Folder with ``reference/dam_break``; default is the environment's GSFLUENT_DATA,
+            else ``shared/data`` beside the checkout.
         dtype: Precision.
 
     Raises:
         FileNotFoundError: The measured fronts are not there.
     """
-    root = data or Path(os.environ.get("GSFLUENT_DATA", ""))
+    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
+    root = data or Path(os.environ.get("GSFLUENT_DATA", beside))
     measured = [pair for pair in martin_moyce(root) if pair[0] <= until]
     if not measured:
         raise FileNotFoundError(

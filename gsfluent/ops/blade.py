@@ -117,9 +117,13 @@ def merged_fields(parent: Tensor, cut: Tensor) -> Tensor:
     Returns:
         bool [K, K], the ``merged`` of :func:`gsfluent.ops.grid_update`.
     """
-    a, b = cut[:, None].to(torch.int64), cut[None, :].to(torch.int64)
-    apart = (((a << 1) & b) | ((b << 1) & a)) & 0x2AAAAAAA
-    return (parent[:, None] == parent[None, :]) & (apart == 0)
+    return (parent[:, None] == parent[None, :]) & ~cut_apart(cut[:, None], cut[None, :])
+
+
+def cut_apart(a: Tensor, b: Tensor) -> Tensor:
+    """Whether sides ``a`` and ``b`` lie on opposite sides of some blade, bool of their shape."""
+    a, b = a.to(torch.int64), b.to(torch.int64)
+    return (((a << 1) & b) | ((b << 1) & a)) & 0x2AAAAAAA != 0
 
 
 @torch.library.register_fake("gsfluent::blade_sides")

@@ -535,6 +535,23 @@ class Solver:
         )  # fmt: skip
         return self._restored(stress)
 
+    def set_colliders(self, colliders: Tensor) -> None:
+        """Replace the rows of the colliders, as many as there were; impulses go on adding up.
+
+        Args:
+            colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
+
+        Raises:
+            ValueError: Another number of rows.
+        """
+        rows, have = pad_colliders(colliders), self._buffers.colliders
+        if rows.shape != have.shape:
+            raise ValueError(
+                f"Solver.set_colliders: colliders must have shape {list(have.shape)}, "
+                f"got {list(rows.shape)}"
+            )
+        have.copy_(rows)
+
     @property
     def impulse(self) -> Tensor:
         """Impulse given to the matter by each collider since the start [N s], float64 [K, 3]."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.errors import InputError
-from gsfluent.ops.blade import MAX_BLADES
+from gsfluent.ops.blade import MAX_BLADES, cut_apart
 from gsfluent.pipeline.rigid import quaternion_of
 from gsfluent.scene import Blade, Scene
 
@@ -84,6 +84,31 @@ class BladeSet:
         times = [t for number in range(len(self)) for t in self.ends(number)]
         return min((t for t in times if t > time), default=math.inf)
 
+    def speed(self, time: float) -> float:
+        """Speed of the fastest blade that moves [m/s]."""
+        speeds = [
+            blade.speed
+            for number, blade in enumerate(self.blades)
+            if self.ends(number)[0] <= time < self.ends(number)[1]
+        ]
+        return max(speeds, default=0.0)
+
+    def gap(self, low: Tensor, high: Tensor, time: float) -> float:
+        """Lower bound of the distance of a box from the way of the blades that move [m]."""
+        nearest = math.inf
+        for number, blade in enumerate(self.blades):
+            start, end = self.ends(number)
+            if not start <= time < end:
+                continue
+            path = torch.tensor(blade.path, dtype=torch.float64)
+            reach = 0.5 * blade.width * torch.tensor(blade.edge, dtype=torch.float64).abs()
+            reach = reach + 0.5 * blade.thickness
+            apart = torch.maximum(
+                path.amin(dim=0) - reach - high.cpu(), low.cpu() - path.amax(dim=0) - reach
+            )
+            nearest = min(nearest, float(apart.clamp(min=0.0).norm()))
+        return nearest
+
     def moving(self, before: float, now: float) -> bool:
         """Whether any blade moves between two times."""
         return any(a < now and b > before for a, b in map(self.ends, range(len(self))))
@@ -118,12 +143,24 @@ class BladeSet:
             return cut
         return ops.blade_sides(position, rows.to(position), cut, REACH * self.dx)
 
+    def splits(self, body: Tensor, cut: Tensor) -> Tensor:
+        """Bodies that have matter on both sides of some blade: their numbers, [S]."""
+        found = torch.unique(body.to(torch.int64) << 32 | cut.to(torch.int64))
+        parent, sides = found >> 32, found & 0xFFFFFFFF
+        same = parent[:, None] == parent[None, :]
+        return torch.unique(parent[(same & cut_apart(sides[:, None], sides[None, :])).any(dim=1)])
+
     def fields(self, body: Tensor, cut: Tensor) -> Fields:
         """Number the fields: every pair of a body and its sides that occurs.
+
+        Sides matter only in bodies that have matter on both sides of a blade, or that the faces of
+        a thick blade must know.
 
         Raises:
             InputError: More than 64 fields.
         """
+        if not any(blade.thickness > 0.0 for blade in self.blades):
+            cut = torch.where(torch.isin(body, self.splits(body, cut)), cut, 0)
         key = body.to(torch.int64) << 32 | cut.to(torch.int64)
         found, field = torch.unique(key, return_inverse=True)
         if found.shape[0] > MAX_FIELDS:

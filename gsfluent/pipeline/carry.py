@@ -184,8 +184,11 @@ class Carry:
 
 
 def _ball_splats(body: Body) -> Gaussians:
-    """Grey splats on the surface of a ball around the origin of its own coordinates."""
-    count = 200
+    """Grey splats on the surface of a ball around the origin of its own coordinates.
+
+    A jet of liquid has none: nothing on it stays where it is.
+    """
+    count = 0 if body.length > 0.0 else 200
     row = torch.arange(count, dtype=torch.float32) + 0.5
     height = 1.0 - 2.0 * row / count
     angle = row * (math.pi * (3.0 - math.sqrt(5.0)))

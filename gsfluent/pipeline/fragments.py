@@ -12,6 +12,8 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from gsfluent.ops.blade import cut_apart
+
 LINK_RADIUS = 1.5
 """Points closer than this many mean spacings at rest are linked."""
 STRETCH_LIMIT = 2.0
@@ -78,6 +80,7 @@ def find_fragments(
     broken: Tensor,
     mass: Tensor,
     *,
+    cut: Tensor | None = None,
     smallest: int = SMALLEST,
 ) -> Fragments:
     """Group the points that still hang together.
@@ -88,6 +91,7 @@ def find_fragments(
         position: Present positions [m], [N, 3].
         broken: Points that are broken, bool [N].
         mass: Masses [kg], [N].
+        cut: Sides of blades, int32 [N]; a link between opposite sides is cut.
         smallest: Components with fewer points count as debris.
 
     Returns:
@@ -113,7 +117,10 @@ def find_fragments(
     a, b = links.to(rest.device).unbind(dim=1)
     length = (rest[a] - rest[b]).norm(dim=1)
     stretched = (position[a] - position[b]).norm(dim=1) > STRETCH_LIMIT * length
-    kept = links[(~(broken[a] | broken[b] | stretched)).cpu()].cpu().numpy()
+    gone = broken[a] | broken[b] | stretched
+    if cut is not None:
+        gone = gone | cut_apart(cut[a], cut[b])
+    kept = links[(~gone).cpu()].cpu().numpy()
     graph = coo_matrix(
         (np.ones(len(kept), dtype=bool), (kept[:, 0], kept[:, 1])), shape=(count, count)
     )

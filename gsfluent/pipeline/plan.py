@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,8 +26,8 @@ from gsfluent.pipeline.orient import DEFAULT_SIZE, make_frame
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.run_simulate import build_scene
 from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_step import CFL
-from gsfluent.scene import Body, Scene
+from gsfluent.pipeline.simulate_solver import CFL
+from gsfluent.scene import Blade, Body, Collider, Scene
 
 _STAND_IN_VOXELS = 48
 # State before and after a step, sorted copies, stress and splat binding, in units of one state.
@@ -57,10 +58,13 @@ def plan_shot(shot: Shot, *, device: torch.device, seed: int = 0) -> dict[str, A
     stage = Simulate(quality=shot.solve.quality, seed=seed, device=device)
     matter = stage.prepare(scene)
     solids = [body for body in scene.bodies if body.solid is not None]
-    speed = max(_impact_speed(body, scene) for body in scene.bodies)
+    speeds = [_impact_speed(body, scene) for body in scene.bodies]
+    speeds += [math.hypot(*thing.velocity) for thing in scene.colliders]
+    speed = max([*speeds, *(blade.speed for blade in scene.blades)])
     wave = max(_fastest(body) for body in scene.bodies)
     dt = CFL * matter.dx / (wave + speed)
-    grid_seconds = max(0.0, shot.output.seconds - _flight_seconds(shot, len(scene.bodies)))
+    moved = len(scene.bodies) + len(scene.colliders) + len(scene.blades)
+    grid_seconds = max(0.0, shot.output.seconds - _flight_seconds(shot, moved))
     substeps = math.ceil(grid_seconds / dt)
     blocks = ops.build_blocks(matter.rest, matter.dx)
     active = int(blocks.coords.shape[0])
@@ -145,10 +149,10 @@ def _impact_speed(body: Body, scene: Scene) -> float:
     return math.hypot(own, fall)
 
 
-def _flight_seconds(shot: Shot, bodies: int) -> float:
+def _flight_seconds(shot: Shot, things: int) -> float:
     """Time [s] in which nothing touches anything and no grid is needed."""
     drops = [event.height for event in shot.events if isinstance(event, Drop)]
-    if not drops or bodies > len(shot.objects):
+    if not drops or things > len(shot.objects):
         return 0.0
     return math.sqrt(2.0 * min(drops) / _GRAVITY)
 
@@ -209,11 +213,17 @@ def _passes(shot: Shot, scene: Scene) -> list[dict[str, Any]]:
         ("texture", True, f"the inside has no colours yet ({method})", ""),
         ("free flight", drops, "closed form until something is touched", "nothing falls"),
         ("contact", several, f"{len(scene.bodies)} bodies", "one body: no second velocity field"),
+        ("rigid things", bool(scene.colliders), _names(scene.colliders), "only the floor"),
+        ("blades", bool(scene.blades), _names(scene.blades), "nothing is cut"),
         ("return map", yields, "a material that yields", "no material yields"),
         ("repair", breaks, "cracks open", "nothing can crack"),
         ("export", bool(exports), ", ".join(exports), "only the video is asked for"),
     ]
     return [{"pass": n, "needed": need, "why": yes if need else no} for n, need, yes, no in rows]
+
+
+def _names(things: Sequence[Collider | Blade]) -> str:
+    return ", ".join(thing.name for thing in things)
 
 
 def _warn(

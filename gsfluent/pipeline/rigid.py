@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.errors import InputError
 from gsfluent.ops import collider as columns
 from gsfluent.scene import Collider, Scene
 from gsfluent.scene_parts import turned
@@ -48,11 +47,6 @@ class RigidSet:
     """
 
     def __init__(self, scene: Scene, dx: float, device: torch.device | str = "cpu") -> None:
-        if scene.blades:
-            raise InputError(
-                "simulate: blades are not part of the simulation stage yet",
-                mend="leave the blade out, or use gsfluent.pipeline.blades with the operators",
-            )
         self.dx = dx
         self.floor = scene.floor
         self._gravity = scene.gravity
@@ -168,7 +162,7 @@ class RigidSet:
             Points [P, 3] and normals [P, 3] in scene metres, and the largest spacing [m].
         """
         found, normals, widest = [], [], 0.0
-        for row in rows:
+        for row in map(self._drawn, self._colliders, rows):
             bound = self._bound(row)
             if not math.isfinite(bound):
                 continue
@@ -186,6 +180,19 @@ class RigidSet:
             none = rows.new_zeros(0, 3)
             return none, none, 0.0
         return torch.cat(found), torch.cat(normals), widest
+
+    def _drawn(self, c: Collider | None, row: Tensor) -> Tensor:
+        """The row as it was asked for, not as the grid needs it."""
+        if c is None or not (c.backed or c.kind == "sphere"):
+            return row
+        row = row.clone()
+        if c.kind == "sphere":
+            row[9] = c.radius
+            return row
+        behind = float(row[28]) - 0.5 * c.size[2]
+        row[3:6] += row.new_tensor(turned(c.orientation, (0.0, 0.0, behind)))
+        row[28] = 0.5 * c.size[2]
+        return row
 
     def _bound(self, row: Tensor) -> float:
         kind, radius = int(row[0]), float(row[9])

@@ -9,8 +9,9 @@ import torch
 
 from gsfluent import materials
 from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
-from gsfluent.data import SURFACE, Frame, Gaussians, Particles, Solid
+from gsfluent.data import Frame, Gaussians, Solid
 from gsfluent.materials import Material
+from gsfluent.pipeline.rigid_splats import bare_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
 from gsfluent.pipeline.run_store import content_digest, fingerprint
@@ -18,8 +19,6 @@ from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.scene import Scene
 
 _STATE = "state.pt"
-# Splats of this many standard deviations per particle spacing close a packing of particles.
-_SIGMA_IN_SPACINGS = 0.6
 
 
 def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
@@ -47,18 +46,6 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     for event in shot.events:
         scene.add_event(event_dict(event))
     return scene
-
-
-def bullet_splats(particles: Particles, scene: Scene) -> Gaussians | None:
-    """Steel-grey splats for bodies that have matter but no photographs, or None without any."""
-    bare = [number for number, body in enumerate(scene.bodies) if body.solid is None]
-    if not bare:
-        return None
-    rows = torch.isin(particles.body, torch.tensor(bare, device=particles.device).to(torch.int32))
-    position, volume = particles.position[rows], particles.volume[rows]
-    scales = _SIGMA_IN_SPACINGS * volume.pow(1.0 / 3.0)
-    grey = torch.full_like(position, 0.25)
-    return Gaussians.from_colors(position, scales, grey, opacities=0.95, label=SURFACE)
 
 
 def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
@@ -128,19 +115,25 @@ def simulate_stage(context: RunContext) -> None:
 
 
 def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
-    """What of a simulated frame goes to disk: splats of the solids, of bullets, transitions."""
+    """What of a simulated frame goes to disk.
+
+    Splats of the solids, then of bullets, liquids and rigid things, then transitions.
+    """
     gaussians, groups = frame.gaussians, frame.groups
     if groups is None:
         groups = torch.full((gaussians.count,), -1, dtype=torch.int32, device=gaussians.device)
     carried = frame.carried.count
-    bullets = bullet_splats(frame.particles, scene)
-    if bullets is not None:
+    bare = bare_splats(frame.particles, scene)
+    steel = rigid_splats(frame.rigid, frame.colliders)
+    for extra in (bare, steel):
+        if extra is None:
+            continue
         first = torch.arange(gaussians.count, device=gaussians.device) < carried
-        parts = [gaussians.select(first), bullets, gaussians.select(~first)]
-        alone = torch.full((bullets.count,), -1, dtype=torch.int32, device=groups.device)
+        parts = [gaussians.select(first), extra, gaussians.select(~first)]
+        alone = torch.full((extra.count,), -1, dtype=torch.int32, device=groups.device)
         gaussians = Gaussians.cat(parts)
         groups = torch.cat([groups[:carried], alone, groups[carried:]])
-        carried += bullets.count
+        carried += extra.count
     return SavedFrame(
         index=frame.index,
         time=frame.time,

@@ -25,8 +25,10 @@ from gsfluent.pipeline.carry import Carry, Motion
 from gsfluent.pipeline.fragments import Fragments
 from gsfluent.pipeline.particles import ALPHA_JITTER, Matter, build_matter, grid_spacing
 from gsfluent.pipeline.repair import Repair, Repaired
+from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_run import Run
-from gsfluent.pipeline.simulate_step import CFL, State
+from gsfluent.pipeline.simulate_solver import CFL
+from gsfluent.pipeline.simulate_state import State
 from gsfluent.pipeline.stage import Progress, Stage, report_progress
 from gsfluent.scene import Scene
 
@@ -50,6 +52,8 @@ class SimulationFrame:
         stats: The figures of run.json's ``per_frame`` for this frame.
         pieces: Sizes of the pieces.
         broken: Broken points, bool [N].
+        rigid: The rigid colliders of the scene.
+        colliders: Their rows now, float64 [M, 32].
     """
 
     index: int
@@ -61,6 +65,8 @@ class SimulationFrame:
     stats: dict[str, Any]
     pieces: Fragments
     broken: Tensor
+    rigid: RigidSet
+    colliders: Tensor
     _carry: Carry | None = None
     _repair: Repair | None = None
 
@@ -122,6 +128,12 @@ class Simulate(Stage):
         jitter: Relative half-width of the noise on ``alpha0``.
         cfl: Courant number of the automatic time step.
         free_flight: Move bodies that touch nothing in closed form instead of on the grid.
+        piece_flight: Do so again with bodies and pieces that touch nothing any more.
+        sleep: Take off the grid what rests, until something comes near.
+        separate_fragments: Give the pieces of a broken body velocity fields of their own, so that
+            they do not weld again where they touch.
+        resident: Use the resident solver wherever it knows the colliders; otherwise the composed
+            operators, step by step.
         irreversible: Broken points stay without cohesion when they are pressed together again.
         repair: Add transition splats along cracks to ``frame.gaussians``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
@@ -147,6 +159,10 @@ class Simulate(Stage):
         jitter: float = ALPHA_JITTER,
         cfl: float = CFL,
         free_flight: bool = True,
+        piece_flight: bool = True,
+        sleep: bool = True,
+        separate_fragments: bool = True,
+        resident: bool = True,
         irreversible: bool = True,
         repair: bool = True,
         splats: bool = True,
@@ -171,6 +187,10 @@ class Simulate(Stage):
         self._options = {
             "cfl": cfl,
             "free_flight": free_flight,
+            "piece_flight": piece_flight,
+            "sleep": sleep,
+            "separate_fragments": separate_fragments,
+            "resident": resident,
             "irreversible": irreversible,
             "return_map": return_map,
         }
@@ -288,6 +308,8 @@ def _frame(run: Run, index: int, carry: Carry | None, repair: Repair | None) -> 
         stats=stats,
         pieces=pieces,
         broken=peak >= 0,
+        rigid=run.stepper.rigid,
+        colliders=run.state.colliders,
         _carry=carry,
         _repair=repair,
     )

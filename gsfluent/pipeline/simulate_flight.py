@@ -1,8 +1,9 @@
 """Free flight: a body that touches nothing moves as a rigid body, exactly, without a grid.
 
-Before its first contact a body has no strain, so gravity and spin are all there is. The centre of
-mass follows the parabola ``x0 + v0 t + g t^2 / 2`` in closed form; the orientation follows
-Euler's equations for a free rigid body with its angular momentum held fixed.
+Before its first contact a body has no strain, so gravity and spin are all there is; a piece that
+has come to rest inside may go back to it. The centre of mass follows the parabola ``x0 + v0 t + g
+t^2 / 2`` in closed form; the orientation follows Euler's equations for a free rigid body with its
+angular momentum held fixed.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import math
 import torch
 from torch import Tensor
 
+from gsfluent import geometry
 from gsfluent.data import Particles
 
 _ANGLE_STEP = 0.02
@@ -21,28 +23,38 @@ with its square.
 
 
 class Flight:
-    """The free flight of one body.
+    """The free flight of one body or piece.
 
     Args:
-        particles: The body's points, moving as a rigid body.
+        particles: Its points.
+        position: Their positions [m], float64 [M, 3].
         gravity: Acceleration [m/s^2], float64 [3].
         time: Time of the given state [s].
         dx: Grid spacing [m]; an APIC point turns like a blob with second moment dx^2 / 4.
         held: Time [s] until which the body waits where it is, its velocity kept for later.
+        rigid: Whether the points move as a rigid body already; if not, the flight has their
+            linear and angular momentum, and their motion against each other is lost.
     """
 
     def __init__(
-        self, particles: Particles, gravity: Tensor, time: float, dx: float, *, held: float = 0.0
+        self,
+        particles: Particles,
+        position: Tensor,
+        gravity: Tensor,
+        time: float,
+        dx: float,
+        *,
+        held: float = 0.0,
+        rigid: bool = True,
     ) -> None:
-        position, velocity = (
-            part.to("cpu", torch.float64) for part in (particles.position, particles.velocity)
-        )
+        position, velocity = (v.to("cpu", torch.float64) for v in (position, particles.velocity))
         mass = particles.mass.to("cpu", torch.float64)[:, None]
         self.particles = particles
         self.gravity = gravity
         self.held = held
         self.start = max(time, held)
         total = mass.sum()
+        self.mass = float(total)
         self.center = (mass * position).sum(dim=0) / total
         self.velocity = (mass * velocity).sum(dim=0) / total
         self.arm = position - self.center
@@ -50,9 +62,18 @@ class Flight:
         eye = torch.eye(3, dtype=torch.float64)
         self.inertia = (mass * squared).sum() * eye - (mass * self.arm).T @ self.arm
         self.inertia += 0.5 * dx * dx * total * eye
-        gradient = particles.affine[0].to("cpu", torch.float64)
-        spin = torch.stack([gradient[2, 1], gradient[0, 2], gradient[1, 0]])
-        self.momentum = self.inertia @ spin
+        if rigid:
+            gradient = particles.affine[0].to("cpu", torch.float64)
+            spin = torch.stack([gradient[2, 1], gradient[0, 2], gradient[1, 0]])
+            self.momentum = self.inertia @ spin
+        else:
+            c = particles.affine.to("cpu", torch.float64)
+            curl = (c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1])
+            turning = torch.linalg.cross(self.arm, velocity - self.velocity)
+            self.momentum = (mass * (turning + 0.25 * dx * dx * torch.stack(curl, dim=1))).sum(0)
+            spin = torch.linalg.solve(self.inertia, self.momentum)
+        self.kinetic = 0.5 * self.mass * float(self.velocity @ self.velocity)
+        self.kinetic += 0.5 * float(self.momentum @ spin)
         self.spins = bool(spin.abs().max() > 0)
         self._span = _ANGLE_STEP / max(float(spin.norm()), 1e-30)
         self._whole, self._turned = 0, eye
@@ -96,6 +117,10 @@ class Flight:
             self.velocity + t * self.gravity,
         )
 
+    def speed_at(self, time: float) -> float:
+        """Upper bound of the speed of any of its points [m/s]; 0 while it is held."""
+        return float(self.center_at(time)[1].norm()) + self.speed_limit
+
     def bounds_at(self, time: float) -> tuple[Tensor, Tensor]:
         """Return a box that holds the body at ``time``; with spin, that of its bounding ball."""
         center, _ = self.center_at(time)
@@ -103,28 +128,37 @@ class Flight:
             return center - self.radius, center + self.radius
         return center + self.low, center + self.high
 
-    def particles_at(self, time: float) -> Particles:
-        """Return the body's points at ``time``."""
+    def state_at(self, time: float) -> tuple[Particles, Tensor]:
+        """Return the points at ``time``, and their positions in float64 [M, 3]."""
         center, velocity = self.center_at(time)
         like = self.particles
+        device = like.position.device
         if not self.spins:
-            return like.replace(
-                position=(center + self.arm).to(like.position),
+            place = (center + self.arm).to(device)
+            still = like.replace(
+                position=place.to(like.dtype),
                 velocity=velocity.to(like.velocity).expand_as(like.velocity).contiguous(),
+                affine=torch.zeros_like(like.affine),
             )
+            return still, place
         rotation = self.rotation_at(time)
         omega = self._omega(rotation)
         arm = self.arm @ rotation.T
         gradient = _cross_matrix(omega)
+        turn = rotation.to(like.affine)
         deformation = like.deformation
         if deformation is not None:
-            deformation = (rotation.to(deformation) @ deformation).contiguous()
-        return like.replace(
-            position=(center + arm).to(like.position),
+            deformation = (turn @ deformation).contiguous()
+        strain = turn @ geometry.unpack_symmetric(like.strain) @ turn.T
+        place = (center + arm).to(device)
+        moved = like.replace(
+            position=place.to(like.dtype),
             velocity=(velocity + arm @ gradient.T).to(like.velocity),
             affine=gradient.to(like.affine).expand_as(like.affine).contiguous(),
+            strain=geometry.pack_symmetric(strain),
             deformation=deformation,
         )
+        return moved, place
 
 
 def _cross_matrix(vector: Tensor) -> Tensor:

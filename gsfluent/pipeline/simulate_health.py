@@ -5,31 +5,88 @@ from __future__ import annotations
 import collections
 import logging
 from collections.abc import Sequence
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.simulate_figures import Figures, measure
-from gsfluent.pipeline.simulate_step import State, Stepper
+from gsfluent.pipeline.simulate_solver import Unhealthy
+from gsfluent.pipeline.simulate_state import State
+from gsfluent.pipeline.simulate_step import Stepper
 
 _log = logging.getLogger(__name__)
 
-CHECK_EVERY = 40
+CHECK_EVERY = 64
 """Grid steps between two checks."""
 VOLUME_RATIO = (0.02, 50.0)
 """Bounds of the volume ratio J; the return map's own guard keeps J inside [0.05, 20]."""
 ENERGY_SLACK = 0.05
 """How far mechanical energy may rise above its start, in units of the largest kinetic plus elastic
 energy so far. Contact and breaking only take energy away."""
-RING = 3
+RING = 2
 RECOVERY = 10
 """Good checks after which a halved time step is doubled again."""
+CAUSES = {
+    "numbers": (
+        "a step too long for the stiffest part, or a force from outside",
+        "lower cfl, check the material's stiffness and the step_hook",
+    ),
+    "speed": (
+        "points thrown further than a cell in one step, by a violent contact or a stiff part",
+        "lower cfl, or soften the stiffest material",
+    ),
+    "volume": (
+        "matter squeezed or stretched beyond what its law can hold",
+        "lower the speed of impact, use a stiffer material or a finer quality",
+    ),
+    "energy": (
+        "a step too long for the contact or the stiffest part, or a force from outside",
+        "lower cfl, check the step_hook",
+    ),
+    "crowded": (
+        "more pieces meet in one place than the grid keeps apart",
+        "use a finer quality, or separate_fragments=False",
+    ),
+    "far": ("matter left the range of the grid", "add a floor, or end the run earlier"),
+    "step": (
+        "a stiffness or a speed that asks for vanishing steps",
+        "soften the stiffest material",
+    ),
+}
+"""Likely cause of each kind of trouble, and what to change."""
 
 
 def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]) -> Figures:
-    """Measure one state; flying bodies must have been brought to its time."""
+    """Measure one state."""
     p = state.particles
-    return measure(matter, p.position, p.velocity, p.affine, p.strain, state.peak, gravity)
+    return measure(matter, state.position, p.velocity, p.affine, p.strain, state.peak, gravity)
+
+
+def region(matter: Matter, state: State, wrong: Tensor, names: Sequence[str]) -> str:
+    """Say where points are: centre and box, and the body most of them belong to.
+
+    Args:
+        matter: The points.
+        state: A state with finite positions.
+        wrong: The points, bool [N].
+        names: Names of the bodies.
+    """
+    rows = wrong & torch.isfinite(state.position).all(dim=1)
+    if not bool(rows.any()):
+        return ""
+    at = state.position[rows]
+    low, high = torch.aminmax(at, dim=0)
+    most = int(torch.mode(matter.particles.body[rows]).values)
+    return (
+        f"{int(rows.sum())} points of {names[most]!r} around {_metres(at.mean(dim=0))}, "
+        f"box {_metres(low)} to {_metres(high)}"
+    )
+
+
+def _metres(place: Tensor) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in place.tolist()) + ") m"
 
 
 class Watch:
@@ -40,6 +97,7 @@ class Watch:
         gravity: Acceleration [m/s^2].
         start: Figures at time 0.
         max_rollbacks: Roll-backs in a row, without a good check in between, before giving up.
+        names: Names of the bodies.
     """
 
     def __init__(
@@ -49,8 +107,10 @@ class Watch:
         start: Figures,
         *,
         max_rollbacks: int = 6,
+        names: Sequence[str] = (),
     ) -> None:
         self.matter, self.gravity = matter, gravity
+        self.names = names or [str(i) for i in range(len(matter.ranges))]
         self.energy = start.total
         self.scale = start.kinetic + start.elastic
         self.max_rollbacks = max_rollbacks
@@ -58,6 +118,7 @@ class Watch:
         self.in_a_row = 0
         self.good_in_a_row = 0
         self.reasons: list[str] = []
+        self.kind = ""
         self._ring: collections.deque[State] = collections.deque(maxlen=RING)
 
     def keep(self, state: State, *, only: bool = False) -> None:
@@ -66,42 +127,59 @@ class Watch:
             self._ring.clear()
         self._ring.append(state)
 
-    def check(self, state: State, stepper: Stepper) -> str:
-        """Return why the state is bad, or an empty string; a good state is kept."""
-        reason = self._judge(stepper.whole(state), stepper)
-        if reason:
-            return reason
+    def check(self, state: State, stepper: Stepper) -> Unhealthy | None:
+        """Return what is wrong with a state, or None; a good state is kept."""
+        trouble = self._judge(state)
+        if trouble is not None:
+            return trouble
         self.keep(state)
         self.in_a_row = 0
         self.good_in_a_row += 1
         if stepper.dt_scale < 1.0 and self.good_in_a_row >= RECOVERY:
             stepper.dt_scale = min(1.0, 2.0 * stepper.dt_scale)
+            stepper.reset()  # a new engine, with the new step
             self.good_in_a_row = 0
-        return ""
+        return None
 
-    def _judge(self, state: State, stepper: Stepper) -> str:
-        lost = int(stepper.lost)
-        if lost:
-            return f"{lost} points were not finite or left the grid"
+    def _judge(self, state: State) -> Unhealthy | None:
         now = figures_of(self.matter, state, self.gravity)
+        p = state.particles
         if now.non_finite:
-            return f"{now.non_finite} points are not finite"
-        low, high = _volume_ratio(state)
-        if not (low >= VOLUME_RATIO[0] and high <= VOLUME_RATIO[1]):
-            return f"volume ratio between {low:.3g} and {high:.3g}"
+            finite = torch.isfinite(p.velocity).all(dim=1) & torch.isfinite(p.strain).all(dim=1)
+            return Unhealthy(f"{now.non_finite} points are not finite", ~finite)
+        ratio = _volume_ratio(state)
+        wrong = (ratio < VOLUME_RATIO[0]) | (ratio > VOLUME_RATIO[1])
+        if bool(wrong.any()):
+            low, high = torch.aminmax(ratio)
+            what = f"volume ratio between {float(low):.3g} and {float(high):.3g}"
+            return Unhealthy(what, wrong, "volume")
         # Height at which gravity's energy is counted is arbitrary, so only its change matters.
         given = self.energy + float(state.work)
         self.scale = max(self.scale, min(now.kinetic + now.elastic, max(given - now.gravity, 0.0)))
         excess = now.total - given
         if not excess <= ENERGY_SLACK * self.scale + 1e-9:
-            return f"energy rose by {excess:.3g} J over the {given:.3g} J it had and was given"
-        return ""
+            speed = p.velocity.norm(dim=1)
+            return Unhealthy(
+                f"energy rose by {excess:.3g} J over the {given:.3g} J it had and was given",
+                speed >= 0.5 * speed.max(),
+                "energy",
+            )
+        return None
 
-    def roll_back(self, reason: str, state: State, stepper: Stepper) -> State | None:
-        """Return the state to go on from with half the time step, or None to give up."""
+    def roll_back(self, trouble: Unhealthy, state: State, stepper: Stepper) -> State | None:
+        """Return the state to go on from with half the time step, or None to give up.
+
+        Too many fields in one place are no matter of the step: then fewer fields may meet.
+        """
         self.good_in_a_row = 0
-        where = f"t = {state.time:.6g} s, step {state.step}: {reason}"
+        where = f"t = {state.time:.6g} s, step {state.step}: {trouble.reason}"
+        if trouble.wrong is not None:
+            # Where the points were when all was well: a bad state may have them anywhere.
+            wrong = stepper.spread(trouble.wrong, state)
+            found = region(self.matter, self._ring[-1], wrong, self.names)
+            where += f" ({found})" if found else ""
         self.reasons.append(where)
+        self.kind = trouble.kind
         if self.in_a_row >= self.max_rollbacks:
             return None
         self.rollbacks += 1
@@ -110,18 +188,32 @@ class Watch:
         if self.in_a_row > 1 and len(self._ring) > 1:
             self._ring.pop()
         stepper.reset()
-        stepper.dt_scale *= 0.5
-        _log.warning("rolled back: %s; time step scale %.3g", where, stepper.dt_scale)
+        if trouble.kind == "crowded" and stepper.field_limit > 2:
+            self._ring[-1] = stepper.relieve(self._ring[-1])
+            _log.warning("rolled back: %s; fields that may meet: %d", where, stepper.field_limit)
+        else:
+            stepper.dt_scale *= 0.5
+            _log.warning("rolled back: %s; time step scale %.3g", where, stepper.dt_scale)
         return self._ring[-1]
 
-    def state(self) -> dict[str, float | int]:
-        """Return what a resumed run needs."""
-        return {"energy": self.energy, "scale": self.scale, "rollbacks": self.rollbacks}
+    def verdict(self, frame: int) -> str:
+        """Words for giving up: frame, time, region, likely cause, what to change."""
+        cause, mend = CAUSES[self.kind]
+        return f"frame {frame}: {self.reasons[-1]}; likely cause: {cause}; mend: {mend}"
 
-    def restore(self, values: dict[str, float | int]) -> None:
+    def state(self) -> dict[str, float | int | list[str]]:
+        """Return what a resumed run needs."""
+        return {
+            "energy": self.energy, "scale": self.scale, "rollbacks": self.rollbacks,
+            "good_in_a_row": self.good_in_a_row, "reasons": self.reasons,
+        }  # fmt: skip
+
+    def restore(self, values: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         self.energy, self.scale = float(values["energy"]), float(values["scale"])
         self.rollbacks = int(values["rollbacks"])
+        self.good_in_a_row = int(values["good_in_a_row"])
+        self.reasons = list(values["reasons"])
 
 
 class Ledger:
@@ -169,10 +261,9 @@ class Ledger:
         return error
 
 
-def _volume_ratio(state: State) -> tuple[float, float]:
-    """Smallest and largest elastic volume ratio J of all points."""
+def _volume_ratio(state: State) -> Tensor:
+    """Elastic volume ratio J of all points, float64 [N]."""
     strain = state.particles.strain.to(torch.float64)
     xx, yy, zz, xy, xz, yz = (strain + strain.new_tensor([1, 1, 1, 0, 0, 0])).unbind(-1)
     squared = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    low, high = torch.aminmax(squared.clamp(min=0.0).sqrt())
-    return float(low), float(high)
+    return squared.clamp(min=0.0).sqrt()

@@ -8,18 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from gsfluent.pipeline.fragments import Fragments, find_fragments, rest_links
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
+from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
 from gsfluent.pipeline.simulate_figures import Figures
 from gsfluent.pipeline.simulate_health import CHECK_EVERY, Ledger, Watch, figures_of
-from gsfluent.pipeline.simulate_state import load_state, save_state
-from gsfluent.pipeline.simulate_step import Counters, State, Stepper, Unhealthy
+from gsfluent.pipeline.simulate_solver import Counters, Unhealthy
+from gsfluent.pipeline.simulate_state import State, load_state, save_state
+from gsfluent.pipeline.simulate_step import Stepper
 from gsfluent.scene import Scene
 
 MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
+REGROUP = 128
+"""Grid steps between two looks for new pieces within a frame."""
 Hook = Callable[[State], State]
 
 
@@ -47,13 +49,18 @@ class Run:
         self.state = self.stepper.initial()
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
-        self.watch = Watch(matter, scene.gravity, self.start, max_rollbacks=max_rollbacks)
+        self.watch = Watch(
+            matter, scene.gravity, self.start,
+            max_rollbacks=max_rollbacks, names=[body.name for body in scene.bodies],
+        )  # fmt: skip
         held = [body.start if body.held else 0.0 for body in scene.bodies]
         self.ledger = Ledger(matter, scene.gravity, self.start, held)
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""
         self._links = rest_links(matter.rest, matter.ranges, matter.spacing)
+        self._breakable = breakable(matter)
+        self._pieces: tuple[State, Fragments] | None = None
 
     @property
     def next_frame(self) -> int:
@@ -68,43 +75,68 @@ class Run:
         # A frame is a clean start: what follows does not depend on what was cached before it, so a
         # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
         stepper.reset()
+        state = self._regroup(state)
         watch.keep(state, only=True)
-        checked = state.step
+        checked = grouped = state.step
+        broken = self._broken(state)
         while state.time < until:
+            trouble: Unhealthy | None = None
             try:
-                state = stepper.advance(state, until)
-                if hook is not None:
-                    state = hook(state)
-                due = state.time >= until or state.step - checked >= CHECK_EVERY
-                reason = watch.check(state, stepper) if due else ""
-                if due:
+                left = CHECK_EVERY - (state.step - checked)
+                now = stepper.advance(state, until, 1 if hook is not None else left)
+                state = now if hook is None else hook(now).adopting(now)
+                if state.time >= until or state.step - checked >= CHECK_EVERY:
+                    trouble = watch.check(state, stepper)
                     checked = state.step
             except Unhealthy as error:
-                reason = str(error)
-            if reason:
-                back = watch.roll_back(reason, state, stepper)
+                trouble = error
+            if trouble is not None:
+                back = watch.roll_back(trouble, state, stepper)
                 if back is None:
-                    self.failure = f"frame {frame}: {watch.reasons[-1]}"
+                    self.failure = watch.verdict(frame)
                     self.seconds += clock.perf_counter() - begun
                     return False
                 state = back
-                checked = state.step
-        self.state = stepper.whole(state)
+                checked = grouped = state.step
+            elif state.step - grouped >= REGROUP and checked == state.step:
+                grouped = state.step
+                if broken != (broken := self._broken(state)):
+                    state = self._regroup(state, at_frame=False)
+        self.state = state
         self.seconds += clock.perf_counter() - begun
         return True
+
+    def _broken(self, state: State) -> int:
+        return int((state.peak >= 0).sum())
+
+    def _fragments(self, state: State) -> Fragments:
+        """The pieces of a state; those of the last one asked for are kept."""
+        if self._pieces is None or self._pieces[0] is not state:
+            found = find_fragments(
+                self._links,
+                self.matter.rest,
+                state.particles.position,
+                state.peak >= 0,
+                self.matter.particles.mass,
+                cut=state.cut if self.scene.blades else None,
+            )
+            self._pieces = state, found
+        return self._pieces[1]
+
+    def _regroup(self, state: State, *, at_frame: bool = True) -> State:
+        """Let the stepper know what hangs together."""
+        may_break = self._breakable
+        if self.scene.blades:
+            may_break = may_break | cut_bodies(self.matter, state.cut)
+        unit = units(self.matter, self._links, self._fragments(state), may_break)
+        return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
 
     def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:
         """Measure the present state and add it to the per-frame records."""
         state, matter = self.state, self.matter
         now = figures_of(matter, state, self.scene.gravity)
         self.figures = now
-        pieces = find_fragments(
-            self._links,
-            matter.rest,
-            state.particles.position,
-            state.peak >= 0,
-            matter.particles.mass,
-        )
+        pieces = self._fragments(state)
         stats = {
             "time": index / self.fps,
             "kinetic": now.kinetic,
@@ -127,12 +159,12 @@ class Run:
     def save(self, path: str | Path) -> None:
         """Write the state of the last frame."""
         counters = dataclasses.asdict(self.stepper.counters)
-        counters["return_map"] = torch.as_tensor(counters["return_map"]).tolist()
         extra = {
             "counters": counters,
             "watch": self.watch.state(),
             "ledger": {"worst": self.ledger.worst, "scale": self.ledger.scale},
             "dt_scale": self.stepper.dt_scale,
+            "field_limit": self.stepper.field_limit,
             "per_frame": self.per_frame,
             "seconds": self.seconds,
             "fps": self.fps,
@@ -154,12 +186,8 @@ class Run:
                 mend="use the same fps, or start without resume",
             )
         self.state = state
-        counters = dict(extra["counters"])
-        total = counters.pop("return_map")
-        sums = torch.tensor(total) if isinstance(total, list) else int(total)
-        if isinstance(sums, torch.Tensor):
-            sums = sums.to(state.peak.device)
-        self.stepper.counters = Counters(**counters, return_map=sums)
+        self.stepper.resume(Counters(**extra["counters"]))
+        self.stepper.field_limit = int(extra["field_limit"])
         self.stepper.dt_scale = float(extra["dt_scale"])
         self.watch.restore(extra["watch"])
         self.ledger.worst = float(extra["ledger"]["worst"])
@@ -170,7 +198,6 @@ class Run:
     def report(self) -> dict[str, Any]:
         """Return the figures of run.json's section ``simulation``, with verdict and reason."""
         c, matter = self.stepper.counters, self.matter
-        plastic, guarded, inverted, _ = _four(c.return_map)
         verdict = "failed" if self.failure else "healed" if self.watch.rollbacks else "clean"
         reason = self.failure or "; ".join(self.watch.reasons)
         keys = self.per_frame[0] if self.per_frame else {}
@@ -191,24 +218,25 @@ class Run:
             "rollbacks": self.watch.rollbacks,
             "momentum_error": self.ledger.worst,
             "momentum_bar": MOMENTUM_BAR,
-            "guarded_points": guarded,
-            "inverted_points": inverted,
+            "guarded_points": c.guarded,
+            "inverted_points": c.inverted,
+            "contact_nodes": c.contact_nodes,
+            "shared_sites_max": c.shared_sites,
+            "fields_max": c.fields_max,
+            "pieces_flown": c.piece_flights,
+            "naps": c.naps,
+            "wakes": c.wakes,
+            "frozen_motion": float(self.state.dissipated),
             "skipped": {
                 "free_flight_seconds": c.flight_seconds,
                 "free_flight_body_steps": c.flight_body_steps,
-                "contact_steps": c.contact_steps_skipped,
+                "piece_flight_fraction": c.flying_point_seconds / max(c.point_seconds, 1e-300),
+                "sleeping_fraction": c.sleeping_point_seconds / max(c.point_seconds, 1e-300),
+                "contact_steps": c.steps - c.contact_steps,
                 "contact_steps_done": c.contact_steps,
                 "stray_points": int(self.state.stray.sum()),
                 "block_searches": max(c.steps - c.block_builds, 0),
-                "elastic_only_fraction": 1.0 - plastic / max(c.particle_steps, 1),
+                "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),
             },
             "per_frame": per_frame,
         }
-
-
-def _four(total: torch.Tensor | int) -> tuple[int, int, int, int]:
-    """Read the summed counters of the return map."""
-    if isinstance(total, int):
-        return 0, 0, 0, 0
-    a, b, c, d = (int(v) for v in total.tolist())
-    return a, b, c, d

@@ -1,21 +1,100 @@
-"""Saving a simulation at a frame and taking it up again."""
+"""The state of a simulation; saving it at a frame and taking it up again."""
 
 from __future__ import annotations
 
 import math
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
+from gsfluent.data import Particles
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
 from gsfluent.pipeline.particles import Matter
-from gsfluent.pipeline.simulate_step import State
 
-VERSION = 2
-_MOVING = ("position", "velocity", "affine", "strain", "alpha", "deformation")
+VERSION = 4
+_MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
+_POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm")
+_WHOLE = ("impulse", "colliders", "work", "dissipated")
+
+
+class State(NamedTuple):
+    """Everything that changes in a simulation. Tensors are never written in place.
+
+    Attributes:
+        particles: All points as of ``time``; positions rounded to their dtype.
+        position: Positions [m], float64 [N, 3]: what the next step starts from.
+        peak: Largest alpha each point ever had, [N]; breaking cannot be undone.
+        time: Simulated time [s].
+        step: Grid steps so far.
+        landed: Which bodies have ended their first flight.
+        impulse: Sum of collider impulses on the bodies [N s], float64 [3].
+        colliders: Rows of the rigid colliders as of ``time``, float64 [M, 32].
+        work: Most energy that colliders can have given to the bodies [J], float64 [].
+        stray: Crumbs that left the grid for good, bool [N] (see
+            :mod:`gsfluent.pipeline.simulate_strays`).
+        field: Velocity field of each point, int32 [N]: its body, or its piece of a broken one.
+        cut: Sides of blades each point lies on, int32 [N] (:func:`gsfluent.ops.blade_sides`).
+        group: First row of the group that moves without the grid and holds the point, int32 [N];
+            -1 for points on the grid and for bodies in their first flight.
+        asleep: Whether that group rests (else it flies), bool [N].
+        calm: Frames in a row during which the point hardly moved, int16 [N].
+        dissipated: Kinetic energy of vibration and of creep that went when groups left the grid
+            [J], float64 [].
+    """
+
+    particles: Particles
+    position: Tensor
+    peak: Tensor
+    time: float
+    step: int
+    landed: tuple[bool, ...]
+    impulse: Tensor
+    colliders: Tensor
+    work: Tensor
+    stray: Tensor
+    field: Tensor
+    cut: Tensor
+    group: Tensor
+    asleep: Tensor
+    calm: Tensor
+    dissipated: Tensor
+
+    @staticmethod
+    def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...]) -> State:
+        """The state at time 0."""
+        p = matter.particles
+        none = torch.zeros(p.count, dtype=torch.bool, device=p.device)
+        zero = torch.zeros((), dtype=torch.float64, device=p.device)
+        return State(
+            particles=p,
+            position=p.position.to(torch.float64),
+            peak=p.alpha,
+            time=0.0,
+            step=0,
+            landed=landed,
+            impulse=torch.zeros(3, dtype=torch.float64, device=p.device),
+            colliders=colliders,
+            work=zero,
+            stray=none,
+            field=p.body,
+            cut=torch.zeros_like(p.body),
+            group=torch.full_like(p.body, -1),
+            asleep=none,
+            calm=torch.zeros(p.count, dtype=torch.int16, device=p.device),
+            dissipated=zero,
+        )
+
+    def adopting(self, before: State) -> State:
+        """Follow positions that somebody changed in ``particles`` since ``before``."""
+        now, then = self.particles.position, before.particles.position
+        if now is then or self.position is not before.position:
+            return self
+        changed = (now != then).any(dim=1, keepdim=True)
+        return self._replace(position=torch.where(changed, now.to(self.position), self.position))
 
 
 def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, Any]) -> None:
@@ -27,16 +106,12 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         matter: The points, of which a fingerprint is stored.
         extra: Counters and records, of plain types.
     """
+    moving = {name: getattr(state.particles, name) for name in _MOVING}
     values: dict[str, Any] = {
         "version": VERSION,
         "fingerprint": _fingerprint(matter),
-        "particles": {name: getattr(state.particles, name).cpu() for name in _MOVING},
-        "peak": state.peak.cpu(),
-        "stress": state.stress.cpu(),
-        "impulse": state.impulse.cpu(),
-        "stray": state.stray.cpu(),
-        "colliders": state.colliders.cpu(),
-        "work": state.work.cpu(),
+        "particles": {name: v if v is None else v.cpu() for name, v in moving.items()},
+        "tensors": {name: getattr(state, name).cpu() for name in _POINTS + _WHOLE},
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
@@ -71,18 +146,14 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
             f"resume: {path} belongs to another scene, quality or seed",
             mend="resume with the settings it was made with, or start without resume",
         )
-    particles = matter.particles.replace(**values["particles"])
+    tensors = values["tensors"]
+    rounded = tensors["position"].to(matter.particles.dtype)
     state = State(
-        particles=particles,
-        peak=values["peak"],
-        stress=values["stress"],
+        particles=matter.particles.replace(position=rounded, **values["particles"]),
         time=float(values["time"]),
         step=int(values["step"]),
         landed=tuple(bool(v) for v in values["landed"]),
-        impulse=values["impulse"],
-        stray=values["stray"],
-        colliders=values["colliders"],
-        work=values["work"],
+        **tensors,
     )
     return state, values["extra"]
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsfluent.data import Particles
 from gsfluent.pipeline.particles import Matter
 
 DISTANCE = 8.0
@@ -43,37 +42,39 @@ def find_strays(position: Tensor, peak: Tensor, candidate: Tensor, reach: float)
 
 
 def drift(
-    particles: Particles,
+    position: Tensor,
+    velocity: Tensor,
+    mass: Tensor,
     rows: Tensor,
-    dt: float,
+    span: float,
     gravity: tuple[float, float, float],
     floor: float | None,
-) -> tuple[Particles, Tensor]:
-    """Move strays by one step, as the grid would move lone points.
+) -> Tensor:
+    """Let strays fall, in place; they stay where they meet the floor.
 
     Args:
-        particles: All points.
+        position: Positions of all points [m], float64 [N, 3]; rows of strays are written.
+        velocity: Velocities of all points [m/s], [N, 3]; likewise.
+        mass: Masses [kg], [N].
         rows: Rows of the strays, int64 [S].
-        dt: Time step [s].
+        span: Time [s].
         gravity: Acceleration [m/s^2].
         floor: Height of the floor [m], or None.
 
     Returns:
-        The points, and the impulse of the floor on the strays [N s], float64 [3].
+        The impulse of the floor on the strays [N s], float64 [3].
     """
-    pull = particles.velocity.new_tensor(gravity)
-    velocity = particles.velocity[rows] + dt * pull
-    position = particles.position[rows] + dt * velocity
+    pull = torch.tensor(gravity, dtype=torch.float64, device=position.device)
+    start = velocity[rows].double()
+    speed = start + span * pull
+    place = position[rows] + span * (0.5 * (start + speed))
     impulse = torch.zeros(3, dtype=torch.float64, device=position.device)
     if floor is not None:
-        down = position[:, 2] <= floor
-        stop = torch.where(down[:, None], velocity, torch.zeros_like(velocity))
-        impulse = -(particles.mass[rows, None] * stop).to(torch.float64).sum(dim=0)
-        velocity = velocity - stop
-        position[:, 2] = position[:, 2].clamp(min=floor)
-    moved = particles.replace(
-        position=particles.position.index_copy(0, rows, position),
-        velocity=particles.velocity.index_copy(0, rows, velocity),
-        affine=particles.affine.index_fill(0, rows, 0.0),
-    )
-    return moved, impulse
+        down = place[:, 2] <= floor
+        stop = torch.where(down[:, None], speed, torch.zeros_like(speed))
+        impulse = -(mass[rows, None].double() * stop).sum(dim=0)
+        speed = speed - stop
+        place[:, 2] = place[:, 2].clamp(min=floor)
+    position[rows] = place
+    velocity[rows] = speed.to(velocity)
+    return impulse

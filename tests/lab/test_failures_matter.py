@@ -179,12 +179,12 @@ def test_row_9_damage_hardly_depends_on_the_step_where_a_ball_breaks() -> None:
 def test_row_10_a_finer_grid_takes_half_the_energy_unless_the_crack_band_is_scaled() -> None:
     """One position of the problem ``double_cantilever``, energy per crack area at two spacings."""
     coarse, fine, plain = (
-        softening.open_cantilever(n, regularised=r, shift=0.25, crossings=7.0)
-        for n, r in ((32, True), (48, True), (48, False))
+        softening.open_cantilever(n, regularised=r, shift=0.25, reference=24, crossings=7.0)
+        for n, r in ((24, True), (36, True), (36, False))
     )
     assert min(coarse.tip, fine.tip, plain.tip) > 0.55  # it passed the place of the measurement
     assert fine.energy == pytest.approx(coarse.energy, rel=0.15)
-    assert plain.energy < 0.75 * coarse.energy
+    assert plain.energy < 0.8 * coarse.energy
 
 
 def test_row_19_stiffness_and_density_ratios_of_thousands() -> None:

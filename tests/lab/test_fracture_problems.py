@@ -14,8 +14,8 @@ from gsfluent.lab.paths import breaking_step
 from gsfluent.lab.slab import nacc
 
 FAST = (
-    "brazilian_disc", "liquid_at_rest", "plate_impact_spall", "return_map_paths",
-    "single_edge_notch", "softening_bar", "taylor_bar",
+    "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",
+    "return_map_paths", "single_edge_notch", "softening_bar", "taylor_bar",
 )  # fmt: skip
 
 

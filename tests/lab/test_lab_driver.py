@@ -165,3 +165,10 @@ def test_problems_are_found_by_name_and_tier(monkeypatch: pytest.MonkeyPatch) ->
         other = types.FunctionType(fall.__code__, globals(), "fall")
         other.__module__ = "elsewhere"
         registry.problem(tier="fast")(other)
+
+
+def test_every_module_of_the_lab_registers_under_names_of_its_own() -> None:
+    registry.discover()
+    found = registry.problems()
+    assert {"projectile", "pull_apart", "taylor_bar"} <= {p.name for p in found}
+    assert all(p.summary != p.name for p in found)  # the table says what each one is

@@ -6,10 +6,14 @@ import math
 
 import pytest
 import torch
+from simulation_shapes import ellipsoid
 from torch import Tensor
 
-from gsfluent import ops
+from gsfluent import materials, ops
+from gsfluent.data import Frame
 from gsfluent.pipeline.blades import BladeSet
+from gsfluent.pipeline.particles import build_matter
+from gsfluent.pipeline.simulate_run import Run
 from gsfluent.scene import Scene
 
 DX = 0.1
@@ -217,8 +221,8 @@ def test_the_halves_push_each_other_when_pressed_together() -> None:
 
 def test_a_thick_blade_opens_the_cut_by_its_thickness() -> None:
     thickness = 0.4 * DX
-    block, blades = Block(), knife(1.4, thickness, speed=2.0)
-    while block.time < blades.ends(0)[1] - 0.5 * DX / 2.0:
+    block, blades = Block(), knife(1.2, thickness, speed=4.0)
+    while block.time < blades.ends(0)[1] - 0.5 * DX / 4.0:
         block.step(blades)
     near = (block.x[:, 2] > -0.2) & (block.x[:, 2] < 0.3)
     right = float(block.x[near & ~block.left, 0].min())
@@ -238,3 +242,64 @@ def test_spread_gives_each_half_its_side_and_joins_what_hangs_together() -> None
     assert blades.fields(body, whole).total == 2
     half = cut_block(0.5)
     assert torch.equal(blades.spread(half.x, body, half.cut, 0), half.cut)
+
+
+# --- in a simulation ---
+
+
+def sliced(depth: float, thickness: float = 0.0, **scene_options: object) -> Run:
+    """A ball of radius 0.1 in free space, cut along x = 0 from above."""
+    scene = Scene(**{"floor": None, "gravity": ZERO} | scene_options)  # type: ignore[arg-type]
+    lifted = Frame(torch.eye(3), torch.tensor([0.0, 0.0, 0.3]), 1.0)
+    scene.add(ellipsoid(), materials.elastic.override(young_modulus=2e4), frame=lifted)
+    scene.blade(
+        [(0, 0, 0.45), (0, 0, 0.45 - depth)], width=0.4, edge=(0, 1, 0), speed=4.0, at=0.02,
+        thickness=thickness,
+    )  # fmt: skip
+    return Run(scene, build_matter(scene, 0.04), 25.0, {}, 3)
+
+
+def test_a_simulated_blade_makes_two_pieces_that_part() -> None:
+    run = sliced(0.3)
+    for frame in range(1, 5):
+        assert run.advance_to(frame, None), run.failure
+        _, pieces, stats = run.record(frame)
+    assert run.report()["verdict"] == "clean" and stats["damaged_fraction"] == 0.0
+    assert pieces.count == 2
+    assert pieces.mass_fractions.tolist() == pytest.approx([0.5, 0.5], abs=0.02)
+    assert stats["kinetic"] < 1e-6
+    p = run.state.particles
+    away = torch.where(p.position[:, :1] > 0, 0.5, -0.5) * torch.tensor([1.0, 0, 0])
+    run.state = run.state._replace(particles=p.replace(velocity=away))
+    run.watch.energy = float(0.5 * p.mass.sum() * 0.25)  # the push comes from outside
+    half = away[:, 0] > 0
+    start = [float((p.mass * away[:, 0])[which].sum()) for which in (half, ~half)]
+    for frame in range(5, 8):
+        assert run.advance_to(frame, None), run.failure
+        run.record(frame)
+    v = run.state.particles.velocity[:, 0]
+    for which, before in zip((half, ~half), start, strict=True):
+        assert float((p.mass * v)[which].sum()) == pytest.approx(before, rel=1e-3)
+
+
+def test_a_blade_that_stops_inside_leaves_one_piece() -> None:
+    run = sliced(0.15)
+    for frame in range(1, 4):
+        assert run.advance_to(frame, None), run.failure
+        _, pieces, _ = run.record(frame)
+    assert pieces.count == 1 and bool((run.state.cut != 0).any())
+    # What is cut stays cut, what is not holds: the solver has to know both sides.
+    assert run.stepper.blades.splits(run.state.field, run.state.cut).tolist() == [0]
+
+
+def test_a_thick_blade_pushes_the_halves_apart_and_its_work_is_booked() -> None:
+    run = sliced(0.35, thickness=0.03)
+    for frame in range(1, 6):
+        assert run.advance_to(frame, None), run.failure
+        _, pieces, stats = run.record(frame)
+    assert run.report()["verdict"] == "clean", run.report()["reason"]
+    assert pieces.count == 2 and run.ledger.worst < 1e-4
+    p = run.state.particles
+    right = run.matter.rest[:, 0] > 0
+    assert float(p.velocity[right, 0].mean() - p.velocity[~right, 0].mean()) > 0.01
+    assert float(run.state.work) >= stats["kinetic"] > 0.0

@@ -16,6 +16,8 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.mesh_distance import mesh_body
 from gsfluent.pipeline.particles import build_matter
 from gsfluent.pipeline.rigid import RigidSet
+from gsfluent.pipeline.run_simulate import saved
+from gsfluent.pipeline.simulate import Simulate
 from gsfluent.pipeline.simulate_run import Run
 from gsfluent.scene import Scene
 
@@ -224,3 +226,29 @@ def test_surfaces_to_draw_lie_on_the_shapes(mesh_file: Path) -> None:
     ball = points[:, 0] < 0.5
     assert torch.allclose(normals[ball], n[ball, 0], atol=1e-6)
     assert 300 < int(ball.sum()) < 4000 and spacing < 0.1
+
+
+def test_frames_show_plate_bullet_and_liquid() -> None:
+    scene = Scene()
+    scene.add(ellipsoid(), SOFT)
+    scene.press(speed=0.4, stroke=0.02, thickness=0.05)
+    scene.bullet((1, 0, 0.6), (0, 0, 0.5), 1.0, radius=0.03, rigid=True)
+    scene.pour((0.4, 0, 0.6), 0.5, 0.03, duration=0.1, material="milk", at=1.0)
+    solid = scene.bodies[0].solid
+    assert solid is not None
+    (frame,) = Simulate(dx=DX)(scene, fps=20, seconds=0.05)
+    kept = saved(frame, scene)
+    own = frame.carried.count
+    assert own == solid.gaussians.count
+    extra = kept.gaussians.means[own : kept.carried]
+    jet = int((frame.particles.body == 1).sum())
+    assert extra.shape[0] > jet + 600
+    milk = kept.gaussians.means[own : own + jet]
+    assert torch.equal(milk, frame.particles.position[frame.particles.body == 1])
+    steel = extra[jet:]
+    ball = (steel - torch.tensor([1.0, 0.0, 0.6])).norm(dim=1)
+    # Drawn as large as it is, though the grid sees it with 0.9 cells.
+    assert ((ball - 0.03).abs() < 1e-4).sum() > 200
+    plate = steel[(ball > 0.1)]
+    assert float(plate[:, 2].min()) == pytest.approx(0.2, abs=1e-3)
+    assert float(plate[:, 2].max()) == pytest.approx(0.25, abs=1e-3)

@@ -150,7 +150,7 @@ def test_one_nan_is_rolled_back_and_healed():
     frames = list(simulate(ball_scene(0.01), fps=20, seconds=0.3))
     report = simulate.report()
     assert report["verdict"] == "healed" and report["rollbacks"] == 1
-    assert "not finite" in report["reason"] or "speed" in report["reason"]
+    assert "finite" in report["reason"] or "speed" in report["reason"]
     assert len(frames) == 6
     assert all(f.stats["non_finite"] == 0 for f in frames)
     difference = (frames[-1].particles.position - wanted.particles.position).abs().max()
