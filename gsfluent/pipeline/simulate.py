@@ -46,7 +46,7 @@ class SimulationFrame:
         index: Frame number, from 0.
         time: Time [s], exactly ``index / fps``.
         particles: The material points.
-        damage: Damage of each point, 0 intact to 1 broken, [N].
+        damage: Damage of each point, 0 intact to 1 broken, [N]; 0 where the law has no damage.
         fragments: Piece of each point, int32 [N], -1 for debris (see :class:`Fragments`).
         energy: ``kinetic``, ``elastic``, ``dissipated``, ``gravity`` [J].
         stats: The figures of run.json's ``per_frame`` for this frame.
@@ -293,6 +293,7 @@ def _frame(run: Run, index: int, carry: Carry | None, repair: Repair | None) -> 
     now, pieces, stats = run.record(index)
     peak, start = run.state.peak, run.matter.particles.alpha
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
+    damage = torch.where(run.matter.brittle, damage, 0.0)
     return SimulationFrame(
         index=index,
         time=index / run.fps,

@@ -207,6 +207,7 @@ class Run:
             "reason": reason,
             "frames": len(self.per_frame),
             "substeps": c.steps,
+            "composed_steps": c.composed_steps,
             "dt_min": c.dt_min if c.steps else 0.0,
             "dt_max": c.dt_max,
             "dx": matter.dx,

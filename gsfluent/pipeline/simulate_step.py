@@ -190,7 +190,7 @@ class Stepper:
 
     def _resident_now(self, state: State) -> bool:
         """Whether the resident solver can go on from here: with no blade at work."""
-        if not (self._resident and resident_can(state.colliders)):
+        if not (self._resident and resident_can(state.colliders, self.rigid, self.matter)):
             return False
         if len(self.blades) == 0:
             return True
@@ -297,7 +297,7 @@ class Stepper:
         grid = _OnGrid(state, self._rows) if not self._empty else None
         to_grid = box_gaps(low, high, grid.low, grid.high) if grid is not None else None
         driven = float(self.rigid.speed(colliders))
-        moving = colliders if driven > 0 else colliders[:0]
+        moving = self.rigid.moving(colliders)
         for i, group in enumerate(groups):
             if group.held(time):
                 clear = min(clear, group.flight.held if group.flight is not None else clear)
