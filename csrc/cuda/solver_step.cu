@@ -153,8 +153,11 @@ __global__ void __launch_bounds__(kP2GThreads)
   for (int index = threadIdx.x; index < kWindowNodes; index += kP2GThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
-    // All four: the mass of a part of the home may round to nothing where its momentum does not.
-    if ((tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at]) == 0) continue;
+    // All channels: the mass of a part of the home may round to nothing where others do not.
+    Word any = tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at];
+    if constexpr (kMoments)
+      if (with_moments) any |= tile[4][at] | tile[5][at] | tile[6][at];
+    if (any == 0) continue;
     const int64_t node = slot_node(neighbour, i, j, k);
     if (node < 0) continue;
     for (int c = 0; c < 4; ++c) {
