@@ -17,7 +17,7 @@ IMPULSE_SUMS = 7
 TILE_ROWS = 32
 """Particles of one tile of a device's arrays (``kTileRows``)."""
 BLOCK_RANGE = 2**16
-MAX_FIELDS = 2**12 - 1
+MAX_FIELDS = 2**12 - 2
 MAX_ROWS = 2**23
 MAX_PARTICLES = 2**26
 """More could overflow the fixed-point sums (``csrc/core/solver_clock.h``)."""
@@ -81,7 +81,7 @@ class Buffers:
     table_home: Tensor
     table_slot: Tensor
     slot_next: Tensor
-    site_near: Tensor
+    slot_near: Tensor
     colliders: Tensor
     collider_state: Tensor
     sdf: Tensor
@@ -121,7 +121,7 @@ class Buffers:
         self.sums = torch.zeros(slots, BLOCK_NODES, 4, dtype=sums, device=device)
         many = slots if fields > 1 else 0
         self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=sums, device=device)
-        self.site_near = torch.zeros(slots, dtype=torch.int64, device=device)
+        self.slot_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())
