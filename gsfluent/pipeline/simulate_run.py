@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gsfluent.ops.blade import cut_apart
 from gsfluent.pipeline.fragments import Fragments, find_fragments, rest_links
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
@@ -130,7 +131,10 @@ class Run:
         may_break = self._breakable
         if self.scene.blades:
             may_break = may_break | cut_bodies(self.matter, state.cut)
-        unit = units(self.matter, self._links, self._fragments(state), may_break)
+        links = self._links.to(state.cut.device)
+        if self.scene.blades:  # powder stays on its side of a cut
+            links = links[~cut_apart(state.cut[links[:, 0]], state.cut[links[:, 1]])]
+        unit = units(self.matter, links, self._fragments(state), may_break)
         return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
 
     def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:

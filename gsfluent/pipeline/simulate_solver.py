@@ -273,7 +273,9 @@ class Resident:
             solver.restore({"colliders": self.colliders, "collider_state": self.colliders})
 
     def _wrong(self, kind: str) -> Tensor:
-        """The points at fault: not finite, or among the fastest."""
+        """The points at fault: not finite, among the fastest, or where most fields meet."""
+        if kind == "crowded":
+            return _most_crowded(self._solver.position, self._solver.body, self._matter.dx)
         speed = self._solver.velocity.norm(dim=1)
         bad = ~torch.isfinite(speed) | ~torch.isfinite(self._solver.strain).all(dim=1)
         if kind == "speed" or not bool(bad.any()):
@@ -308,6 +310,14 @@ class Resident:
         alpha = self._alpha if self._elastic else s.alpha
         peak = self._peak if self._elastic else torch.where(self._brittle, s.peak, self._peak)
         return Points(s.position, s.velocity, s.affine, s.strain, alpha, peak, s.deformation)
+
+
+def _most_crowded(position: Tensor, field: Tensor, dx: float) -> Tensor:
+    """Points of the block of the grid that holds points of most fields, bool [N]."""
+    block = torch.floor(position / (4.0 * dx) - 0.125).long()
+    _, home = torch.unique(block, dim=0, return_inverse=True)
+    pairs = torch.unique(torch.stack([home, field.long()], dim=1), dim=0)
+    return home == torch.bincount(pairs[:, 0]).argmax()
 
 
 def _box(position: Tensor, dx: float) -> int:

@@ -201,7 +201,10 @@ class Stepper:
             return True
         if self.blades.speed(state.time) > 0.0:
             return False
-        return self.blades.splits(state.field, state.cut).numel() == 0
+        # On powder a cut leaves nothing to hold; what shares a field has to lie on one side.
+        whole = self._unit if self.separate_fragments else state.field
+        held = self._unit >= 0
+        return self.blades.splits(whole[held], state.cut[held]).numel() == 0
 
     def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:
         pushed, worked = engine.impulse, engine.work
