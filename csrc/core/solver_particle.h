@@ -8,7 +8,7 @@
 
 namespace gsf {
 
-// Range of alpha past zero over which a broken point loses its cohesion for good.
+// Range of alpha past zero over which a broken point (NACC) loses its cohesion for good.
 inline constexpr double kWeakening = 0.02;
 
 // Laws a kernel is compiled for: fewer laws, fewer registers.
@@ -67,6 +67,18 @@ GSF_HOST_DEVICE void load_three(const SolverView<T>& s, const T* from, int64_t p
   for (int c = 0; c < 3; ++c) out[c] = from[s.at(3, p, c)];
 }
 
+// The larger of two values; NaN counts as larger than any.
+template <typename T>
+GSF_HOST_DEVICE T larger(T a, T b) {
+  return a > b || !(a == a) ? a : b;
+}
+#ifdef __CUDA_ARCH__
+// For values that are not negative: their bits sort as they do, and NaN above all.
+__device__ inline float larger(float a, float b) {
+  return __uint_as_float(max(__float_as_uint(a), __float_as_uint(b)));
+}
+#endif
+
 // Largest momentum one particle can give along one axis to one node before the weight: nodes lie
 // within 1.5 dx of it.
 template <typename T>
@@ -75,8 +87,7 @@ GSF_HOST_DEVICE T momentum_bound(const T* velocity, const T* slope, T mass, T dx
   T largest = T(0);
   for (int i = 0; i < 3; ++i) {
     const T row = abs(slope[3 * i]) + abs(slope[3 * i + 1]) + abs(slope[3 * i + 2]);
-    const T bound = mass * abs(velocity[i]) + T(1.5) * dx * row;
-    largest = bound > largest || !(bound == bound) ? bound : largest;  // keeps NaN
+    largest = larger(mass * abs(velocity[i]) + T(1.5) * dx * row, largest);
   }
   return largest;
 }
@@ -85,7 +96,6 @@ GSF_HOST_DEVICE T momentum_bound(const T* velocity, const T* slope, T mass, T dx
 struct Largest {
   float speed2, wave2, gradient2, bound;
 };
-GSF_HOST_DEVICE float larger(float a, float b) { return a > b || !(a == a) ? a : b; }
 
 struct StepFlags {
   bool plastic, guarded, inverted, invalid;
@@ -96,7 +106,7 @@ struct StepFlags {
 template <typename T>
 GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
   MaterialRow<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
-  if (s.irreversible) m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
+  if (s.irreversible && s.law[row] == kNacc) m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
   return m;
 }
 
@@ -120,24 +130,24 @@ GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, c
 }
 
 // Moves (l, o) of one axis by `step` cells; `leaves` is set within `slack` cells of the end of the
-// window. False when it left the window.
+// window. False when it left the window; a step that is not finite leaves o where it was.
 template <typename T>
 GSF_HOST_DEVICE bool move_axis(T step, T slack, int& l, T& o, bool& leaves) {
   using std::floor;
   const T there = o + step;
-  if (!(there > T(-8) && there < T(8))) return false;  // NaN too
-  T whole = floor(there);
+  const bool known = there > T(-8) && there < T(8);  // false for NaN
+  T whole = known ? floor(there) : T(-8);
   T rest = there - whole;
   if (!(rest < T(1))) {  // rounding of a tiny negative number
     rest = T(0);
     whole += T(1);
   }
   const int cell = l + int(whole);
-  o = rest;
+  o = known ? rest : o;
   l = cell < 0 ? 0 : (cell > kLastCell ? kLastCell : cell);
   const T reached = T(cell) + rest;
-  leaves = leaves || reached < slack || reached > T(kLastCell + 1) - slack;
-  return cell >= 0 && cell <= kLastCell;
+  leaves = leaves || !(reached >= slack && reached <= T(kLastCell + 1) - slack);
+  return known && cell >= 0 && cell <= kLastCell;
 }
 
 // What a particle brings into its update; read before the gather, so that memory works meanwhile.
@@ -209,7 +219,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     const ElasticState<T> state = elastic_state(e, !(det_identity_plus(increment) > T(0)));
     flags.guarded = state.guarded;
     flags.inverted = state.inverted;
-    flags.invalid = !finite(e);
+    flags.invalid = state.guarded && !finite(e);  // what is not finite is out of bounds
     set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, log_volume(state)) : state.e);
     stress = kirchhoff_stress(r[0], r[1], state.d, state.j2m1);
     if (waves) wave2 = elastic_wave_squared(r, state);
@@ -226,7 +236,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     set_strain(s, p, out.strain);
     if (out.alpha != alpha) {
       s.alpha[p] = out.alpha;
-      if (out.alpha > peak) s.peak[p] = out.alpha;
+      if (out.alpha > peak && law == kNacc) s.peak[p] = out.alpha;
     }
     whole = max(out.alpha, peak) < T(0) || law != kNacc;
     stress = out.stress;

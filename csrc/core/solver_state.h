@@ -23,6 +23,7 @@ constexpr int kWindowEdge = 8;
 constexpr int kWindowNodes = 512;
 constexpr int kNeighbours = 27;  // blocks a window can touch
 constexpr int kImpulseSums = 7;
+constexpr int kTileRows = 32;    // particles of one tile of the GPU's arrays
 constexpr int kLastCell = 5;     // largest l
 constexpr int kRowColumns = 12;  // eight material parameters, then those below
 constexpr int kMassColumn = 8;
@@ -176,7 +177,7 @@ struct SolverView {
   // hash table
   uint64_t* key;         // [table_size]
   int32_t* table_count;  // [table_size] particles of a home
-  int32_t* table_mask;   // [table_size] neighbours a home reaches
+  int32_t* table_mask;   // [table_size] neighbours a home reaches; then the shared sites (CUDA)
   int32_t* table_home;   // [table_size]
   int32_t* table_slot;   // [table_size] slot, or head of the slot list of a site
   int32_t* slot_next;    // [S] chain of the slots of a site
@@ -190,11 +191,13 @@ struct SolverView {
   double* impulse;  // [K, kImpulseSums] impulse [N s] and torque [N m s] since the load, then
                     // the mass touched in the last step [kg]
 
-  // Index of component c of particle p in an array of `width` components: component by component on
-  // the GPU (neighbouring lanes read neighbouring words), particle by particle on the CPU.
+  // Index of component c of particle p in an array of `width` components: particle by particle on
+  // the CPU; on the GPU component by component inside tiles of kTileRows particles, so that
+  // neighbouring lanes read neighbouring words and the components of a particle lie at constant
+  // distances.
   GSF_HOST_DEVICE int64_t at(int width, int64_t p, int c) const {
 #ifdef __CUDA_ARCH__
-    return c * count + p;
+    return (p / kTileRows * width + c) * kTileRows + p % kTileRows;
 #else
     return p * width + c;
 #endif

@@ -167,7 +167,8 @@ __global__ void __launch_bounds__(kThreads) sites_kernel(const __grid_constant__
   for (int i = 0; i < kSiteFields; ++i)
     s.site_slots[site * kSiteFields + i] = i < count ? slots[i] : -1;
   for (int i = 0; i < count; ++i) s.slot_shared[slots[i]] = count > 1 ? 1 : 0;
-  if (count > 1) add(&s.clock->shared_sites, 1);
+  // The masks have done their work: their words become the list of shared sites.
+  if (count > 1) s.table_mask[add(&s.clock->shared_sites, 1)] = static_cast<int32_t>(site);
   uint64_t near = 0;
   const Vec3<T> middle = block_middle(s, s.slot_coord + 4 * int64_t(slots[0]));
   for (int64_t k = 0; k < s.collider_count; ++k)
@@ -311,9 +312,9 @@ __global__ void __launch_bounds__(kThreads)
     for (int c = 0; c < width; ++c, ++column) {
       Word* spare = reinterpret_cast<Word*>(s.spare + column * s.count);
       if constexpr (kBack)
-        array[c * s.count + p] = spare[p];
+        array[s.at(width, p, c)] = spare[p];
       else
-        spare[p] = array[c * s.count + from];
+        spare[p] = array[s.at(width, from, c)];
     }
   });
 }

@@ -153,7 +153,8 @@ __global__ void __launch_bounds__(kP2GThreads)
   for (int index = threadIdx.x; index < kWindowNodes; index += kP2GThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
-    if (tile[3][at] == 0) continue;
+    // All four: the mass of a part of the home may round to nothing where its momentum does not.
+    if ((tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at]) == 0) continue;
     const int64_t node = slot_node(neighbour, i, j, k);
     if (node < 0) continue;
     for (int c = 0; c < 4; ++c) {
@@ -213,10 +214,53 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   }
   __syncthreads();
   if (threadIdx.x != 0) return;
-  s.clock->travel += float_of_bits(s.clock->moved);
-  s.clock->moved = 0;
-  end_step(*s.clock, double(s.dx), s.count);
-  choose_unit(*s.clock);
+  // On a copy: all loads at once, then all stores.
+  SolverClock clock = *s.clock;
+  clock.travel += float_of_bits(clock.moved);
+  clock.moved = 0;
+  end_step(clock, double(s.dx), s.count);
+  choose_unit(clock);
+  *s.clock = clock;
+}
+
+// sum w v and sum w v (node - particle) over a stencil, in cells; along z first, then y, then x.
+// The weights of an axis sum to one and their first moments to zero, so each sum is taken of
+// differences to the middle node: what all nodes share goes through without a rounding, and bodies
+// that fly or spin freely keep their momentum longer.
+template <typename T>
+__device__ __forceinline__ void gather(const Stencil<T>& st, const T (&tile)[3][kTile], int base,
+                                       T (&value)[3], Mat3<T>& moment) {
+  T lever[3][3];  // w (node - particle) of each axis
+#pragma unroll
+  for (int axis = 0; axis < 3; ++axis)
+#pragma unroll
+    for (int k = 0; k < 3; ++k) lever[axis][k] = st.w[axis][k] * (T(k) - st.f[axis]);
+#pragma unroll
+  for (int c = 0; c < 3; ++c) {
+    T plane[3], plane_y[3], plane_z[3];
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+      T row[3], row_z[3];
+#pragma unroll
+      for (int j = 0; j < 3; ++j) {
+        const int at = base + i * kStrideX + j * kStrideY;
+        const T middle = tile[c][at + 1];
+        const T below = tile[c][at] - middle, above = tile[c][at + 2] - middle;
+        row[j] = (middle + st.w[2][0] * below) + st.w[2][2] * above;
+        row_z[j] = lever[2][0] * below + lever[2][2] * above;
+      }
+      const T below = row[0] - row[1], above = row[2] - row[1];
+      plane[i] = row[1] + (st.w[1][0] * below + st.w[1][2] * above);
+      plane_y[i] = lever[1][0] * below + lever[1][2] * above;
+      plane_z[i] = st.w[1][0] * row_z[0] + st.w[1][1] * row_z[1] + st.w[1][2] * row_z[2];
+    }
+    const T below = plane[0] - plane[1], above = plane[2] - plane[1];
+    const T* w = st.w[0];
+    value[c] = plane[1] + (w[0] * below + w[2] * above);
+    moment(c, 0) = lever[0][0] * below + lever[0][2] * above;
+    moment(c, 1) = w[0] * plane_y[0] + w[1] * plane_y[1] + w[2] * plane_y[2];
+    moment(c, 2) = w[0] * plane_z[0] + w[1] * plane_z[1] + w[2] * plane_z[2];
+  }
 }
 
 template <typename T, int kLaws, bool kTrack>
@@ -238,8 +282,8 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
     int i, j, k;
     const int at = window_node(index, i, j, k);
     const int64_t node = slot_node(s.neighbour + home * kNeighbours, i, j, k);
-    const T* v = s.node_velocity + 4 * (node < 0 ? 0 : node);
-    for (int c = 0; c < 3; ++c) tile[c][at] = node < 0 ? T(0) : v[c];
+    const Vec3<T> v = node < 0 ? Vec3<T>{T(0), T(0), T(0)} : load_velocity(s, node);
+    for (int c = 0; c < 3; ++c) tile[c][at] = v[c];
   }
   __syncthreads();
   Largest largest{};
@@ -255,37 +299,9 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
       const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
                        min(meta_cell(meta, 1), kLastCell) * kStrideY +
                        min(meta_cell(meta, 2), kLastCell);
-      T value[3] = {T(0), T(0), T(0)};
+      T value[3] = {};
       Mat3<T> moment{};
-      // Along z first, then y, then x: each sum and its first moment in cells.
-#pragma unroll
-      for (int i = 0; i < 3; ++i) {
-        T plane[3] = {}, plane_y[3] = {}, plane_z[3] = {};
-#pragma unroll
-        for (int j = 0; j < 3; ++j) {
-          const int at = base + i * kStrideX + j * kStrideY;
-#pragma unroll
-          for (int c = 0; c < 3; ++c) {
-            const T one = st.w[2][1] * tile[c][at + 1], two = st.w[2][2] * tile[c][at + 2];
-            const T row = st.w[1][j] * (st.w[2][0] * tile[c][at] + one + two);
-            plane[c] += row;
-            if (j == 1) plane_y[c] += row;
-            if (j == 2) plane_y[c] += row + row;
-            plane_z[c] += st.w[1][j] * (one + two + two);
-          }
-        }
-#pragma unroll
-        for (int c = 0; c < 3; ++c) {
-          const T w = st.w[0][i];
-          value[c] += w * plane[c];
-          if (i == 1) moment(c, 0) += w * plane[c];
-          if (i == 2) moment(c, 0) += w * (plane[c] + plane[c]);
-          moment(c, 1) += w * plane_y[c];
-          moment(c, 2) += w * plane_z[c];
-        }
-      }
-      for (int c = 0; c < 3; ++c)
-        for (int d = 0; d < 3; ++d) moment(c, d) -= st.f[d] * value[c];
+      gather(st, tile, base, value, moment);
       flags = finish_particle<T, kLaws, kTrack>(s, p, before, reach, value, moment, dt, dt_next,
                                                 waves, slack, largest);
     }
@@ -346,9 +362,8 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   else
     p2g_kernel<T, false><<<homes * split, kP2GThreads, 0, stream>>>(s, split);
   if (s.moments != nullptr)
-    contact_kernel<T>
-        <<<static_cast<unsigned>((s.slot_capacity + kContactSites - 1) / kContactSites),
-           kBlockNodes, 0, stream>>>(s);
+    contact_kernel<T>  // a shared site has two slots at least
+        <<<static_cast<unsigned>((s.slot_capacity + 1) / 2), kBlockNodes, 0, stream>>>(s);
   grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)

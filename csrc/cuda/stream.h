@@ -13,6 +13,7 @@ namespace gsf {
 class CudaScope {
  public:
   explicit CudaScope(const Tensor& t) : index_(t.get_device_index()), guard_(index_) {}
+  int index() const { return index_; }
   cudaStream_t stream() const {
     void* s = nullptr;
     TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(index_, &s));

@@ -3,6 +3,8 @@
 // names. An empty tensor stands for a part the scene does not use.
 #pragma once
 
+#include <cstring>
+
 #include "core/collider.h"
 #include "core/solver_state.h"
 #include "torch_api.h"
@@ -82,7 +84,9 @@ struct SolverOps {
   template <typename T>
   static SolverView<T> view(const Buffers& b, const std::vector<int64_t>& ints,
                             const std::vector<double>& floats) {
-    SolverView<T> s{};
+    SolverView<T> s;
+    // Every byte, also between members: back ends compare views to see whether anything moved.
+    std::memset(static_cast<void*>(&s), 0, sizeof s);
     const Tensor& like = b[kOffset];
     s.count = b[kMeta].numel();
     s.home_capacity = b[kHomeStart0].size(0);
@@ -96,6 +100,8 @@ struct SolverOps {
     const bool device = like.is_cuda();
     const int64_t n = s.count, h = s.home_capacity, c = s.slot_capacity, t = s.table_size;
     const ScalarType sum = device ? i64 : ScalarType::Double, moment = device ? i64 : real;
+    // What has several components per particle comes in whole tiles on a device.
+    const int64_t tiled = device ? (n + kTileRows - 1) / kTileRows * kTileRows : n;
     const struct {
       const char* name;
       int64_t rows, columns;
@@ -103,14 +109,14 @@ struct SolverOps {
       bool optional;
     } wanted[kSolverBuffers] = {
         {"clock", 1, kClockWords, i64, false},
-        {"offset", n, 3, real, false},
+        {"offset", tiled, 3, real, false},
         {"meta", n, 1, i32, false},
-        {"velocity", n, 3, real, false},
-        {"slope", n, 9, real, false},
-        {"strain", n, 6, real, false},
+        {"velocity", tiled, 3, real, false},
+        {"slope", tiled, 9, real, false},
+        {"strain", tiled, 6, real, false},
         {"alpha", n, 1, real, true},
         {"peak", n, 1, real, true},
-        {"deformation", n, 9, real, true},
+        {"deformation", tiled, 9, real, true},
         {"id", n, 1, i32, false},
         {"spare", n, 9, real, false},
         {"entry", n, 1, i32, false},

@@ -14,6 +14,8 @@ SITE_FIELDS = 16
 CONTACT_MOMENTS = 3
 ROW_COLUMNS = 12
 IMPULSE_SUMS = 7
+TILE_ROWS = 32
+"""Particles of one tile of a device's arrays (``kTileRows``)."""
 BLOCK_RANGE = 2**16
 MAX_FIELDS = 2**12 - 1
 MAX_ROWS = 2**23
@@ -129,6 +131,20 @@ class Buffers:
         self.table_home, self.table_slot = whole(entries), whole(entries)
 
 
+def tiled(values: Tensor) -> Tensor:
+    """Rows [N, W] as a device keeps them: [tiles, W, TILE_ROWS], zero behind the last row."""
+    n, width = values.shape
+    tiles = -(-n // TILE_ROWS)
+    padded = values.new_zeros(tiles * TILE_ROWS, width)
+    padded[:n] = values
+    return padded.view(tiles, TILE_ROWS, width).transpose(1, 2).contiguous()
+
+
+def untiled(values: Tensor, count: int) -> Tensor:
+    """The first ``count`` rows [count, W] of what :func:`tiled` made."""
+    return values.transpose(1, 2).reshape(-1, values.shape[1])[:count]
+
+
 def empty_buffers(like: Tensor, count: int) -> Buffers:
     """Buffers for ``count`` particles without blocks, materials or optional parts."""
     device, real = like.device, like.dtype
@@ -140,7 +156,8 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
     for field in dataclasses.fields(Buffers):
         values[field.name] = zeros(0)
     for name, width in (("offset", 3), ("velocity", 3), ("slope", 9), ("strain", 6), ("spare", 9)):
-        values[name] = zeros(count, width)
+        rows = zeros(count, width)
+        values[name] = tiled(rows) if device.type == "cuda" and name != "spare" else rows
     for name in ("meta", "id", "entry", "place"):
         values[name] = zeros(count, dtype=torch.int32)
     for name in ("law", "home_start0", "home_count0", "home_start1", "home_count1"):

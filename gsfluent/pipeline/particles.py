@@ -8,6 +8,7 @@ so points are sampled from the solid's voxels and the splats ride on them
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Callable
@@ -25,6 +26,8 @@ from gsfluent.scene_parts import quaternion_to, turned
 _log = logging.getLogger(__name__)
 
 POINTS_PER_CELL = 8
+UNBROKEN = -1.0
+"""Peak of points that cannot break, whatever their law keeps in alpha."""
 _WAVES = 128
 ALPHA_JITTER = 0.15
 """Relative half-width of the uniform weakness noise that seeds cracks (equations.md section 17)."""
@@ -55,6 +58,17 @@ class Matter:
     def rest(self) -> Tensor:
         """Positions at time 0 [m], [N, 3]."""
         return self.particles.position
+
+    def of_law(self, *names: str) -> Tensor:
+        """Points whose material obeys one of these laws (:data:`gsfluent.materials.LAWS`), [N]."""
+        law = self.law[self.particles.material.long()]
+        wanted = torch.tensor([materials.LAWS[name] for name in names], device=law.device)
+        return torch.isin(law, wanted.to(law.dtype))
+
+    @functools.cached_property
+    def brittle(self) -> Tensor:
+        """Points that can break, bool [N]: only in NACC is alpha a measure of damage."""
+        return self.of_law("nacc")
 
 
 def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:

@@ -14,8 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsfluent import ops
+from gsfluent import geometry, ops
 from gsfluent.ops import collider as columns
+from gsfluent.pipeline.simulate_near import time_to_meet
 from gsfluent.scene import Collider, Scene
 from gsfluent.scene_parts import turned
 
@@ -76,6 +77,10 @@ class RigidSet:
         self.start = self.scheduled(self.start, 0.0).to(device)
         self._motion = self._motion.to(device)
         self.sdf = torch.cat(self._grids).to(device) if self._grids else None
+        self._pull = math.hypot(*scene.gravity)
+        self._free = [
+            i for i, c in enumerate(self._colliders) if c is not None and c.mass is not None
+        ]
 
     @property
     def count(self) -> int:
@@ -126,19 +131,87 @@ class RigidSet:
         rows = ops.advance_colliders(
             rows, dt, impulse=impulse, torque=torque, gravity=self._gravity
         )
-        return self.scheduled(self._rest_on_floor(rows), time + dt)
+        return self.settled(rows, time + dt)
+
+    def settled(self, rows: Tensor, time: float) -> Tensor:
+        """Rows that have just moved to ``time``: free bodies on the floor, plates as scheduled."""
+        return self.scheduled(self._rest_on_floor(rows), time)
+
+    def floor_wait(self, rows: Tensor, depth: float) -> float:
+        """Least time in which gravity takes a free body to ``depth`` [m] below the floor [s]."""
+        if self.floor is None:
+            return math.inf
+        wait = math.inf
+        for i in self._free:
+            above = float(rows[i, 5]) - self._reach(i, rows) - self.floor
+            down = abs(float(rows[i, 12]))
+            wait = min(wait, time_to_meet(max(above, 0.0) + depth, down, self._pull))
+        return wait
+
+    def speeds(self, rows: Tensor) -> Tensor:
+        """Largest speed of each collider's matter [m/s], [M]."""
+        lever = torch.where(rows[:, 0] == 0, 0.0, rows[:, 26:29].norm(dim=1) + rows[:, 9])
+        return rows[:, 10:13].norm(dim=1) + rows[:, 20:23].norm(dim=1) * lever
 
     def speed(self, rows: Tensor) -> Tensor:
-        """Largest speed of a collider's matter [m/s], a tensor [] on the device."""
-        if self.count == 0:
-            return rows.new_zeros(())
-        lever = torch.where(rows[:, 0] == 0, 0.0, rows[:, 26:29].norm(dim=1) + rows[:, 9])
-        return (rows[:, 10:13].norm(dim=1) + rows[:, 20:23].norm(dim=1) * lever).max()
+        """Largest speed of any collider's matter [m/s], a tensor [] on the device."""
+        return self.speeds(rows).max() if self.count else rows.new_zeros(())
+
+    def moving(self, rows: Tensor) -> Tensor:
+        """Colliders that move, or that gravity is about to move: their rows, [K, 32]."""
+        active = self.speeds(rows) > 0.0
+        for i in self._free if self._pull > 0.0 else ():
+            bottom = float(rows[i, 5]) - self._reach(i, rows)
+            active[i] |= self.floor is None or bottom > self.floor + 1e-9
+        return rows[active]
 
     def work(self, rows: Tensor, impulse: Tensor, torque: Tensor) -> Tensor:
         """Most energy that the colliders can have given to the matter in a step [J], []."""
         given = (impulse * rows[:, 10:13]).sum() + (torque * rows[:, 20:23]).sum()
         return given.clamp(min=0.0)
+
+    def work_between(self, rows: Tensor, now: Tensor, impulse: Tensor, torque: Tensor) -> Tensor:
+        """The same over many steps, during which nothing but matter and gravity acted [J], [].
+
+        Args:
+            rows: Rows before, [M, 32].
+            now: Rows after.
+            impulse: Given to the matter between them [N s], float64 [M, 3].
+            torque: About each collider's point [N m s], float64 [M, 3].
+        """
+        given = (impulse * rows[:, 10:13]).sum(dim=1) + (torque * rows[:, 20:23]).sum(dim=1)
+        pull = torch.tensor(self._gravity, dtype=rows.dtype, device=rows.device)
+        fallen = rows[:, columns.MASS] * ((now[:, 3:6] - rows[:, 3:6]) @ pull)
+        # A free body gives what it loses of its own energy.
+        lost = _kinetic(rows) - _kinetic(now) + fallen
+        return torch.where(rows[:, columns.MASS] > 0.0, lost, given).sum().clamp(min=0.0)
+
+    def touchable(self, rows: Tensor) -> Tensor:
+        """Volume of grid nodes that each free body can touch, its lever counted in [m^3], [M].
+
+        The box around the body, half a cell wider; times ``1 + m r^2 / I`` for what its turning
+        gives way (``collider_give`` in ``csrc/core/collider.h``). 0 for other colliders.
+        """
+        volume = rows.new_zeros(rows.shape[0])
+        for i in self._free:
+            row = rows[i]
+            kind, radius, half = int(row[0]), float(row[9]), row[26:29]
+            if kind == 1:
+                half = torch.full_like(half, radius)
+            elif kind in (3, 4):
+                half = torch.stack([half[2] * 0 + radius, half[2] * 0 + radius, half[2] + radius])
+            elif kind == 5:
+                half = torch.maximum(-row[6:9], row[6:9] + (half - 1) * radius)
+            box = (2.0 * half + self.dx).prod()
+            moments = row[columns.INERTIA : columns.EXTENT]
+            turns = 0.0
+            if bool((moments > 0).any()):
+                turns = float(row[columns.MASS]) * self._bound(row) ** 2
+                turns /= float(moments[moments > 0].min())
+                if kind == 1:  # only friction turns a ball
+                    turns *= float(row[2] ** 2 / (1.0 + row[2] ** 2))
+            volume[i] = box * (1.0 + turns) * (math.pi / 6.0 if kind == 1 else 1.0)
+        return volume
 
     def gap(self, rows: Tensor, low: Tensor, high: Tensor) -> float:
         """Lower bound of the distance between the colliders and a box [m]."""
@@ -148,8 +221,11 @@ class RigidSet:
         lattice = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=rows.dtype)] * 3)
         at = corners[0] + lattice.to(rows.device) * (corners[1] - corners[0])
         distance, _ = ops.collider_distance(at, rows, self.sdf)
-        # No place of the box is further from the lattice than half a lattice cell's diagonal.
-        return float(distance.min()) - 0.125 * float((corners[1] - corners[0]).norm())
+        # No place of the box is further from the lattice than half a lattice cell's diagonal. From
+        # an endless plane the corners are nearest.
+        endless = (rows[:, columns.TYPE] == 0) & (rows[:, columns.RADIUS] == 0)
+        slack = torch.where(endless, 0.0, 0.125 * (corners[1] - corners[0]).norm())
+        return float((distance - slack).min())
 
     def surfaces(self, rows: Tensor, points: int = 2000) -> tuple[Tensor, Tensor, float]:
         """Points spread over the surfaces of all colliders but endless planes, to draw them.
@@ -290,21 +366,33 @@ class RigidSet:
         }
         return body.volume, body.inertia.tolist(), extra
 
+    def _reach(self, i: int, rows: Tensor) -> float:
+        """How far free body i can reach below its point [m]."""
+        c = self._colliders[i]
+        return c.radius if c is not None and c.kind == "sphere" else self._bound(rows[i])
+
     def _rest_on_floor(self, rows: Tensor) -> Tensor:
         """Stop free bodies at the floor: rigid things do not collide with each other otherwise."""
         if self.floor is None:
             return rows
-        free = [i for i, c in enumerate(self._colliders) if c is not None and c.mass is not None]
-        if not free:
+        if not self._free:
             return rows
         rows = rows.clone()
-        for i in free:
-            c = self._colliders[i]
-            reach = c.radius if c is not None and c.kind == "sphere" else self._bound(rows[i])
+        for i in self._free:
+            reach = self._reach(i, rows)
             down = rows[i, 5] < self.floor + reach
             rows[i, 5] = rows[i, 5].clamp(min=self.floor + reach)
             rows[i, 12] = torch.where(down, rows[i, 12].clamp(min=0.0), rows[i, 12])
         return rows
+
+
+def _kinetic(rows: Tensor) -> Tensor:
+    """Kinetic energy of each collider with mass [J], [M]."""
+    turning = rows[:, columns.ANGULAR_VELOCITY : columns.INERTIA]
+    frame = geometry.quaternion_to_matrix(rows[:, columns.ORIENTATION : columns.ANGULAR_VELOCITY])
+    along = (frame.mT @ turning[..., None])[..., 0]
+    spin = (rows[:, columns.INERTIA : columns.EXTENT] * along**2).sum(dim=1)
+    return 0.5 * (rows[:, columns.MASS] * (rows[:, 10:13] ** 2).sum(dim=1) + spin)
 
 
 def _steady(c: Collider) -> bool:

@@ -46,7 +46,7 @@ class SimulationFrame:
         index: Frame number, from 0.
         time: Time [s], exactly ``index / fps``.
         particles: The material points.
-        damage: Damage of each point, 0 intact to 1 broken, [N].
+        damage: Damage of each point, 0 intact to 1 broken, [N]; 0 where the law has no damage.
         fragments: Piece of each point, int32 [N], -1 for debris (see :class:`Fragments`).
         energy: ``kinetic``, ``elastic``, ``dissipated``, ``gravity`` [J].
         stats: The figures of run.json's ``per_frame`` for this frame.
@@ -135,6 +135,9 @@ class Simulate(Stage):
         resident: Use the resident solver wherever it knows the colliders; otherwise the composed
             operators, step by step.
         irreversible: Broken points stay without cohesion when they are pressed together again.
+        law_kernels: Use kernels made for elastic and brittle matter where there is no other.
+        contact_near: Leave out contact where no two bodies or pieces are near each other; False
+            is for comparison: the composed operators then look for contact at every node.
         repair: Add transition splats along cracks to ``frame.gaussians``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
         return_map: Options of :func:`gsfluent.ops.return_mapping`.
@@ -164,6 +167,8 @@ class Simulate(Stage):
         separate_fragments: bool = True,
         resident: bool = True,
         irreversible: bool = True,
+        law_kernels: bool = True,
+        contact_near: bool = True,
         repair: bool = True,
         splats: bool = True,
         return_map: dict[str, float | bool] | None = None,
@@ -192,6 +197,8 @@ class Simulate(Stage):
             "separate_fragments": separate_fragments,
             "resident": resident,
             "irreversible": irreversible,
+            "law_kernels": law_kernels,
+            "contact_near": contact_near,
             "return_map": return_map,
         }
         self._run: Run | None = None
@@ -293,6 +300,7 @@ def _frame(run: Run, index: int, carry: Carry | None, repair: Repair | None) -> 
     now, pieces, stats = run.record(index)
     peak, start = run.state.peak, run.matter.particles.alpha
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
+    damage = torch.where(run.matter.brittle, damage, 0.0)
     return SimulationFrame(
         index=index,
         time=index / run.fps,

@@ -49,6 +49,7 @@ class Composed:
         self._map = dict(settings.return_map or {})
         self.points = state.particles if rows is None else state.particles.select(rows)
         self.peak = state.peak if rows is None else state.peak[rows]
+        self._brittle = matter.brittle if rows is None else matter.brittle[rows]
         field = torch.unique(
             state.field if rows is None else state.field[rows], return_inverse=True
         )[1]
@@ -175,7 +176,7 @@ class Composed:
             position=position, velocity=velocity, affine=affine, deformation=deformation,
             strain=strain, alpha=alpha,
         )  # fmt: skip
-        self.peak = torch.maximum(self.peak, alpha)
+        self.peak = torch.where(self._brittle, torch.maximum(self.peak, alpha), self.peak)
         if impulse.numel():
             self.impulse = self.impulse + impulse.sum(dim=0)
         self.work = self.work + self.rigid.work(rows, impulse, torque)
@@ -187,8 +188,12 @@ class Composed:
         self._lost = self._lost + skipped + info[3]
         c = self.counters
         c.steps += 1
+        c.composed_steps += 1
         c.particle_steps += p.count
         c.dt_min, c.dt_max = min(c.dt_min, dt), max(c.dt_max, dt)
+        c.block_steps += blocks.block_count
+        c.box_steps += blocks.table.numel()
+        c.contact_block_steps += blocks.block_count if several else 0
         c.contact_steps += several
         c.contact_nodes += int(nodes) if several else 0
 
@@ -203,9 +208,9 @@ class Composed:
         self.counters.block_builds += 1
         self.counters.blocks_max = max(self.counters.blocks_max, blocks.block_count)
         # Kernel reach of both (2 x 1.5) plus the slack of the blocks on both sides.
-        self._near = (
-            self._fields > 1
-            and near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
+        self._near = self._fields > 1 and (
+            not self.settings.contact_near
+            or near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
         )
         return blocks
 

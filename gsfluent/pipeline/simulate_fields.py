@@ -11,7 +11,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsfluent.materials import LAWS
 from gsfluent.ops.solver_buffers import SITE_FIELDS
 from gsfluent.pipeline.fragments import DEBRIS, Fragments
 from gsfluent.pipeline.particles import Matter
@@ -24,14 +23,12 @@ MOST = 1024
 
 def breakable(matter: Matter) -> Tensor:
     """Bodies that can break: those with brittle matter, bool [bodies]. Liquids run together."""
-    brittle = matter.law[matter.particles.material.long()] == LAWS["nacc"]
-    return torch.stack([brittle[a:b].any() for a, b in matter.ranges])
+    return torch.stack([matter.brittle[a:b].any() for a, b in matter.ranges])
 
 
 def cut_bodies(matter: Matter, cut: Tensor) -> Tensor:
     """Bodies that a blade has touched, bool [bodies]; liquids run together again."""
-    liquid = matter.law[matter.particles.material.long()] == LAWS["fluid"]
-    mark = (cut != 0) & ~liquid
+    mark = (cut != 0) & ~matter.of_law("fluid")
     return torch.stack([mark[a:b].any() for a, b in matter.ranges])
 
 

@@ -132,7 +132,14 @@ class Leaving:
         dx = self.matter.dx
         if self.sleep and bool(calm.any()):
             pairs = near_pairs(position, label, LANDING * dx).cpu()
-            state = self._nap(state, rows, label, pairs, calm, gaps)
+            moving = self.rigid.moving(state.colliders)
+            driven = torch.tensor(
+                [
+                    moving.shape[0] > 0 and self.rigid.gap(moving, low[i], high[i]) <= TAKE_OFF * dx
+                    for i in range(ids.shape[0])
+                ]
+            )
+            state = self._nap(state, rows, label, pairs, calm, gaps, driven)
         if self.fly:
             high_up = [i for i, gap in enumerate(gaps) if gap > TAKE_OFF * dx and ids[i] >= 0]
             if high_up and len(high_up) < 200:
@@ -150,8 +157,12 @@ class Leaving:
         pairs: Tensor,
         calm: Tensor,
         gaps: list[float],
+        driven: Tensor,
     ) -> State:
-        """Put whole heaps to sleep: all that touch each other, when all of them are calm."""
+        """Put whole heaps to sleep: all that touch each other, when all of them are calm.
+
+        What lies close to a collider that moves (``driven``, bool per unit) stays awake.
+        """
         import numpy as np
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
@@ -162,10 +173,9 @@ class Leaving:
         heaps, heap = connected_components(graph, directed=False)
         heap = torch.from_numpy(heap.astype(np.int64))
         held_up = torch.tensor([gap <= LANDING * dx for gap in gaps])
-        driven = float(self.rigid.speed(state.colliders)) > 0.0
         for number in range(heaps):
             members = heap == number
-            if driven or not bool(calm[members].all()) or not bool(held_up[members].any()):
+            if not bool((calm & ~driven)[members].all()) or not bool(held_up[members].any()):
                 continue
             state = self._lay_down(state, rows[members.to(label.device)[label]])
         return state

@@ -60,6 +60,8 @@ class Run:
         self.failure = ""
         self._links = rest_links(matter.rest, matter.ranges, matter.spacing)
         self._breakable = breakable(matter)
+        # What flows runs apart and together again: it has no pieces.
+        self._flowing = matter.of_law("fluid", "drucker_prager")
         self._pieces: tuple[State, Fragments] | None = None
 
     @property
@@ -116,7 +118,7 @@ class Run:
                 self._links,
                 self.matter.rest,
                 state.particles.position,
-                state.peak >= 0,
+                (state.peak >= 0) | self._flowing,
                 self.matter.particles.mass,
                 cut=state.cut if self.scene.blades else None,
             )
@@ -207,6 +209,7 @@ class Run:
             "reason": reason,
             "frames": len(self.per_frame),
             "substeps": c.steps,
+            "composed_steps": c.composed_steps,
             "dt_min": c.dt_min if c.steps else 0.0,
             "dt_max": c.dt_max,
             "dx": matter.dx,
@@ -234,6 +237,9 @@ class Run:
                 "sleeping_fraction": c.sleeping_point_seconds / max(c.point_seconds, 1e-300),
                 "contact_steps": c.steps - c.contact_steps,
                 "contact_steps_done": c.contact_steps,
+                "contact_block_fraction": 1.0 - c.contact_block_steps / max(c.block_steps, 1),
+                "empty_block_fraction": 1.0 - c.block_steps / max(c.box_steps, 1),
+                "law_kernel_steps": c.law_kernel_steps,
                 "stray_points": int(self.state.stray.sum()),
                 "block_searches": max(c.steps - c.block_builds, 0),
                 "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),

@@ -1,8 +1,8 @@
 """Matter on the grid: two engines with one face.
 
 :class:`Resident` keeps the points in one :class:`gsfluent.ops.Solver`, which takes many steps per
-call. :class:`Composed` takes one step at a time with the composable operators; it is the reference,
-and it alone knows colliders that are free bodies, distance grids, or sweep.
+call. :class:`gsfluent.pipeline.simulate_composed.Composed` takes one step at a time with the
+composable operators; it is the reference, and it alone knows blades at work.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
 from gsfluent.pipeline.particles import Matter
@@ -22,10 +23,17 @@ from gsfluent.pipeline.simulate_state import State
 from gsfluent.scene import Scene
 
 CFL = 0.5
-PLATE_STEP = 0.05
-"""Way of a moving collider [cells] between two looks at where it is."""
+FLOOR_DEPTH = 0.05
+"""How far [cells] a free body may sink into the floor before it is put back."""
 CROWDED = 3
 """Reason of a SolverError: more fields share a block than it has room for."""
+
+
+LOOK = 8
+"""Steps between two looks at how fast matter is, while a collider is faster."""
+OUTWEIGHS = 0.5
+"""Least mass of a free body for the resident solver, in masses of the matter that it can touch:
+what it strikes first lies on one side of it."""
 
 
 class Unhealthy(Exception):
@@ -53,6 +61,16 @@ class Counters:
     particle_steps: int = 0
     flight_seconds: float = 0.0
     flight_body_steps: int = 0
+    composed_steps: int = 0
+    """Steps of the composed operators."""
+    law_kernel_steps: int = 0
+    """Steps of kernels made for the laws of the scene alone."""
+    block_steps: int = 0
+    """Blocks that were stored, summed over steps."""
+    box_steps: int = 0
+    """Blocks of the bounding box of the points on the grid, likewise."""
+    contact_block_steps: int = 0
+    """Stored blocks that took part in the contact pass, likewise."""
     contact_steps: int = 0
     contact_nodes: int = 0
     shared_sites: int = 0
@@ -81,6 +99,8 @@ class Settings(NamedTuple):
     cfl: float = CFL
     irreversible: bool = True
     return_map: dict[str, Any] | None = None
+    law_kernels: bool = True
+    contact_near: bool = True
     dt_scale: float = 1.0
 
 
@@ -118,14 +138,21 @@ class Engine(Protocol):
         """The points now."""
 
 
-def resident_can(rows: Tensor) -> bool:
-    """Whether the resident solver knows these colliders: analytic, moving as told, not turning."""
-    if rows.shape[0] == 0:
-        return True
-    turning = rows[:, columns.ANGULAR_VELOCITY : columns.INERTIA].any(dim=1)
-    special = rows[:, columns.OFFSET + 1 :].any(dim=1)
-    own = (rows[:, columns.MASS] > 0) | (rows[:, columns.SWEEP] > 0) | turning | special
-    return not bool((own | (rows[:, columns.TYPE] > columns.TYPES["cylinder"])).any())
+def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
+    """Whether the resident solver moves these colliders as they should move.
+
+    It shares an impact between a free body and the nodes by the mass that the body touched a step
+    ago, the composed operators by the mass it touches now. At a first touch that is nothing: the
+    nodes get the body's whole velocity, and a body lighter than they are would be thrown back
+    faster than it came. So a free body must outweigh what it can touch.
+
+    Args:
+        rows: Rows of the colliders, float64 [M, 32].
+        rigid: The colliders.
+        matter: The points, for the heaviest density and the grid spacing.
+    """
+    touched = float(matter.params[:, 6].max()) * rigid.touchable(rows)
+    return bool((rows[:, columns.MASS] >= OUTWEIGHS * touched).all())
 
 
 class Resident:
@@ -157,22 +184,31 @@ class Resident:
             for value in (state.position, state.peak, state.field)
         )
         used, field = torch.unique(field, return_inverse=True)
+        law, params = matter.law, matter.params
+        if not settings.law_kernels:  # a row that no point has asks for the kernel of all laws
+            law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
+            params = torch.cat([params, params[:1]])
+        self._special = settings.law_kernels and set(law.tolist()) <= {
+            LAWS["elastic"],
+            LAWS["nacc"],
+        }
         self._solver = _guarded(
             p.velocity,
             lambda: ops.Solver(
                 position, p.velocity, p.mass, p.volume,
-                dx=matter.dx, law=matter.law, params=matter.params, material=p.material,
+                dx=matter.dx, law=law, params=params, material=p.material,
                 strain=p.strain, alpha=p.alpha, peak=peak, affine=p.affine,
                 deformation=p.deformation, body=field.to(torch.int32), gravity=scene.gravity,
-                colliders=state.colliders if state.colliders.shape[0] else None,
+                colliders=state.colliders if state.colliders.shape[0] else None, sdf=rigid.sdf,
                 friction=scene.friction, restitution=scene.restitution, cfl=settings.cfl,
                 irreversible=settings.irreversible, **(settings.return_map or {}),
             ),
         )  # fmt: skip
-        self._solver.dt_scale = settings.dt_scale
-        self._rigid, self._dx, self._counters = rigid, matter.dx, counters
-        self._alpha, self._peak = p.alpha, peak
-        self._elastic = not bool(matter.law.any())
+        self._rigid, self._matter, self._counters = rigid, matter, counters
+        self._dt_scale = settings.dt_scale
+        self._brittle = matter.brittle if rows is None else matter.brittle[rows]
+        self._material, self._alpha, self._peak = p.material, p.alpha, peak
+        self._elastic = not bool(law.any())
         self._start = self.time = state.time
         self.colliders = state.colliders
         self.impulse = torch.zeros(3, dtype=torch.float64, device=p.device)
@@ -183,21 +219,38 @@ class Resident:
     def advance(self, until: float, steps: int) -> int:
         """See :class:`Engine`."""
         before = self._seen["step"]
+        depth = FLOOR_DEPTH * self._matter.dx
         while self.time < until and self._seen["step"] - before < steps:
+            pace = self._pace()
+            self._solver.dt_scale = self._dt_scale * pace
+            wait = self._rigid.floor_wait(self.colliders, depth)
             left = steps - int(self._seen["step"] - before)
-            speed = float(self._rigid.speed(self.colliders))
-            stop = until if speed <= 0 else min(until, self.time + PLATE_STEP * self._dx / speed)
-            if until - stop < 0.1 * (stop - self.time):
-                stop = until
-            self._go(stop, left)
-        return int(self._seen["step"] - before)
+            self._go(min(until, self.time + wait), left if pace == 1.0 else min(left, LOOK))
+        taken, counters = int(self._seen["step"] - before), self._counters
+        sites = int(self._seen["sites"])
+        counters.law_kernel_steps += taken if self._special else 0
+        counters.block_steps += taken * sites
+        counters.contact_block_steps += taken * int(self._seen["shared_sites"])
+        counters.box_steps += taken * max(sites, _box(self._solver.position, self._matter.dx))
+        return taken
+
+    def _pace(self) -> float:
+        """Factor on the time step: what drives matter may be faster than any of it yet."""
+        driven = float(self._rigid.speed(self.colliders))
+        if driven == 0.0:
+            return 1.0
+        matter, solver = self._matter, self._solver
+        wave = ops.wave_speed(
+            solver.strain, law=matter.law, params=matter.params, material=self._material
+        )
+        speed, fastest = float(solver.velocity.norm(dim=1).max()), float(wave.max())
+        return (fastest + speed) / (fastest + max(speed, driven)) if fastest + speed > 0 else 1.0
 
     def _go(self, stop: float, steps: int) -> None:
-        """Advance with the colliders where they are, then move them."""
-        solver, before = self._solver, self.time
-        target = stop - self._start
-        pushed = solver.impulse
-        if target > (before - self._start) + 1e-12 * max(1.0, stop):
+        """Advance; the solver moves the colliders, all but for floor and schedule."""
+        solver, target = self._solver, stop - self._start
+        pushed, twisted = solver.impulse, solver.torque
+        if target > (self.time - self._start) + 1e-12 * max(1.0, stop):
             try:
                 solver.advance(target, steps=steps)
             except SolverError as error:
@@ -208,14 +261,16 @@ class Resident:
         else:
             self.time = stop
         self._count()
-        given = solver.impulse - pushed
-        if given.numel():
-            self.impulse = self.impulse + given.sum(dim=0)
-            self.work = self.work + self._rigid.work(self.colliders, given, torch.zeros_like(given))
-            rows = self._rigid.advance(self.colliders, before, self.time - before)
-            if rows is not self.colliders:
-                self.colliders = rows
-                solver.set_colliders(rows)
+        if not self._rigid.count:
+            return
+        given, turned = solver.impulse - pushed, solver.torque - twisted
+        moved = solver.colliders
+        self.impulse = self.impulse + given.sum(dim=0)
+        self.work = self.work + self._rigid.work_between(self.colliders, moved, given, turned)
+        self.colliders = self._rigid.settled(moved, self.time)
+        if not torch.equal(self.colliders, moved):
+            # Both the rows the nodes see and those the solver moves in float64.
+            solver.restore({"colliders": self.colliders, "collider_state": self.colliders})
 
     def _wrong(self, kind: str) -> Tensor:
         """The points at fault: not finite, or among the fastest."""
@@ -250,8 +305,16 @@ class Resident:
     def read(self) -> Points:
         """See :class:`Engine`."""
         s = self._solver
-        alpha, peak = (self._alpha, self._peak) if self._elastic else (s.alpha, s.peak)
+        alpha = self._alpha if self._elastic else s.alpha
+        peak = self._peak if self._elastic else torch.where(self._brittle, s.peak, self._peak)
         return Points(s.position, s.velocity, s.affine, s.strain, alpha, peak, s.deformation)
+
+
+def _box(position: Tensor, dx: float) -> int:
+    """Blocks of the box around all nodes that points reach, a cell of slack on each side."""
+    cell = torch.floor(torch.stack(torch.aminmax(position, dim=0)) / dx - 0.5)
+    low, high = torch.floor((cell[0] - 1.0) / 4.0), torch.floor((cell[1] + 3.0) / 4.0)
+    return int((high - low + 1.0).prod())
 
 
 def _guarded(like: Tensor, make: Any) -> ops.Solver:

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsfluent.data import Particles
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
-from gsfluent.pipeline.particles import Matter
+from gsfluent.pipeline.particles import UNBROKEN, Matter
 
 VERSION = 4
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
@@ -27,7 +27,8 @@ class State(NamedTuple):
     Attributes:
         particles: All points as of ``time``; positions rounded to their dtype.
         position: Positions [m], float64 [N, 3]: what the next step starts from.
-        peak: Largest alpha each point ever had, [N]; breaking cannot be undone.
+        peak: Largest alpha each brittle point ever had, [N]; breaking cannot be undone.
+            :data:`gsfluent.pipeline.particles.UNBROKEN` for points of other laws.
         time: Simulated time [s].
         step: Grid steps so far.
         landed: Which bodies have ended their first flight.
@@ -72,7 +73,7 @@ class State(NamedTuple):
         return State(
             particles=p,
             position=p.position.to(torch.float64),
-            peak=p.alpha,
+            peak=torch.where(matter.brittle, p.alpha, UNBROKEN),
             time=0.0,
             step=0,
             landed=landed,

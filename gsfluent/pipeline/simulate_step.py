@@ -56,6 +56,9 @@ class Stepper:
         separate_fragments: Whether pieces of a body have velocity fields of their own.
         resident: Whether the resident solver is used where it can be.
         irreversible: Whether broken points stay without cohesion when they are pressed together.
+        law_kernels: Whether kernels made for fewer laws are used where these are all.
+        contact_near: Whether the contact pass is left out where no two fields are near; if not,
+            the composed operators take it in every step.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
     """
@@ -72,12 +75,14 @@ class Stepper:
         separate_fragments: bool = True,
         resident: bool = True,
         irreversible: bool = True,
+        law_kernels: bool = True,
+        contact_near: bool = True,
         return_map: dict[str, Any] | None = None,
     ) -> None:
         self.scene, self.matter = scene, matter
         self.free_flight, self.separate_fragments = free_flight, separate_fragments
-        self._resident = resident
-        self._settings = Settings(cfl, irreversible, return_map)
+        self._resident = resident and contact_near
+        self._settings = Settings(cfl, irreversible, return_map, law_kernels, contact_near)
         self.counters = Counters()
         self.dt_scale = 1.0
         self.field_limit = LIMIT
@@ -190,7 +195,7 @@ class Stepper:
 
     def _resident_now(self, state: State) -> bool:
         """Whether the resident solver can go on from here: with no blade at work."""
-        if not (self._resident and resident_can(state.colliders)):
+        if not (self._resident and resident_can(state.colliders, self.rigid, self.matter)):
             return False
         if len(self.blades) == 0:
             return True
@@ -297,7 +302,7 @@ class Stepper:
         grid = _OnGrid(state, self._rows) if not self._empty else None
         to_grid = box_gaps(low, high, grid.low, grid.high) if grid is not None else None
         driven = float(self.rigid.speed(colliders))
-        moving = colliders if driven > 0 else colliders[:0]
+        moving = self.rigid.moving(colliders)
         for i, group in enumerate(groups):
             if group.held(time):
                 clear = min(clear, group.flight.held if group.flight is not None else clear)
@@ -322,7 +327,7 @@ class Stepper:
                     gap = max(gap, distance(group.points(time), grid.points(close), dx))
                 near.append((gap, HASTE * grid.speed))
             for gap, other_speed in near:
-                if gap <= pad:
+                if gap < pad:
                     touched.add(i)
                 # Half a cell more: a look costs something, and that much nearer is near enough.
                 wait = time_to_meet(

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from solver_scenes import composed, resident, scene
+from solver_scenes import SPEED, bullet, composed, resident, scene
 from torch import Tensor
 
 from gsfluent import ops
@@ -282,3 +282,63 @@ def test_wild_state_words_are_not_followed() -> None:
     solver._write(homes=10**6, rebuild=1)
     with pytest.raises(RuntimeError, match="homes"):
         solver.advance(steps=1)
+
+
+def test_only_brittle_points_have_a_peak_and_others_keep_their_alpha() -> None:
+    given = scene(laws=(0, 1), bodies=2)
+    given["alpha"] = torch.where(given["material"] == 0, 0.3, -0.02).double()
+    solver = resident(given, None, 20)
+    elastic = given["material"] == 0
+    assert torch.equal(solver.alpha[elastic], given["alpha"][elastic])
+    assert bool((solver.peak[elastic] == -1.0).all())
+    alone = resident(scene(laws=(0,)) | {"alpha": torch.full_like(scene()["alpha"], 0.3)}, None, 5)
+    assert bool((alone.alpha == 0.3).all()) and bool((alone.peak == -1.0).all())
+
+
+def test_sand_keeps_its_cohesion_whatever_its_volume_correction() -> None:
+    """alpha of sand is a volume correction: passing zero breaks nothing."""
+    given = scene(speed=0.0)
+    given["law"] = torch.full_like(given["law"], 2)
+    given["params"] = torch.tensor([[4e4, 8e4, 0.3, 2e3, 0, 0, 1000.0, 0]], dtype=torch.float64)
+    given["alpha"] = torch.full_like(given["alpha"], 0.5)
+    kept, free = (ops.Solver(**given, dt=DT, irreversible=on) for on in (True, False))
+    for solver in (kept, free):
+        solver.advance(steps=STEPS)
+    assert kept.counters()["plastic"] > 0
+    assert torch.equal(kept.position, free.position)
+    assert torch.equal(kept.stress, free.stress)
+
+
+def test_stress_of_every_law_can_be_read() -> None:
+    given = scene(laws=(0, 1))
+    given["law"] = torch.tensor([4, 1], dtype=torch.int32)
+    given["params"][0] = torch.tensor([0, 2e5, 0.01, 0, 0, 0, 1000.0, 7.0])
+    solver = resident(given, None, 20)
+    stress = solver.stress
+    assert bool(torch.isfinite(stress).all()) and float(stress.abs().max()) > 0
+
+
+def test_broken_points_show_the_stress_they_have() -> None:
+    """Cohesion that is lost for good holds no tension, in what is read too."""
+    given = scene(laws=(1,), speed=0.0)
+    given["alpha"] = torch.full_like(given["alpha"], 0.1)
+    given["strain"] = torch.full((given["mass"].shape[0], 6), 1e-3, dtype=torch.float64)
+    broken, whole = (ops.Solver(**given, irreversible=on) for on in (True, False))
+    assert float(broken.stress[:, :3].sum(dim=1).max()) < float(
+        whole.stress[:, :3].sum(dim=1).max()
+    )
+
+
+def test_set_colliders_moves_what_moves() -> None:
+    given = scene(speed=0.0)
+    given["colliders"] = bullet(given["position"], torch.float64)
+    solver = ops.Solver(**given, gravity=(0, 0, 0), dt=1e-4)
+    solver.advance(steps=2)
+    rows = solver.colliders
+    rows[0, 3:6] = torch.tensor([5.0, 0.0, 0.0])  # far from any point
+    rows[0, SPEED] = torch.tensor([0.0, -2.0, 0.0])
+    solver.set_colliders(rows)
+    solver.advance(steps=10)
+    want = torch.tensor([5.0, -2.0 * 10 * 1e-4, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(solver.colliders[0, 3:6], want)
+    assert float(solver.colliders[0, 11]) == -2.0

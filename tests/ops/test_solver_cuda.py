@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from solver_scenes import composed, resident, scene
+from solver_scenes import MASS, SPEED, bullet, composed, resident, scene
 from torch import Tensor
 
 from gsfluent import has_cuda, ops
@@ -95,7 +95,7 @@ def test_room_for_blocks_grows() -> None:
 def test_bad_states_stop_with_a_reason() -> None:
     given = scene(dtype=torch.float32, device="cuda")
     solver = ops.Solver(**given, dt=DT)
-    solver._buffers.velocity[0, 5] = float("nan")
+    solver._buffers.velocity[0, 0, 5] = float("nan")
     with pytest.raises(ops.SolverError, match="not finite"):
         solver.advance(steps=10)
     fast = ops.Solver(**given, dt=0.05)
@@ -110,3 +110,19 @@ def test_distance_from_the_origin_changes_nothing() -> None:
     moved = far.position
     moved[:, 0] -= cells * 0.02
     assert float((moved - near.position).abs().max()) < 1e-6 * 0.02
+
+
+def test_a_bullet_hits_matter_at_rest_and_keeps_the_momentum() -> None:
+    """Points at rest have no momentum to count in; what the bullet gives must be counted all the same."""
+    given = scene(dtype=torch.float32, device="cuda", speed=0.0)
+    given["velocity"] = torch.zeros_like(given["velocity"])
+    given["colliders"] = bullet(given["position"], torch.float32)
+    solver = ops.Solver(**given, gravity=(0, 0, 0), dt=1e-4)
+    before = solver.colliders[0]
+    solver.advance(steps=3)
+    after = solver.colliders[0]
+    taken = (given["mass"].double()[:, None] * solver.velocity.double()).sum(dim=0)
+    lost = before[MASS] * (before[SPEED] - after[SPEED])
+    assert float(taken.norm()) > 1e-4
+    torch.testing.assert_close(taken.cpu(), lost.cpu(), rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(solver.impulse[0].cpu(), taken.cpu(), rtol=1e-5, atol=1e-9)

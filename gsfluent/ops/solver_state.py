@@ -1,0 +1,334 @@
+"""What a resident solver holds, and how it is loaded and read.
+
+On the device points are grouped by block and field, positions are kept as cell and offset, and the
+order changes from build to build; here they come back in the order they were given in.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsfluent._check import check_tensor
+from gsfluent.ops import solver_buffers as layout
+from gsfluent.ops.plasticity import return_mapping
+from gsfluent.ops.solver_buffers import INDEX, tiled, untiled
+
+ELASTIC, NACC = 0, 1
+WEAKENING = 0.02
+"""Range of alpha past zero over which a broken point loses its cohesion (``kWeakening``)."""
+UNBROKEN = -1.0
+"""Peak alpha of points whose law does not break."""
+
+
+class SolverState:
+    """State of :class:`gsfluent.ops.Solver`: loading it, and reading it in the order of loading.
+
+    Attributes:
+        device: Device of every tensor.
+        dtype: Of the state.
+        count: Points N.
+        dx: Node spacing [m].
+        fields: Velocity fields.
+        irreversible: Whether broken points lose their cohesion for good.
+        implicit, k, epsilon: Options of the return map.
+    """
+
+    device: torch.device
+    dtype: torch.dtype
+    count: int
+    dx: float
+    fields: int
+    irreversible: bool
+    implicit: bool
+    k: float
+    epsilon: float
+    _buffers: layout.Buffers
+    _params: Tensor
+    _law: Tensor
+    _unused: dict[str, Tensor]
+    """alpha and peak where no law uses them, as given."""
+    _law_set: int
+    _primed: bool
+
+    # --- loading ---
+
+    def _rows(
+        self, material: Tensor | None, mass: Tensor, volume: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows of (parameters, mass, volume) that occur, and the row of each point."""
+        n, count = self.count, self._law.shape[0]
+        if material is None:
+            material = torch.zeros(n, dtype=torch.int32, device=self.device)
+        check_tensor("Solver", "material", material, shape=(n,), dtype=torch.int32)
+        if not bool(((material >= 0) & (material < count)).all()):
+            raise ValueError(f"Solver: material must lie in 0 to {count - 1} (rows of law)")
+        facts = torch.stack([material.to(torch.float64), mass.double(), volume.double()], dim=1)
+        unique, row = torch.unique(facts, dim=0, return_inverse=True)
+        if unique.shape[0] > layout.MAX_ROWS:
+            raise ValueError(
+                f"Solver: {unique.shape[0]} different (material, mass, volume), at most "
+                f"{layout.MAX_ROWS}; give points of one material the same mass and volume"
+            )
+        which = unique[:, 0].long()
+        density = self._params[which, 6:7].double().clamp(min=1e-30)
+        derived = torch.cat([1.0 / density, 4.0 * unique[:, 2:] / self.dx**2], dim=1)
+        numbers = torch.cat([unique[:, 1:], derived], dim=1)
+        rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
+        return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
+
+    def _load(
+        self, position: Tensor, values: dict[str, Tensor], row: Tensor, body: Tensor | None
+    ) -> None:
+        """Group the points by block and field and store them."""
+        b, n = self._buffers, self.count
+        if body is None:
+            body = torch.zeros(n, dtype=torch.int32, device=self.device)
+        check_tensor("Solver", "body", body, shape=(n,), dtype=torch.int32)
+        low, high = int(body.min()), int(body.max())
+        if low < 0 or high >= layout.MAX_FIELDS:
+            raise ValueError(
+                f"Solver: body must lie in 0 to {layout.MAX_FIELDS - 1}, got {low} to {high}"
+            )
+        self.fields = high + 1
+        u = position.to(self.device, torch.float64) / self.dx - 0.5
+        limit = 4.0 * (layout.BLOCK_RANGE - 2)
+        if not bool((u.abs() < limit).all()):
+            wrong = int((~(u.abs() < limit)).any(dim=1).sum())
+            raise ValueError(
+                f"Solver: position must be finite and within {limit:.0f} cells of the origin, "
+                f"got {wrong} of {n} rows that are not"
+            )
+        for name, value in values.items():
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"Solver: {name} must be finite")
+        cell = torch.floor(u)
+        offset = (u - cell).to(self.dtype)
+        over = offset >= 1.0
+        cell = (cell + over).long()
+        offset = offset.masked_fill(over, 0.0)
+        block = cell >> 2
+        key = self._keys(block, body.long())
+        unique, owner, counts = torch.unique(key, return_inverse=True, return_counts=True)
+        order = torch.argsort(owner, stable=True)
+        local = (cell - 4 * block + 1)[order]
+        word = local[:, 0] | local[:, 1] << 3 | local[:, 2] << 6 | row[order] << 9
+        # The word is unsigned on the device; wrap it into the signed type torch has.
+        b.meta = torch.where(word >= 2**31, word - 2**32, word).to(torch.int32)
+        b.offset = self._stored(offset[order])
+        b.id = order.to(torch.int32)
+        for name, value in values.items():
+            setattr(b, name, self._stored(value[order].to(self.dtype)))
+        coord = self._unkey(unique)
+        homes, reach = unique.shape[0], self._reach(coord)
+        b.reserve_blocks(homes + homes // 2 + 64, reach + reach // 3 + 64, self.fields)
+        b.home_coord0[:homes] = coord.to(torch.int32)
+        b.home_count0[:homes] = counts.to(torch.int32)
+        b.home_start0[:homes] = (torch.cumsum(counts, 0) - counts).to(torch.int32)
+        self._write(homes=homes, parity=0, rebuild=1, done=1, grow=0, reason=0)
+        self._primed = False
+
+    @staticmethod
+    def _keys(block: Tensor, field: Tensor) -> Tensor:
+        shift = block + layout.BLOCK_RANGE
+        return ((shift[:, 0] << 17 | shift[:, 1]) << 17 | shift[:, 2]) << 12 | field
+
+    @staticmethod
+    def _unkey(key: Tensor) -> Tensor:
+        parts = [key >> 46, key >> 29, key >> 12]
+        block = [(part & (2**17 - 1)) - layout.BLOCK_RANGE for part in parts]
+        return torch.stack([*block, key & (2**12 - 1)], dim=1)
+
+    def _reach(self, coord: Tensor) -> int:
+        """Number of blocks that windows of these homes can touch at most."""
+        axis = torch.arange(-1, 2, device=coord.device)
+        step = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(27, 3)
+        block = (coord[:, None, :3] + step).reshape(-1, 3)
+        field = coord[:, 3].repeat_interleave(27)
+        return int(torch.unique(self._keys(block, field)).shape[0])
+
+    # --- the clock ---
+
+    def _write(self, **values: float) -> None:
+        clock = self._buffers.clock.cpu()
+        real = clock.view(torch.float64)
+        for name, value in values.items():
+            if name in layout.FLOATS:
+                real[INDEX[name]] = value
+            else:
+                clock[INDEX[name]] = int(value)
+        self._buffers.clock.copy_(clock)
+
+    def clock(self) -> dict[str, float]:
+        """Return every member of the clock; waits for the device."""
+        clock = self._buffers.clock.cpu()
+        whole, real = clock.tolist(), clock.view(torch.float64).tolist()
+        return {
+            name: real[i] if name in layout.FLOATS else whole[i]
+            for i, name in enumerate(layout.CLOCK)
+        }
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return float(self.clock()["time"])
+
+    @property
+    def steps(self) -> int:
+        """Steps so far."""
+        return int(self.clock()["step"])
+
+    @property
+    def dt(self) -> float:
+        """Length of the last step [s]."""
+        return float(self.clock()["dt"])
+
+    @property
+    def dt_scale(self) -> float:
+        """Factor on the automatic time step (halved by a roll-back)."""
+        return float(self.clock()["dt_scale"])
+
+    @dt_scale.setter
+    def dt_scale(self, value: float) -> None:
+        self._write(dt_scale=value)
+
+    def memory(self) -> int:
+        """Return the bytes of every tensor of the solver."""
+        return self._buffers.memory()
+
+    # --- reading ---
+
+    def _owners(self) -> Tensor:
+        """Block and field of each stored point, int64 [N, 4]."""
+        b, now = self._buffers, self.clock()
+        side, homes = str(int(now["parity"])), int(now["homes"])
+        start = getattr(b, f"home_start{side}")[:homes].long()
+        order = torch.argsort(start)
+        counts = getattr(b, f"home_count{side}")[:homes].long()[order]
+        return (
+            getattr(b, f"home_coord{side}")[:homes]
+            .long()[order]
+            .repeat_interleave(counts, dim=0, output_size=self.count)
+        )
+
+    def _stored(self, values: Tensor) -> Tensor:
+        """Values as the device has them."""
+        if self.device.type == "cuda" and values.dim() == 2:
+            return tiled(values)
+        return values.clone(memory_format=torch.contiguous_format)
+
+    def _rowwise(self, name: str) -> Tensor:
+        """Stored values with one row per point."""
+        value: Tensor = getattr(self._buffers, name)
+        return untiled(value, self.count) if value.dim() == 3 else value
+
+    def _restored(self, values: Tensor) -> Tensor:
+        """Bring stored values into the order of loading."""
+        out = torch.empty_like(values, memory_format=torch.contiguous_format)
+        out[self._buffers.id.long()] = values
+        return out
+
+    @property
+    def position(self) -> Tensor:
+        """Positions [m], float64 [N, 3]."""
+        b = self._buffers
+        word = b.meta.long() & 0x1FF
+        local = torch.stack([word & 7, word >> 3 & 7, word >> 6 & 7], dim=1)
+        cell = 4 * self._owners()[:, :3] - 1 + local
+        return self._restored((cell.double() + 0.5 + self._rowwise("offset").double()) * self.dx)
+
+    @property
+    def body(self) -> Tensor:
+        """Velocity field of each point, int32 [N]."""
+        return self._restored(self._owners()[:, 3].to(torch.int32))
+
+    @property
+    def velocity(self) -> Tensor:
+        """Velocities [m/s], [N, 3]."""
+        return self._restored(self._rowwise("velocity"))
+
+    @property
+    def affine(self) -> Tensor:
+        """APIC matrix C [1/s], [N, 3, 3]."""
+        b = self._buffers
+        row = b.meta.long() >> 9 & (layout.MAX_ROWS - 1)
+        return self._restored(self._rowwise("slope") / b.rows[row, 8, None]).view(-1, 3, 3)
+
+    @property
+    def strain(self) -> Tensor:
+        """Strain ``b - I``, [N, 6]."""
+        return self._restored(self._rowwise("strain"))
+
+    @property
+    def alpha(self) -> Tensor:
+        """Alpha of each point's law, [N]; as given where no law of the scene changes it."""
+        return self._scalar("alpha")
+
+    @property
+    def peak(self) -> Tensor:
+        """Largest alpha so far, [N]; -1 for points whose law does not break."""
+        return self._scalar("peak")
+
+    def _scalar(self, name: str) -> Tensor:
+        if name in self._unused:
+            return self._unused[name].clone()
+        return self._restored(getattr(self._buffers, name))
+
+    @property
+    def deformation(self) -> Tensor | None:
+        """Total deformation gradient, [N, 3, 3], or None when it is not tracked."""
+        if self._buffers.deformation.numel() == 0:
+            return None
+        return self._restored(self._rowwise("deformation")).view(-1, 3, 3)
+
+    @property
+    def stress(self) -> Tensor:
+        """Kirchhoff stress of the present state [Pa], [N, 6]; of a liquid without its viscous part.
+
+        That one belongs to the step, not to the state: it is viscosity times rate of strain.
+        """
+        b = self._buffers
+        row = (b.meta.long() >> 9 & (layout.MAX_ROWS - 1)).to(torch.int32)
+        strain, broken = self._rowwise("strain").contiguous(), self._law_set > 0
+        alpha = b.alpha if broken else strain.new_zeros(self.count)
+        law, params = b.law, b.rows[:, :8].contiguous()
+        if broken and self.irreversible:
+            index = row.long()
+            law, params, row = (
+                law[index],
+                params[index],
+                torch.arange(self.count, dtype=torch.int32, device=self.device),
+            )
+            left = 1.0 - (b.peak / WEAKENING).clamp(0.0, 1.0)
+            params[:, 3] *= torch.where(law == NACC, left, torch.ones_like(left))
+        _, _, stress, _ = return_mapping(
+            strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,
+            material=row, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
+            dt=self.dt or 1.0,
+        )  # fmt: skip
+        return self._restored(stress)
+
+    @property
+    def impulse(self) -> Tensor:
+        """Impulse given to the matter by each collider since the start [N s], float64 [K, 3]."""
+        return self._buffers.impulse[:, :3].clone()
+
+    @property
+    def torque(self) -> Tensor:
+        """Angular impulse on the matter by each collider about its point [N m s], [K, 3]."""
+        return self._buffers.impulse[:, 3:6].clone()
+
+    @property
+    def colliders(self) -> Tensor:
+        """The colliders where they are now, float64 [K, columns]."""
+        return self._buffers.collider_state.clone()
+
+    def counters(self) -> dict[str, float]:
+        """Return what was done: steps, builds, blocks, plastic, guarded and inverted points, ..."""
+        now = self.clock()
+        names = (
+            "step", "particle_steps", "builds", "homes", "slots", "homes_max", "slots_max",
+            "sites", "shared_sites", "plastic", "guarded", "inverted", "invalid", "contact_nodes",
+            "contact_steps", "dt_min", "dt_max", "speed_seen", "wave_seen",
+        )  # fmt: skip
+        return {name: now[name] for name in names}
