@@ -214,14 +214,16 @@ class Watch:
         """Return what a resumed run needs."""
         return {
             "energy": self.energy, "scale": self.scale, "rollbacks": self.rollbacks,
-            "good_in_a_row": self.good_in_a_row, "reasons": self.reasons,
+            "in_a_row": self.in_a_row, "good_in_a_row": self.good_in_a_row,
+            "trouble_time": self.trouble_time, "reasons": self.reasons,
         }  # fmt: skip
 
     def restore(self, values: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         self.energy, self.scale = float(values["energy"]), float(values["scale"])
         self.rollbacks = int(values["rollbacks"])
-        self.good_in_a_row = int(values["good_in_a_row"])
+        self.in_a_row, self.good_in_a_row = int(values["in_a_row"]), int(values["good_in_a_row"])
+        self.trouble_time = float(values["trouble_time"])
         self.reasons = list(values["reasons"])
 
 

@@ -206,9 +206,7 @@ class Resident:
         )  # fmt: skip
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = settings.dt_scale
-        self._brittle = matter.brittle if rows is None else matter.brittle[rows]
-        self._material, self._alpha, self._peak = p.material, p.alpha, peak
-        self._elastic = not bool(law.any())
+        self._material = p.material
         self._start = self.time = state.time
         self.colliders = state.colliders
         self.impulse = torch.zeros(3, dtype=torch.float64, device=p.device)
@@ -269,8 +267,7 @@ class Resident:
         self.work = self.work + self._rigid.work_between(self.colliders, moved, given, turned)
         self.colliders = self._rigid.settled(moved, self.time)
         if not torch.equal(self.colliders, moved):
-            # Both the rows the nodes see and those the solver moves in float64.
-            solver.restore({"colliders": self.colliders, "collider_state": self.colliders})
+            solver.set_colliders(self.colliders)
 
     def _wrong(self, kind: str) -> Tensor:
         """The points at fault: not finite, among the fastest, or where most fields meet."""
@@ -307,9 +304,7 @@ class Resident:
     def read(self) -> Points:
         """See :class:`Engine`."""
         s = self._solver
-        alpha = self._alpha if self._elastic else s.alpha
-        peak = self._peak if self._elastic else torch.where(self._brittle, s.peak, self._peak)
-        return Points(s.position, s.velocity, s.affine, s.strain, alpha, peak, s.deformation)
+        return Points(s.position, s.velocity, s.affine, s.strain, s.alpha, s.peak, s.deformation)
 
 
 def _most_crowded(position: Tensor, field: Tensor, dx: float) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials
-from gsfluent.pipeline.particles import UNBROKEN
+from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.scene import Scene
 

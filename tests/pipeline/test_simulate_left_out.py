@@ -6,22 +6,17 @@ from typing import Any
 
 import pytest
 import torch
+from simulation_scenes import SOFT, at, near_miss, resting
 from simulation_shapes import ellipsoid
 from torch import Tensor
 
 from gsfluent import materials, ops
-from gsfluent.data import Frame
 from gsfluent.ops.reference import plasticity
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.scene import Scene
 
-SOFT = materials.elastic.override(young_modulus=2e4)
 APPLE = materials.fruit.apple.override(variation=0.0)
 DX = 0.02
-
-
-def at(x: float, y: float, z: float) -> Frame:
-    return Frame(torch.eye(3), torch.tensor([x, y, z]), 1.0)
 
 
 class Ran:
@@ -162,17 +157,6 @@ def test_bodies_in_their_first_flight_need_no_grid() -> None:
     assert_same(on, off, place=1.1 * bias / DX + 0.02, energy=0.01, momentum=0.01)
 
 
-def near_miss() -> Scene:
-    """Two balls pass each other within two cells without a touch, then part."""
-    scene = Scene(floor=None, gravity=(0, 0, 0))
-    for side in (-1.0, 1.0):
-        scene.add(
-            ellipsoid((0.05,) * 3), SOFT, frame=at(0.08 * side, 0.065 * side, 0),
-            velocity=(-2.0 * side, 0, 0), angular_velocity=(0, 0, 1.0),
-        )  # fmt: skip
-    return scene
-
-
 def test_pieces_that_touch_nothing_any_more_fly_again() -> None:
     on, off = (Ran(near_miss(), fps=40, seconds=0.3, piece_flight=flag) for flag in (True, False))
     assert on.report["pieces_flown"] == 2 and on.skipped["piece_flight_fraction"] > 0.2
@@ -183,15 +167,6 @@ def test_pieces_that_touch_nothing_any_more_fly_again() -> None:
 
 
 # --- rest ---
-
-
-def resting(second: bool) -> Scene:
-    """A ball that lies on the floor; a rod falls on it later."""
-    scene = Scene()
-    scene.add(ellipsoid((0.05, 0.05, 0.04)), SOFT, frame=at(0, 0, 0.04))
-    if second:
-        scene.pour((0.01, 0, 0.3), 1.0, 0.03, duration=0.06, material=SOFT, at=1.6)
-    return scene
 
 
 def test_what_rests_sleeps() -> None:
