@@ -88,6 +88,11 @@ class RigidSet:
         return self.start.shape[0]
 
     @property
+    def frees(self) -> bool:
+        """Whether any of them is a free body."""
+        return bool(self._free)
+
+    @property
     def moves(self) -> bool:
         """Whether any of them ever moves."""
         return bool((self._motion != 0).any() or (self.start[:, columns.MASS] > 0).any())

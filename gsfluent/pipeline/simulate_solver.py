@@ -151,6 +151,8 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         rigid: The colliders.
         matter: The points, for the heaviest density and the grid spacing.
     """
+    if not rigid.frees:
+        return True
     touched = float(matter.params[:, 6].max()) * rigid.touchable(rows)
     return bool((rows[:, columns.MASS] >= OUTWEIGHS * touched).all())
 
