@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from accuracy import enter
+from page import enter
 from torch import Tensor
 
 from gsfluent import ops
