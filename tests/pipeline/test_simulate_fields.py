@@ -1,4 +1,4 @@
-"""Velocity fields of pieces: what hangs together, how many may meet, and that pieces do not weld."""
+"""Velocity fields of pieces: what hangs together, how many may meet, and no welding."""
 
 from __future__ import annotations
 
