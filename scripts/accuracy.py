@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import re
 import sys
 import time
 from collections.abc import Iterator
@@ -34,6 +33,7 @@ from accuracy_cases import (
     mvee_cases,
     raster_cases,
 )
+from page import enter
 from torch import Tensor
 
 from gsfluent import has_cuda, ops
@@ -206,16 +206,6 @@ def table(result: dict[str, Any]) -> str:
             f"| {bar} | {'pass' if r['passed'] else '**FAIL**'} |"
         )
     return "\n".join(lines)
-
-
-def enter(text: str, device: str, part: str) -> str:
-    """``text`` with the part between the device's markers replaced, or appended."""
-    begin, end = f"<!-- {device}: begin -->", f"<!-- {device}: end -->"
-    whole = f"{begin}\n{part}\n{end}"
-    found = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
-    if found.search(text):
-        return found.sub(lambda _: whole, text, count=1)
-    return f"{text.rstrip()}\n\n{whole}\n".lstrip()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -16,7 +16,6 @@ import dataclasses
 import json
 import math
 import platform
-import re
 import sys
 import time
 import traceback
@@ -24,13 +23,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from page import enter
 
 from gsfluent import has_cuda
 from gsfluent.lab import registry
 from gsfluent.lab.driver import running_on
 from gsfluent.lab.registry import Problem, Result
 
-BEGIN, END = "<!-- battery: begin -->", "<!-- battery: end -->"
+HEADING = "## Problems with known answers"
 
 
 def compute(item: Problem) -> dict[str, Any]:
@@ -115,15 +115,6 @@ def cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def enter(text: str, part: str) -> str:
-    """``text`` with the battery section replaced, or appended."""
-    whole = f"{BEGIN}\n{part}\n{END}"
-    found = re.compile(re.escape(BEGIN) + ".*?" + re.escape(END), re.DOTALL)
-    if found.search(text):
-        return found.sub(lambda _: whole, text, count=1)
-    return f"{text.rstrip()}\n\n## Problems with known answers\n\n{whole}\n".lstrip()
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--tier", choices=["fast", "slow", "all"], default="all")
@@ -160,7 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
     sys.stdout.write(text + "\n")
     if options.markdown:
         page = options.markdown
-        page.write_text(enter(page.read_text() if page.exists() else "# Accuracy\n", text))
+        before = page.read_text() if page.exists() else "# Accuracy\n"
+        page.write_text(enter(before, "battery", text, HEADING))
     items = record["problems"].values()
     return int(any(i["error"] or not all(Result(**r).passed for r in i["results"]) for i in items))
 

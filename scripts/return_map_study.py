@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import statistics
 import sys
 import time
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from page import enter
 from return_map_cases import (
     DEFAULT,
     ELASTIC,
@@ -238,16 +238,6 @@ def speed_part(done: dict[str, Result]) -> list[str]:
     return [text, "", *grid(head, rows)]
 
 
-def enter(text: str, part: str) -> str:
-    """``text`` with the part between the markers replaced, or appended."""
-    begin, end = "<!-- return_map_study: begin -->", "<!-- return_map_study: end -->"
-    whole = f"{begin}\n{part}\n{end}"
-    found = re.compile(re.escape(begin) + ".*?" + re.escape(end), re.DOTALL)
-    if found.search(text):
-        return found.sub(lambda _: whole, text, count=1)
-    return f"{text.rstrip()}\n\n{whole}\n"
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--results", type=Path, default=Path("build/return_map_study.json"))
@@ -259,7 +249,7 @@ def main(arguments: list[str] | None = None) -> int:
     sys.stdout.write(text + "\n")
     if options.markdown:
         page = options.markdown
-        page.write_text(enter(page.read_text() if page.exists() else "", text))
+        page.write_text(enter(page.read_text() if page.exists() else "", "return_map_study", text))
     return 0
 
 

@@ -70,7 +70,7 @@ def test_a_miss_and_a_failure_are_rows_and_an_exit_code(
 
 def test_the_accuracy_script_keeps_the_battery(tmp_path: Path, battery: ModuleType) -> None:
     accuracy = importlib.import_module("accuracy")
-    page = battery.enter("# Accuracy\n", "table of problems")
+    page = battery.enter("# Accuracy\n", "battery", "table of problems", battery.HEADING)
     assert "table of problems" in accuracy.enter(page, "cpu", "table of ops")
-    both = battery.enter(accuracy.enter(page, "cpu", "table of ops"), "new table")
+    both = battery.enter(accuracy.enter(page, "cpu", "table of ops"), "battery", "new table")
     assert "table of ops" in both and "table of problems" not in both and "new table" in both

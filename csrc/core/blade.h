@@ -105,9 +105,4 @@ GSF_HOST_DEVICE int32_t blade_cut(const T* rows, int64_t count, const Vec3<T>& x
   return cut;
 }
 
-// Whether two fields of one body lie on opposite sides of some blade.
-GSF_HOST_DEVICE bool cut_apart(int32_t a, int32_t b) {
-  return ((((a << 1) & b) | ((b << 1) & a)) & 0x2aaaaaaa) != 0;
-}
-
 }  // namespace gsf

@@ -37,6 +37,16 @@ inline constexpr double kFluidJMin = 0.6;
 // Beyond this a liquid has parted: the excess is forgotten, so that spray is not denser than the
 // pool when it comes back.
 inline constexpr double kFluidJMax = 1.2;
+// The same as ln J and as the strain J^(2/3) - 1.
+inline constexpr double kFluidLogJMin = -0.5108256237659907;
+inline constexpr double kFluidStrainMin = -0.2886213391019874;
+inline constexpr double kFluidStrainMax = 0.12924323465723409;
+constexpr bool fluid_strain_is(double strain, double j) {
+  const double b = 1.0 + strain, off = b * b * b - j * j;
+  return off < 1e-14 && off > -1e-14;
+}
+static_assert(fluid_strain_is(kFluidStrainMin, kFluidJMin));
+static_assert(fluid_strain_is(kFluidStrainMax, kFluidJMax));
 inline constexpr double kFluidStepMin = 0.8, kFluidStepMax = 1.25;  // growth of J per step
 inline constexpr double kGapMax = 0.5;  // log volume that parted sand remembers
 
@@ -188,7 +198,7 @@ GSF_HOST_DEVICE LawResult<T> fluid(const MaterialRow<T>& m, const Sym3<T>& strai
   // (1 + step)^(2/3) - 1
   const T stretch = step + (T(1) + step) * inverse_cube_root_minus_one(step);
   x += (T(1) + x) * stretch;
-  const T lo = T(-0.2886213391019874), hi = T(0.12924323465723409);  // J^(2/3) - 1 at the bounds
+  const T lo = T(kFluidStrainMin), hi = T(kFluidStrainMax);
   out.guarded = step != growth || x < lo;
   out.plastic = x > hi;
   x = clamp(x, lo, hi);

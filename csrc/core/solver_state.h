@@ -170,9 +170,10 @@ struct SolverView {
   int32_t* slot_coord;   // [S, 4] block and field
   int32_t* slot_shared;  // [S] 1: its site holds several fields; 2 (CUDA): next to such; 0
   int32_t* site_slots;   // [S, kSiteFields] slots of a site in ascending field, -1 after the last
-  void* sums;            // [S, 64, 4] momentum and mass: int64 units on CUDA, T on the CPU
-  void* moments;         // [S, 64, kContactMoments] likewise, where slot_shared; null: one field
-  T* node_velocity;      // [S, 64, 4]
+  void* sums;            // [S, 64, 4] momentum and mass: int64 units on CUDA, double on the CPU
+  // [S, 64, kContactMoments], where slot_shared: int64 units on CUDA, T on the CPU; null: one field
+  void* moments;
+  T* node_velocity;  // [S, 64, 4]
   // hash table
   uint64_t* key;         // [table_size]
   int32_t* table_count;  // [table_size] particles of a home

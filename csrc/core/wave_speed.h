@@ -23,7 +23,7 @@ GSF_HOST_DEVICE T wave_speed_squared(int law, const MaterialRow<T>& m, const Sym
   const T j2m1 = raw >= j2_lo ? min(raw, j2_hi) : j2_lo;
   if (law == kFluid) {
     const T gamma = m.exponent > T(0) ? m.exponent : T(kFluidExponent);
-    const T log_j = clamp(T(0.5) * log1p(j2m1), T(-0.5108256237659907), T(0));  // ln 0.6
+    const T log_j = clamp(T(0.5) * log1p(j2m1), T(kFluidLogJMin), T(0));
     return m.kappa * exp((T(1) - gamma) * log_j) / m.density;
   }
   const T third = trace(strain) * T(1.0 / 3.0);

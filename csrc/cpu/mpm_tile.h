@@ -10,9 +10,6 @@
 
 namespace gsf::cpu {
 
-constexpr int32_t kMaxMargin = 2;
-constexpr int32_t kMaxTileEdge = 6 + 2 * kMaxMargin;
-
 // Blocks of equal colour are `color_stride` apart, so their tiles share no node and may be written
 // at once.
 inline int32_t color_stride(int32_t margin) { return (5 + 2 * margin) / kBlockEdge + 1; }

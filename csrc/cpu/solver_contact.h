@@ -76,7 +76,7 @@ class ContactPlan {
     if (other < 0) return {T(0), {T(0), T(0), T(0)}};
     const int64_t n = int64_t(other) * kBlockNodes + at;
     const T* m = static_cast<const T*>(s_.moments) + kContactMoments * n;
-    return {static_cast<const T*>(s_.sums)[4 * n + 3], {m[0], m[1], m[2]}};
+    return {T(static_cast<const double*>(s_.sums)[4 * n + 3]), {m[0], m[1], m[2]}};
   }
 
  private:

@@ -131,10 +131,10 @@ class HomePass {
     if (r.begin == r.end) return true;
     sort_home(h, r);
     const uint32_t contact = contact_.around_home(h);
-    Lanes<T> tile[kWindowNodes];
+    Lanes<double> tile[kWindowNodes];
     Lanes<T> moment[kWindowNodes];
     for_each_run(h, [&](int t, int64_t, int run) {
-      std::fill(tile + t, tile + t + run, Lanes<T>{});
+      std::fill(tile + t, tile + t + run, Lanes<double>{});
       if (contact != 0) std::fill(moment + t, moment + t + run, Lanes<T>{});
     });
     for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
@@ -150,7 +150,7 @@ class HomePass {
         lane = end;
       }
     }
-    T* sums = static_cast<T*>(s_.sums);
+    double* sums = static_cast<double*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
     const uint8_t mark = contact != 0 ? kTouchedSums | kTouchedMoments : kTouchedSums;
     return for_each_run(h, [&](int t, int64_t node, int run) {

@@ -43,7 +43,7 @@ class NodePass {
     parallel_for(c.slots, kSlotGrain, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
         if (touched[b] & kTouchedSums)
-          std::fill_n(static_cast<T*>(s_.sums) + 4 * kBlockNodes * b, 4 * kBlockNodes, T(0));
+          std::fill_n(static_cast<double*>(s_.sums) + 4 * kBlockNodes * b, 4 * kBlockNodes, 0.0);
         constexpr int64_t kMoments = kBlockNodes * kContactMoments;
         if (touched[b] & kTouchedMoments)
           std::fill_n(static_cast<T*>(s_.moments) + kMoments * b, kMoments, T(0));
@@ -104,15 +104,15 @@ class NodePass {
 
   // One node of a site: velocities, contact, colliders. Returns whether fields touched.
   int64_t node(const Site& site, int local, T dt, double* impulse) {
-    const T* sums = static_cast<const T*>(s_.sums);
+    const double* sums = static_cast<const double*>(s_.sums);
     const int fields = site.fields;
     double mass[kSiteFields];
     Vec3<T> velocity[kSiteFields];
     bool heavy[kSiteFields];
     int present = 0;
     for (int a = 0; a < fields; ++a) {
-      const T* n = sums + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
-      const NodeSums<T> sum{double(n[3]), {double(n[0]), double(n[1]), double(n[2])}};
+      const double* n = sums + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
+      const NodeSums<T> sum{n[3], {n[0], n[1], n[2]}};
       heavy[a] = node_velocity(s_, sum, dt, velocity[a]);
       mass[a] = sum.mass;
       present += heavy[a] ? 1 : 0;

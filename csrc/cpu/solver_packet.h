@@ -143,11 +143,12 @@ Stencil<Pack<T>> packet_stencil(const Pack<T>* offset) {
   Stencil<Pack<T>> s;
   for (int axis = 0; axis < 3; ++axis) {
     const Pack<T> o = offset[axis];
-    const Pack<T> a = Pack<T>(1) - o, b = o - Pack<T>(0.5);
+    const Pack<T> a = Pack<T>(1) - o;
     s.f[axis] = o + Pack<T>(0.5);
     s.w[axis][0] = Pack<T>(0.5) * a * a;
-    s.w[axis][1] = Pack<T>(0.75) - b * b;
     s.w[axis][2] = Pack<T>(0.5) * o * o;
+    // Their sum is one, as the gather takes for granted.
+    s.w[axis][1] = Pack<T>(1) - s.w[axis][0] - s.w[axis][2];
   }
   return s;
 }
@@ -206,8 +207,9 @@ struct PacketMomentum {
   }
 
   // Adds lanes [first, end), all of one cell, to the tile at the base of their stencil; in single
-  // precision two lanes at once.
-  void scatter(int first, int end, Lanes<T>* node) const {
+  // precision two lanes at once. The tile is double: a node's sum has a term per cell, whose
+  // roundings would be most of what a step adds to the momentum.
+  void scatter(int first, int end, Lanes<double>* node) const {
     for (int i = 0; i < 3; ++i, node += kWindowEdge * kWindowEdge) {
       const Pack<T>* w = weight + 9 * i;
       Raw sum[9] = {};
@@ -222,7 +224,9 @@ struct PacketMomentum {
       for (; lane < end; ++lane)
         add_plane(w, sum, one_lane(start[i][lane]), one_lane(y[lane]), one_lane(z[lane]),
                   [&](const Pack<T>& weights) { return Pack<T>(weights[lane]).v; });
-      for (int n = 0; n < 9; ++n) node[n / 3 * kWindowEdge + n % 3] += both_lanes(sum[n]);
+      for (int n = 0; n < 9; ++n)
+        node[n / 3 * kWindowEdge + n % 3] +=
+            __builtin_convertvector(both_lanes(sum[n]), Lanes<double>);
     }
   }
 
@@ -280,7 +284,9 @@ struct PacketGathered {
   Mat3<Pack<T>> first;
 };
 
-// Gathers for lanes that share the cell whose stencil begins at `node`.
+// Gathers for lanes that share the cell whose stencil begins at `node`. The weights along an axis
+// sum to one and the first weights to zero, so both sums are taken over differences to the middle
+// node: what is rounded is then the change of the velocity over a cell and not the velocity.
 template <typename T>
 PacketGathered<T> packet_gather(const Pack<T>* offset, const Lanes<T>* node) {
   const Stencil<Pack<T>> s = packet_stencil(offset);
@@ -291,28 +297,25 @@ PacketGathered<T> packet_gather(const Pack<T>* offset, const Lanes<T>* node) {
   PacketGathered<T> g;
   const T* at = reinterpret_cast<const T*>(node);
   for (int c = 0; c < 3; ++c, ++at) {
-    Pack<T> sum(0), x(0), y(0), z(0);
+    Pack<T> plane[3], plane_y[3], plane_z[3];
     for (int i = 0; i < 3; ++i) {
-      Pack<T> plane(0), plane_y(0), plane_z(0);
+      Pack<T> row[3], row_z[3];
       for (int j = 0; j < 3; ++j) {
         const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
-        const Pack<T> v0(n[0]), v1(n[4]), v2(n[8]);
-        const Pack<T> row = s.w[2][0] * v0 + s.w[2][1] * v1 + s.w[2][2] * v2;
-        const Pack<T> row_z =
-            first_weight[2][0] * v0 + first_weight[2][1] * v1 + first_weight[2][2] * v2;
-        plane += s.w[1][j] * row;
-        plane_y += first_weight[1][j] * row;
-        plane_z += s.w[1][j] * row_z;
+        const Pack<T> v1(n[4]), below = Pack<T>(n[0]) - v1, above = Pack<T>(n[8]) - v1;
+        row[j] = v1 + (s.w[2][0] * below + s.w[2][2] * above);
+        row_z[j] = first_weight[2][0] * below + first_weight[2][2] * above;
       }
-      sum += s.w[0][i] * plane;
-      x += first_weight[0][i] * plane;
-      y += s.w[0][i] * plane_y;
-      z += s.w[0][i] * plane_z;
+      const Pack<T> below = row[0] - row[1], above = row[2] - row[1];
+      plane[i] = row[1] + (s.w[1][0] * below + s.w[1][2] * above);
+      plane_y[i] = first_weight[1][0] * below + first_weight[1][2] * above;
+      plane_z[i] = s.w[1][0] * row_z[0] + s.w[1][1] * row_z[1] + s.w[1][2] * row_z[2];
     }
-    g.value[c] = sum;
-    g.first(c, 0) = x;
-    g.first(c, 1) = y;
-    g.first(c, 2) = z;
+    const Pack<T> below = plane[0] - plane[1], above = plane[2] - plane[1];
+    g.value[c] = plane[1] + (s.w[0][0] * below + s.w[0][2] * above);
+    g.first(c, 0) = first_weight[0][0] * below + first_weight[0][2] * above;
+    g.first(c, 1) = s.w[0][0] * plane_y[0] + s.w[0][1] * plane_y[1] + s.w[0][2] * plane_y[2];
+    g.first(c, 2) = s.w[0][0] * plane_z[0] + s.w[0][1] * plane_z[1] + s.w[0][2] * plane_z[2];
   }
   return g;
 }

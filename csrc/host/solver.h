@@ -99,7 +99,7 @@ struct SolverOps {
     const ScalarType real = like.scalar_type(), i32 = ScalarType::Int, i64 = ScalarType::Long;
     const bool device = like.is_cuda();
     const int64_t n = s.count, h = s.home_capacity, c = s.slot_capacity, t = s.table_size;
-    const ScalarType sum = device ? i64 : real;
+    const ScalarType sum = device ? i64 : ScalarType::Double, moment = device ? i64 : real;
     // What has several components per particle comes in whole tiles on a device.
     const int64_t tiled = device ? (n + kTileRows - 1) / kTileRows * kTileRows : n;
     const struct {
@@ -136,7 +136,7 @@ struct SolverOps {
         {"slot_shared", c, 1, i32, false},
         {"site_slots", c, kSiteFields, i32, false},
         {"sums", c * kBlockNodes, 4, sum, false},
-        {"moments", c * kBlockNodes, kContactMoments, sum, true},
+        {"moments", c * kBlockNodes, kContactMoments, moment, true},
         {"node_velocity", c * kBlockNodes, 4, real, false},
         {"key", t, 1, i64, false},
         {"table_count", t, 1, i32, false},

@@ -21,7 +21,6 @@ from gsfluent.lab.slab import STICKY, plane
 
 PULL = 0.0025
 """Gravity [cells / s^2]: strains of a percent, a tenth of the wave speed after a few cells."""
-REST = (0.0, 0.0, 0.0)
 
 
 def _on_slab(

@@ -100,7 +100,7 @@ class Buffers:
         """Make room for blocks; the list of present homes is kept, nothing else needs to be."""
         like = self.offset
         device, real = like.device, like.dtype
-        sums = torch.int64 if device.type == "cuda" else real
+        sums = torch.int64 if device.type == "cuda" else torch.float64
 
         def whole(*shape: int) -> Tensor:
             return torch.zeros(shape, dtype=torch.int32, device=device)
@@ -120,7 +120,8 @@ class Buffers:
         self.site_slots, self.slot_next = whole(slots, SITE_FIELDS), whole(slots)
         self.sums = torch.zeros(slots, BLOCK_NODES, 4, dtype=sums, device=device)
         many = slots if fields > 1 else 0
-        self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=sums, device=device)
+        moments = torch.int64 if device.type == "cuda" else real
+        self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=moments, device=device)
         self.slot_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         # Homes and slots share the table with one entry per site; half full at most.

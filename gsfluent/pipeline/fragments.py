@@ -89,7 +89,7 @@ def find_fragments(
         links: Pairs at rest, int64 [L, 2], from :func:`rest_links`.
         rest: Rest positions [m], [N, 3].
         position: Present positions [m], [N, 3].
-        broken: Points that are broken, bool [N].
+        broken: Points that are broken, or that belong to no piece for another reason, bool [N].
         mass: Masses [kg], [N].
         cut: Sides of blades, int32 [N]; a link between opposite sides is cut.
         smallest: Components with fewer points count as debris.

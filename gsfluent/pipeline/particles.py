@@ -26,8 +26,6 @@ from gsfluent.scene_parts import quaternion_to, turned
 _log = logging.getLogger(__name__)
 
 POINTS_PER_CELL = 8
-UNBROKEN = -1.0
-"""Peak of points that cannot break, whatever their law keeps in alpha."""
 _WAVES = 128
 ALPHA_JITTER = 0.15
 """Relative half-width of the uniform weakness noise that seeds cracks (equations.md section 17)."""

@@ -88,6 +88,11 @@ class RigidSet:
         return self.start.shape[0]
 
     @property
+    def frees(self) -> bool:
+        """Whether any of them is a free body."""
+        return bool(self._free)
+
+    @property
     def moves(self) -> bool:
         """Whether any of them ever moves."""
         return bool((self._motion != 0).any() or (self.start[:, columns.MASS] > 0).any())
@@ -221,8 +226,11 @@ class RigidSet:
         lattice = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=rows.dtype)] * 3)
         at = corners[0] + lattice.to(rows.device) * (corners[1] - corners[0])
         distance, _ = ops.collider_distance(at, rows, self.sdf)
-        # No place of the box is further from the lattice than half a lattice cell's diagonal.
-        return float(distance.min()) - 0.125 * float((corners[1] - corners[0]).norm())
+        # No place of the box is further from the lattice than half a lattice cell's diagonal. From
+        # an endless plane the corners are nearest.
+        endless = (rows[:, columns.TYPE] == 0) & (rows[:, columns.RADIUS] == 0)
+        slack = torch.where(endless, 0.0, 0.125 * (corners[1] - corners[0]).norm())
+        return float((distance - slack).min())
 
     def surfaces(self, rows: Tensor, points: int = 2000) -> tuple[Tensor, Tensor, float]:
         """Points spread over the surfaces of all colliders but endless planes, to draw them.

@@ -135,6 +135,9 @@ class Simulate(Stage):
         resident: Use the resident solver wherever it knows the colliders; otherwise the composed
             operators, step by step.
         irreversible: Broken points stay without cohesion when they are pressed together again.
+        law_kernels: Use kernels made for elastic and brittle matter where there is no other.
+        contact_near: Leave out contact where no two bodies or pieces are near each other; False
+            is for comparison: the composed operators then look for contact at every node.
         repair: Add transition splats along cracks to ``frame.gaussians``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
         return_map: Options of :func:`gsfluent.ops.return_mapping`.
@@ -164,6 +167,8 @@ class Simulate(Stage):
         separate_fragments: bool = True,
         resident: bool = True,
         irreversible: bool = True,
+        law_kernels: bool = True,
+        contact_near: bool = True,
         repair: bool = True,
         splats: bool = True,
         return_map: dict[str, float | bool] | None = None,
@@ -192,6 +197,8 @@ class Simulate(Stage):
             "separate_fragments": separate_fragments,
             "resident": resident,
             "irreversible": irreversible,
+            "law_kernels": law_kernels,
+            "contact_near": contact_near,
             "return_map": return_map,
         }
         self._run: Run | None = None

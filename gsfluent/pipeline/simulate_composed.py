@@ -191,6 +191,9 @@ class Composed:
         c.composed_steps += 1
         c.particle_steps += p.count
         c.dt_min, c.dt_max = min(c.dt_min, dt), max(c.dt_max, dt)
+        c.block_steps += blocks.block_count
+        c.box_steps += blocks.table.numel()
+        c.contact_block_steps += blocks.block_count if several else 0
         c.contact_steps += several
         c.contact_nodes += int(nodes) if several else 0
 
@@ -205,9 +208,9 @@ class Composed:
         self.counters.block_builds += 1
         self.counters.blocks_max = max(self.counters.blocks_max, blocks.block_count)
         # Kernel reach of both (2 x 1.5) plus the slack of the blocks on both sides.
-        self._near = (
-            self._fields > 1
-            and near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
+        self._near = self._fields > 1 and (
+            not self.settings.contact_near
+            or near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
         )
         return blocks
 

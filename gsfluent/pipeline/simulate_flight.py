@@ -25,6 +25,9 @@ with its square.
 class Flight:
     """The free flight of one body or piece.
 
+    Attributes:
+        speed_limit: Upper bound of the angular part of any point's speed [m/s].
+
     Args:
         particles: Its points.
         position: Their positions [m], float64 [M, 3].
@@ -78,12 +81,11 @@ class Flight:
         self._span = _ANGLE_STEP / max(float(spin.norm()), 1e-30)
         self._whole, self._turned = 0, eye
         self.radius = float(squared.max().sqrt())
+        # Energy is kept, so a tumbling body never turns faster than all of it about one axis.
+        least = float(torch.linalg.eigvalsh(self.inertia)[0])
+        turning = max(float(self.momentum @ spin), 0.0)
+        self.speed_limit = math.sqrt(turning / least) * self.radius
         self.low, self.high = self.arm.amin(dim=0), self.arm.amax(dim=0)
-
-    @property
-    def speed_limit(self) -> float:
-        """Upper bound of the angular part of any point's speed [m/s]."""
-        return float(self._omega(self.rotation_at(self.start)).norm()) * self.radius
 
     def _omega(self, rotation: Tensor) -> Tensor:
         return rotation @ torch.linalg.solve(self.inertia, rotation.T @ self.momentum)

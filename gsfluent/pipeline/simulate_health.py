@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import logging
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,6 +27,8 @@ ENERGY_SLACK = 0.05
 """How far mechanical energy may rise above its start, in units of the largest kinetic plus elastic
 energy so far. Contact and breaking only take energy away."""
 RING = 2
+LEAST_SCALE = 2.0**-12
+"""Factor on the time step at which a run is given up."""
 RECOVERY = 10
 """Good checks after which a halved time step is doubled again."""
 CAUSES = {
@@ -96,7 +99,7 @@ class Watch:
         matter: The points.
         gravity: Acceleration [m/s^2].
         start: Figures at time 0.
-        max_rollbacks: Roll-backs in a row, without a good check in between, before giving up.
+        max_rollbacks: Roll-backs in a row, without getting past the trouble, before giving up.
         names: Names of the bodies.
     """
 
@@ -117,6 +120,7 @@ class Watch:
         self.rollbacks = 0
         self.in_a_row = 0
         self.good_in_a_row = 0
+        self.trouble_time = -math.inf
         self.reasons: list[str] = []
         self.kind = ""
         self._ring: collections.deque[State] = collections.deque(maxlen=RING)
@@ -133,7 +137,8 @@ class Watch:
         if trouble is not None:
             return trouble
         self.keep(state)
-        self.in_a_row = 0
+        if state.time > self.trouble_time:  # past what went wrong, not only on the way there again
+            self.in_a_row = 0
         self.good_in_a_row += 1
         if stepper.dt_scale < 1.0 and self.good_in_a_row >= RECOVERY:
             stepper.dt_scale = min(1.0, 2.0 * stepper.dt_scale)
@@ -180,7 +185,8 @@ class Watch:
             where += f" ({found})" if found else ""
         self.reasons.append(where)
         self.kind = trouble.kind
-        if self.in_a_row >= self.max_rollbacks:
+        self.trouble_time = max(self.trouble_time, self._ring[-1].time, state.time)
+        if self.in_a_row >= self.max_rollbacks or stepper.dt_scale <= LEAST_SCALE:
             return None
         self.rollbacks += 1
         self.in_a_row += 1
@@ -190,11 +196,14 @@ class Watch:
         stepper.reset()
         if trouble.kind == "crowded" and stepper.field_limit > 2:
             self._ring[-1] = stepper.relieve(self._ring[-1])
-            _log.warning("rolled back: %s; fields that may meet: %d", where, stepper.field_limit)
+            how = f"at most {stepper.field_limit} pieces apart in one place"
         else:
             stepper.dt_scale *= 0.5
-            _log.warning("rolled back: %s; time step scale %.3g", where, stepper.dt_scale)
-        return self._ring[-1]
+            how = f"{stepper.dt_scale:.3g} of the time step"
+        back = self._ring[-1]
+        self.reasons[-1] += f"; went back to t = {back.time:.6g} s and on with {how}"
+        _log.warning("rolled back: %s", self.reasons[-1])
+        return back
 
     def verdict(self, frame: int) -> str:
         """Words for giving up: frame, time, region, likely cause, what to change."""
@@ -205,14 +214,16 @@ class Watch:
         """Return what a resumed run needs."""
         return {
             "energy": self.energy, "scale": self.scale, "rollbacks": self.rollbacks,
-            "good_in_a_row": self.good_in_a_row, "reasons": self.reasons,
+            "in_a_row": self.in_a_row, "good_in_a_row": self.good_in_a_row,
+            "trouble_time": self.trouble_time, "reasons": self.reasons,
         }  # fmt: skip
 
     def restore(self, values: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
         self.energy, self.scale = float(values["energy"]), float(values["scale"])
         self.rollbacks = int(values["rollbacks"])
-        self.good_in_a_row = int(values["good_in_a_row"])
+        self.in_a_row, self.good_in_a_row = int(values["in_a_row"]), int(values["good_in_a_row"])
+        self.trouble_time = float(values["trouble_time"])
         self.reasons = list(values["reasons"])
 
 

@@ -8,7 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsfluent.pipeline.fragments import Fragments, find_fragments, rest_links
+from torch import Tensor
+
+from gsfluent.ops.blade import cut_apart
+from gsfluent.pipeline.fragments import STRETCH_LIMIT, Fragments, find_fragments, rest_links
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
 from gsfluent.pipeline.simulate_figures import Figures
@@ -60,6 +63,8 @@ class Run:
         self.failure = ""
         self._links = rest_links(matter.rest, matter.ranges, matter.spacing)
         self._breakable = breakable(matter)
+        # What flows runs apart and together again: it has no pieces.
+        self._flowing = matter.of_law("fluid", "drucker_prager")
         self._pieces: tuple[State, Fragments] | None = None
 
     @property
@@ -116,7 +121,7 @@ class Run:
                 self._links,
                 self.matter.rest,
                 state.particles.position,
-                state.peak >= 0,
+                (state.peak >= 0) | self._flowing,
                 self.matter.particles.mass,
                 cut=state.cut if self.scene.blades else None,
             )
@@ -128,8 +133,18 @@ class Run:
         may_break = self._breakable
         if self.scene.blades:
             may_break = may_break | cut_bodies(self.matter, state.cut)
-        unit = units(self.matter, self._links, self._fragments(state), may_break)
+        unit = units(self.matter, self._holding(state), self._fragments(state), may_break)
         return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
+
+    def _holding(self, state: State) -> Tensor:
+        """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
+        links = self._links.to(state.position.device)
+        a, b = links.unbind(dim=1)
+        rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
+        near = now <= STRETCH_LIMIT * rest
+        if self.scene.blades:
+            near = near & ~cut_apart(state.cut[a], state.cut[b])
+        return links[near]
 
     def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:
         """Measure the present state and add it to the per-frame records."""
@@ -235,6 +250,9 @@ class Run:
                 "sleeping_fraction": c.sleeping_point_seconds / max(c.point_seconds, 1e-300),
                 "contact_steps": c.steps - c.contact_steps,
                 "contact_steps_done": c.contact_steps,
+                "contact_block_fraction": 1.0 - c.contact_block_steps / max(c.block_steps, 1),
+                "empty_block_fraction": 1.0 - c.block_steps / max(c.box_steps, 1),
+                "law_kernel_steps": c.law_kernel_steps,
                 "stray_points": int(self.state.stray.sum()),
                 "block_searches": max(c.steps - c.block_builds, 0),
                 "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),

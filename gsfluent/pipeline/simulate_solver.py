@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
 from gsfluent.pipeline.particles import Matter
@@ -62,6 +63,14 @@ class Counters:
     flight_body_steps: int = 0
     composed_steps: int = 0
     """Steps of the composed operators."""
+    law_kernel_steps: int = 0
+    """Steps of kernels made for the laws of the scene alone."""
+    block_steps: int = 0
+    """Blocks that were stored, summed over steps."""
+    box_steps: int = 0
+    """Blocks of the bounding box of the points on the grid, likewise."""
+    contact_block_steps: int = 0
+    """Stored blocks that took part in the contact pass, likewise."""
     contact_steps: int = 0
     contact_nodes: int = 0
     shared_sites: int = 0
@@ -90,6 +99,8 @@ class Settings(NamedTuple):
     cfl: float = CFL
     irreversible: bool = True
     return_map: dict[str, Any] | None = None
+    law_kernels: bool = True
+    contact_near: bool = True
     dt_scale: float = 1.0
 
 
@@ -140,6 +151,8 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         rigid: The colliders.
         matter: The points, for the heaviest density and the grid spacing.
     """
+    if not rigid.frees:
+        return True
     touched = float(matter.params[:, 6].max()) * rigid.touchable(rows)
     return bool((rows[:, columns.MASS] >= OUTWEIGHS * touched).all())
 
@@ -173,11 +186,19 @@ class Resident:
             for value in (state.position, state.peak, state.field)
         )
         used, field = torch.unique(field, return_inverse=True)
+        law, params = matter.law, matter.params
+        if not settings.law_kernels:  # a row that no point has asks for the kernel of all laws
+            law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
+            params = torch.cat([params, params[:1]])
+        self._special = settings.law_kernels and set(law.tolist()) <= {
+            LAWS["elastic"],
+            LAWS["nacc"],
+        }
         self._solver = _guarded(
             p.velocity,
             lambda: ops.Solver(
                 position, p.velocity, p.mass, p.volume,
-                dx=matter.dx, law=matter.law, params=matter.params, material=p.material,
+                dx=matter.dx, law=law, params=params, material=p.material,
                 strain=p.strain, alpha=p.alpha, peak=peak, affine=p.affine,
                 deformation=p.deformation, body=field.to(torch.int32), gravity=scene.gravity,
                 colliders=state.colliders if state.colliders.shape[0] else None, sdf=rigid.sdf,
@@ -187,9 +208,7 @@ class Resident:
         )  # fmt: skip
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = settings.dt_scale
-        self._brittle = matter.brittle if rows is None else matter.brittle[rows]
-        self._material, self._alpha, self._peak = p.material, p.alpha, peak
-        self._elastic = not bool(matter.law.any())
+        self._material = p.material
         self._start = self.time = state.time
         self.colliders = state.colliders
         self.impulse = torch.zeros(3, dtype=torch.float64, device=p.device)
@@ -207,7 +226,13 @@ class Resident:
             wait = self._rigid.floor_wait(self.colliders, depth)
             left = steps - int(self._seen["step"] - before)
             self._go(min(until, self.time + wait), left if pace == 1.0 else min(left, LOOK))
-        return int(self._seen["step"] - before)
+        taken, counters = int(self._seen["step"] - before), self._counters
+        sites = int(self._seen["sites"])
+        counters.law_kernel_steps += taken if self._special else 0
+        counters.block_steps += taken * sites
+        counters.contact_block_steps += taken * int(self._seen["shared_sites"])
+        counters.box_steps += taken * max(sites, _box(self._solver.position, self._matter.dx))
+        return taken
 
     def _pace(self) -> float:
         """Factor on the time step: what drives matter may be faster than any of it yet."""
@@ -244,11 +269,12 @@ class Resident:
         self.work = self.work + self._rigid.work_between(self.colliders, moved, given, turned)
         self.colliders = self._rigid.settled(moved, self.time)
         if not torch.equal(self.colliders, moved):
-            # Both the rows the nodes see and those the solver moves in float64.
-            solver.restore({"colliders": self.colliders, "collider_state": self.colliders})
+            solver.set_colliders(self.colliders)
 
     def _wrong(self, kind: str) -> Tensor:
-        """The points at fault: not finite, or among the fastest."""
+        """The points at fault: not finite, among the fastest, or where most fields meet."""
+        if kind == "crowded":
+            return _most_crowded(self._solver.position, self._solver.body, self._matter.dx)
         speed = self._solver.velocity.norm(dim=1)
         bad = ~torch.isfinite(speed) | ~torch.isfinite(self._solver.strain).all(dim=1)
         if kind == "speed" or not bool(bad.any()):
@@ -280,9 +306,22 @@ class Resident:
     def read(self) -> Points:
         """See :class:`Engine`."""
         s = self._solver
-        alpha = self._alpha if self._elastic else s.alpha
-        peak = self._peak if self._elastic else torch.where(self._brittle, s.peak, self._peak)
-        return Points(s.position, s.velocity, s.affine, s.strain, alpha, peak, s.deformation)
+        return Points(s.position, s.velocity, s.affine, s.strain, s.alpha, s.peak, s.deformation)
+
+
+def _most_crowded(position: Tensor, field: Tensor, dx: float) -> Tensor:
+    """Points of the block of the grid that holds points of most fields, bool [N]."""
+    block = torch.floor(position / (4.0 * dx) - 0.125).long()
+    _, home = torch.unique(block, dim=0, return_inverse=True)
+    pairs = torch.unique(torch.stack([home, field.long()], dim=1), dim=0)
+    return home == torch.bincount(pairs[:, 0]).argmax()
+
+
+def _box(position: Tensor, dx: float) -> int:
+    """Blocks of the box around all nodes that points reach, a cell of slack on each side."""
+    cell = torch.floor(torch.stack(torch.aminmax(position, dim=0)) / dx - 0.5)
+    low, high = torch.floor((cell[0] - 1.0) / 4.0), torch.floor((cell[1] + 3.0) / 4.0)
+    return int((high - low + 1.0).prod())
 
 
 def _guarded(like: Tensor, make: Any) -> ops.Solver:

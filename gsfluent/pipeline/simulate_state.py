@@ -13,9 +13,10 @@ from torch import Tensor
 from gsfluent.data import Particles
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
-from gsfluent.pipeline.particles import UNBROKEN, Matter
+from gsfluent.ops.solver_state import UNBROKEN
+from gsfluent.pipeline.particles import Matter
 
-VERSION = 4
+VERSION = 5
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
 _POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm")
 _WHOLE = ("impulse", "colliders", "work", "dissipated")
@@ -28,7 +29,7 @@ class State(NamedTuple):
         particles: All points as of ``time``; positions rounded to their dtype.
         position: Positions [m], float64 [N, 3]: what the next step starts from.
         peak: Largest alpha each brittle point ever had, [N]; breaking cannot be undone.
-            :data:`gsfluent.pipeline.particles.UNBROKEN` for points of other laws.
+            :data:`gsfluent.ops.solver_state.UNBROKEN` for points of other laws.
         time: Simulated time [s].
         step: Grid steps so far.
         landed: Which bodies have ended their first flight.

@@ -56,6 +56,9 @@ class Stepper:
         separate_fragments: Whether pieces of a body have velocity fields of their own.
         resident: Whether the resident solver is used where it can be.
         irreversible: Whether broken points stay without cohesion when they are pressed together.
+        law_kernels: Whether kernels made for fewer laws are used where these are all.
+        contact_near: Whether the contact pass is left out where no two fields are near; if not,
+            the composed operators take it in every step.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
     """
@@ -72,12 +75,14 @@ class Stepper:
         separate_fragments: bool = True,
         resident: bool = True,
         irreversible: bool = True,
+        law_kernels: bool = True,
+        contact_near: bool = True,
         return_map: dict[str, Any] | None = None,
     ) -> None:
         self.scene, self.matter = scene, matter
         self.free_flight, self.separate_fragments = free_flight, separate_fragments
-        self._resident = resident
-        self._settings = Settings(cfl, irreversible, return_map)
+        self._resident = resident and contact_near
+        self._settings = Settings(cfl, irreversible, return_map, law_kernels, contact_near)
         self.counters = Counters()
         self.dt_scale = 1.0
         self.field_limit = LIMIT
@@ -196,7 +201,10 @@ class Stepper:
             return True
         if self.blades.speed(state.time) > 0.0:
             return False
-        return self.blades.splits(state.field, state.cut).numel() == 0
+        # On powder a cut leaves nothing to hold; what shares a field has to lie on one side.
+        whole = self._unit if self.separate_fragments else state.field
+        held = self._unit >= 0
+        return self.blades.splits(whole[held], state.cut[held]).numel() == 0
 
     def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:
         pushed, worked = engine.impulse, engine.work
@@ -322,7 +330,7 @@ class Stepper:
                     gap = max(gap, distance(group.points(time), grid.points(close), dx))
                 near.append((gap, HASTE * grid.speed))
             for gap, other_speed in near:
-                if gap <= pad:
+                if gap < pad:
                     touched.add(i)
                 # Half a cell more: a look costs something, and that much nearer is near enough.
                 wait = time_to_meet(

@@ -18,6 +18,7 @@ from gsfluent.scene import Scene
 
 DX = 0.1
 ZERO = (0.0, 0.0, 0.0)
+SOFT = materials.elastic.override(young_modulus=2e4)
 BEND = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
 
 
@@ -247,11 +248,16 @@ def test_spread_gives_each_half_its_side_and_joins_what_hangs_together() -> None
 # --- in a simulation ---
 
 
-def sliced(depth: float, thickness: float = 0.0, **scene_options: object) -> Run:
+def sliced(
+    depth: float,
+    thickness: float = 0.0,
+    material: materials.Material = SOFT,
+    **scene_options: object,
+) -> Run:
     """A ball of radius 0.1 in free space, cut along x = 0 from above."""
     scene = Scene(**{"floor": None, "gravity": ZERO} | scene_options)  # type: ignore[arg-type]
     lifted = Frame(torch.eye(3), torch.tensor([0.0, 0.0, 0.3]), 1.0)
-    scene.add(ellipsoid(), materials.elastic.override(young_modulus=2e4), frame=lifted)
+    scene.add(ellipsoid(), material, frame=lifted)
     scene.blade(
         [(0, 0, 0.45), (0, 0, 0.45 - depth)], width=0.4, edge=(0, 1, 0), speed=4.0, at=0.02,
         thickness=thickness,
@@ -303,3 +309,18 @@ def test_a_thick_blade_pushes_the_halves_apart_and_its_work_is_booked() -> None:
     right = run.matter.rest[:, 0] > 0
     assert float(p.velocity[right, 0].mean() - p.velocity[~right, 0].mean()) > 0.01
     assert float(run.state.work) >= stats["kinetic"] > 0.0
+
+
+def test_after_the_cut_the_resident_solver_goes_on() -> None:
+    """Powder of both sides does not hold the halves together."""
+    run = sliced(0.35, 0.03, materials.fruit.apple.override(alpha0=-0.02))
+    composed = []
+    for frame in range(1, 8):
+        assert run.advance_to(frame, None), run.failure
+        _, pieces, stats = run.record(frame)
+        composed.append(run.stepper.counters.composed_steps)
+    assert stats["damaged_fraction"] > 0.02 and pieces.count >= 2
+    broken = run.state.peak >= 0
+    assert bool((run.state.cut[broken] == 1).any() and (run.state.cut[broken] == 2).any())
+    # The blade is done at 0.02 + 0.35 / 4 s, within frame 3.
+    assert 0 < composed[2] == composed[-1] < run.stepper.counters.steps
