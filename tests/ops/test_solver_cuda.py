@@ -113,7 +113,7 @@ def test_distance_from_the_origin_changes_nothing() -> None:
 
 
 def test_a_bullet_hits_matter_at_rest_and_keeps_the_momentum() -> None:
-    """Points at rest have no momentum to count in; what the bullet gives is counted all the same."""
+    """Points at rest have no momentum to count in; what a bullet gives is counted all the same."""
     given = scene(dtype=torch.float32, device="cuda", speed=0.0)
     given["velocity"] = torch.zeros_like(given["velocity"])
     given["colliders"] = bullet(given["position"], torch.float32)
