@@ -31,7 +31,6 @@ class Scene(Events):
         floor_friction: Coulomb friction of the floor.
         floor_mode: ``separate`` (matter may leave it), ``slip`` or ``sticky``.
         friction: Coulomb friction between bodies.
-        restitution: Restitution of node contact between bodies; elasticity adds its own bounce.
     """
 
     def __init__(
@@ -42,13 +41,11 @@ class Scene(Events):
         floor_friction: float = 0.4,
         floor_mode: str = "separate",
         friction: float = 0.3,
-        restitution: float = 0.0,
     ) -> None:
         self.floor = None if floor is None else number("floor", floor)
         self.gravity = vector("gravity", gravity)
         self.floor_friction = number("floor_friction", floor_friction, low=0.0)
         self.friction = number("friction", friction, low=0.0)
-        self.restitution = number("restitution", restitution, low=0.0, high=1.0)
         known_key("floor_mode", floor_mode, MODES)
         self.floor_mode = floor_mode
         super().__init__()

@@ -179,7 +179,6 @@ class RigidThings:
         turn: Sequence[float] = (0.0, 0.0, 0.0),
         mode: str = "separate",
         friction: float = 0.4,
-        restitution: float = 0.0,
         velocity: Sequence[float] = (0.0, 0.0, 0.0),
         spin: Sequence[float] = (0.0, 0.0, 0.0),
         mass: float | None = None,
@@ -199,7 +198,6 @@ class RigidThings:
             turn: Rotation vector [degrees]: the axis it points along, by its length.
             mode: ``separate``, ``slip`` or ``sticky``.
             friction: Coulomb friction (``separate`` only).
-            restitution: In [0, 1] (``separate`` only).
             velocity: [m/s]; it moves so for ever.
             spin: Angular velocity [rad/s].
             mass: None: it moves as told. A number [kg]: it takes the impulse of what it hits and
@@ -242,7 +240,6 @@ class RigidThings:
                 orientation=quaternion(f"{where}: turn", turn),
                 mode=mode,
                 friction=number(f"{where}: friction", friction, low=0.0),
-                restitution=number(f"{where}: restitution", restitution, low=0.0, high=1.0),
                 velocity=vector(f"{where}: velocity", velocity),
                 angular_velocity=vector(f"{where}: spin", spin),
                 mass=None if mass is None else number(f"{where}: mass", mass, low=1e-9),

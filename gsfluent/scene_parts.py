@@ -158,7 +158,6 @@ class Collider:
         orientation: Quaternion w, x, y, z, own frame to scene.
         mode: ``sticky``, ``slip`` or ``separate``.
         friction: Coulomb friction.
-        restitution: In [0, 1].
         velocity: Of the point from ``start`` to ``stop`` [m/s].
         angular_velocity: From ``start`` to ``stop`` [rad/s].
         mass: None: it moves as told and nothing stops it. A number: it takes the impulse of what
@@ -181,7 +180,6 @@ class Collider:
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     mode: str = "separate"
     friction: float = 0.4
-    restitution: float = 0.0
     velocity: Vector = (0.0, 0.0, 0.0)
     angular_velocity: Vector = (0.0, 0.0, 0.0)
     mass: float | None = None

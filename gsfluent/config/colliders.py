@@ -38,9 +38,6 @@ class ColliderSettings:
         example="sticky",
     )
     friction: float = key(number(0.0), default=0.4, doc="Coulomb friction.", example="0.4")
-    restitution: float = key(
-        number(0.0, 1.0), default=0.0, doc="Bounce: 0 none, 1 all.", example="0.2"
-    )
     velocity: Vector = key(
         vector(3), default=(0.0, 0.0, 0.0), doc="Velocity [m/s].", example="[0.1, 0, 0]"
     )

@@ -23,7 +23,7 @@ from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
-from gsfluent.ops.collider import pad_colliders
+from gsfluent.ops.collider import RESTITUTION, pad_colliders
 from gsfluent.ops.solver_state import ELASTIC, NACC, UNBROKEN, SolverState
 
 LAWS = 7
@@ -43,6 +43,18 @@ _REASONS = {
     ),
     5: ("the time step is too small for the present time to resolve", "look at the stiffest law"),
 }
+
+
+def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
+    """Refuse what would make energy: see docs/contact.md."""
+    rows = None if colliders is None else pad_colliders(colliders)
+    bounces = rows is not None and bool((rows[:, RESTITUTION] != 0).any())
+    if contact != 0.0 or bounces:
+        raise ValueError(
+            f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: given back "
+            "at nodes in every step of a lasting contact it makes energy (docs/contact.md); how "
+            "far bodies bounce follows from their elasticity"
+        )
 
 
 class SolverError(GsfluentError, RuntimeError):
@@ -86,7 +98,8 @@ class Solver(SolverState):
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
         friction: Coulomb friction between fields.
-        restitution: Restitution of node contact between fields.
+        restitution: 0. Given back at nodes in every step of a lasting contact, it makes energy
+            (docs/contact.md); bodies bounce by their elasticity. Likewise that of colliders.
         contact_gap: Distance of the centroids, in cells, up to which fields touch.
         cfl: Courant number of the automatic time step.
         gradient_limit: Largest ``dt |grad v|`` of unbroken matter.
@@ -166,6 +179,7 @@ class Solver(SolverState):
             raise ValueError(f"{op}: law must lie in 0 to {LAWS - 1}, got {sorted(laws)}")
         self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
+        _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
         self._fixed = dt
         self._primed = False
@@ -231,6 +245,7 @@ class Solver(SolverState):
         Raises:
             ValueError: Another number of rows.
         """
+        _no_restitution("Solver.set_colliders", 0.0, colliders)
         rows, have = pad_colliders(colliders), self._buffers.colliders
         if rows.shape != have.shape:
             raise ValueError(

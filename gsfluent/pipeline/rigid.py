@@ -316,7 +316,6 @@ class RigidSet:
             "sdf" if c.kind == "mesh" else c.kind,
             mode=c.mode,
             friction=c.friction,
-            restitution=c.restitution,
             velocity=velocity,
             angular_velocity=c.angular_velocity,
             mass=mass,

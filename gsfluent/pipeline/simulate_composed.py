@@ -164,7 +164,7 @@ class Composed:
             grid, dx=dx, dt=dt, blocks=blocks, gravity=self.scene.gravity,
             colliders=rows.to(grid.dtype), sdf=self.rigid.sdf, moments=moments,
             merged=self._merged if several else None, cut=self._sides if several else None,
-            friction=self.scene.friction, restitution=self.scene.restitution, return_torque=True,
+            friction=self.scene.friction, return_torque=True,
         )  # fmt: skip
         position, velocity, affine, deformation, skipped = ops.g2p(
             velocity_grid, p.position, dx=dx, dt=dt, blocks=blocks, body=body,

@@ -212,7 +212,7 @@ class Resident:
                 strain=p.strain, alpha=p.alpha, peak=peak, affine=p.affine,
                 deformation=p.deformation, body=field.to(torch.int32), gravity=scene.gravity,
                 colliders=state.colliders if state.colliders.shape[0] else None, sdf=rigid.sdf,
-                friction=scene.friction, restitution=scene.restitution, cfl=settings.cfl,
+                friction=scene.friction, cfl=settings.cfl,
                 irreversible=settings.irreversible, **(settings.return_map or {}),
             ),
         )  # fmt: skip
