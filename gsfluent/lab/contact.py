@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsfluent.lab.driver import World
 from gsfluent.lab.registry import Result, compare, problem
-from gsfluent.lab.shapes import box, disc, parameters, rotation
+from gsfluent.lab.shapes import ball, box, disc, parameters, rotation
 
 POISSON = 0.2
 YOUNG = (1.0 + POISSON) * (1.0 - 2.0 * POISSON) / (1.0 - POISSON)
@@ -191,6 +191,33 @@ def hertz_spheres(
         compare("hertz_spheres", "restitution", after, 1.0, tolerance=0.05,
                 source="elastic impact", note="damping of the transfer, see docs/contact.md"),
     ]  # fmt: skip
+
+
+@problem(tier="slow")
+def hertz_axis(radius: float = 7.2, speed: float = 0.05) -> Iterator[Result]:
+    """Head-on lattice balls along an axis of the grid: the setting of solver.md 0, finding 5.
+
+    There contact of two fields acts wherever both have mass, 1.5 to 2.5 cells before they touch.
+
+    Args:
+        radius: [dx].
+        speed: Of each ball over the wave speed.
+    """
+    points = ball([0.0, 0.0, 0.0], radius, SPACING)
+    along = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
+    place = torch.tensor([radius + 0.5, 0.0, 0.0], dtype=torch.float64)
+    shift = torch.tensor([0.13, 0.27, -0.31], dtype=torch.float64)
+    for one_field, gap in ((True, 1.0), (False, 2.0)):
+        parts = [points - place + shift, points + place + shift]
+        world = bodies(parts, [along, -along], one_field=one_field, contact_gap=gap)
+        first = torch.arange(len(world.position)) < len(points)
+        world.run(0.5 / speed + 20.0 * radius * (2.0 * speed) ** -0.2)
+        after = -float(world.momentum(first)[0] / world.scene.mass[first].sum()) / speed
+        yield compare(
+            "hertz_axis", f"restitution, {'one field' if one_field else 'two fields, no gate'}",
+            after, 1.0, tolerance=0.05, source="solver.md 0, finding 5: 0.953 to 0.972",
+            note=f"R = {radius:g} dx, v = {speed:g} c each, {len(points)} points each",
+        )  # fmt: skip
 
 
 @problem(tier="slow")
