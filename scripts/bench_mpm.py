@@ -9,8 +9,9 @@ Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube 
 eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
 E = 1e5, nu = 0.3, dt = 1e-4, walls three cells inside the domain. 50 steps to warm up, then the
 median of five runs of 100 steps; the clock is read once per run. PhysGaussian's column is what
---peer holds, else the figure of that table: CUDA graph, same scene, same kind of GPU. On the CPU: one thread, process
-time, the least of the five runs, and beside it the plain C++ solver of shared/spec/solver.md.
+--peer holds, else the figure of that table: CUDA graph, same scene, same kind of GPU. On the CPU:
+one thread, process time, the least of the five runs, and beside it the plain C++ solver of
+shared/spec/solver.md.
 """
 
 from __future__ import annotations

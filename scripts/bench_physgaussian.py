@@ -4,8 +4,8 @@ git clone https://github.com/XPandora/PhysGaussian && pip install warp-lang==0.1
 python scripts/bench_physgaussian.py PhysGaussian/mpm_solver_warp --json peer.json
 python scripts/bench_mpm.py --peer peer.json --markdown docs/benchmarks.md
 
-Its code is imported from that folder, unchanged, and never copied: it has no licence. One substep is
-captured in a CUDA graph (`p2g2p` without its five synchronising timers, which is faster than as
+Its code is imported from that folder, unchanged, and never copied: it has no licence. One substep
+is captured in a CUDA graph (`p2g2p` without its five synchronising timers, which is faster than as
 shipped), 50 substeps to warm up, then the median of five runs of 100. Material: its jelly (fixed
 corotated), the same E, nu, density, points, step and walls.
 """
@@ -27,7 +27,7 @@ from bench_mpm import PEER, points
 
 
 def solver_module(folder: Path) -> Any:
-    """Import ``mpm_solver_warp`` from a checkout; h5py, which only its samples need, may be absent."""
+    """Import ``mpm_solver_warp`` from a checkout; h5py, which its samples need, may be absent."""
     try:
         importlib.import_module("h5py")
     except ImportError:
