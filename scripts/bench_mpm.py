@@ -3,13 +3,15 @@
 python scripts/bench_mpm.py                                    # this machine's GPU, else its CPU
 python scripts/bench_mpm.py --device cpu --markdown docs/solver_cpu.md   # one core, process time
 python scripts/bench_mpm.py --json bench_mpm.json --markdown docs/benchmarks.md
+python scripts/bench_mpm.py --peer peer.json     # from bench_physgaussian.py on the same machine
 
 Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
 eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
 E = 1e5, nu = 0.3, dt = 1e-4, walls three cells inside the domain. 50 steps to warm up, then the
-median of five runs of 100 steps; the clock is read once per run. PhysGaussian's column is the
-figure of that table: CUDA graph, same scene, same kind of GPU. On the CPU: one thread, process
-time, the least of the five runs, and beside it the plain C++ solver of shared/spec/solver.md.
+median of five runs of 100 steps; the clock is read once per run. PhysGaussian's column is what
+--peer holds, else the figure of that table: CUDA graph, same scene, same kind of GPU. On the CPU:
+one thread, process time, the least of the five runs, and beside it the plain C++ solver of
+shared/spec/solver.md.
 """
 
 from __future__ import annotations
@@ -166,9 +168,13 @@ def main() -> int:
     parser.add_argument("--rows", nargs="*", help="grid:cells, for example 200:50")
     parser.add_argument("--kinds", nargs="*", default=["elastic", "nacc", "two"])
     parser.add_argument("--orders", nargs="*", default=["lattice", "random"])
+    parser.add_argument("--peer", type=Path, help="what bench_physgaussian.py wrote")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
+    if options.peer:
+        for row in json.loads(options.peer.read_text())["rows"]:
+            PEER[row["grid"], row["cells"], row["order"]] = round(row["ms"], 3)
     if options.device == "cuda" and not has_cuda():
         parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
     gpu = options.device == "cuda" or (options.device == "auto" and has_cuda())
