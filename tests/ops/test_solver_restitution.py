@@ -19,7 +19,7 @@ def ball_on_plane(**options: Any) -> ops.Solver:
     down = torch.tensor([0.0, 0.0, -SPEED], dtype=E).expand(len(points), 3).contiguous()
     return ops.Solver(
         points, down, volume, volume, dx=1.0, law=torch.zeros(1, dtype=torch.int32),
-        params=torch.as_tensor(parameters(0.9, 0.2, 1.0)).reshape(1, 8).to(E), gravity=(0.0, 0.0, 0.0), **options,
+        params=parameters(0.9, 0.2, 1.0).reshape(1, 8).to(E), gravity=(0.0, 0.0, 0.0), **options,
     )  # fmt: skip
 
 
