@@ -44,9 +44,11 @@ GSF_HOST_DEVICE T mass_floor() {
 }
 
 struct ContactLaw {
-  double friction;     // Coulomb coefficient between bodies
-  double restitution;  // 0: no approach velocity is left; 1: elastic
-  double gap;          // s_c: centroid separation, in dx, up to which bodies touch
+  double friction;  // Coulomb coefficient between bodies
+  // 0: no approach velocity is left; 1: elastic. Makes energy in a contact of many steps: the
+  // resident solver has none (docs/contact.md).
+  double restitution;
+  double gap;  // s_c: centroid separation, in dx, up to which bodies touch
 };
 
 // Sums of one body at one node.

@@ -210,7 +210,9 @@ def grid_update(
         cut: Sides of blades that each field lies on (:func:`gsfluent.ops.blade_sides`), int32
             [K]; colliders with ``only_cut`` act on those fields only.
         friction: Coulomb coefficient between fields, >= 0.
-        restitution: Of contact between fields, in [0, 1].
+        restitution: Of contact between fields, in [0, 1]. Exact in this step; over the steps of a
+            lasting contact it makes energy, which is why :class:`Solver` has none
+            (docs/contact.md).
         contact_gap: Centroid separation [dx] below which fields touch; 1.0 to 1.1 is right for
             8 particles per cell.
         return_torque: Also return the torque of the colliders.
