@@ -23,7 +23,8 @@ from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
-from gsfluent.ops.collider import pad_colliders
+from gsfluent.ops.collider import check_colliders, pad_colliders
+from gsfluent.ops.plasticity import check_params
 from gsfluent.ops.solver_state import ELASTIC, NACC, UNBROKEN, SolverState
 
 LAWS = 7
@@ -161,6 +162,13 @@ class Solver(SolverState):
             raise ValueError(f"{op}: cfl must lie in (0, 1], got {cfl}")
         if dt is not None and not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"{op}: dt must be positive, got {dt}")
+        for name, number, least, most in (
+            ("friction", friction, 0.0, math.inf), ("restitution", restitution, 0.0, 1.0),
+            ("contact_gap", contact_gap, 0.0, math.inf), ("k", k, 0.0, math.inf),
+            ("gradient_limit", gradient_limit, 1e-6, math.inf), ("epsilon", epsilon, 0.0, 0.999),
+        ):  # fmt: skip
+            if not least <= number <= most:
+                raise ValueError(f"{op}: {name} must lie in [{least:g}, {most:g}], got {number}")
         laws = set(law.tolist())
         if not laws <= set(range(LAWS)):
             raise ValueError(f"{op}: law must lie in 0 to {LAWS - 1}, got {sorted(laws)}")
@@ -171,10 +179,14 @@ class Solver(SolverState):
         self._primed = False
 
         self._params, self._law = params.to(velocity), law.to(self.device)
+        check_params(op, self._law, self._params)
+        if not bool((self._params[:, 6] > 0).all()):
+            raise ValueError(f"{op}: density (params column 6) must be positive")
         row, rows, row_law = self._rows(material, mass, volume)
         b = layout.empty_buffers(velocity, n)
         b.law, b.rows = row_law, rows
         if colliders is not None and colliders.shape[0] > 0:
+            check_colliders(op, pad_colliders(colliders), 0 if sdf is None else sdf.shape[0])
             b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
             b.collider_state = pad_colliders(colliders).to(self.device, torch.float64).clone()
             shape = (colliders.shape[0], layout.IMPULSE_SUMS)
@@ -229,7 +241,7 @@ class Solver(SolverState):
             colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
 
         Raises:
-            ValueError: Another number of rows.
+            ValueError: Another number of rows, or rows that are no collider.
         """
         rows, have = pad_colliders(colliders), self._buffers.colliders
         if rows.shape != have.shape:
@@ -238,6 +250,7 @@ class Solver(SolverState):
                 f"got {list(rows.shape)}"
             )
         if rows.numel():
+            check_colliders("Solver.set_colliders", rows, self._buffers.sdf.shape[0])
             have.copy_(rows)
             self._buffers.collider_state.copy_(rows)
 

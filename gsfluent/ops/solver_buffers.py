@@ -17,7 +17,7 @@ IMPULSE_SUMS = 7
 TILE_ROWS = 32
 """Particles of one tile of a device's arrays (``kTileRows``)."""
 BLOCK_RANGE = 2**16
-MAX_FIELDS = 2**12 - 1
+MAX_FIELDS = 2**12 - 2
 MAX_ROWS = 2**23
 MAX_PARTICLES = 2**26
 """More could overflow the fixed-point sums (``csrc/core/solver_clock.h``)."""

@@ -6,6 +6,8 @@ order changes from build to build; here they come back in the order they were gi
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -190,6 +192,8 @@ class SolverState:
 
     @dt_scale.setter
     def dt_scale(self, value: float) -> None:
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"Solver: dt_scale must be positive, got {value}")
         self._write(dt_scale=value)
 
     def memory(self) -> int:
