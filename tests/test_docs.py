@@ -74,3 +74,9 @@ def test_the_smallest_shot_of_the_readme_is_a_shot(tmp_path: Path) -> None:
     (tmp_path / "shot.yaml").write_text(text)
     shot = load_shot(tmp_path / "shot.yaml")
     assert [type(event).__name__ for event in shot.events] == ["Drop"]
+
+
+def test_the_index_names_every_page() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    assert pages == set(re.findall(r"\]\((\w[\w-]*\.md)\)", index)) - {"index.md"}

@@ -11,6 +11,7 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
+from gsfluent.ops.plasticity import LAWS
 from gsfluent.pipeline.particles import build_matter, sample_points
 from gsfluent.scene import Scene
 
@@ -245,3 +246,8 @@ def test_empty_and_oversized_scenes_are_refused():
     scene.add(ellipsoid(), materials.glass)
     with pytest.raises(InputError, match="material points"):
         build_matter(scene, 1e-4)
+
+
+def test_laws_have_the_numbers_of_the_ops() -> None:
+    """Two tables, so that materials can be read without the compiled library."""
+    assert materials.LAWS == LAWS

@@ -78,9 +78,9 @@ GSF_HOST_DEVICE bool collider_near(const SolverView<T>& s, int64_t k, const Vec3
   if (!collider_valid(row, s.sdf_count)) return false;
   const Vec3<T> omega = load_vec3(row + kAngularVelocity);
   if (!(collider_bound(row) < T(1e30)) && dot(omega, omega) > T(0)) return true;
-  const T ahead =
-      row[kSweep] != T(0) ? norm(load_vec3(row + kVelocity)) * T(max(s.clock->dt, s.clock->dt_next))
-                          : T(0);
+  const T ahead = row[kSweep] != T(0)
+                      ? norm(load_vec3(row + kVelocity)) * T(max(s.clock->dt, s.clock->dt_next))
+                      : T(0);
   Vec3<T> normal;
   return collider_signed_distance(row, s.sdf, middle, normal) <= T(5) * s.dx + ahead;
 }

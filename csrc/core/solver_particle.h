@@ -106,7 +106,8 @@ struct StepFlags {
 template <typename T>
 GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
   MaterialRow<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
-  if (s.irreversible && s.law[row] == kNacc) m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
+  if (s.irreversible && s.law[row] == kNacc)
+    m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
   return m;
 }
 
@@ -200,7 +201,8 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     s.offset[s.at(3, p, axis)] = o;
     s.velocity[s.at(3, p, axis)] = value[axis];
   }
-  s.meta[p] = pack_meta(l[0], l[1], l[2], meta_row(meta));
+  const uint32_t moved = pack_meta(l[0], l[1], l[2], meta_row(meta));
+  if (moved != meta) s.meta[p] = moved;  // few points leave their cell in a step
 
   if constexpr (kTrack) {
     Mat3<T> f;

@@ -181,7 +181,7 @@ struct SolverView {
   int32_t* table_home;   // [table_size]
   int32_t* table_slot;   // [table_size] slot, or head of the slot list of a site
   int32_t* slot_next;    // [S] chain of the slots of a site
-  uint64_t* site_near;   // [S] colliders that can touch the block before the next build, as bits
+  uint64_t* slot_near;   // [S] colliders that can touch the block before the next build, as bits
   // colliders
   T* colliders;            // [K, kColliderColumns] as nodes see them
   double* collider_state;  // [K, kColliderColumns] as they move
@@ -208,10 +208,10 @@ struct SolverView {
 
 // True while a step may run: nothing has ended, failed or asked for new blocks.
 GSF_HOST_DEVICE bool may_step(const SolverClock& c) {
-  return c.done == 0 && c.rebuild == 0 && c.grow == 0 && c.reason == kFine;
+  return (c.done | c.rebuild | c.grow | c.reason) == 0;  // four loads at once
 }
 GSF_HOST_DEVICE bool may_build(const SolverClock& c) {
-  return c.done == 0 && c.rebuild != 0 && c.grow == 0 && c.reason == kFine;
+  return (c.done | c.grow | c.reason) == 0 && c.rebuild != 0;
 }
 
 }  // namespace gsf

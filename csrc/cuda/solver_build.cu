@@ -173,7 +173,7 @@ __global__ void __launch_bounds__(kThreads) sites_kernel(const __grid_constant__
   const Vec3<T> middle = block_middle(s, s.slot_coord + 4 * int64_t(slots[0]));
   for (int64_t k = 0; k < s.collider_count; ++k)
     if (k >= 63 || collider_near(s, k, middle)) near |= uint64_t(1) << min(k, int64_t(63));
-  s.site_near[site] = near;
+  for (int i = 0; i < count; ++i) s.slot_near[slots[i]] = near;
 }
 
 // Contact reads one node beyond the blocks that fields share: marks the slots around those.

@@ -6,6 +6,8 @@
 namespace gsf::cuda {
 namespace {
 
+constexpr int kGridCtas = 5;  // of a multiprocessor, for grid_kernel's registers
+
 // Reads the sums of one node.
 template <typename T>
 __device__ NodeSums<T> read_sums(const SolverView<T>& s, int64_t node) {
@@ -23,10 +25,10 @@ __device__ NodeSums<T> read_sums(const SolverView<T>& s, int64_t node) {
 
 // Clears them for the next step.
 template <typename T>
-__device__ void clear_sums(const SolverView<T>& s, int64_t node) {
+__device__ void clear_sums(const SolverView<T>& s, int64_t node, int32_t shared) {
   longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
   words[0] = words[1] = longlong2{0, 0};
-  if (s.moments == nullptr || s.slot_shared[node / kBlockNodes] == 0) return;
+  if (shared == 0) return;
   int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
   for (int c = 0; c < kContactMoments; ++c) m[c] = 0;
 }
@@ -54,16 +56,26 @@ __device__ inline void add_units(void* to, long long units) {
 // are added up as far as possible before they get there.
 constexpr int kHeldColliders = 4;
 struct HeldSums {
-  long long units[kHeldColliders][kImpulseSums];
+  unsigned long long units[kHeldColliders * kImpulseSums];
+  int done;  // warps that have added all they have
 
   __device__ void clear() {
-    for (int i = threadIdx.x; i < kHeldColliders * kImpulseSums; i += blockDim.x)
-      (&units[0][0])[i] = 0;
+    for (int i = threadIdx.x; i < kHeldColliders * kImpulseSums; i += blockDim.x) units[i] = 0;
+    if (threadIdx.x == 0) done = 0;
   }
+  // Called by whole warps; the last one of the CTA hands over, so that none waits for another.
   template <typename T>
   __device__ void hand_over(const SolverView<T>& s) {
-    for (int i = threadIdx.x; i < kHeldColliders * kImpulseSums; i += blockDim.x)
-      if ((&units[0][0])[i] != 0) add_units(s.impulse_units + i, (&units[0][0])[i]);
+    const int lane = threadIdx.x & 31;
+    __threadfence_block();
+    int before = lane == 0 ? atomicAdd(&done, 1) : 0;
+    before = __shfl_sync(kAllLanes, before, 0);
+    if (before + 1 < int(blockDim.x) / 32) return;
+    __threadfence_block();
+    for (int i = lane; i < kHeldColliders * kImpulseSums; i += 32) {
+      const unsigned long long sum = atomicAdd(units + i, 0ull);
+      if (sum != 0) add_units(s.impulse_units + i, static_cast<long long>(sum));
+    }
   }
 };
 
@@ -79,11 +91,12 @@ __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& h
       double sums[kImpulseSums] = {};
       if (active) node_collide(s, k, x, mass, dt, v, sums);
       if (!__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
+      const double units_of[3] = {1.0 / sum_unit(s, 0), 1.0 / sum_unit(s, 3), 1.0 / sum_unit(s, 6)};
       for (int i = 0; i < kImpulseSums; ++i) {
-        const long long units = warp_sum(__double2ll_rn(sums[i] / sum_unit(s, i)));
+        const long long units = warp_sum(__double2ll_rn(sums[i] * units_of[i / 3]));
         if (units == 0 || (threadIdx.x & 31) != 0) continue;
         if (k < kHeldColliders)
-          add_units(&held.units[k][i], units);
+          add_units(held.units + kImpulseSums * k + i, units);
         else
           add_units(s.impulse_units + kImpulseSums * k + i, units);
       }
@@ -191,7 +204,7 @@ __global__ void __launch_bounds__(kBlockNodes)
   __syncthreads();
   const int32_t* block = s.slot_coord + 4 * int64_t(slots[0]);
   const Vec3<T> x = node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
-  const uint64_t near = s.collider_count > 0 ? s.site_near[site] : 0;
+  const uint64_t near = s.collider_count > 0 ? s.slot_near[slots[0]] : 0;
   Vec3<T> velocity[kSiteFields];
   bool heavy[kSiteFields];
   int present = 0;
@@ -209,56 +222,49 @@ __global__ void __launch_bounds__(kBlockNodes)
           collide_near(s, held, near, heavy[f], x, read_sums(s, node).mass, velocity[f], dt);
     store_velocity(s, node, velocity[f]);
   }
-  if (touched > 0) add_units(&s.clock->touched, touched);
-  __syncthreads();
+  if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
   held.hand_over(s);
 }
 
-// Velocities of one site of one field; those of others are done by contact_kernel, only their sums
-// are cleared. True when colliders were met.
+// Velocities of the nodes of one slot, where its field is alone; those of shared sites are done by
+// contact_kernel, only their sums are cleared.
 template <typename T>
-__device__ bool update_site(const SolverView<T>& s, HeldSums& held, int64_t site) {
+__device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot) {
   const int local = threadIdx.x % kBlockNodes;
-  const int32_t* slots = s.site_slots + site * kSiteFields;
-  const int2 first = *reinterpret_cast<const int2*>(slots);
-  const uint64_t near = s.collider_count > 0 ? s.site_near[site] : 0;
-  const int32_t slot = first.x;
-  if (slot < 0 || slot >= s.slot_capacity) return false;
-  if (first.y >= 0) {
-    for (int f = 0; f < kSiteFields && slots[f] >= 0 && slots[f] < s.slot_capacity; ++f)
-      clear_sums(s, int64_t(slots[f]) * kBlockNodes + local);
-    return false;
-  }
-  const int64_t node = int64_t(slot) * kBlockNodes + local;
+  const int64_t node = slot * kBlockNodes + local;
+  const int32_t shared = s.moments != nullptr ? s.slot_shared[slot] : 0;
+  const uint64_t near = s.collider_count > 0 ? s.slot_near[slot] : 0;
   const NodeSums<T> sums = read_sums(s, node);
-  clear_sums(s, node);
+  clear_sums(s, node, shared);
+  if (shared == 1) return;
   Vec3<T> v;
   const T dt = T(s.clock->dt);
   const bool heavy = node_velocity(s, sums, dt, v);
   if (near != 0) {
-    const int32_t* block = s.slot_coord + 4 * int64_t(slot);
-    const Vec3<T> x = node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
+    const Vec3<T> x =
+        node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
     v = collide_near(s, held, near, heavy, x, sums.mass, v, dt);
   }
   store_velocity(s, node, v);
-  return near != 0;
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kSolverThreads, 6)
+__global__ void __launch_bounds__(kSolverThreads, kGridCtas)
     grid_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;
   __shared__ HeldSums held;
-  held.clear();
-  __syncthreads();
-  const int64_t site =
+  if (s.collider_count > 0) {
+    held.clear();
+    __syncthreads();
+  }
+  const int64_t slot =
       int64_t(blockIdx.x) * (kSolverThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
   // p2g has read the bounds of this step; g2p raises those of the next one from nothing.
   const int64_t home = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
   if (home < clock.homes) s.home_bound[home] = T(0);
-  const bool collided = site < clock.sites && update_site(s, held, site);
-  if (__syncthreads_or(collided)) held.hand_over(s);
+  if (slot < clock.slots) update_slot(s, held, slot);
+  if (s.collider_count > 0) held.hand_over(s);
 }
 
 }  // namespace

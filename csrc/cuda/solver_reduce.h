@@ -29,6 +29,35 @@ __device__ inline void block_largest(const float (&values)[kValues], unsigned (&
   }
 }
 
+// The end of a CTA without a barrier: every warp adds its maxima and leaves; the last one goes on
+// with those of all.
+template <int kValues>
+struct CtaEnd {
+  unsigned largest[kValues];
+  int done;
+
+  __device__ void clear() {
+    if (threadIdx.x < kValues) largest[threadIdx.x] = 0;
+    if (threadIdx.x == kValues) done = 0;
+  }
+  // Called by whole warps; true in the last one.
+  __device__ bool leave(const float (&values)[kValues], unsigned (&out)[kValues]) {
+    const int lane = threadIdx.x & 31;
+    for (int i = 0; i < kValues; ++i) {
+      const unsigned most = __reduce_max_sync(kAllLanes, sortable(values[i]));
+      if (lane == i && most > 0u) atomicMax(largest + i, most);
+    }
+    __threadfence_block();
+    __syncwarp();
+    int before = lane == 0 ? atomicAdd(&done, 1) : 0;
+    before = __shfl_sync(kAllLanes, before, 0);
+    if (before + 1 < int(blockDim.x) / 32) return false;
+    __threadfence_block();
+    for (int i = 0; i < kValues; ++i) out[i] = *static_cast<volatile unsigned*>(largest + i);
+    return true;
+  }
+};
+
 __device__ inline void raise_to(uint64_t* word, unsigned bits) {
   if (bits > 0u && *reinterpret_cast<volatile unsigned long long*>(word) < bits)
     atomicMax(reinterpret_cast<unsigned long long*>(word), static_cast<unsigned long long>(bits));
@@ -57,21 +86,19 @@ __device__ inline void count_lanes(bool yes, int64_t* counter) {
               static_cast<unsigned long long>(__popc(mask)));
 }
 
-// True in every thread of the CTA that is the last of `total` to arrive; what the others wrote
-// before is visible to it.
+// Called by one warp of a CTA; true in all its lanes when it is the last of `total` to arrive. What
+// was written by atomics before is visible to it; what particles hold is the next kernel's matter.
 __device__ inline bool last_to_arrive(int64_t* arrived, int64_t total) {
-  __shared__ bool last;
-  __threadfence();
-  __syncthreads();
-  if (threadIdx.x == 0) {
+  bool last = false;
+  if ((threadIdx.x & 31) == 0) {
+    __threadfence();
     const unsigned long long before =
         atomicAdd(reinterpret_cast<unsigned long long*>(arrived), 1ull);
     last = before + 1 == static_cast<unsigned long long>(total);
     if (last) *arrived = 0;
+    __threadfence();
   }
-  __syncthreads();
-  if (last) __threadfence();
-  return last;
+  return __shfl_sync(kAllLanes, int(last), 0) != 0;
 }
 
 // Entry of a key in the hash table, -1 when it has none.

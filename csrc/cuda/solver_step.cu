@@ -9,13 +9,10 @@ namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = kSolverThreads;
-#ifndef GSF_P2G_THREADS
-#define GSF_P2G_THREADS 256
-#define GSF_G2P_THREADS 256
-#define GSF_G2P_CTAS 3
-#endif
-constexpr int kP2GThreads = GSF_P2G_THREADS;
-constexpr int kG2PThreads = GSF_G2P_THREADS;
+// Threads of a CTA, and CTAs of a multiprocessor that registers must suffice for: measured on an
+// H100 (docs/benchmarks.md).
+constexpr int kP2GThreads = 128, kP2GCtas = 8;
+constexpr int kG2PThreads = 256, kG2PCtas = 3;
 // Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.
 constexpr int kStrideX = 68, kStrideY = 8;
 constexpr int kTile = kWindowEdge * kStrideX;
@@ -47,6 +44,11 @@ __device__ double window_unit(double bound, double share, int64_t count, double 
   return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
 }
 
+// Brings the line at p near; nothing waits for it.
+__device__ inline void prefetch(const void* p) {
+  asm volatile("prefetch.global.L1 [%0];" ::"l"(p));
+}
+
 __device__ int window_node(int index, int& i, int& j, int& k) {
   i = index >> 6;
   j = index >> 3 & 7;
@@ -66,63 +68,100 @@ __device__ int64_t slot_node(const int32_t* neighbour, int i, int j, int k) {
          local_index(window_local(i), window_local(j), window_local(k));
 }
 
-// Small scenes give a home to several CTAs, so that each does less in a row.
-constexpr int kMaxSplit = 2;
+// Small scenes give a home to several CTAs, so that each does less in a row: 2^shift of them.
 template <typename T>
-int split_of(const SolverView<T>& s) {
-  return s.count < 600000 ? kMaxSplit : 1;
+int split_shift(const SolverView<T>& s) {
+  return s.count < 600000 ? 1 : 0;
 }
 
+// Words of a window times 2^shift are units of the step: exact for shift >= 0.
+template <typename Word>
+__device__ long long to_units(Word word, int shift) {
+  if (shift >= 0) return static_cast<long long>(word) << shift;
+  return __double2ll_rn(ldexp(double(word), shift));
+}
+
+// Units of the window of a home.
+template <typename T>
+struct WindowUnits {
+  T per_momentum, per_mass;        // 1 / unit
+  int momentum_shift, mass_shift;  // to units of the step
+
+  __device__ void choose(const SolverView<T>& s, int64_t home, int64_t count) {
+    const SolverClock& clock = *s.clock;
+    const double unit = window_unit<T>(s.home_bound[home], 0.43, count, clock.momentum_unit);
+    const double mass = window_unit<T>(s.home_mass[home], 1.0, count, clock.mass_unit);
+    per_momentum = T(1.0 / unit);
+    per_mass = T(1.0 / mass);
+    momentum_shift = ilogb(unit) - ilogb(clock.momentum_unit);
+    mass_shift = ilogb(mass) - ilogb(clock.mass_unit);
+  }
+};
+
+// What one particle gives, as read.
+template <typename T>
+struct ParticleGiven {
+  T offset[3], velocity[3], slope[9];
+  uint32_t meta;
+
+  __device__ void read(const SolverView<T>& s, int64_t p) {
+    meta = s.meta[p];
+    load_three(s, s.offset, p, offset);
+    load_three(s, s.velocity, p, velocity);
+    load_nine(s, s.slope, p, slope);
+  }
+};
+
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads)
-    p2g_kernel(const __grid_constant__ SolverView<T> s, int split) {
+__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
+    p2g_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
   const SolverClock& clock = *s.clock;
-  if (!may_step(clock) || int64_t(blockIdx.x / split) >= clock.homes) return;
-  const int64_t home = blockIdx.x / split;
-  const int part = blockIdx.x % split;
+  // Backwards: what g2p wrote last is still in the cache.
+  const int64_t home = clock.homes - 1 - (blockIdx.x >> split_shift);
+  if (!may_step(clock) || home < 0) return;
+  const int part = blockIdx.x & ((1 << split_shift) - 1);
   __shared__ Word tile[kChannels][kTile];
   __shared__ int32_t neighbour[kNeighbours];
   __shared__ bool slot_shared[kMoments ? kNeighbours : 1];
-  __shared__ int shared_home;
+  __shared__ WindowUnits<T> units;
   const HomeList<T>& homes = s.homes();
-  const int64_t first = homes.start[home], count = homes.count[home];
-  if (threadIdx.x == 0) shared_home = 0;
+  const int64_t first = homes.start[home];
+  const int64_t count = min(int64_t(homes.count[home]), s.count - first);
+  const int stride = kP2GThreads << split_shift;
+  int64_t r = part * kP2GThreads + threadIdx.x;
+  ParticleGiven<T> given;
+  if (first >= 0 && r < count) given.read(s, first + r);  // while the window is cleared
   for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
-  __syncthreads();
+  bool shared_here = false;
   if (threadIdx.x < kNeighbours) {
     const int32_t slot = s.neighbour[home * kNeighbours + threadIdx.x];
     neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
     if constexpr (kMoments) {
-      slot_shared[threadIdx.x] = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
-      if (slot_shared[threadIdx.x]) shared_home = 1;
+      shared_here = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
+      slot_shared[threadIdx.x] = shared_here;
     }
   }
-  __syncthreads();
-  const bool with_moments = kMoments && shared_home != 0;
-  const double unit = window_unit<T>(s.home_bound[home], 0.43, count, clock.momentum_unit);
-  const double mass_unit = window_unit<T>(s.home_mass[home], 1.0, count, clock.mass_unit);
-  const T per_unit = T(1.0 / unit), per_mass = T(1.0 / mass_unit);
-  for (int64_t r = part * kP2GThreads + threadIdx.x; r < count; r += split * kP2GThreads) {
-    const int64_t p = first + r;
-    if (p < 0 || p >= s.count) continue;
-    const uint32_t meta = s.meta[p];
-    const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
+  if (threadIdx.x == kP2GThreads - 1) units.choose(s, home, count);
+  bool with_moments = false;
+  if constexpr (kMoments)
+    with_moments = __syncthreads_or(shared_here) != 0;
+  else
+    __syncthreads();
+  const T per_unit = units.per_momentum, per_mass = units.per_mass;
+  while (first >= 0 && r < count) {
+    const uint32_t row = meta_row(given.meta) < uint64_t(s.row_count) ? meta_row(given.meta) : 0;
     const T mass = s.rows[int64_t(row) * kRowColumns + kMassColumn];
-    T offset[3], velocity[3], slope[9];
-    load_three(s, s.offset, p, offset);
-    load_three(s, s.velocity, p, velocity);
-    load_nine(s, s.slope, p, slope);
-    const Stencil<T> st = stencil_at(offset);
-    ParticleMomentum<T> q = momentum_given(st, velocity, slope, mass, s.dx);
+    const Stencil<T> st = stencil_at(given.offset);
+    ParticleMomentum<T> q = momentum_given(st, given.velocity, given.slope, mass, s.dx);
     for (int i = 0; i < 3; ++i) q.constant[i] *= per_unit;
     for (int i = 0; i < 9; ++i) q.slope.m[i] *= per_unit;
     const T weight_unit = mass * per_mass;
     // Cells are at most kLastCell by construction; garbage cells stay inside the window too.
-    const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
-                     min(meta_cell(meta, 1), kLastCell) * kStrideY +
-                     min(meta_cell(meta, 2), kLastCell);
+    const int base = min(meta_cell(given.meta, 0), kLastCell) * kStrideX +
+                     min(meta_cell(given.meta, 1), kLastCell) * kStrideY +
+                     min(meta_cell(given.meta, 2), kLastCell);
 #pragma unroll
     for (int i = 0; i < 3; ++i)
 #pragma unroll
@@ -145,47 +184,43 @@ __global__ void __launch_bounds__(kP2GThreads)
             }
           }
         }
+    r += stride;
+    if (r < count) given.read(s, first + r);
   }
   __syncthreads();
-  const double to_step = unit / clock.momentum_unit, to_mass = mass_unit / clock.mass_unit;
   int64_t* sums = static_cast<int64_t*>(s.sums);
   int64_t* moments = static_cast<int64_t*>(s.moments);
+  const int momentum_shift = units.momentum_shift, mass_shift = units.mass_shift;
   for (int index = threadIdx.x; index < kWindowNodes; index += kP2GThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
-    // All four: the mass of a part of the home may round to nothing where its momentum does not.
-    if ((tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at]) == 0) continue;
+    // All channels: the mass of a part of the home may round to nothing where others do not.
+    Word any = tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at];
+    if constexpr (kMoments)
+      if (with_moments) any |= tile[4][at] | tile[5][at] | tile[6][at];
+    if (any == 0) continue;
     const int64_t node = slot_node(neighbour, i, j, k);
     if (node < 0) continue;
     for (int c = 0; c < 4; ++c) {
-      const Word word = tile[c][at];
-      const long long v =
-          sizeof(T) == 8 ? word : __double2ll_rn(double(word) * (c < 3 ? to_step : to_mass));
-      if (v != 0)
-        atomicAdd(reinterpret_cast<unsigned long long*>(sums + 4 * node + c),
-                  static_cast<unsigned long long>(v));
+      const long long v = to_units(tile[c][at], c < 3 ? momentum_shift : mass_shift);
+      if (v != 0) add_units(sums + 4 * node + c, v);
     }
     if constexpr (kMoments) {
       // Only shared slots: nobody would clear the moments of the others.
       if (with_moments && slot_shared[neighbour_of(i, j, k)])
         for (int c = 0; c < kContactMoments; ++c) {
-          const Word word = tile[4 + c][at];
-          const long long v = sizeof(T) == 8 ? word : __double2ll_rn(double(word) * to_mass);
-          if (v != 0)
-            atomicAdd(reinterpret_cast<unsigned long long*>(moments + kContactMoments * node + c),
-                      static_cast<unsigned long long>(v));
+          const long long v = to_units(tile[4 + c][at], mass_shift);
+          if (v != 0) add_units(moments + kContactMoments * node + c, v);
         }
     }
   }
 }
 
-template <int kThreadsHere, typename T>
-__device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_t home,
+// Maxima of a step, for the clock and the home. One warp calls.
+template <typename T>
+__device__ void hand_over(const SolverView<T>& s, const unsigned (&bits)[4], int64_t home,
                           bool moving) {
-  const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
-  unsigned bits[4];
-  block_largest<kThreadsHere>(values, bits);
-  if (threadIdx.x != 0) return;
+  if ((threadIdx.x & 31) != 0) return;
   SolverClock& c = *s.clock;
   if (moving) {
     raise_to(&c.speed, root_up(bits[0]));
@@ -199,11 +234,12 @@ __device__ void hand_over(const SolverView<T>& s, const Largest& largest, int64_
   }
 }
 
-// What the last CTA of a step does: colliders move on, then time. Out of line, so that g2p does not
-// hold its registers.
-template <int kThreadsHere, typename T>
+// What the last warp of a step does: colliders move on, then time. Out of line, so that g2p does
+// not hold its registers.
+template <typename T>
 __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
-  for (int64_t k = threadIdx.x; k < s.collider_count; k += kThreadsHere) {
+  const int lane = threadIdx.x & 31;
+  for (int64_t k = lane; k < s.collider_count; k += 32) {
     double sums[kImpulseSums];
     for (int i = 0; i < kImpulseSums; ++i) {
       sums[i] = double(s.impulse_units[kImpulseSums * k + i]) * sum_unit(s, i);
@@ -212,8 +248,9 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
     const double moved = end_collider(s, k, sums, s.clock->dt);
     if (moved > 0.0) raise_to(&s.clock->moved, sortable(float(moved) * 1.000001f));
   }
-  __syncthreads();
-  if (threadIdx.x != 0) return;
+  __threadfence();
+  __syncwarp();
+  if (lane != 0) return;
   // On a copy: all loads at once, then all stores.
   SolverClock clock = *s.clock;
   clock.travel += float_of_bits(clock.moved);
@@ -264,37 +301,43 @@ __device__ __forceinline__ void gather(const Stencil<T>& st, const T (&tile)[3][
 }
 
 template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
-    g2p_kernel(const __grid_constant__ SolverView<T> s, int split) {
+__global__ void __launch_bounds__(kG2PThreads, kG2PCtas)
+    g2p_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
   const SolverClock& clock = *s.clock;
-  if (!may_step(clock) || int64_t(blockIdx.x / split) >= clock.homes) return;
-  const int64_t home = blockIdx.x / split;
-  const int part = blockIdx.x % split;
+  const int64_t home = blockIdx.x >> split_shift;
+  if (!may_step(clock) || home >= clock.homes) return;
+  const int part = blockIdx.x & ((1 << split_shift) - 1);
   __shared__ T tile[3][kTile];
+  __shared__ CtaEnd<4> end;
+  end.clear();
   const HomeList<T>& homes = s.homes();
-  const int64_t first = homes.start[home], count = homes.count[home];
+  const int64_t first = homes.start[home];
+  const int64_t count = min(int64_t(homes.count[home]), s.count - first);
   const T dt = T(clock.dt), dt_next = T(clock.dt_next);
-  const int64_t arrivals = clock.homes * split;
+  const int64_t arrivals = clock.homes << split_shift;
   const bool waves = measures_waves(clock);
   const T slack = T(clock.slack);
-  const uint32_t reach = reach_of_row(s.neighbour + home * kNeighbours);
+  const int32_t* neighbour = s.neighbour + home * kNeighbours;
+  const uint32_t reach = reach_of_row(neighbour);
+  const int stride = kG2PThreads << split_shift;
+  int64_t r = part * kG2PThreads + threadIdx.x;
+  bool here = first >= 0 && r < count;
   for (int index = threadIdx.x; index < kWindowNodes; index += kG2PThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
-    const int64_t node = slot_node(s.neighbour + home * kNeighbours, i, j, k);
+    const int64_t node = slot_node(neighbour, i, j, k);
     const Vec3<T> v = node < 0 ? Vec3<T>{T(0), T(0), T(0)} : load_velocity(s, node);
     for (int c = 0; c < 3; ++c) tile[c][at] = v[c];
   }
   __syncthreads();
   Largest largest{};
   bool leaves = false, lost = false;
-  const int64_t stride = int64_t(split) * kG2PThreads, rounds = (count + stride - 1) / stride;
-  for (int64_t round = 0; round < rounds; ++round) {
-    const int64_t r = round * stride + part * kG2PThreads + threadIdx.x, p = first + r;
+  while (__any_sync(kAllLanes, here)) {
     StepFlags flags{};
-    if (r < count && p >= 0 && p < s.count) {
-      const ParticleBefore<T> before = particle_before<T, kLaws>(s, p);
+    if (here) {
+      const ParticleBefore<T> before = particle_before<T, kLaws>(s, first + r);
       const uint32_t meta = before.meta;
+      prefetch(s.rows + int64_t(before.row) * kRowColumns);
       const Stencil<T> st = stencil_at(before.offset);
       const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
                        min(meta_cell(meta, 1), kLastCell) * kStrideY +
@@ -302,8 +345,8 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
       T value[3] = {};
       Mat3<T> moment{};
       gather(st, tile, base, value, moment);
-      flags = finish_particle<T, kLaws, kTrack>(s, p, before, reach, value, moment, dt, dt_next,
-                                                waves, slack, largest);
+      flags = finish_particle<T, kLaws, kTrack>(s, first + r, before, reach, value, moment, dt,
+                                                dt_next, waves, slack, largest);
     }
     if constexpr (kLaws != kElasticOnly) count_lanes(flags.plastic, &s.clock->plastic);
     if (__any_sync(kAllLanes, flags.guarded || flags.inverted || flags.invalid)) {
@@ -313,12 +356,16 @@ __global__ void __launch_bounds__(kG2PThreads, GSF_G2P_CTAS)
     }
     leaves = leaves || flags.leaves;
     lost = lost || flags.lost;
+    r += stride;
+    here = here && r < count;
   }
   count_lanes(leaves, &s.clock->leaving);
   count_lanes(lost, &s.clock->lost);
-  hand_over<kG2PThreads>(s, largest, home, true);
-  if (!last_to_arrive(&s.clock->arrived, arrivals)) return;
-  end_of_step<kG2PThreads>(s);
+  const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
+  unsigned bits[4];
+  if (!end.leave(values, bits)) return;
+  hand_over(s, bits, home, true);
+  if (last_to_arrive(&s.clock->arrived, arrivals)) end_of_step(s);
 }
 
 template <typename T>
@@ -326,6 +373,9 @@ __global__ void __launch_bounds__(kThreads)
     prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   const SolverClock& clock = *s.clock;
   if (int64_t(blockIdx.x) >= clock.homes) return;
+  __shared__ CtaEnd<4> end;
+  end.clear();
+  __syncthreads();
   const HomeList<T>& homes = s.homes();
   const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
   const int64_t home_total = clock.homes;
@@ -333,8 +383,12 @@ __global__ void __launch_bounds__(kThreads)
   Largest largest{};
   for (int64_t r = threadIdx.x; r < count; r += kThreads)
     if (first + r >= 0 && first + r < s.count) prime_particle(s, first + r, measure, dt, largest);
-  hand_over<kThreads>(s, largest, measure ? -1 : int64_t(blockIdx.x), measure);
-  if (!last_to_arrive(&s.clock->arrived, home_total) || threadIdx.x != 0) return;
+  __syncwarp();
+  const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
+  unsigned bits[4];
+  if (!end.leave(values, bits)) return;
+  hand_over(s, bits, measure ? -1 : int64_t(blockIdx.x), measure);
+  if (!last_to_arrive(&s.clock->arrived, home_total) || (threadIdx.x & 31) != 0) return;
   if (measure)
     start_clock(*s.clock, double(s.dx));
   else
@@ -354,30 +408,31 @@ cudaError_t solver_prime(const SolverView<T>& s, cudaStream_t stream) {
 template <typename T>
 cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
-  const int split = split_of(s);
-  constexpr int kSitesPerCta = kThreads / kBlockNodes;
-  const unsigned sites = static_cast<unsigned>((s.slot_capacity + kSitesPerCta - 1) / kSitesPerCta);
+  const int shift = split_shift(s);
+  const unsigned ctas = homes << shift;
+  constexpr int kSlotsPerCta = kThreads / kBlockNodes;
+  const unsigned slots = static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta);
   if (s.moments != nullptr)
-    p2g_kernel<T, true><<<homes * split, kP2GThreads, 0, stream>>>(s, split);
+    p2g_kernel<T, true><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
   else
-    p2g_kernel<T, false><<<homes * split, kP2GThreads, 0, stream>>>(s, split);
+    p2g_kernel<T, false><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
   if (s.moments != nullptr)
     contact_kernel<T>  // a shared site has two slots at least
         <<<static_cast<unsigned>((s.slot_capacity + 1) / 2), kBlockNodes, 0, stream>>>(s);
-  grid_kernel<T><<<sites, kThreads, 0, stream>>>(s);
+  grid_kernel<T><<<slots, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)
-    g2p_kernel<T, kElasticOnly, false><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
+    g2p_kernel<T, kElasticOnly, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (law_set == kElasticOnly)
-    g2p_kernel<T, kElasticOnly, true><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
+    g2p_kernel<T, kElasticOnly, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (law_set == kBrittle && !track)
-    g2p_kernel<T, kBrittle, false><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
+    g2p_kernel<T, kBrittle, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (law_set == kBrittle)
-    g2p_kernel<T, kBrittle, true><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
+    g2p_kernel<T, kBrittle, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (!track)
-    g2p_kernel<T, kAnyLaw, false><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
+    g2p_kernel<T, kAnyLaw, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else
-    g2p_kernel<T, kAnyLaw, true><<<homes * split, kG2PThreads, 0, stream>>>(s, split);
+    g2p_kernel<T, kAnyLaw, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   return cudaGetLastError();
 }
 

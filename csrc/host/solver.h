@@ -48,7 +48,7 @@ enum SolverBuffer : int {
   kTableHome,
   kTableSlot,
   kSlotNext,
-  kSiteNear,
+  kSlotNear,
   kColliders,
   kColliderRows,
   kSdfBuffer,
@@ -144,7 +144,7 @@ struct SolverOps {
         {"table_home", t, 1, i32, false},
         {"table_slot", t, 1, i32, false},
         {"slot_next", c, 1, i32, false},
-        {"site_near", c, 1, i64, false},
+        {"slot_near", c, 1, i64, false},
         {"colliders", s.collider_count, kColliderColumns, real, true},
         {"collider_state", s.collider_count, kColliderColumns, ScalarType::Double, true},
         {"sdf", b[kSdfBuffer].numel(), 1, ScalarType::Float, true},
@@ -216,7 +216,7 @@ struct SolverOps {
     s.table_home = int_at(kTableHome);
     s.table_slot = int_at(kTableSlot);
     s.slot_next = int_at(kSlotNext);
-    s.site_near = static_cast<uint64_t*>(any_at(kSiteNear));
+    s.slot_near = static_cast<uint64_t*>(any_at(kSlotNear));
     s.colliders = real_at(kColliders);
     s.collider_state = static_cast<double*>(any_at(kColliderRows));
     s.sdf = static_cast<const float*>(any_at(kSdfBuffer));

@@ -81,7 +81,7 @@ class Buffers:
     table_home: Tensor
     table_slot: Tensor
     slot_next: Tensor
-    site_near: Tensor
+    slot_near: Tensor
     colliders: Tensor
     collider_state: Tensor
     sdf: Tensor
@@ -122,7 +122,7 @@ class Buffers:
         many = slots if fields > 1 else 0
         moments = torch.int64 if device.type == "cuda" else real
         self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=moments, device=device)
-        self.site_near = torch.zeros(slots, dtype=torch.int64, device=device)
+        self.slot_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())

@@ -98,7 +98,9 @@ class Composed:
         if lost:
             bad = ~torch.isfinite(self.points.velocity).all(dim=1)
             raise Unhealthy(
-                f"{lost} points were not finite or left the grid", bad if bool(bad.any()) else None
+                f"{lost} points were not finite or left the grid",
+                bad if bool(bad.any()) else None,
+                time=self.time,
             )
         return done
 

@@ -37,7 +37,7 @@ def units(matter: Matter, links: Tensor, pieces: Fragments, may_break: Tensor) -
 
     Args:
         matter: The points.
-        links: Links at rest, int64 [L, 2].
+        links: Links at rest whose ends are neighbours still, int64 [L, 2].
         pieces: The pieces now.
         may_break: From :func:`breakable`.
     """

@@ -177,7 +177,8 @@ class Watch:
         Too many fields in one place are no matter of the step: then fewer fields may meet.
         """
         self.good_in_a_row = 0
-        where = f"t = {state.time:.6g} s, step {state.step}: {trouble.reason}"
+        time = max(state.time, trouble.time)
+        where = f"t = {time:.6g} s, step {state.step}: {trouble.reason}"
         if trouble.wrong is not None:
             # Where the points were when all was well: a bad state may have them anywhere.
             wrong = stepper.spread(trouble.wrong, state)
@@ -185,7 +186,7 @@ class Watch:
             where += f" ({found})" if found else ""
         self.reasons.append(where)
         self.kind = trouble.kind
-        self.trouble_time = max(self.trouble_time, self._ring[-1].time, state.time)
+        self.trouble_time = max(self.trouble_time, time)
         if self.in_a_row >= self.max_rollbacks or stepper.dt_scale <= LEAST_SCALE:
             return None
         self.rollbacks += 1

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from gsfluent.ops.blade import cut_apart
-from gsfluent.pipeline.fragments import Fragments, find_fragments, rest_links
+from gsfluent.pipeline.fragments import STRETCH_LIMIT, Fragments, find_fragments, rest_links
 from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
 from gsfluent.pipeline.simulate_figures import Figures
@@ -131,11 +133,18 @@ class Run:
         may_break = self._breakable
         if self.scene.blades:
             may_break = may_break | cut_bodies(self.matter, state.cut)
-        links = self._links.to(state.cut.device)
-        if self.scene.blades:  # powder stays on its side of a cut
-            links = links[~cut_apart(state.cut[links[:, 0]], state.cut[links[:, 1]])]
-        unit = units(self.matter, links, self._fragments(state), may_break)
+        unit = units(self.matter, self._holding(state), self._fragments(state), may_break)
         return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
+
+    def _holding(self, state: State) -> Tensor:
+        """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
+        links = self._links.to(state.position.device)
+        a, b = links.unbind(dim=1)
+        rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
+        near = now <= STRETCH_LIMIT * rest
+        if self.scene.blades:
+            near = near & ~cut_apart(state.cut[a], state.cut[b])
+        return links[near]
 
     def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:
         """Measure the present state and add it to the per-frame records."""

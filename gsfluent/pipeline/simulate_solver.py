@@ -8,6 +8,7 @@ composable operators; it is the reference, and it alone knows blades at work.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -30,7 +31,9 @@ CROWDED = 3
 
 
 LOOK = 8
-"""Steps between two looks at how fast matter is, while a collider is faster."""
+"""Steps between two looks at how fast matter is, while a collider is much faster."""
+STEADY = 0.9
+"""Factor on the time step above which that need not be."""
 OUTWEIGHS = 0.5
 """Least mass of a free body for the resident solver, in masses of the matter that it can touch:
 what it strikes first lies on one side of it."""
@@ -43,11 +46,18 @@ class Unhealthy(Exception):
         reason: What is wrong.
         wrong: Points at fault, bool [N], if they are known.
         kind: ``numbers``, ``speed``, ``volume``, ``energy``, ``crowded``, ``far`` or ``step``.
+        time: When, if that is later than the state that was to be advanced [s].
     """
 
-    def __init__(self, reason: str, wrong: Tensor | None = None, kind: str = "numbers") -> None:
+    def __init__(
+        self,
+        reason: str,
+        wrong: Tensor | None = None,
+        kind: str = "numbers",
+        time: float = -math.inf,
+    ) -> None:
         super().__init__(reason)
-        self.reason, self.wrong, self.kind = reason, wrong, kind
+        self.reason, self.wrong, self.kind, self.time = reason, wrong, kind, time
 
 
 _KINDS = {1: "numbers", 2: "speed", CROWDED: "crowded", 4: "far", 5: "step"}
@@ -225,7 +235,7 @@ class Resident:
             self._solver.dt_scale = self._dt_scale * pace
             wait = self._rigid.floor_wait(self.colliders, depth)
             left = steps - int(self._seen["step"] - before)
-            self._go(min(until, self.time + wait), left if pace == 1.0 else min(left, LOOK))
+            self._go(min(until, self.time + wait), left if pace > STEADY else min(left, LOOK))
         taken, counters = int(self._seen["step"] - before), self._counters
         sites = int(self._seen["sites"])
         counters.law_kernel_steps += taken if self._special else 0
@@ -255,7 +265,9 @@ class Resident:
                 solver.advance(target, steps=steps)
             except SolverError as error:
                 kind = _KINDS.get(error.reason, "numbers")
-                raise Unhealthy(str(error).split("\n")[0], self._wrong(kind), kind) from error
+                what = str(error).split("\n")[0].split(": ", 2)[-1]  # its time is its own
+                time = self._start + error.time
+                raise Unhealthy(what, self._wrong(kind), kind, time) from error
             reached = solver.time
             self.time = stop if reached >= target else self._start + reached
         else:

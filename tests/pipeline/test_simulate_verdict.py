@@ -12,6 +12,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.data import Frame
+from gsfluent.ops.solver import Solver, SolverError
 from gsfluent.ops.solver_buffers import SITE_FIELDS
 from gsfluent.pipeline import simulate_run
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
@@ -135,3 +136,21 @@ def test_too_many_pieces_in_one_place_share_fields(monkeypatch: pytest.MonkeyPat
     low, high = re.findall(r"box \(([\d.e-]+), .*? to \(([\d.e-]+),", report["reason"])[0]
     assert float(high) - float(low) <= 4 * 0.04
     assert report["momentum_error"] < 1e-5
+
+
+def test_what_stops_the_solver_at_one_time_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inside a call of the solver too, failures count until the run is past them."""
+    advance, tries = Solver.advance, []
+
+    def breaks(self: Solver, until: float, *, steps: int) -> None:
+        advance(self, until, steps=steps)
+        if self.time > 0.02:  # of the call's own clock, which starts anew at each frame
+            tries.append(self.dt)
+            raise SolverError(1, self.time, self.steps)
+
+    monkeypatch.setattr(Solver, "advance", breaks)
+    frames, simulate = simulated(None, max_rollbacks=3)
+    report = simulate.report()
+    assert report["verdict"] == "failed" and report["rollbacks"] == 3 and len(tries) == 4
+    assert len(frames) == 1 and report["reason"].startswith("frame 1: t = 0.0")
+    assert "is not finite" in report["reason"] and tries[-1] < 0.2 * tries[0]
