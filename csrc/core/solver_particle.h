@@ -5,6 +5,7 @@
 #include "core/grid.h"
 #include "core/return_mapping.h"
 #include "core/solver_clock.h"
+#include "core/solver_layout.h"
 
 namespace gsf {
 
@@ -40,31 +41,6 @@ GSF_HOST_DEVICE ParticleMomentum<T> momentum_given(const Stencil<T>& s, const T*
                     (q.slope(i, 0) * s.f[0] + q.slope(i, 1) * s.f[1] + q.slope(i, 2) * s.f[2]);
   q.mass = mass;
   return q;
-}
-
-template <typename T>
-GSF_HOST_DEVICE Sym3<T> strain_of(const SolverView<T>& s, int64_t p) {
-  const T* e = s.strain;
-  return {e[s.at(6, p, 0)], e[s.at(6, p, 1)], e[s.at(6, p, 2)],
-          e[s.at(6, p, 3)], e[s.at(6, p, 4)], e[s.at(6, p, 5)]};
-}
-template <typename T>
-GSF_HOST_DEVICE void set_strain(const SolverView<T>& s, int64_t p, const Sym3<T>& e) {
-  const T values[6] = {e.xx, e.yy, e.zz, e.xy, e.xz, e.yz};
-  for (int c = 0; c < 6; ++c) s.strain[s.at(6, p, c)] = values[c];
-}
-// The nine components of a 3 x 3 array (slope or deformation) of particle p.
-template <typename T>
-GSF_HOST_DEVICE void load_nine(const SolverView<T>& s, const T* from, int64_t p, T* out) {
-  for (int c = 0; c < 9; ++c) out[c] = from[s.at(9, p, c)];
-}
-template <typename T>
-GSF_HOST_DEVICE void store_nine(const SolverView<T>& s, T* to, int64_t p, const T* values) {
-  for (int c = 0; c < 9; ++c) to[s.at(9, p, c)] = values[c];
-}
-template <typename T>
-GSF_HOST_DEVICE void load_three(const SolverView<T>& s, const T* from, int64_t p, T* out) {
-  for (int c = 0; c < 3; ++c) out[c] = from[s.at(3, p, c)];
 }
 
 // The larger of two values; NaN counts as larger than any.
@@ -163,9 +139,8 @@ struct ParticleBefore {
 template <typename T, int kLaws>
 GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_t p) {
   ParticleBefore<T> b;
-  load_three(s, s.offset, p, b.offset);
-  b.meta = s.meta[p];
-  b.strain = strain_of(s, p);
+  b.meta = load_place(s, p, b.offset);
+  b.strain = load_strain(s, p);
   b.row = meta_row(b.meta) < uint64_t(s.row_count) ? meta_row(b.meta) : 0;
   if constexpr (kLaws != kElasticOnly) {
     b.alpha = s.alpha[p];
@@ -194,21 +169,20 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   for (int i = 0; i < 9; ++i) c.m[i] = T(4) * inv_dx * first.m[i];
 
   int l[3] = {meta_cell(meta, 0), meta_cell(meta, 1), meta_cell(meta, 2)};
+  T o[3];
   for (int axis = 0; axis < 3; ++axis) {
-    T o = before.offset[axis];
-    if (!move_axis(dt * inv_dx * value[axis], slack, l[axis], o, flags.leaves)) flags.lost = true;
+    o[axis] = before.offset[axis];
+    if (!move_axis(dt * inv_dx * value[axis], slack, l[axis], o[axis], flags.leaves))
+      flags.lost = true;
     flags.leaves = flags.leaves || !cell_in_reach(reach, axis, l[axis]);
-    s.offset[s.at(3, p, axis)] = o;
-    s.velocity[s.at(3, p, axis)] = value[axis];
   }
-  const uint32_t moved = pack_meta(l[0], l[1], l[2], meta_row(meta));
-  if (moved != meta) s.meta[p] = moved;  // few points leave their cell in a step
+  store_place(s, p, o, pack_meta(l[0], l[1], l[2], meta_row(meta)));
 
   if constexpr (kTrack) {
     Mat3<T> f;
-    load_nine(s, s.deformation, p, f.m);
+    load_deformation(s, p, f.m);
     f = f + dt * matmul(c, f);
-    store_nine(s, s.deformation, p, f.m);
+    store_deformation(s, p, f.m);
   }
 
   const T* r = s.rows + int64_t(row) * kRowColumns;
@@ -222,7 +196,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     flags.guarded = state.guarded;
     flags.inverted = state.inverted;
     flags.invalid = state.guarded && !finite(e);  // what is not finite is out of bounds
-    set_strain(s, p, state.guarded ? strain_from_isochoric(state.d, log_volume(state)) : state.e);
+    store_strain(s, p, state.guarded ? strain_from_isochoric(state.d, log_volume(state)) : state.e);
     stress = kirchhoff_stress(r[0], r[1], state.d, state.j2m1);
     if (waves) wave2 = elastic_wave_squared(r, state);
   } else {
@@ -235,7 +209,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
     flags.invalid = out.invalid;
-    set_strain(s, p, out.strain);
+    store_strain(s, p, out.strain);
     if (out.alpha != alpha) {
       s.alpha[p] = out.alpha;
       if (out.alpha > peak && law == kNacc) s.peak[p] = out.alpha;
@@ -246,7 +220,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   }
   T slope[9];
   store_slope(slope, c, stress, r, dt_next);
-  store_nine(s, s.slope, p, slope);
+  store_motion(s, p, value, slope);
 
   const T speed2 = value[0] * value[0] + value[1] * value[1] + value[2] * value[2];
   largest.speed2 = larger(float(speed2), largest.speed2);
@@ -275,22 +249,22 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
 template <typename T>
 GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool measure, T dt,
                                     Largest& largest) {
-  const uint32_t row = meta_row(s.meta[p]) < uint64_t(s.row_count) ? meta_row(s.meta[p]) : 0;
+  const uint32_t meta = load_meta(s, p);
+  const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
   const T* r = s.rows + int64_t(row) * kRowColumns;
   const T mass = r[kMassColumn];
   const T alpha = s.alpha != nullptr ? s.alpha[p] : T(0),
           peak = s.peak != nullptr ? s.peak[p] : alpha;
   Mat3<T> c;
-  load_nine(s, s.slope, p, c.m);
+  T v[3];
+  load_motion(s, p, v, c.m);
   const T inverse = mass > T(0) ? T(1) / mass : T(0);
   for (int i = 0; i < 9; ++i) c.m[i] *= inverse;
-  T v[3];
-  load_three(s, s.velocity, p, v);
   if (measure) {
     T speed2 = T(0), gradient2 = T(0);
     for (int i = 0; i < 3; ++i) speed2 += v[i] * v[i];
     for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
-    const T wave2 = wave_speed_squared(s.law[row], load_material(r), strain_of(s, p));
+    const T wave2 = wave_speed_squared(s.law[row], load_material(r), load_strain(s, p));
     largest.speed2 = larger(float(speed2), largest.speed2);
     largest.wave2 = larger(float(wave2), largest.wave2);
     if (peak < T(0) || s.law[row] != kNacc)
@@ -298,11 +272,11 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     return;
   }
   const Mat3<T> none{};
-  const ReturnMapped<T> state = return_mapping(strain_of(s, p), alpha, none, s.law[row],
+  const ReturnMapped<T> state = return_mapping(load_strain(s, p), alpha, none, s.law[row],
                                                material_now(s, row, peak), s.options, dt);
   T slope[9];
   store_slope(slope, c, state.stress, r, dt);
-  store_nine(s, s.slope, p, slope);
+  store_motion(s, p, v, slope);
   largest.bound = larger(float(momentum_bound(v, slope, mass, s.dx)), largest.bound);
 }
 

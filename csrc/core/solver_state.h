@@ -23,7 +23,6 @@ constexpr int kWindowEdge = 8;
 constexpr int kWindowNodes = 512;
 constexpr int kNeighbours = 27;  // blocks a window can touch
 constexpr int kImpulseSums = 7;
-constexpr int kTileRows = 32;    // particles of one tile of the GPU's arrays
 constexpr int kLastCell = 5;     // largest l
 constexpr int kRowColumns = 12;  // eight material parameters, then those below
 constexpr int kMassColumn = 8;
@@ -146,7 +145,7 @@ struct SolverView {
   NaccOptions<T> options;
   bool irreversible;
   SolverClock* clock;
-  // particles, grouped by home; see `at` for the layout
+  // particles, grouped by home; shapes as on the CPU, see core/solver_layout.h
   T* offset;       // [N, 3] o
   uint32_t* meta;  // [N]
   T* velocity;     // [N, 3] m/s
@@ -191,17 +190,6 @@ struct SolverView {
   double* impulse;  // [K, kImpulseSums] impulse [N s] and torque [N m s] since the load, then
                     // the mass touched in the last step [kg]
 
-  // Index of component c of particle p in an array of `width` components: particle by particle on
-  // the CPU; on the GPU component by component inside tiles of kTileRows particles, so that
-  // neighbouring lanes read neighbouring words and the components of a particle lie at constant
-  // distances.
-  GSF_HOST_DEVICE int64_t at(int width, int64_t p, int c) const {
-#ifdef __CUDA_ARCH__
-    return (p / kTileRows * width + c) * kTileRows + p % kTileRows;
-#else
-    return p * width + c;
-#endif
-  }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }
 };

@@ -1,8 +1,6 @@
 // Blocks of the resident solver on the GPU: a hash table finds homes and slots, particles are
 // re-sorted by home, inside a home so that the lanes of a warp lie in different cells. The order of
 // homes, slots and particles varies from run to run; no sum depends on it.
-#include <type_traits>
-
 #include "cuda/solver_reduce.h"
 
 namespace gsf::cuda {
@@ -58,10 +56,11 @@ __global__ void __launch_bounds__(kThreads) insert_kernel(const __grid_constant_
   for (int64_t r = threadIdx.x; r < count; r += kThreads) {
     const int64_t p = first + r;
     if (p < 0 || p >= s.count) continue;
+    const uint32_t meta = load_meta(s, p);
     int32_t block[3], local[3];
     bool inside = true;
     for (int axis = 0; axis < 3; ++axis) {
-      const int32_t cell = 4 * coord[axis] - 1 + meta_cell(s.meta[p], axis);
+      const int32_t cell = 4 * coord[axis] - 1 + meta_cell(meta, axis);
       block[axis] = cell >> 2;
       local[axis] = cell & 3;
       inside = inside && block[axis] > -kBlockRange + 1 && block[axis] < kBlockRange - 2;
@@ -213,11 +212,11 @@ __global__ void __launch_bounds__(kThreads) place_kernel(const __grid_constant__
     const int32_t h = s.table_home[s.entry[p]];
     const HomeList<T>& next = s.next_homes();
     const int64_t at = int64_t(next.start[h]) + s.place[p];
-    const uint32_t meta = s.meta[p];
+    const uint32_t meta = load_meta(s, p);
     int l[3];
     for (int axis = 0; axis < 3; ++axis)
       l[axis] = 4 * (coord[axis] - next.coord[4 * h + axis]) + meta_cell(meta, axis);
-    s.meta[p] = pack_meta(l[0], l[1], l[2], meta_row(meta));
+    store_meta(s, p, pack_meta(l[0], l[1], l[2], meta_row(meta)));
     s.entry[p] = static_cast<int32_t>(at < s.count ? at : s.count - 1);
   }
 }
@@ -247,7 +246,7 @@ __global__ void __launch_bounds__(kThreads) stripe_kernel(const __grid_constant_
   for (int i = threadIdx.x; i < kBlockNodes; i += kThreads) filled[i] = 0;
   __syncthreads();
   for (int64_t r = threadIdx.x; r < count; r += kThreads) {
-    const uint32_t meta = s.meta[s.place[first + r]];
+    const uint32_t meta = load_meta(s, int64_t(s.place[first + r]));
     const int cell = local_index(meta_cell(meta, 0) - 1 & 3, meta_cell(meta, 1) - 1 & 3,
                                  meta_cell(meta, 2) - 1 & 3);
     words[first + r] = atomicAdd(filled + cell, 1) << 6 | cell;
@@ -276,46 +275,51 @@ __global__ void __launch_bounds__(kThreads) stripe_kernel(const __grid_constant_
   }
 }
 
-// What one pass of the re-sort carries through `spare`.
-enum Group : int { kSlopeGroup, kStrainGroup, kRestGroup, kDeformationGroup };
+// What one pass of the re-sort carries through `spare`, nine columns at most.
+enum Pass : int { kPlacePass, kMotionPass, kStrainPass, kDeformationPass };
 
-// Calls f(array, width) for the arrays of a group; every array has words of the size of T or int.
+// Calls f(array) for the arrays of a pass, the widest elements first.
 template <typename T, typename F>
-__device__ void for_group(const SolverView<T>& s, int group, F&& f) {
-  if (group == kSlopeGroup) f(s.slope, 9);
-  if (group == kDeformationGroup) f(s.deformation, 9);
-  if (group == kStrainGroup) {
-    f(s.strain, 6);
-    f(s.velocity, 3);
+__device__ void for_pass(const SolverView<T>& s, int pass, F&& f) {
+  if (pass == kPlacePass) {
+    f(quad_plane(s, s.offset, 0));
+    f(quad_plane(s, s.velocity, 0));
+    f(s.id);
   }
-  if (group == kRestGroup) {
-    f(s.offset, 3);
-    f(reinterpret_cast<int32_t*>(s.meta), 1);
-    f(s.id, 1);
+  if (pass == kMotionPass) {
+    f(quad_plane(s, s.velocity, 1));
+    f(quad_plane(s, s.velocity, 2));
+  }
+  if (pass == kStrainPass) {
+    f(quad_plane(s, s.strain, 0));
+    f(strain_pairs(s));
     if (s.alpha != nullptr) {
-      f(s.alpha, 1);
-      f(s.peak, 1);
+      f(s.alpha);
+      f(s.peak);
     }
+  }
+  if (pass == kDeformationPass) {
+    f(quad_plane(s, s.deformation, 0));
+    f(quad_plane(s, s.deformation, 1));
+    f(s.deformation + 8 * s.count);
   }
 }
 
 template <typename T, bool kBack>
 __global__ void __launch_bounds__(kThreads)
-    carry_kernel(const __grid_constant__ SolverView<T> s, int group) {
+    carry_kernel(const __grid_constant__ SolverView<T> s, int pass) {
   if (!may_build(*s.clock)) return;
   const int64_t p = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (p >= s.count) return;
   const int64_t from = kBack ? p : s.entry[p];
-  int column = 0;
-  for_group(s, group, [&](auto* array, int width) {
-    using Word = std::remove_reference_t<decltype(*array)>;
-    for (int c = 0; c < width; ++c, ++column) {
-      Word* spare = reinterpret_cast<Word*>(s.spare + column * s.count);
-      if constexpr (kBack)
-        array[s.at(width, p, c)] = spare[p];
-      else
-        spare[p] = array[s.at(width, from, c)];
-    }
+  char* spare = reinterpret_cast<char*>(s.spare);
+  for_pass(s, pass, [&](auto* array) {
+    auto* room = reinterpret_cast<decltype(array)>(spare);
+    if constexpr (kBack)
+      array[p] = room[p];
+    else
+      room[p] = array[from];
+    spare += s.count * sizeof *array;
   });
 }
 
@@ -361,10 +365,10 @@ cudaError_t solver_build(const SolverView<T>& s, cudaStream_t stream) {
   place_kernel<T><<<homes, kThreads, 0, stream>>>(s);
   invert_kernel<T><<<ctas(s.count), kThreads, 0, stream>>>(s);
   stripe_kernel<T><<<homes, kThreads, 0, stream>>>(s);
-  for (int group = kSlopeGroup; group <= kDeformationGroup; ++group) {
-    if (group == kDeformationGroup && s.deformation == nullptr) continue;
-    carry_kernel<T, false><<<ctas(s.count), kThreads, 0, stream>>>(s, group);
-    carry_kernel<T, true><<<ctas(s.count), kThreads, 0, stream>>>(s, group);
+  for (int pass = kPlacePass; pass <= kDeformationPass; ++pass) {
+    if (pass == kDeformationPass && s.deformation == nullptr) continue;
+    carry_kernel<T, false><<<ctas(s.count), kThreads, 0, stream>>>(s, pass);
+    carry_kernel<T, true><<<ctas(s.count), kThreads, 0, stream>>>(s, pass);
   }
   bound_kernel<T><<<homes, kThreads, 0, stream>>>(s);
   finish_kernel<T><<<1, 1, 0, stream>>>(s);

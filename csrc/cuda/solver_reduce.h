@@ -128,11 +128,11 @@ __device__ void home_bounds(const SolverView<T>& s, int64_t home, int64_t first,
   float bound = 0.0f, mass = 0.0f;
   for (int64_t r = threadIdx.x; r < count; r += kSolverThreads) {
     const int64_t p = first + r;
-    const uint32_t row = meta_row(s.meta[p]) < uint64_t(s.row_count) ? meta_row(s.meta[p]) : 0;
+    const uint32_t meta = load_meta(s, p);
+    const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
     const T m = s.rows[int64_t(row) * kRowColumns + kMassColumn];
     T velocity[3], slope[9];
-    load_three(s, s.velocity, p, velocity);
-    load_nine(s, s.slope, p, slope);
+    load_motion(s, p, velocity, slope);
     bound = larger(float(momentum_bound(velocity, slope, m, s.dx)), bound);
     mass = larger(float(m), mass);
   }

@@ -105,10 +105,8 @@ struct ParticleGiven {
   uint32_t meta;
 
   __device__ void read(const SolverView<T>& s, int64_t p) {
-    meta = s.meta[p];
-    load_three(s, s.offset, p, offset);
-    load_three(s, s.velocity, p, velocity);
-    load_nine(s, s.slope, p, slope);
+    meta = load_place(s, p, offset);
+    load_motion(s, p, velocity, slope);
   }
 };
 

@@ -88,7 +88,7 @@ struct SolverOps {
     // Every byte, also between members: back ends compare views to see whether anything moved.
     std::memset(static_cast<void*>(&s), 0, sizeof s);
     const Tensor& like = b[kOffset];
-    s.count = b[kMeta].numel();
+    s.count = b[kId].numel();
     s.home_capacity = b[kHomeStart0].size(0);
     s.slot_capacity = b[kSlotNext].size(0);
     s.table_size = b[kKey].size(0);
@@ -100,8 +100,6 @@ struct SolverOps {
     const bool device = like.is_cuda();
     const int64_t n = s.count, h = s.home_capacity, c = s.slot_capacity, t = s.table_size;
     const ScalarType sum = device ? i64 : ScalarType::Double, moment = device ? i64 : real;
-    // What has several components per particle comes in whole tiles on a device.
-    const int64_t tiled = device ? (n + kTileRows - 1) / kTileRows * kTileRows : n;
     const struct {
       const char* name;
       int64_t rows, columns;
@@ -109,14 +107,15 @@ struct SolverOps {
       bool optional;
     } wanted[kSolverBuffers] = {
         {"clock", 1, kClockWords, i64, false},
-        {"offset", tiled, 3, real, false},
-        {"meta", n, 1, i32, false},
-        {"velocity", tiled, 3, real, false},
-        {"slope", tiled, 9, real, false},
-        {"strain", tiled, 6, real, false},
+        // core/solver_layout.h: on a device offset holds meta, and velocity the slope
+        {"offset", n, device ? 4 : 3, real, false},
+        {"meta", device ? 0 : n, 1, i32, false},
+        {"velocity", n, device ? 12 : 3, real, false},
+        {"slope", device ? 0 : n, 9, real, false},
+        {"strain", n, 6, real, false},
         {"alpha", n, 1, real, true},
         {"peak", n, 1, real, true},
-        {"deformation", tiled, 9, real, true},
+        {"deformation", n, 9, real, true},
         {"id", n, 1, i32, false},
         {"spare", n, 9, real, false},
         {"entry", n, 1, i32, false},

@@ -14,8 +14,6 @@ SITE_FIELDS = 16
 CONTACT_MOMENTS = 3
 ROW_COLUMNS = 12
 IMPULSE_SUMS = 7
-TILE_ROWS = 32
-"""Particles of one tile of a device's arrays (``kTileRows``)."""
 BLOCK_RANGE = 2**16
 MAX_FIELDS = 2**12 - 2
 MAX_ROWS = 2**23
@@ -131,18 +129,36 @@ class Buffers:
         self.table_home, self.table_slot = whole(entries), whole(entries)
 
 
-def tiled(values: Tensor) -> Tensor:
-    """Rows [N, W] as a device keeps them: [tiles, W, TILE_ROWS], zero behind the last row."""
-    n, width = values.shape
-    tiles = -(-n // TILE_ROWS)
-    padded = values.new_zeros(tiles * TILE_ROWS, width)
-    padded[:n] = values
-    return padded.view(tiles, TILE_ROWS, width).transpose(1, 2).contiguous()
+def planes(values: Tensor) -> Tensor:
+    """Rows [N, W] in planes of up to four components, as a device keeps them: flat, N W values.
+
+    See ``csrc/core/solver_layout.h``.
+    """
+    return torch.cat([part.reshape(-1) for part in values.split(4, dim=1)])
 
 
-def untiled(values: Tensor, count: int) -> Tensor:
-    """The first ``count`` rows [count, W] of what :func:`tiled` made."""
-    return values.transpose(1, 2).reshape(-1, values.shape[1])[:count]
+def from_planes(values: Tensor, width: int) -> Tensor:
+    """The rows [N, W] that :func:`planes` was given."""
+    count = values.numel() // width
+    parts, at = [], 0
+    for left in range(width, 0, -4):
+        size = min(4, left)
+        parts.append(values[at : at + count * size].view(count, size))
+        at += count * size
+    return torch.cat(parts, dim=1)
+
+
+def word_as_real(word: Tensor, like: Tensor) -> Tensor:
+    """Unsigned 32-bit words (int64) as bits of values of the dtype of ``like``."""
+    if like.dtype == torch.float64:
+        return word.view(torch.float64)
+    return torch.where(word >= 2**31, word - 2**32, word).to(torch.int32).view(torch.float32)
+
+
+def real_as_word(real: Tensor) -> Tensor:
+    """The words that :func:`word_as_real` was given, int64."""
+    whole = torch.int64 if real.dtype == torch.float64 else torch.int32
+    return real.contiguous().view(whole).long() & (2**32 - 1)
 
 
 def empty_buffers(like: Tensor, count: int) -> Buffers:
@@ -155,11 +171,9 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
     values = {}
     for field in dataclasses.fields(Buffers):
         values[field.name] = zeros(0)
-    for name, width in (("offset", 3), ("velocity", 3), ("slope", 9), ("strain", 6), ("spare", 9)):
-        rows = zeros(count, width)
-        values[name] = tiled(rows) if device.type == "cuda" and name != "spare" else rows
-    for name in ("meta", "id", "entry", "place"):
+    for name in ("id", "entry", "place"):
         values[name] = zeros(count, dtype=torch.int32)
+    values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
     for name in ("law", "home_start0", "home_count0", "home_start1", "home_count1"):
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsfluent._check import check_tensor
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.plasticity import return_mapping
-from gsfluent.ops.solver_buffers import INDEX, tiled, untiled
+from gsfluent.ops.solver_buffers import INDEX
 
 ELASTIC, NACC = 0, 1
 WEAKENING = 0.02
@@ -115,12 +115,9 @@ class SolverState:
         order = torch.argsort(owner, stable=True)
         local = (cell - 4 * block + 1)[order]
         word = local[:, 0] | local[:, 1] << 3 | local[:, 2] << 6 | row[order] << 9
-        # The word is unsigned on the device; wrap it into the signed type torch has.
-        b.meta = torch.where(word >= 2**31, word - 2**32, word).to(torch.int32)
-        b.offset = self._stored(offset[order])
         b.id = order.to(torch.int32)
-        for name, value in values.items():
-            setattr(b, name, self._stored(value[order].to(self.dtype)))
+        rows = {name: value[order].to(self.dtype) for name, value in values.items()}
+        self._store(offset[order], word, rows)
         coord = self._unkey(unique)
         homes, reach = unique.shape[0], self._reach(coord)
         b.reserve_blocks(homes + homes // 2 + 64, reach + reach // 3 + 64, self.fields)
@@ -215,16 +212,41 @@ class SolverState:
             .repeat_interleave(counts, dim=0, output_size=self.count)
         )
 
-    def _stored(self, values: Tensor) -> Tensor:
-        """Values as the device has them."""
-        if self.device.type == "cuda" and values.dim() == 2:
-            return tiled(values)
-        return values.clone(memory_format=torch.contiguous_format)
+    def _store(self, offset: Tensor, word: Tensor, rows: dict[str, Tensor]) -> None:
+        """Lay the rows out as ``csrc/core/solver_layout.h`` says."""
+        b = self._buffers
+        if self.device.type == "cuda":
+            bits = layout.word_as_real(word, offset)[:, None]
+            motion = torch.cat([rows.pop("velocity"), rows.pop("slope")], dim=1)
+            b.offset = layout.planes(torch.cat([offset, bits], dim=1))
+            b.velocity = layout.planes(motion)
+            for name, value in rows.items():
+                setattr(b, name, layout.planes(value) if value.dim() == 2 else value.contiguous())
+            return
+        # The word is unsigned there; wrap it into the signed type torch has.
+        b.meta = torch.where(word >= 2**31, word - 2**32, word).to(torch.int32)
+        b.offset = offset.contiguous()
+        for name, value in rows.items():
+            setattr(b, name, value.contiguous())
 
     def _rowwise(self, name: str) -> Tensor:
         """Stored values with one row per point."""
-        value: Tensor = getattr(self._buffers, name)
-        return untiled(value, self.count) if value.dim() == 3 else value
+        b = self._buffers
+        if self.device.type != "cuda":
+            value: Tensor = getattr(b, name)
+            return value
+        if name == "offset":
+            return layout.from_planes(b.offset, 4)[:, :3]
+        if name in ("velocity", "slope"):
+            motion = layout.from_planes(b.velocity, 12)
+            return motion[:, :3] if name == "velocity" else motion[:, 3:]
+        return layout.from_planes(getattr(b, name), 6 if name == "strain" else 9)
+
+    def _words(self) -> Tensor:
+        """Cell and row of each stored point, int64 [N]."""
+        if self.device.type == "cuda":
+            return layout.real_as_word(layout.from_planes(self._buffers.offset, 4)[:, 3])
+        return self._buffers.meta.long() & (2**32 - 1)
 
     def _restored(self, values: Tensor) -> Tensor:
         """Bring stored values into the order of loading."""
@@ -235,8 +257,7 @@ class SolverState:
     @property
     def position(self) -> Tensor:
         """Positions [m], float64 [N, 3]."""
-        b = self._buffers
-        word = b.meta.long() & 0x1FF
+        word = self._words()
         local = torch.stack([word & 7, word >> 3 & 7, word >> 6 & 7], dim=1)
         cell = 4 * self._owners()[:, :3] - 1 + local
         return self._restored((cell.double() + 0.5 + self._rowwise("offset").double()) * self.dx)
@@ -254,9 +275,10 @@ class SolverState:
     @property
     def affine(self) -> Tensor:
         """APIC matrix C [1/s], [N, 3, 3]."""
-        b = self._buffers
-        row = b.meta.long() >> 9 & (layout.MAX_ROWS - 1)
-        return self._restored(self._rowwise("slope") / b.rows[row, 8, None]).view(-1, 3, 3)
+        row = self._words() >> 9
+        return self._restored(self._rowwise("slope") / self._buffers.rows[row, 8, None]).view(
+            -1, 3, 3
+        )
 
     @property
     def strain(self) -> Tensor:
@@ -292,7 +314,7 @@ class SolverState:
         That one belongs to the step, not to the state: it is viscosity times rate of strain.
         """
         b = self._buffers
-        row = (b.meta.long() >> 9 & (layout.MAX_ROWS - 1)).to(torch.int32)
+        row = (self._words() >> 9).to(torch.int32)
         strain, broken = self._rowwise("strain").contiguous(), self._law_set > 0
         alpha = b.alpha if broken else strain.new_zeros(self.count)
         law, params = b.law, b.rows[:, :8].contiguous()
