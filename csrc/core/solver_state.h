@@ -42,7 +42,6 @@ GSF_HOST_DEVICE uint32_t pack_meta(int lx, int ly, int lz, uint32_t row) {
 }
 GSF_HOST_DEVICE int meta_cell(uint32_t meta, int axis) { return int(meta >> (3 * axis) & 7u); }
 GSF_HOST_DEVICE uint32_t meta_row(uint32_t meta) { return meta >> 9; }
-constexpr int64_t kMaxRows = int64_t(1) << 23;
 
 // Key of a block of a field in the hash table; field kMaxSolverFields stands for the site.
 GSF_HOST_DEVICE uint64_t block_key(int32_t x, int32_t y, int32_t z, int32_t field) {
@@ -124,8 +123,9 @@ struct SolverClock {
   double slack;                                                // 47 cells a point may move next
   double travel;   // 48 how far a collider may have moved since the last build [m]
   uint64_t moved;  // 49 bits: furthest a collider moved in this step
+  double dt_most;  // 50 longest automatic step [s]
 };
-constexpr int kClockWords = 50;
+constexpr int kClockWords = 51;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>

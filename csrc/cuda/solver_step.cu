@@ -29,7 +29,6 @@ struct Fixed<float> {
 template <>
 struct Fixed<double> {
   using Word = long long;
-  static constexpr int kBits = 61;
   static __device__ Word round(double v) { return __double2ll_rn(v); }
   static __device__ void add(Word* p, Word v) {
     atomicAdd(reinterpret_cast<unsigned long long*>(p), static_cast<unsigned long long>(v));
@@ -40,8 +39,10 @@ struct Fixed<double> {
 // window uses the unit of the step itself.
 template <typename T>
 __device__ double window_unit(double bound, double share, int64_t count, double step_unit) {
-  if (sizeof(T) == 8) return step_unit;
-  return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
+  if constexpr (sizeof(T) == 8)
+    return step_unit;
+  else
+    return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
 }
 
 // Brings the line at p near; nothing waits for it.
@@ -90,7 +91,7 @@ struct WindowUnits {
   __device__ void choose(const SolverView<T>& s, int64_t home, int64_t count) {
     const SolverClock& clock = *s.clock;
     const double unit = window_unit<T>(s.home_bound[home], 0.43, count, clock.momentum_unit);
-    const double mass = window_unit<T>(s.home_mass[home], 1.0, count, clock.mass_unit);
+    const double mass = window_unit<T>(s.home_mass[home], 0.43, count, clock.mass_unit);
     per_momentum = T(1.0 / unit);
     per_mass = T(1.0 / mass);
     momentum_shift = ilogb(unit) - ilogb(clock.momentum_unit);
@@ -313,7 +314,7 @@ __global__ void __launch_bounds__(kG2PThreads, kG2PCtas)
   const int64_t count = min(int64_t(homes.count[home]), s.count - first);
   const T dt = T(clock.dt), dt_next = T(clock.dt_next);
   const int64_t arrivals = clock.homes << split_shift;
-  const bool waves = measures_waves(clock);
+  const bool waves = measures_waves(clock, kLaws);
   const T slack = T(clock.slack);
   const int32_t* neighbour = s.neighbour + home * kNeighbours;
   const uint32_t reach = reach_of_row(neighbour);
