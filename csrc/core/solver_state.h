@@ -157,7 +157,7 @@ struct SolverView {
   int32_t* id;     // [N] row of the particle when it was loaded
   T* spare;        // [N, 9] scratch of the re-sort
   int32_t* entry;  // [N] scratch
-  int32_t* place;  // [N] scratch
+  int32_t* place;  // [N] scratch; between builds, on CUDA: whether home h touches shared blocks
   // materials
   const int32_t* law;  // [rows]
   const T* rows;       // [rows, kRowColumns]

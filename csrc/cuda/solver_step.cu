@@ -120,6 +120,8 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
   // Backwards: what g2p wrote last is still in the cache.
   const int64_t home = clock.homes - 1 - (blockIdx.x >> split_shift);
   if (!may_step(clock) || home < 0) return;
+  // Where fields share blocks, moments are summed too; those homes are this kernel's other form's.
+  if (s.moments != nullptr && (s.place[home] != 0) != kMoments) return;
   const int part = blockIdx.x & ((1 << split_shift) - 1);
   __shared__ Word tile[kChannels][kTile];
   __shared__ int32_t neighbour[kNeighbours];
@@ -133,21 +135,14 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
   ParticleGiven<T> given;
   if (first >= 0 && r < count) given.read(s, first + r);  // while the window is cleared
   for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
-  bool shared_here = false;
   if (threadIdx.x < kNeighbours) {
     const int32_t slot = s.neighbour[home * kNeighbours + threadIdx.x];
     neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
-    if constexpr (kMoments) {
-      shared_here = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
-      slot_shared[threadIdx.x] = shared_here;
-    }
+    if constexpr (kMoments)
+      slot_shared[threadIdx.x] = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
   }
   if (threadIdx.x == kP2GThreads - 1) units.choose(s, home, count);
-  bool with_moments = false;
-  if constexpr (kMoments)
-    with_moments = __syncthreads_or(shared_here) != 0;
-  else
-    __syncthreads();
+  __syncthreads();
   const T per_unit = units.per_momentum, per_mass = units.per_mass;
   while (first >= 0 && r < count) {
     const uint32_t row = meta_row(given.meta) < uint64_t(s.row_count) ? meta_row(given.meta) : 0;
@@ -176,11 +171,9 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
                                                q.slope(c, 1) * T(j) + q.slope(c, 2) * T(k))));
           Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
           if constexpr (kMoments) {
-            if (with_moments) {
-              const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
-              for (int c = 0; c < kContactMoments; ++c)
-                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
-            }
+            const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
+            for (int c = 0; c < kContactMoments; ++c)
+              Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
           }
         }
     r += stride;
@@ -195,8 +188,7 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
     const int at = window_node(index, i, j, k);
     // All channels: the mass of a part of the home may round to nothing where others do not.
     Word any = tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at];
-    if constexpr (kMoments)
-      if (with_moments) any |= tile[4][at] | tile[5][at] | tile[6][at];
+    if constexpr (kMoments) any |= tile[4][at] | tile[5][at] | tile[6][at];
     if (any == 0) continue;
     const int64_t node = slot_node(neighbour, i, j, k);
     if (node < 0) continue;
@@ -206,7 +198,7 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
     }
     if constexpr (kMoments) {
       // Only shared slots: nobody would clear the moments of the others.
-      if (with_moments && slot_shared[neighbour_of(i, j, k)])
+      if (slot_shared[neighbour_of(i, j, k)])
         for (int c = 0; c < kContactMoments; ++c) {
           const long long v = to_units(tile[4 + c][at], mass_shift);
           if (v != 0) add_units(moments + kContactMoments * node + c, v);
@@ -411,10 +403,8 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   const unsigned ctas = homes << shift;
   constexpr int kSlotsPerCta = kThreads / kBlockNodes;
   const unsigned slots = static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta);
-  if (s.moments != nullptr)
-    p2g_kernel<T, true><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
-  else
-    p2g_kernel<T, false><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
+  p2g_kernel<T, false><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
+  if (s.moments != nullptr) p2g_kernel<T, true><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
   if (s.moments != nullptr)
     contact_kernel<T>  // a shared site has two slots at least
         <<<static_cast<unsigned>((s.slot_capacity + 1) / 2), kBlockNodes, 0, stream>>>(s);
