@@ -82,11 +82,11 @@ def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> op
     velocity[:, 2] = -3.0
     volume = torch.full((count,), dx**3 / 8, device=device)
     body = None
-    if kind in ("two", "apart"):  # the upper half is another body; "apart": 8 cells higher up
+    if kind in ("two", "apart"):  # the upper half is another body; "apart": 0.3 m higher up
         middle = 4 * dx + 0.5 * cells * dx
         body = (x[:, 2] > middle).to(torch.int32)
         if kind == "apart":
-            x[:, 2] += 8 * dx * body
+            x[:, 2] += 4 * round(0.3 / (4 * dx)) * dx * body  # whole blocks
     law = 1 if kind == "nacc" else 0
     return ops.Solver(
         x, velocity, 1000.0 * volume, volume, dx=dx, dt=1e-4, gravity=(0.0, 0.0, -9.8),

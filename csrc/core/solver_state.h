@@ -121,11 +121,12 @@ struct SolverClock {
   double speed_seen, wave_seen;                                // 44, 45
   int64_t leaving;                                             // 46
   double slack;                                                // 47 cells a point may move next
-  double travel;   // 48 how far a collider may have moved since the last build [m]
-  uint64_t moved;  // 49 bits: furthest a collider moved in this step
-  double dt_most;  // 50 longest automatic step [s]
+  double travel;         // 48 how far a collider may have moved since the last build [m]
+  uint64_t moved;        // 49 bits: furthest a collider moved in this step
+  double dt_most;        // 50 longest automatic step [s]
+  int64_t shared_homes;  // 51 homes whose window touches shared blocks (CUDA)
 };
-constexpr int kClockWords = 51;
+constexpr int kClockWords = 52;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>
@@ -156,7 +157,7 @@ struct SolverView {
   T* deformation;  // [N, 3, 3] total deformation gradient, or null
   int32_t* id;     // [N] row of the particle when it was loaded
   T* spare;        // [N, 9] scratch of the re-sort
-  int32_t* entry;  // [N] scratch
+  int32_t* entry;  // [N] scratch; between builds, on CUDA: the homes that touch shared blocks
   int32_t* place;  // [N] scratch; between builds, on CUDA: whether home h touches shared blocks
   // materials
   const int32_t* law;  // [rows]

@@ -13,6 +13,7 @@ constexpr int kThreads = kSolverThreads;
 // H100 (docs/benchmarks.md).
 constexpr int kP2GThreads = 128, kP2GCtas = 8;
 constexpr int kG2PThreads = 256, kG2PCtas = 3;
+constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared blocks need
 // Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.
 constexpr int kStrideX = 68, kStrideY = 8;
 constexpr int kTile = kWindowEdge * kStrideX;
@@ -111,18 +112,13 @@ struct ParticleGiven {
   }
 };
 
+// One home, or part of it. Where its window touches blocks that fields share, moments are summed
+// too.
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
-    p2g_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
+__device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, int part,
+                                         int split_shift) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
-  const SolverClock& clock = *s.clock;
-  // Backwards: what g2p wrote last is still in the cache.
-  const int64_t home = clock.homes - 1 - (blockIdx.x >> split_shift);
-  if (!may_step(clock) || home < 0) return;
-  // Where fields share blocks, moments are summed too; those homes are this kernel's other form's.
-  if (s.moments != nullptr && (s.place[home] != 0) != kMoments) return;
-  const int part = blockIdx.x & ((1 << split_shift) - 1);
   __shared__ Word tile[kChannels][kTile];
   __shared__ int32_t neighbour[kNeighbours];
   __shared__ bool slot_shared[kMoments ? kNeighbours : 1];
@@ -204,6 +200,32 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
           if (v != 0) add_units(moments + kContactMoments * node + c, v);
         }
     }
+  }
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
+    p2g_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
+  const SolverClock& clock = *s.clock;
+  // Backwards: what g2p wrote last is still in the cache.
+  const int64_t home = clock.homes - 1 - (blockIdx.x >> split_shift);
+  if (!may_step(clock) || home < 0) return;
+  if (s.moments != nullptr && s.place[home] != 0) return;  // p2g_shared_kernel's
+  p2g_home<T, false>(s, home, blockIdx.x & ((1 << split_shift) - 1), split_shift);
+}
+
+// The homes that touch shared blocks; bound_kernel has listed them in `entry`. Few CTAs, because
+// most scenes have few such homes.
+template <typename T>
+__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
+    p2g_shared_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  const int64_t work = clock.shared_homes << split_shift;
+  for (int64_t i = blockIdx.x; i < work; i += gridDim.x) {
+    p2g_home<T, true>(s, s.entry[i >> split_shift], static_cast<int>(i & ((1 << split_shift) - 1)),
+                      split_shift);
+    __syncthreads();  // the window is used again
   }
 }
 
@@ -403,11 +425,13 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   const unsigned ctas = homes << shift;
   constexpr int kSlotsPerCta = kThreads / kBlockNodes;
   const unsigned slots = static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta);
-  p2g_kernel<T, false><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
-  if (s.moments != nullptr) p2g_kernel<T, true><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
-  if (s.moments != nullptr)
+  p2g_kernel<T><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
+  if (s.moments != nullptr) {
+    p2g_shared_kernel<T><<<min(ctas, kSharedCtas), kP2GThreads, 0, stream>>>(s, shift);
     contact_kernel<T>  // a shared site has two slots at least
-        <<<static_cast<unsigned>((s.slot_capacity + 1) / 2), kBlockNodes, 0, stream>>>(s);
+        <<<min(static_cast<unsigned>((s.slot_capacity + 1) / 2), kSharedCtas), kBlockNodes, 0,
+           stream>>>(s);
+  }
   grid_kernel<T><<<slots, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)

@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-CLOCK_WORDS = 51
+CLOCK_WORDS = 52
 BLOCK_NODES = 64
 NEIGHBOURS = 27
 SITE_FIELDS = 16
@@ -34,7 +34,7 @@ CLOCK = (
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
     "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "slack",
-    "travel", "moved", "dt_most",
+    "travel", "moved", "dt_most", "shared_homes",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}
