@@ -82,9 +82,11 @@ def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> op
     velocity[:, 2] = -3.0
     volume = torch.full((count,), dx**3 / 8, device=device)
     body = None
-    if kind == "two":  # the upper half is another body
+    if kind in ("two", "apart"):  # the upper half is another body; "apart": 0.3 m higher up
         middle = 4 * dx + 0.5 * cells * dx
         body = (x[:, 2] > middle).to(torch.int32)
+        if kind == "apart":
+            x[:, 2] += 4 * round(0.3 / (4 * dx)) * dx * body  # whole blocks
     law = 1 if kind == "nacc" else 0
     return ops.Solver(
         x, velocity, 1000.0 * volume, volume, dx=dx, dt=1e-4, gravity=(0.0, 0.0, -9.8),
@@ -166,7 +168,7 @@ def main() -> int:
     parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
     parser.add_argument("--threads", type=int, default=1, help="CPU; with several: wall time")
     parser.add_argument("--rows", nargs="*", help="grid:cells, for example 200:50")
-    parser.add_argument("--kinds", nargs="*", default=["elastic", "nacc", "two"])
+    parser.add_argument("--kinds", nargs="*", default=["elastic", "nacc", "two", "apart"])
     parser.add_argument("--orders", nargs="*", default=["lattice", "random"])
     parser.add_argument("--peer", type=Path, help="what bench_physgaussian.py wrote")
     parser.add_argument("--json", type=Path)

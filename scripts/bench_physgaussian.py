@@ -97,7 +97,7 @@ def main() -> int:
         rows.append(measure(module, n, cells, order))
         sys.stderr.write(f"{n}^3 {rows[-1]['particles']:,} {order}: {rows[-1]['ms']:.3f} ms\n")
         options.json.write_text(
-            json.dumps({"device": torch.cuda.get_device_name(), "warp": wp.__version__,
+            json.dumps({"device": torch.cuda.get_device_name(), "warp": wp.config.version,
                         "rows": rows}, indent=1) + "\n"
         )  # fmt: skip
     return 0

@@ -35,7 +35,8 @@ GSF_HOST_DEVICE uint64_t bits_of(T value) {
 }
 
 // Step that the state allows: cfl dx / (c + |v|), and dt |grad v| <= limit, but never less than a
-// quarter of the first rule (one wild point must not freeze the scene).
+// quarter of the first rule (one wild point must not freeze the scene), and never more than
+// gravity needs to move a point at rest by cfl cells (dt_most; matter may have no waves).
 GSF_HOST_DEVICE double stable_step(const SolverClock& c, double dx) {
   const double speed = float_of_bits(c.speed), wave = float_of_bits(c.wave);
   const double steepest = float_of_bits(c.gradient);
@@ -44,7 +45,7 @@ GSF_HOST_DEVICE double stable_step(const SolverClock& c, double dx) {
     const double turned = c.gradient_limit / steepest;
     step = max(min(step, turned), 0.25 * step);
   }
-  return step * c.dt_scale;
+  return min(step * c.dt_scale, c.dt_most);
 }
 
 // Length of the step that begins at `from`; 0 when nothing is left. Two even steps stand in for a
@@ -58,12 +59,15 @@ GSF_HOST_DEVICE double choose_step(const SolverClock& c, double from, double dx)
   return 2.0 * step > left ? 0.5 * left : step;
 }
 
+// Steps between two looks at wave speeds where they change slowly.
+constexpr int64_t kWaveSteps = 4;
+
 // Largest values of the step just done have been used; how far a point may move in the next one
 // (twice what it would at the present speed) is kept for the particles near the end of a window.
 GSF_HOST_DEVICE void reset_largest(SolverClock& c, double dx) {
   c.slack = min(0.5, 0.01 + 2.0 * float_of_bits(c.speed) * max(c.dt, c.dt_next) / dx);
   c.speed = 0;
-  if (c.step % 4 == 0) c.wave = c.gradient = 0;  // kWaveSteps: measured anew in the coming step
+  if (c.step % kWaveSteps == 0) c.wave = c.gradient = 0;  // measured anew in the coming step
 }
 
 GSF_HOST_DEVICE bool check_largest(SolverClock& c) {

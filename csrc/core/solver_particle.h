@@ -149,10 +149,11 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
   return b;
 }
 
-// Steps between two looks at wave speeds and gradients: they change over many steps, and the step
-// leaves room (CFL 0.5 of a limit of 1).
-constexpr int64_t kWaveSteps = 4;
-GSF_HOST_DEVICE bool measures_waves(const SolverClock& c) { return c.step % kWaveSteps == 0; }
+// Whether a step looks at wave speeds and gradients: every step for liquids and other laws whose
+// wave speed may rise by half in one step, else every kWaveSteps (CFL 0.5 leaves room).
+GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
+  return laws == kAnyLaw || c.step % kWaveSteps == 0;
+}
 
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
@@ -240,7 +241,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
                                           Largest& largest) {
   return finish_particle<T, kLaws, kTrack>(s, p, particle_before<T, kLaws>(s, p), reach, value,
-                                           first, dt, dt_next, measures_waves(*s.clock),
+                                           first, dt, dt_next, measures_waves(*s.clock, kLaws),
                                            T(s.clock->slack), largest);
 }
 

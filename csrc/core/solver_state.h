@@ -42,7 +42,6 @@ GSF_HOST_DEVICE uint32_t pack_meta(int lx, int ly, int lz, uint32_t row) {
 }
 GSF_HOST_DEVICE int meta_cell(uint32_t meta, int axis) { return int(meta >> (3 * axis) & 7u); }
 GSF_HOST_DEVICE uint32_t meta_row(uint32_t meta) { return meta >> 9; }
-constexpr int64_t kMaxRows = int64_t(1) << 23;
 
 // Key of a block of a field in the hash table; field kMaxSolverFields stands for the site.
 GSF_HOST_DEVICE uint64_t block_key(int32_t x, int32_t y, int32_t z, int32_t field) {
@@ -122,10 +121,12 @@ struct SolverClock {
   double speed_seen, wave_seen;                                // 44, 45
   int64_t leaving;                                             // 46
   double slack;                                                // 47 cells a point may move next
-  double travel;   // 48 how far a collider may have moved since the last build [m]
-  uint64_t moved;  // 49 bits: furthest a collider moved in this step
+  double travel;         // 48 how far a collider may have moved since the last build [m]
+  uint64_t moved;        // 49 bits: furthest a collider moved in this step
+  double dt_most;        // 50 longest automatic step [s]
+  int64_t shared_homes;  // 51 homes whose window touches shared blocks (CUDA)
 };
-constexpr int kClockWords = 50;
+constexpr int kClockWords = 52;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>
@@ -156,8 +157,8 @@ struct SolverView {
   T* deformation;  // [N, 3, 3] total deformation gradient, or null
   int32_t* id;     // [N] row of the particle when it was loaded
   T* spare;        // [N, 9] scratch of the re-sort
-  int32_t* entry;  // [N] scratch
-  int32_t* place;  // [N] scratch
+  int32_t* entry;  // [N] scratch; between builds, on CUDA: the homes that touch shared blocks
+  int32_t* place;  // [N] scratch; between builds, on CUDA: whether home h touches shared blocks
   // materials
   const int32_t* law;  // [rows]
   const T* rows;       // [rows, kRowColumns]

@@ -128,7 +128,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     most = max(most, select<T>(plain & mask, x, P(0)));
   };
   keep(largest.speed2, plain, speed2);
-  if (measures_waves(*s.clock)) {
+  if (measures_waves(*s.clock, kLaws)) {
     P gradient2(0);
     for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
     // elastic_wave_squared

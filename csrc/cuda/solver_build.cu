@@ -38,7 +38,7 @@ __global__ void clear_kernel(const __grid_constant__ SolverView<T> s) {
   }
   if (i == 0) {
     s.clock->wanted_homes = s.clock->wanted_slots = 0;
-    s.clock->sites = s.clock->cursor = s.clock->shared_sites = 0;
+    s.clock->sites = s.clock->cursor = s.clock->shared_sites = s.clock->shared_homes = 0;
   }
 }
 
@@ -323,13 +323,22 @@ __global__ void __launch_bounds__(kThreads)
   });
 }
 
-// Largest contribution and mass of each home, for the units of its window.
+// Largest contribution and mass of each home, for the units of its window, and whether the window
+// touches shared blocks (noted in `place` and `entry`, whose other work is done).
 template <typename T>
 __global__ void __launch_bounds__(kThreads) bound_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.wanted_homes) return;
   const HomeList<T>& homes = s.next_homes();
   home_bounds(s, blockIdx.x, homes.start[blockIdx.x], homes.count[blockIdx.x]);
+  if (s.moments == nullptr || threadIdx.x >= 32) return;
+  const int32_t slot =
+      threadIdx.x < kNeighbours ? s.neighbour[blockIdx.x * kNeighbours + threadIdx.x] : -1;
+  const bool shared = slot >= 0 && slot < s.slot_capacity && s.slot_shared[slot] != 0;
+  const bool any = __any_sync(kAllLanes, shared) != 0;
+  if (threadIdx.x != 0) return;
+  s.place[blockIdx.x] = any ? 1 : 0;
+  if (any) s.entry[add(&s.clock->shared_homes, 1)] = static_cast<int32_t>(blockIdx.x);
 }
 
 template <typename T>

@@ -172,15 +172,10 @@ struct SlotNear {
 // Velocities of the sites that several fields share; `table_mask` lists them. Before grid_kernel,
 // which clears the sums that this one reads, its own and those of the nodes around.
 template <typename T>
-__global__ void __launch_bounds__(kBlockNodes)
-    contact_kernel(const __grid_constant__ SolverView<T> s) {
+__device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t site, HeldSums& held) {
   const SolverClock& clock = *s.clock;
-  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.shared_sites) return;
-  const int64_t site = s.table_mask[blockIdx.x];
   __shared__ int32_t around[kSiteFields][kNeighbours];
   __shared__ ContactSample<T> staged[kStagedFields][kHaloNodes];
-  __shared__ HeldSums held;
-  held.clear();
   const int local = threadIdx.x;
   const T dt = T(clock.dt);
   const int32_t* slots = s.site_slots + site * kSiteFields;
@@ -223,6 +218,20 @@ __global__ void __launch_bounds__(kBlockNodes)
     store_velocity(s, node, velocity[f]);
   }
   if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kBlockNodes)
+    contact_kernel(const __grid_constant__ SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.shared_sites) return;
+  __shared__ HeldSums held;
+  held.clear();
+  __syncthreads();
+  for (int64_t i = blockIdx.x; i < clock.shared_sites; i += gridDim.x) {
+    contact_site(s, s.table_mask[i], held);
+    __syncthreads();  // what lies in shared memory is used again
+  }
   held.hand_over(s);
 }
 

@@ -13,6 +13,7 @@ constexpr int kThreads = kSolverThreads;
 // H100 (docs/benchmarks.md).
 constexpr int kP2GThreads = 128, kP2GCtas = 8;
 constexpr int kG2PThreads = 256, kG2PCtas = 3;
+constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared blocks need
 // Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.
 constexpr int kStrideX = 68, kStrideY = 8;
 constexpr int kTile = kWindowEdge * kStrideX;
@@ -29,7 +30,6 @@ struct Fixed<float> {
 template <>
 struct Fixed<double> {
   using Word = long long;
-  static constexpr int kBits = 61;
   static __device__ Word round(double v) { return __double2ll_rn(v); }
   static __device__ void add(Word* p, Word v) {
     atomicAdd(reinterpret_cast<unsigned long long*>(p), static_cast<unsigned long long>(v));
@@ -40,8 +40,10 @@ struct Fixed<double> {
 // window uses the unit of the step itself.
 template <typename T>
 __device__ double window_unit(double bound, double share, int64_t count, double step_unit) {
-  if (sizeof(T) == 8) return step_unit;
-  return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
+  if constexpr (sizeof(T) == 8)
+    return step_unit;
+  else
+    return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
 }
 
 // Brings the line at p near; nothing waits for it.
@@ -90,7 +92,7 @@ struct WindowUnits {
   __device__ void choose(const SolverView<T>& s, int64_t home, int64_t count) {
     const SolverClock& clock = *s.clock;
     const double unit = window_unit<T>(s.home_bound[home], 0.43, count, clock.momentum_unit);
-    const double mass = window_unit<T>(s.home_mass[home], 1.0, count, clock.mass_unit);
+    const double mass = window_unit<T>(s.home_mass[home], 0.43, count, clock.mass_unit);
     per_momentum = T(1.0 / unit);
     per_mass = T(1.0 / mass);
     momentum_shift = ilogb(unit) - ilogb(clock.momentum_unit);
@@ -110,16 +112,13 @@ struct ParticleGiven {
   }
 };
 
+// One home, or part of it. Where its window touches blocks that fields share, moments are summed
+// too.
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
-    p2g_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
+__device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, int part,
+                                         int split_shift) {
   using Word = typename Fixed<T>::Word;
   constexpr int kChannels = kMoments ? 4 + kContactMoments : 4;
-  const SolverClock& clock = *s.clock;
-  // Backwards: what g2p wrote last is still in the cache.
-  const int64_t home = clock.homes - 1 - (blockIdx.x >> split_shift);
-  if (!may_step(clock) || home < 0) return;
-  const int part = blockIdx.x & ((1 << split_shift) - 1);
   __shared__ Word tile[kChannels][kTile];
   __shared__ int32_t neighbour[kNeighbours];
   __shared__ bool slot_shared[kMoments ? kNeighbours : 1];
@@ -132,21 +131,14 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
   ParticleGiven<T> given;
   if (first >= 0 && r < count) given.read(s, first + r);  // while the window is cleared
   for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
-  bool shared_here = false;
   if (threadIdx.x < kNeighbours) {
     const int32_t slot = s.neighbour[home * kNeighbours + threadIdx.x];
     neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
-    if constexpr (kMoments) {
-      shared_here = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
-      slot_shared[threadIdx.x] = shared_here;
-    }
+    if constexpr (kMoments)
+      slot_shared[threadIdx.x] = neighbour[threadIdx.x] >= 0 && s.slot_shared[slot] != 0;
   }
   if (threadIdx.x == kP2GThreads - 1) units.choose(s, home, count);
-  bool with_moments = false;
-  if constexpr (kMoments)
-    with_moments = __syncthreads_or(shared_here) != 0;
-  else
-    __syncthreads();
+  __syncthreads();
   const T per_unit = units.per_momentum, per_mass = units.per_mass;
   while (first >= 0 && r < count) {
     const uint32_t row = meta_row(given.meta) < uint64_t(s.row_count) ? meta_row(given.meta) : 0;
@@ -175,11 +167,9 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
                                                q.slope(c, 1) * T(j) + q.slope(c, 2) * T(k))));
           Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
           if constexpr (kMoments) {
-            if (with_moments) {
-              const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
-              for (int c = 0; c < kContactMoments; ++c)
-                Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
-            }
+            const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
+            for (int c = 0; c < kContactMoments; ++c)
+              Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
           }
         }
     r += stride;
@@ -194,8 +184,7 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
     const int at = window_node(index, i, j, k);
     // All channels: the mass of a part of the home may round to nothing where others do not.
     Word any = tile[0][at] | tile[1][at] | tile[2][at] | tile[3][at];
-    if constexpr (kMoments)
-      if (with_moments) any |= tile[4][at] | tile[5][at] | tile[6][at];
+    if constexpr (kMoments) any |= tile[4][at] | tile[5][at] | tile[6][at];
     if (any == 0) continue;
     const int64_t node = slot_node(neighbour, i, j, k);
     if (node < 0) continue;
@@ -205,12 +194,38 @@ __global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
     }
     if constexpr (kMoments) {
       // Only shared slots: nobody would clear the moments of the others.
-      if (with_moments && slot_shared[neighbour_of(i, j, k)])
+      if (slot_shared[neighbour_of(i, j, k)])
         for (int c = 0; c < kContactMoments; ++c) {
           const long long v = to_units(tile[4 + c][at], mass_shift);
           if (v != 0) add_units(moments + kContactMoments * node + c, v);
         }
     }
+  }
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
+    p2g_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
+  const SolverClock& clock = *s.clock;
+  // Backwards: what g2p wrote last is still in the cache.
+  const int64_t home = clock.homes - 1 - (blockIdx.x >> split_shift);
+  if (!may_step(clock) || home < 0) return;
+  if (s.moments != nullptr && s.place[home] != 0) return;  // p2g_shared_kernel's
+  p2g_home<T, false>(s, home, blockIdx.x & ((1 << split_shift) - 1), split_shift);
+}
+
+// The homes that touch shared blocks; bound_kernel has listed them in `entry`. Few CTAs, because
+// most scenes have few such homes.
+template <typename T>
+__global__ void __launch_bounds__(kP2GThreads, kP2GCtas)
+    p2g_shared_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  const int64_t work = clock.shared_homes << split_shift;
+  for (int64_t i = blockIdx.x; i < work; i += gridDim.x) {
+    p2g_home<T, true>(s, s.entry[i >> split_shift], static_cast<int>(i & ((1 << split_shift) - 1)),
+                      split_shift);
+    __syncthreads();  // the window is used again
   }
 }
 
@@ -313,7 +328,7 @@ __global__ void __launch_bounds__(kG2PThreads, kG2PCtas)
   const int64_t count = min(int64_t(homes.count[home]), s.count - first);
   const T dt = T(clock.dt), dt_next = T(clock.dt_next);
   const int64_t arrivals = clock.homes << split_shift;
-  const bool waves = measures_waves(clock);
+  const bool waves = measures_waves(clock, kLaws);
   const T slack = T(clock.slack);
   const int32_t* neighbour = s.neighbour + home * kNeighbours;
   const uint32_t reach = reach_of_row(neighbour);
@@ -410,13 +425,13 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   const unsigned ctas = homes << shift;
   constexpr int kSlotsPerCta = kThreads / kBlockNodes;
   const unsigned slots = static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta);
-  if (s.moments != nullptr)
-    p2g_kernel<T, true><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
-  else
-    p2g_kernel<T, false><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
-  if (s.moments != nullptr)
+  p2g_kernel<T><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
+  if (s.moments != nullptr) {
+    p2g_shared_kernel<T><<<min(ctas, kSharedCtas), kP2GThreads, 0, stream>>>(s, shift);
     contact_kernel<T>  // a shared site has two slots at least
-        <<<static_cast<unsigned>((s.slot_capacity + 1) / 2), kBlockNodes, 0, stream>>>(s);
+        <<<min(static_cast<unsigned>((s.slot_capacity + 1) / 2), kSharedCtas), kBlockNodes, 0,
+           stream>>>(s);
+  }
   grid_kernel<T><<<slots, kThreads, 0, stream>>>(s);
   const bool track = s.deformation != nullptr;
   if (law_set == kElasticOnly && !track)

@@ -226,13 +226,19 @@ class SolveSettings:
     LATER: ClassVar[dict[str, str]] = {
         "error": "choosing the setting by an error bound",
         "seconds_per_frame": "choosing the setting by a time budget",
-        "deterministic": "choosing the order of sums on the GPU",
     }
     quality: str = key(
         choice("preview", "shot", "hero"),
         default="shot",
         doc="Size of the cells of the grid.",
         example="preview",
+    )
+    deterministic: bool = key(
+        flag,
+        default=False,
+        doc="Insist on the same bits from the same input on the same device. The solver gives them "
+        "anyway; a blade at work on a GPU does not, and is refused then.",
+        example="true",
     )
 
 

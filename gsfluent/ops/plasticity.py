@@ -95,6 +95,15 @@ def _viscous(law: Tensor, params: Tensor) -> bool:
     return found
 
 
+def check_params(op: str, law: Tensor, params: Tensor) -> None:
+    """Refuse laws and parameters that are none.
+
+    Raises:
+        ValueError: An unknown law, or a parameter out of its range.
+    """
+    _check_values(op, law, params, None)
+
+
 def _check_material(
     op: str, count: int, like: Tensor, law: Tensor, params: Tensor, material: Tensor | None
 ) -> None:

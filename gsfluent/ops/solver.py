@@ -23,7 +23,8 @@ from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
-from gsfluent.ops.collider import RESTITUTION, pad_colliders
+from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
+from gsfluent.ops.plasticity import check_params
 from gsfluent.ops.solver_state import ELASTIC, NACC, UNBROKEN, SolverState
 
 LAWS = 7
@@ -48,8 +49,8 @@ _REASONS = {
 def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
     """Refuse what would make energy: see docs/contact.md."""
     rows = None if colliders is None else pad_colliders(colliders)
-    bounces = rows is not None and bool((rows[:, RESTITUTION] != 0).any())
-    if contact != 0.0 or bounces:
+    bounces = rows is not None and bool((rows[:, RESTITUTION] > 0).any())
+    if contact > 0.0 or bounces:
         raise ValueError(
             f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: given back "
             "at nodes in every step of a lasting contact it makes energy (docs/contact.md); how "
@@ -174,6 +175,13 @@ class Solver(SolverState):
             raise ValueError(f"{op}: cfl must lie in (0, 1], got {cfl}")
         if dt is not None and not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"{op}: dt must be positive, got {dt}")
+        for name, number, least, most in (
+            ("friction", friction, 0.0, math.inf), ("restitution", restitution, 0.0, 1.0),
+            ("contact_gap", contact_gap, 0.0, math.inf), ("k", k, 0.0, math.inf),
+            ("gradient_limit", gradient_limit, 1e-6, math.inf), ("epsilon", epsilon, 0.0, 0.999),
+        ):  # fmt: skip
+            if not least <= number <= most:
+                raise ValueError(f"{op}: {name} must lie in [{least:g}, {most:g}], got {number}")
         laws = set(law.tolist())
         if not laws <= set(range(LAWS)):
             raise ValueError(f"{op}: law must lie in 0 to {LAWS - 1}, got {sorted(laws)}")
@@ -182,13 +190,16 @@ class Solver(SolverState):
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
         self._fixed = dt
-        self._primed = False
 
         self._params, self._law = params.to(velocity), law.to(self.device)
+        check_params(op, self._law, self._params)
+        if not bool((self._params[:, 6] > 0).all()):
+            raise ValueError(f"{op}: density (params column 6) must be positive")
         row, rows, row_law = self._rows(material, mass, volume)
         b = layout.empty_buffers(velocity, n)
         b.law, b.rows = row_law, rows
         if colliders is not None and colliders.shape[0] > 0:
+            check_colliders(op, pad_colliders(colliders), 0 if sdf is None else sdf.shape[0])
             b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
             b.collider_state = pad_colliders(colliders).to(self.device, torch.float64).clone()
             shape = (colliders.shape[0], layout.IMPULSE_SUMS)
@@ -223,6 +234,7 @@ class Solver(SolverState):
         bits = min(52, 62 - max(0, math.ceil(math.log2(0.43 * n))))
         self._write(
             cfl=cfl, gradient_limit=gradient_limit, dt_scale=1.0, dt_fixed=dt or 0.0,
+            dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
 
@@ -243,7 +255,7 @@ class Solver(SolverState):
             colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
 
         Raises:
-            ValueError: Another number of rows.
+            ValueError: Another number of rows, or rows that are no collider.
         """
         _no_restitution("Solver.set_colliders", 0.0, colliders)
         rows, have = pad_colliders(colliders), self._buffers.colliders
@@ -253,6 +265,7 @@ class Solver(SolverState):
                 f"got {list(rows.shape)}"
             )
         if rows.numel():
+            check_colliders("Solver.set_colliders", rows, self._buffers.sdf.shape[0])
             have.copy_(rows)
             self._buffers.collider_state.copy_(rows)
 

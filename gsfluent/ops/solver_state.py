@@ -6,6 +6,8 @@ order changes from build to build; here they come back in the order they were gi
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -49,7 +51,6 @@ class SolverState:
     _unused: dict[str, Tensor]
     """alpha and peak where no law uses them, as given."""
     _law_set: int
-    _primed: bool
 
     # --- loading ---
 
@@ -123,7 +124,6 @@ class SolverState:
         b.home_count0[:homes] = counts.to(torch.int32)
         b.home_start0[:homes] = (torch.cumsum(counts, 0) - counts).to(torch.int32)
         self._write(homes=homes, parity=0, rebuild=1, done=1, grow=0, reason=0)
-        self._primed = False
 
     @staticmethod
     def _keys(block: Tensor, field: Tensor) -> Tensor:
@@ -187,6 +187,8 @@ class SolverState:
 
     @dt_scale.setter
     def dt_scale(self, value: float) -> None:
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"Solver: dt_scale must be positive, got {value}")
         self._write(dt_scale=value)
 
     def memory(self) -> int:

@@ -87,7 +87,12 @@ def simulate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         scene = build_scene(shot, load_solids(context), context.frame)
-        stage = Simulate(quality=shot.solve.quality, seed=context.seed, device=context.device)
+        stage = Simulate(
+            quality=shot.solve.quality,
+            seed=context.seed,
+            device=context.device,
+            deterministic=shot.solve.deterministic,
+        )
         state = folder / _STATE
         resume = state if state.is_file() and count_frames(folder) > 0 else None
         frames = stage(

@@ -138,6 +138,8 @@ class Simulate(Stage):
         law_kernels: Use kernels made for elastic and brittle matter where there is no other.
         contact_near: Leave out contact where no two bodies or pieces are near each other; False
             is for comparison: the composed operators then look for contact at every node.
+        deterministic: Refuse what cannot give the same bits from the same input on the same
+            device: the composed operators on a GPU, whose sums have no order.
         repair: Add transition splats along cracks to ``frame.gaussians``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
         return_map: Options of :func:`gsfluent.ops.return_mapping`.
@@ -169,6 +171,7 @@ class Simulate(Stage):
         irreversible: bool = True,
         law_kernels: bool = True,
         contact_near: bool = True,
+        deterministic: bool = False,
         repair: bool = True,
         splats: bool = True,
         return_map: dict[str, float | bool] | None = None,
@@ -199,6 +202,7 @@ class Simulate(Stage):
             "irreversible": irreversible,
             "law_kernels": law_kernels,
             "contact_near": contact_near,
+            "deterministic": deterministic,
             "return_map": return_map,
         }
         self._run: Run | None = None

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsfluent.errors import InputError
 from gsfluent.pipeline.blades import BladeSet
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
@@ -59,6 +60,7 @@ class Stepper:
         law_kernels: Whether kernels made for fewer laws are used where these are all.
         contact_near: Whether the contact pass is left out where no two fields are near; if not,
             the composed operators take it in every step.
+        deterministic: Whether the composed operators are refused on a GPU.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
     """
@@ -77,11 +79,13 @@ class Stepper:
         irreversible: bool = True,
         law_kernels: bool = True,
         contact_near: bool = True,
+        deterministic: bool = False,
         return_map: dict[str, Any] | None = None,
     ) -> None:
         self.scene, self.matter = scene, matter
         self.free_flight, self.separate_fragments = free_flight, separate_fragments
         self._resident = resident and contact_near
+        self._ordered = deterministic and matter.particles.device.type == "cuda"
         self._settings = Settings(cfl, irreversible, return_map, law_kernels, contact_near)
         self.counters = Counters()
         self.dt_scale = 1.0
@@ -178,6 +182,13 @@ class Stepper:
             state = self._without_grid(state, until)
         else:
             make = Resident if self._resident_now(state) else Composed
+            if make is Composed and self._ordered:
+                raise InputError(
+                    f"simulate: from t = {state.time:.4g} s on the scene needs operators whose "
+                    "sums have no order on a GPU (a blade at work, or a free body lighter than "
+                    "what it meets), but deterministic was asked for",
+                    mend="leave out solve.deterministic, or run on the CPU",
+                )
             if not isinstance(self._engine, make):
                 settings = self._settings._replace(dt_scale=self.dt_scale)
                 self._engine = make(

@@ -157,7 +157,6 @@ def test_unknown_keys_name_their_path_and_the_nearest(
     [
         {"solve": {"error": 0.03}},
         {"solve": {"seconds_per_frame": 0.5}},
-        {"solve": {"deterministic": True}},
         {"output": {"what": ["usd"]}},
     ],
 )

@@ -11,6 +11,7 @@ from simulation_scenes import SOFT, at, near_miss, resting
 from simulation_shapes import ellipsoid
 
 from gsfluent import has_cuda, materials
+from gsfluent.errors import InputError
 from gsfluent.pipeline.run_simulate import saved
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.scene import Scene
@@ -122,3 +123,18 @@ def test_trouble_on_the_gpu_is_healed_and_placed() -> None:
     report = simulate.report()
     assert report["verdict"] == "healed" and len(frames) == 4
     assert "box (" in report["reason"] and "went back to" in report["reason"]
+
+
+@pytest.mark.parametrize("make", [smashed, lambda: shot(True)])
+def test_the_same_run_gives_the_same_bits(make: Callable[[], Scene]) -> None:
+    ends = []
+    for _ in range(2):
+        simulate = Simulate(dx=0.02, device="cuda", deterministic=True)
+        ends.append(list(simulate(make(), fps=100, seconds=0.03))[-1])
+    assert torch.equal(ends[0].particles.position, ends[1].particles.position)
+    assert torch.equal(ends[0].particles.velocity, ends[1].particles.velocity)
+
+
+def test_what_has_no_order_on_a_gpu_is_refused_when_bits_matter() -> None:
+    with pytest.raises(InputError, match="no order on a GPU"):
+        list(Simulate(dx=0.02, device="cuda", deterministic=True)(cut(), fps=25, seconds=0.16))

@@ -19,8 +19,8 @@ WINDOW_BITS = 30
 """The words of all points of a home fit into 2^30 units of its window."""
 MOMENTUM_SHARE = 0.43
 """Of its bound, that one point gives to one node at most: more than (3/4)^3, the largest weight."""
-MASS_SHARE = 1.0
-"""The same for masses."""
+MASS_SHARE = 0.43
+"""The same for masses; of first moments, in cells, a point gives less."""
 ROUNDED_UP = 1.000002
 """Factor on a float32 bound, so that it is never below what it stands for."""
 

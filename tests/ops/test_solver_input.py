@@ -1,0 +1,59 @@
+"""The resident solver refuses what it cannot run, before it runs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from solver_scenes import scene
+
+from gsfluent import ops
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"friction": NAN}, "friction"),
+        ({"restitution": 1.5}, "restitution"),
+        ({"contact_gap": -1.0}, "contact_gap"),
+        ({"gradient_limit": 0.0}, "gradient_limit"),
+        ({"epsilon": 1.0}, "epsilon"),
+        ({"k": -1.0}, "k must"),
+        ({"colliders": torch.full((1, 32), NAN)}, "colliders row 0"),
+        ({"params": torch.tensor([[NAN, 1.0, 0, 0, 0, 0, 1e3, 0]])}, "mu"),
+        ({"params": torch.tensor([[1e4, -1.0, 0, 0, 0, 0, 1e3, 0]])}, "kappa"),
+        ({"params": torch.tensor([[1e4, 1e4, 0, 0, 0, 0, 0.0, 0]])}, "density"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(change: dict[str, Any], match: str) -> None:
+    given = scene(cells=2, dtype=torch.float32)
+    with pytest.raises(ValueError, match=match):
+        ops.Solver(**(given | change))
+
+
+def test_the_largest_field_runs_and_the_next_is_refused() -> None:
+    given = scene(cells=2, dtype=torch.float32)
+    given["body"] = given["body"] + 4093
+    ops.Solver(**given).advance(steps=1)
+    given["body"] = given["body"] + 1
+    with pytest.raises(ValueError, match="body must lie in 0 to 4093"):
+        ops.Solver(**given)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, NAN, math.inf])
+def test_a_time_step_scale_that_is_none_is_refused(value: float) -> None:
+    solver = ops.Solver(**scene(cells=2, dtype=torch.float32))
+    with pytest.raises(ValueError, match="dt_scale"):
+        solver.dt_scale = value
+
+
+def test_a_sphere_that_is_none_is_refused_between_calls() -> None:
+    solver = ops.Solver(**scene(cells=2, dtype=torch.float32))
+    rows = solver.colliders
+    rows[0, 0] = 1.0  # a sphere without a radius
+    with pytest.raises(ValueError, match="set_colliders"):
+        solver.set_colliders(rows)
