@@ -19,7 +19,8 @@ from gsfluent import ops
 from gsfluent.ops.reference import fixed_point as fixed
 from gsfluent.ops.solver_buffers import MAX_PARTICLES
 
-KERNEL = (Path(__file__).parents[2] / "csrc/cuda/solver_step.cu").read_text(encoding="utf-8")
+CUDA = Path(__file__).parents[2] / "csrc" / "cuda"
+KERNEL = "\n".join(p.read_text(encoding="utf-8") for p in sorted(CUDA.glob("solver_*")))
 WEIGHT = Fraction(3, 4) ** 3
 """Largest weight of a quadratic B-spline in three dimensions."""
 
@@ -58,7 +59,7 @@ def primed(given: dict[str, Any]) -> tuple[fixed.Transfer, dict[str, float]]:
 def test_the_constants_are_those_of_the_kernel() -> None:
     def found(pattern: str) -> float:
         match = re.search(pattern, KERNEL)
-        assert match, f"{pattern} is not in solver_step.cu"
+        assert match, f"{pattern} is not in csrc/cuda/solver_*"
         return float(match.group(1))
 
     assert found(r"Fixed<float> \{[^}]*kBits = (\d+);") == fixed.WINDOW_BITS
