@@ -21,11 +21,11 @@ GSF_HOST_DEVICE Stencil<T> stencil_at(const T* offset) {
   Stencil<T> s{};
   for (int axis = 0; axis < 3; ++axis) {
     const T o = offset[axis];
-    const T a = T(1) - o, b = o - T(0.5);
+    const T a = T(1) - o;
     s.f[axis] = o + T(0.5);
     s.w[axis][0] = T(0.5) * a * a;
-    s.w[axis][1] = T(0.75) - b * b;
     s.w[axis][2] = T(0.5) * o * o;
+    s.w[axis][1] = T(1) - s.w[axis][0] - s.w[axis][2];  // the sum is one to the last bit
   }
   return s;
 }
