@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.ops.solver_state import WEAKENING
 
 __all__ = ["Scene", "Stepper", "automatic_dt", "wave_speed"]
 
@@ -24,8 +25,6 @@ REACH = 3.0
 away, and those receive from points up to 1.5 further."""
 GRADIENT_LIMIT = 0.3
 """Largest ``dt |grad v|`` of one automatic step."""
-WEAKENING = 0.02
-"""Range of alpha past zero over which a broken point loses its cohesion for good."""
 LAW_FLUID = 4
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Particles
+from gsfluent.ops.solver_state import WEAKENING
 from gsfluent.pipeline.blades import BladeSet
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
@@ -27,8 +28,6 @@ GRADIENT_LIMIT = 0.3
 """Largest ``dt |grad v|`` of intact matter in one step."""
 REFRESH = 5
 """Steps between two looks at speeds and stiffness (each one waits for the device)."""
-WEAKENING = 0.02
-"""Range of alpha past zero over which a broken point loses its cohesion for good."""
 
 
 class Composed:

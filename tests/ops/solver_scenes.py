@@ -1,4 +1,4 @@
-"""Scenes for the tests of the resident solver, and the same steps composed of the old operators."""
+"""Scenes for the tests of the resident solver, and the same steps by the composed operators."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def bullet(position: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def composed(arguments: dict[str, Any], dt: float, steps: int) -> dict[str, Tensor]:
-    """The same steps by the old operators, in the dtype of the velocities."""
+    """The same steps by the composed operators, in the dtype of the velocities."""
     a = arguments
     dx, body, law, params = a["dx"], a["body"], a["law"], a["params"]
     x, v = a["position"].to(a["velocity"]), a["velocity"]

@@ -1,4 +1,4 @@
-"""The resident solver on the CPU against the same steps by the old operators, and its promises."""
+"""The resident solver on the CPU against the composed operators, and its promises."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The resident solver on a GPU against the same steps by the old operators, and its guarantees."""
+"""The resident solver on a GPU against the composed operators, and its guarantees."""
 
 from __future__ import annotations
 
