@@ -99,12 +99,15 @@ template <typename T>
 GSF_HOST_DEVICE double end_collider(const SolverView<T>& s, int64_t k, const double* sums,
                                     double dt) {
   double* total = s.impulse + k * kImpulseSums;
-  for (int i = 0; i < 6; ++i) total[i] += sums[i];
-  total[6] = sums[6];
+  double before[6];  // loads first, then stores: they need not wait for each other
+  for (int i = 0; i < 6; ++i) before[i] = total[i];
   double* row = s.collider_state + k * kColliderColumns;
-  const Vec3<double> gravity{double(s.gravity[0]), double(s.gravity[1]), double(s.gravity[2])};
   const Vec3<double> v = load_vec3(row + kVelocity), w = load_vec3(row + kAngularVelocity);
-  if (!(row[kMass] > 0.0) && dot(v, v) == 0.0 && dot(w, w) == 0.0) return 0.0;
+  const double mass = row[kMass];
+  for (int i = 0; i < 6; ++i) total[i] = before[i] + sums[i];
+  total[6] = sums[6];
+  const Vec3<double> gravity{double(s.gravity[0]), double(s.gravity[1]), double(s.gravity[2])};
+  if (!(mass > 0.0) && dot(v, v) == 0.0 && dot(w, w) == 0.0) return 0.0;
   advance_collider(row, dt, load_vec3(sums), load_vec3(sums + 3), gravity);
   for (int i = 0; i < kColliderColumns; ++i) s.colliders[k * kColliderColumns + i] = T(row[i]);
   const double bound = collider_bound(row), turning = norm(load_vec3(row + kAngularVelocity));

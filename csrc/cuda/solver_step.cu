@@ -6,29 +6,30 @@ namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = kSolverThreads;
-constexpr int kG2PThreads = 256, kG2PCtas = 3;  // as kP2GThreads
+constexpr int kG2PThreads = 128;  // as kP2GThreads
+// CTAs of a multiprocessor: more for the laws that need fewer registers.
+constexpr int g2p_ctas(int laws) { return laws == kElasticOnly ? 7 : 6; }
 
 // Brings the line at p near; nothing waits for it.
 __device__ inline void prefetch(const void* p) {
   asm volatile("prefetch.global.L1 [%0];" ::"l"(p));
 }
 
-// Maxima of a step, for the clock and the home. One warp calls.
+// Maxima of a step, for the clock and the home. One warp calls; each lane sees to one of them.
 template <typename T>
 __device__ void hand_over(const SolverView<T>& s, const unsigned (&bits)[4], int64_t home,
                           bool moving) {
-  if ((threadIdx.x & 31) != 0) return;
+  const int lane = threadIdx.x & 31;
   SolverClock& c = *s.clock;
-  if (moving) {
-    raise_to(&c.speed, root_up(bits[0]));
-    raise_to(&c.wave, root_up(bits[1]));
-    raise_to(&c.gradient, root_up(bits[2]));
-  }
-  if (home >= 0) {
+  if (lane < 3 && moving)
+    raise_to(lane == 0 ? &c.speed : (lane == 1 ? &c.wave : &c.gradient),
+             root_up(lane == 0 ? bits[0] : (lane == 1 ? bits[1] : bits[2])));
+  if (lane == 3 && home >= 0) {
     const float bound = __uint_as_float(bits[3]) * 1.000002f;
     raise_real(s.home_bound + home, T(bound));
     raise_to(&c.bound, __float_as_uint(bound));
   }
+  __syncwarp();
 }
 
 // What the last warp of a step does: colliders move on, then time. Out of line, so that g2p does
@@ -37,10 +38,13 @@ template <typename T>
 __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   const int lane = threadIdx.x & 31;
   for (int64_t k = lane; k < s.collider_count; k += 32) {
+    // All loads before the first store, so that they are under way together.
+    int64_t units[kImpulseSums];
+    for (int i = 0; i < kImpulseSums; ++i) units[i] = s.impulse_units[kImpulseSums * k + i];
     double sums[kImpulseSums];
     for (int i = 0; i < kImpulseSums; ++i) {
-      sums[i] = double(s.impulse_units[kImpulseSums * k + i]) * sum_unit(s, i);
-      s.impulse_units[kImpulseSums * k + i] = 0;
+      sums[i] = double(units[i]) * sum_unit(s, i);
+      if (units[i] != 0) s.impulse_units[kImpulseSums * k + i] = 0;
     }
     const double moved = end_collider(s, k, sums, s.clock->dt);
     if (moved > 0.0) raise_to(&s.clock->moved, sortable(float(moved) * 1.000001f));
@@ -98,7 +102,7 @@ __device__ __forceinline__ void gather(const Stencil<T>& st, const T (&tile)[3][
 }
 
 template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kG2PThreads, kG2PCtas)
+__global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws))
     g2p_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
   const SolverClock& clock = *s.clock;
   const int64_t home = blockIdx.x >> split_shift;
