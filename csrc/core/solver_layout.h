@@ -92,18 +92,9 @@ GSF_HOST_DEVICE void load_motion(const SolverView<T>& s, int64_t p, T* velocity,
 #ifdef __CUDA_ARCH__
   const Quad<T> a = quad_plane(s, s.velocity, 0)[p], b = quad_plane(s, s.velocity, 1)[p],
                 c = quad_plane(s, s.velocity, 2)[p];
-  velocity[0] = a.x;
-  velocity[1] = a.y;
-  velocity[2] = a.z;
-  slope[0] = a.w;
-  slope[1] = b.x;
-  slope[2] = b.y;
-  slope[3] = b.z;
-  slope[4] = b.w;
-  slope[5] = c.x;
-  slope[6] = c.y;
-  slope[7] = c.z;
-  slope[8] = c.w;
+  const T values[12] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w};
+  for (int i = 0; i < 3; ++i) velocity[i] = values[i];
+  for (int i = 0; i < 9; ++i) slope[i] = values[3 + i];
 #else
   for (int c = 0; c < 3; ++c) velocity[c] = s.velocity[3 * p + c];
   for (int c = 0; c < 9; ++c) slope[c] = s.slope[9 * p + c];

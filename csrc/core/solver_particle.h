@@ -30,6 +30,44 @@ GSF_HOST_DEVICE Stencil<T> stencil_at(const T* offset) {
   return s;
 }
 
+// Gathers value = sum w v and first = sum w v (node - particle), in cells: along z, then y, then x.
+// The weights of an axis sum to one and their first moments to zero, so each sum is taken of
+// differences to the middle node: what all nodes share goes through without a rounding, and bodies
+// that fly or spin freely keep their momentum longer.
+//   node(c, i, j, k)                     component c of the velocity of a stencil node
+//   row(middle, w0, below, w2, above)    middle + w0 below + w2 above, in the order that is best
+//                                        where it runs: most of the additions are there
+template <typename T, typename Node, typename Row>
+GSF_HOST_DEVICE void gather_stencil(const Stencil<T>& s, const Node& node, const Row& row, T* value,
+                                    Mat3<T>& first) {
+  T lever[3][3];  // w (node - particle) of each axis
+  for (int axis = 0; axis < 3; ++axis)
+    for (int n = 0; n < 3; ++n) lever[axis][n] = s.w[axis][n] * (T(n) - s.f[axis]);
+  const T* w = s.w[0];
+  // One component at a time: its sums and the weights along z stay in registers.
+  for (int c = 0; c < 3; ++c) {
+    T plane[3], plane_y[3], plane_z[3];
+    for (int i = 0; i < 3; ++i) {
+      T line[3], line_z[3];
+      for (int j = 0; j < 3; ++j) {
+        const T middle = node(c, i, j, 1);
+        const T below = node(c, i, j, 0) - middle, above = node(c, i, j, 2) - middle;
+        line[j] = row(middle, s.w[2][0], below, s.w[2][2], above);
+        line_z[j] = lever[2][0] * below + lever[2][2] * above;
+      }
+      const T below = line[0] - line[1], above = line[2] - line[1];
+      plane[i] = line[1] + (s.w[1][0] * below + s.w[1][2] * above);
+      plane_y[i] = lever[1][0] * below + lever[1][2] * above;
+      plane_z[i] = s.w[1][0] * line_z[0] + s.w[1][1] * line_z[1] + s.w[1][2] * line_z[2];
+    }
+    const T below = plane[0] - plane[1], above = plane[2] - plane[1];
+    value[c] = plane[1] + (w[0] * below + w[2] * above);
+    first(c, 0) = lever[0][0] * below + lever[0][2] * above;
+    first(c, 1) = w[0] * plane_y[0] + w[1] * plane_y[1] + w[2] * plane_y[2];
+    first(c, 2) = w[0] * plane_z[0] + w[1] * plane_z[1] + w[2] * plane_z[2];
+  }
+}
+
 // Momentum given to stencil node n in {0, 1, 2}^3 before its weight: constant + slope n.
 template <typename T>
 GSF_HOST_DEVICE ParticleMomentum<T> momentum_given(const Stencil<T>& s, const T* velocity,
@@ -141,7 +179,7 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
   ParticleBefore<T> b;
   b.meta = load_place(s, p, b.offset);
   b.strain = load_strain(s, p);
-  b.row = meta_row(b.meta) < uint64_t(s.row_count) ? meta_row(b.meta) : 0;
+  b.row = s.row_of(b.meta);
   if constexpr (kLaws != kElasticOnly) {
     b.alpha = s.alpha[p];
     b.peak = s.peak[p];
@@ -251,7 +289,7 @@ template <typename T>
 GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool measure, T dt,
                                     Largest& largest) {
   const uint32_t meta = load_meta(s, p);
-  const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
+  const uint32_t row = s.row_of(meta);
   const T* r = s.rows + int64_t(row) * kRowColumns;
   const T mass = r[kMassColumn];
   const T alpha = s.alpha != nullptr ? s.alpha[p] : T(0),

@@ -191,6 +191,10 @@ struct SolverView {
   double* impulse;  // [K, kImpulseSums] impulse [N s] and torque [N m s] since the load, then
                     // the mass touched in the last step [kg]
 
+  // Row of the particle with this meta word; garbage rows count as the first.
+  GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {
+    return meta_row(meta) < uint64_t(row_count) ? meta_row(meta) : 0;
+  }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }
 };

@@ -137,22 +137,6 @@ struct Packet {
   }
 };
 
-// Stencils of a packet: stencil_at of every lane. `slope` weights are w (node - f).
-template <typename T>
-Stencil<Pack<T>> packet_stencil(const Pack<T>* offset) {
-  Stencil<Pack<T>> s;
-  for (int axis = 0; axis < 3; ++axis) {
-    const Pack<T> o = offset[axis];
-    const Pack<T> a = Pack<T>(1) - o;
-    s.f[axis] = o + Pack<T>(0.5);
-    s.w[axis][0] = Pack<T>(0.5) * a * a;
-    s.w[axis][2] = Pack<T>(0.5) * o * o;
-    // Their sum is one, as the gather takes for granted.
-    s.w[axis][1] = Pack<T>(1) - s.w[axis][0] - s.w[axis][2];
-  }
-  return s;
-}
-
 // What the lanes of a packet give to nodes, laid out for one lane at a time.
 template <typename T>
 struct PacketMomentum {
@@ -169,11 +153,9 @@ struct PacketMomentum {
     p.load3(s.offset, offset);
     p.load3(s.velocity, velocity);
     p.load9(s.slope, slope.m);
-    const Stencil<Pack<T>> stencil = packet_stencil(offset);
+    const Stencil<Pack<T>> stencil = stencil_at(offset);
     const auto row = [&](int lane) {
-      return s.rows +
-             (meta_row(p.meta[lane]) < uint64_t(s.row_count) ? meta_row(p.meta[lane]) : 0) *
-                 int64_t(kRowColumns);
+      return s.rows + int64_t(s.row_of(p.meta[lane])) * kRowColumns;
     };
     const Pack<T> mass = p.same_rows()
                              ? Pack<T>(row(0)[kMassColumn])
@@ -284,39 +266,19 @@ struct PacketGathered {
   Mat3<Pack<T>> first;
 };
 
-// Gathers for lanes that share the cell whose stencil begins at `node`. The weights along an axis
-// sum to one and the first weights to zero, so both sums are taken over differences to the middle
-// node: what is rounded is then the change of the velocity over a cell and not the velocity.
+// Gathers for lanes that share the cell whose stencil begins at `node`.
 template <typename T>
 PacketGathered<T> packet_gather(const Pack<T>* offset, const Lanes<T>* node) {
-  const Stencil<Pack<T>> s = packet_stencil(offset);
-  Pack<T> first_weight[3][3];
-  for (int axis = 0; axis < 3; ++axis)
-    for (int n = 0; n < 3; ++n) first_weight[axis][n] = s.w[axis][n] * (Pack<T>(n) - s.f[axis]);
-  // One component at a time: its sums and the weights along z stay in registers.
+  using P = Pack<T>;
+  const T* first = reinterpret_cast<const T*>(node);
+  const auto at = [&](int c, int i, int j, int k) {
+    return P(first[4 * ((i * kWindowEdge + j) * kWindowEdge + k) + c]);
+  };
+  const auto row = [](const P& middle, const P& w0, const P& below, const P& w2, const P& above) {
+    return middle + (w0 * below + w2 * above);
+  };
   PacketGathered<T> g;
-  const T* at = reinterpret_cast<const T*>(node);
-  for (int c = 0; c < 3; ++c, ++at) {
-    Pack<T> plane[3], plane_y[3], plane_z[3];
-    for (int i = 0; i < 3; ++i) {
-      Pack<T> row[3], row_z[3];
-      for (int j = 0; j < 3; ++j) {
-        const T* n = at + 4 * (i * kWindowEdge + j) * kWindowEdge;
-        const Pack<T> v1(n[4]), below = Pack<T>(n[0]) - v1, above = Pack<T>(n[8]) - v1;
-        row[j] = v1 + (s.w[2][0] * below + s.w[2][2] * above);
-        row_z[j] = first_weight[2][0] * below + first_weight[2][2] * above;
-      }
-      const Pack<T> below = row[0] - row[1], above = row[2] - row[1];
-      plane[i] = row[1] + (s.w[1][0] * below + s.w[1][2] * above);
-      plane_y[i] = first_weight[1][0] * below + first_weight[1][2] * above;
-      plane_z[i] = s.w[1][0] * row_z[0] + s.w[1][1] * row_z[1] + s.w[1][2] * row_z[2];
-    }
-    const Pack<T> below = plane[0] - plane[1], above = plane[2] - plane[1];
-    g.value[c] = plane[1] + (s.w[0][0] * below + s.w[0][2] * above);
-    g.first(c, 0) = first_weight[0][0] * below + first_weight[0][2] * above;
-    g.first(c, 1) = s.w[0][0] * plane_y[0] + s.w[0][1] * plane_y[1] + s.w[0][2] * plane_y[2];
-    g.first(c, 2) = s.w[0][0] * plane_z[0] + s.w[0][1] * plane_z[1] + s.w[0][2] * plane_z[2];
-  }
+  gather_stencil(stencil_at(offset), at, row, g.value, g.first);
   return g;
 }
 

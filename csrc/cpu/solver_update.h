@@ -73,11 +73,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     moved |= cell << (3 * axis);
   }
 
-  const auto row_of = [&](int lane) {
-    return meta_row(packet.meta[lane]) < uint64_t(s.row_count)
-               ? int64_t(meta_row(packet.meta[lane]))
-               : int64_t(0);
-  };
+  const auto row_of = [&](int lane) { return int64_t(s.row_of(packet.meta[lane])); };
   P row[kRowColumns];
   if (packet.same_rows()) {
     for (int i = 0; i < kRowColumns; ++i) row[i] = P(s.rows[row_of(0) * kRowColumns + i]);

@@ -52,6 +52,13 @@ __device__ int window_node(int index, int& i, int& j, int& k) {
   return i * kStrideX + j * kStrideY + k;
 }
 
+// Index in the window of the first node of a particle's stencil. Cells are at most kLastCell by
+// construction; garbage cells stay inside the window too.
+__device__ int window_base(uint32_t meta) {
+  return min(meta_cell(meta, 0), kLastCell) * kStrideX +
+         min(meta_cell(meta, 1), kLastCell) * kStrideY + min(meta_cell(meta, 2), kLastCell);
+}
+
 __device__ int neighbour_of(int i, int j, int k) {
   return (window_block(i) * 3 + window_block(j)) * 3 + window_block(k);
 }
@@ -135,17 +142,13 @@ __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, i
   __syncthreads();
   const T per_unit = units.per_momentum, per_mass = units.per_mass;
   while (first >= 0 && r < count) {
-    const uint32_t row = meta_row(given.meta) < uint64_t(s.row_count) ? meta_row(given.meta) : 0;
-    const T mass = s.rows[int64_t(row) * kRowColumns + kMassColumn];
+    const T mass = s.rows[int64_t(s.row_of(given.meta)) * kRowColumns + kMassColumn];
     const Stencil<T> st = stencil_at(given.offset);
     ParticleMomentum<T> q = momentum_given(st, given.velocity, given.slope, mass, s.dx);
     for (int i = 0; i < 3; ++i) q.constant[i] *= per_unit;
     for (int i = 0; i < 9; ++i) q.slope.m[i] *= per_unit;
     const T weight_unit = mass * per_mass;
-    // Cells are at most kLastCell by construction; garbage cells stay inside the window too.
-    const int base = min(meta_cell(given.meta, 0), kLastCell) * kStrideX +
-                     min(meta_cell(given.meta, 1), kLastCell) * kStrideY +
-                     min(meta_cell(given.meta, 2), kLastCell);
+    const int base = window_base(given.meta);
 #pragma unroll
     for (int i = 0; i < 3; ++i)
 #pragma unroll

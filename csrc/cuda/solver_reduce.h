@@ -128,9 +128,7 @@ __device__ void home_bounds(const SolverView<T>& s, int64_t home, int64_t first,
   float bound = 0.0f, mass = 0.0f;
   for (int64_t r = threadIdx.x; r < count; r += kSolverThreads) {
     const int64_t p = first + r;
-    const uint32_t meta = load_meta(s, p);
-    const uint32_t row = meta_row(meta) < uint64_t(s.row_count) ? meta_row(meta) : 0;
-    const T m = s.rows[int64_t(row) * kRowColumns + kMassColumn];
+    const T m = s.rows[int64_t(s.row_of(load_meta(s, p))) * kRowColumns + kMassColumn];
     T velocity[3], slope[9];
     load_motion(s, p, velocity, slope);
     bound = larger(float(momentum_bound(velocity, slope, m, s.dx)), bound);

@@ -61,46 +61,6 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   *s.clock = clock;
 }
 
-// sum w v and sum w v (node - particle) over a stencil, in cells; along z first, then y, then x.
-// The weights of an axis sum to one and their first moments to zero, so each sum is taken of
-// differences to the middle node: what all nodes share goes through without a rounding, and bodies
-// that fly or spin freely keep their momentum longer.
-template <typename T>
-__device__ __forceinline__ void gather(const Stencil<T>& st, const T (&tile)[3][kTile], int base,
-                                       T (&value)[3], Mat3<T>& moment) {
-  T lever[3][3];  // w (node - particle) of each axis
-#pragma unroll
-  for (int axis = 0; axis < 3; ++axis)
-#pragma unroll
-    for (int k = 0; k < 3; ++k) lever[axis][k] = st.w[axis][k] * (T(k) - st.f[axis]);
-#pragma unroll
-  for (int c = 0; c < 3; ++c) {
-    T plane[3], plane_y[3], plane_z[3];
-#pragma unroll
-    for (int i = 0; i < 3; ++i) {
-      T row[3], row_z[3];
-#pragma unroll
-      for (int j = 0; j < 3; ++j) {
-        const int at = base + i * kStrideX + j * kStrideY;
-        const T middle = tile[c][at + 1];
-        const T below = tile[c][at] - middle, above = tile[c][at + 2] - middle;
-        row[j] = (middle + st.w[2][0] * below) + st.w[2][2] * above;
-        row_z[j] = lever[2][0] * below + lever[2][2] * above;
-      }
-      const T below = row[0] - row[1], above = row[2] - row[1];
-      plane[i] = row[1] + (st.w[1][0] * below + st.w[1][2] * above);
-      plane_y[i] = lever[1][0] * below + lever[1][2] * above;
-      plane_z[i] = st.w[1][0] * row_z[0] + st.w[1][1] * row_z[1] + st.w[1][2] * row_z[2];
-    }
-    const T below = plane[0] - plane[1], above = plane[2] - plane[1];
-    const T* w = st.w[0];
-    value[c] = plane[1] + (w[0] * below + w[2] * above);
-    moment(c, 0) = lever[0][0] * below + lever[0][2] * above;
-    moment(c, 1) = w[0] * plane_y[0] + w[1] * plane_y[1] + w[2] * plane_y[2];
-    moment(c, 2) = w[0] * plane_z[0] + w[1] * plane_z[1] + w[2] * plane_z[2];
-  }
-}
-
 template <typename T, int kLaws, bool kTrack>
 __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws))
     g2p_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
@@ -137,15 +97,19 @@ __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws))
     StepFlags flags{};
     if (here) {
       const ParticleBefore<T> before = particle_before<T, kLaws>(s, first + r);
-      const uint32_t meta = before.meta;
       prefetch(s.rows + int64_t(before.row) * kRowColumns);
       const Stencil<T> st = stencil_at(before.offset);
-      const int base = min(meta_cell(meta, 0), kLastCell) * kStrideX +
-                       min(meta_cell(meta, 1), kLastCell) * kStrideY +
-                       min(meta_cell(meta, 2), kLastCell);
+      const int base = window_base(before.meta);
       T value[3] = {};
       Mat3<T> moment{};
-      gather(st, tile, base, value, moment);
+      const auto node = [&](int c, int i, int j, int k) {
+        return tile[c][base + i * kStrideX + j * kStrideY + k];
+      };
+      // Two fused operations; one rounding more does not show beside those of the sums below it.
+      const auto row = [](T middle, T w0, T low, T w2, T high) {
+        return (middle + w0 * low) + w2 * high;
+      };
+      gather_stencil(st, node, row, value, moment);
       flags = finish_particle<T, kLaws, kTrack>(s, first + r, before, reach, value, moment, dt,
                                                 dt_next, waves, slack, largest);
     }
