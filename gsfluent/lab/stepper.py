@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.ops.solver_state import WEAKENING
+from gsfluent.ops.plasticity import weakened
 
 __all__ = ["Scene", "Stepper", "automatic_dt", "wave_speed"]
 
@@ -129,12 +129,7 @@ class Stepper:
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
         if scene.irreversible and bool((self.peak > 0).any()):
-            rows = scene.material.long()
-            params = scene.params[rows].clone()
-            nacc = scene.law[rows] == 1
-            lost = (self.peak / WEAKENING).clamp(0.0, 1.0)
-            params[:, 3] = torch.where(nacc, params[:, 3] * (1.0 - lost), params[:, 3])
-            return scene.law[rows], params, None
+            return *weakened(scene.law, scene.params, scene.material, self.peak), None
         return scene.law, scene.params, scene.material
 
     def _map(self, increment: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

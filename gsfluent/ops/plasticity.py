@@ -23,6 +23,9 @@ LAWS = {
 }
 """Constitutive laws and their numbers."""
 
+WEAKENING = 0.02
+"""Range of alpha past zero over which a broken point (NACC) loses its cohesion (``kWeakening``)."""
+
 PARAM_COLUMNS = (
     "mu",
     "kappa",
@@ -102,6 +105,25 @@ def check_params(op: str, law: Tensor, params: Tensor) -> None:
         ValueError: An unknown law, or a parameter out of its range.
     """
     _check_values(op, law, params, None)
+
+
+def weakened(law: Tensor, params: Tensor, material: Tensor, peak: Tensor) -> tuple[Tensor, Tensor]:
+    """Law and parameters of each point, of broken ones with the cohesion they have left.
+
+    Args:
+        law: Law of each row, int32 [M].
+        params: Parameters of each row, [M, 8].
+        material: Row of each point, int32 [N].
+        peak: Largest alpha each point ever had, [N]; read for NACC points only.
+
+    Returns:
+        Law, int32 [N], and parameters, [N, 8]; for :func:`return_mapping` without ``material``.
+    """
+    row = material.long()
+    law, params = law[row], params[row]
+    left = params[:, 3] * (1.0 - (peak / WEAKENING).clamp(0.0, 1.0))
+    params[:, 3] = torch.where(law == LAWS["nacc"], left, params[:, 3])
+    return law, params
 
 
 def _check_material(

@@ -13,12 +13,9 @@ from torch import Tensor
 
 from gsfluent._check import check_tensor
 from gsfluent.ops import solver_buffers as layout
-from gsfluent.ops.plasticity import return_mapping
+from gsfluent.ops.plasticity import return_mapping, weakened
 from gsfluent.ops.solver_buffers import INDEX
 
-ELASTIC, NACC = 0, 1
-WEAKENING = 0.02
-"""Range of alpha past zero over which a broken point loses its cohesion (``kWeakening``)."""
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
 
@@ -313,21 +310,15 @@ class SolverState:
         """
         b = self._buffers
         row = (self._words() >> 9).to(torch.int32)
+        material: Tensor | None = row
         strain, broken = self._rowwise("strain").contiguous(), self._law_set > 0
         alpha = b.alpha if broken else strain.new_zeros(self.count)
         law, params = b.law, b.rows[:, :8].contiguous()
         if broken and self.irreversible:
-            index = row.long()
-            law, params, row = (
-                law[index],
-                params[index],
-                torch.arange(self.count, dtype=torch.int32, device=self.device),
-            )
-            left = 1.0 - (b.peak / WEAKENING).clamp(0.0, 1.0)
-            params[:, 3] *= torch.where(law == NACC, left, torch.ones_like(left))
+            (law, params), material = weakened(law, params, row, b.peak), None
         _, _, stress, _ = return_mapping(
             strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,
-            material=row, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
+            material=material, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
             dt=self.dt or 1.0,
         )  # fmt: skip
         return self._restored(stress)

@@ -1,7 +1,7 @@
 """The grid step by step, by the composable operators: the other engine of the simulation.
 
-For what the resident solver does not know (free rigid bodies, distance grids, colliders that turn
-or sweep, blades at work), and to compare it with. A step is p2g, grid update, g2p and the return
+For what the resident solver does not know (blades at work, pieces that are partly cut, free bodies
+lighter than what they meet), and to compare it with. A step is p2g, grid update, g2p and the return
 map; the contact pass is left out while no two fields meet, and the search for blocks while the old
 ones hold every point.
 """
@@ -13,13 +13,13 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Particles
-from gsfluent.ops.solver_state import WEAKENING
+from gsfluent.ops.plasticity import weakened
 from gsfluent.pipeline.blades import BladeSet
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_near import near_pairs
 from gsfluent.pipeline.simulate_solver import Counters, Points, Settings, Unhealthy
-from gsfluent.pipeline.simulate_state import State
+from gsfluent.pipeline.simulate_state import State, at_rows
 from gsfluent.scene import Scene
 
 FIELDS = 8
@@ -47,14 +47,11 @@ class Composed:
         self.settings, self.counters = settings, counters
         self._map = dict(settings.return_map or {})
         self.points = state.particles if rows is None else state.particles.select(rows)
-        self.peak = state.peak if rows is None else state.peak[rows]
-        self._brittle = matter.brittle if rows is None else matter.brittle[rows]
-        field = torch.unique(
-            state.field if rows is None else state.field[rows], return_inverse=True
-        )[1]
+        self.peak, self._brittle = at_rows(state.peak, rows), at_rows(matter.brittle, rows)
+        field = torch.unique(at_rows(state.field, rows), return_inverse=True)[1]
         self._unit = field.to(torch.int32)
         self._blades = BladeSet(scene, matter.dx)
-        self.cut = state.cut if rows is None else state.cut[rows]
+        self.cut = at_rows(state.cut, rows)
         self._divide()
         self.time = state.time
         self.colliders = state.colliders
@@ -139,9 +136,8 @@ class Composed:
         self._row: Tensor | None = p.material
         self._params, self._law = matter.params, matter.law
         if self.settings.irreversible and bool((peak > 0).any()):
-            params = matter.params[p.material]
-            params[:, 3] *= 1.0 - (peak / WEAKENING).clamp(0.0, 1.0)
-            self._params, self._law, self._row = params, matter.law[p.material], None
+            self._law, self._params = weakened(matter.law, matter.params, p.material, peak)
+            self._row = None
 
     def _step(self, dt: float) -> None:
         dx, p = self.matter.dx, self.points

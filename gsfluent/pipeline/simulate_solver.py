@@ -2,7 +2,7 @@
 
 :class:`Resident` keeps the points in one :class:`gsfluent.ops.Solver`, which takes many steps per
 call. :class:`gsfluent.pipeline.simulate_composed.Composed` takes one step at a time with the
-composable operators; it is the reference, and it alone knows blades at work.
+composable operators; it is the reference, and it alone knows blades at work and light free bodies.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
-from gsfluent.pipeline.simulate_state import State
+from gsfluent.pipeline.simulate_state import State, at_rows
 from gsfluent.scene import Scene
 
 CFL = 0.5
@@ -192,8 +192,7 @@ class Resident:
     ) -> None:
         p = state.particles if rows is None else state.particles.select(rows)
         position, peak, field = (
-            value if rows is None else value[rows]
-            for value in (state.position, state.peak, state.field)
+            at_rows(value, rows) for value in (state.position, state.peak, state.field)
         )
         used, field = torch.unique(field, return_inverse=True)
         law, params = matter.law, matter.params
@@ -224,6 +223,7 @@ class Resident:
         self.impulse = torch.zeros(3, dtype=torch.float64, device=p.device)
         self.work = torch.zeros((), dtype=torch.float64, device=p.device)
         self._seen = self._solver.counters()
+        self._where: Tensor | None = None
         counters.fields_max = max(counters.fields_max, used.shape[0])
 
     def advance(self, until: float, steps: int) -> int:
@@ -241,8 +241,14 @@ class Resident:
         counters.law_kernel_steps += taken if self._special else 0
         counters.block_steps += taken * sites
         counters.contact_block_steps += taken * int(self._seen["shared_sites"])
-        counters.box_steps += taken * max(sites, _box(self._solver.position, self._matter.dx))
+        counters.box_steps += taken * max(sites, _box(self._position(), self._matter.dx))
         return taken
+
+    def _position(self) -> Tensor:
+        """Where the points are; asked for twice between two advances, put in order once."""
+        if self._where is None:
+            self._where = self._solver.position
+        return self._where
 
     def _pace(self) -> float:
         """Factor on the time step: what drives matter may be faster than any of it yet."""
@@ -260,6 +266,7 @@ class Resident:
         """Advance; the solver moves the colliders, all but for floor and schedule."""
         solver, target = self._solver, stop - self._start
         pushed, twisted = solver.impulse, solver.torque
+        self._where = None
         if target > (self.time - self._start) + 1e-12 * max(1.0, stop):
             try:
                 solver.advance(target, steps=steps)
@@ -286,7 +293,7 @@ class Resident:
     def _wrong(self, kind: str) -> Tensor:
         """The points at fault: not finite, among the fastest, or where most fields meet."""
         if kind == "crowded":
-            return _most_crowded(self._solver.position, self._solver.body, self._matter.dx)
+            return _most_crowded(self._position(), self._solver.body, self._matter.dx)
         speed = self._solver.velocity.norm(dim=1)
         bad = ~torch.isfinite(speed) | ~torch.isfinite(self._solver.strain).all(dim=1)
         if kind == "speed" or not bool(bad.any()):
@@ -318,7 +325,9 @@ class Resident:
     def read(self) -> Points:
         """See :class:`Engine`."""
         s = self._solver
-        return Points(s.position, s.velocity, s.affine, s.strain, s.alpha, s.peak, s.deformation)
+        return Points(
+            self._position(), s.velocity, s.affine, s.strain, s.alpha, s.peak, s.deformation
+        )
 
 
 def _most_crowded(position: Tensor, field: Tensor, dx: float) -> Tensor:

@@ -22,6 +22,11 @@ _POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm
 _WHOLE = ("impulse", "colliders", "work", "dissipated")
 
 
+def at_rows(values: Tensor, rows: Tensor | None) -> Tensor:
+    """The values of some points, int64 [M]; of all for None."""
+    return values if rows is None else values[rows]
+
+
 class State(NamedTuple):
     """Everything that changes in a simulation. Tensors are never written in place.
 

@@ -32,7 +32,7 @@ from gsfluent.pipeline.simulate_solver import (
     Unhealthy,
     resident_can,
 )
-from gsfluent.pipeline.simulate_state import State
+from gsfluent.pipeline.simulate_state import State, at_rows
 from gsfluent.pipeline.simulate_strays import drift, find_strays, reach_of
 from gsfluent.scene import Scene
 
@@ -416,9 +416,8 @@ class _OnGrid:
     """Boxes of the fields on the grid, and the points of some of them."""
 
     def __init__(self, state: State, rows: Tensor | None) -> None:
-        self._position = state.position if rows is None else state.position[rows]
-        self._field = state.field if rows is None else state.field[rows]
-        velocity = state.particles.velocity if rows is None else state.particles.velocity[rows]
+        self._position, self._field = at_rows(state.position, rows), at_rows(state.field, rows)
+        velocity = at_rows(state.particles.velocity, rows)
         speed = float(velocity.norm(dim=1).max())
         self.speed = speed if math.isfinite(speed) else 0.0
         self.low, self.high = boxes(self._position, self._field, int(self._field.max()) + 1)
