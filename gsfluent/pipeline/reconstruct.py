@@ -33,6 +33,7 @@ from gsfluent.pipeline.reconstruct_masks import masked_views
 from gsfluent.pipeline.reconstruct_model import LearningRates, SplatModel
 from gsfluent.pipeline.reconstruct_train import TrainSettings, decibels, train
 from gsfluent.pipeline.reconstruct_views import TrainView, read_views
+from gsfluent.pipeline.solid_clean import clean_views
 from gsfluent.pipeline.stage import Progress, Stage, report_progress
 
 _log = logging.getLogger(__name__)
@@ -62,6 +63,7 @@ class Reconstruct(Stage):
         checkpoint_every: Steps between saves.
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
             what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
+        clean: Take floaters out of the object at the end (:func:`clean_floaters`).
         device: Where to train.
         seed: Seed of everything random.
 
@@ -85,6 +87,7 @@ class Reconstruct(Stage):
         checkpoint: str | Path | None = None,
         checkpoint_every: int = 250,
         separate: bool = True,
+        clean: bool = True,
         device: str | torch.device = "cpu",
         seed: int = 0,
     ) -> None:
@@ -115,6 +118,7 @@ class Reconstruct(Stage):
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.checkpoint_every = int(checkpoint_every)
         self.separate = bool(separate)
+        self.clean = bool(clean)
         self.device = torch.device(device)
 
     def forward(
@@ -129,7 +133,8 @@ class Reconstruct(Stage):
         Returns:
             The Gaussians in the capture's world frame, and the report: ``images, held_out, psnr,
             ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, resumed_at, start,
-            object_gaussians``. When the object was told from its background, labels are set.
+            object_gaussians, cleaned`` (see :func:`clean_floaters`; None when nothing was told
+            from its background). When the object was told from its background, labels are set.
 
         Raises:
             InputError: Black photographs, no masks and no points, or masks that contradict poses.
@@ -160,6 +165,7 @@ class Reconstruct(Stage):
             "iterations": self.iterations,
             "image_size": self.image_size,
             "start": start,
+            "cleaned": run.cleaned,
             "resumed_at": run.resumed_at,
             "seconds": round(time.monotonic() - started, 2),
         }
@@ -190,6 +196,7 @@ class _Run:
         self.progress = progress
         self.saved = checkpoint.load()
         self.resumed_at = 0
+        self.cleaned: dict[str, Any] | None = None
 
     def scene_of(self, capture: Capture, views: list[TrainView]) -> Gaussians:
         """Learn everything, then the object again from the silhouettes of what was found."""
@@ -253,7 +260,11 @@ class _Run:
             isotropic=stage.kernel == "isotropic",
             rates=LearningRates(),
         )
-        return self._train(model, views, 0 if scene is None else 1, before, steps, hull, scene)
+        phase = 0 if scene is None else 1
+        gaussians = self._train(model, views, phase, before, steps, hull, scene)
+        if stage.clean and gaussians.count:
+            gaussians, self.cleaned = clean_views(gaussians, views, hull=hull)
+        return gaussians
 
     def _train(
         self,

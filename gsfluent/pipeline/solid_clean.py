@@ -69,7 +69,7 @@ class CleanLimits:
     huge: float = 0.12
     aspect: float = 12.0
     needle: float = 0.03
-    depth: float = 0.03
+    depth: float = 0.05
     views: int = 2
     weight: float = 0.05
     piece: float = 0.01
