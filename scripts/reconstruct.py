@@ -65,6 +65,7 @@ def stage_of(options: argparse.Namespace) -> gf.pipeline.Reconstruct:
         exposure=options.exposure,
         checkpoint=options.checkpoint,
         separate=not options.whole_scene,
+        clean=not options.no_clean,
         device=options.device,
         seed=options.seed,
     )
@@ -84,6 +85,7 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     add("--densify", default="adc", help="adc or mcmc")
     add("--sh-degree", type=int, default=0, help="bands of view-dependent colour, 0 to 3")
     add("--whole-scene", action="store_true", help="do not learn the object apart")
+    add("--no-clean", action="store_true", help="leave floaters in the object")
     add("--isolate", action="store_true", help="write only the object")
     add("--max-gaussians", type=int, help="cap, and the budget of mcmc")
     add("--start-gaussians", type=int)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,7 @@ from gsfluent.pipeline.reconstruct_model import SplatModel
 from gsfluent.pipeline.reconstruct_recipe import recipe_for
 from gsfluent.pipeline.reconstruct_train import Trainer, TrainSettings, decibels
 from gsfluent.pipeline.reconstruct_views import TrainView, read_views
+from gsfluent.pipeline.solid_clean import clean_views
 from gsfluent.pipeline.stage import Progress, Stage, report_progress
 
 _log = logging.getLogger(__name__)
@@ -46,9 +46,6 @@ _CONTRADICTION = 0.02  # of the hull denied by a silhouette before it is distrus
 _SCENE_SHARE = 0.6  # of the steps for everything, before the object gets the rest
 _FAINT = 0.02  # opacity below which a trained Gaussian is dropped
 _HULL_START = 100_000  # Gaussians on a hull of 96 voxels a side; more would fall on each other
-
-Finish = Callable[[Gaussians, Capture], tuple[Gaussians, dict[str, Any]]]
-"""Mends the trained Gaussians (floaters, thin shells) and says what it did."""
 
 
 class Reconstruct(Stage):
@@ -75,8 +72,7 @@ class Reconstruct(Stage):
         checkpoint_every: Steps between saves.
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
             what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
-        finish: Called with the trained Gaussians and the capture; returns the Gaussians to judge
-            and hand out, and what it did for the report.
+        clean: Take floaters out of the object at the end (:func:`clean_floaters`).
         device: Where to train.
         seed: Seed of everything random.
 
@@ -104,7 +100,7 @@ class Reconstruct(Stage):
         checkpoint: str | Path | None = None,
         checkpoint_every: int = 250,
         separate: bool = True,
-        finish: Finish | None = None,
+        clean: bool = True,
         device: str | torch.device = "cpu",
         seed: int = 0,
     ) -> None:
@@ -147,7 +143,7 @@ class Reconstruct(Stage):
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.checkpoint_every = int(checkpoint_every)
         self.separate = bool(separate)
-        self.finish = finish
+        self.clean = bool(clean)
         self.device = torch.device(device)
 
     def forward(
@@ -162,9 +158,10 @@ class Reconstruct(Stage):
         Returns:
             The Gaussians in the capture's world frame, and the report: ``images, held_out, psnr,
             ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, train_seconds (without
-            reading and judging), resumed_at, start, object_gaussians, history`` (rows of step,
-            count, PSNR on the last training photographs). When the object was told from its
-            background, labels are set.
+            reading and judging), resumed_at, start, object_gaussians, history (rows of step, count,
+            PSNR on the last training photographs), cleaned`` (see :func:`clean_floaters`; None when
+            nothing was told from its background). When the object was told from its background,
+            labels are set.
 
         Raises:
             InputError: Black photographs, no masks and no points, or masks that contradict poses.
@@ -186,9 +183,6 @@ class Reconstruct(Stage):
                 mend="check that the poses belong to the photographs (gsfluent inspect)",
             )
         trained = _now(self.device) - trained
-        finished: dict[str, Any] = {}
-        if self.finish is not None:
-            gaussians, finished = self.finish(gaussians, capture)
         labels = gaussians.labels
         report = {
             "images": len(capture),
@@ -204,11 +198,12 @@ class Reconstruct(Stage):
             "target_psnr": self.target_psnr,
             "exposure": self.exposure,
             "history": run.history,
+            "cleaned": run.cleaned,
             "resumed_at": run.resumed_at,
             "train_seconds": round(trained, 2),
             "seconds": round(time.monotonic() - started, 2),
         }
-        return gaussians, report | finished
+        return gaussians, report
 
     def _identity(self) -> dict[str, Any]:
         """What a checkpoint must agree on to be resumed."""
@@ -235,6 +230,7 @@ class _Run:
         self.history: list[tuple[int, int, float]] = []
         self.saved = checkpoint.load()
         self.resumed_at = 0
+        self.cleaned: dict[str, Any] | None = None
 
     def scene_of(self, capture: Capture, views: list[TrainView]) -> Gaussians:
         """Learn everything, then the object again from the silhouettes of what was found."""
@@ -304,7 +300,11 @@ class _Run:
             isotropic=stage.kernel == "isotropic",
             rates=stage.recipe.object_rates,
         )
-        return self._train(model, views, 0 if scene is None else 1, before, steps, hull, scene)
+        phase = 0 if scene is None else 1
+        gaussians = self._train(model, views, phase, before, steps, hull, scene)
+        if stage.clean and gaussians.count:
+            gaussians, self.cleaned = clean_views(gaussians, views, hull=hull)
+        return gaussians
 
     def _train(
         self,
