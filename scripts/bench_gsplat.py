@@ -38,6 +38,7 @@ from gsfluent import has_cuda, ops
 Renderer = Callable[[dict[str, Tensor], Scene], tuple[Tensor, Any]]
 
 SIZES = {"100k": 100_000, "1M": 1_000_000, "4M": 4_000_000}
+HEADING = "## The rasterizer beside gsplat"
 IMAGES = {"800": (800, 800), "1080p": (1920, 1080)}
 
 
@@ -293,12 +294,9 @@ def main(arguments: list[str] | None = None) -> int:
     sys.stdout.write(text + "\n")
     if options.markdown:
         page = options.markdown
-        part, heading = (
-            ("bench_gsplat", "## The rasterizer beside gsplat")
-            if gpu
-            else ("bench_gsplat cpu", "## The rasterizer on the CPU")
-        )
+        part = "bench_gsplat" if gpu else "bench_gsplat cpu"
         old = page.read_text() if page.exists() else ""
+        heading = "" if HEADING in old else HEADING
         page.write_text(enter(old, part, text, heading))
     return 0
 

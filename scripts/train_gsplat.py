@@ -37,10 +37,9 @@ from torch import Tensor
 import gsfluent as gf
 from gsfluent.data import Capture, Gaussians
 from gsfluent.metrics import psnr, ssim
-from gsfluent.pipeline.reconstruct_evaluate import evaluate
+from gsfluent.pipeline.reconstruct_evaluate import HOLD_OUT, evaluate
 from gsfluent.pipeline.reconstruct_init import focus_point
 
-HOLD_OUT = 8
 SH_C0 = 0.28209479177387814
 RATES = {
     "means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3,
