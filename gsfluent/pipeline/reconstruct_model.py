@@ -116,7 +116,7 @@ class SplatModel:
     # -- optimisation ----------------------------------------------------------------------------
     def means_rate(self, progress: float) -> float:
         """Step size of the centres [world units] at ``progress`` in [0, 1] of the run."""
-        return self.rates.means * self.extent * self.rates.means_end**progress
+        return self.extent * self.rates.at("means", progress)
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
@@ -129,7 +129,7 @@ class SplatModel:
             gradient = parameter.grad
             if gradient is None or parameter.numel() == 0:
                 continue
-            rate = self.means_rate(progress) if name == "means" else getattr(self.rates, name)
+            rate = self.rates.at(name, progress) * (self.extent if name == "means" else 1.0)
             first, second = self.first[name], self.second[name]
             first.lerp_(gradient, 1.0 - _BETA1)
             second.mul_(beta2).addcmul_(gradient, gradient, value=1.0 - beta2)

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsfluent.errors import RunError
 from gsfluent.metrics import ssim
 from gsfluent.pipeline.reconstruct_density import Adc, Density, Mcmc, Place, Wanted, draws
-from gsfluent.pipeline.reconstruct_error import ErrorTarget
+from gsfluent.pipeline.reconstruct_error import ErrorTarget, least_seen
 from gsfluent.pipeline.reconstruct_exposure import Exposure
 from gsfluent.pipeline.reconstruct_init import Hull
 from gsfluent.pipeline.reconstruct_model import SplatModel
@@ -205,7 +205,15 @@ class Trainer:
         wanted = Wanted()
         if self.target is not None:
             wanted = self.target.wanted(self.model, self.degree(done), self.last)
+        elif self._thins(done):
+            wanted = Wanted(drop=least_seen(self.model, self.views, self.settings.recipe.thin))
         self.density.control(self.model, done, wanted)
+
+    def _thins(self, done: int) -> bool:
+        """Whether this look at the density is the first one past a thinning point."""
+        recipe, steps = self.settings.recipe, self.settings.iterations
+        before = done - recipe.densify_every
+        return recipe.thin > 0 and any(before < at * steps <= done for at in recipe.thin_at)
 
     # -- in and out ------------------------------------------------------------------------------
     def state(self) -> dict[str, Tensor]:
