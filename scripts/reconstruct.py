@@ -78,7 +78,7 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     add = parser.add_argument
     add("capture", help="folder with photographs, or demo:NAME")
     add("-o", "--out", type=Path, help="write the splats here (.ply)")
-    add("--report", type=Path, help="folder for sheet.png, report.json and report.md")
+    add("--report", type=Path, help="folder for reconstruct.json, .md, .png (held-out views)")
     add("--iterations", type=int, default=800)
     add("--image-size", type=int, help="longer side while training and judging [px]")
     add("--preset", default="auto", help="auto, quick, long or classic (Kerbl et al. 2023)")

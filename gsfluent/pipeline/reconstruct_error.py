@@ -52,14 +52,37 @@ class ErrorTarget:
             return Wanted(grow=error > self.error * weight)
         drop = None
         if mean < _SLACK * self.error:
-            _, weight = attributed(model, self.views, degree)
-            order = weight.argsort()
-            spent = weight[order].cumsum(0)
-            least = spent <= _DROP_WEIGHT * spent[-1]
-            least[int(_DROP_SHARE * model.count) :] = False
-            drop = torch.zeros_like(least)
-            drop[order] = least
+            drop = least_seen(model, self.views, _DROP_WEIGHT, _DROP_SHARE)
         return Wanted(drop=drop, stop=True)
+
+
+@torch.no_grad()
+def least_seen(
+    model: SplatModel, views: list[TrainView], weight_share: float, count_share: float = 1.0
+) -> Tensor:
+    """Gaussians that blend least into the views.
+
+    Args:
+        model: The Gaussians.
+        views: All photographs.
+        weight_share: How much of all blend weights they may hold together.
+        count_share: How many of the Gaussians they may be.
+
+    Returns:
+        bool [N].
+    """
+    weight = torch.zeros(model.count, device=model.device)
+    for view in views:
+        seen = model.render(view, 0, contribution=True).contribution
+        assert seen is not None
+        weight += seen
+    order = weight.argsort()
+    spent = weight[order].cumsum(0)
+    least = spent <= weight_share * spent[-1]
+    least[int(count_share * model.count) :] = False
+    chosen = torch.zeros_like(least)
+    chosen[order] = least
+    return chosen
 
 
 def attributed(model: SplatModel, views: list[TrainView], degree: int) -> tuple[Tensor, Tensor]:

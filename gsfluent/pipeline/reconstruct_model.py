@@ -116,25 +116,27 @@ class SplatModel:
     # -- optimisation ----------------------------------------------------------------------------
     def means_rate(self, progress: float) -> float:
         """Step size of the centres [world units] at ``progress`` in [0, 1] of the run."""
-        return self.rates.means * self.extent * self.rates.means_end**progress
+        return self.extent * self.rates.at("means", progress)
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
         """One Adam step, then clear the gradients; ``progress`` in [0, 1] sets the decay."""
         self.steps += 1
-        beta2 = self.rates.beta2
-        correction1 = 1.0 - _BETA1**self.steps
-        correction2 = 1.0 - beta2**self.steps
-        for name, parameter in self.parameters.items():
-            gradient = parameter.grad
-            if gradient is None or parameter.numel() == 0:
-                continue
-            rate = self.means_rate(progress) if name == "means" else getattr(self.rates, name)
-            first, second = self.first[name], self.second[name]
-            first.lerp_(gradient, 1.0 - _BETA1)
-            second.mul_(beta2).addcmul_(gradient, gradient, value=1.0 - beta2)
-            scale = (second / correction2).sqrt_().add_(_EPSILON)
-            parameter.addcdiv_(first, scale, value=-rate / correction1)
+        names = [name for name, value in self.parameters.items() if value.numel() > 0]
+        ops.adam_step(
+            [self.parameters[name].detach() for name in names],
+            [self.parameters[name].grad for name in names],
+            [self.first[name] for name in names],
+            [self.second[name] for name in names],
+            lr=[
+                self.rates.at(name, progress) * (self.extent if name == "means" else 1.0)
+                for name in names
+            ],
+            step=self.steps,
+            betas=(_BETA1, self.rates.beta2),
+            eps=_EPSILON,
+        )
+        for parameter in self.parameters.values():
             parameter.grad = None
 
     # -- rows ------------------------------------------------------------------------------------

@@ -14,7 +14,8 @@ class LearningRates:
     """Adam step sizes.
 
     ``means`` is in units of the extent and decays exponentially to ``means_end`` of itself over the
-    run.
+    run; the others decay to ``others_end`` of themselves from ``others_from`` of the run on, so
+    that the jitter of single photographs settles.
     """
 
     means: float = 1.6e-3
@@ -25,6 +26,16 @@ class LearningRates:
     sh0: float = 1.0e-2
     sh_rest: float = 5.0e-4
     beta2: float = 0.99
+    others_end: float = 1.0
+    others_from: float = 0.5
+
+    def at(self, name: str, progress: float) -> float:
+        """Step size of a parameter at ``progress`` in [0, 1] of the run."""
+        rate: float = getattr(self, name)
+        if name == "means":
+            return rate * self.means_end**progress
+        late = max(0.0, progress - self.others_from) / max(1e-9, 1.0 - self.others_from)
+        return rate * self.others_end**late
 
 
 @dataclass(frozen=True)
@@ -44,6 +55,9 @@ class Recipe:
         absgrad_threshold: The same for the sum of absolute gradients (Ye et al. 2024).
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
+        thin: Share of all blend weights that may go in one thinning: the Gaussians that blend
+            least into the photographs.
+        thin_at: Shares of the run at which that happens.
         half_until: Share of the run at half size.
         sh_every: Steps between two bands of view-dependent colour, at most a quarter of the run.
         start_opacity: Opacity of Gaussians at sparse points.
@@ -64,6 +78,8 @@ class Recipe:
     absgrad_threshold: float = 1.6e-3
     reset_every: int = 0
     prune_opacity: float = 0.01
+    thin: float = 0.0
+    thin_at: tuple[float, ...] = ()
     half_until: float = 0.35
     sh_every: int = 1000
     start_opacity: float = 0.3

@@ -22,28 +22,28 @@ _GAP = 4  # pixels between panels
 def write_report(
     folder: str | Path, gaussians: Gaussians, capture: Capture, report: dict[str, Any]
 ) -> list[Path]:
-    """Write ``report.json``, ``report.md`` and, when photographs were held out, ``sheet.png``.
+    """Write ``reconstruct.json``, ``.md`` and, when photographs were held out, ``.png``.
 
-    The sheet has a row per held-out photograph: as photographed, as rendered, and four times the
+    The picture has a row per held-out photograph: as photographed, as rendered, and four times the
     absolute error (mean of the channels).
 
     Args:
         folder: Where to; made when missing.
         gaussians: The result.
         capture: What it was made from.
-        report: What the stage returned.
+        report: What the stage returned, and what else shall stand in the file.
 
     Returns:
         The files written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / "report.json", folder / "report.md"]
+    files = [folder / "reconstruct.json", folder / "reconstruct.md"]
     write_json(files[0], report)
     files[1].write_text(markdown(report), encoding="utf-8")
     held = capture.split(HOLD_OUT)[1]
     if held is not None:
-        files.append(folder / "sheet.png")
+        files.append(folder / "reconstruct.png")
         save_image(sheet(gaussians, held, int(report["image_size"])), files[-1])
     return files
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.errors import RunError
-from gsfluent.metrics import ssim
 from gsfluent.pipeline.reconstruct_density import Adc, Density, Mcmc, Place, Wanted, draws
-from gsfluent.pipeline.reconstruct_error import ErrorTarget
+from gsfluent.pipeline.reconstruct_error import ErrorTarget, least_seen
 from gsfluent.pipeline.reconstruct_exposure import Exposure
 from gsfluent.pipeline.reconstruct_init import Hull
 from gsfluent.pipeline.reconstruct_model import SplatModel
@@ -154,33 +154,31 @@ class Trainer:
         index, view = self._view(step)
         probe = self.density.probe(model)
         rendered = model.render(view, self.degree(step), probe)
-        image, alpha = rendered.image, rendered.alpha
+        image, masked = rendered.image, view.mask is not None
         if self.exposure is not None:
-            image = self.exposure.apply(
-                image, alpha if view.mask is not None else torch.ones_like(alpha), index
-            )
-        if view.valid is not None:
-            image, alpha = image * view.valid[..., None], alpha * view.valid
-        plain = miss = image - view.color
-        terms = []
-        if view.mask is not None:
-            excess = alpha - view.mask
-            miss = miss - excess[..., None] * self.backdrops[step]
-            terms.append(_MASK_WEIGHT * excess.abs().mean())
-        terms.append(0.8 * miss.abs().mean() + 0.2 * (1.0 - ssim(image, view.target)))
+            cover = rendered.alpha if masked else torch.ones_like(rendered.alpha)
+            image = self.exposure.apply(image, cover, index)
+        photometric = ops.photometric_loss(
+            image,
+            view.color,
+            valid=view.valid,
+            alpha=rendered.alpha if masked else None,
+            mask=view.mask,
+            backdrop=self.backdrops[step] if masked else None,
+            mask_weight=_MASK_WEIGHT if masked else 0.0,
+        )
+        loss = photometric.loss
         if settings.scale_regularization > 0:
-            terms.append(settings.scale_regularization * shape_loss(model))
+            loss = loss + settings.scale_regularization * shape_loss(model)
         penalty = self.density.penalty(model)
         if penalty is not None:
-            terms.append(penalty)
+            loss = loss + penalty
         if self.exposure is not None:
-            terms.append(self.exposure.penalty())
-        loss = torch.stack(terms).sum()
+            loss = loss + self.exposure.penalty()
         loss.backward()
         with torch.no_grad():
-            error = plain.square().mean()
-            self.last[index] = error
-            self.recent[:, step % _RECENT] = torch.stack([loss.detach(), error])
+            self.last[index] = photometric.mse
+            self.recent[:, step % _RECENT] = torch.stack([loss.detach(), photometric.mse])
         self.density.observe(rendered, probe, view)
         progress = step / settings.iterations
         model.step(progress)
@@ -205,7 +203,15 @@ class Trainer:
         wanted = Wanted()
         if self.target is not None:
             wanted = self.target.wanted(self.model, self.degree(done), self.last)
+        elif self._thins(done):
+            wanted = Wanted(drop=least_seen(self.model, self.views, self.settings.recipe.thin))
         self.density.control(self.model, done, wanted)
+
+    def _thins(self, done: int) -> bool:
+        """Whether this look at the density is the first one past a thinning point."""
+        recipe, steps = self.settings.recipe, self.settings.iterations
+        before = done - recipe.densify_every
+        return recipe.thin > 0 and any(before < at * steps <= done for at in recipe.thin_at)
 
     # -- in and out ------------------------------------------------------------------------------
     def state(self) -> dict[str, Tensor]:

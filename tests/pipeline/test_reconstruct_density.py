@@ -13,7 +13,7 @@ from gsfluent import demo
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
-from gsfluent.metrics import SsimTarget, psnr
+from gsfluent.metrics import psnr
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.reconstruct_density import (
     Adc,
@@ -58,12 +58,12 @@ def camera(turn: float = 0.0) -> TrainView:
     viewmat = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3], [0, 0, 0, 1.0]])
     K = torch.tensor([[70.0, 0, 0.5 * SIZE], [0, 70.0, 0.5 * SIZE], [0, 0, 1]])
     black = torch.zeros(SIZE, SIZE, 3)
-    return TrainView(black, None, None, viewmat, K, SsimTarget.of(black), SIZE)
+    return TrainView(black, None, None, viewmat, K, SIZE)
 
 
 def photographed(model: SplatModel, view: TrainView) -> TrainView:
     color = model.render(view, 0).image.detach()
-    return TrainView(color, None, None, view.viewmat, view.K, SsimTarget.of(color), SIZE)
+    return TrainView(color, None, None, view.viewmat, view.K, SIZE)
 
 
 def picture(model: SplatModel) -> Tensor:
