@@ -11,8 +11,8 @@ learned and judged by both. Every eighth photograph is held out. gsplat's side i
 scripts/train_gsplat.py; without gsplat installed only gsfluent runs.
 
 The built-in objects are photographed into --demo-folder and found there again; --prepare does only
-that. Each run is one line of the JSON file; runs already in it are not repeated. ``--ours NAME:KEY=VALUE,
-KEY=VALUE`` adds a run of ours with those arguments of ``gsfluent.pipeline.Reconstruct``.
+that. Each run is one line of the JSON file; runs already in it are not repeated. ``--ours
+NAME:KEY=VALUE,KEY=VALUE`` adds a run of ours with those arguments of ``Reconstruct``.
 """
 
 from __future__ import annotations
