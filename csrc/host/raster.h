@@ -1,7 +1,7 @@
 // The rasterizer's operators on the host, once for every backend: checks, allocation, dtype. A
-// backend supplies `kTile` (edge of its lists' tiles), `stride(features)` (numbers saved per splat),
-// `kSavesOrder`, `kWritesGradients` (its adjoint fills every gradient, so none needs zeroing),
-// `Plan<T>` (project, sort, count; then bin and blend) and `backward<T>`.
+// backend supplies `kTile` (edge of its lists' tiles), `stride(features)` (numbers saved per
+// splat), `kSavesOrder`, `kWritesGradients` (its adjoint fills every gradient, so none needs
+// zeroing), `Plan<T>` (project, sort, count; then bin and blend) and `backward<T>`.
 #pragma once
 
 #include "core/raster.h"
@@ -140,13 +140,12 @@ struct RasterOps {
                          OptTensor groups, OptTensor offset, OptTensor absolute, int64_t width,
                          int64_t height, bool antialiased, bool contribution, bool depth,
                          bool median_depth, double near, double far) {
-    RasterInputs in{means, opacities,  viewmat, intrinsics, quats,  scales,  covars,
-                    sh,    colors,     background, normals, groups, offset,  absolute};
+    RasterInputs in{means, opacities, viewmat,    intrinsics, quats,  scales, covars,
+                    sh,    colors,    background, normals,    groups, offset, absolute};
     prepare_raster_inputs(in);
     typename Backend::Scope scope(in.means);
     return dispatch_floating(kRasterOp, in.means, [&]<typename T>() -> Forward {
-      RasterArgs<T> a =
-          raster_args<Backend, T>(in, width, height, antialiased, depth, near, far);
+      RasterArgs<T> a = raster_args<Backend, T>(in, width, height, antialiased, depth, near, far);
       const Tensor& like = in.means;
       const ScalarType real = scalar_type_of<T>();
       const int64_t h = a.height, w = a.width, n = a.count;
@@ -201,8 +200,8 @@ struct RasterOps {
                            OptTensor groups, OptTensor offset, OptTensor absolute, int64_t width,
                            int64_t height, bool antialiased, bool has_depth, double near,
                            double far) {
-    RasterInputs in{means, opacities,  viewmat, intrinsics, quats,  scales,  covars,
-                    sh,    colors,     background, normals, groups, offset,  absolute};
+    RasterInputs in{means, opacities, viewmat,    intrinsics, quats,  scales, covars,
+                    sh,    colors,    background, normals,    groups, offset, absolute};
     prepare_raster_inputs(in);
     typename Backend::Scope scope(in.means);
     return dispatch_floating(kRasterOp, in.means, [&]<typename T>() -> Backward {
@@ -264,10 +263,10 @@ struct RasterOps {
                    ? torch::stable::new_empty(like, t->sizes(), scalar_type_of<T>())
                    : zeros_like(t);
       };
-      Backward out{gradient_of(in.means),   gradient_of(in.opacities),  gradient_of(in.quats),
-                   gradient_of(in.scales),  gradient_of(in.covars),     gradient_of(in.sh),
-                   gradient_of(in.colors),  zeros_like(in.background),  gradient_of(in.normals),
-                   gradient_of(in.offset),  gradient_of(in.absolute)};
+      Backward out{gradient_of(in.means),  gradient_of(in.opacities), gradient_of(in.quats),
+                   gradient_of(in.scales), gradient_of(in.covars),    gradient_of(in.sh),
+                   gradient_of(in.colors), zeros_like(in.background), gradient_of(in.normals),
+                   gradient_of(in.offset), gradient_of(in.absolute)};
       b.grad_means = mptr<T>(std::get<0>(out));
       b.grad_opacities = mptr<T>(std::get<1>(out));
       b.grad_quats = in.quats ? mptr<T>(std::get<2>(out)) : nullptr;
