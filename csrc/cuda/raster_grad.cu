@@ -1,119 +1,221 @@
-// Adjoint of the blend on CUDA: per pixel, summed over the warp, one atomic per warp and value;
-// then one thread per Gaussian takes the sums to the inputs.
+// Adjoint of the blend on CUDA. A warp sums what its 64 pixels say of a splat by exchanging halves
+// (16 shuffles for up to 16 numbers, not 5 each) and adds the sums with one instruction to
+// consecutive words.
 #include "cuda/launch_raster.h"
-#include "cuda/raster_tile.h"
+#include "cuda/raster_walk.h"
 
 namespace gsf::cuda {
 namespace {
 
-template <typename T, int kF>
-__global__ void __launch_bounds__(kTileThreads)
-    blend_backward_kernel(RasterGradArgs<T> b, int active, T* splat_grads) {
-  __shared__ Stage<T, kF> stage;
-  const RasterArgs<T>& a = b.forward;
-  // Only the first `active` features carry a gradient; rows of splat_grads have room for all.
-  const int features = kF ? kF : active, width = kGradFeatures + a.features;
-  const int lane = threadIdx.x % 32;
-  const PixelPlace place = pixel_place(a, blockIdx.x);
-  const T px = T(place.x) + T(0.5), py = T(place.y) + T(0.5);
-  const int64_t pixel = int64_t(place.y) * a.width + place.x;
+constexpr int kLanesSums = 16;  // numbers summed at once
 
-  T grad[kF ? kF : kMaxFeatures];
-  for (int f = 0; f < features; ++f) grad[f] = T(0);
-  // What everything from the current splat to the back adds to the loss, see the CPU's tile.
-  T behind = T(0), left = T(0);
-  if (place.inside) {
-    const T alpha = a.alpha[pixel];
-    left = T(1) - alpha;
-    for (int c = 0; c < a.channels && b.grad_image; ++c) {
-      grad[c] = b.grad_image[pixel * a.channels + c];
-      behind += grad[c] * a.image[pixel * a.channels + c];
-    }
-    for (int c = 0; c < 3 && b.grad_normal; ++c) {
-      grad[a.channels + c] = b.grad_normal[3 * pixel + c];
-      behind += grad[a.channels + c] * a.normal[3 * pixel + c];
-    }
-    T grad_alpha = b.grad_alpha ? b.grad_alpha[pixel] : T(0);
-    if (b.grad_depth && alpha > T(0)) {
-      const T g = b.grad_depth[pixel];
-      grad[features - 1] = g / alpha;
-      grad_alpha -= g * a.depth[pixel] / alpha;
-      behind += g * a.depth[pixel];
-    }
-    behind -= grad_alpha * left;
+// Exchanges halves: of 2 kHalf numbers a lane keeps the sum of one half with its partner's.
+template <typename T, int kHalf>
+__device__ __forceinline__ void exchange(T (&v)[kLanesSums]) {
+  const bool upper = threadIdx.x & (2 * kHalf);
+#pragma unroll
+  for (int k = 0; k < kHalf; ++k) {
+    const T keep = upper ? v[k + kHalf] : v[k], give = upper ? v[k] : v[k + kHalf];
+    v[k] = keep + __shfl_xor_sync(kAllLanes, give, 2 * kHalf);
   }
-  if (b.grad_background) {
-    for (int c = 0; c < a.channels; ++c) {
-      const T share = warp_sum(grad[c] * left);
-      if (lane == 0) atomicAdd(b.grad_background + c, share);
-    }
-  }
-
-  PixelWalk<T> walk(place.inside);
-  for_each_splat(a, blockIdx.x, place, walk, stage, [&](const T* splat, int32_t id, int32_t group) {
-    const auto w = walk.weigh(splat, group, px, py);
-    if (!__any_sync(kAllLanes, w.keep)) return;
-    T v = T(0);
-    if (w.keep) {
-      T along = T(0);
-      for (int f = 0; f < features; ++f) along += grad[f] * splat[kFeatures + f];
-      behind -= w.weight * along;
-      if (w.open) v = w.weight * along - w.alpha * behind / (T(1) - w.alpha);
-    }
-    T* out = splat_grads + int64_t(id) * width;
-    const T vx = v * w.dx, vy = v * w.dy;
-    const T moments[kGradFeatures] = {vx, vy, vx * w.dx, vx * w.dy, vy * w.dy, v};
-    for (int k = 0; k < kGradFeatures; ++k) {
-      const T total = warp_sum(moments[k]);
-      if (lane == 0) atomicAdd(out + k, total);
-    }
-    for (int f = 0; f < features; ++f) {
-      const T total = warp_sum(w.weight * grad[f]);
-      if (lane == 0) atomicAdd(out + kGradFeatures + f, total);
-    }
-  });
 }
 
+// Sums v[0..15] over the warp; lane l returns the total of v[l / 2].
 template <typename T>
-__global__ void splat_backward_kernel(RasterGradArgs<T> b, T* splat_grads) {
+__device__ __forceinline__ T sum_sixteen(T (&v)[kLanesSums]) {
+  exchange<T, 8>(v);
+  exchange<T, 4>(v);
+  exchange<T, 2>(v);
+  exchange<T, 1>(v);
+  return v[0] + __shfl_xor_sync(kAllLanes, v[0], 1);
+}
+
+// Adds `count` numbers, summed over the warp, to out[0..count).
+template <typename T, int kCount>
+__device__ __forceinline__ void add_sums(const T (&value)[kCount], int count, T* out) {
+  const int mine = threadIdx.x % 32 / 2;
+#pragma unroll
+  for (int base = 0; base < kCount; base += kLanesSums) {
+    if (base < count) {
+      T v[kLanesSums];
+#pragma unroll
+      for (int k = 0; k < kLanesSums; ++k) v[k] = base + k < kCount ? value[base + k] : T(0);
+      const T total = sum_sixteen(v);
+      if (threadIdx.x % 2 == 0 && base + mine < count) atomicAdd(out + base + mine, total);
+    }
+  }
+}
+
+template <typename T, int kF, bool kGroups>
+__global__ void __launch_bounds__(kBlockThreads)
+    blend_backward_kernel(RasterGradArgs<T> b, SplatSums<T> sums) {
+  __shared__ StagedSplat<T, kF> stage[kBlockWarps][32];
   const RasterArgs<T>& a = b.forward;
-  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (i >= a.count) return;
-  const T* row = a.splats + i * a.stride;
-  if (!(row[kOpacity] > T(0))) return;
-  // Moments of v -> gradients of centre, conic and opacity; the features stand as they are.
-  T* g = splat_grads + i * (kGradFeatures + a.features);
-  const T x = g[0], y = g[1];
-  g[0] = row[kConicA] * x + row[kConicB] * y;
-  g[1] = row[kConicB] * x + row[kConicC] * y;
-  g[2] *= T(-0.5);
-  g[3] = -g[3];
-  g[4] *= T(-0.5);
-  g[5] /= row[kOpacity];
-  project_splat_backward(b, raster_camera(a), i, g);
+  const int active = sums.active;
+  const WarpPlace place = warp_place(a);
+  const T px = T(place.lane_x) + T(0.5);
+
+  PixelWalk<T, kGroups> walk[kLanePixels];
+  T grad[kLanePixels][kF];
+  // What everything from the current splat to the back adds to the loss: g . (blended features +
+  // T bg) - g_alpha T, reduced splat by splat.
+  T behind[kLanePixels];
+#pragma unroll
+  for (int p = 0; p < kLanePixels; ++p) {
+    const int y = place.lane_y + p * kLaneRows;
+    const bool inside = place.lane_x < a.width && y < a.height;
+    const int64_t pixel =
+        inside ? (int64_t(place.camera) * a.height + y) * a.width + place.lane_x : 0;
+    walk[p].start(inside);
+    behind[p] = T(0);
+    const T alpha = inside ? a.alpha[pixel] : T(0);
+    T grad_alpha = inside && b.grad_alpha ? b.grad_alpha[pixel] : T(0);
+#pragma unroll
+    for (int f = 0; f < kF; ++f) {
+      T g = T(0), value = T(0);
+      if (inside && f < active) {
+        if (f < a.channels) {
+          if (b.grad_image) {
+            g = b.grad_image[pixel * a.channels + f];
+            value = a.image[pixel * a.channels + f];
+          }
+        } else if (a.has_normals && f < a.channels + 3) {
+          if (b.grad_normal) {
+            g = b.grad_normal[3 * pixel + f - a.channels];
+            value = a.normal[3 * pixel + f - a.channels];
+          }
+        } else if (b.grad_depth && alpha > T(0)) {
+          const T gd = b.grad_depth[pixel];
+          grad_alpha -= gd * a.depth[pixel] / alpha;
+          g = gd / alpha;
+          value = a.depth[pixel] * alpha;
+        }
+      }
+      grad[p][f] = g;
+      behind[p] += g * value;
+    }
+    behind[p] -= grad_alpha * (T(1) - alpha);
+  }
+
+  for_each_splat<T, kF, kGroups>(
+      a, place, active, stage[threadIdx.x / 32], [&] { return walk[0].stopped && walk[1].stopped; },
+      [&](const StagedSplat<T, kF>& s) {
+        const T dx = px - s.x, along = s.a * dx * dx, cross = s.b * dx;
+        // Moments, features, absolute gradients of the centre, all over the lane's pixels.
+        constexpr int kCount = kGradFeatures + kF + 2;
+        T value[kCount];
+#pragma unroll
+        for (int k = 0; k < kCount; ++k) value[k] = T(0);
+        bool any = false;
+        T absolute_x = T(0), absolute_y = T(0);
+#pragma unroll
+        for (int p = 0; p < kLanePixels; ++p) {
+          const auto w = walk[p].weigh(s, along, cross, T(place.lane_y + p * kLaneRows) + T(0.5));
+          any = any || w.keep;
+          T toward = T(0);
+#pragma unroll
+          for (int f = 0; f < kF; ++f) {
+            toward += grad[p][f] * s.feature[f];
+            value[kGradFeatures + f] += w.weight * grad[p][f];
+          }
+          behind[p] -= w.weight * toward;
+          const T v = w.open ? w.weight * toward - w.alpha * behind[p] / (T(1) - w.alpha) : T(0);
+          const T vx = v * dx, vy = v * w.dy;
+          value[0] += vx;
+          value[1] += vy;
+          value[2] += vx * dx;
+          value[3] += vx * w.dy;
+          value[4] += vy * w.dy;
+          value[5] += v;
+          if (b.grad_absolute) {
+            // s.a is half of the conic's entry, both in base 2.
+            absolute_x += fabs(2 * s.a * vx + s.b * vy);
+            absolute_y += fabs(s.b * vx + 2 * s.c * vy);
+          }
+        }
+        if (!__any_sync(kAllLanes, any)) return;
+        T* out = sums.data + int64_t(s.id) * sums.stride;
+        if (b.grad_absolute) {
+#pragma unroll
+          for (int k = kGradFeatures; k < kCount; ++k) {
+            if (k == kGradFeatures + active) value[k] = absolute_x * T(1 / kLog2E);
+            if (k == kGradFeatures + active + 1) value[k] = absolute_y * T(1 / kLog2E);
+          }
+          add_sums(value, kGradFeatures + active + 2, out);
+        } else {
+          add_sums(value, kGradFeatures + active, out);
+        }
+      });
+}
+
+// Sum of the image's gradient that shines through, per channel: few blocks, few atomics.
+template <typename T>
+__global__ void background_kernel(RasterGradArgs<T> b) {
+  const RasterArgs<T>& a = b.forward;
+  const int64_t pixels = int64_t(a.width) * a.height, first = blockIdx.y * pixels;
+  __shared__ T block_sum;
+  for (int c = 0; c < a.channels; ++c) {
+    T sum = T(0);
+    for (int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; k < pixels;
+         k += int64_t(gridDim.x) * blockDim.x)
+      sum += b.grad_image[(first + k) * a.channels + c] * (T(1) - a.alpha[first + k]);
+    if (threadIdx.x == 0) block_sum = T(0);
+    __syncthreads();
+    sum = warp_sum(sum);
+    if (threadIdx.x % 32 == 0) atomicAdd(&block_sum, sum);
+    __syncthreads();
+    if (threadIdx.x == 0)
+      atomicAdd(b.grad_background + int64_t(blockIdx.y) * a.background_stride + c, block_sum);
+    __syncthreads();
+  }
+}
+
+// Zeroes the words of every splat that hold sums; the rest of a row may be anything.
+template <typename T>
+__global__ void clear_kernel(SplatSums<T> sums, int width, int64_t splats) {
+  const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (k < splats * width) sums.data[k / width * sums.stride + k % width] = T(0);
 }
 
 }  // namespace
 
 template <typename T>
-cudaError_t raster_backward(const RasterGradArgs<T>& b, T* splat_grads, cudaStream_t stream) {
+SplatSums<T> raster_sums(const RasterGradArgs<T>& b) {
   const RasterArgs<T>& a = b.forward;
   // Features are colours, normal, depth: those behind the last wanted one are left out.
   const int active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
-  const cudaError_t error = with_features<T>(active, [&]<int kF>() {
-    blend_backward_kernel<T, kF>
-        <<<a.tiles_x * a.tiles_y, kTileThreads, 0, stream>>>(b, active, splat_grads);
-    return cudaGetLastError();
-  });
-  if (error != cudaSuccess || a.count == 0) return error;
-  constexpr int kThreads = 128;
-  splat_backward_kernel<T>
-      <<<static_cast<int>((a.count + kThreads - 1) / kThreads), kThreads, 0, stream>>>(b,
-                                                                                       splat_grads);
-  return cudaGetLastError();
+  const int width = kGradFeatures + active + (b.grad_absolute ? 2 : 0);
+  const int room = a.sh ? 3 * sh_coefficients(a.sh_degree) : 0;
+  // One camera's sums fit into the rows that their own gradient of `sh` will fill: saves memory.
+  if (a.cameras == 1 && room >= width) return {b.grad_sh, room, active};
+  return {nullptr, (width + 3) / 4 * 4, active};
 }
 
-template cudaError_t raster_backward<float>(const RasterGradArgs<float>&, float*, cudaStream_t);
-template cudaError_t raster_backward<double>(const RasterGradArgs<double>&, double*, cudaStream_t);
+template <typename T>
+cudaError_t raster_backward(const RasterGradArgs<T>& b, const SplatSums<T>& sums,
+                            cudaStream_t stream) {
+  const RasterArgs<T>& a = b.forward;
+  if (b.grad_background && b.grad_image)
+    background_kernel<T><<<dim3(264, a.cameras), 256, 0, stream>>>(b);
+  if (a.count == 0) return cudaGetLastError();
+  const int width = kGradFeatures + sums.active + (b.grad_absolute ? 2 : 0);
+  const int64_t words = a.splat_count() * width;
+  clear_kernel<T><<<static_cast<unsigned>((words + 255) / 256), 256, 0, stream>>>(sums, width,
+                                                                                  a.splat_count());
+  const cudaError_t error =
+      with_variant<T>(sums.active, a.groups != nullptr, [&]<int kF, bool kGroups>() {
+        blend_backward_kernel<T, kF, kGroups>
+            <<<blend_blocks(a), kBlockThreads, 0, stream>>>(b, sums);
+        return cudaGetLastError();
+      });
+  return error == cudaSuccess ? raster_gaussian_backward(b, sums, stream) : error;
+}
+
+template SplatSums<float> raster_sums(const RasterGradArgs<float>&);
+template SplatSums<double> raster_sums(const RasterGradArgs<double>&);
+template cudaError_t raster_backward<float>(const RasterGradArgs<float>&, const SplatSums<float>&,
+                                            cudaStream_t);
+template cudaError_t raster_backward<double>(const RasterGradArgs<double>&,
+                                             const SplatSums<double>&, cudaStream_t);
 
 }  // namespace gsf::cuda
