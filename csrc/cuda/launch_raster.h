@@ -9,6 +9,11 @@
 
 namespace gsf::cuda {
 
+// Edge of a list's tile [px]. Warps cull splats for their own 8x8 pixels, so the lists may be
+// coarse: at 32 there are 2.3 times fewer entries to write and sort than at 16.
+constexpr int kListTile = 32;
+constexpr int kGeometry = 8;  // numbers per splat before its features
+
 // Per splat, in scratch memory: sort keys, the splats by depth, and how many entries of the lists
 // each needs.
 struct RasterOrder {
@@ -16,7 +21,7 @@ struct RasterOrder {
   int32_t* ids;       // [M] 0, 1, ...
   uint32_t* sorted;   // [M]
   int32_t* order;     // [M] splats, nearest first
-  uint32_t* counts;   // [M] tiles of splat m
+  uint64_t* codes;    // [M] tiles of splat m (TileCode)
   uint32_t* offsets;  // [M] tiles of the splats before rank r
   unsigned long long* total;
   void* temporary;
@@ -29,11 +34,11 @@ RasterOrder carve_raster_order(void* scratch, int64_t splats);
 class ReadBack;
 ReadBack* read_back(int device);
 
-// Projects: fills splats, radii, keys, ids, counts; sends the sum of counts to `number`.
+// Projects: fills splats, radii, keys, ids, codes; sends the number of tiles to `number`.
 template <typename T>
 cudaError_t raster_project(const RasterArgs<T>& a, const RasterOrder& o, ReadBack* number,
                            cudaStream_t stream);
-// Sorts by depth and sums up the counts: fills order and offsets.
+// Sorts by depth and sums up the tiles: fills order and offsets.
 cudaError_t raster_sort(const RasterOrder& o, int64_t splats, cudaStream_t stream);
 // Waits for the number of list entries.
 cudaError_t await_count(ReadBack* number, int64_t* count);
@@ -47,16 +52,35 @@ cudaError_t raster_bin(const RasterArgs<T>& a, const RasterOrder& o, void* scrat
 template <typename T>
 cudaError_t raster_blend(const RasterArgs<T>& a, cudaStream_t stream);
 
-// Sums of a splat over the pixels: moments, the gradients of the first `active` features, and, when
-// wanted, the absolute gradients of the centre; `stride` numbers from splat to splat.
+// Sums of a splat over the pixels: moments, the absolute gradients of the centre when wanted, and
+// the gradients of the first `active` features. Word k of splat m stands in one of up to three
+// arrays, because those of few words are summed right where the gradients of means, quats and
+// scales (or covars) will be: the thread that reads them writes those.
 template <typename T>
 struct SplatSums {
-  T* data;
-  int stride;
+  static constexpr int kParts = 3;
+  T* part[kParts];
+  int stride[kParts];
+  int end[kParts];  // first word that is not in the part
   int active;
+  int features;  // word of the first feature
+
+  GSF_HOST_DEVICE int width() const { return features + active; }
+  // Written without indices that change: those would put the struct into local memory.
+  GSF_HOST_DEVICE int stride_of(int k) const {
+    return k < end[0] ? stride[0] : (k < end[1] ? stride[1] : stride[2]);
+  }
+  GSF_HOST_DEVICE T* word(int k, int64_t m) const {
+    T* base = k < end[0] ? part[0] : (k < end[1] ? part[1] : part[2]);
+    const int before = k < end[0] ? 0 : (k < end[1] ? end[0] : end[1]);
+    return base + m * stride_of(k) + (k - before);
+  }
 };
+// Numbers of memory of their own that the sums need; 0 when the gradients' will do.
 template <typename T>
-SplatSums<T> raster_sums(const RasterGradArgs<T>& b);  // data null: the caller brings memory
+int64_t raster_sums_size(const RasterGradArgs<T>& b);
+template <typename T>
+SplatSums<T> raster_sums(const RasterGradArgs<T>& b, T* own);
 // Fills every gradient but the background's, which it adds to.
 template <typename T>
 cudaError_t raster_backward(const RasterGradArgs<T>& b, const SplatSums<T>& sums,

@@ -15,7 +15,6 @@ namespace {
 constexpr int kThreads = 256;
 constexpr unsigned kAllLanes = 0xffffffffu;
 constexpr int64_t kShortKeys = 65536;  // as many values fit 16 bits
-constexpr uint32_t kOneThread = 32;    // more tiles than that are shared out over a warp
 
 int blocks_for(int64_t n) { return static_cast<int>((n + kThreads - 1) / kThreads); }
 
@@ -34,15 +33,13 @@ struct Carver {
 };
 
 struct CountOfRank {
-  const uint32_t* counts;
+  const uint64_t* codes;
   const int32_t* order;
-  __device__ uint32_t operator()(int r) const { return counts[order[r]]; }
+  __device__ uint32_t operator()(int r) const { return TileCode::count(codes[order[r]]); }
 };
 using RankCounts = thrust::transform_iterator<CountOfRank, thrust::counting_iterator<int>>;
 
-// Writes the list entries of the splats of 32 ranks. `tiles` gets the number of tiles in all where
-// a splat has fewer entries than it counted, so that what the sort leaves behind the last tile is
-// never drawn.
+// Writes the list entries of the splats of 32 ranks; those of many tiles by the whole warp.
 template <typename T, typename Key>
 __global__ void __launch_bounds__(kThreads)
     emit_kernel(RasterArgs<T> a, RasterOrder o, Key* tiles, int32_t* ids) {
@@ -50,31 +47,26 @@ __global__ void __launch_bounds__(kThreads)
   const int lane = threadIdx.x % 32;
   const bool real = r < a.splat_count();
   const int32_t id = real ? o.order[r] : 0;
-  const uint32_t count = real ? o.counts[id] : 0, begin = real ? o.offsets[r] : 0;
-  const Key none = static_cast<Key>(a.tiles() * a.cameras);
+  const uint64_t code = real ? o.codes[id] : 0;
+  const uint32_t begin = real ? o.offsets[r] : 0;
   const auto first_tile = [&](int32_t splat) {
     return a.cameras == 1 ? 0 : static_cast<int>(splat / a.count) * a.tiles();
   };
-  if (count > 0 && count <= kOneThread) {
-    const SplatGeometry<T> g = splat_geometry(a)[id];
-    const SplatBands<T> bands(g, a);
-    const int base = first_tile(id);
-    uint32_t e = begin, end = begin + count;
-    for (int row = bands.y0; row < bands.y1; ++row) {
-      int first, last;
-      bands.columns(g, a, row, &first, &last);
-      for (int x = first; x < last && e < end; ++x, ++e) {
-        tiles[e] = static_cast<Key>(base + row * a.tiles_x + x);
-        ids[e] = id;
-      }
+  const bool many = TileCode::many(code);
+  if (!many) {
+    const int base = first_tile(id) + TileCode::y(code) * a.tiles_x + TileCode::x(code);
+    uint32_t e = begin;
+    for (uint64_t mask = TileCode::mask(code); mask; mask &= mask - 1, ++e) {
+      const int bit = __ffsll(static_cast<long long>(mask)) - 1;
+      tiles[e] = static_cast<Key>(base + bit / TileCode::kEdge * a.tiles_x + bit % TileCode::kEdge);
+      ids[e] = id;
     }
-    for (; e < end; ++e) tiles[e] = none, ids[e] = id;
   }
-  for (unsigned large = __ballot_sync(kAllLanes, count > kOneThread); large; large &= large - 1) {
-    const int source = __ffs(large) - 1;
+  for (unsigned wide = __ballot_sync(kAllLanes, many); wide; wide &= wide - 1) {
+    const int source = __ffs(wide) - 1;
     const int32_t one = __shfl_sync(kAllLanes, id, source);
     uint32_t e = __shfl_sync(kAllLanes, begin, source);
-    const uint32_t end = e + __shfl_sync(kAllLanes, count, source);
+    const uint32_t end = e + __shfl_sync(kAllLanes, TileCode::count(code), source);
     const SplatGeometry<T> g = splat_geometry(a)[one];
     const SplatBands<T> bands(g, a);
     const int base = first_tile(one);
@@ -90,6 +82,9 @@ __global__ void __launch_bounds__(kThreads)
       }
       e += static_cast<uint32_t>(last - first);
     }
+    // Should rounding in this kernel give fewer tiles than in the other, the rest goes behind the
+    // last tile, where nothing is drawn.
+    const Key none = static_cast<Key>(a.tiles() * a.cameras);
     for (uint32_t at = e + lane; at < end; at += 32) tiles[at] = none, ids[at] = one;
   }
 }
@@ -154,7 +149,7 @@ RasterOrder carve_order(Carver& carve, int64_t splats) {
   o.ids = carve.take<int32_t>(splats);
   o.sorted = carve.take<uint32_t>(splats);
   o.order = carve.take<int32_t>(splats);
-  o.counts = carve.take<uint32_t>(splats);
+  o.codes = carve.take<uint64_t>(splats);
   o.offsets = carve.take<uint32_t>(splats);
   o.total = carve.take<unsigned long long>(1);
   o.temporary_bytes = depth_sort_bytes(splats);
@@ -182,7 +177,7 @@ cudaError_t raster_sort(const RasterOrder& o, int64_t splats, cudaStream_t strea
                                                             o.ids, o.order, splats, 0, 32, stream);
   if (error != cudaSuccess) return error;
   bytes = o.temporary_bytes;
-  const RankCounts counts(thrust::counting_iterator<int>(0), CountOfRank{o.counts, o.order});
+  const RankCounts counts(thrust::counting_iterator<int>(0), CountOfRank{o.codes, o.order});
   return cub::DeviceScan::ExclusiveSum(o.temporary, bytes, counts, o.offsets, splats, stream);
 }
 

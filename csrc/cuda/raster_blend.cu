@@ -5,12 +5,14 @@
 namespace gsf::cuda {
 namespace {
 
-template <typename T, int kF, bool kGroups>
+// kExtras: sibling groups, contribution or median depth are wanted; without, nothing of them is in
+// the loop.
+template <typename T, int kF, bool kExtras>
 __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
   __shared__ StagedSplat<T, kF> stage[kBlockWarps][32];
   const WarpPlace place = warp_place(a);
   const T px = T(place.lane_x) + T(0.5);
-  PixelWalk<T, kGroups> walk[kLanePixels];
+  PixelWalk<T, kExtras> walk[kLanePixels];
   T sum[kLanePixels][kF], alpha[kLanePixels], median[kLanePixels];
 #pragma unroll
   for (int p = 0; p < kLanePixels; ++p) {
@@ -26,9 +28,9 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
     return row[0] * mean[0] + row[1] * mean[1] + row[2] * mean[2] + row[3];
   };
 
-  for_each_splat<T, kF, kGroups>(
+  for_each_splat<T, kF, kExtras>(
       a, place, a.features, stage[threadIdx.x / 32],
-      [&] { return walk[0].stopped && walk[1].stopped; },
+      [&] { return walk[0].stopped() && walk[1].stopped(); },
       [&](const StagedSplat<T, kF>& s) {
         const T dx = px - s.x, along = s.a * dx * dx, cross = s.b * dx;
         T both = T(0);
@@ -41,12 +43,17 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
           // Sum of weights: 1 - transmittance would cost thin pixels their precision.
           alpha[p] += w.weight;
           both += w.weight;
-          if (a.median && before > T(0.5) && walk[p].left <= T(0.5)) median[p] = depth_of(s.id);
+          if constexpr (kExtras) {
+            if (a.median && w.keep && before > T(0.5) && walk[p].left <= T(0.5))
+              median[p] = depth_of(s.id);
+          }
         }
-        if (a.contribution && __any_sync(kAllLanes, both > T(0))) {
-          const T total = warp_sum(both);
-          if (threadIdx.x % 32 == 0)
-            atomicAdd(a.contribution + (s.id - int64_t(place.camera) * a.count), total);
+        if constexpr (kExtras) {
+          if (a.contribution && __any_sync(kAllLanes, both > T(0))) {
+            const T total = warp_sum(both);
+            if (threadIdx.x % 32 == 0)
+              atomicAdd(a.contribution + (s.id - int64_t(place.camera) * a.count), total);
+          }
         }
       });
 
@@ -64,7 +71,7 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
     for (int f = 0; f < kF; ++f) {
       if (inside && f < a.channels)
         a.image[pixel * a.channels + f] =
-            sum[p][f] + (background ? walk[p].left * background[f] : T(0));
+            sum[p][f] + (background ? fabs(walk[p].left) * background[f] : T(0));
       else if (inside && a.has_normals && f < a.channels + 3)
         a.normal[3 * pixel + f - a.channels] = sum[p][f];
       else if (inside && a.has_depth && f == a.features - 1)
@@ -77,8 +84,9 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
 
 template <typename T>
 cudaError_t raster_blend(const RasterArgs<T>& a, cudaStream_t stream) {
-  return with_variant<T>(a.features, a.groups != nullptr, [&]<int kF, bool kGroups>() {
-    blend_kernel<T, kF, kGroups><<<blend_blocks(a), kBlockThreads, 0, stream>>>(a);
+  const bool extras = a.groups || a.contribution || a.median;
+  return with_variant<T>(a.features, extras, [&]<int kF, bool kExtras>() {
+    blend_kernel<T, kF, kExtras><<<blend_blocks(a), kBlockThreads, 0, stream>>>(a);
     return cudaGetLastError();
   });
 }

@@ -8,7 +8,7 @@ namespace gsf::cuda {
 namespace {
 
 template <typename T, int kDegree>
-__global__ void __launch_bounds__(kRowThreads)
+__global__ void __launch_bounds__(kRowThreads, 4)
     gaussian_backward_kernel(RasterGradArgs<T> b, SplatSums<T> sums) {
   const RasterArgs<T>& a = b.forward;
   const int64_t i = int64_t(blockIdx.x) * kRowThreads + threadIdx.x;
@@ -31,7 +31,7 @@ __global__ void __launch_bounds__(kRowThreads)
 
   GaussianGradient<T> total;
   T basis[kMaxShCoefficients], rgb[3] = {T(0), T(0), T(0)};
-  const int depth_at = b.grad_depth ? kGradFeatures + a.features - 1 : -1;
+  const int depth_at = b.grad_depth ? sums.features + a.features - 1 : -1;
   if (real) {
     if (b.grad_colors)
       for (int c = 0; c < a.channels; ++c) b.grad_colors[a.channels * i + c] = T(0);
@@ -40,37 +40,39 @@ __global__ void __launch_bounds__(kRowThreads)
   }
   for (int camera = 0; real && camera < a.cameras; ++camera) {
     const int64_t m = camera * a.count + i;
-    T* sum = sums.data + m * sums.stride;
     const bool here = seen_by(camera);
+    const auto sum = [&](int k) { return *sums.word(k, m); };
     T g[kGradFeatures] = {};
-    T* const feature = sum + kGradFeatures;
     if (here) {
+      T moment[kGradFeatures];
+      for (int k = 0; k < kGradFeatures; ++k) moment[k] = sum(k);
       const SplatGeometry<T> s = splat_geometry(a)[m];
-      moments_to_gradient(sum, s.a, s.b, s.c, s.opacity, g);
+      moments_to_gradient(moment, s.a, s.b, s.c, s.opacity, g);
     }
     if (b.grad_offset) {
       b.grad_offset[2 * m] = g[0];
       b.grad_offset[2 * m + 1] = g[1];
     }
     if (b.grad_absolute) {
-      b.grad_absolute[2 * m] = here ? feature[sums.active] : T(0);
-      b.grad_absolute[2 * m + 1] = here ? feature[sums.active + 1] : T(0);
+      b.grad_absolute[2 * m] = here ? sum(kGradFeatures) : T(0);
+      b.grad_absolute[2 * m + 1] = here ? sum(kGradFeatures + 1) : T(0);
     }
     if (!here) continue;
     const SplatCamera<T> view = raster_camera(a, camera);
-    geometry_backward(a, view, i, g, depth_at < 0 ? T(0) : sum[depth_at], &total);
+    geometry_backward(a, view, i, g, depth_at < 0 ? T(0) : sum(depth_at), &total);
     if (sh) {
       const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
-      for (int c = 0; c < 3; ++c) rgb[c] = feature[c];
+      for (int c = 0; c < 3; ++c) rgb[c] = sum(sums.features + c);
       sh_direction_backward(degree, view, mean, sh, rgb, basis, &total.mean);
       // Kept for the second round, below; with one camera the registers hold it.
       if (a.cameras > 1)
-        for (int c = 0; c < 3; ++c) feature[c] = rgb[c];
+        for (int c = 0; c < 3; ++c) *sums.word(sums.features + c, m) = rgb[c];
     } else {
-      for (int c = 0; c < a.channels; ++c) b.grad_colors[a.channels * i + c] += feature[c];
+      for (int c = 0; c < a.channels; ++c)
+        b.grad_colors[a.channels * i + c] += sum(sums.features + c);
     }
     if (b.grad_normals && sums.active > a.channels)
-      for (int c = 0; c < 3; ++c) b.grad_normals[3 * i + c] += feature[a.channels + c];
+      for (int c = 0; c < 3; ++c) b.grad_normals[3 * i + c] += sum(sums.features + a.channels + c);
   }
   if (real) store_gaussian_gradient(b, i, total);
 
@@ -86,12 +88,12 @@ __global__ void __launch_bounds__(kRowThreads)
       for (int j = 0; j < 3 * k; ++j) out[j] = T(0);
       for (int camera = 0; seen && camera < a.cameras; ++camera) {
         if (!seen_by(camera)) continue;
-        const T* feature = sums.data + (camera * a.count + i) * sums.stride + kGradFeatures;
+        const int64_t m = camera * a.count + i;
         const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
         T length;
         sh_basis(degree, view_direction(raster_camera(a, camera), mean, &length), basis);
         for (int j = 0; j < k; ++j)
-          for (int c = 0; c < 3; ++c) out[3 * j + c] += feature[c] * basis[j];
+          for (int c = 0; c < 3; ++c) out[3 * j + c] += *sums.word(sums.features + c, m) * basis[j];
       }
     }
   }

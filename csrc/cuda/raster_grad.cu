@@ -7,51 +7,116 @@
 namespace gsf::cuda {
 namespace {
 
-constexpr int kLanesSums = 16;  // numbers summed at once
+// Branch-free: a division inside a condition would split the warp.
+__device__ __forceinline__ float reciprocal(float x) {
+  float y;
+  asm volatile("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ __forceinline__ double reciprocal(double x) { return 1.0 / x; }
 
 // Exchanges halves: of 2 kHalf numbers a lane keeps the sum of one half with its partner's.
-template <typename T, int kHalf>
-__device__ __forceinline__ void exchange(T (&v)[kLanesSums]) {
-  const bool upper = threadIdx.x & (2 * kHalf);
+template <int kHalf, int kOffset, typename T>
+__device__ __forceinline__ void exchange(T* v) {
+  const bool upper = threadIdx.x & kOffset;
 #pragma unroll
   for (int k = 0; k < kHalf; ++k) {
     const T keep = upper ? v[k + kHalf] : v[k], give = upper ? v[k] : v[k + kHalf];
-    v[k] = keep + __shfl_xor_sync(kAllLanes, give, 2 * kHalf);
+    v[k] = keep + __shfl_xor_sync(kAllLanes, give, kOffset);
   }
 }
+template <int kOffset, typename T>
+__device__ __forceinline__ T summed_below(T v) {
+#pragma unroll
+  for (int offset = kOffset; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
+  return v;
+}
 
-// Sums v[0..15] over the warp; lane l returns the total of v[l / 2].
+// Sums over the warp: lane l returns the total of v[l / 4] (eight numbers), of v[l / 8] (four) or
+// of v[0]. Spoils v.
 template <typename T>
-__device__ __forceinline__ T sum_sixteen(T (&v)[kLanesSums]) {
-  exchange<T, 8>(v);
-  exchange<T, 4>(v);
-  exchange<T, 2>(v);
-  exchange<T, 1>(v);
-  return v[0] + __shfl_xor_sync(kAllLanes, v[0], 1);
+__device__ __forceinline__ T sum_eight(T* v) {
+  exchange<4, 16>(v);
+  exchange<2, 8>(v);
+  exchange<1, 4>(v);
+  return summed_below<2>(v[0]);
+}
+template <typename T>
+__device__ __forceinline__ T sum_four(T* v) {
+  exchange<2, 16>(v);
+  exchange<1, 8>(v);
+  return summed_below<4>(v[0]);
 }
 
-// Adds `count` numbers, summed over the warp, to out[0..count).
-template <typename T, int kCount>
-__device__ __forceinline__ void add_sums(const T (&value)[kCount], int count, T* out) {
-  const int mine = threadIdx.x % 32 / 2;
-#pragma unroll
-  for (int base = 0; base < kCount; base += kLanesSums) {
-    if (base < count) {
-      T v[kLanesSums];
-#pragma unroll
-      for (int k = 0; k < kLanesSums; ++k) v[k] = base + k < kCount ? value[base + k] : T(0);
-      const T total = sum_sixteen(v);
-      if (threadIdx.x % 2 == 0 && base + mine < count) atomicAdd(out + base + mine, total);
-    }
+// Adds a splat's numbers, summed over the warp: eights, then a four or a one, so that a lane ends
+// up with one word, and one instruction adds them all. kCount: words there are room for.
+template <int kCount, typename T>
+class SumAdder {
+ public:
+  __device__ __forceinline__ explicit SumAdder(const SplatSums<T>& sums) {
+    const int lane = threadIdx.x % 32;
+    int word = lane % 4 == 0 ? lane / 4 : -1;
+    // The rest rides along with the first eight, on lanes that those leave free.
+    if (kRest == 1 && lane == 1) word = kFirst;
+    if (kRest > 1 && lane % 8 == 1) word = kFirst + lane / 8;
+    target_ = word >= 0 && word < sums.width() ? sums.word(word, 0) : nullptr;
+    stride_ = sums.stride_of(word);
+    width_ = sums.width();
   }
-}
 
-template <typename T, int kF, bool kGroups>
+  __device__ __forceinline__ void add(const T* value, int64_t id) const {
+    const int lane = threadIdx.x % 32;
+#pragma unroll
+    for (int e = 1; e < kEights; ++e) {  // more than twelve words stand in one array
+      if (8 * e >= width_) break;
+      const T total = eight(value, 8 * e);
+      if (lane % 4 == 0 && 8 * e + lane / 4 < width_)
+        add_global(target_ + id * stride_ + 8 * e, total);
+    }
+    T total = eight(value, 0);
+    if constexpr (kRest == 1) {
+      const T last = summed_below<16>(value[kFirst]);
+      if (lane == 1) total = last;
+    } else if constexpr (kRest > 1) {
+      T v[4];
+#pragma unroll
+      for (int k = 0; k < 4; ++k) v[k] = k < kRest ? value[kFirst + (k < kRest ? k : 0)] : T(0);
+      const T last = sum_four(v);
+      if (lane % 8 == 1) total = last;
+    }
+    if (target_) add_global(target_ + id * stride_, total);
+  }
+
+ private:
+  static constexpr int kEights = kCount <= 4 ? 1 : (kCount + 3) / 8;  // a rest of four is no eight
+  static constexpr int kFirst = 8 * kEights;
+  static constexpr int kRest = kCount > kFirst ? kCount - kFirst : 0;
+  static_assert(kRest <= 4);
+
+  __device__ __forceinline__ static T eight(const T* value, int first) {
+    T v[8];
+#pragma unroll
+    for (int k = 0; k < 8; ++k) v[k] = first + k < kCount ? value[first + k] : T(0);
+    return sum_eight(v);
+  }
+
+  // Said to the compiler, which else allows for shared memory with a loop.
+  __device__ __forceinline__ static void add_global(T* address, T value) {
+    __builtin_assume(__isGlobal(address));
+    atomicAdd(address, value);
+  }
+
+  T* target_;  // word of this lane of splat 0, or null
+  int stride_, width_;
+};
+
+template <typename T, int kF, bool kGroups, bool kAbsolute>
 __global__ void __launch_bounds__(kBlockThreads)
     blend_backward_kernel(RasterGradArgs<T> b, SplatSums<T> sums) {
   __shared__ StagedSplat<T, kF> stage[kBlockWarps][32];
   const RasterArgs<T>& a = b.forward;
   const int active = sums.active;
+  const SumAdder<kGradFeatures + (kAbsolute ? 2 : 0) + kF, T> adder(sums);
   const WarpPlace place = warp_place(a);
   const T px = T(place.lane_x) + T(0.5);
 
@@ -98,16 +163,12 @@ __global__ void __launch_bounds__(kBlockThreads)
   }
 
   for_each_splat<T, kF, kGroups>(
-      a, place, active, stage[threadIdx.x / 32], [&] { return walk[0].stopped && walk[1].stopped; },
+      a, place, active, stage[threadIdx.x / 32],
+      [&] { return walk[0].stopped() && walk[1].stopped(); },
       [&](const StagedSplat<T, kF>& s) {
         const T dx = px - s.x, along = s.a * dx * dx, cross = s.b * dx;
-        // Moments, features, absolute gradients of the centre, all over the lane's pixels.
-        constexpr int kCount = kGradFeatures + kF + 2;
-        T value[kCount];
-#pragma unroll
-        for (int k = 0; k < kCount; ++k) value[k] = T(0);
+        T moment[kGradFeatures] = {}, absolute[2] = {}, feature[kF] = {};
         bool any = false;
-        T absolute_x = T(0), absolute_y = T(0);
 #pragma unroll
         for (int p = 0; p < kLanePixels; ++p) {
           const auto w = walk[p].weigh(s, along, cross, T(place.lane_y + p * kLaneRows) + T(0.5));
@@ -116,35 +177,33 @@ __global__ void __launch_bounds__(kBlockThreads)
 #pragma unroll
           for (int f = 0; f < kF; ++f) {
             toward += grad[p][f] * s.feature[f];
-            value[kGradFeatures + f] += w.weight * grad[p][f];
+            feature[f] += w.weight * grad[p][f];
           }
           behind[p] -= w.weight * toward;
-          const T v = w.open ? w.weight * toward - w.alpha * behind[p] / (T(1) - w.alpha) : T(0);
+          const T all = w.weight * toward - w.alpha * behind[p] * reciprocal(T(1) - w.alpha);
+          const T v = w.open ? all : T(0);
           const T vx = v * dx, vy = v * w.dy;
-          value[0] += vx;
-          value[1] += vy;
-          value[2] += vx * dx;
-          value[3] += vx * w.dy;
-          value[4] += vy * w.dy;
-          value[5] += v;
-          if (b.grad_absolute) {
-            // s.a is half of the conic's entry, both in base 2.
-            absolute_x += fabs(2 * s.a * vx + s.b * vy);
-            absolute_y += fabs(s.b * vx + 2 * s.c * vy);
+          moment[0] += vx;
+          moment[1] += vy;
+          moment[2] += vx * dx;
+          moment[3] += vx * w.dy;
+          moment[4] += vy * w.dy;
+          moment[5] += v;
+          if constexpr (kAbsolute) {
+            // s.a is half of the conic's entry; all three are in base 2.
+            absolute[0] += fabs(2 * s.a * vx + s.b * vy) * T(1 / kLog2E);
+            absolute[1] += fabs(s.b * vx + 2 * s.c * vy) * T(1 / kLog2E);
           }
         }
         if (!__any_sync(kAllLanes, any)) return;
-        T* out = sums.data + int64_t(s.id) * sums.stride;
-        if (b.grad_absolute) {
+        constexpr int kFirst = kGradFeatures + (kAbsolute ? 2 : 0);
+        T value[kFirst + kF];
 #pragma unroll
-          for (int k = kGradFeatures; k < kCount; ++k) {
-            if (k == kGradFeatures + active) value[k] = absolute_x * T(1 / kLog2E);
-            if (k == kGradFeatures + active + 1) value[k] = absolute_y * T(1 / kLog2E);
-          }
-          add_sums(value, kGradFeatures + active + 2, out);
-        } else {
-          add_sums(value, kGradFeatures + active, out);
-        }
+        for (int k = 0; k < kFirst + kF; ++k)
+          value[k] = k < kGradFeatures ? moment[k < kGradFeatures ? k : 0]
+                     : k < kFirst      ? absolute[k < kFirst ? k - kGradFeatures : 0]
+                                       : feature[k < kFirst ? 0 : k - kFirst];
+        adder.add(value, s.id);
       });
 }
 
@@ -170,25 +229,34 @@ __global__ void background_kernel(RasterGradArgs<T> b) {
   }
 }
 
-// Zeroes the words of every splat that hold sums; the rest of a row may be anything.
-template <typename T>
-__global__ void clear_kernel(SplatSums<T> sums, int width, int64_t splats) {
-  const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (k < splats * width) sums.data[k / width * sums.stride + k % width] = T(0);
-}
-
 }  // namespace
 
 template <typename T>
-SplatSums<T> raster_sums(const RasterGradArgs<T>& b) {
+SplatSums<T> raster_sums(const RasterGradArgs<T>& b, T* own) {
   const RasterArgs<T>& a = b.forward;
+  SplatSums<T> s{};
   // Features are colours, normal, depth: those behind the last wanted one are left out.
-  const int active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
-  const int width = kGradFeatures + active + (b.grad_absolute ? 2 : 0);
-  const int room = a.sh ? 3 * sh_coefficients(a.sh_degree) : 0;
-  // One camera's sums fit into the rows that their own gradient of `sh` will fill: saves memory.
-  if (a.cameras == 1 && room >= width) return {b.grad_sh, room, active};
-  return {nullptr, (width + 3) / 4 * 4, active};
+  s.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
+  s.features = kGradFeatures + (b.grad_absolute ? 2 : 0);
+  const int room = a.covars ? 3 + 6 + 1 : 3 + 4 + 3;
+  if (a.cameras == 1 && s.width() <= room) {
+    s.part[0] = b.grad_means, s.stride[0] = 3, s.end[0] = 3;
+    s.part[1] = a.covars ? b.grad_covars : b.grad_quats;
+    s.stride[1] = a.covars ? 6 : 4, s.end[1] = 3 + s.stride[1];
+    s.part[2] = a.covars ? b.grad_opacities : b.grad_scales;
+    s.stride[2] = a.covars ? 1 : 3, s.end[2] = room;
+  } else {
+    const int stride = (s.width() + 3) / 4 * 4;
+    for (int p = 0; p < SplatSums<T>::kParts; ++p)
+      s.part[p] = own, s.stride[p] = stride, s.end[p] = stride;
+  }
+  return s;
+}
+
+template <typename T>
+int64_t raster_sums_size(const RasterGradArgs<T>& b) {
+  const SplatSums<T> s = raster_sums<T>(b, nullptr);
+  return s.part[0] ? 0 : b.forward.splat_count() * s.stride[0];
 }
 
 template <typename T>
@@ -198,21 +266,29 @@ cudaError_t raster_backward(const RasterGradArgs<T>& b, const SplatSums<T>& sums
   if (b.grad_background && b.grad_image)
     background_kernel<T><<<dim3(264, a.cameras), 256, 0, stream>>>(b);
   if (a.count == 0) return cudaGetLastError();
-  const int width = kGradFeatures + sums.active + (b.grad_absolute ? 2 : 0);
-  const int64_t words = a.splat_count() * width;
-  clear_kernel<T><<<static_cast<unsigned>((words + 255) / 256), 256, 0, stream>>>(sums, width,
-                                                                                  a.splat_count());
+  for (int p = 0; p < SplatSums<T>::kParts; ++p) {
+    if (p > 0 && sums.part[p] == sums.part[p - 1]) break;  // one array for all
+    const size_t bytes = sizeof(T) * static_cast<size_t>(a.splat_count() * sums.stride[p]);
+    const cudaError_t error = cudaMemsetAsync(sums.part[p], 0, bytes, stream);
+    if (error != cudaSuccess) return error;
+  }
   const cudaError_t error =
       with_variant<T>(sums.active, a.groups != nullptr, [&]<int kF, bool kGroups>() {
-        blend_backward_kernel<T, kF, kGroups>
-            <<<blend_blocks(a), kBlockThreads, 0, stream>>>(b, sums);
+        if (b.grad_absolute)
+          blend_backward_kernel<T, kF, kGroups, true>
+              <<<blend_blocks(a), kBlockThreads, 0, stream>>>(b, sums);
+        else
+          blend_backward_kernel<T, kF, kGroups, false>
+              <<<blend_blocks(a), kBlockThreads, 0, stream>>>(b, sums);
         return cudaGetLastError();
       });
   return error == cudaSuccess ? raster_gaussian_backward(b, sums, stream) : error;
 }
 
-template SplatSums<float> raster_sums(const RasterGradArgs<float>&);
-template SplatSums<double> raster_sums(const RasterGradArgs<double>&);
+template SplatSums<float> raster_sums(const RasterGradArgs<float>&, float*);
+template SplatSums<double> raster_sums(const RasterGradArgs<double>&, double*);
+template int64_t raster_sums_size(const RasterGradArgs<float>&);
+template int64_t raster_sums_size(const RasterGradArgs<double>&);
 template cudaError_t raster_backward<float>(const RasterGradArgs<float>&, const SplatSums<float>&,
                                             cudaStream_t);
 template cudaError_t raster_backward<double>(const RasterGradArgs<double>&,

@@ -2,14 +2,10 @@
 // splats, the features. And which tiles of the lists a splat touches, row of tiles by row of tiles.
 #pragma once
 
-#include "core/raster.h"
+#include "cuda/launch_raster.h"
 
 namespace gsf::cuda {
 
-// Edge of a list's tile [px]. Warps cull splats for their own 8x8 pixels, so the lists may be
-// coarse: at 32 there are 2.3 times fewer entries to write and sort than at 16.
-constexpr int kListTile = 32;
-constexpr int kGeometry = 8;
 constexpr uint32_t kCulledKey = 0xffffffffu;
 
 template <typename T>
@@ -73,16 +69,41 @@ struct SplatBands {
   }
 };
 
-template <typename T>
-GSF_HOST_DEVICE int64_t count_tiles(const SplatGeometry<T>& g, const RasterArgs<T>& a) {
-  const SplatBands<T> bands(g, a);
-  int64_t count = 0;
-  for (int row = bands.y0; row < bands.y1; ++row) {
-    int first, last;
-    bands.columns(g, a, row, &first, &last);
-    count += last - first;
+// The tiles of one splat in 64 bits. Few: a mask over 6x6 tiles and where those stand. Many: only
+// their number, and who lists them asks SplatBands again.
+class TileCode {
+ public:
+  static constexpr int kEdge = 6;
+
+  template <typename T>
+  GSF_HOST_DEVICE static uint64_t of(const SplatGeometry<T>& g, const RasterArgs<T>& a) {
+    const SplatBands<T> bands(g, a);
+    const int left = bands.pixels.x0 / a.tile, right = (bands.pixels.x1 + a.tile - 1) / a.tile;
+    const bool few = right - left <= kEdge && bands.y1 - bands.y0 <= kEdge;
+    uint64_t mask = 0, count = 0;
+    for (int row = bands.y0; row < bands.y1; ++row) {
+      int first, last;
+      bands.columns(g, a, row, &first, &last);
+      count += static_cast<uint32_t>(last - first);
+      if (few && first < last)
+        mask |= uint64_t((1u << (last - left)) - (1u << (first - left)))
+                << (kEdge * (row - bands.y0));
+    }
+    return few ? mask | uint64_t(left) << kX | uint64_t(bands.y0) << kY : count | kMany;
   }
-  return count;
-}
+  __device__ static bool many(uint64_t code) { return code & kMany; }
+  __device__ static uint64_t mask(uint64_t code) { return code & ((uint64_t(1) << kX) - 1); }
+  // First column and row of the mask.
+  __device__ static int x(uint64_t code) { return code >> kX & kMostTiles; }
+  __device__ static int y(uint64_t code) { return code >> kY & kMostTiles; }
+  __device__ static uint32_t count(uint64_t code) {
+    return many(code) ? static_cast<uint32_t>(code) : __popcll(mask(code));
+  }
+
+ private:
+  static constexpr int kX = kEdge * kEdge, kY = kX + 12;
+  static constexpr int kMostTiles = 4095;  // of a side; images are at most 65536 wide
+  static constexpr uint64_t kMany = uint64_t(1) << 63;
+};
 
 }  // namespace gsf::cuda

@@ -1,6 +1,5 @@
 // The rasterizer's CUDA backend: scratch from torch's allocator, registration.
 #include "cuda/launch_raster.h"
-#include "cuda/raster_layout.h"
 #include "cuda/stream.h"
 #include "host/raster.h"
 
@@ -68,11 +67,8 @@ struct RasterCuda {
   template <typename T>
   static void backward(const RasterGradArgs<T>& b, const Tensor& like, const Scope& scope) {
     check(b.forward);
-    cuda::SplatSums<T> sums = cuda::raster_sums(b);
-    const bool borrowed = sums.data != nullptr;
-    Tensor own = gsf::new_empty(
-        like, {borrowed ? 0 : b.forward.splat_count() * int64_t(sums.stride)}, scalar_type_of<T>());
-    if (!borrowed) sums.data = mptr<T>(own);
+    Tensor own = gsf::new_empty(like, {cuda::raster_sums_size(b)}, scalar_type_of<T>());
+    const cuda::SplatSums<T> sums = cuda::raster_sums(b, own.numel() > 0 ? mptr<T>(own) : nullptr);
     check_raster_launch(cuda::raster_backward(b, sums, scope.stream()));
   }
 };

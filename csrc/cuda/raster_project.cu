@@ -26,17 +26,17 @@ __global__ void __launch_bounds__(kRowThreads) project_kernel(RasterArgs<T> a, R
   if (seen)
     seen =
         splat_features(a, camera, i, degree, sh, s.depth, splat_feature_rows(a) + m * a.features);
-  uint32_t count = 0;
+  uint64_t code = 0;
   if (i < a.count) {
     SplatGeometry<T> g{s.x, s.y, s.a, s.b, s.c, seen ? s.opacity : T(0), s.extent_x, s.extent_y};
     const_cast<SplatGeometry<T>*>(splat_geometry(a))[m] = g;
-    if (seen) count = static_cast<uint32_t>(count_tiles(g, a));
+    if (seen) code = TileCode::of(g, a);
     o.keys[m] = seen ? __float_as_uint(static_cast<float>(s.depth)) : kCulledKey;
     o.ids[m] = static_cast<int32_t>(m);
-    o.counts[m] = count;
+    o.codes[m] = code;
     a.radii[m] = seen ? splat_radius(s) : 0;
   }
-  const unsigned sum = __reduce_add_sync(0xffffffffu, count);
+  const unsigned sum = __reduce_add_sync(0xffffffffu, TileCode::count(code));
   __shared__ unsigned long long block_sum;
   if (threadIdx.x == 0) block_sum = 0;
   __syncthreads();

@@ -83,15 +83,15 @@ __device__ __forceinline__ bool reaches_warp(const SplatGeometry<T>& g, T cutoff
 // One pixel's way through its splats.
 template <typename T, bool kGroups>
 struct PixelWalk {
-  T left = T(1);  // transmittance
-  bool stopped = true;
+  T left;  // transmittance; negative once the pixel has stopped, so that no later test passes
   int32_t ring[kGroups ? kSiblingRing : 1];
 
   __device__ __forceinline__ void start(bool inside) {
-    stopped = !inside;
+    left = inside ? T(1) : T(-1);
 #pragma unroll
     for (int32_t& slot : ring) slot = -1;
   }
+  __device__ __forceinline__ bool stopped() const { return left < T(0); }
 
   struct Weight {
     T dy, alpha, weight;
@@ -106,7 +106,7 @@ struct PixelWalk {
     const T power = max(along + r.dy * (cross + s.c * r.dy), T(0));
     const T raw = s.opacity * exp2_negative(power);
     r.alpha = min(raw, T(kMaxAlpha));
-    bool pass = !stopped && power <= s.cutoff;
+    bool pass = power <= s.cutoff;
     if constexpr (kGroups) {
       if (s.group >= 0) {
 #pragma unroll
@@ -115,10 +115,9 @@ struct PixelWalk {
     }
     const T after = left - r.alpha * left;
     r.keep = pass && after > T(kMinTransmittance);
-    stopped = stopped || (pass && !r.keep);
     r.open = r.keep && raw < T(kMaxAlpha);
     r.weight = r.keep ? r.alpha * left : T(0);
-    left = r.keep ? after : left;
+    left = r.keep ? after : (pass ? -fabs(left) : left);
     if constexpr (kGroups) {
       if (r.keep && s.group >= 0) {
 #pragma unroll
@@ -168,7 +167,8 @@ __device__ __forceinline__ void for_each_splat(const RasterArgs<T>& a, const War
 #pragma unroll
       for (int k = 0; k < kF; ++k) s.feature[k] = k < features ? row[k] : T(0);
       if constexpr (kGroups)
-        s.group = a.groups[a.cameras == 1 ? id : static_cast<int32_t>(id % a.count)];
+        s.group =
+            a.groups ? a.groups[a.cameras == 1 ? id : static_cast<int32_t>(id % a.count)] : -1;
     }
     // The next 32 are on their way while these are weighed.
     id = next_id;
@@ -188,11 +188,11 @@ __device__ __forceinline__ T warp_sum(T v) {
   return v;
 }
 
-// Calls f.operator()<room for features, groups>().
+// Calls f.operator()<room for features, flag>().
 template <typename T, typename F>
-cudaError_t with_variant(int features, bool groups, const F& f) {
+cudaError_t with_variant(int features, bool flag, const F& f) {
   const auto choose = [&]<int kF>() {
-    return groups ? f.template operator()<kF, true>() : f.template operator()<kF, false>();
+    return flag ? f.template operator()<kF, true>() : f.template operator()<kF, false>();
   };
   if constexpr (sizeof(T) == sizeof(float)) {
     if (features <= 3) return choose.template operator()<3>();  // rgb
