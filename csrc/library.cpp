@@ -91,6 +91,22 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "bool depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, "
       "Tensor, Tensor, Tensor, Tensor, Tensor)");
 
+  // --- ssim: structural similarity, the photometric loss of training ---
+  m.def("ssim(Tensor image, Tensor target, bool inside) -> Tensor");
+  m.def("ssim_backward(Tensor grad, Tensor image, Tensor target, bool inside) -> Tensor");
+  // Returns the loss, its figures (similarity, |miss|, miss^2, |excess|: csrc/core/ssim.h), and the
+  // gradients of image and alpha.
+  m.def(
+      "photometric_loss(Tensor image, Tensor target, Tensor? valid, Tensor? alpha, Tensor? mask, "
+      "Tensor? backdrop, float constant, float l1, float ssim, float excess, bool inside, "
+      "bool pixels, bool gradient) -> (Tensor, Tensor, Tensor, Tensor)");
+
+  // --- adam: one optimiser step over several tensors, in place ---
+  m.def(
+      "adam_step(Tensor(a!)[] parameters, Tensor[] gradients, Tensor(b!)[] first, "
+      "Tensor(c!)[] second, float[] rates, float beta1, float beta2, float epsilon, int step, "
+      "Tensor? visible) -> ()");
+
   // --- build information ---
   m.def("compiled_for(Tensor like) -> str");
 }
