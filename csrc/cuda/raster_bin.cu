@@ -14,6 +14,7 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr unsigned kAllLanes = 0xffffffffu;
+constexpr uint32_t kStaged = 512;      // list entries that a warp gathers before it writes them
 constexpr int64_t kShortKeys = 65536;  // as many values fit 16 bits
 
 int blocks_for(int64_t n) { return static_cast<int>((n + kThreads - 1) / kThreads); }
@@ -48,25 +49,45 @@ __global__ void __launch_bounds__(kThreads)
   const bool real = r < a.splat_count();
   const int32_t id = real ? o.order[r] : 0;
   const uint64_t code = real ? o.codes[id] : 0;
-  const uint32_t begin = real ? o.offsets[r] : 0;
+  const uint32_t begin = real ? o.offsets[r] : 0;  // lane 0 of a warp with work is real
   const auto first_tile = [&](int32_t splat) {
     return a.cameras == 1 ? 0 : static_cast<int>(splat / a.count) * a.tiles();
   };
   const bool many = TileCode::many(code);
+  const uint32_t count = TileCode::count(code);
+  // Entries of a warp's ranks are neighbours: through shared memory they leave as whole sectors.
+  __shared__ Key staged_tiles[kThreads / 32][kStaged];
+  __shared__ int32_t staged_ids[kThreads / 32][kStaged];
+  Key* const own_tiles = staged_tiles[threadIdx.x / 32];
+  int32_t* const own_ids = staged_ids[threadIdx.x / 32];
+  const uint32_t start = __shfl_sync(kAllLanes, begin, 0);
+  const uint32_t total = __reduce_add_sync(kAllLanes, count);
+  const bool stage = total <= kStaged && !__any_sync(kAllLanes, many);
   if (!many) {
     const int base = first_tile(id) + TileCode::y(code) * a.tiles_x + TileCode::x(code);
-    uint32_t e = begin;
+    uint32_t e = stage ? begin - start : begin;
+    Key* const to_tiles = stage ? own_tiles : tiles;
+    int32_t* const to_ids = stage ? own_ids : ids;
     for (uint64_t mask = TileCode::mask(code); mask; mask &= mask - 1, ++e) {
       const int bit = __ffsll(static_cast<long long>(mask)) - 1;
-      tiles[e] = static_cast<Key>(base + bit / TileCode::kEdge * a.tiles_x + bit % TileCode::kEdge);
-      ids[e] = id;
+      to_tiles[e] =
+          static_cast<Key>(base + bit / TileCode::kEdge * a.tiles_x + bit % TileCode::kEdge);
+      to_ids[e] = id;
     }
+  }
+  if (stage) {
+    __syncwarp();
+    for (uint32_t e = lane; e < total; e += 32) {
+      tiles[start + e] = own_tiles[e];
+      ids[start + e] = own_ids[e];
+    }
+    return;
   }
   for (unsigned wide = __ballot_sync(kAllLanes, many); wide; wide &= wide - 1) {
     const int source = __ffs(wide) - 1;
     const int32_t one = __shfl_sync(kAllLanes, id, source);
     uint32_t e = __shfl_sync(kAllLanes, begin, source);
-    const uint32_t end = e + __shfl_sync(kAllLanes, TileCode::count(code), source);
+    const uint32_t end = e + __shfl_sync(kAllLanes, count, source);
     const SplatGeometry<T> g = splat_geometry(a)[one];
     const SplatBands<T> bands(g, a);
     const int base = first_tile(one);

@@ -7,6 +7,10 @@
 namespace gsf::cuda {
 namespace {
 
+__device__ __forceinline__ void prefetch(const void* address) {
+  asm volatile("prefetch.global.L1 [%0];" ::"l"(address));
+}
+
 template <typename T, int kDegree>
 __global__ void __launch_bounds__(kRowThreads, 4)
     gaussian_backward_kernel(RasterGradArgs<T> b, SplatSums<T> sums) {
@@ -16,6 +20,16 @@ __global__ void __launch_bounds__(kRowThreads, 4)
   const auto seen_by = [&](int camera) {
     return splat_geometry(a)[camera * a.count + i].opacity > T(0);
   };
+  // What a thread reads after it knows that its Gaussian was seen is on its way before.
+  if (real) {
+    prefetch(a.means + 3 * i);
+    prefetch(a.opacities + i);
+    prefetch(a.covars ? a.covars + 6 * i : a.quats + 4 * i);
+    if (a.scales) prefetch(a.scales + 3 * i);
+    prefetch(sums.word(0, i));
+    prefetch(sums.word(sums.end[0], i));
+    prefetch(sums.word(sums.width() - 1, i));
+  }
   bool seen = false;
   for (int camera = 0; real && camera < a.cameras; ++camera) seen = seen || seen_by(camera);
   const int degree = kDegree > 0 ? kDegree : a.sh_degree;

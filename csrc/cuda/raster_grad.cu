@@ -239,7 +239,8 @@ SplatSums<T> raster_sums(const RasterGradArgs<T>& b, T* own) {
   s.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
   s.features = kGradFeatures + (b.grad_absolute ? 2 : 0);
   const int room = a.covars ? 3 + 6 + 1 : 3 + 4 + 3;
-  if (a.cameras == 1 && s.width() <= room) {
+  // Up to four features are added in one round, in which every lane knows its word's place.
+  if (sizeof(T) == sizeof(float) && a.cameras == 1 && s.active <= 4 && s.width() <= room) {
     s.part[0] = b.grad_means, s.stride[0] = 3, s.end[0] = 3;
     s.part[1] = a.covars ? b.grad_covars : b.grad_quats;
     s.stride[1] = a.covars ? 6 : 4, s.end[1] = 3 + s.stride[1];
