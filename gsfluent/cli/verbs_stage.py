@@ -31,7 +31,7 @@ class Reconstruct(Verb):
 
     CAPTURE is a COLMAP model (text or binary) with its images, or a folder with transforms.json;
     masks are used when there are any. Every eighth photograph is held out; its PSNR stands in
-    reconstruct.json beside the .ply.
+    reconstruct.json beside the .ply, with a page (.md) and a sheet of those photographs (.png).
     """
 
     capture: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAPTURE")]
@@ -48,6 +48,16 @@ class Reconstruct(Verb):
     """Weight of the penalty on large Gaussians."""
     image_size: int | None = None
     """Longest side of the photographs in pixels while fitting."""
+    sh_degree: int | None = None
+    """Bands of view-dependent colour, 0 to 3."""
+    recipe: Literal["auto", "quick", "long", "classic"] | None = None
+    """Schedule; auto follows the number of steps."""
+    densify: Literal["adc", "mcmc"] | None = None
+    """How Gaussians are added: where photographs pull, or towards a budget."""
+    target_psnr: float | None = None
+    """PSNR in dB on the photographs that is enough; Gaussians are added only below it."""
+    exposure: bool | None = None
+    """Learn an affine colour change per photograph."""
     keep_background: bool = False
     """Keep what does not belong to the object."""
 
@@ -62,6 +72,11 @@ class Reconstruct(Verb):
             "kernel": self.kernel,
             "scale_regularization": self.scale_regularization,
             "image_size": self.image_size,
+            "sh_degree": self.sh_degree,
+            "recipe": self.recipe,
+            "densify": self.densify,
+            "target_psnr": self.target_psnr,
+            "exposure": self.exposure,
         }
         options = {name: value for name, value in given.items() if value is not None}
         with self.progress("reconstruct") as progress:

@@ -83,6 +83,27 @@ class ReconstructSettings:
     sh_degree: int | None = key(
         whole(0, 3), default=None, doc="Degree of the view-dependent colours.", example="0"
     )
+    recipe: str | None = key(
+        choice("auto", "quick", "long", "classic"),
+        default=None,
+        doc="Schedule; auto follows the number of steps.",
+        example="long",
+    )
+    densify: str | None = key(
+        choice("adc", "mcmc"),
+        default=None,
+        doc="How splats are added: where photographs pull, or towards a budget.",
+        example="mcmc",
+    )
+    target_psnr: float | None = key(
+        number(1.0, 100.0),
+        default=None,
+        doc="PSNR on the photographs that is enough [dB]; splats are added only below it.",
+        example="32",
+    )
+    exposure: bool | None = key(
+        flag, default=None, doc="Learn an affine colour change per photograph.", example="true"
+    )
 
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""

@@ -37,6 +37,10 @@ _PUBLIC: dict[str, str] = {
     "mvee_lens": "gsfluent.ops.mvee",
     "Rendered": "gsfluent.ops.raster",
     "rasterize": "gsfluent.ops.raster",
+    "Photometric": "gsfluent.ops.losses",
+    "photometric_loss": "gsfluent.ops.losses",
+    "ssim": "gsfluent.ops.losses",
+    "adam_step": "gsfluent.ops.adam",
 }
 
 __all__ = list(_PUBLIC)

@@ -203,6 +203,37 @@ def _test_mvee(device: torch.device) -> float:
     return _worst(wrong_center, 0.1 * float((shape[0] - expected).abs().amax()) / 12.0)
 
 
+def _test_photometric_loss(device: torch.device) -> float:
+    """Equal images have loss 0; flat ones a known similarity and, without it, slope 1 per value."""
+    picture = torch.rand(24, 20, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    same = ops.photometric_loss(picture, picture)
+    a, b = 0.6, 0.2
+    flat = torch.full((16, 12, 3), a, device=device, requires_grad=True)
+    apart = ops.photometric_loss(flat, torch.full_like(flat, b, requires_grad=False))
+    (slope,) = torch.autograd.grad(apart.loss, flat)
+    luminance = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    # d luminance / da, spread over all values by windows that sum to 1
+    steep = 2 * b / (a * a + b * b + 1e-4) - 2 * a * luminance / (a * a + b * b + 1e-4)
+    total = 0.8 - 0.2 * steep
+    # the variance of flat float32 windows, 1e-8, stands beside 9e-4
+    return _worst(
+        float(same.loss.abs()),
+        float((apart.l1.detach() - (a - b)).abs()),
+        0.1 * abs(float(apart.ssim) - luminance),
+        0.1 * abs(float(slope.sum()) - total),
+    )
+
+
+def _test_adam_step(device: torch.device) -> float:
+    """The first step is the rate times the sign of the gradient; rows not seen stay."""
+    value, first, second = (torch.zeros(3, 2, device=device) for _ in range(3))
+    gradient = torch.tensor([[1e-3, -4.0], [5.0, 2e4], [-1.0, 1.0]], device=device)
+    visible = torch.tensor([True, True, False], device=device)
+    ops.adam_step([value], [gradient], [first], [second], lr=0.5, step=1, eps=0.0, visible=visible)
+    expected = -0.5 * gradient.sign() * visible[:, None]
+    return _worst(float((value - expected).abs().amax()))
+
+
 TESTS: dict[str, Callable[[torch.device], float]] = {
     "p2g": _test_p2g,
     "grid_update": _test_grid_update,
@@ -210,6 +241,8 @@ TESTS: dict[str, Callable[[torch.device], float]] = {
     "return_mapping": _test_return_mapping,
     "rasterize": _test_rasterize,
     "mvee": _test_mvee,
+    "photometric_loss": _test_photometric_loss,
+    "adam_step": _test_adam_step,
 }
 
 

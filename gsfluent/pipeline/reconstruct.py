@@ -20,7 +20,8 @@ from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.reconstruct_checkpoint import Checkpoint
-from gsfluent.pipeline.reconstruct_evaluate import evaluate
+from gsfluent.pipeline.reconstruct_density import draws
+from gsfluent.pipeline.reconstruct_evaluate import HOLD_OUT, evaluate
 from gsfluent.pipeline.reconstruct_init import (
     Hull,
     contradiction,
@@ -30,20 +31,21 @@ from gsfluent.pipeline.reconstruct_init import (
     visual_hull,
 )
 from gsfluent.pipeline.reconstruct_masks import masked_views
-from gsfluent.pipeline.reconstruct_model import LearningRates, SplatModel
-from gsfluent.pipeline.reconstruct_train import TrainSettings, decibels, train
+from gsfluent.pipeline.reconstruct_model import SplatModel
+from gsfluent.pipeline.reconstruct_recipe import recipe_for
+from gsfluent.pipeline.reconstruct_train import Trainer, TrainSettings, decibels
 from gsfluent.pipeline.reconstruct_views import TrainView, read_views
 from gsfluent.pipeline.solid_clean import clean_views
 from gsfluent.pipeline.stage import Progress, Stage, report_progress
 
 _log = logging.getLogger(__name__)
 
-_HOLD_OUT = 8  # every eighth photograph judges, the others teach
 _MANY = 24  # views that carry a hull even when some silhouettes are distrusted
 _FORGIVEN = 0.1  # share of many silhouettes that may be wrong about a voxel
 _CONTRADICTION = 0.02  # of the hull denied by a silhouette before it is distrusted
 _SCENE_SHARE = 0.6  # of the steps for everything, before the object gets the rest
 _FAINT = 0.02  # opacity below which a trained Gaussian is dropped
+_HULL_START = 100_000  # Gaussians on a hull of 96 voxels a side; more would fall on each other
 
 
 class Reconstruct(Stage):
@@ -51,14 +53,21 @@ class Reconstruct(Stage):
 
     Args:
         iterations: Training steps, one photograph each.
-        max_gaussians: Hard cap on the count.
+        max_gaussians: Hard cap on the count, and the budget of MCMC; the recipe's when None.
         kernel: "anisotropic" (ellipsoids) or "isotropic" (spheres; costs about 4 dB).
         scale_regularization: Strength of the pull towards small, not needle-shaped Gaussians.
-        image_size: Longer side of the photographs in training [px].
+        image_size: Longer side of the photographs in training [px]; the recipe's when None.
         sh_degree: Bands of view-dependent colour, 0 to 3. 0 (matte) relights best.
-        start_gaussians: Gaussians to start with.
+        start_gaussians: Gaussians to start with; the recipe's when None.
         gradient_threshold: Mean screen-space gradient (units of half the image width) above which a
-            Gaussian is cloned or split.
+            Gaussian is cloned or split; the recipe's when None.
+        recipe: Schedule: "quick", "long", "classic" (Kerbl et al. 2023), or "auto": quick below
+            3000 iterations, long from there.
+        densify: "adc" (adaptive density control) or "mcmc" (relocation and noise with a budget).
+        target_psnr: PSNR [dB] on the training photographs that is enough: Gaussians are added only
+            where the error is above it, and dropped while it is below. None: as many as the
+            schedule makes.
+        exposure: Learn an affine change of colour per photograph. Held-out photographs get none.
         checkpoint: File to save to while training and to resume from when it exists.
         checkpoint_every: Steps between saves.
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
@@ -76,14 +85,18 @@ class Reconstruct(Stage):
     def __init__(
         self,
         iterations: int = 800,
-        max_gaussians: int = 60_000,
+        max_gaussians: int | None = None,
         kernel: str = "anisotropic",
         scale_regularization: float = 1.0,
-        image_size: int = 400,
+        image_size: int | None = None,
         *,
         sh_degree: int = 0,
-        start_gaussians: int = 12_000,
-        gradient_threshold: float = 4e-4,
+        start_gaussians: int | None = None,
+        gradient_threshold: float | None = None,
+        recipe: str = "auto",
+        densify: str = "adc",
+        target_psnr: float | None = None,
+        exposure: bool = False,
         checkpoint: str | Path | None = None,
         checkpoint_every: int = 250,
         separate: bool = True,
@@ -92,29 +105,41 @@ class Reconstruct(Stage):
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
-        if kernel not in ("anisotropic", "isotropic"):
-            raise InputError(
-                f"reconstruct.kernel {kernel!r} is not known", "choose anisotropic or isotropic"
-            )
+        for label, name, known in (
+            ("kernel", kernel, ("anisotropic", "isotropic")),
+            ("densify", densify, ("adc", "mcmc")),
+        ):
+            if name not in known:
+                raise InputError(
+                    f"reconstruct.{label} {name!r} is not known", f"choose {' or '.join(known)}"
+                )
+        self.recipe = recipe_for(recipe, int(iterations))
         for label, value, low, high in (
             ("iterations", iterations, 1, 1_000_000),
             ("max_gaussians", max_gaussians, 10, 50_000_000),
             ("image_size", image_size, 24, 8192),
             ("sh_degree", sh_degree, 0, 3),
             ("scale_regularization", scale_regularization, 0.0, 1e6),
+            ("target_psnr", target_psnr, 1.0, 100.0),
+            ("gradient_threshold", gradient_threshold, 0.0, 1e6),
         ):
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise InputError(
                     f"reconstruct.{label} must be {low} to {high}, got {value}", "change it"
                 )
         self.iterations = int(iterations)
-        self.max_gaussians = int(max_gaussians)
-        self.kernel = kernel
+        self.max_gaussians = int(max_gaussians or self.recipe.max_gaussians)
+        self.kernel, self.densify = kernel, densify
         self.scale_regularization = float(scale_regularization)
-        self.image_size = int(image_size)
+        self.image_size = int(image_size or self.recipe.image_size)
         self.sh_degree = int(sh_degree)
-        self.start_gaussians = min(int(start_gaussians), self.max_gaussians)
-        self.gradient_threshold = float(gradient_threshold)
+        start = self.recipe.start_gaussians if start_gaussians is None else int(start_gaussians)
+        self.start_gaussians = min(start, self.max_gaussians)
+        self.gradient_threshold = float(
+            self.recipe.gradient_threshold if gradient_threshold is None else gradient_threshold
+        )
+        self.target_psnr = target_psnr
+        self.exposure = bool(exposure)
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.checkpoint_every = int(checkpoint_every)
         self.separate = bool(separate)
@@ -128,23 +153,25 @@ class Reconstruct(Stage):
 
         Args:
             capture: Posed photographs, with masks, or with sparse points.
-            progress: Called every 10 steps as ``progress(step, iterations, note)``.
+            progress: Called every 10 steps (50 off the CPU) as ``progress(step, total, note)``.
 
         Returns:
             The Gaussians in the capture's world frame, and the report: ``images, held_out, psnr,
-            ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, resumed_at, start,
-            object_gaussians, cleaned`` (see :func:`clean_floaters`; None when nothing was told
-            from its background). When the object was told from its background, labels are set.
+            ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, train_seconds (without
+            reading and judging), resumed_at, start, object_gaussians, history (rows of step, count,
+            PSNR on the last training photographs), cleaned`` (see :func:`clean_floaters`; None when
+            nothing was told from its background). When the object was told from its background,
+            labels are set.
 
         Raises:
             InputError: Black photographs, no masks and no points, or masks that contradict poses.
             RunError: Training diverged.
         """
         started = time.monotonic()
-        train_set, held = capture.split(_HOLD_OUT)
+        train_set, held = capture.split(HOLD_OUT)
         views = read_views(train_set, self.image_size, self.device, crop=True)
-        generator = torch.Generator().manual_seed(self.seed)
-        run = _Run(self, Checkpoint(self.checkpoint, self._identity()), generator, progress)
+        run = _Run(self, Checkpoint(self.checkpoint, self._identity()), progress)
+        trained = time.monotonic()
         if views[0].mask is not None:
             gaussians, start = run.object_of(views, 0, self.iterations), "visual hull"
             gaussians = _labelled(gaussians, SURFACE)
@@ -155,6 +182,7 @@ class Reconstruct(Stage):
                 "reconstruct: every Gaussian faded away in training",
                 mend="check that the poses belong to the photographs (gsfluent inspect)",
             )
+        trained = _now(self.device) - trained
         labels = gaussians.labels
         report = {
             "images": len(capture),
@@ -165,8 +193,14 @@ class Reconstruct(Stage):
             "iterations": self.iterations,
             "image_size": self.image_size,
             "start": start,
+            "recipe": self.recipe.name,
+            "densify": self.densify,
+            "target_psnr": self.target_psnr,
+            "exposure": self.exposure,
+            "history": run.history,
             "cleaned": run.cleaned,
             "resumed_at": run.resumed_at,
+            "train_seconds": round(trained, 2),
             "seconds": round(time.monotonic() - started, 2),
         }
         return gaussians, report
@@ -175,9 +209,10 @@ class Reconstruct(Stage):
         """What a checkpoint must agree on to be resumed."""
         names = (
             "iterations", "max_gaussians", "kernel", "scale_regularization", "image_size",
-            "sh_degree", "start_gaussians", "gradient_threshold", "separate", "seed",
+            "sh_degree", "start_gaussians", "gradient_threshold", "densify", "target_psnr",
+            "exposure", "separate", "seed",
         )  # fmt: skip
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in names} | {"recipe": self.recipe.name}
 
 
 class _Run:
@@ -187,13 +222,12 @@ class _Run:
         self,
         stage: Reconstruct,
         checkpoint: Checkpoint,
-        generator: torch.Generator,
         progress: Progress | None,
     ) -> None:
         self.stage = stage
         self.checkpoint = checkpoint
-        self.generator = generator
         self.progress = progress
+        self.history: list[tuple[int, int, float]] = []
         self.saved = checkpoint.load()
         self.resumed_at = 0
         self.cleaned: dict[str, Any] | None = None
@@ -209,9 +243,14 @@ class _Run:
             scene = Checkpoint.scene(self.saved, stage.device)
         if scene is None:
             start, extent = point_gaussians(
-                capture, views, stage.start_gaussians, stage.sh_degree, self.generator
+                capture,
+                views,
+                stage.start_gaussians,
+                stage.sh_degree,
+                draws(stage.seed, 5, 0),
+                stage.recipe,
             )
-            rates = LearningRates(means=8e-4)
+            rates = stage.recipe.scene_rates
             model = SplatModel(start, extent, isotropic=stage.kernel == "isotropic", rates=rates)
             scene = self._train(model, views, 0, 0, steps, None, None)
         if steps == stage.iterations:
@@ -250,7 +289,8 @@ class _Run:
         """
         stage = self.stage
         hull = visual_hull(views)
-        start = hull_gaussians(hull, views, stage.start_gaussians, stage.sh_degree, self.generator)
+        count = min(stage.start_gaussians, _HULL_START)
+        start = hull_gaussians(hull, views, count, stage.sh_degree, draws(stage.seed, 6, 0))
         if found is not None:
             start = joined_start(hull, start, found)
         lower, upper = hull.bounds()
@@ -258,7 +298,7 @@ class _Run:
             start,
             0.5 * float((upper - lower).max()),
             isotropic=stage.kernel == "isotropic",
-            rates=LearningRates(),
+            rates=stage.recipe.object_rates,
         )
         phase = 0 if scene is None else 1
         gaussians = self._train(model, views, phase, before, steps, hull, scene)
@@ -277,38 +317,51 @@ class _Run:
         scene: Gaussians | None,
     ) -> Gaussians:
         stage = self.stage
+        whole = 0.5 if hull is None else 1.0  # see Recipe.gradient_threshold
         settings = TrainSettings(
+            stage.recipe,
             steps,
             stage.max_gaussians,
             stage.scale_regularization,
             stage.sh_degree,
-            # The mean over a whole photograph weighs a pixel about half as much as over a crop.
-            stage.gradient_threshold * (0.5 if hull is None else 1.0),
+            stage.gradient_threshold * whole,
+            densify=stage.densify,
+            target_psnr=stage.target_psnr,
+            exposure=stage.exposure,
+            seed=stage.seed + phase,
         )
-        first = 0
+        trainer = Trainer(model, views, settings, hull)
         if self.saved is not None and int(self.saved["phase"]) == phase:
-            model.restore(self.saved)
-            self.generator.set_state(self.saved["generator"])
-            first = int(self.saved["done"])
-            self.resumed_at = before + first
+            trainer.restore(self.saved)
+            self.resumed_at = before + trainer.done
             self.saved = None
 
-        def on_step(done: int, error: float) -> None:
-            if done % 10 == 0 or done == steps:
-                note = f"{decibels(error):.1f} dB, {model.count} Gaussians"
-                report_progress(self.progress, before + done, stage.iterations, note)
-            if done % stage.checkpoint_every == 0:
-                self.checkpoint.save(model.state(), self.generator, phase, done, scene)
+        def on_look(done: int, error: float) -> None:
+            note = f"{decibels(error):.1f} dB, {model.count} Gaussians"
+            report_progress(self.progress, before + done, stage.iterations, note)
+
+        def save(done: int) -> None:
+            self.checkpoint.save(trainer.state(), phase, scene)
 
         try:
-            train(model, views, settings, self.generator, hull=hull, first=first, on_step=on_step)
+            trainer.run(on_look, save, stage.checkpoint_every)
         except RunError as error:
             kept = self.checkpoint.path
             if kept is None or not kept.is_file():
                 raise
             raise RunError(error.what, f"the last checkpoint, {kept}", error.mend) from error
+        self.history += [
+            (before + step, count, round(db, 2)) for step, count, db in trainer.history
+        ]
         gaussians = model.gaussians(stage.sh_degree)
-        return gaussians.select(gaussians.opacities > _FAINT)
+        return gaussians.select(gaussians.opacities > min(_FAINT, stage.recipe.prune_opacity))
+
+
+def _now(device: torch.device) -> float:
+    """The clock, once the device has done what it was told."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.monotonic()
 
 
 def _agreeing(views: list[TrainView]) -> list[TrainView]:

@@ -34,17 +34,14 @@ class Checkpoint:
     def save(
         self,
         state: dict[str, Tensor],
-        generator: torch.Generator,
         phase: int,
-        done: int,
         scene: Gaussians | None,
     ) -> None:
-        """Write the state after ``done`` steps of ``phase``, and the finished scene."""
+        """Write the state within ``phase``, and the finished scene."""
         if self.path is None:
             return
         values = dict(state)
-        values["phase"], values["done"] = torch.tensor(phase), torch.tensor(done)
-        values["generator"] = generator.get_state()
+        values["phase"] = torch.tensor(phase)
         values["settings"] = torch.tensor(list(self._mark.encode()), dtype=torch.uint8)
         if scene is not None:
             values |= {f"scene.{name}": getattr(scene, name) for name in _FIELDS}
@@ -62,7 +59,7 @@ class Checkpoint:
         try:
             state: dict[str, Tensor] = torch.load(self.path, map_location="cpu", weights_only=True)
             mark = bytes(state["settings"].tolist()).decode()
-            _ = state["phase"], state["done"], state["generator"], state["steps"]
+            _ = state["phase"], state["done"], state["steps"], state["recent"]
         except Exception as error:
             raise InputError(
                 f"{self.path}: the checkpoint is damaged ({type(error).__name__})",

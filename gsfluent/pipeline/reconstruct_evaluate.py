@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import BACKGROUND, Camera, Capture, Gaussians
+from gsfluent.data.capture import View
 from gsfluent.metrics import psnr, ssim
 from gsfluent.pipeline.reconstruct_masks import silhouette
 
+HOLD_OUT = 8
+"""Every eighth photograph judges, the others teach."""
+
 
 @torch.no_grad()
-def render_view(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+def render_view(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
     """Render Gaussians as a camera sees them, before black: image [H, W, 3] and alpha [H, W]."""
     result = ops.rasterize(
         gaussians.means,
@@ -28,6 +33,32 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, tor
         near=1e-4,
     )
     return result.image, result.alpha
+
+
+class Judged(NamedTuple):
+    """A held-out photograph and the render that is compared with it.
+
+    Attributes:
+        image: The render, [H, W, 3] in [0, 1], on the CPU; before white when there is a mask.
+        target: The photograph, likewise.
+        valid: 1 where the photograph covers the pixel, [H, W]; None when everywhere.
+    """
+
+    image: Tensor
+    target: Tensor
+    valid: Tensor | None
+
+
+def judged(gaussians: Gaussians, view: View) -> Judged:
+    """Render what a photograph shows, as :func:`evaluate` compares it."""
+    image, alpha = (value.cpu() for value in render_view(gaussians, view.camera))
+    target = view.image
+    if view.mask is not None:
+        mask = view.mask[..., None]
+        target = target * mask + (1.0 - mask)
+        image = image + (1.0 - alpha[..., None])
+    valid = None if view.valid is None else view.valid.float()
+    return Judged(image.clamp(0.0, 1.0), target, valid)
 
 
 def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> dict[str, Any]:
@@ -57,18 +88,11 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
         rest = gaussians.select(gaussians.labels == BACKGROUND)
     for index in range(len(held_out)):
         view = held_out.view(index, max_size)
-        image, alpha = render_view(gaussians, view.camera)
-        image, alpha = image.cpu(), alpha.cpu()
-        target = view.image
-        if view.mask is not None:
-            masked = True
-            mask = view.mask[..., None]
-            target = target * mask + (1.0 - mask)
-            image = image + (1.0 - alpha[..., None])
-        image = image.clamp(0.0, 1.0)
-        valid = None if view.valid is None else view.valid.float()
+        image, target, valid = judged(gaussians, view)
+        masked |= view.mask is not None
         whole.append(psnr(image, target, valid))
-        similar.append(float(ssim(image, target)))
+        shut = 1.0 if valid is None else valid[..., None]
+        similar.append(float(ssim(image * shut, target * shut)))
         shown = view.mask
         if shown is None and found is not None and rest is not None:
             camera = view.camera

@@ -14,6 +14,7 @@ from torch.nn import functional
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import matrix_to_quaternion
+from gsfluent.pipeline.reconstruct_recipe import QUICK, Recipe
 from gsfluent.pipeline.reconstruct_views import TrainView
 
 _log = logging.getLogger(__name__)
@@ -284,15 +285,28 @@ def _facing_colors(points: Tensor, normal: Tensor, views: list[TrainView]) -> Te
 
 
 def point_gaussians(
-    capture: Capture, views: list[TrainView], count: int, degree: int, generator: torch.Generator
+    capture: Capture,
+    views: list[TrainView],
+    count: int,
+    degree: int,
+    generator: torch.Generator,
+    recipe: Recipe = QUICK,
 ) -> tuple[Gaussians, float]:
     """Round Gaussians at the sparse points, filtered to the scene, and a far shell behind it.
 
     Points farther from the focus than eight times the median camera distance, and points whose
     neighbours are ten times farther than usual, are dropped as triangulation errors.
 
+    Args:
+        capture: Whose points.
+        views: Its photographs, for the colours of the shell.
+        count: How many points at most.
+        degree: SH degree of the result.
+        generator: Draws points and shell (CPU).
+        recipe: Says their opacity and size, and whether there is a shell.
+
     Returns:
-        The Gaussians (about ``count`` at most) and the scene's extent [world units]: the median
+        The Gaussians and the scene's extent [world units]: the median
         distance of the cameras from what they look at.
 
     Raises:
@@ -322,11 +336,13 @@ def point_gaussians(
         pick = torch.randperm(len(points), generator=generator)[:count]
         spacing = spacing[pick] * math.sqrt(len(points) / count)
         points, colors = points[pick], colors[pick]
-    shell, shell_color, shell_size = _far_shell(views, middle.float(), extent, generator)
-    means = torch.cat([points, shell]).to(device)
-    scales = torch.cat([spacing.clamp_max(0.1 * extent) * 0.7, shell_size]).to(device)
+    scales = spacing.clamp_max(0.1 * extent) * recipe.start_scale
+    if recipe.shell:
+        shell, shell_color, shell_size = _far_shell(views, middle.float(), extent, generator)
+        points, colors = torch.cat([points, shell]), torch.cat([colors, shell_color])
+        scales = torch.cat([scales, shell_size])
     gaussians = Gaussians.from_colors(
-        means, scales, torch.cat([colors, shell_color]).to(device), opacities=0.3
+        points.to(device), scales.to(device), colors.to(device), opacities=recipe.start_opacity
     )
     return gaussians.with_sh_degree(degree), extent
 

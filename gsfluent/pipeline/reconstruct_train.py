@@ -1,4 +1,8 @@
-"""The training loop: one photograph per step, densification and pruning every hundred."""
+"""The training loop: one photograph per step, nothing read back between two looks at the density.
+
+Everything random is drawn from the seed and the step alone (:func:`draws`), so a resumed run is the
+uninterrupted run, and the order of the photographs is the same on every device.
+"""
 
 from __future__ import annotations
 
@@ -9,113 +13,229 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.errors import RunError
-from gsfluent.metrics import ssim
+from gsfluent.pipeline.reconstruct_density import Adc, Density, Mcmc, Place, Wanted, draws
+from gsfluent.pipeline.reconstruct_error import ErrorTarget, least_seen
+from gsfluent.pipeline.reconstruct_exposure import Exposure
 from gsfluent.pipeline.reconstruct_init import Hull
 from gsfluent.pipeline.reconstruct_model import SplatModel
+from gsfluent.pipeline.reconstruct_recipe import Recipe
 from gsfluent.pipeline.reconstruct_views import TrainView, halved
 
-_DENSIFY_EVERY = 100
-_DENSIFY_UNTIL = 0.6  # of the run
-_RAMP_UNTIL = 0.35  # of the run at half size
-_RAMP_SMALLEST = 64  # pixels; smaller photographs are not halved
+_HALVED_FROM = 64  # pixels; smaller photographs are not halved
 _MASK_WEIGHT = 2.0  # weight of the opacity loss; 0.5 leaves a rim of a third of a pixel (measured)
 _NEEDLE = 6.0  # longest over middle axis before it is pulled back
+_RECENT = 64  # steps whose losses are remembered
+_LOOK = {"cpu": 10}  # steps between two looks at the losses
+_LOOK_ELSEWHERE = 50  # each look waits for the device
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of :func:`train`, see :class:`gsfluent.pipeline.Reconstruct`."""
+    """Settings of :class:`Trainer`, see :class:`gsfluent.pipeline.Reconstruct`."""
 
+    recipe: Recipe
     iterations: int
     max_gaussians: int
     scale_regularization: float
     sh_degree: int
     gradient_threshold: float
+    densify: str = "adc"
+    absgrad: bool = False
+    target_psnr: float | None = None
+    exposure: bool = False
+    seed: int = 0
+
+    @property
+    def sh_every(self) -> float:
+        """Steps between two bands of view-dependent colour."""
+        return min(float(self.recipe.sh_every), self.iterations / 4)
 
 
-OnStep = Callable[[int, float], None]
+OnLook = Callable[[int, float], None]
 
 
-def train(
-    model: SplatModel,
-    views: list[TrainView],
-    settings: TrainSettings,
-    generator: torch.Generator,
-    *,
-    hull: Hull | None,
-    first: int = 0,
-    on_step: OnStep,
-) -> None:
-    """Train ``model`` in place.
+class Trainer:
+    """One training of one model.
 
     Args:
-        model: What is trained.
-        views: Photographs.
+        model: What is trained, in place.
+        views: Photographs, on the model's device.
         settings: Settings.
-        generator: Draws the order of the photographs and the backdrops (CPU).
         hull: Where the object can be; None when unknown.
-        first: Step to start from.
-        on_step: Called after each step with the number of steps done and the mean squared error of
-            the last ones.
-
-    Raises:
-        RunError: The loss is not finite, or no Gaussian survives.
     """
-    large = min(min(view.size) for view in views) >= _RAMP_SMALLEST
-    small = [halved(view) for view in views] if large else views
-    eyes = torch.stack([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views])
-    recent: list[float] = []
-    order: list[int] = []
-    for step in range(first, settings.iterations):
-        if not order:
-            order = torch.randperm(len(views), generator=generator).tolist()
-        chosen = small if step < _RAMP_UNTIL * settings.iterations else views
-        view = chosen[order.pop()]
-        error = _step(model, view, step, settings, generator)
-        recent = [*recent[-29:], error]
-        done = step + 1
-        if done % _DENSIFY_EVERY == 0:
-            control(model, settings, done, generator, hull=hull, eyes=eyes)
-        on_step(done, sum(recent) / len(recent))
 
-
-def _step(
-    model: SplatModel,
-    view: TrainView,
-    step: int,
-    settings: TrainSettings,
-    generator: torch.Generator,
-) -> float:
-    """One photograph: loss, gradients, Adam. Returns the mean squared error."""
-    device = view.color.device
-    degree = min(settings.sh_degree, 4 * step // settings.iterations)
-    offset = torch.zeros(model.count, 2, device=device, requires_grad=True)
-    rendered = model.render(view, degree, offset)
-    image, alpha = rendered.image, rendered.alpha
-    if view.valid is not None:
-        image, alpha = image * view.valid[..., None], alpha * view.valid
-    miss = image - view.color
-    loss = torch.zeros((), device=device)
-    if view.mask is not None:
+    def __init__(
+        self,
+        model: SplatModel,
+        views: list[TrainView],
+        settings: TrainSettings,
+        hull: Hull | None,
+    ) -> None:
+        self.model, self.views, self.settings = model, views, settings
+        recipe = settings.recipe
+        large = min(min(view.size) for view in views) >= _HALVED_FROM
+        self.half_until = recipe.half_until * settings.iterations if large else 0.0
+        self.small = [halved(view) for view in views] if self.half_until > 0 else views
+        eyes = torch.stack([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views])
+        place = Place(hull, eyes)
+        steps, limit = settings.iterations, settings.max_gaussians
+        self.density: Density
+        if settings.densify == "mcmc":
+            self.density = Mcmc(recipe, steps, limit, place, seed=settings.seed)
+        else:
+            self.density = Adc(
+                recipe,
+                steps,
+                limit,
+                settings.gradient_threshold,
+                place,
+                absgrad=settings.absgrad,
+                seed=settings.seed,
+            )
+        device = model.device
+        self.target = None
+        if settings.target_psnr is not None:
+            self.target = ErrorTarget(views, settings.target_psnr)
+        self.exposure = Exposure(len(views), device) if settings.exposure else None
+        self.last = torch.full((len(views),), math.nan, device=device)
+        self.recent = torch.zeros(2, _RECENT, device=device)
         # Before black a dark object may stay transparent; before a random colour it may not.
-        backdrop = torch.rand(3, generator=generator).to(device)
-        excess = alpha - view.mask
-        miss = miss - excess[..., None] * backdrop
-        loss = loss + _MASK_WEIGHT * excess.abs().mean()
-    loss = loss + 0.8 * miss.abs().mean() + 0.2 * (1.0 - ssim(image, view.target))
-    if settings.scale_regularization > 0:
-        loss = loss + settings.scale_regularization * shape_loss(model)
-    if not bool(torch.isfinite(loss)):
-        raise RunError(
-            f"reconstruct: the loss became {loss.item()} at step {step}",
-            mend="check the poses with `gsfluent inspect`, or change the seed",
+        self.backdrops = torch.rand(steps, 3, generator=draws(settings.seed, 4, 0)).to(device)
+        self.done = 0
+        self.order: list[int] = []
+        self.history: list[tuple[int, int, float]] = []
+
+    # -- the loop --------------------------------------------------------------------------------
+    def run(self, on_look: OnLook, save: Callable[[int], None], save_every: int) -> None:
+        """Train from where it stands to the end.
+
+        Args:
+            on_look: Called every 10 steps (50 off the CPU) and at the end with the steps done and
+                the mean squared error of the last ones.
+            save: Called every ``save_every`` steps, after the losses were found finite.
+            save_every: Steps.
+
+        Raises:
+            RunError: The loss is not finite, or no Gaussian survives.
+        """
+        settings, recipe = self.settings, self.settings.recipe
+        look = _LOOK.get(self.model.device.type, _LOOK_ELSEWHERE)
+        while self.done < settings.iterations:
+            self._step(self.done)
+            self.done += 1
+            done, last = self.done, self.done == settings.iterations
+            if done % recipe.densify_every == 0 and not last:
+                error = self._look()
+                self._control(done)
+                self.history.append((done, self.model.count, decibels(error)))
+            if done % look == 0 or last:
+                on_look(done, self._look())
+            if done % save_every == 0:
+                self._look()
+                save(done)
+
+    def _view(self, step: int) -> tuple[int, TrainView]:
+        count = len(self.views)
+        if not self.order or step % count == 0:
+            generator = draws(self.settings.seed, 0, step // count)
+            self.order = torch.randperm(count, generator=generator).tolist()
+        index = self.order[step % count]
+        return index, (self.small if step < self.half_until else self.views)[index]
+
+    def degree(self, step: int) -> int:
+        """SH bands in use at a step."""
+        return min(self.settings.sh_degree, int(step / self.settings.sh_every))
+
+    def _step(self, step: int) -> None:
+        """One photograph: loss, gradients, Adam."""
+        model, settings = self.model, self.settings
+        index, view = self._view(step)
+        probe = self.density.probe(model)
+        rendered = model.render(view, self.degree(step), probe)
+        image, masked = rendered.image, view.mask is not None
+        if self.exposure is not None:
+            cover = rendered.alpha if masked else torch.ones_like(rendered.alpha)
+            image = self.exposure.apply(image, cover, index)
+        photometric = ops.photometric_loss(
+            image,
+            view.color,
+            valid=view.valid,
+            alpha=rendered.alpha if masked else None,
+            mask=view.mask,
+            backdrop=self.backdrops[step] if masked else None,
+            mask_weight=_MASK_WEIGHT if masked else 0.0,
         )
-    loss.backward()
-    assert offset.grad is not None
-    model.observe(offset.grad, rendered.radii, view.full_width)
-    model.step(step / settings.iterations)
-    return float(miss.detach().square().mean())
+        loss = photometric.loss
+        if settings.scale_regularization > 0:
+            loss = loss + settings.scale_regularization * shape_loss(model)
+        penalty = self.density.penalty(model)
+        if penalty is not None:
+            loss = loss + penalty
+        if self.exposure is not None:
+            loss = loss + self.exposure.penalty()
+        loss.backward()
+        with torch.no_grad():
+            self.last[index] = photometric.mse
+            self.recent[:, step % _RECENT] = torch.stack([loss.detach(), photometric.mse])
+        self.density.observe(rendered, probe, view)
+        progress = step / settings.iterations
+        model.step(progress)
+        if self.exposure is not None:
+            self.exposure.step(index, step // len(self.views) + 1, progress)
+        self.density.after_step(model, step + 1)
+
+    def _look(self) -> float:
+        """Read the last losses back; returns the mean squared error of the last 30 steps."""
+        losses, errors = self.recent.tolist()
+        first = max(0, self.done - _RECENT)
+        for step in range(first, self.done):
+            if not math.isfinite(losses[step % _RECENT]):
+                raise RunError(
+                    f"reconstruct: the loss became {losses[step % _RECENT]} at step {step}",
+                    mend="check the poses with `gsfluent inspect`, or change the seed",
+                )
+        steps = range(max(0, self.done - 30), self.done)
+        return sum(errors[step % _RECENT] for step in steps) / max(1, len(steps))
+
+    def _control(self, done: int) -> None:
+        wanted = Wanted()
+        if self.target is not None:
+            wanted = self.target.wanted(self.model, self.degree(done), self.last)
+        elif self._thins(done):
+            wanted = Wanted(drop=least_seen(self.model, self.views, self.settings.recipe.thin))
+        self.density.control(self.model, done, wanted)
+
+    def _thins(self, done: int) -> bool:
+        """Whether this look at the density is the first one past a thinning point."""
+        recipe, steps = self.settings.recipe, self.settings.iterations
+        before = done - recipe.densify_every
+        return recipe.thin > 0 and any(before < at * steps <= done for at in recipe.thin_at)
+
+    # -- in and out ------------------------------------------------------------------------------
+    def state(self) -> dict[str, Tensor]:
+        """Everything needed to go on, tensors only."""
+        values = self.model.state() | self.density.state()
+        values |= {"last": self.last, "recent": self.recent, "done": torch.tensor(self.done)}
+        values["history"] = torch.tensor(self.history, dtype=torch.float64).reshape(-1, 3)
+        return values | ({} if self.exposure is None else self.exposure.state())
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over what :meth:`state` returned.
+
+        Raises:
+            KeyError: Something is missing.
+        """
+        self.model.restore(state)
+        self.density.restore(state)
+        if self.exposure is not None:
+            self.exposure.restore(state)
+        self.last = state["last"].to(self.model.device)
+        self.recent = state["recent"].to(self.model.device)
+        self.done = int(state["done"])
+        self.order = []
+        self.history = [(int(a), int(b), c) for a, b, c in state["history"].tolist()]
 
 
 def shape_loss(model: SplatModel) -> Tensor:
@@ -128,44 +248,10 @@ def shape_loss(model: SplatModel) -> Tensor:
     size = 0.5 * scales.mean() / model.extent
     if model.isotropic:
         return size
-    ordered = scales.sort(dim=1).values
-    aspect = ordered[:, 2] / ordered[:, 1].clamp_min(1e-9)
+    longest = scales.amax(1)
+    middle = scales.sum(1) - longest - scales.amin(1)
+    aspect = longest / middle.clamp_min(1e-9)
     return size + 0.002 * (aspect - _NEEDLE).clamp_min(0.0).mean()
-
-
-@torch.no_grad()
-def control(
-    model: SplatModel,
-    settings: TrainSettings,
-    done: int,
-    generator: torch.Generator,
-    *,
-    hull: Hull | None,
-    eyes: Tensor,
-) -> None:
-    """Densify while it is time, and prune what is transparent, huge or where no object can be."""
-    if done <= _DENSIFY_UNTIL * settings.iterations:
-        model.densify(
-            settings.gradient_threshold, settings.max_gaussians, 0.01 * model.extent, generator
-        )
-    else:
-        model.reset_statistics()
-    means, scales = model.parameters["means"], model.scales()
-    keep = torch.sigmoid(model.parameters["opacities"]) > 0.01
-    keep &= torch.isfinite(means).all(1)
-    if hull is not None:
-        keep &= scales.amax(1) < 0.3 * model.extent
-        keep &= hull.contains(means, slack=4)
-    else:
-        # Matter right before a lens explains one photograph and spoils all others.
-        keep &= torch.cdist(means, eyes).amin(1) > 0.3 * model.extent
-        keep &= scales.amax(1) < model.extent
-    if not bool(keep.any()):
-        raise RunError(
-            f"reconstruct: no Gaussian survived step {done}",
-            mend="check that masks, poses and photographs belong together",
-        )
-    model.keep(keep)
 
 
 def decibels(mean_squared_error: float) -> float:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Capture
 from gsfluent.errors import InputError
-from gsfluent.metrics import SsimTarget
 
 _log = logging.getLogger(__name__)
 
@@ -29,7 +28,6 @@ class TrainView:
         valid: 1 where the photograph covers the pixel, [H, W]; None when everywhere.
         viewmat: World to camera [4, 4], float32.
         K: Intrinsics of this crop [3, 3], float32.
-        target: ``color`` prepared for SSIM, before a black background.
         full_width: Width of the uncropped photograph at this size [px].
     """
 
@@ -38,7 +36,6 @@ class TrainView:
     valid: Tensor | None
     viewmat: Tensor
     K: Tensor
-    target: SsimTarget
     full_width: int
 
     @property
@@ -113,7 +110,7 @@ def cropped(view: TrainView) -> TrainView:
     K = view.K.clone()
     K[0, 2] -= left
     K[1, 2] -= top
-    return TrainView(color, mask, valid, view.viewmat, K, SsimTarget.of(color), view.full_width)
+    return TrainView(color, mask, valid, view.viewmat, K, view.full_width)
 
 
 def _mask_box(mask: Tensor) -> tuple[int, int, int, int]:
@@ -144,7 +141,6 @@ def _prepare(
         share,
         camera.viewmat.to(device, torch.float32),
         camera.K.to(device, torch.float32),
-        SsimTarget.of(color if soft is None else color * soft[..., None]),
         camera.width,
     )
 
@@ -162,6 +158,4 @@ def halved(view: TrainView) -> TrainView:
     K[:2] *= 0.5
     mask = None if view.mask is None else half(view.mask[..., None])[..., 0]
     valid = None if view.valid is None else half(view.valid[..., None])[..., 0]
-    return TrainView(
-        color, mask, valid, view.viewmat, K, SsimTarget.of(color), view.full_width // 2
-    )
+    return TrainView(color, mask, valid, view.viewmat, K, view.full_width // 2)

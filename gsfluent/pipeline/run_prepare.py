@@ -15,6 +15,7 @@ from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.orient import make_frame, orient
 from gsfluent.pipeline.reconstruct import Reconstruct
+from gsfluent.pipeline.reconstruct_report import write_report
 from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
@@ -43,6 +44,7 @@ def reconstruct_stage(context: RunContext) -> None:
         )
         gaussians, report = stage(capture, progress=context.reporter.task("reconstruct"))
         gaussians.save(folder / "model.ply")
+        write_report(folder, gaussians, capture, report)
         return dict(report)
 
     result = context.store.run("reconstruct", key, work)

@@ -9,10 +9,11 @@ from typing import Any
 import torch
 
 from gsfluent.data import Capture, Solid
-from gsfluent.io import load, load_capture, write_json
+from gsfluent.io import load, load_capture
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.reconstruct import Reconstruct
+from gsfluent.pipeline.reconstruct_report import write_report
 from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.stage import Progress
 from gsfluent.pipeline.texture import Texture
@@ -28,7 +29,7 @@ def reconstruct_to(
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, Any]:
-    """Photographs to a splat file, with ``reconstruct.json`` beside it.
+    """Photographs to a splat file; ``reconstruct.json``, ``.md`` and ``.png`` beside it.
 
     Args:
         capture: Folder of posed photographs.
@@ -49,11 +50,10 @@ def reconstruct_to(
     photographs = load_capture(capture)
     stage = Reconstruct(**options, device=device, seed=seed)
     gaussians, report = stage(photographs, progress=progress)
-    if not keep_background:
-        gaussians = Isolate(seed=seed)(gaussians, photographs)
-    gaussians.save(out)
-    values = dict(report) | {"gaussians_saved": gaussians.count, "output": str(out)}
-    write_json(out.with_name("reconstruct.json"), values)
+    kept = gaussians if keep_background else Isolate(seed=seed)(gaussians, photographs)
+    kept.save(out)
+    values = dict(report) | {"gaussians_saved": kept.count, "output": str(out)}
+    write_report(out.parent, gaussians, photographs, values)
     return values
 
 

@@ -1,0 +1,151 @@
+"""Schedules of a reconstruction: what a short run on a CPU does, and what a long one does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from gsfluent.errors import InputError
+
+_LONG_FROM = 3000  # iterations; below, every step counts too much for resets and slow rates
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam step sizes.
+
+    ``means`` is in units of the extent and decays exponentially to ``means_end`` of itself over the
+    run; the others decay to ``others_end`` of themselves from ``others_from`` of the run on, so
+    that the jitter of single photographs settles.
+    """
+
+    means: float = 1.6e-3
+    means_end: float = 0.02
+    scales: float = 1.0e-2
+    quats: float = 2.0e-3
+    opacities: float = 5.0e-2
+    sh0: float = 1.0e-2
+    sh_rest: float = 5.0e-4
+    beta2: float = 0.99
+    others_end: float = 1.0
+    others_from: float = 0.5
+
+    def at(self, name: str, progress: float) -> float:
+        """Step size of a parameter at ``progress`` in [0, 1] of the run."""
+        rate: float = getattr(self, name)
+        if name == "means":
+            return rate * self.means_end**progress
+        late = max(0.0, progress - self.others_from) / max(1e-9, 1.0 - self.others_from)
+        return rate * self.others_end**late
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One schedule.
+
+    Attributes:
+        name: What the report calls it.
+        object_rates: Step sizes when the extent is that of one object.
+        scene_rates: Step sizes when the extent is the distance of the cameras.
+        densify_from: First step that may densify.
+        densify_until: Share of the run after which the count no longer grows.
+        densify_every: Steps between two looks at the density.
+        gradient_threshold: Mean screen-space gradient (units of half the image width) above which
+            a Gaussian is cloned or split, for photographs cropped to the object; half of it for
+            whole ones, whose mean weighs a pixel about half as much.
+        absgrad_threshold: The same for the sum of absolute gradients (Ye et al. 2024).
+        reset_every: Steps between opacity resets; 0 for none.
+        prune_opacity: Opacity below which a Gaussian goes.
+        thin: Share of all blend weights that may go in one thinning: the Gaussians that blend
+            least into the photographs.
+        thin_at: Shares of the run at which that happens.
+        half_until: Share of the run at half size.
+        sh_every: Steps between two bands of view-dependent colour, at most a quarter of the run.
+        start_opacity: Opacity of Gaussians at sparse points.
+        start_scale: Their size in units of the mean distance of three neighbours.
+        shell: Add a far shell for plain walls.
+        max_gaussians: Cap when none is given.
+        start_gaussians: Start when none is given.
+        image_size: Longer side of the photographs when none is given [px].
+    """
+
+    name: str
+    object_rates: LearningRates
+    scene_rates: LearningRates
+    densify_from: int = 100
+    densify_until: float = 0.6
+    densify_every: int = 100
+    gradient_threshold: float = 4e-4
+    absgrad_threshold: float = 1.6e-3
+    reset_every: int = 0
+    prune_opacity: float = 0.01
+    thin: float = 0.0
+    thin_at: tuple[float, ...] = ()
+    half_until: float = 0.35
+    sh_every: int = 1000
+    start_opacity: float = 0.3
+    start_scale: float = 0.7
+    shell: bool = True
+    max_gaussians: int = 60_000
+    start_gaussians: int = 12_000
+    image_size: int = 400
+
+
+QUICK = Recipe("quick", LearningRates(), LearningRates(means=8e-4))
+
+_SLOW = LearningRates(
+    means=1.6e-4,
+    means_end=0.01,
+    scales=5e-3,
+    quats=1e-3,
+    opacities=5e-2,
+    sh0=2.5e-3,
+    sh_rest=1.25e-4,
+    beta2=0.999,
+)
+
+CLASSIC = Recipe(
+    "classic",
+    replace(_SLOW, means=8e-4),
+    _SLOW,
+    densify_from=500,
+    densify_until=1.0,
+    reset_every=3000,
+    prune_opacity=0.005,
+    half_until=0.0,
+    start_opacity=0.1,
+    start_scale=1.0,
+    shell=False,
+    max_gaussians=5_000_000,
+    start_gaussians=1_000_000,
+    image_size=800,
+)
+"""The schedule of Kerbl et al. 2023 and gsplat's default trainer: what others are measured with."""
+
+LONG = replace(
+    CLASSIC,
+    name="long",
+    densify_until=0.75,
+    reset_every=0,
+    half_until=0.15,
+    start_opacity=0.3,
+    start_scale=0.7,
+    shell=True,
+)
+
+RECIPES = {recipe.name: recipe for recipe in (QUICK, LONG, CLASSIC)}
+
+
+def recipe_for(name: str, iterations: int) -> Recipe:
+    """The recipe ``name``; "auto" takes quick below 3000 iterations and long from there.
+
+    Raises:
+        InputError: No such recipe.
+    """
+    if name == "auto":
+        return LONG if iterations >= _LONG_FROM else QUICK
+    if name not in RECIPES:
+        raise InputError(
+            f"reconstruct.recipe {name!r} is not known",
+            f"choose auto, {', '.join(sorted(RECIPES))}",
+        )
+    return RECIPES[name]
