@@ -55,6 +55,8 @@ class Recipe:
         absgrad_threshold: The same for the sum of absolute gradients (Ye et al. 2024).
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
+        error_gate: Only Gaussians with at least so many times the mean squared error under them
+            are multiplied; 0 for all.
         thin: Share of all blend weights that may go in one thinning: the Gaussians that blend
             least into the photographs.
         thin_at: Shares of the run at which that happens.
@@ -78,6 +80,7 @@ class Recipe:
     absgrad_threshold: float = 1.6e-3
     reset_every: int = 0
     prune_opacity: float = 0.01
+    error_gate: float = 0.0
     thin: float = 0.0
     thin_at: tuple[float, ...] = ()
     half_until: float = 0.35
