@@ -70,24 +70,26 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "radius) -> (Tensor, Tensor, Tensor)");
 
   // --- raster: Gaussian splatting ---
-  // Returns image, alpha, depth, normal, contribution, radii, then what the adjoint needs: splats,
-  // order, tile_start, instances.
+  // Returns image, alpha, depth, median depth, normal, contribution, radii, then what the adjoint
+  // needs: splats, order, tile_start, instances.
   m.def(
       "rasterize(Tensor means, Tensor opacities, Tensor viewmat, Tensor K, Tensor? quats, "
       "Tensor? scales, Tensor? covars, Tensor? sh, Tensor? colors, Tensor? background, "
-      "Tensor? normals, Tensor? groups, Tensor? means2d_offset, int width, int height, "
-      "bool antialiased, bool contribution, float near, float far) -> "
-      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+      "Tensor? normals, Tensor? groups, Tensor? means2d_offset, Tensor? means2d_absgrad, "
+      "int width, int height, bool antialiased, bool contribution, bool depth, "
+      "bool median_depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, "
+      "Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   // Gradients of means, opacities, quats, scales, covars, sh, colors, background, normals,
-  // means2d_offset.
+  // means2d_offset, means2d_absgrad.
   m.def(
       "rasterize_backward(Tensor? grad_image, Tensor? grad_alpha, Tensor? grad_depth, "
       "Tensor? grad_normal, Tensor image, Tensor alpha, Tensor depth, Tensor normal, "
       "Tensor splats, Tensor order, Tensor tile_start, Tensor instances, Tensor means, "
       "Tensor opacities, Tensor viewmat, Tensor K, Tensor? quats, Tensor? scales, Tensor? covars, "
       "Tensor? sh, Tensor? colors, Tensor? background, Tensor? normals, Tensor? groups, "
-      "Tensor? means2d_offset, int width, int height, bool antialiased, float near, float far) -> "
-      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+      "Tensor? means2d_offset, Tensor? means2d_absgrad, int width, int height, bool antialiased, "
+      "bool depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, "
+      "Tensor, Tensor, Tensor, Tensor, Tensor)");
 
   // --- ssim: structural similarity, the photometric loss of training ---
   m.def("ssim(Tensor image, Tensor target, bool inside) -> Tensor");

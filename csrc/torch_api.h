@@ -39,7 +39,7 @@ inline std::string shape_string(const Tensor& t) {
 
 // Second fence behind gsfluent/_check.py: expected sizes, -1 = any.
 inline void check_shape(const char* op, const char* name, const Tensor& t,
-                        std::initializer_list<int64_t> expected) {
+                        const std::vector<int64_t>& expected) {
   bool ok = t.dim() == static_cast<int64_t>(expected.size());
   if (ok) {
     int64_t i = 0;
@@ -77,15 +77,13 @@ inline Tensor contiguous(const Tensor& t) {
   return t.is_contiguous() ? t : torch::stable::contiguous(t);
 }
 
-inline Tensor new_empty(const Tensor& like, std::initializer_list<int64_t> sizes,
-                        ScalarType dtype) {
+inline Tensor new_empty(const Tensor& like, const std::vector<int64_t>& sizes, ScalarType dtype) {
   return torch::stable::new_empty(
-      like, torch::headeronly::IntHeaderOnlyArrayRef(sizes.begin(), sizes.size()), dtype);
+      like, torch::headeronly::IntHeaderOnlyArrayRef(sizes.data(), sizes.size()), dtype);
 }
-inline Tensor new_zeros(const Tensor& like, std::initializer_list<int64_t> sizes,
-                        ScalarType dtype) {
+inline Tensor new_zeros(const Tensor& like, const std::vector<int64_t>& sizes, ScalarType dtype) {
   return torch::stable::new_zeros(
-      like, torch::headeronly::IntHeaderOnlyArrayRef(sizes.begin(), sizes.size()), dtype);
+      like, torch::headeronly::IntHeaderOnlyArrayRef(sizes.data(), sizes.size()), dtype);
 }
 
 // Calls f.template operator()<float>() or <double>() by the dtype of `t`.

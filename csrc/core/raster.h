@@ -1,34 +1,18 @@
 // Arguments of the rasterizer's kernels: plain pointers and sizes, the same for CPU and CUDA, and
-// the per-splat steps both run (load a Gaussian, project it, take its gradients back).
+// the per-splat steps both run (project a Gaussian, evaluate its features, take gradients back).
 #pragma once
 
 #include "core/splat.h"
 
 namespace gsf {
 
-// Row of `splats`: the header below, then the blended features (colours, normal, depth).
-enum SplatField : int {
-  kX,
-  kY,
-  kConicA,
-  kConicB,
-  kConicC,
-  kOpacity,
-  kCutoff,
-  kExtentX,
-  kExtentY,
-  kFeatures
-};
 constexpr int kMaxChannels = 32;
 constexpr int kMaxFeatures = kMaxChannels + 4;
 // Gradient of one splat from the pixels: x, y, conic a, b, c, opacity, then the features.
 constexpr int kGradFeatures = 6;
 
-GSF_HOST_DEVICE constexpr int splat_stride(int features) {
-  return (kFeatures + features + 3) / 4 * 4;
-}
-
-// Optional pointers are null when the argument was not given.
+// Splats are counted camera by camera: splat `camera * count + i` is Gaussian i in that camera.
+// Optional pointers are null when the argument was not given or the output is not wanted.
 template <typename T>
 struct RasterArgs {
   const T* means;      // [N, 3]
@@ -36,32 +20,42 @@ struct RasterArgs {
   const T* quats;      // [N, 4] with scales [N, 3], or covars [N, 6]
   const T* scales;
   const T* covars;
-  const T* sh;  // [N, (degree + 1)^2, 3], or colors [N, C]
+  const T* sh;  // [N, (degree + 1)^2, 3], or colors [N, channels]
   const T* colors;
   const T* normals;       // [N, 3]
-  const T* background;    // [C]
-  const T* offset;        // [N, 2]
+  const T* background;    // [channels], or [C, channels] with background_stride = channels
+  const T* offset;        // [C, N, 2]
   const int32_t* groups;  // [N]
-  const T* viewmat;       // [4, 4]
-  const T* intrinsics;    // [3, 3]
-  int64_t count;
-  int sh_degree, channels, features, stride;
-  int width, height, tiles_x, tiles_y;
-  bool antialiased, has_normals;
+  const T* viewmat;       // [C, 4, 4]
+  const T* intrinsics;    // [C, 3, 3]
+  int64_t count;          // N
+  int cameras;            // C
+  int sh_degree, channels, features, stride, background_stride;
+  int width, height;
+  int tile, tiles_x, tiles_y;  // tile edge [px] of the lists, tiles of one camera's image
+  bool antialiased, has_normals, has_depth;
   T near, far;
 
-  T* splats;            // [N, stride]; row order is the backend's own
-  int32_t* order;       // [N] Gaussians by depth; on the CPU, row r of `splats` is Gaussian
-                        // order[r], and -1 stands beyond the visible ones
-  int32_t* tile_start;  // [tiles + 1] ranges of `instances`
-  int32_t* instances;   // [I] rows of `splats`, by tile, front to back
+  // Saved for the adjoint; the layout of the first three is the backend's own.
+  T* splats;            // [C N, stride]
+  int32_t* order;       // [C N] or empty
+  int32_t* tile_start;  // [C tiles + 1] ranges of `instances`
+  int32_t* instances;   // [I] by tile, front to back
   int64_t instance_count;
-  int32_t* radii;   // [N]
-  T* image;         // [H, W, C]
-  T* alpha;         // [H, W]
-  T* depth;         // [H, W]
-  T* normal;        // [H, W, 3] or null
+
+  int32_t* radii;   // [C, N]
+  T* image;         // [C, H, W, channels]
+  T* alpha;         // [C, H, W]
+  T* depth;         // [C, H, W], when has_depth
+  T* median;        // [C, H, W] or null
+  T* normal;        // [C, H, W, 3], when has_normals
   T* contribution;  // [N] or null
+
+  GSF_HOST_DEVICE int64_t splat_count() const { return count * cameras; }
+  GSF_HOST_DEVICE int tiles() const { return tiles_x * tiles_y; }
+  GSF_HOST_DEVICE const T* background_of(int camera) const {
+    return background ? background + int64_t(camera) * background_stride : nullptr;
+  }
 };
 
 template <typename T>
@@ -71,7 +65,7 @@ struct RasterGradArgs {
   const T* grad_alpha;
   const T* grad_depth;
   const T* grad_normal;
-  T* grad_means;  // outputs, zeroed by the caller; null where the input is null
+  T* grad_means;  // outputs; null where the input is null
   T* grad_opacities;
   T* grad_quats;
   T* grad_scales;
@@ -79,16 +73,17 @@ struct RasterGradArgs {
   T* grad_sh;
   T* grad_colors;
   T* grad_normals;
-  T* grad_background;
-  T* grad_offset;
+  T* grad_background;  // zeroed by the host
+  T* grad_offset;      // [C, N, 2]
+  T* grad_absolute;    // [C, N, 2]
 };
 
 template <typename T>
-GSF_HOST_DEVICE SplatCamera<T> raster_camera(const RasterArgs<T>& a) {
-  return make_splat_camera(a.viewmat, a.intrinsics, a.width, a.height, a.near, a.far);
+GSF_HOST_DEVICE SplatCamera<T> raster_camera(const RasterArgs<T>& a, int camera) {
+  return make_splat_camera(a.viewmat + 16 * camera, a.intrinsics + 9 * camera, a.width, a.height,
+                           a.near, a.far);
 }
 
-// Colour of Gaussian `i` and, for the adjoint, the basis and the view direction.
 template <typename T>
 GSF_HOST_DEVICE Vec3<T> view_direction(const SplatCamera<T>& cam, const Vec3<T>& mean, T* length) {
   const Vec3<T> d = mean - cam.centre;
@@ -96,10 +91,10 @@ GSF_HOST_DEVICE Vec3<T> view_direction(const SplatCamera<T>& cam, const Vec3<T>&
   return (T(1) / *length) * d;
 }
 
-// Projects Gaussian `i` and writes its row; false (row untouched) when it cannot be seen.
+// Projects Gaussian `i` as splat `row`; false when it cannot be seen.
 template <typename T>
-GSF_HOST_DEVICE bool project_splat(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
-                                   T* row, T* depth, int32_t* radius) {
+GSF_HOST_DEVICE bool project_geometry(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
+                                      int64_t row, Splat<T>* s) {
   const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
   SplatFrame<T> frame;
   if (!splat_frame_point(cam, mean, &frame)) return false;
@@ -110,23 +105,37 @@ GSF_HOST_DEVICE bool project_splat(const RasterArgs<T>& a, const SplatCamera<T>&
     if (!rotation_from_quat(a.quats + 4 * i, &axes)) return false;
     splat_frame_axes(axes, a.scales + 3 * i, &frame);
   }
-  Splat<T> s;
-  const T ox = a.offset ? a.offset[2 * i] : T(0), oy = a.offset ? a.offset[2 * i + 1] : T(0);
-  if (!splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, &s)) return false;
+  const T ox = a.offset ? a.offset[2 * row] : T(0), oy = a.offset ? a.offset[2 * row + 1] : T(0);
+  return splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, s);
+}
 
-  T* feature = row + kFeatures;
+// rgb = max(0, sum_k basis_k c_k + 0.5) of the coefficients `c` [(degree + 1)^2, 3]; false when
+// that is not finite.
+template <typename T>
+GSF_HOST_DEVICE bool sh_color(int degree, const Vec3<T>& direction, const T* c, T* rgb) {
+  T basis[kMaxShCoefficients];
+  const int k = sh_coefficients(degree);
+  sh_basis(degree, direction, basis);
   bool good = true;
-  if (a.sh) {
-    T length, basis[kMaxShCoefficients];
-    const int k = sh_coefficients(a.sh_degree);
-    sh_basis(a.sh_degree, view_direction(cam, mean, &length), basis);
-    const T* c = a.sh + 3 * k * i;
-    for (int ch = 0; ch < 3; ++ch) {
-      T sum = T(0.5);
-      for (int j = 0; j < k; ++j) sum += basis[j] * c[3 * j + ch];
-      good = good && finite(sum);
-      feature[ch] = max(sum, T(0));
-    }
+  for (int ch = 0; ch < 3; ++ch) {
+    T sum = T(0.5);
+    for (int j = 0; j < k; ++j) sum += basis[j] * c[3 * j + ch];
+    good = good && finite(sum);
+    rgb[ch] = max(sum, T(0));
+  }
+  return good;
+}
+
+// Colours, normal and depth of Gaussian `i` in the order in which they are blended. `sh` are its
+// coefficients (null when plain colours are given). False when one is not finite.
+template <typename T>
+GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
+                                    int degree, const T* sh, T depth, T* feature) {
+  bool good = true;
+  if (sh) {
+    const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
+    T length;
+    good = sh_color(degree, view_direction(cam, mean, &length), sh, feature);
   } else {
     for (int ch = 0; ch < a.channels; ++ch) {
       feature[ch] = a.colors[a.channels * i + ch];
@@ -139,99 +148,120 @@ GSF_HOST_DEVICE bool project_splat(const RasterArgs<T>& a, const SplatCamera<T>&
       good = good && finite(feature[a.channels + j]);
     }
   }
-  if (!good) return false;
-  feature[a.features - 1] = s.depth;
-  row[kX] = s.x;
-  row[kY] = s.y;
-  row[kConicA] = s.a;
-  row[kConicB] = s.b;
-  row[kConicC] = s.c;
-  row[kOpacity] = s.opacity;
-  row[kCutoff] = s.cutoff;
-  row[kExtentX] = s.extent_x;
-  row[kExtentY] = s.extent_y;
-  *depth = s.depth;
-  using std::ceil;
-  *radius = static_cast<int32_t>(ceil(min(max(s.extent_x, s.extent_y), T(1 << 24))));
-  return true;
+  if (a.has_depth) feature[a.features - 1] = depth;
+  return good;
 }
 
-// Takes the pixels' gradient of one splat, `g` (layout kGradFeatures), to the inputs of Gaussian
-// `i`. The splat was visible, so every input is finite.
+// Half size of the splat's box [px], for the caller.
 template <typename T>
-GSF_HOST_DEVICE void project_splat_backward(const RasterGradArgs<T>& b, const SplatCamera<T>& cam,
-                                            int64_t i, const T* g) {
-  const RasterArgs<T>& a = b.forward;
+GSF_HOST_DEVICE int32_t splat_radius(const Splat<T>& s) {
+  using std::ceil;
+  return static_cast<int32_t>(ceil(min(max(s.extent_x, s.extent_y), T(1 << 24))));
+}
+
+// Sums of v dx, v dy, v dx^2, v dx dy, v dy^2, v over the pixels, with v = dL/d ln alpha, become
+// gradients of centre, conic and opacity (of the splat, after antialiasing).
+template <typename T>
+GSF_HOST_DEVICE void moments_to_gradient(const T* moment, T conic_a, T conic_b, T conic_c,
+                                         T opacity, T* g) {
+  const T x = moment[0], y = moment[1];
+  g[0] = conic_a * x + conic_b * y;
+  g[1] = conic_b * x + conic_c * y;
+  g[2] = T(-0.5) * moment[2];
+  g[3] = -moment[3];
+  g[4] = T(-0.5) * moment[4];
+  g[5] = moment[5] / opacity;
+}
+
+// Gradient of one Gaussian, summed over the cameras that saw it.
+template <typename T>
+struct GaussianGradient {
+  Vec3<T> mean{T(0), T(0), T(0)};
+  Mat3<T> covariance{};  // entries of the full symmetric matrix
+  T opacity = T(0);
+};
+
+// Adds what `g` (layout kGradFeatures; the depth's gradient is `depth`) says of one camera. The
+// splat was visible there, so every input is finite.
+template <typename T>
+GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
+                                       const T* g, T depth, GaussianGradient<T>* total) {
   const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
   SplatFrame<T> frame;
   if (!splat_frame_point(cam, mean, &frame)) return;
-  Mat3<T> axes = identity3<T>();
   Sym3<T> covariance;
   if (a.covars) {
     covariance = load_sym3(a.covars + 6 * i);
     splat_frame_covariance(covariance, &frame);
   } else {
+    Mat3<T> axes;
     if (!rotation_from_quat(a.quats + 4 * i, &axes)) return;
     splat_frame_axes(axes, a.scales + 3 * i, &frame);
     covariance = splat_covariance(axes, a.scales + 3 * i);
   }
-  const T* feature = g + kGradFeatures;
-  const SplatGradient<T> pixel{g[0], g[1], g[2], g[3], g[4], g[5], feature[a.features - 1]};
+  const SplatGradient<T> pixel{g[0], g[1], g[2], g[3], g[4], g[5], depth};
   Mat3<T> grad_covariance;
-  Vec3<T> grad_mean = splat_backward(cam, frame, covariance, a.opacities[i], a.antialiased, pixel,
-                                     &grad_covariance, b.grad_opacities + i);
+  T grad_opacity;
+  total->mean = total->mean + splat_backward(cam, frame, covariance, a.opacities[i], a.antialiased,
+                                             pixel, &grad_covariance, &grad_opacity);
+  total->covariance = total->covariance + grad_covariance;
+  total->opacity += grad_opacity;
+}
+
+// Adds the gradient of the coefficients to `out` [(degree + 1)^2, 3] and the part of the mean's
+// that comes through the view direction to `grad_mean`. `out` may be `c` only when k = 1.
+template <typename T>
+GSF_HOST_DEVICE void sh_backward(int degree, const SplatCamera<T>& cam, const Vec3<T>& mean,
+                                 const T* c, const T* grad_rgb, T* out, Vec3<T>* grad_mean) {
+  T length, basis[kMaxShCoefficients], weight[kMaxShCoefficients];
+  const int k = sh_coefficients(degree);
+  const Vec3<T> d = view_direction(cam, mean, &length);
+  sh_basis(degree, d, basis);
+  for (int j = 0; j < k; ++j) weight[j] = T(0);
+  for (int ch = 0; ch < 3; ++ch) {
+    T sum = T(0.5);
+    for (int j = 0; j < k; ++j) sum += basis[j] * c[3 * j + ch];
+    if (!(sum > T(0))) continue;  // clamped at zero: no gradient
+    for (int j = 0; j < k; ++j) {
+      weight[j] += grad_rgb[ch] * c[3 * j + ch];
+      out[3 * j + ch] += grad_rgb[ch] * basis[j];
+    }
+  }
+  const Vec3<T> gd = sh_basis_gradient(degree, d, weight);
+  *grad_mean = *grad_mean + (T(1) / length) * (gd - dot(gd, d) * d);
+}
+
+// Writes the summed gradient of Gaussian `i`: means, opacities, and covars or quats and scales.
+template <typename T>
+GSF_HOST_DEVICE void store_gaussian_gradient(const RasterGradArgs<T>& b, int64_t i,
+                                             const GaussianGradient<T>& total) {
+  const RasterArgs<T>& a = b.forward;
+  for (int j = 0; j < 3; ++j) b.grad_means[3 * i + j] = total.mean[j];
+  b.grad_opacities[i] = total.opacity;
   if (a.covars) {
     // The six numbers stand for the full symmetric matrix: off-diagonal entries count twice.
     T* out = b.grad_covars + 6 * i;
-    out[0] = grad_covariance(0, 0);
-    out[1] = grad_covariance(1, 1);
-    out[2] = grad_covariance(2, 2);
-    out[3] = 2 * grad_covariance(0, 1);
-    out[4] = 2 * grad_covariance(0, 2);
-    out[5] = 2 * grad_covariance(1, 2);
-  } else {
-    splat_axes_backward(axes, a.scales + 3 * i, a.quats + 4 * i, grad_covariance,
+    out[0] = total.covariance(0, 0);
+    out[1] = total.covariance(1, 1);
+    out[2] = total.covariance(2, 2);
+    out[3] = 2 * total.covariance(0, 1);
+    out[4] = 2 * total.covariance(0, 2);
+    out[5] = 2 * total.covariance(1, 2);
+    return;
+  }
+  Mat3<T> axes;
+  if (rotation_from_quat(a.quats + 4 * i, &axes)) {
+    splat_axes_backward(axes, a.scales + 3 * i, a.quats + 4 * i, total.covariance,
                         b.grad_scales + 3 * i, b.grad_quats + 4 * i);
-  }
-  if (a.sh) {
-    T length, basis[kMaxShCoefficients], weight[kMaxShCoefficients];
-    const int k = sh_coefficients(a.sh_degree);
-    const Vec3<T> d = view_direction(cam, mean, &length);
-    sh_basis(a.sh_degree, d, basis);
-    const T* c = a.sh + 3 * k * i;
-    T* out = b.grad_sh + 3 * k * i;
-    for (int j = 0; j < k; ++j) weight[j] = T(0);
-    for (int ch = 0; ch < 3; ++ch) {
-      T sum = T(0.5);
-      for (int j = 0; j < k; ++j) sum += basis[j] * c[3 * j + ch];
-      if (!(sum > T(0))) continue;  // clamped at zero: no gradient
-      for (int j = 0; j < k; ++j) {
-        out[3 * j + ch] = feature[ch] * basis[j];
-        weight[j] += feature[ch] * c[3 * j + ch];
-      }
-    }
-    const Vec3<T> gd = sh_basis_gradient(a.sh_degree, d, weight);
-    grad_mean = grad_mean + (T(1) / length) * (gd - dot(gd, d) * d);
   } else {
-    for (int ch = 0; ch < a.channels; ++ch) b.grad_colors[a.channels * i + ch] = feature[ch];
+    for (int j = 0; j < 3; ++j) b.grad_scales[3 * i + j] = T(0);
+    for (int j = 0; j < 4; ++j) b.grad_quats[4 * i + j] = T(0);
   }
-  if (a.has_normals)
-    for (int j = 0; j < 3; ++j) b.grad_normals[3 * i + j] = feature[a.channels + j];
-  if (b.grad_offset) {
-    b.grad_offset[2 * i] = g[0];
-    b.grad_offset[2 * i + 1] = g[1];
-  }
-  for (int j = 0; j < 3; ++j) b.grad_means[3 * i + j] = grad_mean[j];
 }
 
-// The tiles a pixel box touches, [x0, x1) x [y0, y1).
-GSF_HOST_DEVICE PixelBox tile_box(const PixelBox& p) {
-  return {p.x0 / kTile, p.y0 / kTile, (p.x1 + kTile - 1) / kTile, (p.y1 + kTile - 1) / kTile};
-}
-
-template <typename T>
-GSF_HOST_DEVICE PixelBox splat_tiles(const T* row, int width, int height) {
-  return tile_box(splat_box(row[kX], row[kY], row[kExtentX], row[kExtentY], width, height));
+// The tiles of edge `tile` that a pixel box touches, [x0, x1) x [y0, y1).
+GSF_HOST_DEVICE PixelBox tile_box(const PixelBox& p, int tile) {
+  return {p.x0 / tile, p.y0 / tile, (p.x1 + tile - 1) / tile, (p.y1 + tile - 1) / tile};
 }
 
 }  // namespace gsf

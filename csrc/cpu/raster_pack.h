@@ -94,6 +94,11 @@ inline Pack<double> pack_sqrt<double>(Pack<double> a) {
 #endif
 
 template <typename T>
+inline Pack<T> pack_abs(Pack<T> a) {
+  return a < Pack<T>{} ? -a : a;
+}
+
+template <typename T>
 inline T pack_sum(Pack<T> a) {
   T s = T(0);
   for (int i = 0; i < PackOf<T>::kLanes; ++i) s += a[i];

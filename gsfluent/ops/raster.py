@@ -9,28 +9,39 @@ from torch import Tensor
 
 from gsfluent import _load  # noqa: F401  (loads the compiled operators)
 from gsfluent._check import check_tensor
+from gsfluent.ops._raster_grad import Rasterize
 
 _OP = "rasterize"
 _MAX_CHANNELS = 32
+_TENSORS = 14
 _MAX_SIZE = 65536
 _SH_COEFFICIENTS = (1, 4, 9, 16)
 
 
 class Rendered(NamedTuple):
-    """What :func:`rasterize` returns."""
+    """What :func:`rasterize` returns.
+
+    Per-pixel tensors and radii have the cameras' axis in front ([C, H, W, ...], [C, N]) when
+    ``viewmat`` has one.
+    """
 
     image: Tensor
-    """Blended colours, shape [H, W, C]."""
+    """Blended colours, shape [H, W, channels]."""
     alpha: Tensor
     """Accumulated opacity in [0, 1], shape [H, W]."""
-    depth: Tensor
-    """Expected camera z [world units], divided by alpha; 0 where alpha is 0. Shape [H, W]."""
+    depth: Tensor | None
+    """Expected camera z [world units], divided by alpha; 0 where alpha is 0. Shape [H, W]; None
+    when not wanted."""
     normal: Tensor | None
     """Blended (not normalised) normals, shape [H, W, 3]; None unless normals were given."""
     contribution: Tensor | None
-    """Sum of blend weights over all pixels, shape [N]; None unless asked for. No gradient."""
+    """Sum of blend weights over all pixels of all cameras, shape [N]; None unless asked for. No
+    gradient."""
     radii: Tensor
     """Half size of the splat's box [px], int32, shape [N]; 0 for splats that cannot be seen."""
+    median_depth: Tensor | None = None
+    """Camera z [world units] of the splat that takes the transmittance to 1/2 or below, 0 where
+    none does. Shape [H, W]; None unless asked for. No gradient."""
 
 
 def rasterize(
@@ -51,7 +62,10 @@ def rasterize(
     normals: Tensor | None = None,
     groups: Tensor | None = None,
     means2d_offset: Tensor | None = None,
+    means2d_absgrad: Tensor | None = None,
     contribution: bool = False,
+    depth: bool = True,
+    median_depth: bool = False,
     near: float = 0.01,
     far: float = 1e6,
 ) -> Rendered:
@@ -67,8 +81,9 @@ def rasterize(
         means: Centres [world units], shape [N, 3], float32 or float64.
         opacities: Peak opacities in [0, 1], shape [N].
         viewmat: Rigid world-to-camera transform, OpenCV axes (x right, y down, z forward), shape
-            [4, 4].
-        K: Intrinsics [px] without skew, shape [3, 3]; the centre of the first pixel is (0.5, 0.5).
+            [4, 4], or [C, 4, 4] for C cameras in one call.
+        K: Intrinsics [px] without skew, shape [3, 3] or [C, 3, 3]; the centre of the first pixel is
+            (0.5, 0.5).
         width: Image width [px].
         height: Image height [px].
         quats: Rotations wxyz, normalised inside, shape [N, 4]; together with ``scales``.
@@ -76,16 +91,22 @@ def rasterize(
         covars: World covariances xx, yy, zz, xy, xz, yz instead of quats and scales, shape [N, 6].
         sh: Spherical harmonics of degree 0 to 3, shape [N, (degree + 1)^2, 3]; the colour is
             ``max(0, sum_k sh_k Y_k(direction) + 0.5)``.
-        colors: Colours or other features instead of ``sh``, shape [N, C] with C <= 32.
-        background: Colour behind everything, shape [C]; black when None.
+        colors: Colours or other features instead of ``sh``, shape [N, channels] with at
+            most 32 channels.
+        background: Colour behind everything, shape [channels], or [C, channels] for one per camera;
+            black when None.
         antialiased: Scale opacity by sqrt(det / det_blurred), at least 0.005, so that the low-pass
             does not thicken splats smaller than a pixel.
         normals: Vectors to blend along with the colours, shape [N, 3].
         groups: Sibling group per Gaussian, int32, shape [N]; -1 for none. Per pixel only the
             nearest member of a group contributes (the last 8 contributing groups are remembered).
-        means2d_offset: Added to the projected centres [px], shape [N, 2]. Zeros that require grad
-            receive the screen-space gradient used for densification.
+        means2d_offset: Added to the projected centres [px], shape [N, 2] or [C, N, 2]. Zeros that
+            require grad receive the screen-space gradient used for densification.
+        means2d_absgrad: Not read, shape [N, 2] or [C, N, 2]. Zeros that require grad receive the
+            sum over the pixels of the absolute values of the gradient of the projected centre.
         contribution: Also return each Gaussian's sum of blend weights.
+        depth: Return the expected depth; False saves the time it takes.
+        median_depth: Also return the median depth.
         near: Nearest camera z that is drawn [world units], positive.
         far: Farthest camera z that is drawn [world units].
 
@@ -98,25 +119,123 @@ def rasterize(
         NotImplementedError: ``viewmat`` or ``K`` requires grad.
 
     Gradient: with respect to means, opacities, quats, scales, covars, sh, colors, background,
-        normals and means2d_offset, from image, alpha, depth and normal.
+        normals, means2d_offset and means2d_absgrad, from image, alpha, depth and normal.
     Determinism: bit-identical on the CPU for any number of threads; on CUDA the gradients' sums are
         reordered by atomics.
     Source: Kerbl et al. 2023 (3D Gaussian Splatting), Zwicker et al. 2001 (EWA), Yu et al. 2024
-        (Mip-Splatting, the antialiased mode); conventions in docs/rasterizer.md.
+        (Mip-Splatting, the antialiased mode), Ye et al. 2024 (AbsGS, the absolute gradients);
+        conventions in docs/rasterizer.md.
     """
+    arguments = (
+        means,
+        opacities,
+        viewmat,
+        K,
+        quats,
+        scales,
+        covars,
+        sh,
+        colors,
+        background,
+        normals,
+        groups,
+        means2d_offset,
+        means2d_absgrad,
+        width,
+        height,
+        antialiased,
+        contribution,
+        depth,
+        median_depth,
+        near,
+        far,
+    )
+    if torch.compiler.is_compiling():
+        outputs = torch.ops.gsfluent.rasterize(*_checked(*arguments))
+    else:
+        outputs = _run(arguments)
+    image, alpha, depths, median, normal, weight, radii = outputs[:7]
+    return Rendered(
+        image,
+        alpha,
+        depths if depth else None,
+        normal if normals is not None else None,
+        weight if contribution else None,
+        radii,
+        median if median_depth else None,
+    )
+
+
+def _run(arguments: tuple[Any, ...]) -> tuple[Tensor, ...]:
+    """Call the operator.
+
+    A frame takes half a millisecond on a GPU, so arguments that the operator accepts as they are
+    (it checks shapes, dtypes and devices itself) are not checked twice.
+    """
+    viewmat, K, near, far = arguments[2], arguments[3], arguments[-2], arguments[-1]
+    try:
+        means = arguments[0]
+        ready = viewmat.dtype == means.dtype == K.dtype and type(arguments[14]) is int
+        ready = ready and viewmat.device == means.device == K.device and type(arguments[15]) is int
+        ready = ready and 0.0 < near < far and not (viewmat.requires_grad or K.requires_grad)
+        if not ready:
+            arguments = _checked(*arguments)
+        if torch.is_grad_enabled() and any(
+            t is not None and t.requires_grad for t in arguments[:_TENSORS]
+        ):
+            outputs: tuple[Tensor, ...] = Rasterize.apply(*arguments)
+        else:
+            outputs = torch.ops.gsfluent.rasterize.default(*arguments)
+    except (RuntimeError, TypeError, AttributeError):
+        _checked(*arguments)  # names the argument at fault
+        raise
+    return outputs
+
+
+def _checked(
+    means: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    covars: Tensor | None,
+    sh: Tensor | None,
+    colors: Tensor | None,
+    background: Tensor | None,
+    normals: Tensor | None,
+    groups: Tensor | None,
+    means2d_offset: Tensor | None,
+    means2d_absgrad: Tensor | None,
+    width: int,
+    height: int,
+    antialiased: bool,
+    contribution: bool,
+    depth: bool,
+    median_depth: bool,
+    near: float,
+    far: float,
+) -> tuple[Any, ...]:
+    """The operator's arguments, the cameras moved to the Gaussians; raises what is wrong."""
     check_tensor(_OP, "means", means, shape=("N", 3))
     n = means.shape[0]
     check_tensor(_OP, "opacities", opacities, shape=(n,), like=means)
-    check_tensor(_OP, "viewmat", viewmat, shape=(4, 4))
-    check_tensor(_OP, "K", K, shape=(3, 3))
+    batched = isinstance(viewmat, Tensor) and viewmat.dim() == 3
+    leading: tuple[int, ...] = (viewmat.shape[0],) if batched else ()
+    check_tensor(_OP, "viewmat", viewmat, shape=(*leading, 4, 4))
+    check_tensor(_OP, "K", K, shape=(*leading, 3, 3))
+    if leading == (0,):
+        raise ValueError(f"{_OP}: viewmat must hold at least one camera, got [0, 4, 4]")
     _check_size("width", width)
     _check_size("height", height)
     _check_shape_arguments(means, quats, scales, covars)
     channels = _check_color_arguments(means, sh, colors)
+    per_camera = isinstance(background, Tensor) and background.dim() == 2
     optional: tuple[tuple[str, Tensor | None, tuple[int, ...]], ...] = (
-        ("background", background, (channels,)),
+        ("background", background, (*leading, channels) if per_camera else (channels,)),
         ("normals", normals, (n, 3)),
-        ("means2d_offset", means2d_offset, (n, 2)),
+        ("means2d_offset", means2d_offset, (*leading, n, 2)),
+        ("means2d_absgrad", means2d_absgrad, (*leading, n, 2)),
     )
     for name, value, shape in optional:
         if value is not None:
@@ -130,7 +249,7 @@ def rasterize(
             raise NotImplementedError(
                 f"{_OP}: no gradient with respect to {name}; pass {name}.detach()"
             )
-    outputs = torch.ops.gsfluent.rasterize(
+    return (
         means,
         opacities,
         viewmat.to(device=means.device, dtype=means.dtype),
@@ -144,21 +263,15 @@ def rasterize(
         normals,
         groups,
         means2d_offset,
+        means2d_absgrad,
         width,
         height,
         bool(antialiased),
         bool(contribution),
+        bool(depth),
+        bool(median_depth),
         float(near),
         float(far),
-    )
-    image, alpha, depth, normal, weight, radii = outputs[:6]
-    return Rendered(
-        image,
-        alpha,
-        depth,
-        normal if normals is not None else None,
-        weight if contribution else None,
-        radii,
     )
 
 
@@ -205,96 +318,3 @@ def _check_color_arguments(means: Tensor, sh: Tensor | None, colors: Tensor | No
             "render more channels in several calls"
         )
     return given.shape[1]
-
-
-@torch.library.register_fake("gsfluent::rasterize")
-def _(
-    means: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    sh: Tensor | None,
-    colors: Tensor | None,
-    background: Tensor | None,
-    normals: Tensor | None,
-    groups: Tensor | None,
-    means2d_offset: Tensor | None,
-    width: int,
-    height: int,
-    antialiased: bool,
-    contribution: bool,
-    near: float,
-    far: float,
-) -> tuple[Tensor, ...]:
-    n = means.shape[0]
-    channels = colors.shape[1] if colors is not None else 3
-    features = channels + (3 if normals is not None else 0) + 1
-    tiles = ((width + 15) // 16) * ((height + 15) // 16)
-    instances = torch.library.get_ctx().new_dynamic_size()
-    real = means.new_empty
-    return (
-        real((height, width, channels)),
-        real((height, width)),
-        real((height, width)),
-        real((height, width, 3 if normals is not None else 0)),
-        real((n if contribution else 0,)),
-        means.new_empty((n,), dtype=torch.int32),
-        real((n, (9 + features + 3) // 4 * 4)),
-        means.new_empty((n,), dtype=torch.int32),
-        means.new_empty((tiles + 1,), dtype=torch.int32),
-        means.new_empty((instances,), dtype=torch.int32),
-    )
-
-
-@torch.library.register_fake("gsfluent::rasterize_backward")
-def _(*args: Any) -> tuple[Tensor, ...]:
-    means, opacities = args[12:14]
-    quats, scales, covars, sh, colors, background, normals, _, offset = args[16:25]
-    return tuple(
-        means.new_empty(t.shape if t is not None else (0,))
-        for t in (
-            means,
-            opacities,
-            quats,
-            scales,
-            covars,
-            sh,
-            colors,
-            background,
-            normals,
-            offset,
-        )
-    )
-
-
-def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    image, alpha, depth, normal, weight, radii, splats, order, tile_start, instances = output
-    ctx.save_for_backward(
-        image, alpha, depth, normal, splats, order, tile_start, instances, *inputs[:13]
-    )
-    ctx.scalars = (*inputs[13:16], *inputs[17:19])  # without `contribution`
-    ctx.mark_non_differentiable(weight, radii, splats, order, tile_start, instances)
-    ctx.set_materialize_grads(False)
-
-
-def _backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-    saved = ctx.saved_tensors
-    present = [t is not None for t in saved[8:]]
-    if all(g is None for g in grads[:4]):
-        return (None,) * 19
-    out = torch.ops.gsfluent.rasterize_backward(*grads[:4], *saved, *ctx.scalars)
-    means, opacities, quats, scales, covars, sh, colors, background, normals, offset = out
-    by_input = (means, opacities, None, None, quats, scales, covars, sh, colors, background)
-    tensors = (*by_input, normals, None, offset)
-    needed = ctx.needs_input_grad
-    kept = tuple(
-        g if have and need else None
-        for g, have, need in zip(tensors, present, needed, strict=False)
-    )
-    return kept + (None,) * 6
-
-
-torch.library.register_autograd("gsfluent::rasterize", _backward, setup_context=_setup_context)

@@ -21,6 +21,17 @@ def camera() -> tuple[Tensor, Tensor]:
     return viewmat, K
 
 
+def cameras(count: int) -> tuple[Tensor, Tensor]:
+    """Cameras around the one above: viewmats [count, 4, 4] and Ks [count, 3, 3] in float64."""
+    viewmat, K = camera()
+    step = torch.arange(count, dtype=torch.float64)
+    viewmats, Ks = viewmat.repeat(count, 1, 1), K.repeat(count, 1, 1)
+    viewmats[:, 0, 3] += 0.3 * step
+    viewmats[:, 2, 3] += 0.2 * step
+    Ks[:, :2, :2] *= 1.0 + 0.1 * step[:, None, None]
+    return viewmats, Ks
+
+
 def scene(count: int, *, degree: int = 3, seed: int = 1) -> dict[str, Tensor]:
     """Random float64 Gaussians in front of :func:`camera`, with all optional inputs but groups."""
     g = torch.Generator().manual_seed(seed)

@@ -47,11 +47,12 @@ def raw_arguments(count: int, requires_grad: bool) -> tuple[Any, ...]:
         *(a[k] for k in ("background", "normals")),
         groups,
         a["means2d_offset"],
+        torch.zeros(count, 2),
     ]
     tensors[2], tensors[3] = tensors[2].float(), tensors[3].float()
-    for k in (0, 1, 4, 5, 7, 9, 10, 12):
+    for k in (0, 1, 4, 5, 7, 9, 10, 12, 13):
         tensors[k] = tensors[k].requires_grad_(requires_grad)
-    return (*tensors, WIDTH, HEIGHT, True, True, 0.01, 1e6)
+    return (*tensors, WIDTH, HEIGHT, True, True, True, True, 0.01, 1e6)
 
 
 @pytest.mark.parametrize("requires_grad", [False, True])
@@ -128,25 +129,30 @@ def test_the_operator_itself_refuses_wrong_shapes() -> None:
         torch.ops.gsfluent.rasterize(*raw)
 
 
-@pytest.mark.parametrize("change", ["shorter", "rank", "order", "ranges", "splats"])
+@pytest.mark.parametrize("change", ["shorter", "splat", "camera", "order", "ranges", "boxes"])
 def test_the_adjoint_survives_state_of_another_call(change: str) -> None:
-    raw = raw_arguments(12, False)
+    raw = list(raw_arguments(12, False))
+    for k in (2, 3, 12, 13):
+        raw[k] = torch.stack([raw[k], raw[k]])  # two cameras
     out = [t.clone() for t in torch.ops.gsfluent.rasterize(*raw)]
-    splats, order, tile_start, instances = out[6:]
+    splats, order, tile_start, instances = out[7:]
     if change == "shorter":
         instances = instances[:-1]
-    elif change == "rank":
+    elif change == "splat":
         instances[3] = 10**6
+    elif change == "camera":
+        instances[0] = instances[-1]
     elif change == "order":
         order[0] = 10**6
     elif change == "ranges":
         tile_start[2] = 10**6
     else:
-        splats[:, :2] = splats.flip(0)[:, :2]  # centres of other splats: boxes no longer fit
-    state = [*out[:4], splats, order, tile_start, instances]
+        splats[:12] = splats[:12].flip(0)  # other splats: they do not touch these tiles
+    state = [out[k] for k in (0, 1, 2, 4)] + [splats, order, tile_start, instances]
+    numbers = (WIDTH, HEIGHT, True, True, 0.01, 1e6)
     with pytest.raises(RuntimeError, match="saved state does not belong to these inputs"):
         torch.ops.gsfluent.rasterize_backward(
-            torch.ones_like(out[0]), None, None, None, *state, *raw[:13], *raw[13:16], *raw[17:19]
+            torch.ones_like(out[0]), None, None, None, *state, *raw[:14], *numbers
         )
 
 

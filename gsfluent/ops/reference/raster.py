@@ -6,6 +6,7 @@ Written from the formulas, not from the kernels; meant for float64 and a few hun
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -73,6 +74,18 @@ def world_covariances(quats: Tensor | None, scales: Tensor | None, covars: Tenso
     return factor @ factor.transpose(1, 2)
 
 
+class _PerPixel(torch.autograd.Function):
+    """Zeros [N, H, W, 2] in place of [N, 2]; the gradient is the sum of absolute values."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, height: int, width: int) -> Tensor:
+        return x.new_zeros(x.shape[0], height, width, 2)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        return grads[0].abs().sum((1, 2)), None, None
+
+
 def rasterize(
     means: Tensor,
     opacities: Tensor,
@@ -91,10 +104,33 @@ def rasterize(
     normals: Tensor | None = None,
     groups: Tensor | None = None,
     means2d_offset: Tensor | None = None,
+    means2d_absgrad: Tensor | None = None,
     near: float = 0.01,
     far: float = 1e6,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
-    """Image, alpha, depth, normal, contribution of finite Gaussians; see ops.rasterize."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor]:
+    """Image, alpha, depth, normal, contribution, median depth of finite Gaussians.
+
+    See ops.rasterize; every output is computed, whether wanted or not.
+    """
+    if viewmat.dim() == 3:
+        rest: dict[str, Any] = {"quats": quats, "scales": scales, "covars": covars, "sh": sh}
+        rest |= {"colors": colors, "antialiased": antialiased, "normals": normals}
+        rest |= {"groups": groups, "near": near, "far": far}
+        views = []
+        for c in range(viewmat.shape[0]):
+            own: dict[str, Any] = {"background": background}
+            own |= {"means2d_offset": means2d_offset, "means2d_absgrad": means2d_absgrad}
+            for name, value in own.items():
+                if value is not None and (name != "background" or value.dim() == 2):
+                    own[name] = value[c]
+            view = rasterize(means, opacities, viewmat[c], K[c], width, height, **own, **rest)
+            views.append(view)
+
+        def stacked(k: int) -> Tensor:
+            return torch.stack([cast(Tensor, view[k]) for view in views])
+
+        normal = None if normals is None else stacked(3)
+        return stacked(0), stacked(1), stacked(2), normal, stacked(4).sum(0), stacked(5)
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
@@ -126,6 +162,9 @@ def rasterize(
     channels = features.shape[1]
     features = torch.cat([features, *([normals] if normals is not None else []), z[:, None]], -1)
 
+    spread = None
+    if means2d_absgrad is not None:
+        spread = _PerPixel.apply(means2d_absgrad, height, width)
     rows = torch.arange(height, dtype=means.dtype) + 0.5
     columns = torch.arange(width, dtype=means.dtype) + 0.5
     left = means.new_ones(height, width)
@@ -133,12 +172,15 @@ def rasterize(
     ring = torch.full((SIBLING_RING, height, width), -1, dtype=torch.int64)
     blended = means.new_zeros(height, width, features.shape[1])
     contribution = means.new_zeros(means.shape[0])
+    median = means.new_zeros(height, width)
     # Depths are compared in float32, like the kernels' sort keys; equal ones keep their order.
     for i in torch.sort(z.detach().float(), stable=True).indices.tolist():
         peak = float(opacity[i].detach())
         if not near <= float(z[i].detach()) <= far or peak < MIN_ALPHA:
             continue
         dx, dy = columns - centre[i, 0], rows[:, None] - centre[i, 1]
+        if spread is not None:
+            dx, dy = dx - spread[i, ..., 0], dy - spread[i, ..., 1]
         power = 0.5 * (conic[i, 0, 0] * dx * dx + conic[i, 1, 1] * dy * dy)
         power = power + conic[i, 0, 1] * dx * dy
         alpha = torch.clamp(opacity[i] * torch.exp(-power), max=MAX_ALPHA)
@@ -154,7 +196,8 @@ def rasterize(
         weight = torch.where(keep, alpha * left, 0.0)
         blended = blended + weight[..., None] * features[i]
         contribution[i] = weight.detach().sum()
-        left = torch.where(keep, left * (1 - alpha), left)
+        before, left = left, torch.where(keep, left * (1 - alpha), left)
+        median = torch.where((before > 0.5) & (left <= 0.5), z[i], median).detach()
         if group >= 0:
             pushed = torch.cat([torch.full_like(ring[:1], group), ring[:-1]])
             ring = torch.where(keep, pushed, ring)
@@ -165,4 +208,4 @@ def rasterize(
     covered = alpha > 0
     depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1.0), 0.0)
     normal = blended[..., channels : channels + 3] if normals is not None else None
-    return image, alpha, depth, normal, contribution
+    return image, alpha, depth, normal, contribution, median

@@ -1,0 +1,112 @@
+"""Autograd and shape rules of the operators behind :func:`gsfluent.ops.rasterize`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+# Positions in the schemas (csrc/library.cpp): tensor inputs come first, then these numbers.
+_TENSORS = 14
+_NUMBERS = (
+    "width",
+    "height",
+    "antialiased",
+    "contribution",
+    "depth",
+    "median_depth",
+    "near",
+    "far",
+)
+# Outputs with a gradient; the adjoint wants them, and the last four, back.
+_IMAGE, _ALPHA, _DEPTH, _NORMAL = 0, 1, 2, 4
+_DIFFERENTIABLE = (_IMAGE, _ALPHA, _DEPTH, _NORMAL)
+# Inputs in the order of the adjoint's results.
+_WITH_GRADIENT = (0, 1, 4, 5, 6, 7, 8, 9, 10, 12, 13)
+
+
+def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    """Keep what the adjoint needs."""
+    ctx.save_for_backward(*[output[k] for k in _DIFFERENTIABLE], *output[7:], *inputs[:_TENSORS])
+    width, height, antialiased, _, depth, _, near, far = inputs[_TENSORS:]
+    ctx.numbers = (width, height, antialiased, depth, near, far)
+    ctx.mark_non_differentiable(*[t for k, t in enumerate(output) if k not in _DIFFERENTIABLE])
+    ctx.set_materialize_grads(False)
+
+
+def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+    """Gradients of all inputs of the operator."""
+    result: list[Tensor | None] = [None] * (_TENSORS + len(_NUMBERS))
+    wanted = [grads[k] for k in _DIFFERENTIABLE]
+    if all(g is None for g in wanted):
+        return tuple(result)
+    saved = ctx.saved_tensors
+    found = torch.ops.gsfluent.rasterize_backward.default(*wanted, *saved, *ctx.numbers)
+    needed, given = ctx.needs_input_grad, saved[-_TENSORS:]
+    for k, gradient in zip(_WITH_GRADIENT, found, strict=True):
+        if needed[k] and given[k] is not None:
+            result[k] = gradient
+    return tuple(result)
+
+
+class Rasterize(torch.autograd.Function):
+    """The operator with its gradient, without the 0.1 ms of the dispatcher's Python rule."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
+        """Call the operator (autograd is off in here)."""
+        output: tuple[Tensor, ...] = torch.ops.gsfluent.rasterize.default(*inputs)
+        setup_context(ctx, inputs, output)
+        return output
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        """See :func:`backward`."""
+        return backward(ctx, *grads)
+
+
+torch.library.register_autograd("gsfluent::rasterize", backward, setup_context=setup_context)
+
+
+@torch.library.register_fake("gsfluent::rasterize")
+def _(*inputs: Any) -> tuple[Tensor, ...]:
+    means, viewmat, colors, normals = (inputs[k] for k in (0, 2, 8, 10))
+    width, height, _, contribution, depth, median_depth, *_ = inputs[_TENSORS:]
+    n = means.shape[0]
+    leading = tuple(viewmat.shape[:-2])
+    channels = colors.shape[1] if colors is not None else 3
+    plane = (*leading, height, width)
+    # What is saved for the adjoint has the layout of the backend.
+    unknown = torch.library.get_ctx().new_dynamic_size
+
+    def real(*shape: Any) -> Tensor:
+        return means.new_empty(shape)
+
+    def whole(*shape: Any) -> Tensor:
+        return means.new_empty(shape, dtype=torch.int32)
+
+    return (
+        real(*plane, channels),
+        real(*plane),
+        real(*plane) if depth else real(0),
+        real(*plane) if median_depth else real(0),
+        real(*plane, 3) if normals is not None else real(0),
+        real(n if contribution else 0),
+        whole(*leading, n),
+        real(unknown(), unknown()),
+        whole(unknown()),
+        whole(unknown()),
+        whole(unknown()),
+    )
+
+
+@torch.library.register_fake("gsfluent::rasterize_backward")
+def _(*args: Any) -> tuple[Tensor, ...]:
+    means = args[12]
+    inputs = args[12 : 12 + _TENSORS]
+    return tuple(
+        means.new_empty(inputs[k].shape if inputs[k] is not None else (0,)) for k in _WITH_GRADIENT
+    )
