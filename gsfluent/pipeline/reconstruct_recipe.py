@@ -52,7 +52,8 @@ class Recipe:
         gradient_threshold: Mean screen-space gradient (units of half the image width) above which
             a Gaussian is cloned or split, for photographs cropped to the object; half of it for
             whole ones, whose mean weighs a pixel about half as much.
-        absgrad_threshold: The same for the sum of absolute gradients (Ye et al. 2024).
+        absgrad: Take the sum over the pixels of absolute gradients (Ye et al. 2024, AbsGS).
+        absgrad_threshold: Threshold for it.
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
         error_gate: Only Gaussians with at least so many times the mean squared error under them
@@ -77,6 +78,7 @@ class Recipe:
     densify_until: float = 0.6
     densify_every: int = 100
     gradient_threshold: float = 4e-4
+    absgrad: bool = False
     absgrad_threshold: float = 1.6e-3
     reset_every: int = 0
     prune_opacity: float = 0.01

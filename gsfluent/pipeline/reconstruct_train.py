@@ -154,7 +154,7 @@ class Trainer:
         model, settings = self.model, self.settings
         index, view = self._view(step)
         probe = self.density.probe(model)
-        rendered = model.render(view, self.degree(step), probe)
+        rendered = model.render(view, self.degree(step), probe, absgrad=self.density.absgrad)
         image, masked = rendered.image, view.mask is not None
         if self.exposure is not None:
             cover = rendered.alpha if masked else torch.ones_like(rendered.alpha)
