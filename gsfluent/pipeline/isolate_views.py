@@ -35,7 +35,7 @@ _ROUNDS = 2
 _FORGIVEN_HULL = (0.05, 0.1)  # tried in turn where poses contradict masks
 _BARE = 0.03  # of the masks that a good hull may leave uncovered
 _LOOKS = 24  # views that tell which background shows
-_SHOWN = 0.25  # of its weight without the object: a splat that shows less is hidden
+_SHOWN = 0.1  # of its weight without the object: a splat that shows less is hidden
 
 
 def object_views(
