@@ -265,6 +265,9 @@ def _loss_gradient(ctx: Any, grad: Tensor | None, *_: Any) -> tuple[Tensor | Non
     none = (None,) * 13
     if grad is None:
         return none
+    if torch.is_grad_enabled() and grad.requires_grad:
+        # the saved gradient does not know that it depends on the image
+        raise NotImplementedError("photometric_loss: differentiable once, not twice")
     if not ctx.computed:
         raise RuntimeError("photometric_loss: called without `gradient`, so there is none")
     of_image, _, _, of_alpha = ctx.needs_input_grad[:4]
