@@ -172,7 +172,7 @@ void gaussian_backward(const RasterGradArgs<T>& b, const std::vector<SplatCamera
     }
     if (!seen) continue;
     any = true;
-    const T* feature = sum + kGradFeatures;
+    T* feature = sum + kGradFeatures;
     const T depth = b.grad_depth ? feature[slots.active - 1] : T(0);
     geometry_backward(a, cameras[camera], i, g, depth, &total);
     if (a.sh) {
