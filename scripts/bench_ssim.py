@@ -1,5 +1,8 @@
 """Time SSIM, the photometric loss and Adam beside plain torch on this machine; print markdown.
 
+Plain torch: SSIM by separable depthwise convolutions (half the time of one 11 x 11 convolution),
+Adam by ``torch.optim.Adam(foreach=True)``.
+
 python scripts/bench_ssim.py                 # CPU, and the GPU when there is one
 python scripts/bench_ssim.py --device cuda
 """
@@ -14,9 +17,9 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 from gsfluent import has_cuda, ops
-from gsfluent.ops.reference import losses as reference
 
 SIZES = ((200, 200), (800, 800), (1080, 1920))
 GAUSSIANS = {"cpu": 100_000, "cuda": 1_000_000}
@@ -43,6 +46,30 @@ def milliseconds(run: Callable[[], object], device: str, seconds: float = 1.0) -
     return statistics.median(times)
 
 
+def plain_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean over the windows inside the image, [H, W, C]."""
+    channels = image.shape[2]
+    offset = torch.arange(11.0, device=image.device) - 5.0
+    line = torch.exp(-offset.square() / 4.5)
+    across = (line / line.sum()).view(1, 1, 1, 11).repeat(channels, 1, 1, 1)
+    x, y = (t.permute(2, 0, 1)[None] for t in (image, target))
+
+    def blur(value: Tensor) -> Tensor:
+        rows = conv2d(value, across, groups=channels)
+        return conv2d(rows, across.transpose(2, 3), groups=channels)
+
+    mean_x, mean_y = blur(x), blur(y)
+    variances = blur(x * x + y * y) - mean_x.square() - mean_y.square()
+    covariance = blur(x * y) - mean_x * mean_y
+    above = (2.0 * mean_x * mean_y + 1e-4) * (2.0 * covariance + 9e-4)
+    return (above / ((mean_x.square() + mean_y.square() + 1e-4) * (variances + 9e-4))).mean()
+
+
+def plain_loss(image: Tensor, target: Tensor) -> Tensor:
+    l1 = (image - target).abs().mean()
+    return 0.8 * l1 + 0.2 * (1.0 - plain_ssim(image, target))
+
+
 def loss_rows(device: str, size: tuple[int, int]) -> list[tuple[str, float, float]]:
     """Name, ours, plain torch [ms]; forward and backward."""
     generator = torch.Generator().manual_seed(0)
@@ -56,18 +83,19 @@ def loss_rows(device: str, size: tuple[int, int]) -> list[tuple[str, float, floa
         return milliseconds(both(ours), device), milliseconds(both(plain), device)
 
     text = f"{size[1]} x {size[0]} x 3"
-    forward = (lambda: ops.ssim(image, target)), (lambda: reference.ssim(image, target))
+    assert abs(ops.ssim(image, target).item() - plain_ssim(image, target).item()) < 1e-4
+    forward = (lambda: ops.ssim(image, target)), (lambda: plain_ssim(image, target))
     return [
         (f"ssim, forward, {text}", *(milliseconds(f, device) for f in forward)),
         (
             f"ssim, forward + backward, {text}",
-            *pair(lambda: ops.ssim(leaf, target), lambda: reference.ssim(leaf, target)),
+            *pair(lambda: ops.ssim(leaf, target), lambda: plain_ssim(leaf, target)),
         ),
         (
             f"photometric loss, forward + backward, {text}",
             *pair(
                 lambda: ops.photometric_loss(leaf, target).loss,
-                lambda: reference.photometric_loss(leaf, target)[0],
+                lambda: plain_loss(leaf, target),
             ),
         ),
     ]

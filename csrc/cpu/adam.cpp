@@ -76,25 +76,30 @@ template <typename T>
 void update_stretch(const AdamTensor<T>& t, const AdamVisible& visible, int64_t begin,
                     int64_t end) {
   const int64_t columns = t.columns;
-  const auto row = [&](int64_t r) { return t.gradient + r * columns; };
-  bool takes_part[kStretchValues];
-  int64_t parts = 0;
-  for (int64_t r = begin; r < end; ++r) parts += takes_part[r - begin] = visible(r);
-  if (parts == 0) return;
-  const bool all = parts == end - begin;
-  const bool clean = (all || columns < kLongRow) && all_finite(row(begin), (end - begin) * columns);
+  const auto gradient = [&](int64_t r) { return t.gradient + r * columns; };
+  int64_t chosen[kStretchValues];  // rows that take part
+  int64_t count = 0;
+  for (int64_t r = begin; r < end; ++r) {
+    chosen[count] = r;
+    count += visible(r);
+  }
+  if (count == 0) return;
+  const bool all = count == end - begin;
+  const bool clean =
+      (all || columns < kLongRow) && all_finite(gradient(begin), (end - begin) * columns);
   if (all && clean) return update_values<false>(t, begin * columns, end * columns);
-  if (!clean)
-    for (int64_t r = begin; r < end; ++r)
-      takes_part[r - begin] = takes_part[r - begin] && all_finite(row(r), columns);
   if (columns >= kLongRow) {
-    for (int64_t r = begin; r < end; ++r)
-      if (takes_part[r - begin]) update_values<false>(t, r * columns, (r + 1) * columns);
+    for (int64_t i = 0; i < count; ++i)
+      if (all_finite(gradient(chosen[i]), columns))
+        update_values<false>(t, chosen[i] * columns, (chosen[i] + 1) * columns);
     return;
   }
+  T row_part[kStretchValues] = {};
+  for (int64_t i = 0; i < count; ++i)
+    row_part[chosen[i] - begin] = T(clean || all_finite(gradient(chosen[i]), columns));
   T part[kStretchValues + Pack<T>::kLanes];
   for (int64_t c = 0; c < columns; ++c)  // rows inside: they are many, and columns few
-    for (int64_t r = 0; r < end - begin; ++r) part[r * columns + c] = T(takes_part[r]);
+    for (int64_t r = 0; r < end - begin; ++r) part[r * columns + c] = row_part[r];
   std::fill_n(part + (end - begin) * columns, Pack<T>::kLanes, T(0));
   update_values<true>(t, begin * columns, end * columns, part);
 }

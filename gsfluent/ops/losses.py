@@ -47,7 +47,7 @@ def ssim(
         image: Shape [H, W, C] with 1 to 32 channels, float32 or float64.
         target: Same shape and dtype.
         padding: "valid" takes the pixels whose window lies inside the image (Wang et al.); "same"
-            takes all, with zeros around both images (the training loss of gsplat and INRIA).
+            takes all, with zeros around both images (Kerbl et al.'s training loss).
         reduction: "mean" or "none".
 
     Returns:
