@@ -208,27 +208,35 @@ GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera
   total->opacity += grad_opacity;
 }
 
-// Adds the gradient of the coefficients to `out` [(degree + 1)^2, 3] and the part of the mean's
-// that comes through the view direction to `grad_mean`. `out` may be `c` only when k = 1.
+// First half of the colour's adjoint: drops the channels of `grad_rgb` that the clamp at zero held,
+// adds the part of the mean's gradient that comes through the view direction, and leaves the basis.
 template <typename T>
-GSF_HOST_DEVICE void sh_backward(int degree, const SplatCamera<T>& cam, const Vec3<T>& mean,
-                                 const T* c, const T* grad_rgb, T* out, Vec3<T>* grad_mean) {
-  T length, basis[kMaxShCoefficients], weight[kMaxShCoefficients];
+GSF_HOST_DEVICE void sh_direction_backward(int degree, const SplatCamera<T>& cam,
+                                           const Vec3<T>& mean, const T* c, T* grad_rgb, T* basis,
+                                           Vec3<T>* grad_mean) {
+  T length, weight[kMaxShCoefficients];
   const int k = sh_coefficients(degree);
   const Vec3<T> d = view_direction(cam, mean, &length);
   sh_basis(degree, d, basis);
-  for (int j = 0; j < k; ++j) weight[j] = T(0);
   for (int ch = 0; ch < 3; ++ch) {
     T sum = T(0.5);
     for (int j = 0; j < k; ++j) sum += basis[j] * c[3 * j + ch];
-    if (!(sum > T(0))) continue;  // clamped at zero: no gradient
-    for (int j = 0; j < k; ++j) {
-      weight[j] += grad_rgb[ch] * c[3 * j + ch];
-      out[3 * j + ch] += grad_rgb[ch] * basis[j];
-    }
+    if (!(sum > T(0))) grad_rgb[ch] = T(0);
   }
+  for (int j = 0; j < k; ++j)
+    weight[j] = grad_rgb[0] * c[3 * j] + grad_rgb[1] * c[3 * j + 1] + grad_rgb[2] * c[3 * j + 2];
   const Vec3<T> gd = sh_basis_gradient(degree, d, weight);
   *grad_mean = *grad_mean + (T(1) / length) * (gd - dot(gd, d) * d);
+}
+
+// Adjoint of the colour: adds the gradient of the coefficients to `out` [(degree + 1)^2, 3].
+template <typename T>
+GSF_HOST_DEVICE void sh_backward(int degree, const SplatCamera<T>& cam, const Vec3<T>& mean,
+                                 const T* c, T* grad_rgb, T* out, Vec3<T>* grad_mean) {
+  T basis[kMaxShCoefficients];
+  sh_direction_backward(degree, cam, mean, c, grad_rgb, basis, grad_mean);
+  for (int j = 0; j < sh_coefficients(degree); ++j)
+    for (int ch = 0; ch < 3; ++ch) out[3 * j + ch] += grad_rgb[ch] * basis[j];
 }
 
 // Writes the summed gradient of Gaussian `i`: means, opacities, and covars or quats and scales.

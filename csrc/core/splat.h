@@ -195,12 +195,18 @@ GSF_HOST_DEVICE PixelBox splat_box(T x, T y, T extent_x, T extent_y, int width, 
           static_cast<int>(clamp(floor(y + extent_y - half) + T(1), T(0), h))};
 }
 
+// Power beyond which alpha falls below 1/255, at most the support; opacity > 0.
+template <typename T>
+GSF_HOST_DEVICE T splat_cutoff(T opacity) {
+  using std::log;
+  return min(log(opacity * T(255)), T(kMaxPower));
+}
+
 // Last step of projection; false when the splat cannot be seen or is not a finite splat.
 // `offset_x`, `offset_y` [px] move the centre.
 template <typename T>
 GSF_HOST_DEVICE bool splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>& f, T opacity,
                                   bool antialiased, T offset_x, T offset_y, Splat<T>* s) {
-  using std::log;
   using std::sqrt;
   if (!(f.det > T(0)) || !finite(f.det) || !(f.cov_a >= T(0)) || !(f.cov_c >= T(0))) return false;
   const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur);
@@ -210,7 +216,7 @@ GSF_HOST_DEVICE bool splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>
   s->c = a * inverse;
   s->opacity = antialiased ? opacity * splat_compensation(f) : opacity;
   if (!(s->opacity >= T(kMinAlpha)) || !finite(s->opacity)) return false;
-  s->cutoff = min(log(s->opacity * T(255)), T(kMaxPower));
+  s->cutoff = splat_cutoff(s->opacity);
   s->x = cam.fx * f.point.x * f.inverse_z + cam.cx + offset_x;
   s->y = cam.fy * f.point.y * f.inverse_z + cam.cy + offset_y;
   s->extent_x = sqrt(2 * max(s->cutoff, T(0)) * a);

@@ -1,16 +1,21 @@
-// Ordering on CUDA: project, one radix sort of the Gaussians by depth, then one stable radix sort
-// of the instances by tile number alone. Equal depths keep their order, as on the CPU.
+// Ordering on CUDA: one radix sort of the splats by depth, then one stable radix sort of the list
+// entries by tile number alone. Equal depths keep their order, as on the CPU.
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
+
 #include <cub/device/device_radix_sort.cuh>
 #include <cub/device/device_scan.cuh>
 
 #include "cuda/launch_raster.h"
+#include "cuda/raster_layout.h"
 
 namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr uint32_t kCulled = 0xffffffffu;
-constexpr int64_t kShortTiles = 65536;  // as many tiles fit 16-bit keys
+constexpr unsigned kAllLanes = 0xffffffffu;
+constexpr uint32_t kStaged = 512;      // list entries that a warp gathers before it writes them
+constexpr int64_t kShortKeys = 65536;  // as many values fit 16 bits
 
 int blocks_for(int64_t n) { return static_cast<int>((n + kThreads - 1) / kThreads); }
 
@@ -28,54 +33,81 @@ struct Carver {
   }
 };
 
-template <typename T>
-__global__ void project_kernel(RasterArgs<T> a, uint32_t* keys, int32_t* ids) {
-  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (i >= a.count) return;
-  T* row = a.splats + i * a.stride;
-  T depth = T(0);
-  int32_t radius = 0;
-  const bool seen = project_splat(a, raster_camera(a), i, row, &depth, &radius);
-  if (!seen) row[kOpacity] = T(0);
-  keys[i] = seen ? __float_as_uint(static_cast<float>(depth)) : kCulled;
-  ids[i] = static_cast<int32_t>(i);
-  a.radii[i] = seen ? radius : 0;
-}
+struct CountOfRank {
+  const uint64_t* codes;
+  const int32_t* order;
+  __device__ uint32_t operator()(int r) const { return TileCode::count(codes[order[r]]); }
+};
+using RankCounts = thrust::transform_iterator<CountOfRank, thrust::counting_iterator<int>>;
 
-template <typename T>
-__global__ void count_kernel(RasterArgs<T> a, int64_t* counts) {
-  const int64_t r = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (r >= a.count) return;
-  const T* row = a.splats + int64_t(a.order[r]) * a.stride;
-  int64_t count = 0;
-  if (row[kOpacity] > T(0)) {
-    const PixelBox box = splat_tiles(row, a.width, a.height);
-    count = int64_t(box.x1 - box.x0) * (box.y1 - box.y0);
-  }
-  counts[r] = count;
-}
-
-// One thread per instance: a splat that fills the screen is spread over as many threads as tiles.
+// Writes the list entries of the splats of 32 ranks; those of many tiles by the whole warp.
 template <typename T, typename Key>
-__global__ void emit_kernel(RasterArgs<T> a, const int64_t* offsets, Key* tiles, int32_t* ids) {
-  const int64_t e = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (e >= a.instance_count) return;
-  int64_t low = 0, high = a.count - 1;  // first rank whose running total exceeds e
-  while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    if (offsets[middle] > e)
-      high = middle;
-    else
-      low = middle + 1;
+__global__ void __launch_bounds__(kThreads)
+    emit_kernel(RasterArgs<T> a, RasterOrder o, Key* tiles, int32_t* ids) {
+  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int lane = threadIdx.x % 32;
+  const bool real = r < a.splat_count();
+  const int32_t id = real ? o.order[r] : 0;
+  const uint64_t code = real ? o.codes[id] : 0;
+  const uint32_t begin = real ? o.offsets[r] : 0;  // lane 0 of a warp with work is real
+  const auto first_tile = [&](int32_t splat) {
+    return a.cameras == 1 ? 0 : static_cast<int>(splat / a.count) * a.tiles();
+  };
+  const bool many = TileCode::many(code);
+  const uint32_t count = TileCode::count(code);
+  // Entries of a warp's ranks are neighbours: through shared memory they leave as whole sectors.
+  __shared__ Key staged_tiles[kThreads / 32][kStaged];
+  __shared__ int32_t staged_ids[kThreads / 32][kStaged];
+  Key* const own_tiles = staged_tiles[threadIdx.x / 32];
+  int32_t* const own_ids = staged_ids[threadIdx.x / 32];
+  const uint32_t start = __shfl_sync(kAllLanes, begin, 0);
+  const uint32_t total = __reduce_add_sync(kAllLanes, count);
+  const bool stage = total <= kStaged && !__any_sync(kAllLanes, many);
+  if (!many) {
+    const int base = first_tile(id) + TileCode::y(code) * a.tiles_x + TileCode::x(code);
+    uint32_t e = stage ? begin - start : begin;
+    Key* const to_tiles = stage ? own_tiles : tiles;
+    int32_t* const to_ids = stage ? own_ids : ids;
+    for (uint64_t mask = TileCode::mask(code); mask; mask &= mask - 1, ++e) {
+      const int bit = __ffsll(static_cast<long long>(mask)) - 1;
+      to_tiles[e] =
+          static_cast<Key>(base + bit / TileCode::kEdge * a.tiles_x + bit % TileCode::kEdge);
+      to_ids[e] = id;
+    }
   }
-  const int32_t id = a.order[low];
-  const PixelBox box = splat_tiles(a.splats + int64_t(id) * a.stride, a.width, a.height);
-  const int64_t local = e - (low > 0 ? offsets[low - 1] : 0);
-  const int columns = box.x1 - box.x0;
-  const int y = box.y0 + static_cast<int>(local / columns);
-  const int x = box.x0 + static_cast<int>(local % columns);
-  tiles[e] = static_cast<Key>(y * a.tiles_x + x);
-  ids[e] = id;
+  if (stage) {
+    __syncwarp();
+    for (uint32_t e = lane; e < total; e += 32) {
+      tiles[start + e] = own_tiles[e];
+      ids[start + e] = own_ids[e];
+    }
+    return;
+  }
+  for (unsigned wide = __ballot_sync(kAllLanes, many); wide; wide &= wide - 1) {
+    const int source = __ffs(wide) - 1;
+    const int32_t one = __shfl_sync(kAllLanes, id, source);
+    uint32_t e = __shfl_sync(kAllLanes, begin, source);
+    const uint32_t end = e + __shfl_sync(kAllLanes, count, source);
+    const SplatGeometry<T> g = splat_geometry(a)[one];
+    const SplatBands<T> bands(g, a);
+    const int base = first_tile(one);
+    for (int row = bands.y0; row < bands.y1; ++row) {
+      int first, last;
+      bands.columns(g, a, row, &first, &last);
+      for (int x = first + lane; x < last; x += 32) {
+        const uint32_t at = e + static_cast<uint32_t>(x - first);
+        if (at < end) {
+          tiles[at] = static_cast<Key>(base + row * a.tiles_x + x);
+          ids[at] = one;
+        }
+      }
+      e += static_cast<uint32_t>(last - first);
+    }
+    // Should rounding in this kernel give fewer tiles than in the other, the rest goes behind the
+    // last tile, where nothing is drawn.
+    const Key none = static_cast<Key>(a.tiles() * a.cameras);
+    for (uint32_t at = e + lane; at < end; at += 32) tiles[at] = none, ids[at] = one;
+  }
 }
 
 template <typename Key>
@@ -103,10 +135,10 @@ size_t tile_sort_bytes(int64_t instances, int bits) {
 }
 
 template <typename T, typename Key>
-cudaError_t bin_with_keys(const RasterArgs<T>& a, void* scratch, size_t bytes,
-                          const int64_t* offsets, cudaStream_t stream) {
+cudaError_t bin_with_keys(const RasterArgs<T>& a, const RasterOrder& o, void* scratch, size_t bytes,
+                          cudaStream_t stream) {
   const int64_t n = a.instance_count;
-  const int tile_count = a.tiles_x * a.tiles_y, bits = bits_for(tile_count);
+  const int tile_count = a.tiles() * a.cameras, bits = bits_for(tile_count + 1);
   Carver carve{static_cast<char*>(scratch)};
   Key* tiles = carve.take<Key>(n);
   Key* sorted = carve.take<Key>(n);
@@ -114,7 +146,7 @@ cudaError_t bin_with_keys(const RasterArgs<T>& a, void* scratch, size_t bytes,
   size_t sort_bytes = tile_sort_bytes<Key>(n, bits);
   void* sort_scratch = carve.take<char>(static_cast<int64_t>(sort_bytes));
   if (carve.used > bytes) return cudaErrorInvalidValue;
-  emit_kernel<T, Key><<<blocks_for(n), kThreads, 0, stream>>>(a, offsets, tiles, ids);
+  emit_kernel<T, Key><<<blocks_for(a.splat_count()), kThreads, 0, stream>>>(a, o, tiles, ids);
   const cudaError_t error = cub::DeviceRadixSort::SortPairs(sort_scratch, sort_bytes, tiles, sorted,
                                                             ids, a.instances, n, 0, bits, stream);
   if (error != cudaSuccess) return error;
@@ -123,77 +155,75 @@ cudaError_t bin_with_keys(const RasterArgs<T>& a, void* scratch, size_t bytes,
   return cudaGetLastError();
 }
 
-}  // namespace
-
-size_t raster_order_scratch(int64_t count) {
+size_t depth_sort_bytes(int64_t splats) {
   size_t sort = 0, scan = 0;
   cub::DeviceRadixSort::SortPairs<uint32_t, int32_t>(nullptr, sort, nullptr, nullptr, nullptr,
-                                                     nullptr, count);
-  cub::DeviceScan::InclusiveSum(nullptr, scan, static_cast<int64_t*>(nullptr),
-                                static_cast<int64_t*>(nullptr), count);
-  return 2 * aligned(sizeof(uint32_t) * count) + aligned(sizeof(int32_t) * count) +
-         aligned(sizeof(int64_t) * count) + aligned(sort) + aligned(scan);
+                                                     nullptr, splats);
+  cub::DeviceScan::ExclusiveSum(nullptr, scan, RankCounts({}, {}), static_cast<uint32_t*>(nullptr),
+                                splats);
+  return sort > scan ? sort : scan;
 }
 
-template <typename T>
-cudaError_t raster_order(const RasterArgs<T>& a, void* scratch, size_t bytes, int64_t* offsets,
-                         int64_t* total, cudaStream_t stream) {
-  *total = 0;
-  if (a.count == 0) return cudaSuccess;
-  size_t sort_bytes = 0, scan_bytes = 0;
-  cub::DeviceRadixSort::SortPairs<uint32_t, int32_t>(nullptr, sort_bytes, nullptr, nullptr, nullptr,
-                                                     nullptr, a.count);
-  cub::DeviceScan::InclusiveSum(nullptr, scan_bytes, static_cast<int64_t*>(nullptr),
-                                static_cast<int64_t*>(nullptr), a.count);
-  Carver carve{static_cast<char*>(scratch)};
-  uint32_t* keys = carve.take<uint32_t>(a.count);
-  uint32_t* sorted = carve.take<uint32_t>(a.count);
-  int32_t* ids = carve.take<int32_t>(a.count);
-  int64_t* counts = carve.take<int64_t>(a.count);
-  void* sort_scratch = carve.take<char>(static_cast<int64_t>(sort_bytes));
-  void* scan_scratch = carve.take<char>(static_cast<int64_t>(scan_bytes));
-  if (carve.used > bytes) return cudaErrorInvalidValue;
+RasterOrder carve_order(Carver& carve, int64_t splats) {
+  RasterOrder o{};
+  o.keys = carve.take<uint32_t>(splats);
+  o.ids = carve.take<int32_t>(splats);
+  o.sorted = carve.take<uint32_t>(splats);
+  o.order = carve.take<int32_t>(splats);
+  o.codes = carve.take<uint64_t>(splats);
+  o.offsets = carve.take<uint32_t>(splats);
+  o.total = carve.take<unsigned long long>(1);
+  o.temporary_bytes = depth_sort_bytes(splats);
+  o.temporary = carve.take<char>(static_cast<int64_t>(o.temporary_bytes));
+  return o;
+}
 
-  const int blocks = blocks_for(a.count);
-  project_kernel<T><<<blocks, kThreads, 0, stream>>>(a, keys, ids);
-  cudaError_t error = cub::DeviceRadixSort::SortPairs(sort_scratch, sort_bytes, keys, sorted, ids,
-                                                      a.order, a.count, 0, 32, stream);
+}  // namespace
+
+size_t raster_order_scratch(int64_t splats) {
+  Carver carve{nullptr};
+  carve_order(carve, splats);
+  return carve.used;
+}
+
+RasterOrder carve_raster_order(void* scratch, int64_t splats) {
+  Carver carve{static_cast<char*>(scratch)};
+  return carve_order(carve, splats);
+}
+
+cudaError_t raster_sort(const RasterOrder& o, int64_t splats, cudaStream_t stream) {
+  if (splats == 0) return cudaSuccess;
+  size_t bytes = o.temporary_bytes;
+  const cudaError_t error = cub::DeviceRadixSort::SortPairs(o.temporary, bytes, o.keys, o.sorted,
+                                                            o.ids, o.order, splats, 0, 32, stream);
   if (error != cudaSuccess) return error;
-  count_kernel<T><<<blocks, kThreads, 0, stream>>>(a, counts);
-  error = cub::DeviceScan::InclusiveSum(scan_scratch, scan_bytes, counts, offsets, a.count, stream);
-  if (error != cudaSuccess) return error;
-  error = cudaMemcpyAsync(total, offsets + a.count - 1, sizeof(int64_t), cudaMemcpyDeviceToHost,
-                          stream);
-  if (error != cudaSuccess) return error;
-  return cudaStreamSynchronize(stream);
+  bytes = o.temporary_bytes;
+  const RankCounts counts(thrust::counting_iterator<int>(0), CountOfRank{o.codes, o.order});
+  return cub::DeviceScan::ExclusiveSum(o.temporary, bytes, counts, o.offsets, splats, stream);
 }
 
 size_t raster_bin_scratch(int64_t instances, int64_t tiles) {
-  const bool small = tiles <= kShortTiles;
+  const bool small = tiles < kShortKeys;
   const size_t key = small ? sizeof(uint16_t) : sizeof(uint32_t);
-  const int bits = bits_for(tiles);
+  const int bits = bits_for(tiles + 1);
   const size_t sort = small ? tile_sort_bytes<uint16_t>(instances, bits)
                             : tile_sort_bytes<uint32_t>(instances, bits);
   return 2 * aligned(key * instances) + aligned(sizeof(int32_t) * instances) + aligned(sort);
 }
 
 template <typename T>
-cudaError_t raster_bin(const RasterArgs<T>& a, void* scratch, size_t bytes, const int64_t* offsets,
+cudaError_t raster_bin(const RasterArgs<T>& a, const RasterOrder& o, void* scratch, size_t bytes,
                        cudaStream_t stream) {
-  const int64_t tiles = int64_t(a.tiles_x) * a.tiles_y;
+  const int64_t tiles = int64_t(a.tiles()) * a.cameras;
   if (a.instance_count == 0)
     return cudaMemsetAsync(a.tile_start, 0, sizeof(int32_t) * (tiles + 1), stream);
-  return tiles <= kShortTiles ? bin_with_keys<T, uint16_t>(a, scratch, bytes, offsets, stream)
-                              : bin_with_keys<T, uint32_t>(a, scratch, bytes, offsets, stream);
+  return tiles < kShortKeys ? bin_with_keys<T, uint16_t>(a, o, scratch, bytes, stream)
+                            : bin_with_keys<T, uint32_t>(a, o, scratch, bytes, stream);
 }
 
-template cudaError_t raster_order<float>(const RasterArgs<float>&, void*, size_t, int64_t*,
-                                         int64_t*, cudaStream_t);
-template cudaError_t raster_order<double>(const RasterArgs<double>&, void*, size_t, int64_t*,
-                                          int64_t*, cudaStream_t);
-template cudaError_t raster_bin<float>(const RasterArgs<float>&, void*, size_t, const int64_t*,
+template cudaError_t raster_bin<float>(const RasterArgs<float>&, const RasterOrder&, void*, size_t,
                                        cudaStream_t);
-template cudaError_t raster_bin<double>(const RasterArgs<double>&, void*, size_t, const int64_t*,
-                                        cudaStream_t);
+template cudaError_t raster_bin<double>(const RasterArgs<double>&, const RasterOrder&, void*,
+                                        size_t, cudaStream_t);
 
 }  // namespace gsf::cuda
