@@ -24,6 +24,7 @@ import inspect
 import json
 import logging
 import os
+import platform
 import sys
 import tempfile
 from pathlib import Path
@@ -118,7 +119,14 @@ def table(lines: list[dict[str, Any]]) -> str:
         for x in lines
         if x["trainer"] == "gsplat"
     }
+    devices = sorted({x["device"] for x in lines if "device" in x})
     rows = [
+        "Same photographs, same held-out ones (every eighth), same number of steps. gsplat: its "
+        "default loop and values (scripts/train_gsplat.py). PSNR and SSIM on the held-out "
+        "photographs; seconds are training alone, without reading and judging. Bar: PSNR no more "
+        f"than {PSNR_SLACK} dB lower, SSIM {SSIM_SLACK}, no more Gaussians, less time. "
+        + ("; ".join(devices) + "." if devices else ""),
+        "",
         "| capture | held out | trainer | steps | Gaussians | PSNR dB | SSIM | seconds | "
         "against gsplat |",
         "| --- " * 9 + "|",
@@ -157,6 +165,13 @@ def verdict(ours: dict[str, Any], theirs: dict[str, Any]) -> str:
     ]
     end = "met" if not missed else "misses " + ", ".join(missed)
     return f"{psnr:+.2f} dB, {ssim:+.4f}, count x {count:.2f}, time x {speed:.2f}: {end}"
+
+
+def device_name(device: str) -> str:
+    """The GPU's name, or the processor's."""
+    if device.startswith("cuda"):
+        return torch.cuda.get_device_name(torch.device(device))
+    return platform.processor() or platform.machine()
 
 
 def read_lines(path: Path | None) -> list[dict[str, Any]]:
@@ -233,7 +248,7 @@ def main(arguments: list[str] | None = None) -> int:
                     failed += 1
                     sys.stderr.write(f"{name}, {label}: {error}\n")
                     continue
-                line |= {"capture": name, "trainer": label}
+                line |= {"capture": name, "trainer": label, "device": device_name(options.device)}
                 lines.append(line)
                 text = json.dumps(line)
                 sys.stderr.write(text + "\n")

@@ -59,6 +59,7 @@ def stage_of(options: argparse.Namespace) -> gf.pipeline.Reconstruct:
         sh_degree=options.sh_degree,
         start_gaussians=options.start_gaussians,
         gradient_threshold=options.gradient_threshold,
+        absgrad=options.absgrad,
         recipe=options.preset,
         densify=options.densify,
         target_psnr=options.target_psnr,
@@ -90,6 +91,7 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     add("--max-gaussians", type=int, help="cap, and the budget of mcmc")
     add("--start-gaussians", type=int)
     add("--gradient-threshold", type=float)
+    add("--absgrad", action=argparse.BooleanOptionalAction, help="sum of absolute gradients")
     add("--target-psnr", type=float, help="enough on the training photographs [dB]")
     add("--exposure", action="store_true", help="learn an affine colour change per photograph")
     add("--kernel", default="anisotropic", help="anisotropic or isotropic")

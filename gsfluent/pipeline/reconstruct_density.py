@@ -86,6 +86,8 @@ class Wanted:
 class Density(Protocol):
     """What the training loop asks of a density control."""
 
+    absgrad: bool
+
     def probe(self, model: SplatModel) -> Tensor | None:
         """Zeros [N, 2] that shall receive the screen-space gradient, or None."""
 
@@ -260,7 +262,7 @@ class Mcmc:
     ) -> None:
         self.recipe, self.iterations, self.limit = recipe, iterations, limit
         self.place, self.seed = place, seed
-        self.full = False
+        self.absgrad = False
 
     def probe(self, model: SplatModel) -> Tensor | None:
         """None: no gradient is looked at."""

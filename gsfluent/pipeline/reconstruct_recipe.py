@@ -52,9 +52,12 @@ class Recipe:
         gradient_threshold: Mean screen-space gradient (units of half the image width) above which
             a Gaussian is cloned or split, for photographs cropped to the object; half of it for
             whole ones, whose mean weighs a pixel about half as much.
-        absgrad_threshold: The same for the sum of absolute gradients (Ye et al. 2024).
+        absgrad: Take the sum over the pixels of absolute gradients (Ye et al. 2024, AbsGS).
+        absgrad_threshold: Threshold for it.
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
+        error_gate: Only Gaussians with at least so many times the mean squared error under them
+            are multiplied; 0 for all.
         thin: Share of all blend weights that may go in one thinning: the Gaussians that blend
             least into the photographs.
         thin_at: Shares of the run at which that happens.
@@ -75,9 +78,11 @@ class Recipe:
     densify_until: float = 0.6
     densify_every: int = 100
     gradient_threshold: float = 4e-4
+    absgrad: bool = False
     absgrad_threshold: float = 1.6e-3
     reset_every: int = 0
     prune_opacity: float = 0.01
+    error_gate: float = 0.0
     thin: float = 0.0
     thin_at: tuple[float, ...] = ()
     half_until: float = 0.35
