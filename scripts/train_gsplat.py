@@ -13,7 +13,8 @@ sparse points, opacity 0.1, scale the mean distance of three neighbours; unpacke
 Favours to gsplat: photographs stay on the device (its loader copies them), the loss is not read
 back each step, SSIM is gsfluent's. Two things differ because its loader knows only COLMAP scenes: a
 capture with masks is trained and judged before white, and one without sparse points starts from
-100,000 random points in a cube of half a scene size around the point the cameras look at.
+10,000 coloured points on the visual hull that gsfluent starts from (its loader's other start,
+100,000 random points, is not measured here).
 
 The photographs, the held-out ones (every eighth) and the judging are gsfluent's own:
 ``gsfluent.pipeline.reconstruct_evaluate.evaluate``; ``psnr_own`` is the same through gsplat's
@@ -36,9 +37,11 @@ from torch import Tensor
 
 import gsfluent as gf
 from gsfluent.data import Capture, Gaussians
+from gsfluent.errors import GsfluentError, InputError
 from gsfluent.metrics import psnr, ssim
 from gsfluent.pipeline.reconstruct_evaluate import HOLD_OUT, evaluate
-from gsfluent.pipeline.reconstruct_init import focus_point
+from gsfluent.pipeline.reconstruct_init import focus_point, hull_gaussians, visual_hull
+from gsfluent.pipeline.reconstruct_views import read_views
 
 SH_C0 = 0.28209479177387814
 RATES = {
@@ -47,7 +50,7 @@ RATES = {
 }  # fmt: skip
 SSIM_SHARE, FINAL_RATE = 0.2, 0.01
 SH_EVERY, SH_DEGREE = 1000, 3
-START_OPACITY, RANDOM_POINTS, RANDOM_EXTENT = 0.1, 100_000, 0.5
+START_OPACITY, HULL_POINTS = 0.1, 10_000
 NEAR, FAR = 0.01, 1e10
 
 
@@ -119,18 +122,31 @@ def photographs(
     return found, white
 
 
-def start(capture: Capture, frame: Frame, device: torch.device, seed: int) -> dict[str, Tensor]:
-    """The first splats: at the sparse points, or random ones where there are none."""
+def hull_points(capture: Capture, size: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Points on the visual hull of the masks and their colours, [P, 3] each, world frame."""
+    views = read_views(capture, size, torch.device("cpu"), crop=True)
+    g = torch.Generator().manual_seed(seed)
+    found = hull_gaussians(visual_hull(views), views, HULL_POINTS, 0, g)
+    return found.means.double(), found.colors()
+
+
+def start(capture: Capture, frame: Frame, size: int, seed: int) -> dict[str, Tensor]:
+    """The first splats: at the sparse points, or on the visual hull where there are none.
+
+    Raises:
+        InputError: The capture has neither points nor masks.
+    """
     from scipy.spatial import cKDTree
 
     g = torch.Generator().manual_seed(seed)
-    if capture.points.shape[0] >= 4:
-        points = ((capture.points.double() - frame.center) * frame.scale).float()
-        colors = capture.point_colors.float()
-    else:
-        extent = RANDOM_EXTENT * frame.scene_scale
-        points = extent * (2.0 * torch.rand(RANDOM_POINTS, 3, generator=g) - 1.0)
-        colors = torch.rand(RANDOM_POINTS, 3, generator=g)
+    points, colors = capture.points.double(), capture.point_colors.float()
+    if points.shape[0] < 4:
+        if capture.view(0, size).mask is None:
+            raise InputError(
+                f"{capture.root}: no sparse points and no masks to start from", "give either"
+            )
+        points, colors = hull_points(capture, size, seed)
+    points = ((points - frame.center) * frame.scale).float()
     near, _ = cKDTree(points.numpy()).query(points.numpy(), k=4)
     distance = torch.from_numpy(near[:, 1:]).square().mean(1).sqrt().float().clamp_min(1e-7)
     count = points.shape[0]
@@ -144,7 +160,7 @@ def start(capture: Capture, frame: Frame, device: torch.device, seed: int) -> di
         "sh0": sh[:, :1].contiguous(),
         "shN": sh[:, 1:].contiguous(),
     }
-    return {name: value.to(device) for name, value in values.items()}
+    return values
 
 
 def draw(
@@ -240,7 +256,9 @@ def reconstruct(
     frame = Frame.of(train_set)
     views, white = photographs(train_set, frame, image_size, device)
     loop = time.monotonic()
-    first = start(capture, frame, device, seed)
+    first = {
+        name: value.to(device) for name, value in start(train_set, frame, image_size, seed).items()
+    }
     splats = train(first, views, white, frame, iterations, seed)
     if device.type == "cuda":
         torch.cuda.synchronize()
@@ -282,13 +300,17 @@ def main(arguments: list[str] | None = None) -> int:
         import gsplat  # noqa: F401
     except ImportError:
         parser.error("gsplat is not installed; docs/benchmarks.md says which version to build")
-    capture = gf.load_capture(options.capture)
     device = torch.device(options.device)
-    gaussians, report = reconstruct(
-        capture, options.iterations, options.image_size, device, options.seed
-    )
-    if options.out is not None:
-        gaussians.to("cpu").save(options.out)
+    try:
+        capture = gf.load_capture(options.capture)
+        gaussians, report = reconstruct(
+            capture, options.iterations, options.image_size, device, options.seed
+        )
+        if options.out is not None:
+            gaussians.to("cpu").save(options.out)
+    except GsfluentError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 1
     sys.stdout.write(json.dumps(report) + "\n")
     return 0
 

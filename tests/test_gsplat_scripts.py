@@ -17,7 +17,8 @@ from torch import Tensor
 
 import gsfluent as gf
 from gsfluent import ops
-from gsfluent.demo import make_capture
+from gsfluent.demo import make_capture, make_object
+from gsfluent.errors import InputError
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 CPU = torch.device("cpu")
@@ -175,13 +176,21 @@ def test_normalised_frame_sees_the_same_pixels_and_comes_back(
     torch.testing.assert_close(pixels[:, :2] / pixels[:, 2:], wanted, atol=1e-3, rtol=1e-5)
     eyes = (table_capture.centers() - frame.center) * frame.scale
     assert float(eyes.norm(dim=1).median()) == pytest.approx(1.0)
-    first = trainer.start(table_capture, frame, CPU, 0)
+    first = trainer.start(table_capture, frame, 40, 0)
     world = frame.world(first)
     torch.testing.assert_close(world.means, table_capture.points.float(), atol=1e-4, rtol=1e-4)
     assert float(world.opacities.mean()) == pytest.approx(0.1)
     torch.testing.assert_close(
         world.colors(), table_capture.point_colors.float(), atol=1e-5, rtol=0
     )
+
+
+def test_nothing_to_start_from_is_an_error(script: Any, table_capture: gf.data.Capture) -> None:
+    trainer = script("train_gsplat")
+    empty = torch.zeros(0, 3)
+    capture = table_capture.replace(points=empty.double(), point_colors=empty)
+    with pytest.raises(InputError, match="no sparse points and no masks"):
+        trainer.start(capture, trainer.Frame.of(capture), 40, 0)
 
 
 def test_first_scales_are_the_distance_of_three_neighbours(
@@ -192,8 +201,26 @@ def test_first_scales_are_the_distance_of_three_neighbours(
     points = lattice.reshape(-1, 3).double()  # every point has three neighbours at distance 1
     capture = table_capture.replace(points=points, point_colors=torch.zeros(64, 3))
     frame = trainer.Frame.of(table_capture)
-    scales = trainer.start(capture, frame, CPU, 0)["scales"].exp()
+    scales = trainer.start(capture, frame, 40, 0)["scales"].exp()
     torch.testing.assert_close(scales, torch.full((64, 3), frame.scale), rtol=1e-4, atol=0)
+
+
+def test_a_capture_with_masks_starts_on_its_hull(script: Any, tmp_path: Path) -> None:
+    trainer = script("train_gsplat")
+    make_capture("watermelon", tmp_path, views=9, size=40)
+    capture = gf.load_capture(tmp_path)
+    frame = trainer.Frame.of(capture)
+    first = trainer.start(capture, frame, 40, 0)
+    world = frame.world(first)
+    thing = make_object("watermelon")
+    reach = (world.means.double() - thing.center) / torch.tensor(thing.axes)
+    # a hull encloses the object; nine views at 40 pixels leave it less than half too large
+    assert float(reach.norm(dim=1).median()) == pytest.approx(1.05, abs=0.15)
+    assert float(reach.norm(dim=1).max()) < 1.5
+    views, white = trainer.photographs(capture, frame, 40, CPU)
+    assert white is not None
+    corner = torch.stack([view.color[0, 0] for view in views])
+    assert torch.equal(corner, torch.ones(9, 3))  # composited over white
 
 
 def test_loss_ignores_pixels_that_no_photograph_covers(script: Any) -> None:
@@ -318,6 +345,24 @@ def test_runs_already_made_are_not_repeated(
     with pytest.raises(SystemExit):
         module.main(["--only", "demo:pear"])
     assert "demo:pear" in capsys.readouterr().err
+
+
+def test_built_in_captures_are_photographed_once(
+    script: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = script("compare_reconstruction")
+    made = []
+
+    def photographed(name: str, folder: Path, **rest: Any) -> None:
+        made.append((name, rest["support"], rest["masks"]))
+        make_capture(name, folder, views=3, size=32, support=rest["support"], masks=rest["masks"])
+
+    monkeypatch.setattr(module, "make_capture", photographed)
+    for _ in range(2):
+        capture = module.opened("demo:watermelon-table", tmp_path, 3, 32)
+    assert made == [("watermelon", "table", False)]
+    assert len(capture) == 3
+    assert not capture.has_masks
 
 
 def test_a_run_of_ours_has_the_keys_of_the_trainer(

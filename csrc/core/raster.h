@@ -254,11 +254,11 @@ GSF_HOST_DEVICE void sh_direction_backward(int degree, const SplatCamera<T>& cam
 // Adjoint of the colour: adds the gradient of the coefficients to `out` [(degree + 1)^2, 3].
 template <typename T>
 GSF_HOST_DEVICE void sh_backward(int degree, const SplatCamera<T>& cam, const Vec3<T>& mean,
-                                 const T* c, T* grad_rgb, T* out, Vec3<T>* grad_mean) {
-  T basis[kMaxShCoefficients];
-  sh_direction_backward(degree, cam, mean, c, grad_rgb, basis, grad_mean);
+                                 const T* c, const T* grad_rgb, T* out, Vec3<T>* grad_mean) {
+  T basis[kMaxShCoefficients], rgb[3] = {grad_rgb[0], grad_rgb[1], grad_rgb[2]};
+  sh_direction_backward(degree, cam, mean, c, rgb, basis, grad_mean);
   for (int j = 0; j < sh_coefficients(degree); ++j)
-    for (int ch = 0; ch < 3; ++ch) out[3 * j + ch] += grad_rgb[ch] * basis[j];
+    for (int ch = 0; ch < 3; ++ch) out[3 * j + ch] += rgb[ch] * basis[j];
 }
 
 // Writes the summed gradient of Gaussian `i`: means, opacities, and covars or quats and scales.

@@ -12,7 +12,7 @@ from gsfluent import __version__
 from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_look import Doctor, Inspect, Plan
 from gsfluent.cli.verbs_run import Demo, Export, Render, Run
-from gsfluent.cli.verbs_stage import Fill, Reconstruct, Texture
+from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
 
 VERBS: dict[str, type[Verb]] = {
     "doctor": Doctor,
@@ -21,6 +21,7 @@ VERBS: dict[str, type[Verb]] = {
     "reconstruct": Reconstruct,
     "fill": Fill,
     "texture": Texture,
+    "mesh": Mesh,
     "plan": Plan,
     "run": Run,
     "render": Render,

@@ -1,4 +1,4 @@
-"""Verbs that run one stage on files: reconstruct, fill, texture."""
+"""Verbs that run one stage on files: reconstruct, fill, texture, mesh."""
 
 from __future__ import annotations
 
@@ -194,3 +194,46 @@ class Texture(Verb):
                 progress=progress,
                 **options,
             )
+
+
+@dataclass(kw_only=True)
+class Mesh(Verb):
+    """Write the closed surface of an object as a triangle mesh.
+
+    Examples:
+      gsfluent mesh melon.ply -o melon.glb                       # a splat: its inside is found
+      gsfluent mesh melon.ply -o melon.obj --capture captures/melon
+      gsfluent mesh solid.ply -o solid.stl                       # a solid made by `gsfluent fill`
+      gsfluent mesh captures/melon -o hull.ply --method hull     # masks alone: the visual hull
+      gsfluent mesh scan.obj -o closed.obj                       # an open mesh, closed
+
+    The mesh is watertight and wound outward; vertices wear the colours of the splats next to them.
+    """
+
+    input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """Splat or solid .ply, capture folder with masks, or mesh file."""
+    out: Out
+    """What to write: .obj, .ply, .glb or .stl."""
+    capture: Path | None = None
+    """Photographs that the splat was made from."""
+    method: Literal["auto", "hull", "density", "tsdf", "mesh"] = "auto"
+    """Where the solid is taken from."""
+    resolution: int = 96
+    """Voxels along the longest side."""
+    scale: float = 1.0
+    """Units of the file per world unit."""
+
+    def execute(self) -> dict[str, Any]:
+        """Find the solid and write its surface."""
+        from gsfluent.pipeline.solid_mesh import mesh_to
+
+        existing(self.input, "INPUT")
+        return mesh_to(
+            self.input,
+            self.out,
+            capture=self.capture,
+            method=self.method,
+            resolution=self.resolution,
+            scale=self.scale,
+            seed=self.seed,
+        )

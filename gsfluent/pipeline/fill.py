@@ -154,28 +154,8 @@ class Fill(Stage):
 
         began = time.perf_counter()
         gaussians = gaussians.validated()
-        if gaussians.count < 16:
-            raise InputError(
-                f"fill: needs at least 16 Gaussians, got {gaussians.count}",
-                mend="check that isolation kept the object",
-            )
         total = 5
-        report_progress(progress, 0, total, "density")
-        box, strays = choose_grid(gaussians.means, gaussians.opacities, self.resolution)
-        density = density_field(
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
-        ).numpy()
-        shell = density >= self.threshold
-        if not shell.any():
-            raise InputError(
-                f"fill: no voxel reaches density {self.threshold:g} (largest {density.max():.3g})",
-                mend="lower threshold or resolution: the splats are transparent or sparse",
-            )
-        report_progress(progress, 1, total, "inside")
-        down = self.down
-        if down is None and capture is not None:
-            down = -np.asarray(orient(gaussians, capture).up, dtype=float)
-        solid, report = self._decide(box, density, shell, capture, down)
+        box, solid, report = self.inside(gaussians, capture, progress)
         report_progress(progress, 2, total, "depth")
         solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel)
         report_progress(progress, 3, total, "interior Gaussians")
@@ -210,7 +190,6 @@ class Fill(Stage):
             "hollow_fraction": hollow_fraction,
             "grid": list(box.shape),
             "voxel": box.voxel,
-            "stray_gaussians": strays,
             **report,
             **refined,
             "seconds": time.perf_counter() - began,
@@ -231,6 +210,50 @@ class Fill(Stage):
             regions=None,
             report=report,
         )
+
+    def inside(
+        self,
+        gaussians: Gaussians,
+        capture: Capture | None = None,
+        progress: Progress | None = None,
+    ) -> tuple[GridBox, np.ndarray, dict[str, Any]]:
+        """Decide which voxels hold matter, and put nothing there.
+
+        Args:
+            gaussians: Splats of one object.
+            capture: The photographs it came from; enables the hull.
+            progress: Optional callback ``(done, total, note)``.
+
+        Returns:
+            The grid, the occupied voxels bool [X, Y, Z], and the notes ``method, leaks,
+            leaking_voxels, closed_side, closed_side_open_fraction, components_dropped,
+            buried_surface_fraction, stray_gaussians``.
+
+        Raises:
+            InputError: Too few splats, or none reaches the density of a surface.
+        """
+        if gaussians.count < 16:
+            raise InputError(
+                f"fill: needs at least 16 Gaussians, got {gaussians.count}",
+                mend="check that isolation kept the object",
+            )
+        report_progress(progress, 0, 5, "density")
+        box, strays = choose_grid(gaussians.means, gaussians.opacities, self.resolution)
+        density = density_field(
+            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
+        ).numpy()
+        shell = density >= self.threshold
+        if not shell.any():
+            raise InputError(
+                f"fill: no voxel reaches density {self.threshold:g} (largest {density.max():.3g})",
+                mend="lower threshold or resolution: the splats are transparent or sparse",
+            )
+        report_progress(progress, 1, 5, "inside")
+        down = self.down
+        if down is None and capture is not None:
+            down = -np.asarray(orient(gaussians, capture).up, dtype=float)
+        solid, notes = self._decide(box, density, shell, capture, down)
+        return box, solid, notes | {"stray_gaussians": strays}
 
     def _decide(
         self,

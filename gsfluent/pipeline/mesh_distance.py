@@ -79,15 +79,44 @@ def mesh_body(path: str | Path, scale: float, spacing: float) -> MeshBody:
     spacing = max(spacing, float((high - low).max()) / (MAX_VALUES - 8))
     size = np.ceil((high - low) / spacing).astype(int) + 7
     corner = 0.5 * (low + high) - 0.5 * (size - 1) * spacing
+    values = signed_distances(triangles, corner, spacing, size)
+    _log.info("%s: %d triangles, %s distances %.3g m apart", path, len(triangles), size, spacing)
+    return MeshBody(values, spacing, corner, center, axes, float(mesh.volume), moments)
+
+
+def signed_distances(
+    triangles: np.ndarray,
+    corner: np.ndarray,
+    spacing: float,
+    size: np.ndarray,
+    band: float | None = None,
+) -> np.ndarray:
+    """Signed distances to a closed surface at the nodes of a grid, float32 [X, Y, Z].
+
+    Args:
+        triangles: Corners [F, 3, 3] of a closed surface.
+        corner: First node [3].
+        spacing: Distance between nodes.
+        size: Number of nodes along each axis [3].
+        band: Distance in spacings up to which it is exact; farther off that to the nearest node
+            on the other side is taken, half a spacing more or less. None: exact everywhere.
+    """
+    from scipy import ndimage
+
     grid = [corner[i] + spacing * np.arange(size[i]) for i in range(3)]
     nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
-    distance = _distance(nodes, triangles, spacing)
     inside = _inside(triangles, grid)
-    values = np.where(inside.reshape(-1), -distance, distance).reshape(tuple(size))
-    _log.info("%s: %d triangles, %s distances %.3g m apart", path, len(triangles), size, spacing)
-    return MeshBody(
-        values.astype(np.float32), spacing, corner, center, axes, float(mesh.volume), moments
-    )
+    if band is None:
+        distance = _distance(nodes, triangles, spacing)
+    else:
+        outer = ndimage.distance_transform_edt(~inside)
+        inner = ndimage.distance_transform_edt(inside)
+        steps = np.maximum(np.maximum(outer, inner) - 0.5, 0.0).reshape(-1)
+        near = steps <= band
+        distance = steps * spacing
+        distance[near] = _distance(nodes[near], triangles, spacing)
+    signed = np.where(inside.reshape(-1), -distance, distance).reshape(tuple(size))
+    return np.asarray(signed, dtype=np.float32)
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
@@ -109,7 +138,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"collider: {path} holds no triangles", mend="give a triangle mesh")
-    mesh.merge_vertices()
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures are no openings
     return mesh
 
 
@@ -130,6 +159,11 @@ def _distance(nodes: np.ndarray, triangles: np.ndarray, spacing: float) -> np.nd
             best = np.minimum(best, _point_triangle(part, triangles[owner[index[:, k]]]))
         result[begin : begin + 65536] = best
     return result
+
+
+def surface_samples(triangles: np.ndarray, spacing: float) -> np.ndarray:
+    """Points [M, 3] on triangles [F, 3, 3], nowhere farther than ``spacing`` apart."""
+    return _samples(triangles, spacing)[0]
 
 
 def _samples(triangles: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -61,6 +61,8 @@ class Reconstruct(Stage):
         start_gaussians: Gaussians to start with; the recipe's when None.
         gradient_threshold: Mean screen-space gradient (units of half the image width) above which a
             Gaussian is cloned or split; the recipe's when None.
+        absgrad: Judge that by the sum of absolute gradients over the pixels (AbsGS), which finds
+            large Gaussians over fine texture; as the recipe says when None.
         recipe: Schedule: "quick", "long", "classic" (Kerbl et al. 2023), or "auto": quick below
             3000 iterations, long from there.
         densify: "adc" (adaptive density control) or "mcmc" (relocation and noise with a budget).
@@ -69,7 +71,7 @@ class Reconstruct(Stage):
             schedule makes.
         exposure: Learn an affine change of colour per photograph. Held-out photographs get none.
         checkpoint: File to save to while training and to resume from when it exists.
-        checkpoint_every: Steps between saves.
+        checkpoint_every: Steps between saves; a tenth of the run, at least 250, when None.
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
             what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
         clean: Take floaters out of the object at the end (:func:`clean_floaters`).
@@ -93,12 +95,13 @@ class Reconstruct(Stage):
         sh_degree: int = 0,
         start_gaussians: int | None = None,
         gradient_threshold: float | None = None,
+        absgrad: bool | None = None,
         recipe: str = "auto",
         densify: str = "adc",
         target_psnr: float | None = None,
         exposure: bool = False,
         checkpoint: str | Path | None = None,
-        checkpoint_every: int = 250,
+        checkpoint_every: int | None = None,
         separate: bool = True,
         clean: bool = True,
         device: str | torch.device = "cpu",
@@ -135,13 +138,17 @@ class Reconstruct(Stage):
         self.sh_degree = int(sh_degree)
         start = self.recipe.start_gaussians if start_gaussians is None else int(start_gaussians)
         self.start_gaussians = min(start, self.max_gaussians)
-        self.gradient_threshold = float(
-            self.recipe.gradient_threshold if gradient_threshold is None else gradient_threshold
-        )
+        self.absgrad = self.recipe.absgrad if absgrad is None else bool(absgrad)
+        if gradient_threshold is None:
+            chosen = self.recipe
+            gradient_threshold = (
+                chosen.absgrad_threshold if self.absgrad else chosen.gradient_threshold
+            )
+        self.gradient_threshold = float(gradient_threshold)
         self.target_psnr = target_psnr
         self.exposure = bool(exposure)
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self.checkpoint_every = int(checkpoint_every)
+        self.checkpoint_every = int(checkpoint_every or max(250, self.iterations // 10))
         self.separate = bool(separate)
         self.clean = bool(clean)
         self.device = torch.device(device)
@@ -209,8 +216,8 @@ class Reconstruct(Stage):
         """What a checkpoint must agree on to be resumed."""
         names = (
             "iterations", "max_gaussians", "kernel", "scale_regularization", "image_size",
-            "sh_degree", "start_gaussians", "gradient_threshold", "densify", "target_psnr",
-            "exposure", "separate", "seed",
+            "sh_degree", "start_gaussians", "gradient_threshold", "absgrad", "densify",
+            "target_psnr", "exposure", "separate", "seed",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names} | {"recipe": self.recipe.name}
 
@@ -326,6 +333,7 @@ class _Run:
             stage.sh_degree,
             stage.gradient_threshold * whole,
             densify=stage.densify,
+            absgrad=stage.absgrad,
             target_psnr=stage.target_psnr,
             exposure=stage.exposure,
             seed=stage.seed + phase,

@@ -31,6 +31,7 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
         scales=gaussians.scales,
         sh=gaussians.sh,
         near=1e-4,
+        depth=False,
     )
     return result.image, result.alpha
 

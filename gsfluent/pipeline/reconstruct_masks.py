@@ -47,6 +47,7 @@ def silhouette(
         scales=both.scales,
         colors=flag[:, None].contiguous(),
         near=1e-4,
+        depth=False,
     )
     return result.image[..., 0]
 

@@ -78,6 +78,7 @@ class SplatModel:
         degree: int,
         offset: Tensor | None = None,
         *,
+        absgrad: bool = False,
         features: Tensor | None = None,
         contribution: bool = False,
     ) -> ops.raster.Rendered:
@@ -87,6 +88,7 @@ class SplatModel:
             view: The camera.
             degree: SH bands that are used.
             offset: Zeros [N, 2] that receive the gradient of the projected centres.
+            absgrad: They receive the sum of its absolute values over the pixels.
             features: Values [N, C] to blend instead of the colours.
             contribution: Also sum each Gaussian's blend weights.
         """
@@ -108,8 +110,10 @@ class SplatModel:
             scales=self.scales().contiguous(),
             sh=sh,
             colors=features,
-            means2d_offset=offset,
+            means2d_offset=None if absgrad else offset,
+            means2d_absgrad=offset if absgrad else None,
             contribution=contribution,
+            depth=False,
             near=0.01 * self.extent,
         )
 

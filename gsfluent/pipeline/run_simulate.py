@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +10,18 @@ import torch
 
 from gsfluent import materials
 from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
-from gsfluent.data import Frame, Gaussians, Solid
+from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.rigid_splats import bare_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
 from gsfluent.pipeline.run_store import content_digest, fingerprint
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
+from gsfluent.pipeline.solid_field import SignedDistance
+from gsfluent.pipeline.solid_thin import thin_shells
 from gsfluent.scene import Scene
 
+_log = logging.getLogger(__name__)
 _STATE = "state.pt"
 
 
@@ -106,7 +110,7 @@ def simulate_stage(context: RunContext) -> None:
             save_frame(folder, saved(frame, scene))
             # after the frame: a state on disk always has its picture
             stage.save_state(state)
-        return stage.report()
+        return stage.report() | {"thin": _thin_walls(scene, stage.report()["dx"])}
 
     result = context.store.run("simulate", key, work)
     report = dict(result.report)
@@ -117,6 +121,32 @@ def simulate_stage(context: RunContext) -> None:
             fill[name] = report[name]
     context.record.values["simulation"] = report
     context.source_key = result.fingerprint
+
+
+def _thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
+    """Walls that the grid cannot carry, by body, in scene metres; a warning for each with some."""
+    found = {}
+    for body in scene.bodies:
+        if body.solid is None:
+            continue
+        scale, splats = body.frame.scale, body.solid.gaussians
+        assert splats.labels is not None  # a solid has labels
+        skin = splats.select(splats.labels.eq(SURFACE))
+        field = SignedDistance.of_solid(body.solid)
+        report = thin_shells(
+            field.replace(values=field.values * scale, voxel=field.voxel * scale),
+            dx,
+            gaussian_size=scale * float(skin.scales.amax(1).median()) if skin.count else None,
+            unit=" m",
+        )
+        if report["middle"] is not None:
+            # measured from the corner of the grid, in metres
+            local = torch.tensor(report["middle"]) - field.origin
+            report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
+        if report["warning"]:
+            _log.warning("%s: %s; mend: %s", body.name, report["warning"], report["mend"])
+        found[body.name] = report
+    return found
 
 
 def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:

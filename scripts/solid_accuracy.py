@@ -1,0 +1,150 @@
+"""Measure every source of the solid against meshes whose inside is known; enter docs/solid.md.
+
+    python scripts/solid_accuracy.py [--resolution 96] [--only torus skull] [--write]
+
+Analytic shapes always; the meshes of the data folder (GSFLUENT_DATA, or ../shared/data beside the
+checkout) when it is there. Splats are discs on the true surface, as a perfect reconstruction would
+leave them; masks are their silhouettes from 48 cameras.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from page import enter
+
+from gsfluent import ops
+from gsfluent.data import Capture, Gaussians
+from gsfluent.pipeline.mesh_distance import load_mesh
+from gsfluent.pipeline.reconstruct_init import _quats_of
+from gsfluent.pipeline.solid_field import SignedDistance
+from gsfluent.pipeline.solid_source import find_solid
+from gsfluent.pipeline.solid_tsdf import ring_of_cameras
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data")) / "meshes"
+PAGE = ROOT / "docs" / "solid.md"
+FILES = {
+    "skull": "skull/skull_low_resolution.obj",
+    "armadillo": "armadillo/armadillo.obj",
+    "penguin": "penguin/penguin.obj",
+    "bowl": "bowl/evo_bowl.gltf",
+    "bell pepper": "bell_pepper/yellow_bell_pepper_no_stem_low.gltf",
+    "mango": "mango/mango-v1.glb",
+}
+
+
+def shapes() -> dict[str, Any]:
+    import trimesh
+
+    made = trimesh.creation
+    found = {
+        "sphere": made.icosphere(subdivisions=4),
+        "torus": made.torus(1.0, 0.4, major_sections=64, minor_sections=32),
+        "box": made.box((1.0, 0.7, 0.5)),
+    }
+    for name, file in FILES.items():
+        if (DATA / file).is_file():
+            mesh = load_mesh(DATA / file)
+            if mesh.is_watertight:
+                found[name] = mesh
+    return found
+
+
+def discs(mesh: Any, count: int = 20_000) -> Gaussians:
+    """Flat splats on the surface of a mesh."""
+    import trimesh
+
+    points, face = trimesh.sample.sample_surface_even(mesh, count, seed=0)
+    if len(points) < 0.5 * count:  # rejection leaves too few on slivers
+        points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
+    normal = torch.from_numpy(mesh.face_normals[face].copy()).float()
+    radius = float(np.sqrt(mesh.area / len(points)))
+    scales = torch.tensor([0.7 * radius, 0.7 * radius, 0.15 * radius]).repeat(len(points), 1)
+    colors = torch.full((len(points), 3), 0.6)
+    means = torch.from_numpy(points.copy()).float()
+    return Gaussians.from_colors(means, scales, colors, opacities=0.95, quats=_quats_of(normal))
+
+
+def masked_capture(splats: Gaussians, folder: Path) -> Capture:
+    """Silhouettes of the splats from a sphere of cameras, as photographs with an alpha channel."""
+    from PIL import Image
+
+    low, high = splats.bounds()
+    cameras = []
+    for index, camera in enumerate(
+        ring_of_cameras(0.5 * (low + high), 0.5 * float((high - low).norm()))
+    ):
+        alpha = ops.rasterize(
+            splats.means, splats.opacities, camera.viewmat.float(), camera.K.float(),
+            camera.width, camera.height, quats=splats.quats, scales=splats.scales,
+            colors=torch.zeros(splats.count, 1),
+        ).alpha  # fmt: skip
+        picture = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
+        picture[..., :3] = 128
+        picture[..., 3] = ((alpha > 0.5).numpy() * 255).astype(np.uint8)
+        path = folder / f"{index:03d}.png"
+        Image.fromarray(picture).save(path)
+        cameras.append(camera.replace(image_path=path, name=path.name))
+    return Capture(cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder)
+
+
+def compared(field: SignedDistance, truth: SignedDistance) -> tuple[float, float]:
+    """Intersection over union at the voxel centres of the truth, and relative volume error."""
+    size = torch.tensor(truth.values.shape)
+    axes = [torch.arange(int(n)) + 0.5 for n in size]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    guess = field.at(truth.origin + grid * truth.voxel) <= 0
+    true = truth.inside.reshape(-1)
+    union = float((guess | true).sum())
+    return float((guess & true).sum()) / union, field.volume / truth.volume - 1.0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--resolution", type=int, default=96)
+    parser.add_argument("--only", nargs="*", default=None)
+    parser.add_argument("--write", action="store_true", help="enter the table into docs/solid.md")
+    given = parser.parse_args()
+    methods = ("hull", "density", "tsdf", "auto")
+    head = "| shape | " + " | ".join(f"{m}: IoU | volume | s" for m in methods) + " | mesh s |"
+    rows = [head, "| --- " * (3 * len(methods) + 2) + "|"]
+    for name, mesh in shapes().items():
+        if given.only and name not in given.only:
+            continue
+        began = time.process_time()
+        truth = find_solid(mesh=mesh, resolution=given.resolution)
+        exact = time.process_time() - began
+        splats, cells = discs(mesh), [name]
+        with tempfile.TemporaryDirectory() as folder:
+            capture = masked_capture(splats, Path(folder))
+            for method in methods:
+                began = time.process_time()
+                field = find_solid(
+                    None if method == "hull" else splats,
+                    capture if method in ("hull", "auto") else None,
+                    method=method,
+                    resolution=given.resolution,
+                )
+                spent = time.process_time() - began
+                iou, volume = compared(field, truth)
+                cells += [f"{iou:.3f}", f"{100 * volume:+.1f} %", f"{spent:.1f}"]
+        rows.append("| " + " | ".join([*cells, f"{exact:.1f}"]) + " |")
+        sys.stderr.write(rows[-1] + "\n")
+    table = "\n".join(rows)
+    sys.stdout.write(table + "\n")
+    if given.write:
+        PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), "accuracy", table))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
