@@ -122,7 +122,7 @@ def table(lines: list[dict[str, Any]]) -> str:
     devices = sorted({x["device"] for x in lines if "device" in x})
     rows = [
         "Same photographs, same held-out ones (every eighth), same number of steps. gsplat: its "
-        "default trainer's loop and values (scripts/train_gsplat.py). PSNR and SSIM on the held-out "
+        "default loop and values (scripts/train_gsplat.py). PSNR and SSIM on the held-out "
         "photographs; seconds are training alone, without reading and judging. Bar: PSNR no more "
         f"than {PSNR_SLACK} dB lower, SSIM {SSIM_SLACK}, no more Gaussians, less time. "
         + ("; ".join(devices) + "." if devices else ""),

@@ -12,24 +12,18 @@ constexpr int row_size(int degree) { return 3 * sh_coefficients(degree); }
 // Odd, so that 32 lanes reading word j of their rows touch 32 banks.
 constexpr int row_stride(int degree) { return row_size(degree) | 1; }
 
-// Calls f(word, place in shared memory) for the words of the warp's rows that are `wanted`.
+// Calls f(word, row offset in shared memory) for the words of the warp's rows that are `wanted`.
 template <int kDegree, typename F>
 __device__ __forceinline__ void for_row_words(int64_t i, bool wanted, const F& f) {
-  constexpr int kSize = row_size(kDegree), kStride = row_stride(kDegree);
+  constexpr int kSize = row_size(kDegree);
   const unsigned mask = __ballot_sync(0xffffffffu, wanted);
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
-  const int64_t first = (i - lane) * kSize + lane;
-  // Row and word of it, 32 words further each step; without division.
-  int owner = lane / kSize, word = lane % kSize;
-  int at = (warp * 32 + owner) * kStride + word;
-  // Not all at once: the compiler would keep every place for the way back, and spill.
-#pragma unroll kSize % 12 == 0 ? 12 : 9
+  const int64_t first = (i - lane) * kSize;
+#pragma unroll
   for (int step = 0; step < kSize; ++step) {
-    if (mask >> owner & 1) f(first + step * 32, at);
-    word += 32 % kSize;
-    owner += 32 / kSize;
-    at += 32 / kSize * kStride + 32 % kSize;
-    if (word >= kSize) word -= kSize, ++owner, at += kStride - kSize;
+    const int word = step * 32 + lane, owner = word / kSize;
+    if (mask >> owner & 1)
+      f(first + word, (warp * 32 + owner) * row_stride(kDegree) + word % kSize);
   }
 }
 
