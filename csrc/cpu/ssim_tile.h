@@ -110,6 +110,7 @@ class Tile {
   void blur_row(T* out) const {
     for (int64_t i = 0; i < span_; i += kLanes) {
       Pack<T> m(0), d(0), mm(0), dd(0);
+#pragma GCC unroll 11
       for (int k = 0; k < kSsimWindow; ++k) {
         const Pack<T> tap(ssim_tap<T>(k));
         const Pack<T> a = load_pack(m_ + i + k * ch_), b = load_pack(d_ + i + k * ch_);
@@ -130,6 +131,7 @@ class Tile {
   template <int kPlanes>
   void down(const T* const* rows, int64_t i, Pack<T>* out) const {
     for (int q = 0; q < kPlanes; ++q) out[q] = Pack<T>(0);
+#pragma GCC unroll 11
     for (int k = 0; k < kSsimWindow; ++k) {
       const Pack<T> tap(ssim_tap<T>(k));
       for (int q = 0; q < kPlanes; ++q) out[q] += tap * load_pack(rows[k] + q * pitch_ + i);
@@ -180,6 +182,7 @@ class Tile {
     for (int64_t i = 0; i < own_; i += kLanes)
       for (int q = 0; q < 3; ++q) {
         Pack<T> total(0);
+#pragma GCC unroll 11
         for (int k = 0; k < kSsimWindow; ++k)
           total += Pack<T>(ssim_tap<T>(k)) * load_pack(slopes_ + q * pitch_ + i + k * ch_);
         store_pack(out + q * pitch_ + i, total);
