@@ -66,7 +66,7 @@ class Reconstruct(Stage):
             schedule makes.
         exposure: Learn an affine change of colour per photograph. Held-out photographs get none.
         checkpoint: File to save to while training and to resume from when it exists.
-        checkpoint_every: Steps between saves.
+        checkpoint_every: Steps between saves; a tenth of the run, at least 250, when None.
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
             what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
         clean: Take floaters out of the object at the end (:func:`clean_floaters`).
@@ -96,7 +96,7 @@ class Reconstruct(Stage):
         target_psnr: float | None = None,
         exposure: bool = False,
         checkpoint: str | Path | None = None,
-        checkpoint_every: int = 250,
+        checkpoint_every: int | None = None,
         separate: bool = True,
         clean: bool = True,
         device: str | torch.device = "cpu",
@@ -143,7 +143,7 @@ class Reconstruct(Stage):
         self.target_psnr = target_psnr
         self.exposure = bool(exposure)
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
-        self.checkpoint_every = int(checkpoint_every)
+        self.checkpoint_every = int(checkpoint_every or max(250, self.iterations // 10))
         self.separate = bool(separate)
         self.clean = bool(clean)
         self.device = torch.device(device)

@@ -56,6 +56,8 @@ class Recipe:
         absgrad_threshold: Threshold for it.
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
+        ramped: Let the cap rise evenly from the start to its value at the end of densification,
+            so that the strongest pulls are served first.
         error_gate: Only Gaussians with at least so many times the mean squared error under them
             are multiplied; 0 for all.
         thin: Share of all blend weights that may go in one thinning: the Gaussians that blend
@@ -82,6 +84,7 @@ class Recipe:
     absgrad_threshold: float = 1.6e-3
     reset_every: int = 0
     prune_opacity: float = 0.01
+    ramped: bool = False
     error_gate: float = 0.0
     thin: float = 0.0
     thin_at: tuple[float, ...] = ()
@@ -126,16 +129,7 @@ CLASSIC = Recipe(
 )
 """The schedule of Kerbl et al. 2023 and gsplat's default trainer: what others are measured with."""
 
-LONG = replace(
-    CLASSIC,
-    name="long",
-    densify_until=0.75,
-    reset_every=0,
-    half_until=0.15,
-    start_opacity=0.3,
-    start_scale=0.7,
-    shell=True,
-)
+LONG = replace(CLASSIC, name="long", densify_until=0.75, reset_every=0, shell=True)
 
 RECIPES = {recipe.name: recipe for recipe in (QUICK, LONG, CLASSIC)}
 

@@ -89,6 +89,7 @@ class Trainer:
             self.density = Adc(
                 recipe,
                 steps,
+                model.count,
                 limit,
                 settings.gradient_threshold,
                 place,

@@ -127,7 +127,7 @@ def test_what_is_misplaced_goes() -> None:
     place = Place(None, torch.tensor([[0.0, 0.0, -3.0]]))
     model = model_of(gaussians)
     assert place.misplaced(model).nonzero()[:, 0].tolist() == [0, 1, 2]
-    adc = Adc(QUICK, 1000, 1000, 1.0, place, absgrad=False, seed=0)
+    adc = Adc(QUICK, 1000, 120, 1000, 1.0, place, absgrad=False, seed=0)
     adc.control(model, 100, Wanted(drop=torch.arange(120) == 5))
     assert model.count == 116
 
