@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsfluent.ops._memory import refuse_pairs
+
 # Positions in the schemas (csrc/library.cpp): tensor inputs come first, then these numbers.
 _TENSORS = 14
 _NUMBERS = (
@@ -43,6 +45,9 @@ def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     if all(g is None for g in wanted):
         return tuple(result)
     saved = ctx.saved_tensors
+    image, instances = saved[0], saved[7]
+    if instances.device.type == "cpu":
+        refuse_pairs(instances.numel(), 12 + image.shape[-1], image.element_size())
     found = torch.ops.gsfluent.rasterize_backward.default(*wanted, *saved, *ctx.numbers)
     needed, given = ctx.needs_input_grad, saved[-_TENSORS:]
     for k, gradient in zip(_WITH_GRADIENT, found, strict=True):
