@@ -7,9 +7,10 @@
 
 namespace gsf {
 
-constexpr double kScreenBlur = 0.3;              // low-pass added to both variances [px^2]
-constexpr double kMinAlpha = 1.0 / 255.0;        // smaller contributions are skipped
-constexpr double kMaxAlpha = 0.99;               // cap; no gradient where it binds
+constexpr double kScreenBlur = 0.3;        // low-pass added to both variances [px^2]
+constexpr double kMinAlpha = 1.0 / 255.0;  // smaller contributions are skipped
+// Cap; no gradient where it binds. A float in double too: two capped splats end a pixel either way.
+constexpr double kMaxAlpha = 0.99f;
 constexpr double kMinTransmittance = 1e-4;       // a pixel stops before going below
 constexpr double kMaxPower = 0.5 * 3.33 * 3.33;  // support in half squared sigmas
 constexpr double kMinCompensation = 0.005;       // floor of the antialiasing factor

@@ -45,9 +45,6 @@ def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
     if all(g is None for g in wanted):
         return tuple(result)
     saved = ctx.saved_tensors
-    image, instances = saved[0], saved[7]
-    if instances.device.type == "cpu":
-        refuse_pairs(instances.numel(), 12 + image.shape[-1], image.element_size())
     found = torch.ops.gsfluent.rasterize_backward.default(*wanted, *saved, *ctx.numbers)
     needed, given = ctx.needs_input_grad, saved[-_TENSORS:]
     for k, gradient in zip(_WITH_GRADIENT, found, strict=True):
@@ -70,6 +67,10 @@ class Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """See :func:`backward`."""
+        image, instances = ctx.saved_tensors[0], ctx.saved_tensors[7]
+        if instances.device.type == "cpu":
+            # six moments and the features of the image, for each
+            refuse_pairs(instances.numel(), 6 + image.shape[-1], image.element_size())
         return backward(ctx, *grads)
 
 
