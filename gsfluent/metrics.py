@@ -1,15 +1,13 @@
-"""Image quality: PSNR and SSIM, for reports and as a training loss."""
+"""Image quality: PSNR and SSIM, for reports; the training loss is ``ops.photometric_loss``."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.ops.losses import WINDOW as _WINDOW
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -40,32 +38,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     return math.inf if mean == 0 else -10.0 * math.log10(mean)
 
 
-@dataclass(frozen=True)
-class SsimTarget:
-    """A target image whose size has been checked.
-
-    Attributes:
-        image: Shape [H, W, C].
-    """
-
-    image: Tensor
-
-    @staticmethod
-    def of(target: Tensor) -> SsimTarget:
-        """Check ``target``, shape [H, W, C].
-
-        Raises:
-            ValueError: A side is shorter than the 11-pixel window.
-        """
-        if target.dim() != 3 or min(target.shape[:2]) < _WINDOW:
-            raise ValueError(
-                f"ssim: images must be [H, W, C] with sides of at least {_WINDOW} pixels, "
-                f"got {list(target.shape)}"
-            )
-        return SsimTarget(target.detach().contiguous())
-
-
-def ssim(image: Tensor, target: Tensor | SsimTarget) -> Tensor:
+def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity of images with values in [0, 1].
 
     Gaussian window of 11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03, averaged over the pixels whose
@@ -83,7 +56,7 @@ def ssim(image: Tensor, target: Tensor | SsimTarget) -> Tensor:
         TypeError: Not float32 or float64 tensors.
         ValueError: The shapes differ, or a side is shorter than the window.
     """
-    return ops.ssim(image, target.image if isinstance(target, SsimTarget) else target)
+    return ops.ssim(image, target)
 
 
 def _check_pair(name: str, image: Tensor, target: Tensor) -> None:

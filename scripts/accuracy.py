@@ -27,6 +27,7 @@ from accuracy_cases import (
     DX,
     Case,
     Results,
+    loss_cases,
     material_cases,
     melon,
     mpm_cases,
@@ -166,6 +167,7 @@ def measure(device: str, sizes: tuple[int, int, int]) -> dict[str, Any]:
         *material_cases(particles),
         *mvee_cases(fits),
         *raster_cases(count),
+        *loss_cases(particles),
     ):
         if device == "cuda" and case.reference is not None and "sampled" in case.name:
             continue  # a question to the reference

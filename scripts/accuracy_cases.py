@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials, ops
-from gsfluent.ops.reference import deform, mpm, mvee, plasticity, raster
+from gsfluent.ops.reference import adam, deform, losses, mpm, mvee, plasticity, raster
 
 DX = 0.0128  # the demo's node spacing [m]
 DT = 1e-4
@@ -305,3 +305,54 @@ def raster_cases(count: int) -> Iterator[Case]:
             window[name] = value[seen]
     yield Case(f"rasterize, window, {int(seen.sum())} splats", window, _rasterize, raster, CUT)
     yield Case(f"rasterize, {width}x{height}, {count} splats", whole, _rasterize, None, CUT)
+
+
+def _photometric(op: Any, p: dict[str, Any]) -> Results:
+    wrt = leaves(p, "image", "alpha")
+    fixed = {k: p[k] for k in ("valid", "mask", "backdrop")}
+    got = op.photometric_loss(
+        wrt["image"], p["target"], alpha=wrt["alpha"], mask_weight=2.0, **fixed
+    )
+    found = gradients([got[0]], [p["seed"]], wrt)
+    labels = ("loss", "|miss|", "similarity", "miss^2", "|excess|")
+    return {**{k: t.detach() for k, t in zip(labels, got, strict=True)}, **found}
+
+
+def _ssim_map(op: Any, p: dict[str, Any]) -> Results:
+    wrt = leaves(p, "image", "target")
+    got = op.ssim(*wrt.values(), padding="same", reduction="none")
+    return {"map": got.detach(), **gradients([got], [p["seed_map"]], wrt)}
+
+
+def _adam(op: Any, p: dict[str, Any]) -> Results:
+    """One step; the reference returns what the op changes in place."""
+    state = [p[k].clone() for k in ("value", "gradient", "first", "second")]
+    given = {"lr": 1e-2, "step": 7, "betas": (0.9, 0.99), "eps": 1e-15, "visible": p["visible"]}
+    if op is adam:
+        value, first, second = adam.adam_step(*state, **given)
+    else:
+        op.adam_step(*([t] for t in state), **given)
+        value, _, first, second = state
+    return {"moved": value - p["value"], "first": first, "second": second}
+
+
+def loss_cases(count: int) -> Iterator[Case]:
+    side = max(int(math.sqrt(count)), 24)
+    image = uniform(33, side, side + 7, 3)
+    plane = image.shape[:2]
+    pictures = {
+        "image": image,
+        "target": 0.8 * image + 0.2 * uniform(34, *image.shape),
+        "valid": uniform(35, *plane),
+        "alpha": uniform(36, *plane),
+        "mask": uniform(37, *plane).round(),
+        "backdrop": uniform(38, 3),
+        "seed": torch.ones(()),
+        "seed_map": normal(39, *image.shape),
+    }
+    yield Case("ssim, zeros around", pictures, _ssim_map, losses)
+    yield Case("photometric_loss", pictures, _photometric, losses)
+    rows = {k: normal(40 + i, count, 15, 3) for i, k in enumerate(("value", "gradient", "first"))}
+    rows["second"] = uniform(43, count, 15, 3)
+    rows["visible"] = (uniform(44, count) > 0.3).int()
+    yield Case("adam_step", rows, _adam, adam)

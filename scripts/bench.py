@@ -148,6 +148,18 @@ def enclose(device: torch.device, dtype: torch.dtype, count: int) -> Callable[[]
     return lambda: ops.mvee(cloud, tolerance=1e-3)[1]
 
 
+def compare(device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    side = int(count**0.5)
+    image, target = (random((side, side, 3), seed, device, dtype) for seed in (15, 16))
+    image.requires_grad_()
+    return lambda: torch.autograd.grad(ops.photometric_loss(image, target).loss, image)
+
+
+def advance(device: torch.device, dtype: torch.dtype, count: int) -> Callable[[], Any]:
+    state = [[random((count, 59), seed, device, dtype)] for seed in range(17, 21)]
+    return lambda: ops.adam_step(*state, lr=1e-3, step=10)
+
+
 # name, unit, full count, builder
 CASES = [
     Case("p2g", "particles", 200_000, scatter),
@@ -167,6 +179,8 @@ CASES = [
     Case("rasterize", "splats", 60_000, draw),
     Case("rasterize + backward", "splats", 60_000, draw_backward),
     Case("mvee", "fits", 20_000, enclose),
+    Case("photometric_loss + backward", "pixels", 640_000, compare),
+    Case("adam_step", "splats", 60_000, advance),
 ]
 
 

@@ -33,7 +33,8 @@ def test_every_op_is_within_its_bar_and_the_page_keeps_both_parts(
     result = json.loads(figures.read_text())
     ops = {row["op"].split(",")[0] for row in result["rows"]}
     expected = (
-        "build_blocks p2g grid_update g2p return_mapping polar_clamped mvee mvee_lens rasterize"
+        "build_blocks p2g grid_update g2p return_mapping polar_clamped mvee mvee_lens rasterize "
+        "ssim photometric_loss adam_step"
     )
     assert ops == set(expected.split())
     wrt = {row["result"] for row in result["rows"] if row["op"].startswith("rasterize")}

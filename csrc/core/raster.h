@@ -53,6 +53,11 @@ struct RasterArgs {
 
   GSF_HOST_DEVICE int64_t splat_count() const { return count * cameras; }
   GSF_HOST_DEVICE int tiles() const { return tiles_x * tiles_y; }
+  // What shines through channel `c`; held where features are.
+  GSF_HOST_DEVICE T background_color(int camera, int c) const {
+    const T* color = background_of(camera);
+    return color ? clamp(color[c], T(-kMaxFeature), T(kMaxFeature)) : T(0);
+  }
   GSF_HOST_DEVICE const T* background_of(int camera) const {
     return background ? background + int64_t(camera) * background_stride : nullptr;
   }
@@ -109,8 +114,14 @@ GSF_HOST_DEVICE bool project_geometry(const RasterArgs<T>& a, const SplatCamera<
   return splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, s);
 }
 
+// False for what is not drawn, NaN among it.
+template <typename T>
+GSF_HOST_DEVICE bool drawable(T x) {
+  return x >= T(-kMaxFeature) && x <= T(kMaxFeature);
+}
+
 // rgb = max(0, sum_k basis_k c_k + 0.5) of the coefficients `c` [(degree + 1)^2, 3]; false when
-// that is not finite.
+// that cannot be drawn.
 template <typename T>
 GSF_HOST_DEVICE bool sh_color(int degree, const Vec3<T>& direction, const T* c, T* rgb) {
   T basis[kMaxShCoefficients];
@@ -120,14 +131,14 @@ GSF_HOST_DEVICE bool sh_color(int degree, const Vec3<T>& direction, const T* c, 
   for (int ch = 0; ch < 3; ++ch) {
     T sum = T(0.5);
     for (int j = 0; j < k; ++j) sum += basis[j] * c[3 * j + ch];
-    good = good && finite(sum);
+    good = good && drawable(sum);
     rgb[ch] = max(sum, T(0));
   }
   return good;
 }
 
 // Colours, normal and depth of Gaussian `i` in the order in which they are blended. `sh` are its
-// coefficients (null when plain colours are given). False when one is not finite.
+// coefficients (null when plain colours are given). False when one cannot be drawn.
 template <typename T>
 GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
                                     int degree, const T* sh, T depth, T* feature) {
@@ -139,13 +150,13 @@ GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const SplatCamera<T>
   } else {
     for (int ch = 0; ch < a.channels; ++ch) {
       feature[ch] = a.colors[a.channels * i + ch];
-      good = good && finite(feature[ch]);
+      good = good && drawable(feature[ch]);
     }
   }
   if (a.has_normals) {
     for (int j = 0; j < 3; ++j) {
       feature[a.channels + j] = a.normals[3 * i + j];
-      good = good && finite(feature[a.channels + j]);
+      good = good && drawable(feature[a.channels + j]);
     }
   }
   if (a.has_depth) feature[a.features - 1] = depth;
@@ -160,16 +171,19 @@ GSF_HOST_DEVICE int32_t splat_radius(const Splat<T>& s) {
 }
 
 // Sums of v dx, v dy, v dx^2, v dx dy, v dy^2, v over the pixels, with v = dL/d ln alpha, become
-// gradients of centre, conic and opacity (of the splat, after antialiasing).
+// gradients of centre, covariance (entries of the symmetric matrix) and opacity (of the splat,
+// after antialiasing). With e = Q d, Q the conic: d ln alpha = e.dcentre + e e^T : dcovariance / 2.
 template <typename T>
 GSF_HOST_DEVICE void moments_to_gradient(const T* moment, T conic_a, T conic_b, T conic_c,
                                          T opacity, T* g) {
-  const T x = moment[0], y = moment[1];
+  const T x = moment[0], y = moment[1], xx = moment[2], xy = moment[3], yy = moment[4];
   g[0] = conic_a * x + conic_b * y;
   g[1] = conic_b * x + conic_c * y;
-  g[2] = T(-0.5) * moment[2];
-  g[3] = -moment[3];
-  g[4] = T(-0.5) * moment[4];
+  const T ax = conic_a * xx + conic_b * xy, ay = conic_a * xy + conic_b * yy;
+  const T cx = conic_b * xx + conic_c * xy, cy = conic_b * xy + conic_c * yy;
+  g[2] = T(0.5) * (ax * conic_a + ay * conic_b);
+  g[3] = T(0.5) * (ax * conic_b + ay * conic_c);
+  g[4] = T(0.5) * (cx * conic_b + cy * conic_c);
   g[5] = moment[5] / opacity;
 }
 
@@ -181,8 +195,9 @@ struct GaussianGradient {
   T opacity = T(0);
 };
 
-// Adds what `g` (layout kGradFeatures; the depth's gradient is `depth`) says of one camera. The
-// splat was visible there, so every input is finite.
+// Adds what `g` (as from moments_to_gradient; the depth's gradient is `depth`) says of one camera.
+// The splat was visible there, so every input is finite. A part that leaves T's range although `g`
+// did not (a focal length or scale near the end of the range) is left out.
 template <typename T>
 GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
                                        const T* g, T depth, GaussianGradient<T>* total) {
@@ -202,8 +217,12 @@ GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera
   const SplatGradient<T> pixel{g[0], g[1], g[2], g[3], g[4], g[5], depth};
   Mat3<T> grad_covariance;
   T grad_opacity;
-  total->mean = total->mean + splat_backward(cam, frame, covariance, a.opacities[i], a.antialiased,
-                                             pixel, &grad_covariance, &grad_opacity);
+  const Vec3<T> grad_mean = splat_backward(cam, frame, covariance, a.opacities[i], a.antialiased,
+                                           pixel, &grad_covariance, &grad_opacity);
+  T all = grad_mean.x + grad_mean.y + grad_mean.z + grad_opacity;
+  for (int k = 0; k < 9; ++k) all += grad_covariance.m[k];
+  if (!finite(all) && finite(g[0] + g[1] + g[2] + g[3] + g[4] + g[5] + depth)) return;
+  total->mean = total->mean + grad_mean;
   total->covariance = total->covariance + grad_covariance;
   total->opacity += grad_opacity;
 }
@@ -226,7 +245,10 @@ GSF_HOST_DEVICE void sh_direction_backward(int degree, const SplatCamera<T>& cam
   for (int j = 0; j < k; ++j)
     weight[j] = grad_rgb[0] * c[3 * j] + grad_rgb[1] * c[3 * j + 1] + grad_rgb[2] * c[3 * j + 2];
   const Vec3<T> gd = sh_basis_gradient(degree, d, weight);
-  *grad_mean = *grad_mean + (T(1) / length) * (gd - dot(gd, d) * d);
+  const Vec3<T> part = (T(1) / length) * (gd - dot(gd, d) * d);
+  // Coefficients near the end of T's range, which cancel in the colour, do not cancel here.
+  if (!finite(part.x + part.y + part.z) && finite(grad_rgb[0] + grad_rgb[1] + grad_rgb[2])) return;
+  *grad_mean = *grad_mean + part;
 }
 
 // Adjoint of the colour: adds the gradient of the coefficients to `out` [(degree + 1)^2, 3].
@@ -257,14 +279,20 @@ GSF_HOST_DEVICE void store_gaussian_gradient(const RasterGradArgs<T>& b, int64_t
     out[5] = 2 * total.covariance(1, 2);
     return;
   }
+  T *grad_scales = b.grad_scales + 3 * i, *grad_quats = b.grad_quats + 4 * i;
   Mat3<T> axes;
+  T all = T(0);
   if (rotation_from_quat(a.quats + 4 * i, &axes)) {
-    splat_axes_backward(axes, a.scales + 3 * i, a.quats + 4 * i, total.covariance,
-                        b.grad_scales + 3 * i, b.grad_quats + 4 * i);
-  } else {
-    for (int j = 0; j < 3; ++j) b.grad_scales[3 * i + j] = T(0);
-    for (int j = 0; j < 4; ++j) b.grad_quats[4 * i + j] = T(0);
+    splat_axes_backward(axes, a.scales + 3 * i, a.quats + 4 * i, total.covariance, grad_scales,
+                        grad_quats);
+    for (int j = 0; j < 3; ++j) all += grad_scales[j];
+    for (int j = 0; j < 4; ++j) all += grad_quats[j];
+    T given = T(0);
+    for (int j = 0; j < 9; ++j) given += total.covariance.m[j];
+    if (finite(all) || !finite(given)) return;
   }
+  for (int j = 0; j < 3; ++j) grad_scales[j] = T(0);
+  for (int j = 0; j < 4; ++j) grad_quats[j] = T(0);
 }
 
 // The tiles of edge `tile` that a pixel box touches, [x0, x1) x [y0, y1).

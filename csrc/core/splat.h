@@ -14,8 +14,10 @@ constexpr double kMinTransmittance = 1e-4;       // a pixel stops before going b
 constexpr double kMaxPower = 0.5 * 3.33 * 3.33;  // support in half squared sigmas
 constexpr double kMinCompensation = 0.005;       // floor of the antialiasing factor
 constexpr double kFrustumMargin = 0.3;           // of tan(fov/2), beyond the image edges, for J
-constexpr int kSiblingRing = 8;                  // group ids remembered per pixel
-constexpr int kTile = 16;                        // tile edge [px]
+// Colours, normals and camera z beyond are not drawn: times a gradient they would leave float32.
+constexpr double kMaxFeature = 1e15;
+constexpr int kSiblingRing = 8;  // group ids remembered per pixel
+constexpr int kTile = 16;        // tile edge [px]
 
 // Pinhole camera as the kernels use it. `rotation`, `translation`: world->camera.
 template <typename T>
@@ -49,7 +51,7 @@ GSF_HOST_DEVICE SplatCamera<T> make_splat_camera(const T* viewmat, const T* intr
   c.low_v = -c.cy / c.fy - margin_v;
   c.high_v = (T(height) - c.cy) / c.fy + margin_v;
   c.near = near;
-  c.far = far;
+  c.far = min(far, T(kMaxFeature));
   c.width = width;
   c.height = height;
   return c;
@@ -99,6 +101,7 @@ struct Splat {
   T opacity;             // after antialiasing
   T cutoff;              // ln(255 opacity), at most kMaxPower
   T extent_x, extent_y;  // half size of the tight box of the support [px]
+  T cov_c;               // vertical variance [px^2]
   T depth;               // camera z
 };
 
@@ -221,6 +224,7 @@ GSF_HOST_DEVICE bool splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>
   s->y = cam.fy * f.point.y * f.inverse_z + cam.cy + offset_y;
   s->extent_x = sqrt(2 * max(s->cutoff, T(0)) * a);
   s->extent_y = sqrt(2 * max(s->cutoff, T(0)) * c);
+  s->cov_c = c;
   s->depth = f.point.z;
   if (!finite(s->x) || !finite(s->y) || !finite(s->a) || !finite(s->b) || !finite(s->c))
     return false;
@@ -228,10 +232,11 @@ GSF_HOST_DEVICE bool splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>
   return !splat_box(s->x, s->y, s->extent_x, s->extent_y, cam.width, cam.height).empty();
 }
 
-// Gradients that reach a splat from the pixels.
+// Gradients that reach a splat from the pixels; those of the covariance are entries of the
+// symmetric 2x2 matrix (the off-diagonal one counts for each of its two places).
 template <typename T>
 struct SplatGradient {
-  T x, y, a, b, c, opacity, depth;
+  T x, y, cov_a, cov_b, cov_c, opacity, depth;
 };
 
 // Adjoint of the projection. `covariance` is the world covariance (of either form). Returns the
@@ -242,17 +247,11 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
                                        const Sym3<T>& covariance, T opacity, bool antialiased,
                                        const SplatGradient<T>& g, Mat3<T>* grad_covariance,
                                        T* grad_opacity) {
-  const T blur = T(kScreenBlur);
-  const T a = f.cov_a + blur, b = f.cov_b, c = f.cov_c + blur;
   const T inverse = T(1) / f.det;
-  const T qa = c * inverse, qb = -b * inverse, qc = a * inverse;
-  // dCov = -Q G Q with Q = Cov^-1 and G = [[ga, gb/2], [gb/2, gc]].
-  const T ga = g.a, gb = T(0.5) * g.b, gc = g.c;
-  const T ra = qa * ga + qb * gb, rb = qa * gb + qb * gc;
-  const T sa = qb * ga + qc * gb, sb = qb * gb + qc * gc;
-  T da = -(ra * qa + rb * qb), db = -(ra * qb + rb * qc), dc = -(sa * qb + sb * qc);
+  T da = g.cov_a, db = g.cov_b, dc = g.cov_c;
   *grad_opacity = g.opacity;
   if (antialiased) {
+    const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur);
     const T compensation = splat_compensation(f);
     *grad_opacity = g.opacity * compensation;
     const T ratio = f.det0 * inverse;
@@ -260,7 +259,7 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
       const T gr = g.opacity * opacity * T(0.5) / compensation * inverse;
       da += gr * (f.cov_c - ratio * c);
       dc += gr * (f.cov_a - ratio * a);
-      db += gr * (ratio - T(1)) * b;  // half of the off-diagonal gradient: db is a matrix entry
+      db += gr * (ratio - T(1)) * f.cov_b;
     }
   }
   const Mat3<T> sigma = to_mat3(covariance);

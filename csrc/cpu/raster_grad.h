@@ -21,9 +21,9 @@ struct GradSlots {
 };
 
 // Adjoint of blend_tile. Per instance it writes one row of slots: the moments of the opacity
-// gradient (sum v dx, v dy, v dx^2, v dx dy, v dy^2, v with v = dL/d ln alpha), the gradients of
-// the features, then sum |dL/dx|, |dL/dy| of the centre. `background` is this tile's share
-// [channels], or null. kF: features when known at compile time, else 0.
+// gradient (see row_gradient), the gradients of the features, then sum |dL/dx|, |dL/dy| of the
+// centre. `background` is this tile's share [channels], or null. kF: features when known at compile
+// time, else 0.
 template <typename T, int kF, bool kGroups, bool kAbsolute>
 void blend_tile_backward(const RasterGradArgs<T>& b, int64_t tile, const GradSlots<T>& slots,
                          T* background) {
@@ -33,42 +33,47 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int64_t tile, const GradSlo
   const int64_t first = area.camera * a.count;
   BlockWalk<T, kGroups> walk;
   walk.reset(area.width, area.height);
+  SplatRows<T> rows;
   alignas(32) Pack<T> grad[kF ? kF : kMaxFeatures][kBlocks<T>];
   // What everything from the current splat to the back adds to the loss:
   // g.(blended features + T bg) - g_alpha T, reduced splat by splat.
   alignas(32) Pack<T> behind[kBlocks<T>];
-  for (int f = 0; f < active; ++f)
-    for (auto& block : grad[f]) block = Pack<T>{};
-  for (auto& block : behind) block = Pack<T>{};
-  for (int y = 0; y < area.height; ++y) {
-    for (int x = 0; x < area.width; ++x) {
-      const int block = x / kLanes<T> * kTileEdge + y, lane = x % kLanes<T>;
-      const int64_t pixel = pixel_index(a, area, x, y);
-      const T alpha = a.alpha[pixel], left = T(1) - alpha;
-      T total = T(0);
-      for (int c = 0; c < a.channels && b.grad_image; ++c) {
-        const T g = b.grad_image[pixel * a.channels + c];
-        grad[c][block][lane] = g;
-        total += g * a.image[pixel * a.channels + c];
-        if (background) background[c] += g * left;
-      }
-      for (int c = 0; c < 3 && b.grad_normal; ++c) {
-        const T g = b.grad_normal[3 * pixel + c];
-        grad[a.channels + c][block][lane] = g;
-        total += g * a.normal[3 * pixel + c];
-      }
-      T grad_alpha = b.grad_alpha ? b.grad_alpha[pixel] : T(0);
-      if (b.grad_depth && alpha > T(0)) {
-        const T g = b.grad_depth[pixel];
-        grad[active - 1][block][lane] = g / alpha;
-        grad_alpha -= g * a.depth[pixel] / alpha;
-        total += g * a.depth[pixel];
-      }
-      behind[block][lane] = total - grad_alpha * left;
+  for_each_block(a, area, [&](int block, int lanes, int64_t pixel) {
+    const auto read = [&](const T* in, int step) {
+      T lane[kLanes<T>] = {};
+      for (int k = 0; k < lanes; ++k) lane[k] = in[k * step];
+      return load_pack(lane);
+    };
+    const Pack<T> alpha = read(a.alpha + pixel, 1), left = T(1) - alpha;
+    Pack<T> total{};
+    for (int c = 0; c < active; ++c) grad[c][block] = Pack<T>{};
+    for (int c = 0; c < a.channels && b.grad_image; ++c) {
+      const Pack<T> g = read(b.grad_image + pixel * a.channels + c, a.channels);
+      grad[c][block] = g;
+      total += g * read(a.image + pixel * a.channels + c, a.channels);
+      if (background) background[c] += pack_sum<T>(g * left);
     }
-  }
+    for (int c = 0; c < 3 && b.grad_normal; ++c) {
+      const Pack<T> g = read(b.grad_normal + 3 * pixel + c, 3);
+      grad[a.channels + c][block] = g;
+      total += g * read(a.normal + 3 * pixel + c, 3);
+    }
+    Pack<T> grad_alpha = b.grad_alpha ? read(b.grad_alpha + pixel, 1) : Pack<T>{};
+    if (b.grad_depth) {
+      const Pack<T> g = read(b.grad_depth + pixel, 1), depth = read(a.depth + pixel, 1);
+      const auto covered = alpha > T(0);
+      const Pack<T> share = covered ? g / alpha : Pack<T>{};
+      grad[active - 1][block] = share;
+      grad_alpha -= share * depth;
+      total += covered ? g * depth : Pack<T>{};
+    }
+    behind[block] = total - grad_alpha * left;
+  });
 
-  const T tile_x = T(area.x), tile_y = T(area.y);
+  constexpr int kFixed = kGradFeatures + (kAbsolute ? 2 : 0);
+  // Sums of the instance at hand, in whole packs: moments, features, absolute values.
+  constexpr int kRoom = (kFixed + (kF ? kF : kMaxFeatures) + kLanes<T> - 1) / kLanes<T> * kLanes<T>;
+  Pack<T> sums[kRoom] = {};
   const int32_t end = a.tile_start[tile + 1];
   int32_t e = a.tile_start[tile];
   for (; e < end && walk.alive; ++e) {
@@ -77,14 +82,24 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int64_t tile, const GradSlo
     const T* splat = a.splats + int64_t(s) * a.stride;
     int group = -1;
     if constexpr (kGroups) group = a.groups[s - first];
-    Pack<T> moment[kGradFeatures] = {};
-    Pack<T> feature[kF ? kF : kMaxFeatures];
-    Pack<T> absolute[2] = {};
-    for (int f = 0; f < active; ++f) feature[f] = Pack<T>{};
-    for (uint64_t bits = reached_blocks(splat, tile_x, tile_y) & walk.alive; bits;
-         bits &= bits - 1) {
+    const int64_t place = instance_slot(a, s, area);
+    if (place < 0) {
+      *slots.unsound = true;
+      return;
+    }
+    T* row = slots.row(place);
+    const uint64_t reached = rows.place(splat, T(area.x), T(area.y)) & walk.alive;
+    if (!reached) {
+      std::fill_n(row, slots.width, T(0));
+      continue;
+    }
+    for (int k = 0; k < kFixed + active; ++k) sums[k] = Pack<T>{};
+    Pack<T>*moment = sums, *feature = sums + kGradFeatures, *absolute = feature + active;
+    const T x = T(2 / kLog2E) * splat[kAcross], y = T(2 / kLog2E) * splat[kDown];
+    for (uint64_t bits = reached; bits; bits &= bits - 1) {
       const int block = __builtin_ctzll(bits);
-      const auto w = walk.weigh(splat, group, block, tile_x, tile_y);
+      const auto w = walk.weigh(splat, rows, group, block);
+      const T down = rows.down[block % kTileEdge];
       Pack<T> along{};
       for (int f = 0; f < active; ++f) {
         along += grad[f][block] * splat[kFeatures + f];
@@ -93,35 +108,30 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int64_t tile, const GradSlo
       const Pack<T> rest = behind[block] - w.weight * along;
       behind[block] = rest;
       const Pack<T> v = w.open ? w.weight * along - w.alpha * rest / (T(1) - w.alpha) : Pack<T>{};
-      const Pack<T> vx = v * w.dx;
+      const Pack<T> vx = v * w.across, vy = v * down;
       moment[0] += vx;
-      moment[1] += v * w.dy;
-      moment[2] += vx * w.dx;
-      moment[3] += vx * w.dy;
-      moment[4] += v * (w.dy * w.dy);
+      moment[1] += vy;
+      moment[2] += vx * w.across;
+      moment[3] += vx * down;
+      moment[4] += vy * down;
       moment[5] += v;
       if constexpr (kAbsolute) {
-        absolute[0] += pack_abs<T>(v * (splat[kConicA] * w.dx + splat[kConicB] * w.dy));
-        absolute[1] += pack_abs<T>(v * (splat[kConicB] * w.dx + splat[kConicC] * w.dy));
+        absolute[0] += pack_abs<T>(x * vx);
+        absolute[1] += pack_abs<T>(y * vy - splat[kSlope] * x * vx);
       }
     }
-    const int64_t place = instance_slot(a, s, area);
-    if (place < 0) {
-      *slots.unsound = true;
-      continue;
-    }
-    T* row = slots.row(place);
-    for (int k = 0; k < kGradFeatures; ++k) row[k] = pack_sum<T>(moment[k]);
-    for (int f = 0; f < active; ++f) row[kGradFeatures + f] = pack_sum<T>(feature[f]);
-    if constexpr (kAbsolute)
-      for (int k = 0; k < 2; ++k) row[kGradFeatures + active + k] = pack_sum<T>(absolute[k]);
+    alignas(32) T out[kRoom];
+    for (int k = 0; k < kFixed + active; k += kLanes<T>)
+      store_pack(out + k, pack_sums<T>(sums + k));
+    std::copy_n(out, kFixed + active, row);
   }
   for (; e < end; ++e) {
     const int64_t place = instance_slot(a, a.instances[e], area);
-    if (place < 0)
+    if (place < 0) {
       *slots.unsound = true;
-    else
-      std::fill_n(slots.row(place), slots.width, T(0));
+      return;
+    }
+    std::fill_n(slots.row(place), slots.width, T(0));
   }
 }
 
@@ -162,8 +172,7 @@ void gaussian_backward(const RasterGradArgs<T>& b, const std::vector<SplatCamera
     for (int k = 0; k < slots.width; ++k) seen = seen || sum[k] != T(0);
     T g[kGradFeatures] = {};
     if (seen) {
-      const T* row = a.splats + s * a.stride;
-      moments_to_gradient(sum, row[kConicA], row[kConicB], row[kConicC], row[kOpacity], g);
+      row_gradient(sum, a.splats + s * a.stride, g);
     }
     if (b.grad_offset) std::copy_n(g, 2, b.grad_offset + 2 * s);
     if (b.grad_absolute) {

@@ -110,20 +110,34 @@ inline float pack_sum<float>(Pack<float> a) {
   return (s0 + s2) + (s1 + s3);
 }
 
-// exp(-x) for 0 <= x <= 80. Relative error below 2e-7: 2^n times the degree-6 Taylor polynomial of
-// 2^f, |f| <= 1/2 (remainder (ln 2 / 2)^7 / 7! = 1.2e-7).
-inline Pack<float> exp_negative(Pack<float> x) {
-  const Pack<float> y = x * -1.44269504088896341f;
+// Sums of the lanes of eight packs (four with double), lane k holding that of v[k].
+template <typename T>
+inline Pack<T> pack_sums(const Pack<T>* v) {
+  Pack<T> sums{};
+  for (int k = 0; k < PackOf<T>::kLanes; ++k) sums[k] = pack_sum<T>(v[k]);
+  return sums;
+}
+#ifdef __AVX__
+template <>
+inline Pack<float> pack_sums<float>(const Pack<float>* v) {
+  const __m256 a = _mm256_hadd_ps(_mm256_hadd_ps(v[0], v[1]), _mm256_hadd_ps(v[2], v[3]));
+  const __m256 b = _mm256_hadd_ps(_mm256_hadd_ps(v[4], v[5]), _mm256_hadd_ps(v[6], v[7]));
+  return _mm256_add_ps(_mm256_permute2f128_ps(a, b, 0x20), _mm256_permute2f128_ps(a, b, 0x31));
+}
+#endif
+
+// 2^x for -126 <= x <= 128, infinite from there on; relative error below 1.5e-7. 2^f on
+// |f| <= 1/2 is the polynomial of degree 5 with the smallest relative error, 7.5e-8 (Remez).
+inline Pack<float> exp2_pack(Pack<float> x) {
   // Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low mantissa bits.
   const float magic = 12582912.0f;
-  const Pack<float> shifted = y + magic;
-  const Pack<float> f = y - (shifted - magic);
-  Pack<float> p = 1.5403530393381609e-4f * f + 1.3333558146428443e-3f;
-  p = p * f + 9.6181291076284772e-3f;
-  p = p * f + 5.5504108664821580e-2f;
-  p = p * f + 2.4022650695910071e-1f;
-  p = p * f + 6.9314718055994531e-1f;
-  p = p * f + 1.0f;
+  const Pack<float> shifted = x + magic;
+  const Pack<float> f = x - (shifted - magic);
+  Pack<float> p = 1.3276471993e-3f * f + 9.6755413344e-3f;
+  p = p * f + 5.5507132735e-2f;
+  p = p * f + 2.4022119724e-1f;
+  p = p * f + 6.9314696706e-1f;
+  p = p * f + 1.0000000717f;
   PackMask<float> n;
   std::memcpy(&n, &shifted, sizeof n);
   n = (n << 23) + 0x3f800000;
@@ -131,8 +145,18 @@ inline Pack<float> exp_negative(Pack<float> x) {
   std::memcpy(&scale, &n, sizeof scale);
   return p * scale;
 }
-inline Pack<double> exp_negative(Pack<double> x) {
-  for (int i = 0; i < 4; ++i) x[i] = std::exp(-x[i]);
+inline Pack<double> exp2_pack(Pack<double> x) {
+  for (int i = 0; i < 4; ++i) x[i] = std::exp2(x[i]);
+  return x;
+}
+
+// -|x| where the mask holds, x elsewhere.
+template <typename T>
+inline Pack<T> negative_magnitude(Pack<T> x, PackMask<T> where) {
+  PackMask<T> bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  bits |= where << (8 * sizeof(T) - 1);
+  std::memcpy(&x, &bits, sizeof bits);
   return x;
 }
 

@@ -26,29 +26,38 @@ inline Pack<T> lane_centres() {
   return v;
 }
 
-// Bit set of the blocks whose pixels may lie in the support of the splat. Conservative (a little
-// slack); the exact test is per pixel. On a row, the support is an interval around
-// x - b/a dy with half width sqrt(2 cutoff / a) sqrt(1 - (dy / extent_y)^2).
+// A splat on the rows of pixels of one tile.
 template <typename T>
-inline uint64_t reached_blocks(const T* splat, T tile_x, T tile_y) {
-  const T width = splat[kHalfWidth] * T(1.0001) + T(1e-3);
-  const T slope = splat[kSlope], inverse_extent = splat[kInverseExtent];
-  uint64_t bits = 0;
-  for (int r = 0; r < kTileEdge; r += kLanes<T>) {
-    const Pack<T> dy = lane_centres<T>() + (tile_y + T(r) - splat[kY]);
-    const Pack<T> t = dy * inverse_extent;
-    const Pack<T> rest = T(1.0001) - t * t;
-    const Pack<T> half = width * pack_sqrt<T>(pack_max<T>(rest, Pack<T>{}));
-    const Pack<T> centre = splat[kX] + slope * dy;
-    const Pack<T> low = centre - half, high = centre + half;
-    for (int column = 0; column < kColumns<T>; ++column) {
-      const T x0 = tile_x + T(column * kLanes<T>) + T(0.5);
-      const auto reached = (high >= x0) & (low <= x0 + T(kLanes<T> - 1)) & (rest > T(0));
-      bits |= static_cast<uint64_t>(lane_bits(reached)) << (column * kTileEdge + r);
+struct SplatRows {
+  alignas(32) T start[kTileEdge];  // `across` at the tile's left edge
+  alignas(32) T down[kTileEdge];
+  alignas(32) T peak[kTileEdge];  // log2 of the opacity at across = 0
+
+  // Fills the rows and returns the bit set of the blocks whose pixels may lie in the support.
+  // Conservative (a little slack); the exact test is per pixel.
+  inline uint64_t place(const T* splat, T tile_x, T tile_y) {
+    uint64_t bits = 0;
+    const T reach = splat[kReach] * T(1.0001) + T(1e-3);
+    for (int r = 0; r < kTileEdge; r += kLanes<T>) {
+      const Pack<T> dy = lane_centres<T>() + (tile_y + T(r) - splat[kY]);
+      const Pack<T> below = splat[kDown] * dy, square = below * below;
+      const Pack<T> middle = splat[kSlope] * dy + (splat[kX] - tile_x);
+      const Pack<T> rest = reach - square;
+      const Pack<T> half =
+          splat[kInverseAcross] * pack_sqrt<T>(pack_max<T>(rest, Pack<T>{})) + T(1e-3);
+      store_pack(start + r, -splat[kAcross] * middle);
+      store_pack(down + r, below);
+      store_pack(peak + r, splat[kLogOpacity] - square);
+      const Pack<T> low = middle - half, high = middle + half;
+      for (int column = 0; column < kColumns<T>; ++column) {
+        const T x0 = T(column * kLanes<T>) + T(0.5);
+        const auto reached = (high >= x0) & (low <= x0 + T(kLanes<T> - 1)) & (rest > T(0));
+        bits |= static_cast<uint64_t>(lane_bits(reached)) << (column * kTileEdge + r);
+      }
     }
+    return bits;
   }
-  return bits;
-}
+};
 
 // Transmittance of the tile's pixels and the sibling ring. A pixel that has stopped, or lies off
 // the image, carries a negative transmittance: no later test can pass then.
@@ -75,30 +84,26 @@ struct BlockWalk {
   }
 
   struct Weight {
+    Pack<T> across;
     Pack<T> alpha;   // capped
     Pack<T> before;  // transmittance in front of the splat
     Pack<T> weight;  // alpha * before where it contributes, else 0
     PackMask<T> keep;
     PackMask<T> open;  // contributes and the cap does not bind
-    Pack<T> dx;
-    T dy;
   };
 
   // Weight of the splat in a block; advances transmittance, ring and the alive set.
-  inline Weight weigh(const T* splat, int group, int block, T tile_x, T tile_y) {
+  inline Weight weigh(const T* splat, const SplatRows<T>& rows, int group, int block) {
     Weight r;
     const int column = block / kTileEdge, row = block % kTileEdge;
-    r.dy = tile_y + T(row) + T(0.5) - splat[kY];
-    r.dx = lane_centres<T>() + (tile_x + T(column * kLanes<T>) - splat[kX]);
-    const T half_a = T(0.5) * splat[kConicA];
-    const Pack<T> power = pack_max<T>(
-        r.dx * (half_a * r.dx + splat[kConicB] * r.dy) + T(0.5) * splat[kConicC] * r.dy * r.dy,
-        Pack<T>{});
-    const Pack<T> raw = splat[kOpacity] * exp_negative(power);
+    const Pack<T> x = lane_centres<T>() + T(column * kLanes<T>);
+    r.across = splat[kAcross] * x + rows.start[row];
+    const Pack<T> level = rows.peak[row] - r.across * r.across;
+    const Pack<T> raw = exp2_pack(level);
     r.alpha = pack_min<T>(raw, splat_pack<T>(T(kMaxAlpha)));
     r.before = transmittance[block];
     const Pack<T> after = r.before - r.alpha * r.before;
-    PackMask<T> pass = power <= splat[kCutoff];
+    PackMask<T> pass = level >= splat[kLogOpacity] - splat[kReach];
     if constexpr (kGroups) {
       if (group >= 0)
         for (int k = 0; k < kSiblingRing; ++k) pass &= ring[k][block] != group;
@@ -106,8 +111,7 @@ struct BlockWalk {
     r.keep = pass & (after > T(kMinTransmittance));
     r.open = r.keep & (raw < T(kMaxAlpha));
     r.weight = r.keep ? r.alpha * r.before : Pack<T>{};
-    const Pack<T> stopped = r.before < T(0) ? r.before : -r.before;
-    const Pack<T> next = r.keep ? after : (pass ? stopped : r.before);
+    const Pack<T> next = r.keep ? after : negative_magnitude<T>(r.before, pass);
     transmittance[block] = next;
     if constexpr (kGroups) {
       if (group >= 0) {
@@ -159,9 +163,14 @@ inline TileArea tile_area(const RasterArgs<T>& a, int64_t tile) {
           std::min(kTileEdge, a.height - y)};
 }
 
-template <typename T>
-inline int64_t pixel_index(const RasterArgs<T>& a, const TileArea& area, int x, int y) {
-  return (int64_t(area.camera) * a.height + area.y + y) * a.width + area.x + x;
+// Calls f(block, lanes, pixel) for the blocks of a tile that lie on the image: `lanes` of its
+// pixels do, the first of which is `pixel`.
+template <typename T, typename F>
+inline void for_each_block(const RasterArgs<T>& a, const TileArea& area, const F& f) {
+  for (int y = 0; y < area.height; ++y)
+    for (int x = 0; x < area.width; x += kLanes<T>)
+      f(x / kLanes<T> * kTileEdge + y, std::min(kLanes<T>, area.width - x),
+        (int64_t(area.camera) * a.height + area.y + y) * a.width + area.x + x);
 }
 
 // Place of an instance among those of all splats, which lie splat by splat and row by row over the
@@ -187,6 +196,7 @@ void blend_tile(const RasterArgs<T>& a, int64_t tile, const T* depth, T* slots) 
   const bool has_median = a.median != nullptr;
   BlockWalk<T, kGroups> walk;
   walk.reset(area.width, area.height);
+  SplatRows<T> rows;
   alignas(32) Pack<T> sum[kF ? kF : kMaxFeatures][kBlocks<T>];
   // Alpha is the sum of weights: 1 - transmittance would cost thin pixels their precision.
   alignas(32) Pack<T> weights[kBlocks<T>];
@@ -195,7 +205,6 @@ void blend_tile(const RasterArgs<T>& a, int64_t tile, const T* depth, T* slots) 
   for (auto& block : median) block = Pack<T>{};
   for (int f = 0; f < features; ++f)
     for (auto& block : sum[f]) block = Pack<T>{};
-  const T tile_x = T(area.x), tile_y = T(area.y);
   const int32_t end = a.tile_start[tile + 1];
   int32_t e = a.tile_start[tile];
   for (; e < end && walk.alive; ++e) {
@@ -205,10 +214,10 @@ void blend_tile(const RasterArgs<T>& a, int64_t tile, const T* depth, T* slots) 
     int group = -1;
     if constexpr (kGroups) group = a.groups[s - first];
     Pack<T> total{};
-    for (uint64_t bits = reached_blocks(splat, tile_x, tile_y) & walk.alive; bits;
+    for (uint64_t bits = rows.place(splat, T(area.x), T(area.y)) & walk.alive; bits;
          bits &= bits - 1) {
       const int block = __builtin_ctzll(bits);
-      const auto w = walk.weigh(splat, group, block, tile_x, tile_y);
+      const auto w = walk.weigh(splat, rows, group, block);
       for (int f = 0; f < features; ++f) sum[f][block] += w.weight * splat[kFeatures + f];
       weights[block] += w.weight;
       total += w.weight;
@@ -222,24 +231,25 @@ void blend_tile(const RasterArgs<T>& a, int64_t tile, const T* depth, T* slots) 
   if (slots)
     for (; e < end; ++e) slots[instance_slot(a, a.instances[e], area)] = T(0);
 
-  const T* background = a.background_of(area.camera);
-  for (int y = 0; y < area.height; ++y) {
-    for (int x = 0; x < area.width; ++x) {
-      const int block = x / kLanes<T> * kTileEdge + y, lane = x % kLanes<T>;
-      const int64_t pixel = pixel_index(a, area, x, y);
-      const T left = std::abs(walk.transmittance[block][lane]);
-      const T alpha = std::min(weights[block][lane], T(1));
-      a.alpha[pixel] = alpha;
-      for (int c = 0; c < a.channels; ++c)
-        a.image[pixel * a.channels + c] =
-            sum[c][block][lane] + (background ? left * background[c] : T(0));
-      if (a.has_normals)
-        for (int c = 0; c < 3; ++c) a.normal[3 * pixel + c] = sum[a.channels + c][block][lane];
-      if (a.has_depth)
-        a.depth[pixel] = alpha > T(0) ? sum[features - 1][block][lane] / alpha : T(0);
-      if (has_median) a.median[pixel] = median[block][lane];
-    }
-  }
+  T background[kMaxChannels];
+  for (int c = 0; c < a.channels; ++c) background[c] = a.background_color(area.camera, c);
+  for_each_block(a, area, [&](int block, int lanes, int64_t pixel) {
+    const Pack<T> before = walk.transmittance[block], left = pack_abs<T>(before);
+    const Pack<T> alpha = pack_min<T>(weights[block], splat_pack<T>(T(1)));
+    const auto write = [&](const Pack<T>& value, T* out, int step) {
+      T lane[kLanes<T>];
+      store_pack(lane, value);
+      for (int k = 0; k < lanes; ++k) out[k * step] = lane[k];
+    };
+    write(alpha, a.alpha + pixel, 1);
+    for (int c = 0; c < a.channels; ++c)
+      write(sum[c][block] + left * background[c], a.image + pixel * a.channels + c, a.channels);
+    if (a.has_normals)
+      for (int c = 0; c < 3; ++c) write(sum[a.channels + c][block], a.normal + 3 * pixel + c, 3);
+    if (a.has_depth)
+      write(alpha > T(0) ? sum[features - 1][block] / alpha : Pack<T>{}, a.depth + pixel, 1);
+    if (has_median) write(median[block], a.median + pixel, 1);
+  });
 }
 
 }  // namespace gsf::raster_cpu

@@ -6,8 +6,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <utility>
-#include <vector>
 
 #include "core/ssim.h"
 #include "cpu/pack.h"
@@ -38,8 +38,10 @@ class Tile {
     own_ = (c1 - c0) * ch_;
     // lanes past the end of a row are computed and never read
     pitch_ = std::max(span_, own_) + 2 * kSsimRadius * ch_ + 2 * kLanes;
-    arena_.assign(static_cast<size_t>(pitch_ * kArenaRows), T(0));
-    T* next = arena_.data();
+    const int64_t rings = (4 + (gradient ? 3 : 0)) * kSsimWindow;
+    arena_.reset(new T[static_cast<size_t>(pitch_ * (kLines + rings))]);
+    std::fill_n(arena_.get(), pitch_ * kLines, T(0));  // the rings are written before they are read
+    T* next = arena_.get();
     const auto take = [&](int64_t rows) { return std::exchange(next, next + rows * pitch_); };
     m_ = take(1);
     d_ = take(1);
@@ -69,7 +71,7 @@ class Tile {
 
  private:
   static constexpr int kLanes = Pack<T>::kLanes;
-  static constexpr int64_t kArenaRows = 9 + 7 * kSsimWindow;
+  static constexpr int64_t kLines = 9;  // single rows in the arena
 
   static int64_t slot(int64_t row) { return (row + kSsimWindow) % kSsimWindow; }
 
@@ -110,6 +112,7 @@ class Tile {
   void blur_row(T* out) const {
     for (int64_t i = 0; i < span_; i += kLanes) {
       Pack<T> m(0), d(0), mm(0), dd(0);
+#pragma GCC unroll 11
       for (int k = 0; k < kSsimWindow; ++k) {
         const Pack<T> tap(ssim_tap<T>(k));
         const Pack<T> a = load_pack(m_ + i + k * ch_), b = load_pack(d_ + i + k * ch_);
@@ -130,6 +133,7 @@ class Tile {
   template <int kPlanes>
   void down(const T* const* rows, int64_t i, Pack<T>* out) const {
     for (int q = 0; q < kPlanes; ++q) out[q] = Pack<T>(0);
+#pragma GCC unroll 11
     for (int k = 0; k < kSsimWindow; ++k) {
       const Pack<T> tap(ssim_tap<T>(k));
       for (int q = 0; q < kPlanes; ++q) out[q] += tap * load_pack(rows[k] + q * pitch_ + i);
@@ -180,6 +184,7 @@ class Tile {
     for (int64_t i = 0; i < own_; i += kLanes)
       for (int q = 0; q < 3; ++q) {
         Pack<T> total(0);
+#pragma GCC unroll 11
         for (int k = 0; k < kSsimWindow; ++k)
           total += Pack<T>(ssim_tap<T>(k)) * load_pack(slopes_ + q * pitch_ + i + k * ch_);
         store_pack(out + q * pitch_ + i, total);
@@ -269,7 +274,7 @@ class Tile {
   RowSums* sums_;
   int64_t top_, bottom_, left_, right_;  // of the map that the tile reads, in pixels of the image
   int64_t span_, own_, pitch_;           // values of a map row, of a row of the tile, of a buffer
-  std::vector<T> arena_;
+  std::unique_ptr<T[]> arena_;
   T *m_, *d_, *value_, *valid_, *shift_, *miss_, *slopes_, *moments_;
   T* spread_ = nullptr;
 };

@@ -66,16 +66,24 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
     const T covered = min(alpha[p], T(1));
     if (inside) a.alpha[pixel] = covered;
     if (inside && a.median) a.median[pixel] = median[p];
-    // Constant indices keep `sum` in registers.
+    // Constant indices keep `sum` in registers. Colours alone are the common case.
+    const auto color = [&](int f) {
+      return sum[p][f] + (background ? fabs(walk[p].left) * background[f] : T(0));
+    };
+    if (a.features == kF && a.channels == kF) {
 #pragma unroll
-    for (int f = 0; f < kF; ++f) {
-      if (inside && f < a.channels)
-        a.image[pixel * a.channels + f] =
-            sum[p][f] + (background ? fabs(walk[p].left) * background[f] : T(0));
-      else if (inside && a.has_normals && f < a.channels + 3)
-        a.normal[3 * pixel + f - a.channels] = sum[p][f];
-      else if (inside && a.has_depth && f == a.features - 1)
-        a.depth[pixel] = covered > T(0) ? sum[p][f] / covered : T(0);
+      for (int f = 0; f < kF; ++f)
+        if (inside) a.image[pixel * kF + f] = color(f);
+    } else {
+#pragma unroll
+      for (int f = 0; f < kF; ++f) {
+        if (inside && f < a.channels)
+          a.image[pixel * a.channels + f] = color(f);
+        else if (inside && a.has_normals && f < a.channels + 3)
+          a.normal[3 * pixel + f - a.channels] = sum[p][f];
+        else if (inside && a.has_depth && f == a.features - 1)
+          a.depth[pixel] = covered > T(0) ? sum[p][f] / covered : T(0);
+      }
     }
   }
 }

@@ -17,7 +17,7 @@ __device__ __forceinline__ bool seen_by(const RasterArgs<T>& a, int camera, int6
 // Gradient of the coefficients. What the colours say of the mean, through the view direction, is
 // left in the first camera's words of the colours, for the kernel below.
 template <typename T, int kDegree>
-__global__ void __launch_bounds__(kRowThreads, 5)
+__global__ void __launch_bounds__(kRowThreads, 4)
     color_backward_kernel(RasterGradArgs<T> b, SplatSums<T> sums) {
   const RasterArgs<T>& a = b.forward;
   const int64_t i = int64_t(blockIdx.x) * kRowThreads + threadIdx.x;
@@ -25,14 +25,15 @@ __global__ void __launch_bounds__(kRowThreads, 5)
   bool seen = false;
   for (int camera = 0; real && camera < a.cameras; ++camera) seen = seen || seen_by(a, camera, i);
   const int degree = kDegree > 0 ? kDegree : a.sh_degree, k = sh_coefficients(degree);
+  // Coefficients, then their gradient, of one Gaussian: in registers, or where they stand.
   const T* sh = a.sh + 3 * k * i;
   T* out = b.grad_sh + 3 * k * i;
-  T* shared = nullptr;
+  using Rows = std::conditional_t<(kDegree > 0), SharedRows<T, kDegree>, char>;
+  __shared__ Rows rows;
+  alignas(16) T row[RowLayout<T, kDegree>::kSize];
   if constexpr (kDegree > 0) {
-    __shared__ T rows[kRowThreads * row_stride(kDegree)];
-    shared = rows;
-    out = load_rows<T, kDegree>(a.sh, i, seen, rows);
-    sh = out;
+    rows.load(a.sh, i, seen, row);
+    sh = out = row;
   }
   Vec3<T> to_mean{T(0), T(0), T(0)};
   T basis[kMaxShCoefficients], rgb[3] = {T(0), T(0), T(0)};
@@ -65,7 +66,7 @@ __global__ void __launch_bounds__(kRowThreads, 5)
   }
   if (real)
     for (int c = 0; c < 3; ++c) *word(0, c) = to_mean[c];
-  if constexpr (kDegree > 0) store_rows<T, kDegree>(b.grad_sh, i, real, shared);
+  if constexpr (kDegree > 0) rows.store(b.grad_sh, i, real, row);
 }
 
 template <typename T>
@@ -121,7 +122,10 @@ cudaError_t raster_gaussian_backward(const RasterGradArgs<T>& b, const SplatSums
   const RasterArgs<T>& a = b.forward;
   const auto blocks = static_cast<unsigned>((a.count + kRowThreads - 1) / kRowThreads);
   if (a.sh) {
-    const cudaError_t error = with_degree<T>(a, [&]<int kDegree>() {
+    // Both must be aligned for wide words.
+    const bool aligned = reinterpret_cast<uintptr_t>(b.grad_sh) % sizeof(float4) == 0;
+    const T* aligned_sh = aligned ? a.sh : b.grad_sh;
+    const cudaError_t error = with_degree<T>(aligned_sh, a.sh_degree, [&]<int kDegree>() {
       color_backward_kernel<T, kDegree><<<blocks, kRowThreads, 0, stream>>>(b, sums);
       return cudaGetLastError();
     });

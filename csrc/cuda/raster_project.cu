@@ -14,14 +14,14 @@ __global__ void __launch_bounds__(kRowThreads) project_kernel(RasterArgs<T> a, R
   const SplatCamera<T> camera = raster_camera(a, blockIdx.y);
   Splat<T> s{};
   bool seen = i < a.count && project_geometry(a, camera, i, m, &s);
-  const T* sh = a.sh;
+  const T* sh = a.sh ? a.sh + 3 * sh_coefficients(a.sh_degree) * i : nullptr;
   int degree = a.sh_degree;
   if constexpr (kDegree > 0) {
-    __shared__ T rows[kRowThreads * row_stride(kDegree)];
+    __shared__ SharedRows<T, kDegree> rows;
+    alignas(16) T row[RowLayout<T, kDegree>::kSize];
+    rows.load(a.sh, i, seen, row);
     degree = kDegree;
-    sh = load_rows<T, kDegree>(a.sh, i, seen, rows);
-  } else if (sh) {
-    sh += 3 * sh_coefficients(degree) * i;
+    sh = row;
   }
   if (seen)
     seen =
@@ -80,7 +80,7 @@ cudaError_t raster_project(const RasterArgs<T>& a, const RasterOrder& o, ReadBac
   cudaError_t error = cudaMemsetAsync(o.total, 0, sizeof *o.total, stream);
   if (error != cudaSuccess) return error;
   if (a.count > 0) {
-    error = with_degree<T>(a, [&]<int kDegree>() {
+    error = with_degree<T>(a.sh, a.sh_degree, [&]<int kDegree>() {
       const dim3 blocks(static_cast<unsigned>((a.count + kRowThreads - 1) / kRowThreads),
                         static_cast<unsigned>(a.cameras));
       project_kernel<T, kDegree><<<blocks, kRowThreads, 0, stream>>>(a, o);

@@ -47,7 +47,8 @@ def adam_step(
         betas: Decay of the moments, each in [0, 1).
         eps: Added to the root of the second moment, at least 0.
         visible: Rows that take part: bool, or int32 of which positive ones do (``radii`` of
-            :func:`rasterize`), shape [N] with N the rows of every tensor; all when None.
+            :func:`rasterize`; their largest over several cameras), shape [N] with N the rows of
+            every tensor; all when None.
 
     Raises:
         TypeError: Not tensors, or a wrong dtype.

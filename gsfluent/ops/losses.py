@@ -47,7 +47,7 @@ def ssim(
         image: Shape [H, W, C] with 1 to 32 channels, float32 or float64.
         target: Same shape and dtype.
         padding: "valid" takes the pixels whose window lies inside the image (Wang et al.); "same"
-            takes all, with zeros around both images (the training loss of gsplat and INRIA).
+            takes all, with zeros around both images (Kerbl et al.'s training loss).
         reduction: "mean" or "none".
 
     Returns:
@@ -265,6 +265,9 @@ def _loss_gradient(ctx: Any, grad: Tensor | None, *_: Any) -> tuple[Tensor | Non
     none = (None,) * 13
     if grad is None:
         return none
+    if torch.is_grad_enabled() and grad.requires_grad:
+        # the saved gradient does not know that it depends on the image
+        raise NotImplementedError("photometric_loss: differentiable once, not twice")
     if not ctx.computed:
         raise RuntimeError("photometric_loss: called without `gradient`, so there is none")
     of_image, _, _, of_alpha = ctx.needs_input_grad[:4]

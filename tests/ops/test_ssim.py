@@ -211,7 +211,7 @@ def test_no_gradient_is_computed_where_none_is_wanted() -> None:
         assert torch.equal(ops.photometric_loss(leaf, y).loss, out.loss)
 
 
-def test_second_derivatives_of_the_map_are_refused() -> None:
+def test_second_derivatives_are_refused_and_never_left_out() -> None:
     x, y = pair(12, 12, 1, torch.float64)
     x.requires_grad_()
     weight = torch.rand(2, 2, 1, dtype=torch.float64, requires_grad=True)
@@ -219,6 +219,10 @@ def test_second_derivatives_of_the_map_are_refused() -> None:
     (slope,) = torch.autograd.grad(value, x, create_graph=True)
     with pytest.raises(NotImplementedError, match="once"):
         slope.sum().backward()
+    with pytest.raises(NotImplementedError, match="once"):
+        torch.autograd.grad(ops.photometric_loss(x, y).loss.square(), x, create_graph=True)
+    (slope,) = torch.autograd.grad(ops.ssim(x, y), x, create_graph=True)
+    assert not slope.requires_grad
 
 
 def test_registration() -> None:
@@ -237,6 +241,10 @@ def test_registration() -> None:
     compiled = torch.compile(ops.photometric_loss, fullgraph=True, backend="aot_eager")
     for got, want in zip(compiled(x, y), ops.photometric_loss(x, y), strict=True):
         assert torch.equal(got, want)
+    leaf = x.detach().clone().requires_grad_()
+    compiled(leaf, y).loss.square().backward()
+    (want,) = torch.autograd.grad(ops.photometric_loss(leaf, y).loss.square(), leaf)
+    assert leaf.grad is not None and torch.equal(leaf.grad, want)
 
 
 def test_errors_name_the_argument() -> None:
