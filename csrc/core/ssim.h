@@ -113,22 +113,24 @@ GSF_HOST_DEVICE T ssim_excess(const SsimArgs<T>& a, int64_t p) {
   return (a.valid == nullptr ? a.alpha[p] : a.valid[p] * a.alpha[p]) - a.mask[p];
 }
 
-// x - y - excess backdrop of channel c of pixel p.
+// x - y - excess backdrop of channel c.
 template <typename T>
-GSF_HOST_DEVICE T ssim_miss(const SsimArgs<T>& a, int64_t p, int64_t c, T excess) {
-  const int64_t i = p * a.channels + c;
-  const T x = a.valid == nullptr ? a.image[i] : a.valid[p] * a.image[i];
-  return x - a.target[i] - (a.backdrop == nullptr ? T(0) : excess * a.backdrop[c]);
+GSF_HOST_DEVICE T ssim_miss(const SsimArgs<T>& a, int64_t c, T x, T y, T excess) {
+  return a.backdrop == nullptr ? x - y : x - y - excess * a.backdrop[c];
 }
 
 // d loss / d alpha of pixel p.
 template <typename T>
 GSF_HOST_DEVICE T ssim_alpha_slope(const SsimArgs<T>& a, int64_t p, T excess) {
+  const T valid = a.valid == nullptr ? T(1) : a.valid[p];
   T slope = a.excess_slope * sign_of(excess);
   if (a.backdrop != nullptr)
-    for (int64_t c = 0; c < a.channels; ++c)
-      slope -= a.miss_slope * a.backdrop[c] * sign_of(ssim_miss(a, p, c, excess));
-  return a.valid == nullptr ? slope : a.valid[p] * slope;
+    for (int64_t c = 0; c < a.channels; ++c) {
+      const int64_t i = p * a.channels + c;
+      const T miss = ssim_miss(a, c, valid * a.image[i], a.target[i], excess);
+      slope -= a.miss_slope * a.backdrop[c] * sign_of(miss);
+    }
+  return valid * slope;
 }
 
 // Loss and the four means it is made of.

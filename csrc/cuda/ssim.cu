@@ -50,14 +50,13 @@ __device__ void store_sums(const double (&mine)[kSums], double* out) {
   }
 }
 
-// x (times valid) and y of a value of the image.
+// x (times valid) and y: value `at` of the image, of pixel `pixel`.
 template <typename T>
-__device__ __forceinline__ void load_pair(const SsimArgs<T>& a, int64_t row, int column, int pixel,
-                                          T& x, T& y) {
-  const int64_t i = row * a.width * a.channels + column;
-  x = a.image[i];
-  y = a.target[i];
-  if (a.valid != nullptr) x *= a.valid[row * a.width + pixel];
+__device__ __forceinline__ void load_pair(const SsimArgs<T>& a, int64_t at, int64_t pixel, T& x,
+                                          T& y) {
+  x = a.image[at];
+  y = a.target[at];
+  if (a.valid != nullptr) x *= a.valid[pixel];
 }
 
 // The map, its sum per CTA, its slopes. kC: channels, 0 when only known at run time.
@@ -70,31 +69,35 @@ __global__ __launch_bounds__(kColumns, kCtasPerSm<T>) void moments_kernel(SsimAr
   const int pitch = kColumns + kTaps * channels;
   const int row_values = int(a.width) * channels;
   const int inset = int(a.inset);
-  const int map_height = int(a.height) - 2 * inset;
+  const int height = int(a.height), map_height = height - 2 * inset;
   const int map_values = row_values - 2 * inset * channels;
   const int column = blockIdx.x * kColumns + threadIdx.x;  // of the map
   const int first = blockIdx.y * rows, last = min(first + rows, map_height);
   // value of the image row behind place 0 in shared memory
   const int origin = blockIdx.x * kColumns + (inset - kSsimRadius) * channels;
 
+  const int begin = first + inset - kSsimRadius, end = last + inset + kSsimRadius;
   T next_m[kLoads<kC>], next_d[kLoads<kC>];
+  int64_t next_at = int64_t(begin) * row_values + origin + threadIdx.x;
   const auto fetch = [&](int row) {
 #pragma unroll
     for (int n = 0; n < kLoads<kC>; ++n) {
       const int place = threadIdx.x + n * kColumns, i = origin + place;
       next_m[n] = T(kSsimOutside);
       next_d[n] = T(0);
-      if (place >= pitch || row < 0 || row >= a.height || i < 0 || i >= row_values) continue;
+      if (place >= pitch || i < 0 || i >= row_values || row < 0 || row >= height) continue;
       T x, y;
-      load_pair(a, row, i, i / channels, x, y);
+      load_pair(a, next_at + n * kColumns, row * a.width + i / channels, x, y);
       next_m[n] = T(0.5) * (x + y) + T(kSsimOutside);
       next_d[n] = x - y;
     }
+    next_at += row_values;
   };
 
   T run_m[kTaps] = {}, run_d[kTaps] = {}, run_mm[kTaps] = {}, run_dd[kTaps] = {};
   double total[1] = {0};
-  const int begin = first + inset - kSsimRadius, end = last + inset + kSsimRadius;
+  int64_t at = int64_t(first) * map_values + column;  // of the map
+  const int64_t plane = int64_t(map_height) * map_values;
   fetch(begin);
   for (int row = begin; row < end; ++row) {
     // two buffers: whoever writes one again has met all others at the barrier in between
@@ -124,32 +127,33 @@ __global__ __launch_bounds__(kColumns, kCtasPerSm<T>) void moments_kernel(SsimAr
     if (i < first || column >= map_values) continue;
     SsimSlopes<T> s;
     const T value = ssim_value(w, s);
-    const int64_t at = int64_t(i) * map_values + column;
     total[0] += double(value);
     if (a.map != nullptr) a.map[at] = value;
-    if (slopes == nullptr) continue;
-    const T g = a.map_slope != nullptr ? a.map_slope[at] : a.similarity_slope;
-    const int64_t plane = int64_t(map_height) * map_values;
-    slopes[at] = g * s.linear;
-    slopes[plane + at] = g * s.square_m;
-    slopes[2 * plane + at] = g * s.square_d;
+    if (slopes != nullptr) {
+      const T g = a.map_slope != nullptr ? a.map_slope[at] : a.similarity_slope;
+      slopes[at] = g * s.linear;
+      slopes[plane + at] = g * s.square_m;
+      slopes[2 * plane + at] = g * s.square_d;
+    }
+    at += map_values;
   }
   if (sums != nullptr) store_sums(total, sums + int64_t(blockIdx.y) * gridDim.x + blockIdx.x);
 }
 
-// |miss|, miss^2, |excess| of one value into `total`; adds the slope of |miss| to `gradient`, and
-// writes that of alpha.
+// |miss|, miss^2, |excess| of one value, channel c of pixel p, into `total`; writes the slope of
+// alpha. Returns the slope of |miss|.
 template <typename T>
-__device__ __forceinline__ void add_pixel(const SsimArgs<T>& a, int64_t p, int c, T& gradient,
-                                          double (&total)[kSsimSums - 1]) {
+__device__ __forceinline__ T add_pixel(const SsimArgs<T>& a, int64_t p, int c, T x, T y,
+                                       double (&total)[kSsimSums - 1]) {
   const T excess = ssim_excess(a, p);
-  const T miss = ssim_miss(a, p, c, excess);
-  gradient += a.miss_slope * sign_of(miss);
+  const T miss = ssim_miss(a, c, x, y, excess);
   total[0] += double(miss < T(0) ? -miss : miss);
   total[1] += double(miss) * double(miss);
-  if (c != 0 || a.alpha == nullptr) return;
-  total[2] += double(excess < T(0) ? -excess : excess);
-  if (a.grad_alpha != nullptr) a.grad_alpha[p] = ssim_alpha_slope(a, p, excess);
+  if (c == 0 && a.alpha != nullptr) {
+    total[2] += double(excess < T(0) ? -excess : excess);
+    if (a.grad_alpha != nullptr) a.grad_alpha[p] = ssim_alpha_slope(a, p, excess);
+  }
+  return a.miss_slope * sign_of(miss);
 }
 
 // Gradient of the image from the slopes of the map, and the sums over pixels.
@@ -163,29 +167,33 @@ __global__ __launch_bounds__(kColumns, kCtasPerSm<T>) void gradient_kernel(SsimA
   const int pitch = kColumns + kTaps * channels;
   const int row_values = int(a.width) * channels;
   const int inset = int(a.inset);
-  const int map_height = int(a.height) - 2 * inset;
+  const int height = int(a.height), map_height = height - 2 * inset;
   const int map_values = row_values - 2 * inset * channels;
   const int64_t plane = int64_t(map_height) * map_values;
   const int column = blockIdx.x * kColumns + threadIdx.x;  // of the image
   const int pixel = column / channels, channel = column % channels;
-  const int first = blockIdx.y * rows, last = min(first + rows, int(a.height));
+  const int first = blockIdx.y * rows, last = min(first + rows, height);
   const int origin = blockIdx.x * kColumns - (inset + kSsimRadius) * channels;
 
+  const int begin = first - inset - kSsimRadius, end = last - inset + kSsimRadius;
   T next[3][kLoads<kC>];
+  int64_t next_at = int64_t(begin) * map_values + origin + threadIdx.x;
   const auto fetch = [&](int row) {  // of the map; zeros outside
 #pragma unroll
     for (int n = 0; n < kLoads<kC>; ++n) {
       const int place = threadIdx.x + n * kColumns, i = origin + place;
-      const bool there = place < pitch && row >= 0 && row < map_height && i >= 0 && i < map_values;
-      const int64_t at = int64_t(row) * map_values + i;
+      const bool there = place < pitch && i >= 0 && i < map_values && row >= 0 && row < map_height;
+      const T* const from = slopes + next_at + n * kColumns;
 #pragma unroll
-      for (int q = 0; q < 3; ++q) next[q][n] = there ? slopes[q * plane + at] : T(0);
+      for (int q = 0; q < 3; ++q) next[q][n] = there ? from[q * plane] : T(0);
     }
+    next_at += map_values;
   };
 
   T running[3][kTaps] = {};
   double total[kSsimSums - 1] = {};
-  const int begin = first - inset - kSsimRadius, end = last - inset + kSsimRadius;
+  int64_t at = int64_t(first) * row_values + column;  // of the image
+  int64_t p = int64_t(first) * a.width + pixel;
   fetch(begin);
   for (int row = begin; row < end; ++row) {
     T* const buffer = shared + ((row - begin) % 2) * 3 * pitch;
@@ -201,7 +209,7 @@ __global__ __launch_bounds__(kColumns, kCtasPerSm<T>) void gradient_kernel(SsimA
     const int r = row + inset - kSsimRadius;  // row of the gradient that is complete
     const bool mine = r >= first && column < row_values;
     T x = T(0), y = T(0);
-    if (mine) load_pair(a, r, column, pixel, x, y);
+    if (mine) load_pair(a, at, p, x, y);
     T w[3];
 #pragma unroll
     for (int q = 0; q < 3; ++q) {
@@ -212,10 +220,11 @@ __global__ __launch_bounds__(kColumns, kCtasPerSm<T>) void gradient_kernel(SsimA
       w[q] = push(running[q], across);
     }
     if (!mine) continue;
-    const int64_t p = int64_t(r) * a.width + pixel;
     T gradient = w[0] + (T(0.5) * (x + y) + T(kSsimOutside)) * w[1] + (x - y) * w[2];
-    if (a.pixels) add_pixel(a, p, channel, gradient, total);
-    a.grad_image[p * channels + channel] = a.valid == nullptr ? gradient : a.valid[p] * gradient;
+    if (a.pixels) gradient += add_pixel(a, p, channel, x, y, total);
+    a.grad_image[at] = a.valid == nullptr ? gradient : a.valid[p] * gradient;
+    at += row_values;
+    p += a.width;
   }
   if (sums != nullptr)
     store_sums(total, sums + (kSsimSums - 1) * (int64_t(blockIdx.y) * gridDim.x + blockIdx.x));
@@ -230,8 +239,10 @@ __global__ __launch_bounds__(kColumns) void pixels_kernel(SsimArgs<T> a, int row
   double total[kSsimSums - 1] = {};
   if (column < a.width * channels)
     for (int r = first; r < last; ++r) {
-      T unused = T(0);
-      add_pixel(a, int64_t(r) * a.width + column / channels, column % channels, unused, total);
+      const int64_t p = int64_t(r) * a.width + column / channels;
+      T x, y;
+      load_pair(a, p * channels + column % channels, p, x, y);
+      add_pixel(a, p, column % channels, x, y, total);
     }
   store_sums(total, sums + (kSsimSums - 1) * (int64_t(blockIdx.y) * gridDim.x + blockIdx.x));
 }

@@ -313,6 +313,11 @@ class OutputSettings:
         doc="orbit, the number of a photograph (0 is the first), or a JSON file with a path.",
         example="orbit",
     )  # fmt: skip
+    backdrop: str = key(
+        choice("studio", "captured"), default="studio",
+        doc="What stands behind: the studio, or the surroundings that the capture shows.",
+        example="captured",
+    )  # fmt: skip
     what: tuple[str, ...] = key(
         several(choice("mp4", "ply-seq", "vtk", later=("usd", "png-seq", "spz", "gltf"))),
         default=("mp4",),

@@ -85,8 +85,9 @@ class Shot:
         example="-y",
     )  # fmt: skip
     floor: str | float = key(
-        either(choice("auto", "none"), number()), default="auto",
-        doc="Floor: auto, none, or its height along up: input coordinate times scale [m].",
+        either(choice("auto", "none", "plane"), number()), default="auto",
+        doc="Floor: auto (below the object), plane (what it stood on in the capture), none, or its "
+        "height along up: input coordinate times scale [m].",
         example="auto",
     )  # fmt: skip
     floor_mode: str = key(
@@ -170,6 +171,10 @@ class Shot:
         if shot.splats is not None and shot.reconstruct != ReconstructSettings():
             raise InputError(
                 "reconstruct: does nothing when splats are given", "remove the section"
+            )
+        if shot.floor == "plane" and shot.capture is None:
+            raise InputError(
+                "floor: plane is found in a capture, got splats", "use auto, or its height"
             )
         if not shot.objects:
             shot = dataclasses.replace(shot, objects={"object": ObjectSettings("object")})

@@ -103,7 +103,7 @@ def make_frame(
     """Return the transform from world coordinates to scene metres.
 
     The scene has +z up. The object's centre stands on the z axis; its lowest point lies at z = 0,
-    unless the shot gives a floor height, which then becomes z = 0.
+    unless the shot gives a floor height, or asks for the support plane, which then becomes z = 0.
 
     Args:
         gaussians: The object's splats (background removed), world coordinates.
@@ -111,7 +111,7 @@ def make_frame(
         shot: Settings ``up``, ``floor``, ``scale`` and ``size``; automatic without.
 
     Raises:
-        InputError: No splats, or all in one point.
+        InputError: No splats, or all in one point; or no support plane where one is asked for.
     """
     gaussians.validated("make_frame")
     stance = orient(gaussians, capture, "auto" if shot is None else shot.up)
@@ -132,6 +132,13 @@ def make_frame(
     ground = low[2]
     if shot is not None and not isinstance(shot.floor, str):
         ground = shot.floor / scale
+    elif shot is not None and shot.floor == "plane":
+        if stance.floor_from != "support plane":
+            raise InputError(
+                "floor: plane: the capture shows no plane that the object stands on",
+                "use floor: auto, or give its height",
+            )
+        ground = stance.floor
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, ground])
     return Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
 

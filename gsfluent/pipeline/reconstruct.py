@@ -19,18 +19,16 @@ import torch
 from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.isolate import Isolate
+from gsfluent.pipeline.isolate_views import agreed_hull, object_views, seen_background
 from gsfluent.pipeline.reconstruct_checkpoint import Checkpoint
 from gsfluent.pipeline.reconstruct_density import draws
 from gsfluent.pipeline.reconstruct_evaluate import HOLD_OUT, evaluate
 from gsfluent.pipeline.reconstruct_init import (
     Hull,
-    contradiction,
     hull_gaussians,
     joined_start,
     point_gaussians,
-    visual_hull,
 )
-from gsfluent.pipeline.reconstruct_masks import masked_views
 from gsfluent.pipeline.reconstruct_model import SplatModel
 from gsfluent.pipeline.reconstruct_recipe import recipe_for
 from gsfluent.pipeline.reconstruct_train import Trainer, TrainSettings, decibels
@@ -40,9 +38,6 @@ from gsfluent.pipeline.stage import Progress, Stage, report_progress
 
 _log = logging.getLogger(__name__)
 
-_MANY = 24  # views that carry a hull even when some silhouettes are distrusted
-_FORGIVEN = 0.1  # share of many silhouettes that may be wrong about a voxel
-_CONTRADICTION = 0.02  # of the hull denied by a silhouette before it is distrusted
 _SCENE_SHARE = 0.6  # of the steps for everything, before the object gets the rest
 _FAINT = 0.02  # opacity below which a trained Gaussian is dropped
 _HULL_START = 100_000  # Gaussians on a hull of 96 voxels a side; more would fall on each other
@@ -55,7 +50,8 @@ class Reconstruct(Stage):
         iterations: Training steps, one photograph each.
         max_gaussians: Hard cap on the count, and the budget of MCMC; the recipe's when None.
         kernel: "anisotropic" (ellipsoids) or "isotropic" (spheres; costs about 4 dB).
-        scale_regularization: Strength of the pull towards small, not needle-shaped Gaussians.
+        scale_regularization: Strength of the pull towards small, not needle-shaped Gaussians; when
+            None 1 for an object, and 0 for a whole scene, whose plain walls need large ones.
         image_size: Longer side of the photographs in training [px]; the recipe's when None.
         sh_degree: Bands of view-dependent colour, 0 to 3. 0 (matte) relights best.
         start_gaussians: Gaussians to start with; the recipe's when None.
@@ -89,7 +85,7 @@ class Reconstruct(Stage):
         iterations: int = 800,
         max_gaussians: int | None = None,
         kernel: str = "anisotropic",
-        scale_regularization: float = 1.0,
+        scale_regularization: float | None = None,
         image_size: int | None = None,
         *,
         sh_degree: int = 0,
@@ -133,7 +129,7 @@ class Reconstruct(Stage):
         self.iterations = int(iterations)
         self.max_gaussians = int(max_gaussians or self.recipe.max_gaussians)
         self.kernel, self.densify = kernel, densify
-        self.scale_regularization = float(scale_regularization)
+        self.scale_regularization = scale_regularization
         self.image_size = int(image_size or self.recipe.image_size)
         self.sh_degree = int(sh_degree)
         start = self.recipe.start_gaussians if start_gaussians is None else int(start_gaussians)
@@ -267,14 +263,14 @@ class _Run:
         except InputError as error:
             _log.warning("the object was not told from its background: %s", error.what)
             return scene
-        masked = masked_views(views, found, rest)
+        masked, _ = object_views(views, found, rest)
         if len(masked) < max(3, len(views) // 2):
             _log.warning(
                 "the object shows in %d of %d views; not separated", len(masked), len(views)
             )
             return scene
-        masked = _agreeing(masked)
         found = self.object_of(masked, steps, stage.iterations - steps, scene, found)
+        rest, _ = seen_background(found, rest, views)
         return Gaussians.cat([_labelled(found, SURFACE), _labelled(rest, BACKGROUND)])
 
     def object_of(
@@ -295,7 +291,7 @@ class _Run:
             found: The object as the earlier phase has it.
         """
         stage = self.stage
-        hull = visual_hull(views)
+        hull = agreed_hull(views)
         count = min(stage.start_gaussians, _HULL_START)
         start = hull_gaussians(hull, views, count, stage.sh_degree, draws(stage.seed, 6, 0))
         if found is not None:
@@ -325,11 +321,14 @@ class _Run:
     ) -> Gaussians:
         stage = self.stage
         whole = 0.5 if hull is None else 1.0  # see Recipe.gradient_threshold
+        regularization = stage.scale_regularization
+        if regularization is None:
+            regularization = 0.0 if hull is None else 1.0
         settings = TrainSettings(
             stage.recipe,
             steps,
             stage.max_gaussians,
-            stage.scale_regularization,
+            regularization,
             stage.sh_degree,
             stage.gradient_threshold * whole,
             densify=stage.densify,
@@ -370,16 +369,6 @@ def _now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.monotonic()
-
-
-def _agreeing(views: list[TrainView]) -> list[TrainView]:
-    """Views whose found masks agree with the hull of most; a mask that misses a part spoils it."""
-    if len(views) < _MANY:
-        return views
-    hull = visual_hull(views, forgiven=_FORGIVEN)
-    agreeing = [view for view in views if contradiction(hull, view) < _CONTRADICTION]
-    _log.info("%d of %d silhouettes agree", len(agreeing), len(views))
-    return agreeing if len(agreeing) >= max(3, len(views) // 2) else views
 
 
 def _labelled(gaussians: Gaussians, label: int) -> Gaussians:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Gaussians
-from gsfluent.pipeline.reconstruct_views import TrainView, cropped
 
 _REACH = 0.018  # of the longer side: how far the border of a silhouette may be wrong
 _ROUNDS = 3
@@ -52,28 +49,13 @@ def silhouette(
     return result.image[..., 0]
 
 
-def masked_views(views: list[TrainView], found: Gaussians, rest: Gaussians) -> list[TrainView]:
-    """The photographs cut to the object; those that do not show it are left out.
-
-    The rendered silhouette says roughly where the object is; GrabCut (Rother et al. 2004) moves its
-    border to where the photograph's colours change.
-    """
-    result = []
-    for view in views:
-        width, height = view.size
-        share = silhouette(found, rest, view.viewmat, view.K, width, height)
-        mask = refined_mask(share.cpu(), view.color.cpu())
-        if mask is not None:
-            result.append(cropped(replace(view, mask=mask.to(view.color))))
-    return result
-
-
-def refined_mask(share: Tensor, image: Tensor) -> Tensor | None:
+def refined_mask(share: Tensor, image: Tensor, *, inner: float = 1.0) -> Tensor | None:
     """Mask of the object from a rough silhouette and the photograph.
 
     Args:
         share: Rough share of the object per pixel, [H, W].
         image: The photograph, [H, W, 3] in [0, 1].
+        inner: How much more the silhouette may be too large than too small.
 
     Returns:
         One closed body with soft edges, [H, W], or None when the silhouette is all but empty.
@@ -87,7 +69,7 @@ def refined_mask(share: Tensor, image: Tensor) -> Tensor | None:
     if int(body.sum()) < _SMALLEST_BODY:
         return None
     trimap = np.where(body, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    trimap[ndimage.binary_erosion(body, iterations=reach)] = cv2.GC_FGD
+    trimap[ndimage.binary_erosion(body, iterations=round(inner * reach))] = cv2.GC_FGD
     trimap[~ndimage.binary_dilation(values > 0.3, iterations=reach)] = cv2.GC_BGD
     known = np.isin(trimap, (cv2.GC_BGD, cv2.GC_PR_BGD))
     if bool(known.any()) and not bool(known.all()):

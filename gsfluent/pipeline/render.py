@@ -17,6 +17,7 @@ from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light import Light, ShadowMap, blinn_phong, to_display, to_linear
+from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_normals import estimate_normals
 from gsfluent.pipeline.stage import Stage
@@ -51,6 +52,7 @@ class Render(Stage):
         camera: Default camera; a call may bring its own.
         light: The light; None leaves the captured colours as they are.
         studio: Floor and backdrop; None composites over ``background``.
+        backdrop: Captured surroundings before the studio; None for none.
         background: Display colour behind the splats when there is no studio.
         antialiased: Antialiased splatting (opacity compensation for the pixel filter).
         normal_cell: Grid spacing [m] of the normal estimate; found anew for each picture when None
@@ -67,6 +69,7 @@ class Render(Stage):
         light: Light | None = None,
         *,
         studio: Studio | None = None,
+        backdrop: Backdrop | None = None,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         antialiased: bool = False,
         normal_cell: float | None = None,
@@ -76,6 +79,7 @@ class Render(Stage):
         self.camera = camera
         self.light = light
         self.studio = studio
+        self.backdrop = backdrop
         self.background = background
         self.antialiased = antialiased
         self.normal_cell = normal_cell
@@ -136,12 +140,21 @@ class Render(Stage):
                 albedo, normal, seen.alpha, seen.depth, eye, rays, viewmat, shadow, gaussians
             )
         if self.studio is not None:
-            behind = self.studio.shade(eye, rays, light or Light(shadow=False), shadow, gaussians)
-            background = to_display(behind)
+            lit = self.studio.shade(eye, rays, light or Light(shadow=False), shadow, gaussians)
+            background = to_display(lit)
         else:
             background = means.new_tensor(self.background).expand_as(radiance)
         # splats were fitted by blending display values, so blending stays in display values
-        image = (to_display(radiance) * alpha + background * (1.0 - alpha)).clamp(0.0, 1.0)
+        image = to_display(radiance) * alpha + background * (1.0 - alpha)
+        if self.backdrop is not None:
+            behind = self.backdrop.draw(camera, rays, light, shadow)
+            cover = behind.alpha[..., None]
+            background = behind.image + background * (1.0 - cover)
+            image = to_display(radiance) * alpha + background * (1.0 - alpha)
+            # what is nearer than the matter hides it
+            before = (cover > 0.5) & (behind.depth < seen.depth)[..., None] & (alpha > 0.0)
+            image = torch.where(before, behind.image + image * (1.0 - cover), image)
+        image = image.clamp(0.0, 1.0)
         return Layers(image, seen.alpha, seen.depth, normal)
 
     def _camera(self, camera: Camera | None) -> Camera:

@@ -10,10 +10,11 @@ from typing import Any
 import torch
 
 from gsfluent.data import Frame, Solid
+from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, write_json
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.isolate import Isolate
-from gsfluent.pipeline.orient import make_frame, orient
+from gsfluent.pipeline.orient import Orientation, make_frame, orient
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.reconstruct_report import write_report
 from gsfluent.pipeline.render_cuts import save_cut_views
@@ -61,6 +62,7 @@ def isolate_stage(context: RunContext) -> None:
     else:
         source = context.store.root / "reconstruct" / "model.ply"
     placing = {"scale": shot.scale, "size": shot.size, "up": shot.up, "floor": shot.floor}
+    captured = shot.output.backdrop == "captured"
     key = fingerprint("isolate", context.key(context.source_key, placing))
 
     def work(folder: Path) -> dict[str, Any]:
@@ -72,6 +74,11 @@ def isolate_stage(context: RunContext) -> None:
         whole.save(folder / "object.ply")
         if background.count:
             background.save(folder / "background.ply")
+        elif captured:
+            raise InputError(
+                "output.backdrop: captured: nothing but the object is there",
+                "masks and isolated splats have no background; use studio",
+            )
         write_json(folder / "frame.json", frame.to_dict())
         return dict(stage.report) | {
             "gaussians_kept": whole.count,
@@ -80,12 +87,26 @@ def isolate_stage(context: RunContext) -> None:
             "up_from": stance.up_from,
             "floor_from": stance.floor_from,
             "scale": frame.scale,
+            "support_plane": _support_plane(stance, frame),
         }
 
     result = context.store.run("isolate", key, work)
     context.frame = read_frame(result.folder)
     context.record.values["isolation"] = result.report
     context.source_key = result.fingerprint
+
+
+def _support_plane(stance: Orientation, frame: Frame) -> dict[str, Any] | None:
+    """What the object stood on, ``normal @ x = offset``, in world units and in the scene [m]."""
+    if stance.floor_from != "support plane":
+        return None
+    normal = torch.from_numpy(stance.up).double()
+    turned = frame.apply_vector(normal[None])[0].double()
+    foot = frame.apply((stance.floor * normal)[None])[0].double()
+    return {
+        "world": {"normal": normal.tolist(), "offset": stance.floor},
+        "scene": {"normal": turned.tolist(), "offset": float(foot @ turned)},
+    }
 
 
 def read_frame(folder: Path) -> Frame:

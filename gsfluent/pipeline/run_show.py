@@ -16,10 +16,11 @@ import torch
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import load_capture, save_image
+from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
 from gsfluent.pipeline.light import Light
 from gsfluent.pipeline.render import Render
+from gsfluent.pipeline.render_backdrop import Backdrop, covered_floor, object_radius
 from gsfluent.pipeline.render_camera import Action, cameras_for
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_holes import hole_fraction
@@ -92,7 +93,15 @@ class Film:
             capture=load_capture(shot.capture) if needs_capture and shot.capture else None,
             frame=read_frame(out / "stages" / "isolate") if needs_capture else None,
         )
-        render = Render(light=light, studio=studio, normal_cell=occupancy_cell(first.gaussians))
+        backdrop = None
+        if shot.output.backdrop == "captured":
+            backdrop = captured_backdrop(out / "stages" / "isolate", device)
+        render = Render(
+            light=light,
+            studio=studio,
+            backdrop=backdrop,
+            normal_cell=occupancy_cell(first.gaussians),
+        )
         return cls(folder, cameras, render, device)
 
     def __len__(self) -> int:
@@ -109,11 +118,30 @@ class Film:
         return self.render(frame.gaussians, camera, groups=frame.groups)
 
 
+def captured_backdrop(folder: Path, device: torch.device) -> Backdrop:
+    """The background that the isolate stage left, in the scene, with the object's place covered.
+
+    Raises:
+        InputError: It left none.
+    """
+    path = folder / "background.ply"
+    if not path.is_file():
+        raise InputError(
+            "output.backdrop: captured: nothing but the object is there",
+            "masks and isolated splats have no background; use studio",
+        )
+    frame = read_frame(folder)
+    whole = load(folder / "object.ply").transformed(frame).means
+    around = covered_floor(load(path).transformed(frame), whole, 0.0)
+    return Backdrop(around.to(device), object_radius(whole))
+
+
 def render_stage(context: RunContext) -> None:
     """``video.mp4`` and ``poster.png``, and how many holes the repair closed."""
     shot = context.shot
     light = light_of(shot)
     output = [list(shot.output.size), str(shot.output.camera), shot.output.fps]
+    output.append(shot.output.backdrop)
     path = shot.output.camera
     camera_key = content_digest(path) if isinstance(path, Path) else None
     key = fingerprint("render", context.key(context.source_key, repr(light), output, camera_key))

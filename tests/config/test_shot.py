@@ -178,7 +178,7 @@ def test_what_would_do_nothing_yet_is_refused(folder: Path, keys: dict[str, Any]
         ({"up": "+w"}, "up must be auto"),
         ({"up": [0, 0, 0]}, "up must not be zero"),
         ({"up": [0, 1]}, "up must be 3 numbers"),
-        ({"floor": "low"}, "floor must be one of auto, none, got 'low'"),
+        ({"floor": "low"}, "floor must be one of auto, none, plane, got 'low'"),
         ({"reconstruct": {"iterations": 100}}, "does nothing when splats are given"),
         ({"texture": {"method": "exemplar"}}, "texture.exemplar is missing"),
         ({"texture": {"method": "procedural"}}, "texture.preset is missing"),

@@ -1,0 +1,165 @@
+"""What stood behind the object when it was photographed, kept behind it while it breaks.
+
+The background splats keep their captured colours, take the shadows that the moving matter casts,
+and hide it where they are nearer. Where the object stood nobody saw the table: the hole is covered
+by flat splats in the colours around it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.data import BACKGROUND, Camera, Gaussians
+from gsfluent.pipeline.light import Light, ShadowMap, to_display, to_linear
+
+__all__ = ["Backdrop", "Behind", "covered_floor"]
+
+_NEAREST = 24  # splats that colour a covered spot
+_PATCH = 40  # spots along the diameter of the covered disc
+_ALPHA_FLOOR = 1e-4
+
+
+@dataclass(frozen=True)
+class Behind:
+    """The backdrop as one camera sees it.
+
+    Attributes:
+        image: Display values times opacity, [H, W, 3].
+        alpha: Opacity, [H, W].
+        depth: Expected camera z [m], 0 where there is none, [H, W].
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """Background splats in the scene frame.
+
+    Attributes:
+        gaussians: The splats, captured colours.
+        radius: Size of the object [m]; its shadow is a little soft on that scale.
+    """
+
+    gaussians: Gaussians
+    radius: float
+
+    @torch.no_grad()
+    def draw(
+        self, camera: Camera, rays: Tensor, light: Light | None, shadow: ShadowMap | None
+    ) -> Behind:
+        """Draw the backdrop.
+
+        Args:
+            camera: Pinhole camera.
+            rays: Unit rays of its pixels in the scene, [H, W, 3].
+            light: The light, for the strength of shadows; None draws none.
+            shadow: What the matter leaves of the light.
+        """
+        splats = self.gaussians
+        viewmat = camera.viewmat.to(splats.means)
+        seen = ops.rasterize(
+            splats.means,
+            splats.opacities,
+            viewmat,
+            camera.K.to(splats.means),
+            camera.width,
+            camera.height,
+            quats=splats.quats,
+            scales=splats.scales,
+            sh=splats.sh,
+            near=1e-3 * max(self.radius, 1e-6),
+        )
+        image, alpha = seen.image, seen.alpha
+        if light is None or shadow is None:
+            return Behind(image, alpha, seen.depth)
+        hit = alpha > 0.5
+        eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        along = seen.depth[hit] / (rays[hit] @ viewmat[2, :3])
+        points = eye + along[:, None] * rays[hit]
+        arrives = shadow.cast(points, softness=0.035 * self.radius)
+        # only what lies behind the matter, as the light sees it, is in its shadow
+        texel, depth = shadow.project(points)
+        size = shadow.alpha.shape[0]
+        index = texel.long().clamp(0, size - 1)
+        before = depth > shadow.depth[index[:, 1], index[:, 0]] + 0.02 * self.radius
+        arrives = torch.where(before, arrives, 1.0)
+        # the captured colour is that of an open place in this light
+        up = float(light.toward(points)[2].clamp(min=0.0))
+        share = (light.ambient + light.intensity * arrives * up) / max(
+            light.ambient + light.intensity * up, _ALPHA_FLOOR
+        )
+        cover = alpha[hit][:, None]
+        linear = to_linear(image[hit] / cover) * share[:, None]
+        image = image.clone()
+        image[hit] = to_display(linear) * cover
+        return Behind(image, alpha, seen.depth)
+
+
+def covered_floor(background: Gaussians, object_points: Tensor, height: float) -> Gaussians:
+    """Cover the hole that the object leaves in what it stood on.
+
+    Spots of a disc under the object that no background splat covers get a flat splat, coloured by
+    the nearest ones of the plane.
+
+    Args:
+        background: Background splats, scene frame.
+        object_points: Points of the object [N, 3].
+        height: z of the plane [m].
+
+    Returns:
+        The background with the added splats (``BACKGROUND``) at its end; unchanged when fewer than
+        two dozen splats lie on the plane near the object.
+    """
+    from scipy.spatial import cKDTree
+
+    points = object_points.double().cpu().numpy()
+    low, high = np.quantile(points[:, :2], [0.01, 0.99], axis=0)
+    middle, radius = 0.5 * (low + high), 0.75 * float(np.hypot(*(high - low)))
+    if not radius > 0:
+        return background
+    step = 2.0 * radius / _PATCH
+    means = background.means.double().cpu().numpy()
+    solid = (background.opacities > 0.2).cpu().numpy()
+    near = solid & (np.abs(means[:, 2] - height) < 2.0 * step)
+    near &= np.hypot(*(means[:, :2] - middle).T) < 3.0 * radius
+    if int(near.sum()) < _NEAREST:
+        return background
+    axis = (np.arange(_PATCH) + 0.5) * step - radius
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    grid = grid[np.hypot(*grid.T) < radius] + middle
+    tree = cKDTree(means[near][:, :2])
+    distance, index = tree.query(grid, k=_NEAREST)
+    size = background.scales.amax(1).double().cpu().numpy()[near]
+    open_spot = (distance > np.maximum(step, 1.5 * size[index])).all(axis=1)
+    if not open_spot.any():
+        return background
+    color = background.colors().double().cpu().numpy()[near][index[open_spot]]
+    weight = 1.0 / (distance[open_spot] + 0.25 * step) ** 2
+    weight /= weight.sum(1, keepdims=True)
+    mixed = np.einsum("nk,nkc->nc", weight, color)
+    count = int(open_spot.sum())
+    # half a splat below the plane, so that the object never sinks into the cover
+    place = np.column_stack([grid[open_spot], np.full(count, height - 0.1 * step)])
+    patch = Gaussians.from_colors(
+        torch.from_numpy(place).to(background.means),
+        torch.tensor([0.8 * step, 0.8 * step, 0.08 * step]).repeat(count, 1).to(background.means),
+        torch.from_numpy(mixed).to(background.means).clamp(0.0, 1.0),
+        opacities=0.95,
+        label=BACKGROUND,
+    )
+    return Gaussians.cat([background, patch])
+
+
+def object_radius(points: Tensor) -> float:
+    """Half the diagonal of the box of points [N, 3], less stray ones [m]."""
+    low, high = points.double().quantile(torch.tensor([0.01, 0.99]).to(points).double(), dim=0)
+    return 0.5 * math.sqrt(float((high - low).square().sum()))
