@@ -191,7 +191,7 @@ GSF_HOST_DEVICE void moments_to_gradient(const T* moment, T conic_a, T conic_b, 
 template <typename T>
 struct GaussianGradient {
   Vec3<T> mean{T(0), T(0), T(0)};
-  Mat3<T> covariance{};  // entries of the full symmetric matrix
+  Mat3<T> covariance{};  // as splat_backward gives it
   T opacity = T(0);
 };
 
@@ -204,21 +204,20 @@ GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera
   const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
   SplatFrame<T> frame;
   if (!splat_frame_point(cam, mean, &frame)) return;
-  Sym3<T> covariance;
+  SplatShape<T> shape{};
   if (a.covars) {
-    covariance = load_sym3(a.covars + 6 * i);
-    splat_frame_covariance(covariance, &frame);
+    shape.covariance = load_sym3(a.covars + 6 * i);
+    splat_frame_covariance(shape.covariance, &frame);
   } else {
-    Mat3<T> axes;
-    if (!rotation_from_quat(a.quats + 4 * i, &axes)) return;
-    splat_frame_axes(axes, a.scales + 3 * i, &frame);
-    covariance = splat_covariance(axes, a.scales + 3 * i);
+    if (!rotation_from_quat(a.quats + 4 * i, &shape.axes)) return;
+    shape.scales = a.scales + 3 * i;
+    splat_frame_axes(shape.axes, shape.scales, &frame);
   }
   const SplatGradient<T> pixel{g[0], g[1], g[2], g[3], g[4], g[5], depth};
   Mat3<T> grad_covariance;
   T grad_opacity;
-  const Vec3<T> grad_mean = splat_backward(cam, frame, covariance, a.opacities[i], a.antialiased,
-                                           pixel, &grad_covariance, &grad_opacity);
+  const Vec3<T> grad_mean = splat_backward(cam, frame, shape, a.opacities[i], a.antialiased, pixel,
+                                           &grad_covariance, &grad_opacity);
   T all = grad_mean.x + grad_mean.y + grad_mean.z + grad_opacity;
   for (int k = 0; k < 9; ++k) all += grad_covariance.m[k];
   if (!finite(all) && finite(g[0] + g[1] + g[2] + g[3] + g[4] + g[5] + depth)) return;

@@ -7,9 +7,10 @@
 
 namespace gsf {
 
-constexpr double kScreenBlur = 0.3;              // low-pass added to both variances [px^2]
-constexpr double kMinAlpha = 1.0 / 255.0;        // smaller contributions are skipped
-constexpr double kMaxAlpha = 0.99;               // cap; no gradient where it binds
+constexpr double kScreenBlur = 0.3;        // low-pass added to both variances [px^2]
+constexpr double kMinAlpha = 1.0 / 255.0;  // smaller contributions are skipped
+// Cap; no gradient where it binds. A float in double too: two capped splats end a pixel either way.
+constexpr double kMaxAlpha = 0.99f;
 constexpr double kMinTransmittance = 1e-4;       // a pixel stops before going below
 constexpr double kMaxPower = 0.5 * 3.33 * 3.33;  // support in half squared sigmas
 constexpr double kMinCompensation = 0.005;       // floor of the antialiasing factor
@@ -239,42 +240,89 @@ struct SplatGradient {
   T x, y, cov_a, cov_b, cov_c, opacity, depth;
 };
 
-// Adjoint of the projection. `covariance` is the world covariance (of either form). Returns the
-// gradient of the mean; writes the symmetric world-covariance gradient (full-matrix entries) and
-// the gradient of the raw opacity.
+// A Gaussian's shape to the adjoint: rotated axes with standard deviations, or (scales null) the
+// world covariance.
+template <typename T>
+struct SplatShape {
+  Mat3<T> axes;
+  const T* scales;
+  Sym3<T> covariance;
+};
+
+// Adjoint of the projection. Returns the gradient of the mean; writes the gradient of the raw
+// opacity and that of the covariance (entries of the full symmetric matrix): of the world's, or in
+// the frame of the axes. There the entries of a needle, which differ by the square of its
+// slenderness, do not mix.
 template <typename T>
 GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFrame<T>& f,
-                                       const Sym3<T>& covariance, T opacity, bool antialiased,
+                                       const SplatShape<T>& shape, T opacity, bool antialiased,
                                        const SplatGradient<T>& g, Mat3<T>* grad_covariance,
                                        T* grad_opacity) {
-  const T inverse = T(1) / f.det;
-  T da = g.cov_a, db = g.cov_b, dc = g.cov_c;
+  T da = g.cov_a, db = g.cov_b, dc = g.cov_c, d_det0 = T(0);
   *grad_opacity = g.opacity;
   if (antialiased) {
-    const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur);
+    const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur), inverse = T(1) / f.det;
     const T compensation = splat_compensation(f);
     *grad_opacity = g.opacity * compensation;
     const T ratio = f.det0 * inverse;
     if (ratio > T(kMinCompensation) * T(kMinCompensation)) {
-      const T gr = g.opacity * opacity * T(0.5) / compensation * inverse;
-      da += gr * (f.cov_c - ratio * c);
-      dc += gr * (f.cov_a - ratio * a);
-      db += gr * (ratio - T(1)) * f.cov_b;
+      d_det0 = g.opacity * opacity * T(0.5) / compensation * inverse;
+      da -= d_det0 * ratio * c;
+      dc -= d_det0 * ratio * a;
+      db += d_det0 * ratio * f.cov_b;
+      if (!shape.scales) {
+        da += d_det0 * f.cov_c;
+        dc += d_det0 * f.cov_a;
+        db -= d_det0 * f.cov_b;
+      }
     }
   }
-  const Mat3<T> sigma = to_mat3(covariance);
-  const Vec3<T>&mx = f.row_x, &my = f.row_y;
+  // The map to the screen, and the covariance times it, in the frame of the shape.
+  Vec3<T> mx = f.row_x, my = f.row_y, sx, sy, square{T(0), T(0), T(0)};
+  if (shape.scales) {
+    const Mat3<T> turned = transpose(shape.axes);
+    mx = matvec(turned, mx);
+    my = matvec(turned, my);
+    for (int k = 0; k < 3; ++k) {
+      square[k] = shape.scales[k] * shape.scales[k];
+      sx[k] = square[k] * mx[k];
+      sy[k] = square[k] * my[k];
+    }
+  } else {
+    const Mat3<T> sigma = to_mat3(shape.covariance);
+    sx = matvec(sigma, mx);
+    sy = matvec(sigma, my);
+  }
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
       (*grad_covariance)(i, j) =
           da * mx[i] * mx[j] + db * (mx[i] * my[j] + my[i] * mx[j]) + dc * my[i] * my[j];
-  const Vec3<T> sx = matvec(sigma, mx), sy = matvec(sigma, my);
-  const Vec3<T> dmx = T(2) * (da * sx + db * sy), dmy = T(2) * (db * sx + dc * sy);
+  Vec3<T> dmx = T(2) * (da * sx + db * sy), dmy = T(2) * (db * sx + dc * sy);
+  if (shape.scales && d_det0 != T(0)) {
+    // det0 = sum_k s_i^2 s_j^2 n_k^2 with n = mx x my and i, j the other two: no differences.
+    const Vec3<T> n = cross(mx, my);
+    Vec3<T> dn;
+    for (int k = 0; k < 3; ++k) {
+      const int i = (k + 1) % 3, j = (k + 2) % 3;
+      dn[k] = T(2) * d_det0 * square[i] * square[j] * n[k];
+      (*grad_covariance)(i, i) += d_det0 * square[j] * n[k] * n[k];
+      (*grad_covariance)(j, j) += d_det0 * square[i] * n[k] * n[k];
+      (*grad_covariance)(i, j) -= d_det0 * square[k] * n[i] * n[j];
+      (*grad_covariance)(j, i) -= d_det0 * square[k] * n[i] * n[j];
+    }
+    dmx = dmx + cross(my, dn);
+    dmy = dmy + cross(dn, mx);
+  }
+  const T along = dot(dmx, mx) + dot(dmy, my);
+  if (shape.scales) {
+    dmx = matvec(shape.axes, dmx);
+    dmy = matvec(shape.axes, dmy);
+  }
   // rows = f/z (R_row - u R_2), so their gradients reach 1/z and the clamped u, v.
   const Mat3<T>& r = cam.rotation;
   const Vec3<T> r2{r(2, 0), r(2, 1), r(2, 2)};
   const T z = f.point.z;
-  T d_inverse = z * (dot(dmx, mx) + dot(dmy, my));
+  T d_inverse = z * along;
   const T du = -cam.fx * f.inverse_z * dot(dmx, r2), dv = -cam.fy * f.inverse_z * dot(dmy, r2);
   d_inverse += g.x * cam.fx * f.point.x + g.y * cam.fy * f.point.y;
   Vec3<T> dp{g.x * cam.fx * f.inverse_z, g.y * cam.fy * f.inverse_z, g.depth};
@@ -290,35 +338,19 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
   return matvec(transpose(r), dp);
 }
 
-// Covariance gradient -> gradients of scales and quaternion, Sigma = R diag(s)^2 R^T.
+// Covariance gradient in the frame of the axes -> gradients of scales and quaternion.
 template <typename T>
 GSF_HOST_DEVICE void splat_axes_backward(const Mat3<T>& axes, const T* scales, const T* quat,
                                          const Mat3<T>& grad_covariance, T* grad_scales,
                                          T* grad_quat) {
   Mat3<T> grad_axes;
   for (int k = 0; k < 3; ++k) {
-    const Vec3<T> axis{axes(0, k), axes(1, k), axes(2, k)};
-    const Vec3<T> h = matvec(grad_covariance, axis);  // dSigma/d(axis) = 2 s^2 G axis
-    grad_scales[k] = 2 * scales[k] * dot(axis, h);
-    for (int i = 0; i < 3; ++i) grad_axes(i, k) = 2 * scales[k] * scales[k] * h[i];
+    const Vec3<T> h{grad_covariance(0, k), grad_covariance(1, k), grad_covariance(2, k)};
+    const Vec3<T> world = matvec(axes, h);  // dSigma/d(axis) = 2 s^2 G axis
+    grad_scales[k] = 2 * scales[k] * h[k];
+    for (int i = 0; i < 3; ++i) grad_axes(i, k) = 2 * scales[k] * scales[k] * world[i];
   }
   rotation_from_quat_backward(quat, grad_axes, grad_quat);
-}
-
-template <typename T>
-GSF_HOST_DEVICE Sym3<T> splat_covariance(const Mat3<T>& axes, const T* scales) {
-  Sym3<T> s{T(0), T(0), T(0), T(0), T(0), T(0)};
-  for (int k = 0; k < 3; ++k) {
-    const T v = scales[k] * scales[k];
-    const T x = axes(0, k), y = axes(1, k), z = axes(2, k);
-    s.xx += v * x * x;
-    s.yy += v * y * y;
-    s.zz += v * z * z;
-    s.xy += v * x * y;
-    s.xz += v * x * z;
-    s.yz += v * y * z;
-  }
-  return s;
 }
 
 }  // namespace gsf

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from gsfluent.ops._memory import refuse_pairs
+
 # Positions in the schemas (csrc/library.cpp): tensor inputs come first, then these numbers.
 _TENSORS = 14
 _NUMBERS = (
@@ -65,6 +67,10 @@ class Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """See :func:`backward`."""
+        image, instances = ctx.saved_tensors[0], ctx.saved_tensors[7]
+        if instances.device.type == "cpu":
+            # six moments and the features of the image, for each
+            refuse_pairs(instances.numel(), 6 + image.shape[-1], image.element_size())
         return backward(ctx, *grads)
 
 

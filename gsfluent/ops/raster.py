@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsfluent import _load  # noqa: F401  (loads the compiled operators)
 from gsfluent._check import check_tensor
+from gsfluent.ops._memory import is_shortage, refuse_if_too_large, shortage
 from gsfluent.ops._raster_grad import Rasterize
 
 _OP = "rasterize"
@@ -16,6 +17,8 @@ _MAX_CHANNELS = 32
 _TENSORS = 14
 _MAX_SIZE = 65536
 _SH_COEFFICIENTS = (1, 4, 9, 16)
+# From here on a call is asked whether it fits in memory.
+_MANY = 1_000_000
 
 
 class Rendered(NamedTuple):
@@ -117,6 +120,8 @@ def rasterize(
         TypeError: An argument is not a tensor, or has a wrong dtype.
         ValueError: A shape, device, size or combination of arguments does not fit.
         NotImplementedError: ``viewmat`` or ``K`` requires grad.
+        MemoryError: The scene needs more memory than the machine has; on a GPU
+            torch.OutOfMemoryError. Both name the bytes.
 
     Gradient: with respect to means, opacities, quats, scales, covars, sh, colors, background,
         normals, means2d_offset and means2d_absgrad, from image, alpha, depth and normal.
@@ -180,15 +185,21 @@ def _run(arguments: tuple[Any, ...]) -> tuple[Tensor, ...]:
         ready = ready and 0.0 < near < far and not (viewmat.requires_grad or K.requires_grad)
         if not ready:
             arguments = _checked(*arguments)
+        many = means.shape[0] > _MANY or arguments[14] * arguments[15] > _MANY
+        if many and means.device.type == "cpu":
+            refuse_if_too_large(arguments)
         if torch.is_grad_enabled() and any(
             t is not None and t.requires_grad for t in arguments[:_TENSORS]
         ):
             outputs: tuple[Tensor, ...] = Rasterize.apply(*arguments)
         else:
             outputs = torch.ops.gsfluent.rasterize.default(*arguments)
-    except (RuntimeError, TypeError, AttributeError):
+    except (RuntimeError, TypeError, AttributeError) as error:
         _checked(*arguments)  # names the argument at fault
-        raise
+        if not is_shortage(error):
+            raise
+        kind = MemoryError if means.device.type == "cpu" else torch.OutOfMemoryError
+        raise kind(f"{shortage(arguments)}, which could not be allocated") from error
     return outputs
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 import gsfluent
 from gsfluent import ops
 from gsfluent._load import HAS_CUDA_KERNELS
+from gsfluent.ops._memory import available_memory
 
 _LIBRARIES = (
     "numpy",
@@ -61,7 +62,7 @@ def examine(device: torch.device, *, every_device: bool = True) -> dict[str, Any
             "threads": torch.get_num_threads(),
             "capability": torch.backends.cpu.get_cpu_capability(),
             "memory_bytes": _physical_memory(),
-            "memory_available_bytes": _available_memory(),
+            "memory_available_bytes": available_memory(),
         },
         "disk_free_bytes": shutil.disk_usage(".").free,
         "cuda_library": "loaded" if HAS_CUDA_KERNELS else "not built, or torch has no CUDA",
@@ -255,17 +256,6 @@ def _version(name: str) -> str | None:
 
 def _physical_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def _available_memory() -> int | None:
-    try:
-        with open("/proc/meminfo", encoding="ascii") as lines:
-            for line in lines:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
-    except OSError:
-        return None
-    return None
 
 
 def _describe_gpu(index: int) -> dict[str, Any]:

@@ -167,8 +167,11 @@ class Adc:
         return round(self.start + share * max(0, self.limit - self.start))
 
     def penalty(self, model: SplatModel) -> Tensor | None:
-        """None."""
-        return None
+        """Pull on opacities, as the recipe has it, while the count may grow."""
+        recipe = self.recipe
+        if recipe.opacity_pull == 0 or model.steps >= recipe.densify_until * self.iterations:
+            return None
+        return recipe.opacity_pull * model.opacities().mean()
 
     def after_step(self, model: SplatModel, done: int) -> None:
         """Reset opacities when it is time."""

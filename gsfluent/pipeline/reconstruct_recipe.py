@@ -56,6 +56,8 @@ class Recipe:
         absgrad_threshold: Threshold for it.
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
+        opacity_pull: Weight of the mean opacity in the loss while the count may grow, so that
+            Gaussians that are not needed fade, are pruned and make room.
         ramped: Let the cap rise evenly from the start to its value at the end of densification,
             so that the strongest pulls are served first.
         error_gate: Only Gaussians with at least so many times the mean squared error under them
@@ -84,6 +86,7 @@ class Recipe:
     absgrad_threshold: float = 1.6e-3
     reset_every: int = 0
     prune_opacity: float = 0.01
+    opacity_pull: float = 0.0
     ramped: bool = False
     error_gate: float = 0.0
     thin: float = 0.0
@@ -129,7 +132,30 @@ CLASSIC = Recipe(
 )
 """The schedule of Kerbl et al. 2023 and gsplat's default trainer: what others are measured with."""
 
-LONG = replace(CLASSIC, name="long", densify_until=0.75, reset_every=0, shell=True)
+_BRISK = replace(
+    _SLOW,
+    means=4e-4,
+    scales=1e-2,
+    quats=2e-3,
+    sh0=5e-3,
+    sh_rest=2.5e-4,
+    others_end=0.1,
+    others_from=0.75,
+)
+
+LONG = replace(
+    CLASSIC,
+    name="long",
+    object_rates=replace(_BRISK, means=8e-4),
+    scene_rates=_BRISK,
+    densify_until=0.75,
+    reset_every=0,
+    shell=True,
+    absgrad=True,
+    opacity_pull=0.01,
+)
+"""Long runs: no resets; a pull on opacities instead frees what is not needed (measured in
+docs/reconstruction.md)."""
 
 RECIPES = {recipe.name: recipe for recipe in (QUICK, LONG, CLASSIC)}
 

@@ -56,6 +56,45 @@ def scene(count: int, *, degree: int = 3, seed: int = 1) -> dict[str, Tensor]:
     }
 
 
+HARD = ("behind", "border", "needles", "points", "huge", "transparent", "coincident", "opaque")
+
+
+def hard_scene(kind: str, count: int = 60) -> dict[str, Tensor]:
+    """A scene of :func:`scene`, half of whose Gaussians are of one of the kinds in ``HARD``."""
+    inputs = scene(count, degree=1, seed=21)
+    g = torch.Generator().manual_seed(22)
+    half = torch.arange(count) % 2 == 0
+    many = int(half.sum())
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    means, scales, opacities = inputs["means"], inputs["scales"], inputs["opacities"]
+    if kind == "behind":  # and beside the camera, some closer than the near plane
+        means[half, 2] = uniform(-3.0, 0.3, many)
+    elif kind == "border":
+        means[half, 0] = means[half, 2] * torch.where(uniform(0, 1, many) < 0.5, -0.6, 0.45)
+        means[half, 1] *= 2.5
+    elif kind == "needles":
+        scales[half] = torch.stack([uniform(0.5, 2.0, many), *uniform(1e-6, 1e-3, 2, many)], -1)
+    elif kind == "points":
+        scales[half] = 0.0
+    elif kind == "huge":
+        scales[half] = 10 ** uniform(0.0, 3.0, many, 3)
+        opacities[half] *= 0.3
+    elif kind == "transparent":
+        opacities[half] = torch.where(uniform(0, 1, many) < 0.2, 0.0, uniform(0.0, 0.02, many))
+    elif kind == "coincident":
+        for value in (means, scales, inputs["quats"]):
+            value[half] = value[0].clone()
+    elif kind == "opaque":  # the cap binds, pixels stop early
+        opacities[half] = uniform(0.9, 3.0, many)
+        scales[half] *= 3
+    else:
+        raise ValueError(kind)
+    return inputs
+
+
 def render(op: Any, inputs: dict[str, Tensor], **options: Any) -> Any:
     """Call `op` (the operator or the reference) on a scene."""
     viewmat, K = camera()

@@ -1,4 +1,4 @@
-"""The rasterizer against its reference: values and gradients, float32 and float64."""
+"""The rasterizer against its reference on every device: values, gradients, hard scenes."""
 
 from __future__ import annotations
 
@@ -6,15 +6,25 @@ from typing import Any
 
 import pytest
 import torch
-from raster_scene import relative_error, render, scene
+from raster_scene import HARD, hard_scene, relative_error, render, scene
 from torch import Tensor
 
 from gsfluent.ops import rasterize
 from gsfluent.ops.reference import raster as reference
 
-# float64 differs by rounding; float32 by the projection's rounding (1e-5 of the largest value).
-FORWARD = {torch.float64: 1e-12, torch.float32: 1e-5}
-BACKWARD = {torch.float64: 1e-11, torch.float32: 1e-4}
+# Largest error of a value and of a gradient, over the largest value: float64 differs by rounding,
+# float32 by the projection's rounding; a GPU divides and takes roots to 2 ulp.
+BARS = {
+    ("cpu", torch.float64): (1e-12, 1e-11),
+    ("cpu", torch.float32): (1e-5, 1e-4),
+    ("cuda", torch.float64): (1e-10, 1e-9),
+    ("cuda", torch.float32): (2e-4, 1e-3),
+}
+DEVICES = [
+    pytest.param(device, dtype, id=f"{device}-{str(dtype)[6:]}", marks=marks)
+    for device, marks in (("cpu", ()), ("cuda", pytest.mark.cuda))
+    for dtype in (torch.float64, torch.float32)
+]
 OUTPUTS = ("image", "alpha", "depth", "normal")
 
 
@@ -48,6 +58,9 @@ def variants() -> dict[str, tuple[dict[str, Tensor], dict[str, Any]]]:
             {"antialiased": True},
         ),
         "near cut": (full, {"near": 2.8, "far": 3.5}),
+        "no normals": (plain | {"sh": full["sh"], "background": full["background"]}, {}),
+        "five channels": (plain | {"colors": features(5), "background": features(5)[0]}, {}),
+        "six features": (plain | {"colors": features(2), "normals": full["normals"]}, {}),
         "single": ({k: v if k == "background" else v[:1] for k, v in full.items()}, {}),
     }
 
@@ -55,44 +68,69 @@ def variants() -> dict[str, tuple[dict[str, Tensor], dict[str, Any]]]:
 VARIANTS = variants()
 
 
-def cast(inputs: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    return {k: v.detach().to(dtype).requires_grad_() for k, v in inputs.items()}
+def cast(inputs: dict[str, Tensor], dtype: torch.dtype, device: str = "cpu") -> dict[str, Tensor]:
+    return {k: v.detach().to(device, dtype).requires_grad_() for k, v in inputs.items()}
 
 
-@pytest.mark.parametrize("name", VARIANTS)
-@pytest.mark.parametrize("dtype", FORWARD, ids=str)
-def test_forward_and_gradients_equal_reference(name: str, dtype: torch.dtype) -> None:
-    inputs, options = VARIANTS[name]
-    ours, theirs = cast(inputs, dtype), cast(inputs, torch.float64)
-    result = render(rasterize, ours, contribution=True, **options)
+def compare(
+    inputs: dict[str, Tensor], options: dict[str, Any], device: str, dtype: torch.dtype
+) -> tuple[float, float]:
+    """Largest relative error of the outputs and of the gradients of a weighted sum of them."""
+    ours, theirs = cast(inputs, dtype, device), cast(inputs, torch.float64)
+    moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in options.items()}
+    result = render(rasterize, ours, contribution=True, **moved)
     expected = render(reference.rasterize, theirs, **options)
     g = torch.Generator().manual_seed(7)
-    loss, expected_loss = torch.zeros((), dtype=dtype), torch.zeros((), dtype=torch.float64)
+    loss = torch.zeros((), dtype=dtype, device=device)
+    expected_loss = torch.zeros((), dtype=torch.float64)
+    errors = [relative_error(result.contribution.cpu(), expected[4])]
     for output, value, want in zip(OUTPUTS, result[:4], expected[:4], strict=True):
         if want is None:
             assert value is None
             continue
         # Depth is divided by alpha, which float32 resolves to 3e-8 of 1.
         slack = 2 if output == "depth" else 1
-        assert relative_error(value.detach(), want.detach()) < slack * FORWARD[dtype], output
+        errors.append(relative_error(value.detach().cpu(), want.detach()) / slack)
         weight = torch.randn(want.shape, generator=g, dtype=torch.float64)
-        loss = loss + (value * weight.to(dtype)).sum()
+        loss = loss + (value * weight.to(device, dtype)).sum()
         expected_loss = expected_loss + (want * weight).sum()
-    assert relative_error(result.contribution, expected[4]) < FORWARD[dtype]
     loss.backward()
     expected_loss.backward()
-    for key, value in ours.items():
-        assert relative_error(value.grad, theirs[key].grad) < BACKWARD[dtype], key
+    gradients = [relative_error(v.grad.cpu(), theirs[k].grad) for k, v in ours.items()]
+    return max(errors), max(gradients)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize(("device", "dtype"), DEVICES)
+def test_forward_and_gradients_equal_reference(name: str, device: str, dtype: torch.dtype) -> None:
+    inputs, options = VARIANTS[name]
+    value, gradient = compare(inputs, options, device, dtype)
+    assert value < BARS[device, dtype][0] and gradient < BARS[device, dtype][1]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("kind", HARD)
+@pytest.mark.parametrize(("device", "dtype"), DEVICES)
+def test_hard_scenes_equal_reference(
+    kind: str, antialiased: bool, device: str, dtype: torch.dtype
+) -> None:
+    value, gradient = compare(hard_scene(kind), {"antialiased": antialiased}, device, dtype)
+    tight = dtype == torch.float64
+    assert value < (1e-9 if tight else 2e-4) and gradient < (1e-8 if tight else 1e-3)
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
-def test_gradient_of_each_output_alone_equals_reference(output: str) -> None:
+@pytest.mark.parametrize(("device", "dtype"), DEVICES)
+def test_gradient_of_each_output_alone_equals_reference(
+    output: str, device: str, dtype: torch.dtype
+) -> None:
     inputs = scene(60)
-    ours, theirs = cast(inputs, torch.float32), cast(inputs, torch.float64)
+    ours, theirs = cast(inputs, dtype, device), cast(inputs, torch.float64)
     index = OUTPUTS.index(output)
     value, want = render(rasterize, ours)[index], render(reference.rasterize, theirs)[index]
     weight = torch.randn(want.shape, dtype=torch.float64)
-    (value * weight.float()).sum().backward()
+    (value * weight.to(device, dtype)).sum().backward()
     (want * weight).sum().backward()
     for key in ("means", "opacities", "quats", "scales", "means2d_offset"):
-        assert relative_error(ours[key].grad, theirs[key].grad) < BACKWARD[torch.float32], key
+        error = relative_error(ours[key].grad.cpu(), theirs[key].grad)
+        assert error < BARS[device, dtype][1], key

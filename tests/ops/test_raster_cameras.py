@@ -14,6 +14,14 @@ from gsfluent.ops import Rendered, rasterize
 from gsfluent.ops.reference import raster as reference
 
 CAMERAS = 3
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+# Largest error of a value and of a gradient (see test_raster.py).
+BARS = {
+    ("cpu", torch.float64): (1e-12, 1e-11),
+    ("cpu", torch.float32): (2e-5, 1e-4),
+    ("cuda", torch.float64): (1e-10, 1e-9),
+    ("cuda", torch.float32): (2e-4, 1e-3),
+}
 
 
 @pytest.fixture
@@ -23,7 +31,9 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def batch(count: int, dtype: torch.dtype, own_background: bool = True) -> dict[str, Tensor]:
+def batch(
+    count: int, dtype: torch.dtype, own_background: bool = True, device: str = "cpu"
+) -> dict[str, Tensor]:
     """A scene with the inputs that every camera has for itself."""
     g = torch.Generator().manual_seed(11)
     inputs = scene(count)
@@ -32,7 +42,7 @@ def batch(count: int, dtype: torch.dtype, own_background: bool = True) -> dict[s
     offset = torch.randn(CAMERAS, count, 2, generator=g, dtype=torch.float64)
     inputs["means2d_offset"] = 0.5 * offset
     inputs["means2d_absgrad"] = torch.zeros(CAMERAS, count, 2, dtype=torch.float64)
-    return {k: v.to(dtype).requires_grad_() for k, v in inputs.items()}
+    return {k: v.to(device, dtype).requires_grad_() for k, v in inputs.items()}
 
 
 def view(op: Any, inputs: dict[str, Tensor], viewmat: Tensor, K: Tensor, **options: Any) -> Any:
@@ -48,33 +58,34 @@ def loss(outputs: tuple[Tensor, ...]) -> Tensor:
     total = outputs[0].new_zeros(())
     for value in outputs[:4]:
         weight = torch.randn(value.shape, generator=g, dtype=torch.float64)
-        total = total + (value * weight.to(value.dtype)).sum()
+        total = total + (value * weight.to(value.device, value.dtype)).sum()
     return total
 
 
 @pytest.mark.parametrize("grouped", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize("device", DEVICES)
 def test_cameras_median_and_absolute_gradients_equal_reference(
-    dtype: torch.dtype, grouped: bool
+    device: str, dtype: torch.dtype, grouped: bool
 ) -> None:
     viewmat, K = cameras(CAMERAS)
-    ours, theirs = batch(40, dtype), batch(40, torch.float64)
+    ours, theirs = batch(40, dtype, device=device), batch(40, torch.float64)
     groups = torch.arange(40, dtype=torch.int32) % 9 - 1 if grouped else None
+    moved = None if groups is None else groups.to(device)
     options = {"contribution": True, "median_depth": True, "antialiased": True}
-    got = view(rasterize, ours, viewmat, K, groups=groups, **options)
+    got = view(rasterize, ours, viewmat, K, groups=moved, **options)
     want = view(reference.rasterize, theirs, viewmat, K, groups=groups, antialiased=True)
-    tight = dtype == torch.float64
+    value_bar, gradient_bar = BARS[device, dtype]
     for value, expected in zip(got[:5], want[:5], strict=True):
-        assert relative_error(value.detach(), expected.detach()) < (1e-12 if tight else 2e-5)
+        assert relative_error(value.detach().cpu(), expected.detach()) < value_bar
     assert want[5].max() > 0
     # A pixel that is within rounding of transmittance 1/2 may take the next splat.
-    off = (got.median_depth.double() - want[5]).abs() > (1e-12 if tight else 1e-5)
-    assert off.double().mean() <= (0.0 if tight else 1e-3)
+    off = (got.median_depth.double().cpu() - want[5]).abs() > value_bar
+    assert off.double().mean() <= (0.0 if dtype == torch.float64 else 1e-3)
     loss(got).backward()
     loss(want).backward()
-    for key, value in ours.items():
-        error = relative_error(value.grad, theirs[key].grad)
-        assert error < (1e-11 if tight else 1e-4), key
+    for key, leaf in ours.items():
+        assert relative_error(leaf.grad.cpu(), theirs[key].grad) < gradient_bar, key
 
 
 def test_cameras_together_equal_cameras_one_by_one() -> None:

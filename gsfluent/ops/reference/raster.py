@@ -13,7 +13,7 @@ from torch import Tensor
 
 SCREEN_BLUR = 0.3
 MIN_ALPHA = 1.0 / 255.0
-MAX_ALPHA = 0.99
+MAX_ALPHA = float(torch.tensor(0.99))  # in float32, as in the kernels: two of them end a pixel
 MIN_TRANSMITTANCE = 1e-4
 MAX_POWER = 0.5 * 3.33**2
 SIBLING_RING = 8

@@ -1,0 +1,94 @@
+"""How much memory there is, and what :func:`gsfluent.ops.rasterize` needs of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+_OP = "rasterize"
+# Below this nobody asks the system what is left.
+_SMALL = 1 << 28
+# Per (camera, Gaussian) beside its row: radius, list of tiles, depth, box, sort keys.
+_PER_SPLAT = 40
+_ROW_HEADER = 10
+
+
+def available_memory() -> int | None:
+    """Bytes of main memory that can still be used; None where the system does not say."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            for line in lines:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    except OSError:
+        return None
+    return None
+
+
+def required_bytes(arguments: tuple[Any, ...]) -> int:
+    """Least memory that a call of the operator takes beside its inputs, with their gradients.
+
+    The (splat, tile) pairs, whose number is only known later, are not in it.
+
+    Args:
+        arguments: The operator's arguments in the order of its schema.
+    """
+    means, viewmat, colors, normals = (arguments[k] for k in (0, 2, 8, 10))
+    width, height, _, _, depth, median_depth = arguments[14:20]
+    cameras = viewmat.shape[0] if viewmat.dim() == 3 else 1
+    splats = cameras * means.shape[0]
+    channels = colors.shape[1] if colors is not None else 3
+    features = channels + (3 if normals is not None else 0) + int(depth)
+    size = means.element_size()
+    pixels = cameras * width * height * size * (features + 1 + int(median_depth))
+    gradients = 0
+    if torch.is_grad_enabled():
+        gradients = sum(
+            t.numel() * t.element_size()
+            for t in arguments
+            if isinstance(t, Tensor) and t.requires_grad
+        )
+    return int(splats * ((_ROW_HEADER + features) * size + _PER_SPLAT) + pixels + gradients)
+
+
+def refuse_if_too_large(arguments: tuple[Any, ...]) -> None:
+    """Raise MemoryError, before anything is allocated, for a scene that main memory cannot hold."""
+    need = required_bytes(arguments)
+    if need < _SMALL:
+        return
+    there = available_memory()
+    if there is not None and need > there:
+        raise MemoryError(f"{shortage(arguments)}, {there} bytes are available")
+
+
+def refuse_pairs(pairs: int, numbers: int, size: int) -> None:
+    """Raise MemoryError when the sums of all (splat, tile) pairs do not fit in main memory."""
+    need = pairs * numbers * size
+    if need < _SMALL:
+        return
+    there = available_memory()
+    if there is not None and need > there:
+        raise MemoryError(
+            f"{_OP}: the gradients of {pairs} (splat, tile) pairs need {need} bytes, {there} bytes "
+            "are available; render a smaller image or fewer cameras at once"
+        )
+
+
+def shortage(arguments: tuple[Any, ...]) -> str:
+    """The sentence that says what a call needs."""
+    means, viewmat, width, height = (arguments[k] for k in (0, 2, 14, 15))
+    cameras = viewmat.shape[0] if viewmat.dim() == 3 else 1
+    need = required_bytes(arguments)
+    return (
+        f"{_OP}: {means.shape[0]} Gaussians in {cameras} images of {width} x {height} px need at "
+        f"least {need} bytes ({need / 2**30:.1f} GiB) on {means.device}"
+    )
+
+
+def is_shortage(error: BaseException) -> bool:
+    """True when the allocator refused (torch's stable ABI reports only the call that failed)."""
+    return isinstance(error, torch.OutOfMemoryError) or (
+        "API call failed" in str(error) and ("new_empty" in str(error) or "new_zeros" in str(error))
+    )
