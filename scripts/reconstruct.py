@@ -95,7 +95,7 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     add("--target-psnr", type=float, help="enough on the training photographs [dB]")
     add("--exposure", action="store_true", help="learn an affine colour change per photograph")
     add("--kernel", default="anisotropic", help="anisotropic or isotropic")
-    add("--scale-regularization", type=float, default=1.0)
+    add("--scale-regularization", type=float, help="1 for objects, 0 for scenes when not given")
     add("--checkpoint", type=Path, help="save to and resume from this file")
     add("--device", default="cpu", help="cpu or cuda")
     add("--seed", type=int, default=0)

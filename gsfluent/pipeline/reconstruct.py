@@ -50,7 +50,8 @@ class Reconstruct(Stage):
         iterations: Training steps, one photograph each.
         max_gaussians: Hard cap on the count, and the budget of MCMC; the recipe's when None.
         kernel: "anisotropic" (ellipsoids) or "isotropic" (spheres; costs about 4 dB).
-        scale_regularization: Strength of the pull towards small, not needle-shaped Gaussians.
+        scale_regularization: Strength of the pull towards small, not needle-shaped Gaussians; when
+            None 1 for an object, and 0 for a whole scene, whose plain walls need large ones.
         image_size: Longer side of the photographs in training [px]; the recipe's when None.
         sh_degree: Bands of view-dependent colour, 0 to 3. 0 (matte) relights best.
         start_gaussians: Gaussians to start with; the recipe's when None.
@@ -84,7 +85,7 @@ class Reconstruct(Stage):
         iterations: int = 800,
         max_gaussians: int | None = None,
         kernel: str = "anisotropic",
-        scale_regularization: float = 1.0,
+        scale_regularization: float | None = None,
         image_size: int | None = None,
         *,
         sh_degree: int = 0,
@@ -128,7 +129,7 @@ class Reconstruct(Stage):
         self.iterations = int(iterations)
         self.max_gaussians = int(max_gaussians or self.recipe.max_gaussians)
         self.kernel, self.densify = kernel, densify
-        self.scale_regularization = float(scale_regularization)
+        self.scale_regularization = scale_regularization
         self.image_size = int(image_size or self.recipe.image_size)
         self.sh_degree = int(sh_degree)
         start = self.recipe.start_gaussians if start_gaussians is None else int(start_gaussians)
@@ -320,11 +321,14 @@ class _Run:
     ) -> Gaussians:
         stage = self.stage
         whole = 0.5 if hull is None else 1.0  # see Recipe.gradient_threshold
+        regularization = stage.scale_regularization
+        if regularization is None:
+            regularization = 0.0 if hull is None else 1.0
         settings = TrainSettings(
             stage.recipe,
             steps,
             stage.max_gaussians,
-            stage.scale_regularization,
+            regularization,
             stage.sh_degree,
             stage.gradient_threshold * whole,
             densify=stage.densify,

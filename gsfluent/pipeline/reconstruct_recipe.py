@@ -132,7 +132,16 @@ CLASSIC = Recipe(
 )
 """The schedule of Kerbl et al. 2023 and gsplat's default trainer: what others are measured with."""
 
-_BRISK = replace(_SLOW, means=4e-4, scales=1e-2, quats=2e-3, sh0=5e-3, sh_rest=2.5e-4)
+_BRISK = replace(
+    _SLOW,
+    means=4e-4,
+    scales=1e-2,
+    quats=2e-3,
+    sh0=5e-3,
+    sh_rest=2.5e-4,
+    others_end=0.1,
+    others_from=0.75,
+)
 
 LONG = replace(
     CLASSIC,
