@@ -117,6 +117,7 @@ def test_doctor_reports_and_tests_every_op(capsys: pytest.CaptureFixture[str]) -
     assert report["ok"] is True
     assert report["torch"] == torch.__version__
     names = {"p2g", "grid_update", "g2p", "return_mapping", "rasterize", "mvee"}
+    names |= {"photometric_loss", "adam_step"}
     assert names <= set(report["ops"])
     assert all("cpu" in report["ops"][name] for name in names)
     assert {test["op"] for test in report["self_test"]} == names
