@@ -144,10 +144,10 @@ def test_noise_spares_opaque_gaussians() -> None:
     gaussians = cloud()
     model = model_of(gaussians.replace(opacities=torch.full((120,), 0.9)))
     mcmc = Mcmc(LONG, 1000, 1000, Place(None, torch.zeros(1, 3)), seed=0)
-    mcmc.after_step(model, 1)
+    mcmc.after_step(model, 5)
     assert torch.allclose(model.parameters["means"], gaussians.means, atol=1e-7)
     model = model_of(gaussians.replace(opacities=torch.full((120,), 0.005)))
-    mcmc.after_step(model, 1)
+    mcmc.after_step(model, 5)
     assert float((model.parameters["means"].detach() - gaussians.means).norm()) > 1e-3
 
 
