@@ -21,7 +21,8 @@ from gsfluent.pipeline.mesh_distance import load_mesh, signed_distances, surface
 from gsfluent.pipeline.reconstruct_init import visual_hull
 from gsfluent.pipeline.reconstruct_views import read_views
 from gsfluent.pipeline.solid_field import SignedDistance, distances_of
-from gsfluent.pipeline.solid_tsdf import Fused, fuse_depths, ring_of_cameras, zoomed
+from gsfluent.pipeline.solid_skin import drawn_outlines, mask_outlines, match_outline
+from gsfluent.pipeline.solid_tsdf import fuse_depths, ring_of_cameras, zoomed
 
 if TYPE_CHECKING:
     import trimesh
@@ -34,6 +35,7 @@ METHODS = ("auto", "hull", "density", "tsdf", "mesh")
 _HULL_SIZE = 400  # pixels of the masks
 _CAVITY = 0.02  # share of the solid from which what cameras look into is taken out
 _SKIN = 1.5  # voxels; density and depths may disagree by so much about where the skin is
+_DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/solid.md)
 _FAINT = 0.05  # opacity below which a splat is no matter
 _AGREE = 0.7  # share of the rays that must meet an open mesh
 _BAND = 3.0  # voxels around a mesh with exact distances
@@ -109,7 +111,7 @@ def _choose(
     mesh: Any,
 ) -> tuple[str, str]:
     """Which source, and why."""
-    masks = capture is not None and (capture.has_masks or capture.view(0, 64).mask is not None)
+    masks = capture is not None and _has_masks(capture)
     needs = {"hull": masks, "density": gaussians is not None, "tsdf": gaussians is not None}
     if method != "auto":
         if not needs.get(method, mesh is not None):
@@ -158,11 +160,14 @@ def _of_density(
     gaussians = gaussians.validated("solid")
     box, solid, notes = Fill(resolution, seed=seed).inside(gaussians, capture)
     source, note = "density", ""
+    cameras, views = _lookers(capture, box, notes["closed_side"])
+    visible = gaussians.select(gaussians.opacities > _FAINT)
+    notes |= views
     if carve:
-        fused, views = _fused(gaussians, capture, box, notes["closed_side"])
+        fused = fuse_depths(visible, cameras, box)
         cavity = _cavities(solid, fused.values)
         share = float(cavity.sum() / max(1, int(solid.sum())))
-        notes |= views | {"cavity_share": share}
+        notes["cavity_share"] = share
         if share > _CAVITY:
             if share > 0.5:  # mostly a shell: both of its sides are the depths' to tell
                 body = ndimage.binary_dilation(solid) & (fused.values <= 0)
@@ -175,7 +180,7 @@ def _of_density(
         elif notes["closed_side"] is not None and views["virtual_cameras"]:
             note = "; one side is open and was closed: if it is no hole, choose tsdf"
     field = SignedDistance.of_voxels(solid, np.array(box.origin), box.voxel, source, notes)
-    return field, note
+    return _matched(field, visible, capture, cameras), note
 
 
 def _cavities(solid: np.ndarray, depths: np.ndarray) -> np.ndarray:
@@ -192,13 +197,10 @@ def _cavities(solid: np.ndarray, depths: np.ndarray) -> np.ndarray:
     return result
 
 
-def _fused(
-    gaussians: Gaussians,
-    capture: Capture | None,
-    box: GridBox,
-    open_side: Sequence[float] | None,
-) -> tuple[Fused, dict[str, Any]]:
-    """Depths fused from the cameras of the capture, else from a ring of cameras around.
+def _lookers(
+    capture: Capture | None, box: GridBox, open_side: Sequence[float] | None
+) -> tuple[list[Camera], dict[str, Any]]:
+    """Cameras of the capture cut to the object, else a ring of cameras around it.
 
     No camera of the ring looks from an open side: it would see the inside of the far skin.
     """
@@ -214,15 +216,15 @@ def _fused(
         if open_side is not None:
             side = torch.tensor(open_side, dtype=torch.float64)
             cameras = [c for c in cameras if float(c.forward() @ side) > -0.1]
-    visible = gaussians.select(gaussians.opacities > _FAINT)
-    notes = {"cameras": len(cameras), "virtual_cameras": virtual}
-    return fuse_depths(visible, cameras, box), notes
+    return cameras, {"cameras": len(cameras), "virtual_cameras": virtual}
 
 
 def _of_depths(gaussians: Gaussians, capture: Capture | None, resolution: int) -> SignedDistance:
     gaussians = gaussians.validated("solid")
     box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
-    fused, views = _fused(gaussians, capture, box, None)
+    cameras, views = _lookers(capture, box, None)
+    visible = gaussians.select(gaussians.opacities > _FAINT)
+    fused = fuse_depths(visible, cameras, box)
     body = fused.values <= 0
     for axis in range(3):  # hidden voxels at the border belong to nothing
         body[(slice(None),) * axis + ([0, -1],)] = False
@@ -238,13 +240,41 @@ def _of_depths(gaussians: Gaussians, capture: Capture | None, resolution: int) -
         "unseen_surface": _unseen(occupied, fused.known),
         "leaks": 0,
     }
-    return SignedDistance(
+    field = SignedDistance(
         torch.from_numpy((values * box.voxel).astype(np.float32)),
         torch.tensor(box.origin, dtype=torch.float32),
         box.voxel,
         "tsdf",
         notes,
     )
+    return _matched(field, visible, capture, cameras)
+
+
+def _matched(
+    field: SignedDistance,
+    visible: Gaussians,
+    capture: Capture | None,
+    cameras: Sequence[Camera],
+) -> SignedDistance:
+    """The field with the outline that masks show, or the splats when there are none."""
+    if capture is None or not _has_masks(capture):
+        grown, offset = match_outline(field, drawn_outlines(visible, cameras), trust=_DRAWN)
+        notes = {"skin_offset": offset, "skin_from": "splats"}
+        return grown.replace(report=field.report | notes)
+    grown, offset = match_outline(field, mask_outlines(capture))
+    notes = {"skin_offset": offset, "skin_from": "masks"}
+    values = grown.values
+    if offset > 0:  # what was added must lie in the masks as well
+        hull = _of_hull(capture, max(field.values.shape))
+        axes = [torch.arange(n) + 0.5 for n in field.values.shape]
+        grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        bound = hull.at(field.origin + grid * field.voxel).reshape(values.shape)
+        values = torch.maximum(values, torch.minimum(bound, field.values))
+    return grown.replace(values=values, report=field.report | notes)
+
+
+def _has_masks(capture: Capture) -> bool:
+    return capture.has_masks or capture.view(0, 64).mask is not None
 
 
 def _unseen(occupied: np.ndarray, known: np.ndarray) -> float:

@@ -178,6 +178,9 @@ def _drawn(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
         quats=gaussians.quats,
         scales=gaussians.scales,
         colors=torch.zeros_like(gaussians.means[:, :1]),
+        depth=False,
+        median_depth=True,
         near=1e-4,
     )
-    return result.depth, result.alpha
+    assert result.median_depth is not None  # asked for
+    return result.median_depth, result.alpha

@@ -11,6 +11,7 @@ from raster_scene import HEIGHT, WIDTH, camera, relative_error, render, scene
 from torch import Tensor
 
 from gsfluent.ops import rasterize
+from gsfluent.ops.reference import raster as reference
 
 
 def arguments(count: int, dtype: torch.dtype = torch.float32, **changes: Any) -> dict[str, Any]:
@@ -21,8 +22,9 @@ def arguments(count: int, dtype: torch.dtype = torch.float32, **changes: Any) ->
     return {k: v for k, v in call.items() if v is not None}
 
 
+@pytest.mark.parametrize("op", [rasterize, reference.rasterize], ids=["kernels", "reference"])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradcheck(antialiased: bool) -> None:
+def test_gradcheck(antialiased: bool, op: Any) -> None:
     inputs = scene(8, degree=2)
     # Large soft splats: no pixel sits on a threshold within the step of the finite differences.
     inputs["opacities"] = 0.2 + 0.5 * inputs["opacities"]
@@ -31,7 +33,7 @@ def test_gradcheck(antialiased: bool) -> None:
 
     def call(*values: Tensor) -> tuple[Tensor, ...]:
         named = dict(zip(inputs, values, strict=True))
-        return tuple(render(rasterize, named, antialiased=antialiased)[:4])
+        return tuple(render(op, named, antialiased=antialiased)[:4])
 
     assert torch.autograd.gradcheck(call, leaves, fast_mode=True)
 
