@@ -28,7 +28,8 @@ _SPLIT_ABOVE = 0.01  # of the extent: larger is split, smaller cloned
 _RESET_OPACITY = 0.01
 _GROWTH = 1.05  # of the count, each time (MCMC)
 _DEAD = 0.005  # opacity below which MCMC relocates
-_NOISE = 5e5  # strength of the noise in units of the position's step size
+_NOISE = 80.0  # strength of the noise: 5e5 times a step of 1.6e-4, in units of the extent
+_NOISE_END = 0.01  # of it, at the end of the run
 _SHARPNESS = 100.0  # of the switch that spares opaque Gaussians from noise
 _MOST_COPIES = 50  # one Gaussian is split among at most so many
 _MCMC_OPACITY = 0.01  # weight of the mean opacity in the loss
@@ -299,7 +300,8 @@ class Mcmc:
         draw = torch.randn(means.shape, generator=generator, device=means.device)
         # sigmoid(-k (o - 0.005)): 1/2 at the opacity that is dead, none from 0.05 on
         weight = torch.sigmoid(-_SHARPNESS * (model.opacities() - _DEAD))
-        rate = _NOISE * model.means_rate(done / self.iterations)
+        # covariances over the extent: the original lets the scene have the size 1
+        rate = _NOISE * _NOISE_END ** (done / self.iterations) / model.extent
         turn = quaternion_to_matrix(normalize_quaternions(model.parameters["quats"].detach()))
         variance = model.scales().square()
         local = (turn.transpose(1, 2) @ draw[..., None])[..., 0] * variance
