@@ -17,6 +17,8 @@ constexpr double kMinCompensation = 0.005;       // floor of the antialiasing fa
 constexpr double kFrustumMargin = 0.3;           // of tan(fov/2), beyond the image edges, for J
 // Colours, normals and camera z beyond are not drawn: times a gradient they would leave float32.
 constexpr double kMaxFeature = 1e15;
+// Wider splats are not drawn: sums of squared distances [px^2] would leave float32 too.
+constexpr double kMaxVariance = 1e18;
 constexpr int kSiblingRing = 8;  // group ids remembered per pixel
 constexpr int kTile = 16;        // tile edge [px]
 
@@ -214,6 +216,7 @@ GSF_HOST_DEVICE bool splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>
   using std::sqrt;
   if (!(f.det > T(0)) || !finite(f.det) || !(f.cov_a >= T(0)) || !(f.cov_c >= T(0))) return false;
   const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur);
+  if (!(a <= T(kMaxVariance) && c <= T(kMaxVariance))) return false;
   const T inverse = T(1) / f.det;
   s->a = c * inverse;
   s->b = -f.cov_b * inverse;

@@ -84,7 +84,7 @@ struct RasterCpu {
     slots.unsound = &unsound;
     slots.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
     slots.width = kGradFeatures + slots.active + (b.grad_absolute ? 2 : 0);
-    std::unique_ptr<T[]> rows(new T[static_cast<size_t>(a.instance_count) * slots.width]);
+    const Scratch<T> rows(static_cast<size_t>(a.instance_count) * slots.width);
     slots.rows = rows.get();
     const std::vector<int32_t> tiles = tiles_by_work(a);
     std::vector<T> background(b.grad_background ? tiles.size() * a.channels : 0, T(0));

@@ -92,3 +92,8 @@ def is_shortage(error: BaseException) -> bool:
     return isinstance(error, torch.OutOfMemoryError) or (
         "API call failed" in str(error) and ("new_empty" in str(error) or "new_zeros" in str(error))
     )
+
+
+def shortage_error(device: torch.device) -> type[Exception]:
+    """What is raised when memory runs out on ``device``."""
+    return MemoryError if device.type == "cpu" else torch.OutOfMemoryError

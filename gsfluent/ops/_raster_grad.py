@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsfluent.ops._memory import refuse_pairs
+from gsfluent.ops._memory import is_shortage, refuse_pairs, shortage_error
 
 # Positions in the schemas (csrc/library.cpp): tensor inputs come first, then these numbers.
 _TENSORS = 14
@@ -67,11 +67,21 @@ class Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """See :func:`backward`."""
-        image, instances = ctx.saved_tensors[0], ctx.saved_tensors[7]
+        image, instances, means = (ctx.saved_tensors[k] for k in (0, 7, 8))
         if instances.device.type == "cpu":
             # six moments and the features of the image, for each
             refuse_pairs(instances.numel(), 6 + image.shape[-1], image.element_size())
-        return backward(ctx, *grads)
+        try:
+            return backward(ctx, *grads)
+        except RuntimeError as error:
+            if not is_shortage(error):
+                raise
+            given = [t for k, t in enumerate(ctx.saved_tensors[8:]) if ctx.needs_input_grad[k]]
+            need = sum(t.numel() * t.element_size() for t in given)
+            raise shortage_error(means.device)(
+                f"rasterize: the gradients of {means.shape[0]} Gaussians need at least {need} "
+                f"bytes ({need / 2**30:.1f} GiB) on {means.device}, which could not be allocated"
+            ) from error
 
 
 torch.library.register_autograd("gsfluent::rasterize", backward, setup_context=setup_context)

@@ -9,7 +9,12 @@ from torch import Tensor
 
 from gsfluent import _load  # noqa: F401  (loads the compiled operators)
 from gsfluent._check import check_tensor
-from gsfluent.ops._memory import is_shortage, refuse_if_too_large, shortage
+from gsfluent.ops._memory import (
+    is_shortage,
+    refuse_if_too_large,
+    shortage,
+    shortage_error,
+)
 from gsfluent.ops._raster_grad import Rasterize
 
 _OP = "rasterize"
@@ -198,8 +203,8 @@ def _run(arguments: tuple[Any, ...]) -> tuple[Tensor, ...]:
         _checked(*arguments)  # names the argument at fault
         if not is_shortage(error):
             raise
-        kind = MemoryError if means.device.type == "cpu" else torch.OutOfMemoryError
-        raise kind(f"{shortage(arguments)}, which could not be allocated") from error
+        text = f"{shortage(arguments)}, which could not be allocated"
+        raise shortage_error(means.device)(text) from error
     return outputs
 
 

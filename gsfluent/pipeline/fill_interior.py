@@ -149,6 +149,7 @@ def refine_opacity(
             quats=gaussians.quats,
             scales=gaussians.scales,
             sh=sh,
+            depth=False,
         )
         if mask is None:
             # without a mask the background is unknown: judge only where the surface itself is seen
@@ -163,6 +164,7 @@ def refine_opacity(
                     quats=gaussians.quats[surface],
                     scales=gaussians.scales[surface],
                     sh=gaussians.sh[surface],
+                    depth=False,
                 ).alpha
             loss = (weight[..., None] * (rendered.image - image) ** 2).mean()
             loss = loss + ((1 - weight) * rendered.alpha**2).mean()

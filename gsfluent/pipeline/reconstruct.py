@@ -40,6 +40,7 @@ _log = logging.getLogger(__name__)
 
 _SCENE_SHARE = 0.6  # of the steps for everything, before the object gets the rest
 _FAINT = 0.02  # opacity below which a trained Gaussian is dropped
+_BUDGET = 100_000  # of MCMC, when none is given
 _HULL_START = 100_000  # Gaussians on a hull of 96 voxels a side; more would fall on each other
 
 
@@ -48,7 +49,8 @@ class Reconstruct(Stage):
 
     Args:
         iterations: Training steps, one photograph each.
-        max_gaussians: Hard cap on the count, and the budget of MCMC; the recipe's when None.
+        max_gaussians: Hard cap on the count; the recipe's when None. It is the budget of MCMC
+            (100,000 when None), which fills it.
         kernel: "anisotropic" (ellipsoids) or "isotropic" (spheres; costs about 4 dB).
         scale_regularization: Strength of the pull towards small, not needle-shaped Gaussians; when
             None 1 for an object, and 0 for a whole scene, whose plain walls need large ones.
@@ -127,7 +129,10 @@ class Reconstruct(Stage):
                     f"reconstruct.{label} must be {low} to {high}, got {value}", "change it"
                 )
         self.iterations = int(iterations)
-        self.max_gaussians = int(max_gaussians or self.recipe.max_gaussians)
+        limit = self.recipe.max_gaussians
+        self.max_gaussians = int(
+            max_gaussians or (min(limit, _BUDGET) if densify == "mcmc" else limit)
+        )
         self.kernel, self.densify = kernel, densify
         self.scale_regularization = scale_regularization
         self.image_size = int(image_size or self.recipe.image_size)

@@ -28,7 +28,10 @@ _SPLIT_ABOVE = 0.01  # of the extent: larger is split, smaller cloned
 _RESET_OPACITY = 0.01
 _GROWTH = 1.05  # of the count, each time (MCMC)
 _DEAD = 0.005  # opacity below which MCMC relocates
-_NOISE = 5e5  # strength of the noise in units of the position's step size
+_NOISE = 80.0  # strength of the noise: 5e5 times a step of 1.6e-4, in units of the extent
+_NOISE_END = 0.01  # of it, at the end of the run
+_NOISE_EVERY = 5  # steps; five times the variance, a fifth of the work
+_UNTIL = 0.85  # of the run: the end of relocation and growth (MCMC)
 _SHARPNESS = 100.0  # of the switch that spares opaque Gaussians from noise
 _MOST_COPIES = 50  # one Gaussian is split among at most so many
 _MCMC_OPACITY = 0.01  # weight of the mean opacity in the loss
@@ -264,7 +267,7 @@ class Mcmc:
     """Relocation, growth to a budget, and noise on the centres.
 
     Args:
-        recipe: Schedule; growth and relocation end at its ``densify_until``.
+        recipe: Schedule; relocation and growth go on until 85 % of the run, though.
         iterations: Length of the run.
         limit: The budget.
         place: Where Gaussians may be; what is elsewhere counts as dead.
@@ -277,6 +280,7 @@ class Mcmc:
         self.recipe, self.iterations, self.limit = recipe, iterations, limit
         self.place, self.seed = place, seed
         self.absgrad = False
+        self.generator: torch.Generator | None = None
 
     def probe(self, model: SplatModel) -> Tensor | None:
         """None: no gradient is looked at."""
@@ -293,13 +297,19 @@ class Mcmc:
     @torch.no_grad()
     def after_step(self, model: SplatModel, done: int) -> None:
         """Shake the centres along each Gaussian, the transparent ones most."""
-        generator = torch.Generator(device=model.device)
+        if done % _NOISE_EVERY != 0:
+            return
+        if self.generator is None:
+            self.generator = torch.Generator(device=model.device)
+        generator = self.generator
         generator.manual_seed((self.seed * 1_000_003 + done) * 8 + 2)
         means = model.parameters["means"].detach()
         draw = torch.randn(means.shape, generator=generator, device=means.device)
         # sigmoid(-k (o - 0.005)): 1/2 at the opacity that is dead, none from 0.05 on
         weight = torch.sigmoid(-_SHARPNESS * (model.opacities() - _DEAD))
-        rate = _NOISE * model.means_rate(done / self.iterations)
+        # covariances over the extent: the original lets the scene have the size 1
+        rate = _NOISE * _NOISE_END ** (done / self.iterations) / model.extent
+        rate *= math.sqrt(_NOISE_EVERY)
         turn = quaternion_to_matrix(normalize_quaternions(model.parameters["quats"].detach()))
         variance = model.scales().square()
         local = (turn.transpose(1, 2) @ draw[..., None])[..., 0] * variance
@@ -312,8 +322,7 @@ class Mcmc:
         Raises:
             RunError: All are dead.
         """
-        recipe = self.recipe
-        if not recipe.densify_from <= done <= recipe.densify_until * self.iterations:
+        if not self.recipe.densify_from <= done <= _UNTIL * self.iterations:
             if wanted.drop is not None:
                 model.keep(~wanted.drop)
             return

@@ -16,8 +16,8 @@ from gsfluent.pipeline.reconstruct_views import TrainView
 
 _MOST_VIEWS = 24  # views looked at for growth; the worst
 _SLACK = 0.97  # of the target error: below, Gaussians are dropped
-_DROP_SHARE = 0.05  # of the Gaussians, at most, each time
-_DROP_WEIGHT = 0.001  # of all blend weights, at most, each time
+_DROP_SHARE = 0.1  # of the Gaussians, at most, each time
+_DROP_WEIGHT = 0.02  # of all blend weights, at most, each time, when there is no error at all
 _MARGIN_DB = 0.15  # training ends a little better than its target, steps still jitter
 
 
@@ -52,7 +52,8 @@ class ErrorTarget:
             return Wanted(grow=error > self.error * weight)
         drop = None
         if mean < _SLACK * self.error:
-            drop = least_seen(model, self.views, _DROP_WEIGHT, _DROP_SHARE)
+            share = _DROP_WEIGHT * (1.0 - mean / self.error)
+            drop = least_seen(model, self.views, share, _DROP_SHARE)
         return Wanted(drop=drop, stop=True)
 
 

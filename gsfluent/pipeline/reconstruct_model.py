@@ -118,10 +118,6 @@ class SplatModel:
         )
 
     # -- optimisation ----------------------------------------------------------------------------
-    def means_rate(self, progress: float) -> float:
-        """Step size of the centres [world units] at ``progress`` in [0, 1] of the run."""
-        return self.extent * self.rates.at("means", progress)
-
     @torch.no_grad()
     def step(self, progress: float) -> None:
         """One Adam step, then clear the gradients; ``progress`` in [0, 1] sets the decay."""

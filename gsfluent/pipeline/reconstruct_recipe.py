@@ -148,11 +148,12 @@ LONG = replace(
     name="long",
     object_rates=replace(_BRISK, means=8e-4),
     scene_rates=_BRISK,
-    densify_until=0.75,
+    densify_until=0.5,
     reset_every=0,
     shell=True,
     absgrad=True,
-    opacity_pull=0.01,
+    absgrad_threshold=3.2e-3,
+    opacity_pull=0.03,
 )
 """Long runs: no resets; a pull on opacities instead frees what is not needed (measured in
 docs/reconstruction.md)."""

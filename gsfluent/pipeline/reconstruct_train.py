@@ -26,6 +26,7 @@ from gsfluent.pipeline.reconstruct_views import TrainView, halved
 _HALVED_FROM = 64  # pixels; smaller photographs are not halved
 _MASK_WEIGHT = 2.0  # weight of the opacity loss; 0.5 leaves a rim of a third of a pixel (measured)
 _NEEDLE = 6.0  # longest over middle axis before it is pulled back
+_DROP_UNTIL = 0.9  # of the run; what was dropped for an error target is made up for afterwards
 _GATE_VIEWS = 12  # photographs whose error decides where to grow, each time
 _RECENT = 64  # steps whose losses are remembered
 _LOOK = {"cpu": 10}  # steps between two looks at the losses
@@ -204,7 +205,7 @@ class Trainer:
     def _control(self, done: int) -> None:
         recipe, wanted, degree = self.settings.recipe, Wanted(), self.degree(done)
         growing = recipe.densify_from <= done <= recipe.densify_until * self.settings.iterations
-        if self.target is not None:
+        if self.target is not None and done <= _DROP_UNTIL * self.settings.iterations:
             wanted = self.target.wanted(self.model, degree, self.last)
         elif self._thins(done):
             wanted = Wanted(drop=least_seen(self.model, self.views, recipe.thin))

@@ -56,6 +56,7 @@ def hole_fraction(
         quats=quats.contiguous(),
         scales=(_SIGMA_IN_SPACINGS * spacing)[:, None].expand(-1, 3).contiguous(),
         colors=torch.zeros_like(positions[:, :1]),
+        depth=False,
     ).alpha
     drawn = ops.rasterize(
         gaussians.means,
@@ -68,6 +69,7 @@ def hole_fraction(
         scales=gaussians.scales,
         colors=torch.zeros_like(gaussians.means[:, :1]),
         groups=groups,
+        depth=False,
     ).alpha
     silhouette = erode(matter > _SOLID)
     area = int(silhouette.sum())

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsfluent.ops import _memory, rasterize
+from gsfluent.ops import _memory, _raster_grad, rasterize
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 COUNT = 6
@@ -145,6 +145,25 @@ def test_an_allocation_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> N
             scales=torch.zeros(3, 3),
             colors=torch.zeros(3, 32),  # half a terabyte of image
         )
+
+
+def test_gradients_that_cannot_be_allocated_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The operator's allocator fails in the adjoint as it does above in the forward pass."""
+    means = torch.rand(3, 3, requires_grad=True)
+    camera, size = (torch.eye(4), torch.eye(3)), 8
+    shape = {"quats": torch.ones(3, 4), "scales": torch.ones(3, 3), "colors": torch.ones(3, 1)}
+    out = rasterize(means, torch.ones(3), *camera, size, size, **shape)
+
+    def fail(*_: object) -> None:
+        torch.ops.gsfluent.rasterize(
+            *(torch.zeros(1, 3), torch.zeros(1), *camera, torch.zeros(1, 4), torch.zeros(1, 3)),
+            *(None, None, torch.zeros(1, 32), None, None, None, None, None),
+            *(65536, 65536, False, False, False, False, 0.01, 1e6),
+        )
+
+    monkeypatch.setattr(_raster_grad, "backward", fail)
+    with pytest.raises(MemoryError, match="gradients of 3 Gaussians need at least 36 bytes"):
+        out.image.sum().backward()
 
 
 @pytest.mark.parametrize("device", DEVICES)
