@@ -1,4 +1,7 @@
-"""Stages: each an ``nn.Module``, containers in, containers out; ``gsfluent run`` chains them."""
+"""Stages: each an ``nn.Module``, containers in, containers out; ``gsfluent run`` chains them.
+
+Beside them the functions around an object's solid (docs/solid.md).
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,12 @@ _PUBLIC: dict[str, str] = {
     "Simulate": "gsfluent.pipeline.simulate",
     "Repair": "gsfluent.pipeline.repair",
     "Render": "gsfluent.pipeline.render",
+    "SignedDistance": "gsfluent.pipeline.solid_field",
+    "find_solid": "gsfluent.pipeline.solid_source",
+    "closed_mesh": "gsfluent.pipeline.solid_mesh",
+    "save_mesh": "gsfluent.pipeline.solid_mesh",
+    "clean_floaters": "gsfluent.pipeline.solid_clean",
+    "thin_shells": "gsfluent.pipeline.solid_thin",
 }
 
 __all__ = list(_PUBLIC)

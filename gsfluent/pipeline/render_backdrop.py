@@ -21,6 +21,7 @@ from gsfluent.pipeline.light import Light, ShadowMap, to_display, to_linear
 __all__ = ["Backdrop", "Behind", "covered_floor"]
 
 _NEAREST = 24  # splats that colour a covered spot
+_COLUMN = 0.9  # of the object's half width: the column whose inside nobody saw
 _PATCH = 40  # spots along the diameter of the covered disc
 _ALPHA_FLOOR = 1e-4
 
@@ -32,7 +33,7 @@ class Behind:
     Attributes:
         image: Display values times opacity, [H, W, 3].
         alpha: Opacity, [H, W].
-        depth: Expected camera z [m], 0 where there is none, [H, W].
+        depth: Median camera z [m], 0 where there is none, [H, W].
     """
 
     image: Tensor
@@ -76,14 +77,17 @@ class Backdrop:
             quats=splats.quats,
             scales=splats.scales,
             sh=splats.sh,
+            depth=False,
+            median_depth=True,  # haze before a surface pulls the mean depth off it
             near=1e-3 * max(self.radius, 1e-6),
         )
-        image, alpha = seen.image, seen.alpha
+        image, alpha, surface = seen.image, seen.alpha, seen.median_depth
+        assert surface is not None  # asked for
         if light is None or shadow is None:
-            return Behind(image, alpha, seen.depth)
+            return Behind(image, alpha, surface)
         hit = alpha > 0.5
         eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        along = seen.depth[hit] / (rays[hit] @ viewmat[2, :3])
+        along = surface[hit] / (rays[hit] @ viewmat[2, :3])
         points = eye + along[:, None] * rays[hit]
         arrives = shadow.cast(points, softness=0.035 * self.radius)
         # only what lies behind the matter, as the light sees it, is in its shadow
@@ -101,13 +105,14 @@ class Backdrop:
         linear = to_linear(image[hit] / cover) * share[:, None]
         image = image.clone()
         image[hit] = to_display(linear) * cover
-        return Behind(image, alpha, seen.depth)
+        return Behind(image, alpha, surface)
 
 
 def covered_floor(background: Gaussians, object_points: Tensor, height: float) -> Gaussians:
     """Cover the hole that the object leaves in what it stood on.
 
-    Spots of a disc under the object that no background splat covers get a flat splat, coloured by
+    Nothing is believed of the background in the column where the object stood: no photograph saw
+    it. Spots of a disc under the object that no other splat covers get a flat splat, coloured by
     the nearest ones of the plane.
 
     Args:
@@ -116,8 +121,8 @@ def covered_floor(background: Gaussians, object_points: Tensor, height: float) -
         height: z of the plane [m].
 
     Returns:
-        The background with the added splats (``BACKGROUND``) at its end; unchanged when fewer than
-        two dozen splats lie on the plane near the object.
+        The background less that column, with the added splats (``BACKGROUND``) at its end;
+        unchanged when fewer than two dozen splats lie on the plane around the object.
     """
     from scipy.spatial import cKDTree
 
@@ -128,21 +133,26 @@ def covered_floor(background: Gaussians, object_points: Tensor, height: float) -
         return background
     step = 2.0 * radius / _PATCH
     means = background.means.double().cpu().numpy()
+    off_axis = np.hypot(*(means[:, :2] - middle).T)
+    column = off_axis < _COLUMN * 0.5 * float((high - low).min())
+    column &= (means[:, 2] > height - radius) & (means[:, 2] < points[:, 2].max())
     solid = (background.opacities > 0.2).cpu().numpy()
     near = solid & (np.abs(means[:, 2] - height) < 2.0 * step)
-    near &= np.hypot(*(means[:, :2] - middle).T) < 3.0 * radius
+    near &= (off_axis < 3.0 * radius) & ~column
     if int(near.sum()) < _NEAREST:
         return background
+    size = background.scales.amax(1).double().cpu().numpy()[near]
+    paint = background.colors().double().cpu().numpy()[near]
+    background = background.select(torch.from_numpy(~column).to(background.device))
     axis = (np.arange(_PATCH) + 0.5) * step - radius
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     grid = grid[np.hypot(*grid.T) < radius] + middle
     tree = cKDTree(means[near][:, :2])
     distance, index = tree.query(grid, k=_NEAREST)
-    size = background.scales.amax(1).double().cpu().numpy()[near]
     open_spot = (distance > np.maximum(step, 1.5 * size[index])).all(axis=1)
     if not open_spot.any():
         return background
-    color = background.colors().double().cpu().numpy()[near][index[open_spot]]
+    color = paint[index[open_spot]]
     weight = 1.0 / (distance[open_spot] + 0.25 * step) ** 2
     weight /= weight.sum(1, keepdims=True)
     mixed = np.einsum("nk,nkc->nc", weight, color)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsfluent.config import Shot
-from gsfluent.data import Camera, Gaussians
+from gsfluent.data import Camera, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
@@ -29,11 +29,13 @@ from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame
 from gsfluent.pipeline.run_prepare import read_frame
 from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
+from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.stage import Progress, report_progress
 from gsfluent.pipeline.video import to_bytes, write_video
 
 # The pieces need a moment to part before a picture of them tells anything.
 _POSTER_DELAY = 0.08
+_RESIDUE = 4.0  # voxels around a solid in which no background is believed
 
 
 def light_of(shot: Shot) -> Light:
@@ -95,7 +97,7 @@ class Film:
         )
         backdrop = None
         if shot.output.backdrop == "captured":
-            backdrop = captured_backdrop(out / "stages" / "isolate", device)
+            backdrop = captured_backdrop(out / "stages", list(shot.objects), device)
         render = Render(
             light=light,
             studio=studio,
@@ -118,21 +120,25 @@ class Film:
         return self.render(frame.gaussians, camera, groups=frame.groups)
 
 
-def captured_backdrop(folder: Path, device: torch.device) -> Backdrop:
-    """The background that the isolate stage left, in the scene, with the object's place covered.
+def captured_backdrop(stages: Path, objects: list[str], device: torch.device) -> Backdrop:
+    """The background that the isolate stage left, in the scene, without what lies in the objects.
 
     Raises:
         InputError: It left none.
     """
-    path = folder / "background.ply"
+    path = stages / "isolate" / "background.ply"
     if not path.is_file():
         raise InputError(
             "output.backdrop: captured: nothing but the object is there",
             "masks and isolated splats have no background; use studio",
         )
-    frame = read_frame(folder)
-    whole = load(folder / "object.ply").transformed(frame).means
-    around = covered_floor(load(path).transformed(frame), whole, 0.0)
+    frame = read_frame(stages / "isolate")
+    around = load(path)
+    for name in objects:
+        solid = SignedDistance.of_solid(Solid.load(stages / "fill" / f"{name}.ply"))
+        around = around.select(solid.at(around.means) > _RESIDUE * solid.voxel)
+    whole = load(stages / "isolate" / "object.ply").transformed(frame).means
+    around = covered_floor(around.transformed(frame), whole, 0.0)
     return Backdrop(around.to(device), object_radius(whole))
 
 

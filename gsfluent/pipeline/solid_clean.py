@@ -243,14 +243,14 @@ def _witness(
     slack = limits.depth * extent + 2.0 * longest
     means = gaussians.means.nan_to_num(nan=1e9)
     for camera in map(_small, cameras):
-        result = _render(gaussians, camera, contribution=True)
-        assert result.contribution is not None
+        result = _render(gaussians, camera, witness=True)
+        assert result.contribution is not None and result.median_depth is not None
         pixel, z = camera.project(means.double().cpu())
         pixel, z = pixel.to(means), z.to(means)
         column, row = pixel.floor().clamp(-1, 1e6).long().unbind(1)
         on = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-        alpha, depth = result.alpha[row, column], result.depth[row, column]
+        alpha, depth = result.alpha[row, column], result.median_depth[row, column]
         solid = on & (alpha > 0.5)
         seen.weight = seen.weight + result.contribution
         seen.seen += result.contribution >= limits.weight
@@ -291,9 +291,8 @@ def _quality(gaussians: Gaussians, cameras: Sequence[Camera], targets: Sequence[
     return total / len(cameras)
 
 
-def _render(
-    gaussians: Gaussians, camera: Camera, *, contribution: bool = False
-) -> ops.raster.Rendered:
+def _render(gaussians: Gaussians, camera: Camera, *, witness: bool = False) -> ops.raster.Rendered:
+    """A picture before black; with ``witness`` also blend weights and median depth."""
     return ops.rasterize(
         gaussians.means,
         gaussians.opacities,
@@ -304,7 +303,9 @@ def _render(
         quats=gaussians.quats,
         scales=gaussians.scales,
         sh=gaussians.sh,
-        contribution=contribution,
+        contribution=witness,
+        depth=False,
+        median_depth=witness,
         near=1e-4,
     )
 

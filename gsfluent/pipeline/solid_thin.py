@@ -68,6 +68,9 @@ def thin_shells(
 ) -> dict[str, Any]:
     """Flag walls that a simulation grid cannot carry.
 
+    Thin is what is thinner than two cells and farther than a cell from where a ball of two cells
+    fits in: flakes and bumps of a rough surface ride on thick matter and are no walls.
+
     Args:
         field: The solid, world units.
         cell: Edge of a cell of the simulation [world units].
@@ -88,7 +91,7 @@ def thin_shells(
         raise ValueError(f"thin_shells: cell must be positive, got {cell}")
     limit, most = _CELLS * cell, 8.0 * cell
     points, thickness = wall_thickness(field, most)
-    thin = thickness < limit
+    thin = (thickness < limit) & (_from_core(field, points, 0.5 * limit) > 0.5 * limit + cell)
     share = float(thin.double().mean()) if len(thickness) else 0.0
     report: dict[str, Any] = {
         "cell": cell,
@@ -103,14 +106,17 @@ def thin_shells(
     }
     if len(thickness) == 0:
         return report
-    low, middle = thickness.double().quantile(torch.tensor([0.05, 0.5]).to(thickness).double())
-    report["thinnest"] = float(low) if float(low) < most else None
-    report["median"] = float(middle) if float(middle) < most else None
+    walls = thickness[thin | (thickness >= limit)].double()
+    if len(walls) == 0:
+        walls = thickness.double()
+    low, middle = walls.quantile(torch.tensor([0.05, 0.5]).to(walls)).tolist()
+    report["thinnest"] = low if low < most else None
+    report["median"] = middle if middle < most else None
     if share > 0:
         report["middle"] = points[thin].mean(dim=0).tolist()
     if share <= _SHARE:
         return report
-    thinnest = max(float(low), field.voxel)
+    thinnest = max(low, field.voxel)
     report["cells_needed"] = limit / thinnest
     report["warning"] = (
         f"{100 * share:.0f} % of the surface stands on walls under two cells ({limit:.3g}{unit}); "
@@ -123,3 +129,14 @@ def thin_shells(
         mend += "; a finer fill.resolution would know the wall better"
     report["mend"] = mend
     return report
+
+
+def _from_core(field: SignedDistance, points: Tensor, depth: float) -> Tensor:
+    """Distance of points [M, 3] from what lies deeper than ``depth``; infinite without any."""
+    from scipy import ndimage
+
+    core = (field.values <= -depth).cpu().numpy()
+    if not core.any():
+        return torch.full_like(points[:, 0], math.inf)
+    distance = ndimage.distance_transform_edt(~core) * field.voxel
+    return field.replace(values=torch.from_numpy(distance).to(field.values)).at(points)

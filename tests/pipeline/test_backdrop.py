@@ -81,14 +81,23 @@ def test_the_hole_under_the_object_is_covered_in_the_colours_around_it() -> None
     holed = table(hole=0.4)
     stood = 0.3 * torch.nn.functional.normalize(torch.randn(500, 3), dim=1)
     covered = covered_floor(holed, stood, 0.0)
+    # the table's own splats outside of the hole stay, in their order
+    assert torch.equal(covered.means[: holed.count], holed.means)
     added = covered.select(torch.arange(covered.count) >= holed.count)
     assert added.count > 20 and covered.labels is not None
     assert float(added.means[:, :2].norm(dim=1).max()) < 0.5
     assert torch.allclose(added.colors(), torch.tensor(RED).expand_as(added.means), atol=0.02)
     assert float(added.means[:, 2].abs().max()) < 0.01
     assert bool((covered.labels == BACKGROUND).all())
-    # nothing is added where there is no hole, or no table
-    assert covered_floor(table(), stood, 0.0).count == table().count
+    # what the training left where the object stood goes, and the table is closed again
+    residue = Gaussians.from_colors(
+        torch.tensor([[0.0, 0.0, 0.1], [0.1, 0.0, 0.05]]), torch.full((2,), 0.05),
+        torch.tensor([[0.0, 1.0, 0.0]] * 2), label=BACKGROUND,
+    )  # fmt: skip
+    again = covered_floor(Gaussians.cat([residue, holed]), stood, 0.0)
+    assert not bool((again.colors()[:, 1] > 0.5).any())
+    assert bool(((again.means[:, :2].norm(dim=1) < 0.1) & (again.means[:, 2].abs() < 0.01)).any())
+    # nothing happens where there is no table
     assert covered_floor(sheet(-3.0, RED), stood, 0.0).count == sheet(-3.0, RED).count
     assert object_radius(stood) == pytest.approx(0.3 * 3**0.5, rel=0.1)
 
