@@ -28,6 +28,7 @@ from .fill_interior import (
 )
 from .fill_view import cut_view, surface_colors
 from .orient import orient
+from .solid_skin import grown_to_masks
 from .stage import Progress, Stage, report_progress
 
 if TYPE_CHECKING:
@@ -295,6 +296,10 @@ class Fill(Stage):
         untrimmed = solid
         solid = smooth_boundary(trim_outer_flank(solid, shell, density))
         solid, more = keep_components(solid)
+        offset = 0.0
+        if views and capture is not None:
+            # what one sees reaches beyond the centres of the splats; the masks say how far
+            solid, offset = grown_to_masks(solid, hull, box, capture)
         inner = int((solid & ~shell).sum())
         if inner == 0:
             logger.warning(
@@ -317,6 +322,7 @@ class Fill(Stage):
             "closed_side_open_fraction": vote.open_fraction,
             "components_dropped": dropped + more,
             "buried_surface_fraction": buried,
+            "skin_offset": offset,
         }
         return solid, notes
 
