@@ -170,20 +170,35 @@ GSF_HOST_DEVICE int32_t splat_radius(const Splat<T>& s) {
   return static_cast<int32_t>(ceil(min(max(s.extent_x, s.extent_y), T(1 << 24))));
 }
 
-// Sums of v dx, v dy, v dx^2, v dx dy, v dy^2, v over the pixels, with v = dL/d ln alpha, become
-// gradients of centre, covariance (entries of the symmetric matrix) and opacity (of the splat,
-// after antialiasing). With e = Q d, Q the conic: d ln alpha = e.dcentre + e e^T : dcovariance / 2.
+// A splat's conic as a sum of squares: power / ln 2 = across^2 + down^2 with
+// across = conic.across (dx - slope dy), down = conic.down dy. Neither cancels, however thin the
+// splat is, and both stay below 3 within the support. Powers of two, because those are cheap.
+constexpr double kLog2E = 1.4426950408889634;
 template <typename T>
-GSF_HOST_DEVICE void moments_to_gradient(const T* moment, T conic_a, T conic_b, T conic_c,
-                                         T opacity, T* g) {
-  const T x = moment[0], y = moment[1], xx = moment[2], xy = moment[3], yy = moment[4];
-  g[0] = conic_a * x + conic_b * y;
-  g[1] = conic_b * x + conic_c * y;
-  const T ax = conic_a * xx + conic_b * xy, ay = conic_a * xy + conic_b * yy;
-  const T cx = conic_b * xx + conic_c * xy, cy = conic_b * xy + conic_c * yy;
-  g[2] = T(0.5) * (ax * conic_a + ay * conic_b);
-  g[3] = T(0.5) * (ax * conic_b + ay * conic_c);
-  g[4] = T(0.5) * (cx * conic_b + cy * conic_c);
+struct SplatConic {
+  T across, slope, down;
+
+  GSF_HOST_DEVICE static SplatConic of(const Splat<T>& s) {
+    using std::sqrt;
+    const T half = T(0.5 * kLog2E);
+    return {sqrt(half * s.a), -s.b / s.a, sqrt(half / s.cov_c)};  // c - b^2 / a = 1 / cov_c
+  }
+};
+
+// Sums of v across, v down, v across^2, v across down, v down^2, v over the pixels, with
+// v = dL/d ln alpha, become gradients of centre, covariance (entries of the symmetric matrix) and
+// opacity (of the splat, after antialiasing). With e the conic times the distance to the centre,
+// linear in across and down: d ln alpha = e . dcentre + e e^T : dcovariance / 2.
+template <typename T>
+GSF_HOST_DEVICE void moments_to_gradient(const T* moment, const SplatConic<T>& conic, T opacity,
+                                         T* g) {
+  const T x = T(2 / kLog2E) * conic.across, y = T(2 / kLog2E) * conic.down, z = -conic.slope * x;
+  const T xx = x * moment[2], xy = x * moment[3], yy = y * moment[4];
+  g[0] = x * moment[0];
+  g[1] = z * moment[0] + y * moment[1];
+  g[2] = T(0.5) * x * xx;
+  g[3] = T(0.5) * (z * xx + y * xy);
+  g[4] = T(0.5) * (z * z * moment[2] + 2 * y * z * moment[3] + y * yy);
   g[5] = moment[5] / opacity;
 }
 

@@ -51,9 +51,9 @@ struct GradSlots {
 };
 
 // Adjoint of blend_tile. Per instance it writes one row of slots: the moments of the opacity
-// gradient (see row_gradient), the gradients of the features, then sum |dL/dx|, |dL/dy| of the
-// centre. `background` is this tile's share [channels], or null. kF: features when known at compile
-// time, else 0.
+// gradient (see moments_to_gradient), the gradients of the features, then sum |dL/dx|, |dL/dy| of
+// the centre. `background` is this tile's share [channels], or null. kF: features when known at
+// compile time, else 0.
 template <typename T, int kF, bool kGroups, bool kAbsolute>
 void blend_tile_backward(const RasterGradArgs<T>& b, int64_t tile, const GradSlots<T>& slots,
                          T* background) {
@@ -202,7 +202,9 @@ void gaussian_backward(const RasterGradArgs<T>& b, const std::vector<SplatCamera
     for (int k = 0; k < slots.width; ++k) seen = seen || sum[k] != T(0);
     T g[kGradFeatures] = {};
     if (seen) {
-      row_gradient(sum, a.splats + s * a.stride, g);
+      const T* row = a.splats + s * a.stride;
+      const SplatConic<T> conic{row[kAcross], row[kSlope], row[kDown]};
+      moments_to_gradient(sum, conic, std::exp2(row[kLogOpacity]), g);
     }
     if (b.grad_offset) std::copy_n(g, 2, b.grad_offset + 2 * s);
     if (b.grad_absolute) {

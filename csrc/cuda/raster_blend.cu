@@ -32,12 +32,12 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
       a, place, a.features, stage[threadIdx.x / 32],
       [&] { return walk[0].stopped() && walk[1].stopped(); },
       [&](const StagedSplat<T, kF>& s) {
-        const T dx = px - s.x, along = s.a * dx * dx, cross = s.b * dx;
+        const T along = s.across * (px - s.x);
         T both = T(0);
 #pragma unroll
         for (int p = 0; p < kLanePixels; ++p) {
           const T before = walk[p].left;
-          const auto w = walk[p].weigh(s, along, cross, T(place.lane_y + p * kLaneRows) + T(0.5));
+          const auto w = walk[p].weigh(s, along, T(place.lane_y + p * kLaneRows) + T(0.5));
 #pragma unroll
           for (int f = 0; f < kF; ++f) sum[p][f] += w.weight * s.feature[f];
           // Sum of weights: 1 - transmittance would cost thin pixels their precision.
@@ -57,7 +57,6 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
         }
       });
 
-  const T* background = a.background_of(place.camera);
 #pragma unroll
   for (int p = 0; p < kLanePixels; ++p) {
     const int y = place.lane_y + p * kLaneRows;
@@ -68,7 +67,7 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
     if (inside && a.median) a.median[pixel] = median[p];
     // Constant indices keep `sum` in registers. Colours alone are the common case.
     const auto color = [&](int f) {
-      return sum[p][f] + (background ? fabs(walk[p].left) * background[f] : T(0));
+      return sum[p][f] + fabs(walk[p].left) * a.background_color(place.camera, f);
     };
     if (a.features == kF && a.channels == kF) {
 #pragma unroll

@@ -92,7 +92,7 @@ __global__ void __launch_bounds__(kRowThreads, 5)
     if (here) {
       T moment[kGradFeatures];
       for (int k = 0; k < kGradFeatures; ++k) moment[k] = sum(k);
-      moments_to_gradient(moment, s.a, s.b, s.c, s.opacity, g);
+      moments_to_gradient(moment, s.conic, s.opacity, g);
     }
     if (b.grad_offset) {
       b.grad_offset[2 * m] = g[0];

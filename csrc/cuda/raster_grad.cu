@@ -166,12 +166,12 @@ __global__ void __launch_bounds__(kBlockThreads)
       a, place, active, stage[threadIdx.x / 32],
       [&] { return walk[0].stopped() && walk[1].stopped(); },
       [&](const StagedSplat<T, kF>& s) {
-        const T dx = px - s.x, along = s.a * dx * dx, cross = s.b * dx;
+        const T along = s.across * (px - s.x);
         T moment[kGradFeatures] = {}, absolute[2] = {}, feature[kF] = {};
         bool any = false;
 #pragma unroll
         for (int p = 0; p < kLanePixels; ++p) {
-          const auto w = walk[p].weigh(s, along, cross, T(place.lane_y + p * kLaneRows) + T(0.5));
+          const auto w = walk[p].weigh(s, along, T(place.lane_y + p * kLaneRows) + T(0.5));
           any = any || w.keep;
           T toward = T(0);
 #pragma unroll
@@ -182,17 +182,17 @@ __global__ void __launch_bounds__(kBlockThreads)
           behind[p] -= w.weight * toward;
           const T all = w.weight * toward - w.alpha * behind[p] * reciprocal(T(1) - w.alpha);
           const T v = w.open ? all : T(0);
-          const T vx = v * dx, vy = v * w.dy;
+          const T vx = v * w.across, vy = v * w.down;
           moment[0] += vx;
           moment[1] += vy;
-          moment[2] += vx * dx;
-          moment[3] += vx * w.dy;
-          moment[4] += vy * w.dy;
+          moment[2] += vx * w.across;
+          moment[3] += vx * w.down;
+          moment[4] += vy * w.down;
           moment[5] += v;
           if constexpr (kAbsolute) {
-            // s.a is half of the conic's entry; all three are in base 2.
-            absolute[0] += fabs(2 * s.a * vx + s.b * vy) * T(1 / kLog2E);
-            absolute[1] += fabs(s.b * vx + 2 * s.c * vy) * T(1 / kLog2E);
+            // As moments_to_gradient has the centre's, pixel by pixel.
+            absolute[0] += T(2 / kLog2E) * fabs(s.across * vx);
+            absolute[1] += T(2 / kLog2E) * fabs(s.down * vy - s.skew * vx);
           }
         }
         if (!__any_sync(kAllLanes, any)) return;

@@ -10,7 +10,8 @@ constexpr uint32_t kCulledKey = 0xffffffffu;
 
 template <typename T>
 struct alignas(16) SplatGeometry {
-  T x, y, a, b, c;
+  T x, y;
+  SplatConic<T> conic;
   T opacity;  // after antialiasing; 0 marks a splat that cannot be seen
   T extent_x, extent_y;
 };
@@ -22,6 +23,13 @@ GSF_HOST_DEVICE const SplatGeometry<T>* splat_geometry(const RasterArgs<T>& a) {
 template <typename T>
 GSF_HOST_DEVICE T* splat_feature_rows(const RasterArgs<T>& a) {
   return a.splats + kGeometry * a.splat_count();
+}
+
+// dy / dx of the line through the middles of the support on all pixel columns: slope var_y / var_x.
+template <typename T>
+GSF_HOST_DEVICE T vertical_slope(const SplatGeometry<T>& g) {
+  const T ratio = g.extent_y / g.extent_x;
+  return g.conic.slope * ratio * ratio;
 }
 
 // Rows of tiles [y0, y1) that a splat may touch, and its pixel box.
@@ -36,13 +44,12 @@ struct SplatBands {
     pixels = splat_box(g.x, g.y, g.extent_x, g.extent_y, a.width, a.height);
     y0 = pixels.y0 / a.tile;
     y1 = (pixels.y1 + a.tile - 1) / a.tile;
-    // On the line dy the support is slope_x dy +- half_width sqrt(1 - (dy / extent_y)^2); a little
-    // slack absorbs rounding. extent_x^2 = 2 cutoff var_x and conic give half_width^2 =
-    // 2 cutoff / a = extent_x^2 (1 - rho^2), free of the cancellation in a c - b^2.
-    slope_x = -g.b / g.a;
-    slope_y = -g.b / g.c;
-    const T cutoff = splat_cutoff(g.opacity);
-    half_width = sqrt(2 * max(cutoff, T(0)) / g.a) * T(1.0001) + T(1e-3);
+    // On the line dy the support is slope dy +- half_width sqrt(1 - (dy / extent_y)^2); a little
+    // slack absorbs rounding.
+    slope_x = g.conic.slope;
+    slope_y = vertical_slope(g);
+    const T cutoff = T(kLog2E) * splat_cutoff(g.opacity);
+    half_width = sqrt(max(cutoff, T(0))) / g.conic.across * T(1.0001) + T(1e-3);
     inverse_extent = T(1) / (g.extent_y + T(1e-3));
   }
 

@@ -28,7 +28,8 @@ __global__ void __launch_bounds__(kRowThreads) project_kernel(RasterArgs<T> a, R
         splat_features(a, camera, i, degree, sh, s.depth, splat_feature_rows(a) + m * a.features);
   uint64_t code = 0;
   if (i < a.count) {
-    SplatGeometry<T> g{s.x, s.y, s.a, s.b, s.c, seen ? s.opacity : T(0), s.extent_x, s.extent_y};
+    SplatGeometry<T> g{};
+    if (seen) g = {s.x, s.y, SplatConic<T>::of(s), s.opacity, s.extent_x, s.extent_y};
     const_cast<SplatGeometry<T>*>(splat_geometry(a))[m] = g;
     if (seen) code = TileCode::of(g, a);
     o.keys[m] = seen ? __float_as_uint(static_cast<float>(s.depth)) : kCulledKey;

@@ -15,22 +15,23 @@ constexpr int kLaneRows = 4;
 constexpr int kBlockWarps = 4;  // a block draws 16x16 pixels
 constexpr int kBlockEdge = 16;
 constexpr int kBlockThreads = 32 * kBlockWarps;
-constexpr double kLog2E = 1.4426950408889634;
+constexpr double kLog2Of255 = 7.994353436858858;
 
-__device__ __forceinline__ float exp2_negative(float x) {  // of 0..8
+__device__ __forceinline__ float exp2_of(float x) {
   float y;
-  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(-x));
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
 }
-__device__ __forceinline__ double exp2_negative(double x) { return exp2(-x); }
+__device__ __forceinline__ double exp2_of(double x) { return exp2(x); }
 __device__ __forceinline__ float log2_of(float x) { return __log2f(x); }
 __device__ __forceinline__ double log2_of(double x) { return log2(x); }
 
-// A splat as the pixels of a warp read it; powers in base 2. kF: room for features.
+// A splat as the pixels of a warp read it: log2 alpha = log_opacity - across^2 - down^2 with
+// across = this.across dx - skew dy, down = this.down dy. kF: room for features.
 template <typename T, int kF>
 struct alignas(16) StagedSplat {
-  T x, y, a, b, c;  // power = (a dx + b dy) dx + c dy^2
-  T opacity, cutoff;
+  T x, y, across, skew, down;
+  T log_opacity, least;  // base 2; least log2 alpha that still contributes
   int32_t id;
   T feature[kF];
   int32_t group;
@@ -62,21 +63,24 @@ inline dim3 blend_blocks(const RasterArgs<T>& a) {
               a.cameras);
 }
 
-// True when the support of the splat may reach a pixel centre of the warp: the smallest power over
-// the rectangle lies on an edge that faces the centre. A little slack absorbs rounding.
+// True when the support of the splat (across^2 + down^2 up to `reach`) may reach a pixel centre of
+// the warp: the smallest power over the rectangle lies on an edge that faces the centre. A little
+// slack absorbs rounding.
 template <typename T>
-__device__ __forceinline__ bool reaches_warp(const SplatGeometry<T>& g, T cutoff,
+__device__ __forceinline__ bool reaches_warp(const SplatGeometry<T>& g, T reach,
                                              const WarpPlace& p) {
   const T x0 = T(p.x) + T(0.5) - g.x, x1 = x0 + T(kWarpEdge - 1);
   const T y0 = T(p.y) + T(0.5) - g.y, y1 = y0 + T(kWarpEdge - 1);
   const T dx = clamp(T(0), x0, x1), dy = clamp(T(0), y0, y1);  // nearest point to the centre
   if (fabs(dx) > g.extent_x || fabs(dy) > g.extent_y) return false;
-  const T limit = cutoff * T(1.001) + T(1e-4);
-  const T y = clamp(-g.b * dx / g.c, y0, y1), x = clamp(-g.b * dy / g.a, x0, x1);
-  const T over_x = T(0.5) * (g.a * dx * dx + g.c * y * y) + g.b * dx * y;
-  const T over_y = T(0.5) * (g.a * x * x + g.c * dy * dy) + g.b * x * dy;
+  const T limit = reach * T(1.001) + T(1e-4);
+  const auto within = [&](T x, T y) {
+    const T across = g.conic.across * (x - g.conic.slope * y), down = g.conic.down * y;
+    return across * across + down * down <= limit;
+  };
+  const bool by_x = dx != T(0) && within(dx, clamp(vertical_slope(g) * dx, y0, y1));
+  const bool by_y = dy != T(0) && within(clamp(g.conic.slope * dy, x0, x1), dy);
   // Where the centre lies between two edges, those say nothing.
-  const bool by_x = dx != T(0) && over_x <= limit, by_y = dy != T(0) && over_y <= limit;
   return by_x || by_y || (dx == T(0) && dy == T(0));
 }
 
@@ -94,19 +98,21 @@ struct PixelWalk {
   __device__ __forceinline__ bool stopped() const { return left < T(0); }
 
   struct Weight {
-    T dy, alpha, weight;
+    T across, down, alpha, weight;
     bool keep, open;  // contributes; contributes and the cap does not bind
   };
 
-  // `along` is (a dx) dx, `cross` is b dx of the lane's column.
+  // `along` is the part of `across` that the lane's column gives.
   template <int kF>
-  __device__ __forceinline__ Weight weigh(const StagedSplat<T, kF>& s, T along, T cross, T py) {
+  __device__ __forceinline__ Weight weigh(const StagedSplat<T, kF>& s, T along, T py) {
     Weight r;
-    r.dy = py - s.y;
-    const T power = max(along + r.dy * (cross + s.c * r.dy), T(0));
-    const T raw = s.opacity * exp2_negative(power);
+    const T dy = py - s.y;
+    r.across = along - s.skew * dy;
+    r.down = s.down * dy;
+    const T log_alpha = s.log_opacity - r.down * r.down - r.across * r.across;
+    const T raw = exp2_of(log_alpha);
     r.alpha = min(raw, T(kMaxAlpha));
-    bool pass = power <= s.cutoff;
+    bool pass = log_alpha >= s.least;
     if constexpr (kGroups) {
       if (s.group >= 0) {
 #pragma unroll
@@ -150,18 +156,19 @@ __device__ __forceinline__ void for_each_splat(const RasterArgs<T>& a, const War
     if (__all_sync(kAllLanes, stopped())) return;
     // A culled splat is in no list; lists that were tampered with must not make log(0).
     const bool real = first + lane < end && g.opacity > T(0);
-    const T cutoff2 = real ? min(log2_of(g.opacity * T(255)), T(kMaxPower * kLog2E)) : T(0);
-    const bool reaches = real && reaches_warp(g, cutoff2 * T(1 / kLog2E), place);
+    const T log_opacity = real ? log2_of(g.opacity) : T(0);
+    const T reach = min(log_opacity + T(kLog2Of255), T(kMaxPower * kLog2E));
+    const bool reaches = real && reaches_warp(g, reach, place);
     const unsigned mask = __ballot_sync(kAllLanes, reaches);
     if (reaches) {
       StagedSplat<T, kF>& s = stage[__popc(mask & ((1u << lane) - 1))];
       s.x = g.x;
       s.y = g.y;
-      s.a = T(0.5 * kLog2E) * g.a;
-      s.b = T(kLog2E) * g.b;
-      s.c = T(0.5 * kLog2E) * g.c;
-      s.opacity = g.opacity;
-      s.cutoff = cutoff2;
+      s.across = g.conic.across;
+      s.skew = g.conic.across * g.conic.slope;
+      s.down = g.conic.down;
+      s.log_opacity = log_opacity;
+      s.least = log_opacity - reach;
       s.id = id;
       const T* row = feature_rows + int64_t(id) * a.features;
 #pragma unroll

@@ -41,7 +41,7 @@ _log = logging.getLogger(__name__)
 _SCENE_SHARE = 0.6  # of the steps for everything, before the object gets the rest
 _FAINT = 0.02  # opacity below which a trained Gaussian is dropped
 _BUDGET = 100_000  # of MCMC, when none is given
-_HULL_START = 100_000  # Gaussians on a hull of 96 voxels a side; more would fall on each other
+_HULL_START = 20_000  # Gaussians on a hull at most; photographs ask for more where they want them
 
 
 class Reconstruct(Stage):

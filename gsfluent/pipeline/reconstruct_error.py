@@ -7,6 +7,8 @@ by one backward pass through a feature that is zero everywhere: the gradient of
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -18,6 +20,7 @@ _MOST_VIEWS = 24  # views looked at for growth; the worst
 _SLACK = 0.97  # of the target error: below, Gaussians are dropped
 _DROP_SHARE = 0.1  # of the Gaussians, at most, each time
 _DROP_WEIGHT = 0.02  # of all blend weights, at most, each time, when there is no error at all
+_FALLING = 0.96  # of the last mean error: while training alone gains so much, none is added
 _MARGIN_DB = 0.15  # training ends a little better than its target, steps still jitter
 
 
@@ -32,6 +35,7 @@ class ErrorTarget:
     def __init__(self, views: list[TrainView], psnr: float) -> None:
         self.views = views
         self.error = 10.0 ** (-(psnr + _MARGIN_DB) / 10.0)
+        self.previous = math.inf
 
     def wanted(self, model: SplatModel, degree: int, last: Tensor) -> Wanted:
         """What the next change of the count shall be.
@@ -45,6 +49,9 @@ class ErrorTarget:
         if not bool(known.any()):
             return Wanted()
         mean = float(last[known].mean())
+        falling, self.previous = mean < _FALLING * self.previous, mean
+        if mean > self.error and falling:
+            return Wanted(stop=True)
         if mean > self.error:
             chosen = torch.where(known, last, torch.zeros_like(last))
             worst = chosen.topk(min(_MOST_VIEWS, len(self.views))).indices.tolist()

@@ -230,6 +230,8 @@ class Trainer:
         values = self.model.state() | self.density.state()
         values |= {"last": self.last, "recent": self.recent, "done": torch.tensor(self.done)}
         values["history"] = torch.tensor(self.history, dtype=torch.float64).reshape(-1, 3)
+        if self.target is not None:
+            values["target"] = torch.tensor(self.target.previous, dtype=torch.float64)
         return values | ({} if self.exposure is None else self.exposure.state())
 
     def restore(self, state: dict[str, Tensor]) -> None:
@@ -242,6 +244,8 @@ class Trainer:
         self.density.restore(state)
         if self.exposure is not None:
             self.exposure.restore(state)
+        if self.target is not None:
+            self.target.previous = float(state["target"])
         self.last = state["last"].to(self.model.device)
         self.recent = state["recent"].to(self.model.device)
         self.done = int(state["done"])

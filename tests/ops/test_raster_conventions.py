@@ -148,7 +148,10 @@ def test_real_splats_equal_the_published_formulas(name: str, device: str, data_r
     """Every sixteenth splat, scaled to the unit ball."""
     from gsfluent.io.splats import load_splats
 
-    full = load_splats(data_root / "splats" / name)
+    path = data_root / "splats" / name
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    full = load_splats(path)
     centre = full.means.median(0).values
     scale = 1 / float((full.means - centre).norm(dim=1).quantile(0.98))
     some = full.select(torch.arange(0, len(full), 16))
