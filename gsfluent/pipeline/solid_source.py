@@ -92,6 +92,8 @@ def find_solid(
         carve = method == "auto"
         field, note = _of_density(gaussians, capture, resolution, seed, carve=carve)
         why += note
+    if chosen != "mesh":
+        field = field.tidied()
     if not bool(field.inside.any()):
         raise InputError(
             f"solid: {chosen} found no inside at {resolution} voxels",
