@@ -160,7 +160,7 @@ def _of_density(
     from scipy import ndimage
 
     gaussians = gaussians.validated("solid")
-    box, solid, notes = Fill(resolution, seed=seed).inside(gaussians, capture)
+    box, solid, notes = Fill(resolution, match_masks=False, seed=seed).inside(gaussians, capture)
     source, note = "density", ""
     cameras, views = _lookers(capture, box, notes["closed_side"])
     visible = gaussians.select(gaussians.opacities > _FAINT)
