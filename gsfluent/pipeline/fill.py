@@ -28,6 +28,7 @@ from .fill_interior import (
 )
 from .fill_view import cut_view, surface_colors
 from .orient import orient
+from .solid_skin import grown_to_masks
 from .stage import Progress, Stage, report_progress
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ class Fill(Stage):
         down: Downward direction in world coordinates; None asks the capture, and without one finds
             an unseen side by itself.
         close_underside: Close the side that no photograph shows, at its rim.
+        match_masks: Grow the solid to the outline of the masks, where there are any.
         refine_iterations: Steps of the opacity fit (0 switches it off).
         refine_image_size: Longest image side in the fit [pixels].
         seed: Seed of lattice jitter and view order.
@@ -88,6 +90,7 @@ class Fill(Stage):
         max_interior: int = 200_000,
         down: tuple[float, float, float] | None = None,
         close_underside: bool = True,
+        match_masks: bool = True,
         refine_iterations: int = 24,
         refine_image_size: int = 200,
         seed: int = 0,
@@ -127,6 +130,7 @@ class Fill(Stage):
         self.max_interior = int(max_interior)
         self.down = None if down is None else np.asarray(down, dtype=float)
         self.close_underside = close_underside
+        self.match_masks = match_masks
         self.refine_iterations = int(refine_iterations)
         self.refine_image_size = int(refine_image_size)
 
@@ -295,6 +299,10 @@ class Fill(Stage):
         untrimmed = solid
         solid = smooth_boundary(trim_outer_flank(solid, shell, density))
         solid, more = keep_components(solid)
+        offset = 0.0
+        if self.match_masks and views and capture is not None:
+            # what one sees reaches beyond the centres of the splats; the masks say how far
+            solid, offset = grown_to_masks(solid, hull, box, capture)
         inner = int((solid & ~shell).sum())
         if inner == 0:
             logger.warning(
@@ -317,6 +325,7 @@ class Fill(Stage):
             "closed_side_open_fraction": vote.open_fraction,
             "components_dropped": dropped + more,
             "buried_surface_fraction": buried,
+            "skin_offset": offset,
         }
         return solid, notes
 

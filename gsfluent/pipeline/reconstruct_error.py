@@ -20,7 +20,8 @@ _MOST_VIEWS = 24  # views looked at for growth; the worst
 _SLACK = 0.97  # of the target error: below, Gaussians are dropped
 _DROP_SHARE = 0.1  # of the Gaussians, at most, each time
 _DROP_WEIGHT = 0.02  # of all blend weights, at most, each time, when there is no error at all
-_FALLING = 0.96  # of the last mean error: while training alone gains so much, none is added
+_NEAR = 2.0  # times the target error: from there on patience is worth it
+_FALLING = 0.9  # of the last mean error: while training alone gains so much, none is added
 _MARGIN_DB = 0.15  # training ends a little better than its target, steps still jitter
 
 
@@ -50,7 +51,7 @@ class ErrorTarget:
             return Wanted()
         mean = float(last[known].mean())
         falling, self.previous = mean < _FALLING * self.previous, mean
-        if mean > self.error and falling:
+        if self.error < mean < _NEAR * self.error and falling:
             return Wanted(stop=True)
         if mean > self.error:
             chosen = torch.where(known, last, torch.zeros_like(last))

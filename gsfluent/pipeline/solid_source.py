@@ -92,6 +92,8 @@ def find_solid(
         carve = method == "auto"
         field, note = _of_density(gaussians, capture, resolution, seed, carve=carve)
         why += note
+    if chosen != "mesh":
+        field = field.tidied()
     if not bool(field.inside.any()):
         raise InputError(
             f"solid: {chosen} found no inside at {resolution} voxels",
@@ -158,7 +160,7 @@ def _of_density(
     from scipy import ndimage
 
     gaussians = gaussians.validated("solid")
-    box, solid, notes = Fill(resolution, seed=seed).inside(gaussians, capture)
+    box, solid, notes = Fill(resolution, match_masks=False, seed=seed).inside(gaussians, capture)
     source, note = "density", ""
     cameras, views = _lookers(capture, box, notes["closed_side"])
     visible = gaussians.select(gaussians.opacities > _FAINT)

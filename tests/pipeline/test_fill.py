@@ -10,8 +10,10 @@ import pytest
 import torch
 from interior_shapes import RADII, ellipsoid_shell, ellipsoid_truth, iou
 
+from gsfluent import demo
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
+from gsfluent.io import load_capture
 from gsfluent.pipeline.fill import Fill, cut_view
 from gsfluent.pipeline.fill_density import GridBox, density_field
 from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, count_leaks
@@ -337,3 +339,26 @@ def test_real_plush_dog(data_root: Path) -> None:
     assert 0.05 < report["volume"] / float(box) < 0.8
     # a body, not a shell: the deepest point is many voxels below the surface
     assert float(filled.depth.max()) > 6 * filled.voxel
+
+
+def test_masks_say_how_far_the_skin_lies_from_the_centres_of_the_splats(tmp_path: Path) -> None:
+    paths = demo.make_capture("watermelon", tmp_path, views=12, size=96)
+    capture = load_capture(paths.root)
+    truth = demo.make_object("watermelon", 0)
+    lower, upper = truth.bounds()
+    half, middle = 0.5 * (upper - lower), 0.5 * (upper + lower)
+    # splats a twentieth below the true skin, as training leaves them
+    shell = ellipsoid_shell(4000, (1.0, 1.0, 1.0))
+    place = (middle + 0.95 * half * shell.means.double()).float()
+    sunk = shell.replace(means=place, scales=shell.scales * 0.95 * float(half.mean()))
+    points = lower + (upper - lower) * torch.rand(
+        50_000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    true = truth.inside(points)
+    shares = {}
+    for photographs in (None, capture):
+        solid = Fill(resolution=48, refine_iterations=0)(sunk, photographs)
+        guess = solid.contains(points.float())
+        shares[photographs is None] = float((guess & true).sum() / (guess | true).sum())
+    assert solid.report["skin_offset"] > 0.5
+    assert shares[False] > shares[True] + 0.05 and shares[False] > 0.9

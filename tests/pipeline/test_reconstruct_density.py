@@ -167,9 +167,10 @@ def test_target_stops_growth_and_drops_what_is_not_seen() -> None:
     model = model_of(cloud())
     views = [photographed(model, camera(turn)) for turn in (0.0, 0.8)]
     target = ErrorTarget(views, 30.0)
-    far = torch.tensor([0.1, 0.1])
-    assert target.wanted(model, 0, far).stop  # it may fall by itself yet
-    far_off = target.wanted(model, 0, far)
+    near = torch.tensor([1.5e-3, 1.5e-3])
+    assert target.wanted(model, 0, near).stop  # it may fall by itself yet
+    assert not target.wanted(model, 0, near).stop
+    far_off = target.wanted(model, 0, torch.tensor([0.1, 0.1]))
     assert not far_off.stop and far_off.grow is not None and not bool(far_off.grow.any())
     model.parameters["opacities"].detach()[3] = -9.0  # blends into nothing
     met = target.wanted(model, 0, torch.tensor([1e-5, math.nan]))

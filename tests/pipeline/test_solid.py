@@ -131,6 +131,21 @@ def test_distances_are_those_of_a_ball() -> None:
     assert field.volume == pytest.approx(4 / 3 * math.pi * 12**3, rel=0.01)
 
 
+def test_crumbs_and_bubbles_go_and_the_rest_stays() -> None:
+    body = np.zeros((30, 30, 30), bool)
+    body[5:20, 5:20, 5:20] = True
+    body[10:12, 10:12, 10:12] = False  # a bubble
+    body[25, 25, 25] = True  # a crumb
+    body[22:27, 8:13, 8:13] = True  # a piece of 4 %
+    field = SignedDistance.of_voxels(body, np.zeros(3), 1.0, "test")
+    tidy = field.tidied()
+    change = tidy.inside.int() - field.inside.int()
+    assert int(change.clamp_min(0).sum()) == 8 and int((-change).clamp_min(0).sum()) == 1
+    mesh = closed_mesh(tidy)
+    assert mesh.body_count == 2 and mesh.is_watertight
+    assert torch.equal(tidy.values[change == 0], field.values[change == 0])
+
+
 def test_smoothing_moves_no_voxel_to_the_other_side() -> None:
     noise = np.random.default_rng(0).random((24, 24, 24)) < 0.3
     assert np.array_equal(distances_of(noise) <= 0, noise)
