@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import BACKGROUND, Camera, Capture, Gaussians
 from gsfluent.data.capture import View
 from gsfluent.metrics import psnr, ssim
+from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.reconstruct_masks import silhouette
 
 HOLD_OUT = 8
@@ -20,19 +20,7 @@ HOLD_OUT = 8
 @torch.no_grad()
 def render_view(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
     """Render Gaussians as a camera sees them, before black: image [H, W, 3] and alpha [H, W]."""
-    result = ops.rasterize(
-        gaussians.means,
-        gaussians.opacities,
-        camera.viewmat.to(gaussians.means),
-        camera.K.to(gaussians.means),
-        camera.width,
-        camera.height,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        sh=gaussians.sh,
-        near=1e-4,
-        depth=False,
-    )
+    result = draw(gaussians, camera)
     return result.image, result.alpha
 
 

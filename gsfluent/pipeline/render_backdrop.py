@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import BACKGROUND, Camera, Gaussians
+from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.light import Light, ShadowMap, to_display, to_linear
 
 __all__ = ["Backdrop", "Behind", "covered_floor"]
@@ -67,20 +67,9 @@ class Backdrop:
         """
         splats = self.gaussians
         viewmat = camera.viewmat.to(splats.means)
-        seen = ops.rasterize(
-            splats.means,
-            splats.opacities,
-            viewmat,
-            camera.K.to(splats.means),
-            camera.width,
-            camera.height,
-            quats=splats.quats,
-            scales=splats.scales,
-            sh=splats.sh,
-            depth=False,
-            median_depth=True,  # haze before a surface pulls the mean depth off it
-            near=1e-3 * max(self.radius, 1e-6),
-        )
+        # Median depth: haze before a surface pulls the mean depth off it.
+        near = 1e-3 * max(self.radius, 1e-6)
+        seen = draw(splats, camera, median_depth=True, near=near)
         image, alpha, surface = seen.image, seen.alpha, seen.median_depth
         assert surface is not None  # asked for
         if light is None or shadow is None:

@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import BACKGROUND, Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.metrics import psnr
+from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.fill_density import choose_grid, density_field
 from gsfluent.pipeline.inspect_shape import robust_box
 from gsfluent.pipeline.reconstruct_init import Hull
@@ -243,7 +243,7 @@ def _witness(
     slack = limits.depth * extent + 2.0 * longest
     means = gaussians.means.nan_to_num(nan=1e9)
     for camera in map(_small, cameras):
-        result = _render(gaussians, camera, witness=True)
+        result = draw(gaussians, camera, contribution=True, median_depth=True)
         assert result.contribution is not None and result.median_depth is not None
         pixel, z = camera.project(means.double().cpu())
         pixel, z = pixel.to(means), z.to(means)
@@ -286,28 +286,9 @@ def _quality(gaussians: Gaussians, cameras: Sequence[Camera], targets: Sequence[
     """Mean PSNR [dB] of the pictures before black."""
     total = 0.0
     for camera, target in zip(cameras, targets, strict=True):
-        image = _render(gaussians, camera).image.clamp(0.0, 1.0)
+        image = draw(gaussians, camera).image.clamp(0.0, 1.0)
         total += min(psnr(image, target.to(image)), 100.0)
     return total / len(cameras)
-
-
-def _render(gaussians: Gaussians, camera: Camera, *, witness: bool = False) -> ops.raster.Rendered:
-    """A picture before black; with ``witness`` also blend weights and median depth."""
-    return ops.rasterize(
-        gaussians.means,
-        gaussians.opacities,
-        camera.viewmat.to(gaussians.means),
-        camera.K.to(gaussians.means),
-        camera.width,
-        camera.height,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        sh=gaussians.sh,
-        contribution=witness,
-        depth=False,
-        median_depth=witness,
-        near=1e-4,
-    )
 
 
 def _small(camera: Camera) -> Camera:

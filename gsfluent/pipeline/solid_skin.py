@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsfluent import ops
 from gsfluent.data import Camera, Capture, Gaussians
+from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.fill_density import GridBox
 from gsfluent.pipeline.solid_field import SignedDistance, distances_of
 
@@ -45,20 +45,8 @@ def drawn_outlines(gaussians: Gaussians, cameras: Sequence[Camera]) -> Iterator[
     step = max(1, len(cameras) // _CAMERAS)
     for given in cameras[::step]:
         camera = given.scaled(_SIZE / max(given.width, given.height))
-        alpha = ops.rasterize(
-            gaussians.means,
-            gaussians.opacities,
-            camera.viewmat.to(gaussians.means),
-            camera.K.to(gaussians.means),
-            camera.width,
-            camera.height,
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            colors=torch.zeros_like(gaussians.means[:, :1]),
-            antialiased=True,
-            depth=False,
-            near=1e-4,
-        ).alpha
+        flat = torch.zeros_like(gaussians.means[:, :1])
+        alpha = draw(gaussians, camera, colors=flat, antialiased=True).alpha
         yield camera, alpha > _SOLID
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
+from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.fill_density import GridBox
 
 __all__ = ["Fused", "fuse_depths", "ring_of_cameras", "zoomed"]
@@ -168,19 +168,7 @@ def _clear(alpha: Tensor) -> Tensor:
 
 def _drawn(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
     """Depth and opacity as a camera sees them, [H, W] each."""
-    result = ops.rasterize(
-        gaussians.means,
-        gaussians.opacities,
-        camera.viewmat.to(gaussians.means),
-        camera.K.to(gaussians.means),
-        camera.width,
-        camera.height,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        colors=torch.zeros_like(gaussians.means[:, :1]),
-        depth=False,
-        median_depth=True,
-        near=1e-4,
-    )
+    flat = torch.zeros_like(gaussians.means[:, :1])
+    result = draw(gaussians, camera, colors=flat, median_depth=True)
     assert result.median_depth is not None  # asked for
     return result.median_depth, result.alpha
