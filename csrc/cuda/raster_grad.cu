@@ -1,6 +1,5 @@
 // Adjoint of the blend on CUDA. A warp sums what its 64 pixels say of a splat by exchanging halves
-// (16 shuffles for up to 16 numbers, not 5 each) and adds the sums with one instruction to
-// consecutive words.
+// (14 shuffles for nine numbers, not 45) and adds the sums with one instruction.
 #include "cuda/launch_raster.h"
 #include "cuda/raster_walk.h"
 

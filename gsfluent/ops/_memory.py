@@ -89,8 +89,10 @@ def shortage(arguments: tuple[Any, ...]) -> str:
 
 def is_shortage(error: BaseException) -> bool:
     """True when the allocator refused (torch's stable ABI reports only the call that failed)."""
+    text = str(error)
     return isinstance(error, torch.OutOfMemoryError) or (
-        "API call failed" in str(error) and ("new_empty" in str(error) or "new_zeros" in str(error))
+        "API call failed" in text
+        and any(name in text for name in ("new_empty", "new_zeros", "contiguous"))
     )
 
 
