@@ -119,7 +119,6 @@ class Adc:
     Args:
         recipe: Schedule.
         iterations: Length of the run.
-        start: Count at the start.
         limit: Cap on the count.
         threshold: Mean screen-space gradient above which a Gaussian is cloned or split.
         place: Where Gaussians may be.
@@ -131,7 +130,6 @@ class Adc:
         self,
         recipe: Recipe,
         iterations: int,
-        start: int,
         limit: int,
         threshold: float,
         place: Place,
@@ -139,8 +137,7 @@ class Adc:
         absgrad: bool,
         seed: int,
     ) -> None:
-        self.recipe, self.iterations = recipe, iterations
-        self.start, self.limit = start, limit
+        self.recipe, self.iterations, self.limit = recipe, iterations, limit
         self.threshold, self.place, self.absgrad, self.seed = threshold, place, absgrad, seed
         self.gradient = self.visits = torch.empty(0)
 
@@ -160,14 +157,6 @@ class Adc:
             self.visits = torch.zeros_like(self.gradient)
         self.gradient += probe.grad.norm(dim=1) * (0.5 * view.full_width)  # 0 where not seen
         self.visits += rendered.radii > 0
-
-    def cap(self, done: int) -> int:
-        """Cap on the count at a step."""
-        recipe = self.recipe
-        if not recipe.ramped:
-            return self.limit
-        share = min(1.0, done / (recipe.densify_until * self.iterations))
-        return round(self.start + share * max(0, self.limit - self.start))
 
     def penalty(self, model: SplatModel) -> Tensor | None:
         """Pull on opacities, as the recipe has it, while the count may grow."""
@@ -196,7 +185,7 @@ class Adc:
                 mean = self.gradient / self.visits.clamp_min(1.0)
                 if wanted.grow is not None:
                     mean = mean * wanted.grow
-                densify(model, mean, self.threshold, self.cap(done), draws(self.seed, 1, done))
+                densify(model, mean, self.threshold, self.limit, draws(self.seed, 1, done))
         keep = ~self.place.misplaced(model)
         keep &= model.opacities() > recipe.prune_opacity
         if wanted.drop is not None:

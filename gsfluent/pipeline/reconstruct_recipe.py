@@ -58,13 +58,6 @@ class Recipe:
         prune_opacity: Opacity below which a Gaussian goes.
         opacity_pull: Weight of the mean opacity in the loss while the count may grow, so that
             Gaussians that are not needed fade, are pruned and make room.
-        ramped: Let the cap rise evenly from the start to its value at the end of densification,
-            so that the strongest pulls are served first.
-        error_gate: Only Gaussians with at least so many times the mean squared error under them
-            are multiplied; 0 for all.
-        thin: Share of all blend weights that may go in one thinning: the Gaussians that blend
-            least into the photographs.
-        thin_at: Shares of the run at which that happens.
         half_until: Share of the run at half size.
         sh_every: Steps between two bands of view-dependent colour, at most a quarter of the run.
         start_opacity: Opacity of Gaussians at sparse points.
@@ -87,10 +80,6 @@ class Recipe:
     reset_every: int = 0
     prune_opacity: float = 0.01
     opacity_pull: float = 0.0
-    ramped: bool = False
-    error_gate: float = 0.0
-    thin: float = 0.0
-    thin_at: tuple[float, ...] = ()
     half_until: float = 0.35
     sh_every: int = 1000
     start_opacity: float = 0.3

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.errors import RunError
 from gsfluent.pipeline.reconstruct_density import Adc, Density, Mcmc, Place, Wanted, draws
-from gsfluent.pipeline.reconstruct_error import ErrorTarget, attributed, least_seen
+from gsfluent.pipeline.reconstruct_error import ErrorTarget
 from gsfluent.pipeline.reconstruct_exposure import Exposure
 from gsfluent.pipeline.reconstruct_init import Hull
 from gsfluent.pipeline.reconstruct_model import SplatModel
@@ -27,7 +27,6 @@ _HALVED_FROM = 64  # pixels; smaller photographs are not halved
 _MASK_WEIGHT = 2.0  # weight of the opacity loss; 0.5 leaves a rim of a third of a pixel (measured)
 _NEEDLE = 6.0  # longest over middle axis before it is pulled back
 _DROP_UNTIL = 0.9  # of the run; what was dropped for an error target is made up for afterwards
-_GATE_VIEWS = 12  # photographs whose error decides where to grow, each time
 _RECENT = 64  # steps whose losses are remembered
 _LOOK = {"cpu": 10}  # steps between two looks at the losses
 _LOOK_ELSEWHERE = 50  # each look waits for the device
@@ -90,7 +89,6 @@ class Trainer:
             self.density = Adc(
                 recipe,
                 steps,
-                model.count,
                 limit,
                 settings.gradient_threshold,
                 place,
@@ -203,26 +201,10 @@ class Trainer:
         return sum(errors[step % _RECENT] for step in steps) / max(1, len(steps))
 
     def _control(self, done: int) -> None:
-        recipe, wanted, degree = self.settings.recipe, Wanted(), self.degree(done)
-        growing = recipe.densify_from <= done <= recipe.densify_until * self.settings.iterations
+        wanted = Wanted()
         if self.target is not None and done <= _DROP_UNTIL * self.settings.iterations:
-            wanted = self.target.wanted(self.model, degree, self.last)
-        elif self._thins(done):
-            wanted = Wanted(drop=least_seen(self.model, self.views, recipe.thin))
-        elif recipe.error_gate > 0 and growing:
-            # in turn, so that every photograph has its say over the run
-            first = done // recipe.densify_every * _GATE_VIEWS
-            chosen = [self.views[(first + k) % len(self.views)] for k in range(_GATE_VIEWS)]
-            error, weight = attributed(self.model, chosen[: len(self.views)], degree)
-            mean = error.sum() / weight.sum().clamp_min(1e-9)
-            wanted = Wanted(grow=error > recipe.error_gate * mean * weight)
+            wanted = self.target.wanted(self.model, self.degree(done), self.last)
         self.density.control(self.model, done, wanted)
-
-    def _thins(self, done: int) -> bool:
-        """Whether this look at the density is the first one past a thinning point."""
-        recipe, steps = self.settings.recipe, self.settings.iterations
-        before = done - recipe.densify_every
-        return recipe.thin > 0 and any(before < at * steps <= done for at in recipe.thin_at)
 
     # -- in and out ------------------------------------------------------------------------------
     def state(self) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from gsfluent import demo
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import load_capture
+from gsfluent.io import load_capture, load_image
 from gsfluent.metrics import psnr
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.reconstruct_density import (
@@ -31,6 +32,7 @@ from gsfluent.pipeline.reconstruct_error import ErrorTarget, attributed
 from gsfluent.pipeline.reconstruct_exposure import Exposure
 from gsfluent.pipeline.reconstruct_model import SplatModel
 from gsfluent.pipeline.reconstruct_recipe import LONG, QUICK, LearningRates, recipe_for
+from gsfluent.pipeline.reconstruct_report import write_report
 from gsfluent.pipeline.reconstruct_views import TrainView
 
 SIZE = 48
@@ -127,7 +129,7 @@ def test_what_is_misplaced_goes() -> None:
     place = Place(None, torch.tensor([[0.0, 0.0, -3.0]]))
     model = model_of(gaussians)
     assert place.misplaced(model).nonzero()[:, 0].tolist() == [0, 1, 2]
-    adc = Adc(QUICK, 1000, 120, 1000, 1.0, place, absgrad=False, seed=0)
+    adc = Adc(QUICK, 1000, 1000, 1.0, place, absgrad=False, seed=0)
     adc.control(model, 100, Wanted(drop=torch.arange(120) == 5))
     assert model.count == 116
 
@@ -249,3 +251,21 @@ def test_recipe_follows_the_length_of_the_run() -> None:
         Reconstruct(densify="more")
     with pytest.raises(InputError, match="target_psnr"):
         Reconstruct(target_psnr=-3.0)
+
+
+def test_report_shows_held_out_photographs_and_quality_against_count(
+    capture: Capture, tmp_path: Path
+) -> None:
+    gaussians, report = Reconstruct(110, image_size=48, start_gaussians=600)(capture)
+    files = write_report(tmp_path / "report", gaussians, capture, report)
+    assert [file.name for file in files] == [
+        "reconstruct.json",
+        "reconstruct.md",
+        "reconstruct.png",
+    ]
+    assert json.loads(files[0].read_text())["psnr"] == report["psnr"]
+    step, count, db = report["history"][0]
+    assert f"| {step} | {count} | {db:.2f} |" in files[1].read_text()
+    rows = load_image(files[2])
+    assert rows.shape == (2 * 48 + 4, 3 * 48 + 2 * 4, 3)  # two of 16 held out, three panels each
+    assert float(rows[:48, 48:52].min()) == 1.0
