@@ -325,7 +325,9 @@ class _Run:
         scene: Gaussians | None,
     ) -> Gaussians:
         stage = self.stage
-        whole = 0.5 if hull is None else 1.0  # see Recipe.gradient_threshold
+        whole = 1.0  # share of the threshold, see Recipe.gradient_threshold
+        if hull is None:
+            whole = stage.recipe.absgrad_whole if stage.absgrad else 0.5
         regularization = stage.scale_regularization
         if regularization is None:
             regularization = 0.0 if hull is None else 1.0

@@ -53,7 +53,8 @@ class Recipe:
             a Gaussian is cloned or split, for photographs cropped to the object; half of it for
             whole ones, whose mean weighs a pixel about half as much.
         absgrad: Take the sum over the pixels of absolute gradients (Ye et al. 2024, AbsGS).
-        absgrad_threshold: Threshold for it.
+        absgrad_threshold: Threshold for it, for photographs cropped to the object.
+        absgrad_whole: Share of that for whole photographs.
         reset_every: Steps between opacity resets; 0 for none.
         prune_opacity: Opacity below which a Gaussian goes.
         opacity_pull: Weight of the mean opacity in the loss while the count may grow, so that
@@ -77,6 +78,7 @@ class Recipe:
     gradient_threshold: float = 4e-4
     absgrad: bool = False
     absgrad_threshold: float = 1.6e-3
+    absgrad_whole: float = 0.5
     reset_every: int = 0
     prune_opacity: float = 0.01
     opacity_pull: float = 0.0
@@ -141,7 +143,7 @@ LONG = replace(
     reset_every=0,
     shell=True,
     absgrad=True,
-    absgrad_threshold=3.2e-3,
+    absgrad_whole=1.0,
     opacity_pull=0.03,
 )
 """Long runs: no resets; a pull on opacities instead frees what is not needed (measured in
