@@ -20,7 +20,6 @@ constexpr double kMaxFeature = 1e15;
 // Wider splats are not drawn: sums of squared distances [px^2] would leave float32 too.
 constexpr double kMaxVariance = 1e18;
 constexpr int kSiblingRing = 8;  // group ids remembered per pixel
-constexpr int kTile = 16;        // tile edge [px]
 
 // Pinhole camera as the kernels use it. `rotation`, `translation`: world->camera.
 template <typename T>

@@ -25,14 +25,36 @@ def draw(
     Returns:
         What :func:`gsfluent.ops.rasterize` returns, before black.
     """
+    size = (camera.width, camera.height)
+    return draw_at(gaussians, camera.viewmat, camera.K, size, colors=colors, **options)
+
+
+def draw_at(
+    gaussians: Gaussians,
+    viewmat: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+    *,
+    colors: Tensor | None = None,
+    **options: Any,
+) -> Rendered:
+    """As :func:`draw`, where there is no :class:`Camera`.
+
+    Args:
+        gaussians: What is drawn.
+        viewmat: World to camera, [4, 4].
+        K: Intrinsics [px], [3, 3].
+        size: Width and height [px].
+        colors: Drawn instead of the Gaussians' own colours, [N, C].
+        options: As for :func:`draw`.
+    """
     given: dict[str, Any] = {"near": 1e-4, "depth": False} | options
     return ops.rasterize(
         gaussians.means,
         gaussians.opacities,
-        camera.viewmat.to(gaussians.means),
-        camera.K.to(gaussians.means),
-        camera.width,
-        camera.height,
+        viewmat.to(gaussians.means),
+        K.to(gaussians.means),
+        *size,
         quats=gaussians.quats,
         scales=gaussians.scales,
         sh=gaussians.sh if colors is None else None,

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsfluent import ops
 from gsfluent.data import Gaussians
+from gsfluent.pipeline.draw import draw_at
 from gsfluent.pipeline.reconstruct_init import Hull, contradiction, visual_hull
 from gsfluent.pipeline.reconstruct_masks import refined_mask, silhouette
 from gsfluent.pipeline.reconstruct_views import TrainView, cropped
@@ -141,20 +141,9 @@ def seen_background(
 @torch.no_grad()
 def _blend_weights(gaussians: Gaussians, view: TrainView) -> Tensor:
     """Sum of blend weights of each splat in one view [px], [N]."""
-    width, height = view.size
-    weight = ops.rasterize(
-        gaussians.means,
-        gaussians.opacities,
-        view.viewmat.to(gaussians.means),
-        view.K.to(gaussians.means),
-        width,
-        height,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        colors=torch.zeros_like(gaussians.means[:, :1]),
-        contribution=True,
-        near=1e-4,
-    ).contribution
+    flat = torch.zeros_like(gaussians.means[:, :1])
+    seen = draw_at(gaussians, view.viewmat, view.K, view.size, colors=flat, contribution=True)
+    weight = seen.contribution
     assert weight is not None  # asked for
     return weight
 

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import Gaussians
+from gsfluent.pipeline.draw import draw_at
 
 _REACH = 0.018  # of the longer side: how far the border of a silhouette may be wrong
 _ROUNDS = 3
@@ -33,20 +33,8 @@ def silhouette(
     """
     both = Gaussians.cat([found, rest])
     flag = torch.cat([torch.ones_like(found.opacities), torch.zeros_like(rest.opacities)])
-    result = ops.rasterize(
-        both.means,
-        both.opacities,
-        viewmat.to(both.means),
-        K.to(both.means),
-        width,
-        height,
-        quats=both.quats,
-        scales=both.scales,
-        colors=flag[:, None].contiguous(),
-        near=1e-4,
-        depth=False,
-    )
-    return result.image[..., 0]
+    seen = draw_at(both, viewmat, K, (width, height), colors=flag[:, None].contiguous())
+    return seen.image[..., 0]
 
 
 def refined_mask(share: Tensor, image: Tensor, *, inner: float = 1.0) -> Tensor | None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import BACKGROUND, Camera, Gaussians
+from gsfluent.errors import InputError
 from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.light import Light, ShadowMap, to_display, to_linear
 
@@ -95,6 +96,14 @@ class Backdrop:
         image = image.clone()
         image[hit] = to_display(linear) * cover
         return Behind(image, alpha, surface)
+
+
+def no_background() -> InputError:
+    """What to raise when a shot asks for a captured backdrop and there is none."""
+    return InputError(
+        "output.backdrop: captured: nothing but the object is there",
+        "masks and isolated splats have no background; use studio",
+    )
 
 
 def covered_floor(background: Gaussians, object_points: Tensor, height: float) -> Gaussians:

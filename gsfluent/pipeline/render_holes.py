@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
+from gsfluent.pipeline.draw import draw
 
 # Balls of this many standard deviations per particle spacing overlap enough to close the silhouette
 # of a packing.
@@ -58,19 +59,8 @@ def hole_fraction(
         colors=torch.zeros_like(positions[:, :1]),
         depth=False,
     ).alpha
-    drawn = ops.rasterize(
-        gaussians.means,
-        gaussians.opacities,
-        viewmat,
-        intrinsics,
-        camera.width,
-        camera.height,
-        quats=gaussians.quats,
-        scales=gaussians.scales,
-        colors=torch.zeros_like(gaussians.means[:, :1]),
-        groups=groups,
-        depth=False,
-    ).alpha
+    flat = torch.zeros_like(gaussians.means[:, :1])
+    drawn = draw(gaussians, camera, colors=flat, groups=groups, near=0.01).alpha
     silhouette = erode(matter > _SOLID)
     area = int(silhouette.sum())
     return float((silhouette & (drawn < _HOLE)).sum()) / area if area else 0.0

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 
 from gsfluent.data import Frame, Solid
-from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, write_json
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.orient import Orientation, make_frame, orient
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.reconstruct_report import write_report
+from gsfluent.pipeline.render_backdrop import no_background
 from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
@@ -75,10 +75,7 @@ def isolate_stage(context: RunContext) -> None:
         if background.count:
             background.save(folder / "background.ply")
         elif captured:
-            raise InputError(
-                "output.backdrop: captured: nothing but the object is there",
-                "masks and isolated splats have no background; use studio",
-            )
+            raise no_background()
         write_json(folder / "frame.json", frame.to_dict())
         return dict(stage.report) | {
             "gaussians_kept": whole.count,

@@ -20,7 +20,12 @@ from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
 from gsfluent.pipeline.light import Light
 from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_backdrop import Backdrop, covered_floor, object_radius
+from gsfluent.pipeline.render_backdrop import (
+    Backdrop,
+    covered_floor,
+    no_background,
+    object_radius,
+)
 from gsfluent.pipeline.render_camera import Action, cameras_for
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_holes import hole_fraction
@@ -128,10 +133,7 @@ def captured_backdrop(stages: Path, objects: list[str], device: torch.device) ->
     """
     path = stages / "isolate" / "background.ply"
     if not path.is_file():
-        raise InputError(
-            "output.backdrop: captured: nothing but the object is there",
-            "masks and isolated splats have no background; use studio",
-        )
+        raise no_background()
     frame = read_frame(stages / "isolate")
     around = load(path)
     for name in objects:
