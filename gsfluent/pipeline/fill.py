@@ -245,7 +245,7 @@ class Fill(Stage):
         box, strays = choose_grid(gaussians.means, gaussians.opacities, self.resolution)
         density = density_field(
             gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
-        ).numpy()
+        ).cpu().numpy()
         shell = density >= self.threshold
         if not shell.any():
             raise InputError(

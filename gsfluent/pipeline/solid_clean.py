@@ -269,7 +269,7 @@ def _apart(gaussians: Gaussians, piece: float) -> Tensor:
     box, _ = choose_grid(gaussians.means, gaussians.opacities, _GRID)
     density = density_field(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
-    ).numpy()
+    ).cpu().numpy()
     label, count = ndimage.label(density > _JOINED, structure=np.ones((3, 3, 3)))
     mass = np.bincount(label.ravel(), weights=density.ravel(), minlength=count + 1)
     mass[0] = 0.0
