@@ -102,9 +102,9 @@ def density_field(
 
     Splats are grouped by the voxel half-widths of their box; within a group the quadratic form of
     all splats at all offsets is one matrix product, because ``(o - f)^T P (o - f)`` is linear in
-    ten monomials of the offset ``o``. It runs where ``means`` live. On a GPU the terms are summed in
-    fixed point (2^-32), because sums of integers do not depend on the order in which threads come:
-    the same splats give the same field.
+    ten monomials of the offset ``o``. It runs where ``means`` live. On a GPU the terms are summed
+    in fixed point (2^-32), because sums of integers do not depend on the order in which threads
+    come: the same splats give the same field.
 
     Args:
         means: [N, 3] world units.
