@@ -20,6 +20,7 @@ from gsfluent.config.settings import (
     SolveSettings,
     TextureSettings,
 )
+from gsfluent.config.settings_inpaint import InpaintSettings
 from gsfluent.config.shot import Shot
 
 SECTIONS: dict[str, type[Any]] = {
@@ -27,6 +28,7 @@ SECTIONS: dict[str, type[Any]] = {
     "reconstruct": ReconstructSettings,
     "fill": FillSettings,
     "texture": TextureSettings,
+    "texture.inpaint": InpaintSettings,
     "objects.NAME.select": Select,
     "objects.NAME.parts[].where": Where,
     **{f"events[] with type: {name}": cls for name, cls in EVENTS.items()},

@@ -24,6 +24,7 @@ from gsfluent.config.read import (
     text,
     whole,
 )
+from gsfluent.config.settings_inpaint import InpaintSettings
 from gsfluent.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -49,7 +50,15 @@ def _camera(value: Any, place: Place) -> str | int | Path:
     return index
 
 
-_TEXTURE_METHODS = ("exemplar", "diffusion", "color_copy", "procedural", "profile", "telea")
+_TEXTURE_METHODS = (
+    "exemplar",
+    "diffusion",
+    "inpaint",
+    "color_copy",
+    "procedural",
+    "profile",
+    "telea",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,15 +216,30 @@ class TextureSettings:
         example="true",
     )
 
+    inpaint: InpaintSettings = key(
+        nested(InpaintSettings),
+        default=InpaintSettings(),
+        doc="How slices are inpainted (methods diffusion and inpaint).",
+        example="{tile: 2, memory: balanced}",
+    )
+    polish: bool | None = key(
+        flag,
+        default=None,
+        doc="Fit interior splats coarser than the voxels to slices of the colours.",
+        example="true",
+    )
+
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
-        return given(self)
+        values = given(self)
+        values["inpaint"] = self.inpaint.given()
+        return {name: value for name, value in values.items() if value != {}}
 
 
 _TEXTURE_READERS = {
     "preset": ("procedural",),
-    "prompt": ("diffusion",),
-    "model": ("diffusion",),
+    "prompt": ("diffusion", "inpaint"),
+    "model": ("diffusion", "inpaint"),
     **dict.fromkeys(("quality", "scale", "guide", "directional", "inclusions"), ("exemplar",)),
 }
 """Keys of ``texture:`` that only these methods read."""
@@ -233,9 +257,19 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
                 f"{place.inside(name).path} does nothing with method {method}",
                 f"remove it, or set method: {readers[0]}",
             )
-    needed = {"exemplar": "exemplar", "procedural": "preset", "diffusion": "model"}.get(
-        method or ""
-    )
+    if settings.inpaint.given() and method not in ("diffusion", "inpaint"):
+        raise InputError(
+            f"{place.inside('inpaint').path} does nothing with method {method}",
+            "remove it, or set method: inpaint",
+        )
+    if method in ("diffusion", "inpaint") and settings.inpaint.backend not in (None, "diffusers"):
+        return settings
+    needed = {
+        "exemplar": "exemplar",
+        "procedural": "preset",
+        "diffusion": "model",
+        "inpaint": "model",
+    }.get(method or "")
     if needed is not None and getattr(settings, needed) is None:
         raise InputError(
             f"{place.inside(needed).path} is missing",

@@ -22,7 +22,7 @@ __all__ = ["SlabRenderer", "SlicePlane", "Steps", "fuse_colors", "stack_planes"]
 _SIGMA = 0.55  # standard deviation of a footprint over the spacing of the Gaussians
 _CUT = 2.5  # standard deviations
 _LEAST = 0.35  # weight below which a pixel shows too little to count
-_STORED = 24_000_000  # matrix entries kept (about 0.4 GB); beyond they are made anew each time
+_STORED = 40_000_000  # matrix entries kept (about 0.6 GB); beyond they are made anew each time
 
 
 @dataclass(frozen=True)
