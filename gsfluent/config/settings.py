@@ -22,6 +22,7 @@ from gsfluent.config.read import (
     section,
     several,
     text,
+    vector,
     whole,
 )
 from gsfluent.config.settings_inpaint import InpaintSettings
@@ -154,6 +155,51 @@ class FillSettings:
         return values
 
 
+def _white(value: Any, place: Place) -> str | float | tuple[float, ...]:
+    if isinstance(value, str):
+        return str(choice("auto", "none", "skin")(value, place))
+    if isinstance(value, list | tuple):
+        return tuple(vector(3, 0.0, 255.0)(value, place))
+    return float(number(1000.0, 25000.0)(value, place))
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoSettings:
+    """``texture: photo:`` - what is done to exemplar photographs before their material is used."""
+
+    cutout: str | None = key(
+        choice("auto", "ground", "grabcut", "none"),
+        default=None,
+        doc="How the object is told from its ground; none takes the whole picture as material.",
+        example="auto",
+    )
+    rim: bool | None = key(
+        flag, default=None, doc="Take leftovers of the surroundings off the rim.", example="true"
+    )
+    holes: bool | None = key(
+        flag, default=None, doc="Paint open cavities in the colour of their walls.", example="true"
+    )
+    glints: bool | None = key(flag, default=None, doc="Paint over specular spots.", example="true")
+    shading: bool | None = key(
+        flag, default=None, doc="Even out a gradient of the light.", example="true"
+    )
+    white: str | float | tuple[float, ...] | None = key(
+        _white,
+        default=None,
+        doc="White balance: auto, none, skin (as the object's), kelvin, or [r, g, b] of a white.",
+        example="auto",
+    )
+    stain: bool | None = key(
+        flag,
+        default=None,
+        doc="Give stained (grey) parts the colour of the unstained ones.",
+        example="true",
+    )
+    palette: str | None = key(
+        text, default=None, doc="Take the colours of this preset instead.", example="apple"
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class TextureSettings:
     """``texture:`` - colours for the inside."""
@@ -215,10 +261,15 @@ class TextureSettings:
         doc="Find seeds and stones in the exemplar and place them (method exemplar).",
         example="true",
     )
-
-    inpaint: InpaintSettings = key(
+    photo: PhotoSettings | None = key(
+        nested(PhotoSettings),
+        default=None,
+        doc="Preparation of photographs (method exemplar).",
+        example="{stain: true}",
+    )
+    inpaint: InpaintSettings | None = key(
         nested(InpaintSettings),
-        default=InpaintSettings(),
+        default=None,
         doc="How slices are inpainted (methods diffusion and inpaint).",
         example="{tile: 2, memory: balanced}",
     )
@@ -232,15 +283,19 @@ class TextureSettings:
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
         values = given(self)
-        values["inpaint"] = self.inpaint.given()
-        return {name: value for name, value in values.items() if value != {}}
+        if self.photo is not None:
+            values["photo"] = given(self.photo)
+        if self.inpaint is not None:
+            values["inpaint"] = self.inpaint.given()
+        return values
 
 
 _TEXTURE_READERS = {
     "preset": ("procedural",),
-    "prompt": ("diffusion", "inpaint"),
-    "model": ("diffusion", "inpaint"),
-    **dict.fromkeys(("quality", "scale", "guide", "directional", "inclusions"), ("exemplar",)),
+    **dict.fromkeys(("prompt", "model", "inpaint"), ("diffusion", "inpaint")),
+    **dict.fromkeys(
+        ("quality", "scale", "guide", "directional", "inclusions", "photo"), ("exemplar",)
+    ),
 }
 """Keys of ``texture:`` that only these methods read."""
 
@@ -257,12 +312,12 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
                 f"{place.inside(name).path} does nothing with method {method}",
                 f"remove it, or set method: {readers[0]}",
             )
-    if settings.inpaint.given() and method not in ("diffusion", "inpaint"):
-        raise InputError(
-            f"{place.inside('inpaint').path} does nothing with method {method}",
-            "remove it, or set method: inpaint",
-        )
-    if method in ("diffusion", "inpaint") and settings.inpaint.backend not in (None, "diffusers"):
+    inpaint = settings.inpaint
+    if (
+        method in ("diffusion", "inpaint")
+        and inpaint
+        and inpaint.backend not in (None, "diffusers")
+    ):
         return settings
     needed = {
         "exemplar": "exemplar",
