@@ -234,7 +234,9 @@ def populate(
         opacities=INTERIOR_OPACITY,
         label=INTERIOR,
     )
-    wide = placed.sigmas / (_SIGMA_PER_SPACING * box.voxel)
-    low, high = (float(wide.quantile(q)) for q in (0.05, 0.95)) if count < 1 << 24 else (0.0, 0.0)
-    notes = {"spacing_skin": low, "spacing_core": high}
+    ranked = (placed.sigmas / (_SIGMA_PER_SPACING * box.voxel)).sort().values
+    notes = {
+        "spacing_skin": float(ranked[count // 20]),
+        "spacing_core": float(ranked[count - 1 - count // 20]),
+    }
     return Gaussians.cat([surface.replace(normals=None), interior]), inner, notes
