@@ -26,7 +26,7 @@ from .metrics import (
     patch_distance,
     volume_slices,
 )
-from .photo import Exemplar
+from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
 from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
 
@@ -76,6 +76,8 @@ class Texture(Stage):
         directional: True for grained materials: the exemplar is not turned or mirrored.
         inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
+        photo: What is done to photographs before their material is used (:class:`PhotoOptions`,
+            or its settings as a mapping); None for the defaults.
         inpaint: Settings of the slice methods, or a mapping of them.
         resume: Folder in which the diffusion method keeps finished slices.
         seed: Seed of everything random.
@@ -100,6 +102,7 @@ class Texture(Stage):
         directional: bool = False,
         inclusions: bool = True,
         axis: tuple[float, float, float] | None = None,
+        photo: PhotoOptions | Mapping[str, Any] | None = None,
         inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
         seed: int = 0,
@@ -154,6 +157,7 @@ class Texture(Stage):
         self.directional = directional
         self.inclusions = inclusions
         self.axis = None if axis is None else np.asarray(axis, dtype=float)
+        self.photo = PhotoOptions.of(photo)
         self.inpaint = options
         self.resume = None if resume is None else Path(resume)
 
@@ -179,8 +183,13 @@ class Texture(Stage):
             InputError: The exemplar, preset or model cannot be used.
         """
         began = time.perf_counter()
-        exemplars = load_exemplars(self.exemplar) if self.exemplar is not None else None
         domain = InteriorDomain.from_solid(solid, self.axis)
+        exemplars = None
+        if self.exemplar is not None:
+            opened = open_exemplars(self.exemplar, self.photo)
+            if self.photo.white == "skin":
+                opened = with_skin(opened, domain.skin[domain.shell])
+            exemplars = load_exemplars(opened)
         if not domain.inside.any():
             raise InputError("texture: the solid is empty", mend="run fill first")
         texture = self._make(domain, exemplars, progress)
