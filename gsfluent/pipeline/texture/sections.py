@@ -1,0 +1,129 @@
+"""A photographed cross-section carried through the object along its axis.
+
+A cut across an orange shows segments, one across a log shows rings: structure that depth alone
+does not know. Every voxel is given the place in the photograph at its own azimuth whose depth and
+distance to the axis come closest to its own: near the skin the depth decides (the peel follows the
+surface to the poles), in the core the distance (a core stays as wide as it is).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from .guides import PlacedPhoto
+from .levels import trilinear
+
+__all__ = ["Section"]
+
+_TURNS, _RADII, _DEPTHS, _STEPS = 180, 64, 48, 160
+
+
+class Section:
+    """Lookup of photograph places by azimuth, distance to the axis and depth.
+
+    Args:
+        placed: Photograph of a cut across the object's axis (axis 2 of its frame).
+        largest: Largest depth of the object [voxels].
+        reach: Largest distance of matter to the axis [voxels].
+        device: Where to compute.
+    """
+
+    def __init__(
+        self, placed: PlacedPhoto, largest: float, reach: float, device: torch.device
+    ) -> None:
+        from scipy import ndimage
+
+        mask = placed.mask
+        if placed.fitted:
+            center = np.array(_pixel_of(placed, np.zeros(2)))
+        else:
+            deep = placed.depth >= 0.95 * placed.depth.max()
+            center = np.argwhere(deep).mean(0)
+        self.center, self.reach, self.largest = center, max(reach, 1.0), max(largest, 1e-6)
+        self.placed = placed
+        longest = float(np.hypot(*mask.shape))
+        steps = np.linspace(0.0, 1.0, _STEPS)
+        angle = 2 * np.pi * np.arange(_TURNS) / _TURNS
+        ray = np.stack([np.cos(angle), np.sin(angle)], -1)
+        fine = np.linspace(0.0, longest, 4 * int(longest))
+        line = center[:, None, None] + ray.T[:, :, None] * fine
+        hit = ndimage.map_coordinates(mask.astype(np.float32), line, order=1) > 0.5
+        last = np.where(hit.any(1), hit.shape[1] - 1 - hit[:, ::-1].argmax(1), 1)
+        self.radius = torch.from_numpy(fine[last]).float().to(device)  # pixels, per azimuth
+        spot = center[:, None, None] + ray.T[:, :, None] * (fine[last][:, None] * steps)
+        depth = ndimage.map_coordinates(placed.depth, spot, order=1, mode="nearest")
+        place = np.stack(
+            [
+                ndimage.map_coordinates(placed.local[..., k], spot, order=1, mode="nearest")
+                for k in range(2)
+            ]
+        )
+        if not placed.fitted:
+            place = place - placed.local[tuple(np.rint(center).astype(int))][:2, None, None]
+        distance = np.hypot(place[0], place[1])
+        table = torch.empty(_TURNS, _RADII, _DEPTHS, device=device)
+        want_r = torch.linspace(0, self.reach, _RADII, device=device)
+        want_d = _skin_guide(torch.linspace(0, 1, _DEPTHS, device=device))
+        unit = torch.linspace(0, 1, _STEPS, device=device)
+        for k in range(_TURNS):
+            have_r = torch.from_numpy(distance[k]).float().to(device)
+            have_d = _skin_guide(torch.from_numpy(depth[k]).float().to(device) / self.largest)
+            cost = ((want_d[:, None] - have_d) ** 2)[None] + (
+                ((want_r[:, None] - have_r) * (2.0 / self.largest)) ** 2
+            )[:, None]
+            # the weighted mean of near equals instead of the best one: no jumps
+            table[k] = torch.softmax(-cost / 0.003, -1) @ unit
+        self.table = torch.cat([table, table[:1]])[None]
+
+    def color(self, local: Tensor, depth: Tensor, image: Tensor) -> Tensor:
+        """Colours [n, C] that a picture [C, U, V] (whole frame) shows at places.
+
+        Args:
+            local: Places in the object's frame [n, 3].
+            depth: Depths [n], voxels of the solid.
+            image: Picture of the photograph, at any resolution.
+        """
+        turn = torch.atan2(local[:, 1], local[:, 0]) / (2 * torch.pi) % 1.0
+        radius = torch.hypot(local[:, 0], local[:, 1])
+        cell = torch.stack(
+            [
+                turn * _TURNS + 0.5,
+                (radius / self.reach).clamp(0, 1) * (_RADII - 1) + 0.5,
+                (depth / self.largest).clamp(0, 1) * (_DEPTHS - 1) + 0.5,
+            ],
+            -1,
+        )
+        relative = trilinear(self.table, cell)[0]
+        outline = torch.cat([self.radius, self.radius[:1]])[None, :, None, None]
+        column = torch.stack([cell[:, 0], torch.full_like(turn, 0.5), torch.full_like(turn, 0.5)], -1)
+        pixels = relative * trilinear(outline, column)[0]
+        angle = turn * 2 * torch.pi
+        spot = torch.stack(
+            [
+                self.center[0] + 0.5 + pixels * angle.cos(),
+                self.center[1] + 0.5 + pixels * angle.sin(),
+            ],
+            -1,
+        )
+        height, width = self.placed.mask.shape
+        grid = torch.stack([2 * spot[:, 1] / width - 1, 2 * spot[:, 0] / height - 1], -1)
+        values = functional.grid_sample(
+            image[None], grid[None, None].float(), padding_mode="border", align_corners=False
+        )
+        return values[0, :, 0].T
+
+
+def _skin_guide(relative: Tensor) -> Tensor:
+    """Steep in the outer tenth of the depth, flat below."""
+    return 3.0 * (1.0 - torch.exp(-relative / 0.1))
+
+
+def _pixel_of(placed: PlacedPhoto, place: np.ndarray) -> tuple[float, float]:
+    """Pixel index (continuous, centres at whole numbers) of a place in the cut's plane."""
+    first, last = placed.local[0, 0, :2], placed.local[-1, -1, :2]
+    count = np.array(placed.mask.shape) - 1.0
+    found = (place - first) / np.where(last == first, 1.0, last - first) * count
+    return float(found[0]), float(found[1])
