@@ -126,7 +126,11 @@ class FillSettings:
         example="auto",
     )
     resolution: int | None = key(
-        whole(8, 512), default=None, doc="Voxels along the longest side.", example="96"
+        whole(8, 512),
+        default=None,
+        doc="Voxels along the longest side; by default two per cell of the simulation, at least 96 "
+        "for the largest object.",
+        example="96",
     )
 
     def given(self, scale: float = 1.0) -> dict[str, Any]:

@@ -243,9 +243,13 @@ class Fill(Stage):
             )
         report_progress(progress, 0, 5, "density")
         box, strays = choose_grid(gaussians.means, gaussians.opacities, self.resolution)
-        density = density_field(
-            gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
-        ).numpy()
+        density = (
+            density_field(
+                gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
+            )
+            .cpu()
+            .numpy()
+        )
         shell = density >= self.threshold
         if not shell.any():
             raise InputError(

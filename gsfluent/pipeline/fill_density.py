@@ -20,7 +20,9 @@ _RADII = (2, 3, 4, 6, 8, 12, 16, 20)  # half-widths [voxels] that splats are gro
 _CUTOFF = 2.5  # standard deviations; exp(-3.1) = 0.044 of the peak is dropped
 _MIN_SIGMA = 0.5  # voxels: a surface sampled about once per voxel stays closed
 _MAX_SIGMA = _RADII[-1] / _CUTOFF
-_CHUNK = 4_000_000  # kernel values per batch: 16 MB of float32, stays in cache-friendly territory
+# kernel values per batch: 16 MB of float32 stay in the caches of a CPU, a GPU wants to be filled
+_CHUNK, _CHUNK_CUDA = 4_000_000, 64_000_000
+_FIXED = float(1 << 32)  # fixed-point unit of the sums on a GPU
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,10 @@ def choose_grid(means: Tensor, opacities: Tensor, resolution: int) -> tuple[Grid
     visible = means[opacities > 0.05]
     if visible.shape[0] < 8:
         visible = means
-    points = visible.detach().double().cpu().numpy()
-    low, high = points.min(0), points.max(0)
-    inner_low, inner_high = np.quantile(points, [0.005, 0.995], axis=0)
+    points = visible.detach().double()
+    ordered = points.T.contiguous().sort(dim=1).values
+    low, high = ordered[:, 0].cpu().numpy(), ordered[:, -1].cpu().numpy()
+    inner_low, inner_high = (_quantile(ordered, share) for share in (0.005, 0.995))
     inner = np.maximum(inner_high - inner_low, 1e-12)
     stray = (high - low) > 1.5 * inner + 1e-9
     low = np.where(stray, np.maximum(low, inner_low - 0.25 * inner), low)
@@ -68,13 +71,24 @@ def choose_grid(means: Tensor, opacities: Tensor, resolution: int) -> tuple[Grid
     shape = np.ceil((high - low) / voxel).astype(int) + 1 + 2 * rim
     middle = 0.5 * (low + high)
     origin = middle - 0.5 * shape * voxel
-    outside = int((((points < origin) | (points > origin + shape * voxel)).any(1)).sum())
+    corners = torch.from_numpy(np.stack([origin, origin + shape * voxel])).to(points.device)
+    outside = int(((points < corners[0]) | (points > corners[1])).any(1).sum())
     box = GridBox(
         (float(origin[0]), float(origin[1]), float(origin[2])),
         voxel,
         (int(shape[0]), int(shape[1]), int(shape[2])),
     )
     return box, outside
+
+
+def _quantile(ordered: Tensor, share: float) -> np.ndarray:
+    """Linear quantile [3] of the sorted rows of ``ordered`` [3, N]."""
+    place = share * (ordered.shape[1] - 1)
+    below = int(place)
+    above = min(below + 1, ordered.shape[1] - 1)
+    between = torch.lerp(ordered[:, below], ordered[:, above], place - below)
+    value: np.ndarray = between.cpu().numpy()
+    return value
 
 
 def density_field(
@@ -88,7 +102,9 @@ def density_field(
 
     Splats are grouped by the voxel half-widths of their box; within a group the quadratic form of
     all splats at all offsets is one matrix product, because ``(o - f)^T P (o - f)`` is linear in
-    ten monomials of the offset ``o``.
+    ten monomials of the offset ``o``. It runs where ``means`` live. On a GPU the terms are summed
+    in fixed point (2^-32), because sums of integers do not depend on the order in which threads
+    come: the same splats give the same field.
 
     Args:
         means: [N, 3] world units.
@@ -98,26 +114,29 @@ def density_field(
         box: Target grid.
 
     Returns:
-        Density float32 [X, Y, Z], dimensionless.
+        Density float32 [X, Y, Z], dimensionless, on the device of ``means``.
     """
+    device = means.device
+    fixed = device.type == "cuda"
     pad = _RADII[-1]
     shape = tuple(s + 2 * pad for s in box.shape)
-    field = torch.zeros(shape[0] * shape[1] * shape[2], dtype=torch.float32)
-    position = (
-        means.detach().cpu().double() - torch.tensor(box.origin, dtype=torch.float64)
-    ) / box.voxel - 0.5
-    limit = torch.tensor(box.shape, dtype=torch.float64) - 0.5
-    keep = ((position > -0.5) & (position < limit)).all(1) & (opacities.detach().cpu() > 1e-3)
+    field = torch.zeros(
+        shape[0] * shape[1] * shape[2],
+        dtype=torch.int64 if fixed else torch.float32,
+        device=device,
+    )
+    origin = torch.tensor(box.origin, dtype=torch.float64, device=device)
+    position = (means.detach().double() - origin) / box.voxel - 0.5
+    limit = torch.tensor(box.shape, dtype=torch.float64, device=device) - 0.5
+    keep = ((position > -0.5) & (position < limit)).all(1) & (opacities.detach() > 1e-3)
     position = position[keep]
-    if position.shape[0] == 0:
-        return field.view(shape)[pad:-pad, pad:-pad, pad:-pad].clone()
-    sigma = (scales.detach().cpu().double()[keep] / box.voxel).clamp(_MIN_SIGMA, _MAX_SIGMA)
-    rotation = _rotation(quats.detach().cpu().double()[keep])
-    alpha = opacities.detach().cpu().float()[keep]
+    sigma = (scales.detach().double()[keep] / box.voxel).clamp(_MIN_SIGMA, _MAX_SIGMA)
+    rotation = _rotation(quats.detach().double()[keep])
+    alpha = opacities.detach().float()[keep]
     precision = torch.einsum("nij,nj,nkj->nik", rotation, sigma**-2, rotation)
     reach = _CUTOFF * torch.einsum("nij,nj->ni", rotation**2, sigma**2).sqrt()
 
-    radii = torch.tensor(_RADII, dtype=torch.float64)
+    radii = torch.tensor(_RADII, dtype=torch.float64, device=device)
     bucket = torch.bucketize(reach, radii).clamp_(max=len(_RADII) - 1)
     key = (bucket[:, 0] * len(_RADII) + bucket[:, 1]) * len(_RADII) + bucket[:, 2]
     base = position.round().long()
@@ -129,23 +148,26 @@ def density_field(
         members = (key == value).nonzero()[:, 0]
         size = len(_RADII)
         half = [_RADII[value // size // size], _RADII[value // size % size], _RADII[value % size]]
-        offset = torch.cartesian_prod(*(torch.arange(-h, h + 1) for h in half))
+        offset = torch.cartesian_prod(*(torch.arange(-h, h + 1, device=device) for h in half))
         flat_offset = (offset[:, 0] * shape[1] + offset[:, 1]) * shape[2] + offset[:, 2]
         monomials = _monomials(offset.float())
-        step = max(1, _CHUNK // offset.shape[0])
+        step = max(1, (_CHUNK_CUDA if fixed else _CHUNK) // offset.shape[0])
         for start in range(0, members.shape[0], step):
             part = members[start : start + step]
             weight = (coefficients[part] @ monomials.T).clamp_(min=0.0).mul_(-0.5).exp_()
             weight *= alpha[part, None]
             index = flat_base[part, None] + flat_offset[None]
+            if fixed:
+                weight = weight.double().mul_(_FIXED).long()
             field.index_add_(0, index.reshape(-1), weight.reshape(-1))
-    return field.view(shape)[pad:-pad, pad:-pad, pad:-pad].clone()
+    inner = field.view(shape)[pad:-pad, pad:-pad, pad:-pad]
+    return (inner.double() / _FIXED).float() if fixed else inner.clone()
 
 
 def _rotation(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of wxyz quaternions; a zero quaternion counts as no rotation."""
     norm = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
     q = torch.where(norm > 1e-12, quats / norm.clamp(min=1e-12), identity)
     w, x, y, z = q.unbind(1)
     rows = [

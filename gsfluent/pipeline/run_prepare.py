@@ -12,6 +12,7 @@ import torch
 from gsfluent.data import Frame, Solid
 from gsfluent.io import load, load_capture, write_json
 from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.fill_resolution import fill_resolution, visible_extent
 from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.orient import Orientation, make_frame, orient
 from gsfluent.pipeline.reconstruct import Reconstruct
@@ -21,6 +22,7 @@ from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_store import content_digest, fingerprint, publish
 from gsfluent.pipeline.select import select_mask
+from gsfluent.pipeline.simulate import QUALITY
 from gsfluent.pipeline.texture import Texture
 
 _log = logging.getLogger(__name__)
@@ -117,19 +119,28 @@ def fill_stage(context: RunContext) -> None:
     selections = {name: repr(o.select) for name, o in shot.objects.items()}
     labels = [content_digest(o.select.labels) for o in shot.objects.values() if o.select.labels]
     options = shot.fill.given(frame.scale)
-    key = fingerprint("fill", context.key(context.source_key, options, selections, labels))
+    cells = QUALITY[shot.solve.quality]
+    # a finer simulation asks for another solid only where it asks for finer voxels
+    fine = options.get("resolution", fill_resolution(1.0, 1.0, cells))
+    key = fingerprint("fill", context.key(context.source_key, options, fine, selections, labels))
 
     def work(folder: Path) -> dict[str, Any]:
         everything = load(context.store.root / "isolate" / "object.ply")
+        objects = {}
         taken = torch.zeros(everything.count, dtype=torch.bool)
-        reports = []
         for name, settings in shot.objects.items():
             mask = select_mask(everything, settings.select, frame) & ~taken
             taken |= mask
-            down = -frame.rotation[2]
-            stage = Fill(**options, down=tuple(down.tolist()), seed=context.seed)
+            objects[name] = everything.select(mask)
+        extents = {name: visible_extent(splats) for name, splats in objects.items()}
+        largest = max(extents.values())
+        down = tuple((-frame.rotation[2]).tolist())
+        reports = []
+        for name, splats in objects.items():
+            wanted = {"resolution": fill_resolution(extents[name], largest, cells)}
+            stage = Fill(**wanted | options, down=down, seed=context.seed)
             solid = stage(
-                everything.select(mask),
+                splats.to(context.device),
                 context.capture,
                 progress=context.reporter.task("fill"),
             )

@@ -267,9 +267,11 @@ def _apart(gaussians: Gaussians, piece: float) -> Tensor:
     if gaussians.count < 16:
         return torch.zeros(gaussians.count, dtype=torch.bool, device=gaussians.device)
     box, _ = choose_grid(gaussians.means, gaussians.opacities, _GRID)
-    density = density_field(
-        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
-    ).numpy()
+    density = (
+        density_field(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box)
+        .cpu()
+        .numpy()
+    )
     label, count = ndimage.label(density > _JOINED, structure=np.ones((3, 3, 3)))
     mass = np.bincount(label.ravel(), weights=density.ravel(), minlength=count + 1)
     mass[0] = 0.0
