@@ -317,8 +317,8 @@ def _synthesize(
         reach = float(max(np.abs(fields.low[:2]).max(), np.abs(fields.high[:2]).max()))
         section = Section(across, fields.max_depth, reach, device)
     groups = dict(prepared)
+    first = next(iter(prepared.values()))
     if not directional:
-        first = next(iter(prepared.values()))
         groups = {axis: prepared.get(axis, first) for axis in range(3)}
     keep = keep_surface
     if keep is None:
@@ -331,7 +331,7 @@ def _synthesize(
         here = fields.on(lattice)
         if not bool(here["inside"].any()):
             continue
-        guides = _Guides(kind, fields, lattice, section, own)
+        guides = _Guides(kind, fields, lattice, section, own, directional)
         guide = guides.of_volume(here)
         photos: dict[int, LevelPhoto] = {}
         for group in groups.values():
@@ -358,18 +358,24 @@ def _synthesize(
             torch.cat([p.guide[p.mask] for p in photos.values()]),
         )
         if volume is None:
+            base = guides.base(guide, reference, inside)
             volume = _initial(lattice, inside, guide, reference, seed)
         else:
-            volume = _refined(volume, previous, lattice, inside, fields)
+            volume = _refined(volume, previous, lattice, inside)
+            # detail that the guide fixes and the coarser level could not hold
+            base = guides.base(guide, reference, inside)
+            volume = volume + base - _refined(base_before, previous, lattice, inside)
         fixed = here["shell"] if keep else torch.zeros_like(inside)
         skin = rgb_to_lab100(here["skin"].movedim(0, -1)).movedim(-1, 0)
         volume = torch.where(fixed, skin, volume)
-        level = SynthesisLevel(volume, inside, fixed, guide, banks, reference)
+        along = 0.0 if kind != "axis" else 2.0 if directional else 0.7
+        level = SynthesisLevel(volume, inside, fixed, guide, banks, reference, along)
         rounds = schedule.at(step, len(lattices))
         disagreement = synthesize_level(
             level, schedule, rounds, transport_last_only=kind == "none", rng=rng
         )
         volume, previous = level.volume, (lattice, inside)
+        base_before = base
     report_progress(progress, len(lattices), len(lattices), "patches")
     assert volume is not None  # the last lattice holds every voxel
     figures = {
@@ -391,7 +397,10 @@ class _Guides:
         lattice: Lattice,
         section: Section | None,
         own: str | np.ndarray,
+        directional: bool,
     ) -> None:
+        self.directional = directional
+        self._polar: Tensor | None = None
         self.kind, self.fields, self.lattice, self.section = kind, fields, lattice, section
         self.own: Tensor | None = None
         if not isinstance(own, str):
@@ -402,38 +411,59 @@ class _Guides:
         pitch = self.lattice.pitch
         if self.kind == "none":
             return torch.zeros_like(depth)[None]
-        values = [depth_guide(depth, self.fields.max_depth)]
+        layered = 1.0 if self.section is None else self.section.skin
+        values = [layered * depth_guide(depth, self.fields.max_depth)]
         if self.kind == "height":
             values.append((_PER_VOXEL / pitch * local[2]).expand_as(depth))
         if self.kind == "axis" and picture is not None:
-            radius = torch.sqrt(local[0] ** 2 + local[1] ** 2).expand_as(depth)
-            values.append(_PER_VOXEL / pitch * radius)
-            values += list(_SECTION_WEIGHT * picture)
+            values += list(picture)
         return torch.stack(values)
 
-    def _blurred(self) -> Tensor:
+    def polar(self) -> Tensor:
+        """What the section carries along the axis, at this level's detail."""
+        if self._polar is None:
+            assert self.section is not None
+            image, _, _, _ = self.section.placed.at(self.lattice.pitch)
+            lab = rgb_to_lab100(torch.from_numpy(image).to(self.fields.device)).movedim(-1, 0)
+            self._polar = self.section.polar(lab, self.directional)
+        return self._polar
+
+    def _carried(self, local: Tensor, depth: Tensor) -> Tensor:
+        """Radius and colour in the section [n, 4], weighted."""
         assert self.section is not None
-        image, _, _, _ = self.section.placed.at(self.lattice.pitch)
-        lab = rgb_to_lab100(torch.from_numpy(image).to(self.fields.device)).movedim(-1, 0)
-        line = torch.arange(-3, 4, device=lab.device).float()
-        kernel = torch.exp(-0.5 * line**2)
-        kernel = kernel / kernel.sum()
-        padded = functional.pad(lab[:, None], (3, 3, 3, 3), mode="replicate")
-        padded = functional.conv2d(padded, kernel[None, None, None])
-        return functional.conv2d(padded, kernel[None, None, :, None])[:, 0]
+        turn, relative = self.section.locate(local, depth)
+        radius = _PER_VOXEL / self.lattice.pitch * self.section.reach * relative
+        colors = self.section.color(turn, relative, self.polar())
+        return torch.cat([radius[:, None], _SECTION_WEIGHT * colors], 1)
+
+    def widths(self) -> list[float]:
+        """Half a cell of this level, in guide values."""
+        if self.own is not None:
+            return [0.05]
+        near_skin = 4.5 * self.lattice.pitch / max(self.fields.max_depth, 1e-6)
+        return [0.5 * near_skin, 0.5 * _PER_VOXEL]
+
+    def base(self, guide: Tensor, reference: tuple[Tensor, Tensor], inside: Tensor) -> Tensor:
+        """What the guide alone says about the colours, [3, X, Y, Z]."""
+        if self.kind == "none":
+            return torch.zeros(3, *inside.shape, device=guide.device)
+        if self.section is not None:
+            return guide[-3:] / _SECTION_WEIGHT
+        flat = guide.reshape(len(guide), -1)[:, inside.reshape(-1)].T
+        result = torch.zeros(3, *inside.shape, device=guide.device)
+        result[:, inside] = _regress(flat, *reference, self.widths()).T
+        return result
 
     def of_volume(self, here: dict[str, Tensor]) -> Tensor:
         """Guide values [G, X, Y, Z]."""
         local = self.lattice.local(self.fields.device)
         picture = None
         if self.section is not None:
-            blurred = self._blurred()
             inside = here["inside"]
             spot = inside.nonzero()
             places = torch.stack([local[k].reshape(-1)[spot[:, k]] for k in range(3)], -1)
-            found = self.section.color(places, here["depth"][inside], blurred)
-            picture = torch.zeros(3, *inside.shape, device=found.device)
-            picture[:, inside] = found.T
+            picture = torch.zeros(4, *inside.shape, device=places.device)
+            picture[:, inside] = self._carried(places, here["depth"][inside]).T
         if self.own is not None:
             value = self.lattice.sample(self.own[None])
             return depth_like(value)
@@ -448,10 +478,8 @@ class _Guides:
         place = torch.from_numpy(local).to(device)
         picture = None
         if self.section is not None:
-            colors = self.section.color(
-                place.reshape(-1, 3), below.reshape(-1), self._blurred()
-            )
-            picture = colors.T.reshape(3, *mask.shape)
+            found = self._carried(place.reshape(-1, 3), below.reshape(-1))
+            picture = found.T.reshape(4, *mask.shape)
         if self.own is not None:
             turn = torch.tensor(self.fields.rotation, dtype=torch.float32, device=device)
             center = torch.tensor(self.fields.center, dtype=torch.float32, device=device)
@@ -466,6 +494,47 @@ class _Guides:
 def depth_like(value: Tensor) -> Tensor:
     """A user's coordinate, weighted like a depth."""
     return 4.5 * value
+
+
+def _regress(query: Tensor, color: Tensor, place: Tensor, width: list[float]) -> Tensor:
+    """Mean colour [n, 3] of the photographs near guide values [n, G], G one or two.
+
+    Kernel regression (Nadaraya 1964; Watson 1964) on a table, read bilinearly.
+
+    Args:
+        query: Guide values wanted [n, G].
+        color: Colours of the photographs' pixels [m, 3].
+        place: Their guide values [m, G].
+        width: Bandwidth per guide value [G].
+    """
+    if len(place) > 6000:
+        some = torch.linspace(0, len(place) - 1, 6000, device=place.device).long()
+        color, place = color[some], place[some]
+    if place.shape[1] == 1:
+        place, query, width = (
+            functional.pad(place, (0, 1)), functional.pad(query, (0, 1)), [*width, 1.0]
+        )
+    scale = torch.tensor(width[:2], device=place.device)
+    place, query = place / scale, query / scale
+    low = torch.minimum(place.amin(0), query.amin(0))
+    high = torch.maximum(place.amax(0), query.amax(0))
+    count = [min(400, max(2, int(2 * float(high[k] - low[k])))) for k in range(2)]
+    lines = [torch.linspace(float(low[k]), float(high[k]), count[k]) for k in range(2)]
+    grid = torch.stack(torch.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 2).to(place)
+    table = []
+    for part in grid.split(max(1, (1 << 24) // len(place))):
+        gap = torch.cdist(part, place) ** 2
+        # the second, wide kernel decides where there is no pixel near
+        weight = torch.exp(-0.5 * gap) + 1e-4 / (1.0 + gap) ** 2
+        table.append(weight @ color / weight.sum(1, keepdim=True))
+    image = torch.cat(table).T.reshape(1, 3, *count)
+    at = (query - low) / (high - low).clamp(min=1e-6)
+    size = torch.tensor(count, device=place.device)
+    at = 2 * (at * (size - 1) + 0.5) / size - 1
+    found = functional.grid_sample(
+        image, at.flip(-1)[None, None], padding_mode="border", align_corners=False
+    )
+    return found[0, :, 0].T
 
 
 def _initial(
@@ -509,7 +578,6 @@ def _refined(
     previous: tuple[Lattice, Tensor],
     lattice: Lattice,
     inside: Tensor,
-    fields: ObjectFields,
 ) -> Tensor:
     """The coarser volume on a finer lattice of the same object."""
     coarse, known = previous

@@ -13,16 +13,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from .guides import PlacedPhoto
+from .guides import PlacedPhoto, explained
 from .levels import trilinear
 
 __all__ = ["Section"]
 
-_TURNS, _RADII, _DEPTHS, _STEPS = 180, 64, 48, 160
+_TURNS, _RADII, _DEPTHS, _STEPS = 180, 64, 48, 160  # of the lookup
+_FINE_TURNS, _FINE_STEPS = 1080, 256  # of pictures
 
 
 class Section:
     """Lookup of photograph places by azimuth, distance to the axis and depth.
+
+    Attributes:
+        skin: How far the photograph's rim follows its depth, 0 to 1.
 
     Args:
         placed: Photograph of a cut across the object's axis (axis 2 of its frame).
@@ -44,6 +48,10 @@ class Section:
             center = np.argwhere(deep).mean(0)
         self.center, self.reach, self.largest = center, max(reach, 1.0), max(largest, 1e-6)
         self.placed = placed
+        # bark and peel follow the surface; the faces of a sawn block do not
+        rim = mask & (placed.depth < 0.2 * placed.depth.max())
+        layered = explained(placed.depth[rim], placed.image[rim])
+        self.skin = float(np.clip((layered - 0.1) / 0.2, 0.0, 1.0))
         longest = float(np.hypot(*mask.shape))
         steps = np.linspace(0.0, 1.0, _STEPS)
         angle = 2 * np.pi * np.arange(_TURNS) / _TURNS
@@ -66,11 +74,11 @@ class Section:
         distance = np.hypot(place[0], place[1])
         table = torch.empty(_TURNS, _RADII, _DEPTHS, device=device)
         want_r = torch.linspace(0, self.reach, _RADII, device=device)
-        want_d = _skin_guide(torch.linspace(0, 1, _DEPTHS, device=device))
+        want_d = self.skin * _skin_guide(torch.linspace(0, 1, _DEPTHS, device=device))
         unit = torch.linspace(0, 1, _STEPS, device=device)
         for k in range(_TURNS):
             have_r = torch.from_numpy(distance[k]).float().to(device)
-            have_d = _skin_guide(torch.from_numpy(depth[k]).float().to(device) / self.largest)
+            have_d = self.skin * _skin_guide(torch.from_numpy(depth[k]).float().to(device) / self.largest)
             cost = ((want_d[:, None] - have_d) ** 2)[None] + (
                 ((want_r[:, None] - have_r) * (2.0 / self.largest)) ** 2
             )[:, None]
@@ -78,13 +86,51 @@ class Section:
             table[k] = torch.softmax(-cost / 0.003, -1) @ unit
         self.table = torch.cat([table, table[:1]])[None]
 
-    def color(self, local: Tensor, depth: Tensor, image: Tensor) -> Tensor:
-        """Colours [n, C] that a picture [C, U, V] (whole frame) shows at places.
+    def polar(self, image: Tensor, whole: bool) -> Tensor:
+        """The structure of a picture that goes on along the axis, by azimuth and relative radius.
+
+        Lines that run outwards (membranes) and lines that run around (rings, rind) go on; grains
+        and cells in between do not. So: the mean along the radius plus the mean around, less the
+        mean of both.
+
+        Args:
+            image: The photograph at any resolution [C, U, V].
+            whole: Everything goes on (fibres).
+
+        Returns:
+            [C, azimuth, radius].
+        """
+        device = image.device
+        height, width = self.placed.mask.shape
+        angle = 2 * torch.pi * torch.arange(_FINE_TURNS, device=device) / _FINE_TURNS
+        turn = torch.arange(_FINE_TURNS, device=device) * (_TURNS / _FINE_TURNS)
+        length = self._outline(turn)[:, None] * torch.linspace(0, 1, _FINE_STEPS, device=device)
+        u = self.center[0] + 0.5 + length * angle.cos()[:, None]
+        v = self.center[1] + 0.5 + length * angle.sin()[:, None]
+        grid = torch.stack([2 * v / width - 1, 2 * u / height - 1], -1).float()
+        found = functional.grid_sample(
+            image[None], grid[None], padding_mode="border", align_corners=False
+        )
+        if whole:
+            return found[0]
+        outward = _blur(found, 0.10 * _FINE_STEPS, 3, "replicate")
+        around = _blur(found, _FINE_TURNS / 15.0, 2, "circular")
+        both = _blur(outward, _FINE_TURNS / 15.0, 2, "circular")
+        return (outward + around - both)[0]
+
+    def _outline(self, turn: Tensor) -> Tensor:
+        """Distance of the outline from the axis [pixels] at azimuths counted in table rows."""
+        low = turn.floor().long()
+        share = turn - low
+        first, second = self.radius[low % _TURNS], self.radius[(low + 1) % _TURNS]
+        return first * (1 - share) + second * share
+
+    def locate(self, local: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """Azimuth [n] in turns and relative radius [n] of the places in the photograph.
 
         Args:
             local: Places in the object's frame [n, 3].
             depth: Depths [n], voxels of the solid.
-            image: Picture of the photograph, at any resolution.
         """
         turn = torch.atan2(local[:, 1], local[:, 0]) / (2 * torch.pi) % 1.0
         radius = torch.hypot(local[:, 0], local[:, 1])
@@ -96,29 +142,37 @@ class Section:
             ],
             -1,
         )
-        relative = trilinear(self.table, cell)[0]
-        outline = torch.cat([self.radius, self.radius[:1]])[None, :, None, None]
-        column = torch.stack([cell[:, 0], torch.full_like(turn, 0.5), torch.full_like(turn, 0.5)], -1)
-        pixels = relative * trilinear(outline, column)[0]
-        angle = turn * 2 * torch.pi
-        spot = torch.stack(
-            [
-                self.center[0] + 0.5 + pixels * angle.cos(),
-                self.center[1] + 0.5 + pixels * angle.sin(),
-            ],
-            -1,
-        )
-        height, width = self.placed.mask.shape
-        grid = torch.stack([2 * spot[:, 1] / width - 1, 2 * spot[:, 0] / height - 1], -1)
+        return turn, trilinear(self.table, cell)[0]
+
+    def color(self, turn: Tensor, relative: Tensor, polar: Tensor) -> Tensor:
+        """Colours [n, C] of a polar picture (:meth:`polar`) at located places."""
+        around = torch.cat([polar, polar[:, :1]], 1)
+        rows, columns = around.shape[1:]
+        place = [
+            2 * (relative * (columns - 1) + 0.5) / columns - 1,
+            2 * (turn * _FINE_TURNS + 0.5) / rows - 1,
+        ]
+        grid = torch.stack(place, -1)[None, None]
         values = functional.grid_sample(
-            image[None], grid[None, None].float(), padding_mode="border", align_corners=False
+            around[None], grid, padding_mode="border", align_corners=False
         )
         return values[0, :, 0].T
 
 
+def _blur(image: Tensor, sigma: float, axis: int, mode: str) -> Tensor:
+    """Gaussian blur of [1, C, H, W] along axis 2 or 3."""
+    reach = int(2.5 * sigma)
+    line = torch.arange(-reach, reach + 1, device=image.device).float()
+    kernel = torch.exp(-0.5 * (line / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).reshape([1, 1, -1, 1] if axis == 2 else [1, 1, 1, -1])
+    pad = (0, 0, reach, reach) if axis == 2 else (reach, reach, 0, 0)
+    padded = functional.pad(image, pad, mode=mode).movedim(1, 0)
+    return functional.conv2d(padded, kernel).movedim(0, 1)
+
+
 def _skin_guide(relative: Tensor) -> Tensor:
     """Steep in the outer tenth of the depth, flat below."""
-    return 3.0 * (1.0 - torch.exp(-relative / 0.1))
+    return 12.0 * (1.0 - torch.exp(-relative / 0.1))
 
 
 def _pixel_of(placed: PlacedPhoto, place: np.ndarray) -> tuple[float, float]:

@@ -24,6 +24,7 @@ __all__ = ["Schedule", "SynthesisLevel", "synthesize_level"]
 logger = logging.getLogger(__name__)
 
 _FALLOFF = 0.45  # vote window: standard deviation over half the patch width
+_ALONE = 0.3  # of the median squared distance
 _CHUNK = 1 << 17  # patches gathered at once
 
 
@@ -43,7 +44,7 @@ class Schedule:
     """
 
     iterations: tuple[int, ...] = (6, 4, 2)
-    polish: tuple[int, ...] = (8, 8, 8)
+    polish: tuple[int, ...] = (8, 8, 4)
     bank: int = 3072
     samples: int = 640
     sinkhorn: int = 3
@@ -70,6 +71,7 @@ class SynthesisLevel:
         guide: Guide values [G, X, Y, Z].
         banks: Patches per slice axis.
         reference: Colours [m, 3] and guide values [m, G] of the photographs' pixels.
+        along: Standard deviation [voxels] of a smoothing along the third axis (fibres).
     """
 
     volume: Tensor
@@ -78,6 +80,7 @@ class SynthesisLevel:
     guide: Tensor
     banks: dict[int, Bank]
     reference: tuple[Tensor, Tensor]
+    along: float = 0.0
 
 
 def synthesize_level(
@@ -138,12 +141,16 @@ def synthesize_level(
         if not transport_last_only or iteration == rounds[0] - 1:
             colors = match_near(colors, guide, *level.reference, rng)
         volume[flat] = colors
+        if level.along > 0:
+            volume = _smoothed_along(volume, inside, level.along)
         volume[flat[fixed]] = kept
     if rounds[1]:
         volume[target] = volume[source]
         grid = volume.T.reshape(3, *shape)
         grid = _polished(level, grid, inside, functional.pad(level.fixed, rim), rim, rounds[1], rng)
         volume = grid.reshape(3, -1).T.contiguous()
+        if level.along > 0:
+            volume = _smoothed_along(volume, inside, level.along)
         colors = match_near(volume[flat], guide, *level.reference, rng)
         volume[flat] = colors
         volume[flat[fixed]] = kept
@@ -151,6 +158,20 @@ def synthesize_level(
     grid = volume.T.reshape(3, *shape)
     level.volume = grid[:, inner, inner, inner] * level.inside
     return disagreement
+
+
+def _smoothed_along(volume: Tensor, inside: Tensor, sigma: float) -> Tensor:
+    """Volume [V, 3] blurred along the third axis, by inside voxels only."""
+    reach = max(1, int(2.5 * sigma))
+    line = torch.arange(-reach, reach + 1, device=volume.device).float()
+    kernel = torch.exp(-0.5 * (line / sigma) ** 2).reshape(1, 1, -1)
+    share = inside.float()
+    values = torch.cat([volume.T.reshape(3, *inside.shape) * share, share[None]])
+    lines = values.reshape(4, -1, inside.shape[2]).movedim(0, 1).reshape(-1, 1, inside.shape[2])
+    blurred = functional.conv1d(lines, kernel, padding=reach)
+    blurred = blurred.reshape(-1, 4, inside.shape[2]).movedim(1, 0).reshape(4, -1)
+    smooth = (blurred[:3] / blurred[3].clamp(min=1e-6)).T
+    return torch.where(inside.reshape(-1, 1), smooth, volume)
 
 
 def _polished(
@@ -211,12 +232,15 @@ def _axis_votes(
     if len(picked) == 0:
         return total, share
     sample = torch.from_numpy((draw * len(picked)).astype(np.int64)).to(picked.device)
-    bank.balance(describe(picked[sample]), schedule.sinkhorn)
+    query = describe(picked[sample])
+    bank.balance(query, schedule.sinkhorn)
+    # a patch that fits perfectly must not be alone: the lattice of centres would show
+    floor = _ALONE * float(bank.nearest(query)[1].median()) + 1e-4
     gauss = torch.exp(-0.5 * (window.float() / (_FALLOFF * half)) ** 2)
     falloff = (gauss[:, None] * gauss[None]).reshape(-1)
     for part in picked.split(_CHUNK):
         best, distance = bank.nearest(describe(part))
-        weight = 1.0 / (distance + 1e-4)
+        weight = 1.0 / (distance + floor)
         center = flat[part]
         for k in range(len(offset)):
             # within one offset no voxel is met twice: the sums are the same in every run

@@ -136,7 +136,7 @@ def polish_patches(
     rounds: int,
     filters: int = 8,
     step: float = 1.0,
-    share: int = 3,
+    share: int = 1,
     parts: int = 6,
 ) -> Tensor:
     """Let the patches of all slices have the distribution of the photographs' patches.
