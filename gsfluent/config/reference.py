@@ -16,10 +16,12 @@ from gsfluent.config.settings import (
     KeyLight,
     LightSettings,
     OutputSettings,
+    PhotoSettings,
     ReconstructSettings,
     SolveSettings,
     TextureSettings,
 )
+from gsfluent.config.settings_inpaint import InpaintSettings
 from gsfluent.config.shot import Shot
 
 SECTIONS: dict[str, type[Any]] = {
@@ -27,6 +29,8 @@ SECTIONS: dict[str, type[Any]] = {
     "reconstruct": ReconstructSettings,
     "fill": FillSettings,
     "texture": TextureSettings,
+    "texture.inpaint": InpaintSettings,
+    "texture.photo": PhotoSettings,
     "objects.NAME.select": Select,
     "objects.NAME.parts[].where": Where,
     **{f"events[] with type: {name}": cls for name, cls in EVENTS.items()},

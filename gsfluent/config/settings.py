@@ -22,8 +22,10 @@ from gsfluent.config.read import (
     section,
     several,
     text,
+    vector,
     whole,
 )
+from gsfluent.config.settings_inpaint import InpaintSettings
 from gsfluent.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -49,7 +51,15 @@ def _camera(value: Any, place: Place) -> str | int | Path:
     return index
 
 
-_TEXTURE_METHODS = ("exemplar", "diffusion", "color_copy", "procedural", "profile", "telea")
+_TEXTURE_METHODS = (
+    "exemplar",
+    "diffusion",
+    "inpaint",
+    "color_copy",
+    "procedural",
+    "profile",
+    "telea",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +155,51 @@ class FillSettings:
         return values
 
 
+def _white(value: Any, place: Place) -> str | float | tuple[float, ...]:
+    if isinstance(value, str):
+        return str(choice("auto", "none", "skin")(value, place))
+    if isinstance(value, list | tuple):
+        return tuple(vector(3, 0.0, 255.0)(value, place))
+    return float(number(1000.0, 25000.0)(value, place))
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoSettings:
+    """``texture: photo:`` - what is done to exemplar photographs before their material is used."""
+
+    cutout: str | None = key(
+        choice("auto", "ground", "grabcut", "none"),
+        default=None,
+        doc="How the object is told from its ground; none takes the whole picture as material.",
+        example="auto",
+    )
+    rim: bool | None = key(
+        flag, default=None, doc="Take leftovers of the surroundings off the rim.", example="true"
+    )
+    holes: bool | None = key(
+        flag, default=None, doc="Paint open cavities in the colour of their walls.", example="true"
+    )
+    glints: bool | None = key(flag, default=None, doc="Paint over specular spots.", example="true")
+    shading: bool | None = key(
+        flag, default=None, doc="Even out a gradient of the light.", example="true"
+    )
+    white: str | float | tuple[float, ...] | None = key(
+        _white,
+        default=None,
+        doc="White balance: auto, none, skin (as the object's), kelvin, or [r, g, b] of a white.",
+        example="auto",
+    )
+    stain: bool | None = key(
+        flag,
+        default=None,
+        doc="Give stained (grey) parts the colour of the unstained ones.",
+        example="true",
+    )
+    palette: str | None = key(
+        text, default=None, doc="Take the colours of this preset instead.", example="apple"
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class TextureSettings:
     """``texture:`` - colours for the inside."""
@@ -206,17 +261,41 @@ class TextureSettings:
         doc="Find seeds and stones in the exemplar and place them (method exemplar).",
         example="true",
     )
+    photo: PhotoSettings | None = key(
+        nested(PhotoSettings),
+        default=None,
+        doc="Preparation of photographs (method exemplar).",
+        example="{stain: true}",
+    )
+    inpaint: InpaintSettings | None = key(
+        nested(InpaintSettings),
+        default=None,
+        doc="How slices are inpainted (methods diffusion and inpaint).",
+        example="{tile: 2, memory: balanced}",
+    )
+    polish: bool | None = key(
+        flag,
+        default=None,
+        doc="Fit interior splats coarser than the voxels to slices of the colours.",
+        example="true",
+    )
 
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
-        return given(self)
+        values = given(self)
+        if self.photo is not None:
+            values["photo"] = given(self.photo)
+        if self.inpaint is not None:
+            values["inpaint"] = self.inpaint.given()
+        return values
 
 
 _TEXTURE_READERS = {
     "preset": ("procedural",),
-    "prompt": ("diffusion",),
-    "model": ("diffusion",),
-    **dict.fromkeys(("quality", "scale", "guide", "directional", "inclusions"), ("exemplar",)),
+    **dict.fromkeys(("prompt", "model", "inpaint"), ("diffusion", "inpaint")),
+    **dict.fromkeys(
+        ("quality", "scale", "guide", "directional", "inclusions", "photo"), ("exemplar",)
+    ),
 }
 """Keys of ``texture:`` that only these methods read."""
 
@@ -233,9 +312,19 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
                 f"{place.inside(name).path} does nothing with method {method}",
                 f"remove it, or set method: {readers[0]}",
             )
-    needed = {"exemplar": "exemplar", "procedural": "preset", "diffusion": "model"}.get(
-        method or ""
-    )
+    inpaint = settings.inpaint
+    if (
+        method in ("diffusion", "inpaint")
+        and inpaint
+        and inpaint.backend not in (None, "diffusers")
+    ):
+        return settings
+    needed = {
+        "exemplar": "exemplar",
+        "procedural": "preset",
+        "diffusion": "model",
+        "inpaint": "model",
+    }.get(method or "")
     if needed is not None and getattr(settings, needed) is None:
         raise InputError(
             f"{place.inside(needed).path} is missing",

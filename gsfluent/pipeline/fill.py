@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gsfluent.errors import InputError
 
@@ -21,15 +20,13 @@ from .fill_inside import (
     trim_outer_flank,
     visual_hull,
 )
-from .fill_interior import (
-    _INTERIOR_OPACITY,
-    interior_gaussians,
-    refine_opacity,
-)
-from .fill_view import cut_view, surface_colors
+from .fill_interior import populate
+from .fill_refine import refine_opacity
+from .fill_view import cut_view
 from .orient import orient
 from .solid_skin import grown_to_masks
 from .stage import Progress, Stage, report_progress
+from .voxels import distance_transform, nearest_empty
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Gaussians, Solid
@@ -67,8 +64,8 @@ class Fill(Stage):
             an unseen side by itself.
         close_underside: Close the side that no photograph shows, at its rim.
         match_masks: Grow the solid to the outline of the masks, where there are any.
-        refine_iterations: Steps of the opacity fit (0 switches it off).
-        refine_image_size: Longest image side in the fit [pixels].
+        refine_views: Photographs asked about the interior (0 asks none).
+        refine_image_size: Longest image side then [pixels].
         seed: Seed of lattice jitter and view order.
 
     Raises:
@@ -91,7 +88,7 @@ class Fill(Stage):
         down: tuple[float, float, float] | None = None,
         close_underside: bool = True,
         match_masks: bool = True,
-        refine_iterations: int = 24,
+        refine_views: int = 24,
         refine_image_size: int = 200,
         seed: int = 0,
     ) -> None:
@@ -131,7 +128,7 @@ class Fill(Stage):
         self.down = None if down is None else np.asarray(down, dtype=float)
         self.close_underside = close_underside
         self.match_masks = match_masks
-        self.refine_iterations = int(refine_iterations)
+        self.refine_views = int(refine_views)
         self.refine_image_size = int(refine_image_size)
 
     def forward(
@@ -161,40 +158,44 @@ class Fill(Stage):
         total = 5
         box, solid, report = self.inside(gaussians, capture, progress)
         report_progress(progress, 2, total, "depth")
-        solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel)
+        solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel, gaussians.device)
         report_progress(progress, 3, total, "interior Gaussians")
         surface = gaussians.replace(
             labels=torch.full(
                 (gaussians.count,), SURFACE, dtype=torch.int32, device=gaussians.means.device
             )
         )
-        merged, inner = self._populate(surface, solid, depth, nearest, box)
-        refined: dict[str, float] = {}
-        pruned = 0
-        if capture is not None and self.refine_iterations > 0 and bool(inner.any()):
-            opacity, refined = refine_opacity(
+        merged, inner, placed = populate(
+            surface,
+            solid,
+            depth,
+            nearest,
+            box,
+            spacing=self.spacing,
+            max_interior=self.max_interior,
+            seed=self.seed,
+        )
+        refined: dict[str, Any] = {}
+        if capture is not None and self.refine_views > 0 and bool(inner.any()):
+            merged, inner, refined = refine_opacity(
                 merged,
                 inner,
                 capture,
-                iterations=self.refine_iterations,
+                views=self.refine_views,
                 image_size=self.refine_image_size,
-                seed=self.seed,
                 progress=progress,
             )
-            keep = ~inner | (opacity > 0.1)
-            pruned = int((~keep).sum())
-            merged = merged.replace(opacities=opacity).select(keep)
-            inner = inner[keep]
         report_progress(progress, total, total, "filled")
         report = {
             "interior_gaussians": int(inner.sum()),
-            "pruned": pruned,
+            "pruned": refined.pop("pruned", 0),
             "volume": float(solid.sum() * box.voxel**3),
             "leaks": report.pop("leaks"),
             "hollow_fraction": hollow_fraction,
             "grid": list(box.shape),
             "voxel": box.voxel,
             **report,
+            **placed,
             **refined,
             "seconds": time.perf_counter() - began,
         }
@@ -260,7 +261,7 @@ class Fill(Stage):
         down = self.down
         if down is None and capture is not None:
             down = -np.asarray(orient(gaussians, capture).up, dtype=float)
-        solid, notes = self._decide(box, density, shell, capture, down)
+        solid, notes = self._decide(box, density, shell, capture, down, gaussians.device)
         return box, solid, notes | {"stray_gaussians": strays}
 
     def _decide(
@@ -270,6 +271,7 @@ class Fill(Stage):
         shell: np.ndarray,
         capture: Capture | None,
         down: np.ndarray | None,
+        device: torch.device,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Occupied voxels and what was noticed on the way."""
         from scipy import ndimage
@@ -285,7 +287,7 @@ class Fill(Stage):
         solid = inside | shell
         method = "vote"
         if views:
-            hull = visual_hull(box, views)
+            hull = visual_hull(box, views, device)
             # masks say what is not the object; rays cap the cone under objects seen only from above
             # (just outside a convex surface about half of the rays hit it)
             solid = hull & (shell | (vote.score >= 0.65))
@@ -301,19 +303,19 @@ class Fill(Stage):
         if vote.open_side is not None:
             leaks = max(leaks, 1)
         untrimmed = solid
-        solid = smooth_boundary(trim_outer_flank(solid, shell, density))
+        solid = smooth_boundary(trim_outer_flank(solid, shell, density, device))
         solid, more = keep_components(solid)
         offset = 0.0
         if self.match_masks and views and capture is not None:
             # what one sees reaches beyond the centres of the splats; the masks say how far
-            solid, offset = grown_to_masks(solid, hull, box, capture)
+            solid, offset = grown_to_masks(solid, hull, box, capture, device)
         inner = int((solid & ~shell).sum())
         if inner == 0:
             logger.warning(
                 "fill: the object is all shell at this resolution: nothing but thin parts"
             )
         # splats well below the surface hint at a cavity or an inner wall
-        depth = ndimage.distance_transform_edt(untrimmed)
+        depth = distance_transform(untrimmed, device)
         buried = float((shell & (depth > 5.0)).sum() / max(int(shell.sum()), 1))
         if vote.open_side is not None:
             logger.info(
@@ -334,13 +336,11 @@ class Fill(Stage):
         return solid, notes
 
     def _depth(
-        self, solid: np.ndarray, voxel: float
+        self, solid: np.ndarray, voxel: float, device: torch.device
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """Hollow the solid if asked; depth in world units and nearest outer voxel [3, X, Y, Z]."""
-        from scipy import ndimage
-
         # the grid has a rim of empty voxels, so every solid voxel has an outer one
-        distance, nearest = ndimage.distance_transform_edt(solid, return_indices=True)
+        distance, nearest = nearest_empty(solid, device)
         # voxel centres are half a voxel from the boundary that the transform measures to
         depth = np.where(solid, (distance - 0.5) * voxel, 0.0).astype(np.float32)
         if self.hollow is None:
@@ -353,44 +353,6 @@ class Fill(Stage):
         wall = solid & (depth <= self.hollow)
         removed = 1.0 - float(wall.sum()) / max(int(solid.sum()), 1)
         return wall, np.where(wall, depth, 0.0).astype(np.float32), nearest, removed
-
-    def _populate(
-        self,
-        surface: Gaussians,
-        solid: np.ndarray,
-        depth: np.ndarray,
-        nearest: np.ndarray,
-        box: GridBox,
-    ) -> tuple[Gaussians, Tensor]:
-        """Append interior Gaussians that wear the colour of the surface nearest to them."""
-        from gsfluent.data import INTERIOR, Gaussians
-
-        spacing = self.spacing
-        if spacing is None:
-            spacing = max(1.25, float(solid.sum() / max(self.max_interior, 1)) ** (1 / 3))
-        origin = np.asarray(box.origin)
-        centers, sigma = interior_gaussians(
-            solid, depth, origin, box.voxel, spacing * box.voxel, self.seed
-        )
-        count = centers.shape[0]
-        device, dtype = surface.means.device, surface.dtype
-        inner = torch.zeros(surface.count + count, dtype=torch.bool, device=device)
-        inner[surface.count :] = True
-        if count == 0:
-            return surface, inner
-        voxel = tuple(np.floor((centers - origin) / box.voxel).astype(int).T)
-        skin = np.stack([nearest[i][voxel] for i in range(3)], axis=1)
-        # few distinct skin voxels serve many Gaussians; asking the tree from deep inside is slow
-        unique, back = np.unique(skin, axis=0, return_inverse=True)
-        color = surface_colors(surface, box.centers(unique), box.voxel)[back.reshape(-1)]
-        interior = Gaussians.from_colors(
-            torch.from_numpy(centers).to(device, dtype),
-            torch.full((count,), sigma, dtype=dtype, device=device),
-            torch.from_numpy(color).to(device, dtype),
-            opacities=_INTERIOR_OPACITY,
-            label=INTERIOR,
-        )
-        return Gaussians.cat([surface.replace(normals=None), interior]), inner
 
 
 def _parse_hollow(hollow: str | float) -> float | None:

@@ -18,6 +18,7 @@ from gsfluent.errors import InputError
 
 from ..stage import Progress, report_progress
 from .bank import Bank, LevelPhoto
+from .choice import surface_verdict
 from .color import lab_to_rgb, rgb_to_lab100
 from .domain import InteriorDomain, InteriorTexture
 from .guides import GUIDES, PlacedPhoto, depth_guide, explained, place_photo
@@ -27,7 +28,7 @@ from .photo import Exemplar, load_exemplar
 from .sections import Section
 from .synthesis import Schedule, SynthesisLevel, synthesize_level
 
-__all__ = ["QUALITIES", "exemplar_texture", "load_exemplars"]
+__all__ = ["QUALITIES", "SURFACES", "exemplar_texture", "load_exemplars"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +37,7 @@ QUALITIES: dict[str, Schedule] = {
     "fast": Schedule(),
     "full": Schedule(iterations=(8, 5, 3), bank=6144, samples=2000, sinkhorn=5, stride=2),
 }
+SURFACES = ("auto", "keep", "copy", "ignore")
 _AXES = {"x": 0, "y": 1, "z": 2}
 _PER_VOXEL = 0.08  # guide weight of a cell of height or distance to the axis
 _SECTION_WEIGHT = 3.0  # against the 75 values of a patch: structure leads, texture decides
@@ -91,7 +93,7 @@ def exemplar_texture(
     directional: bool = False,
     inclusions: bool = True,
     depth_scale: float | None = None,
-    keep_surface: bool | None = None,
+    surface: str = "auto",
     device: str | torch.device = "auto",
     seed: int = 0,
     progress: Progress | None = None,
@@ -114,8 +116,10 @@ def exemplar_texture(
         inclusions: Find seeds and stones and place them as labelled ellipsoids.
         depth_scale: Depth of the photograph's deepest point in units of the object's largest
             depth; None works it out.
-        keep_surface: Hold the surface's colours fixed; None does so for unlayered materials whose
-            surface looks like the photographs.
+        surface: What the surface's colours are to the inside: ``keep`` them fixed and grow the
+            inside from them, ``copy`` them inwards, ``ignore`` them, or ``auto``: copied where that
+            gives the photograph's statistics without streaks, kept where the material is unlayered
+            and its surface looks like the photograph, else ignored (:mod:`.choice`).
         device: Where to compute; ``auto`` takes a CUDA device when there is one.
         seed: Seed. The same seed gives the same texture on the same kind of device.
         progress: Optional callback.
@@ -129,6 +133,11 @@ def exemplar_texture(
             positive, or an empty solid.
     """
     _check(quality, scale, guide, depth_scale)
+    if surface not in SURFACES:
+        raise InputError(
+            f"texture: surface must be one of {', '.join(SURFACES)}, got {surface!r}",
+            mend="leave it at auto",
+        )
     began = time.process_time()
     where = _device(device)
     photos = {a: [e] if isinstance(e, Exemplar) else list(e) for a, e in exemplars.items()}
@@ -151,14 +160,18 @@ def exemplar_texture(
     kind = guide if isinstance(guide, str) else "array"
     if kind == "auto":
         kind = _choose_guide(prepared) if guided else "none"
-    volume, lattice, figures = _synthesize(
-        crop, fields, prepared, QUALITIES[quality], kind, guide, directional, keep_surface, seed,
-        rng, progress,
-    )
-    rgb = _to_grid(volume, lattice, fields, crop)
+    verdict, surface = _surface(crop, prepared, kind, surface, seed)
+    if surface == "copy":
+        rgb, figures = crop.skin, {"levels": 0, "axis_disagreement": 0.0}
+    else:
+        volume, lattice, figures = _synthesize(
+            crop, fields, prepared, QUALITIES[quality], kind, guide, directional,
+            surface == "keep", seed, rng, progress,
+        )  # fmt: skip
+        rgb = _to_grid(volume, lattice, fields, crop)
     labels = np.zeros(crop.inside.shape, np.int32)
     count = 0
-    if blobs is not None:
+    if blobs is not None and surface != "copy":
         found, original, pitch = blobs
         rgb, labels, count = paint_inclusions(
             rgb, crop.inside, crop.depth, original, found, pitch, rng
@@ -174,11 +187,43 @@ def exemplar_texture(
         "exemplars": len({id(e) for e in everything}),
         "laid_into_object": all(p.fitted for group in prepared.values() for p in group),
         "inclusions": count,
+        "photo_pitch": next(iter(prepared.values()))[0].pitch,
+        "surface": surface,
+        **verdict,
         "device": str(where),
         "cpu_seconds": time.process_time() - began,
         **figures,
     }
     return InteriorTexture(full, full_labels, report)
+
+
+def _surface(
+    domain: InteriorDomain,
+    prepared: dict[int, list[PlacedPhoto]],
+    kind: str,
+    wanted: str,
+    seed: int,
+) -> tuple[dict[str, Any], str]:
+    """What the surface is to the inside, and why."""
+    placed = list({id(p): p for group in prepared.values() for p in group}.values())
+    verdict = surface_verdict(domain, placed, seed)
+    alike = verdict["surface_like_interior"]
+    if wanted != "auto":
+        return verdict | {"why": f"surface: {wanted} was asked for"}, wanted
+    if verdict["copy_suffices"]:
+        why = "the surface copied inwards has the photograph's colours and patches and no streaks"
+        choice = "copy"
+    elif alike and kind == "none":
+        why = "the surface looks like the photograph; copied inwards it would make streaks: kept"
+        choice = "keep"
+    elif alike:
+        why = "the surface looks like the photograph, but the inside follows a guide: synthesised"
+        choice = "ignore"
+    else:
+        why = "the surface does not look like the photograph: synthesised"
+        choice = "ignore"
+    logger.info("texture: %s", why)
+    return verdict | {"why": why}, choice
 
 
 def _check(
@@ -304,7 +349,7 @@ def _synthesize(
     kind: str,
     own: str | np.ndarray,
     directional: bool,
-    keep_surface: bool | None,
+    keep: bool,
     seed: int,
     rng: np.random.Generator,
     progress: Progress | None,
@@ -320,9 +365,6 @@ def _synthesize(
     first = next(iter(prepared.values()))
     if not directional:
         groups = {axis: prepared.get(axis, first) for axis in range(3)}
-    keep = keep_surface
-    if keep is None:
-        keep = kind == "none" and _skin_is_material(domain, next(iter(prepared.values()))[0].photo)
     lattices = fields.lattices()
     volume: Tensor | None = None
     disagreement = 0.0
@@ -608,10 +650,3 @@ def _to_grid(
         colors = lab_to_rgb(lattice.read(extended, points).T)
         rgb[k][domain.inside[k]] = colors.cpu().numpy()
     return rgb
-
-
-def _skin_is_material(domain: InteriorDomain, photo: Exemplar) -> bool:
-    from .metrics import lab_histogram_distance
-
-    skin = domain.skin[domain.shell]
-    return lab_histogram_distance(skin, photo.image[photo.mask]) < 8.0

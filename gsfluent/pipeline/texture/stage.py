@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from ..stage import Progress, Stage, report_progress
 from .baselines import color_copy, telea_slices
 from .domain import InteriorDomain, InteriorTexture, blend_skin
 from .exemplar import QUALITIES, exemplar_texture, load_exemplars
+from .inpaint_options import InpaintOptions
 from .metrics import (
     depth_profile_error,
     lab_histogram_distance,
@@ -24,20 +26,27 @@ from .metrics import (
     patch_distance,
     volume_slices,
 )
-from .photo import Exemplar
+from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
 from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
 
-    from .inpaint import InpaintOptions
-
 __all__ = ["METHODS", "Texture"]
 
 logger = logging.getLogger(__name__)
 
-METHODS = ("auto", "exemplar", "procedural", "diffusion", "profile", "color_copy", "telea")
+METHODS = (
+    "auto",
+    "exemplar",
+    "procedural",
+    "diffusion",
+    "inpaint",
+    "profile",
+    "color_copy",
+    "telea",
+)
 
 
 class Texture(Stage):
@@ -49,24 +58,37 @@ class Texture(Stage):
     Methods:
         ``exemplar``: guided patch synthesis from photographs of a cut object (the default when an
         exemplar is given); ``procedural``: a preset; ``diffusion``: slices inpainted by a diffusers
-        pipeline; ``profile``: surface colour fading to its mean (the default with nothing given,
-        with a warning); ``color_copy`` and ``telea``: baselines for comparison.
+        pipeline; ``inpaint``: slices inpainted by another backend (``inpaint={"backend": ...}``,
+        :class:`.inpaint_options.InpaintOptions`); ``profile``: surface colour fading to its mean
+        (the default with nothing given, with a warning); ``color_copy`` and ``telea``: baselines
+        for comparison.
 
     Args:
         method: One of the above, or ``auto``.
-        exemplar: Photograph of the inside (path or array), or one per axis ``{x: ..., z: ...}``.
+        exemplar: Photograph of the inside (path or array), a list of them, or one or a list per axis
+            ``{x: ..., z: ...}``.
         preset: Name of a procedural preset.
         prompt: Text for the diffusion model.
         model: Local folder or hub id of an inpainting pipeline.
         quality: ``preview``, ``fast`` or ``full`` (exemplar method).
         scale: Size of the exemplar's structure relative to the automatic choice.
-        guide: ``auto``, ``depth``, ``none``, or ``axis`` when the photograph is a cut across the
-            object's axis (exemplar method).
+        guide: What the structure follows: ``auto``, ``depth``, ``axis`` (a cut across the object's
+            axis shows what goes on along it), ``height`` (layers along the axis) or ``none``
+            (exemplar method).
         directional: True for grained materials: the exemplar is not turned or mirrored.
         inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
-        inpaint: Settings of the diffusion method.
+        photo: What is done to photographs before their material is used (:class:`PhotoOptions`,
+            or its settings as a mapping); None for the defaults.
+        inpaint: Settings of the slice methods, or a mapping of them.
         resume: Folder in which the diffusion method keeps finished slices.
+        polish: Fit the colours of interior Gaussians that are coarser than the voxels to slices
+            of the volume, instead of sampling it at their centres (:mod:`.polish`).
+        depth_scale: Depth of the photograph's deepest point in units of the object's largest depth;
+            None works it out (exemplar method).
+        surface: What the surface's colours are to the inside: ``auto``, ``keep``, ``copy`` or
+            ``ignore`` (exemplar method, :func:`.exemplar.exemplar_texture`).
+        device: Where the exemplar method computes; ``auto`` takes a CUDA device when there is one.
         seed: Seed of everything random.
 
     Raises:
@@ -89,8 +111,13 @@ class Texture(Stage):
         directional: bool = False,
         inclusions: bool = True,
         axis: tuple[float, float, float] | None = None,
-        inpaint: InpaintOptions | None = None,
+        photo: PhotoOptions | Mapping[str, Any] | None = None,
+        inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
+        polish: bool = False,
+        depth_scale: float | None = None,
+        surface: str = "auto",
+        device: str = "auto",
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -124,9 +151,11 @@ class Texture(Stage):
                     f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
                     mend="choose one of these or give an exemplar photograph",
                 )
-        if method == "diffusion" and model is None:
+        options = InpaintOptions.of(inpaint)
+        slices = method in ("diffusion", "inpaint")
+        if slices and "diffusers" in (options.backend, options.coarse) and model is None:
             raise InputError(
-                "texture: method 'diffusion' needs a model",
+                f"texture: method {method!r} needs a model",
                 mend="give a local folder or hub id, for example "
                 "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
             )
@@ -141,8 +170,13 @@ class Texture(Stage):
         self.directional = directional
         self.inclusions = inclusions
         self.axis = None if axis is None else np.asarray(axis, dtype=float)
-        self.inpaint = inpaint
+        self.photo = PhotoOptions.of(photo)
+        self.inpaint = options
         self.resume = None if resume is None else Path(resume)
+        self.polish = bool(polish)
+        self.depth_scale = depth_scale
+        self.surface = surface
+        self.device = device
 
     def forward(
         self,
@@ -166,14 +200,19 @@ class Texture(Stage):
             InputError: The exemplar, preset or model cannot be used.
         """
         began = time.perf_counter()
-        exemplars = load_exemplars(self.exemplar) if self.exemplar is not None else None
         domain = InteriorDomain.from_solid(solid, self.axis)
+        exemplars = None
+        if self.exemplar is not None:
+            opened = open_exemplars(self.exemplar, self.photo)
+            if self.photo.white == "skin":
+                opened = with_skin(opened, domain.skin[domain.shell])
+            exemplars = load_exemplars(opened)
         if not domain.inside.any():
             raise InputError("texture: the solid is empty", mend="run fill first")
         texture = self._make(domain, exemplars, progress)
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
-        colored = _color_interior(solid, replace(texture, rgb=rgb), domain)
-        report = self._report(domain, texture, exemplars)
+        colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
+        report = self._report(domain, texture, exemplars) | polished
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
         regions = solid.regions
@@ -191,7 +230,7 @@ class Texture(Stage):
     def _make(
         self,
         domain: InteriorDomain,
-        exemplars: dict[int, Exemplar] | None,
+        exemplars: dict[int, list[Exemplar]] | None,
         progress: Progress | None,
     ) -> InteriorTexture:
         """Run the chosen method."""
@@ -204,6 +243,9 @@ class Texture(Stage):
                 guide=self.guide,
                 directional=self.directional,
                 inclusions=self.inclusions,
+                depth_scale=self.depth_scale,
+                surface=self.surface,
+                device=self.device,
                 seed=self.seed,
                 progress=progress,
             )
@@ -213,15 +255,15 @@ class Texture(Stage):
             return color_copy(domain)
         if self.method == "telea":
             return telea_slices(domain)
-        if self.method == "diffusion" and self.model is not None:
-            from .inpaint import InpaintOptions, diffusion_texture
+        if self.method in ("diffusion", "inpaint"):
+            from .inpaint import diffusion_texture
 
             return diffusion_texture(
                 domain,
                 self.model,
                 prompt=self.prompt,
-                options=self.inpaint or InpaintOptions(),
-                exemplar=None if exemplars is None else exemplars[0],
+                options=self.inpaint,
+                exemplar=None if exemplars is None else _one_per_axis(exemplars),
                 resume=self.resume,
                 seed=self.seed,
                 progress=progress,
@@ -233,7 +275,7 @@ class Texture(Stage):
         self,
         domain: InteriorDomain,
         texture: InteriorTexture,
-        exemplars: dict[int, Exemplar] | None,
+        exemplars: dict[int, list[Exemplar]] | None,
     ) -> dict[str, Any]:
         """Figures for ``run.json``; distances are to the exemplar and null without one."""
         ratios = neighbour_slice_ratio(texture.rgb, domain.inside)
@@ -247,8 +289,10 @@ class Texture(Stage):
             **texture.report,
         }
         if exemplars is not None:
-            photo = exemplars[0]
-            if photo.silhouette:
+            photo = _one_per_axis(exemplars)[0]
+            if "photo_pitch" in texture.report:
+                factor = texture.report["photo_pitch"] / self.scale
+            elif photo.silhouette:
                 factor = domain.max_depth / max(photo.max_depth, 1.0)
             else:
                 factor = max(domain.inside.shape) / max(photo.mask.shape)
@@ -259,31 +303,40 @@ class Texture(Stage):
             report["color_distance"] = lab_histogram_distance(interior, photo.image[photo.mask])
             if photo.silhouette:
                 report["depth_profile_error"] = depth_profile_error(domain, texture.rgb, photo)
-            skin = lab_histogram_distance(domain.skin[domain.shell], photo.image[photo.mask])
-            report["surface_like_interior"] = skin < 3.0
-            if skin < 3.0:
-                logger.info(
-                    "texture: the surface looks like the exemplar already (Lab distance %.1f); "
-                    "color_copy would do as well",
-                    skin,
-                )
         return report
 
 
-def _color_interior(solid: Solid, texture: InteriorTexture, domain: InteriorDomain) -> Any:
-    """Gaussians whose INTERIOR rows wear the volume's colour; all other rows are the same."""
+def _one_per_axis(exemplars: dict[int, list[Exemplar]]) -> dict[int, Exemplar]:
+    """The first photograph of every axis; axes without one share the first of all."""
+    first = next(iter(exemplars.values()))
+    return {axis: exemplars.get(axis, first)[0] for axis in range(3)}
+
+
+def _color_interior(
+    solid: Solid, texture: InteriorTexture, domain: InteriorDomain, polish: bool = False
+) -> tuple[Any, dict[str, Any]]:
+    """Gaussians whose INTERIOR rows wear the volume's colour, all others the same; a report."""
     from gsfluent.data import INTERIOR
     from gsfluent.geometry import rgb_to_sh0
 
     gaussians = solid.gaussians
     if gaussians.labels is None:
-        return gaussians
+        return gaussians, {}
     chosen = gaussians.labels == INTERIOR
     if not bool(chosen.any()):
-        return gaussians
+        return gaussians, {}
     means = gaussians.means[chosen].detach().double().cpu().numpy()
-    color = texture.sample((means - domain.origin) / domain.voxel, domain.inside)
+    place = (means - domain.origin) / domain.voxel
+    color = texture.sample(place, domain.inside)
+    report: dict[str, Any] = {}
+    if polish:
+        from .polish import polish_colors
+
+        color, figures = polish_colors(
+            domain, texture.rgb, place, color, device=solid.occupancy.device
+        )
+        report = {"polish": figures}
     sh = gaussians.sh.clone()
     sh[chosen] = 0.0
     sh[chosen, 0] = rgb_to_sh0(torch.from_numpy(color).to(sh))
-    return gaussians.replace(sh=sh)
+    return gaussians.replace(sh=sh), report

@@ -15,11 +15,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from .bank import Bank
+from .bank import Bank, LevelPhoto
+from .color import lab_to_rgb, rgb_to_lab100
 from .levels import nearest_inside
 from .transport import match_near, polish_patches
 
-__all__ = ["Schedule", "SynthesisLevel", "synthesize_level"]
+__all__ = ["Schedule", "SynthesisLevel", "project_slice", "synthesize_level"]
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +71,8 @@ class SynthesisLevel:
         fixed: Voxels whose colour stays, bool [X, Y, Z].
         guide: Guide values [G, X, Y, Z].
         banks: Patches per slice axis.
-        reference: Colours [m, 3] and guide values [m, G] of the photographs' pixels.
+        reference: Colours [m, 3] and guide values [m, G] of the photographs' pixels; None
+            leaves the colours to the patches.
         along: Standard deviation [voxels] of a smoothing along the third axis (fibres).
     """
 
@@ -79,7 +81,7 @@ class SynthesisLevel:
     fixed: Tensor
     guide: Tensor
     banks: dict[int, Bank]
-    reference: tuple[Tensor, Tensor]
+    reference: tuple[Tensor, Tensor] | None
     along: float = 0.0
 
 
@@ -138,7 +140,8 @@ def synthesize_level(
         variance = square[flat] / weight[flat].clamp(min=1e-9) - (mean**2).sum(1)
         disagreement = float((variance[voted].clamp(min=0).mean() / 3).sqrt())
         colors = torch.where(voted[:, None], mean, volume[flat])
-        if not transport_last_only or iteration == rounds[0] - 1:
+        last = iteration == rounds[0] - 1
+        if level.reference is not None and (last or not transport_last_only):
             colors = match_near(colors, guide, *level.reference, rng)
         volume[flat] = colors
         if level.along > 0:
@@ -151,8 +154,8 @@ def synthesize_level(
         volume = grid.reshape(3, -1).T.contiguous()
         if level.along > 0:
             volume = _smoothed_along(volume, inside, level.along)
-        colors = match_near(volume[flat], guide, *level.reference, rng)
-        volume[flat] = colors
+        if level.reference is not None:
+            volume[flat] = match_near(volume[flat], guide, *level.reference, rng)
         volume[flat[fixed]] = kept
     inner = slice(pad, -pad)
     grid = volume.T.reshape(3, *shape)
@@ -249,3 +252,50 @@ def _axis_votes(
             total.index_add_(0, at, bank.patches[best, k] * votes[:, None])
             share.index_add_(0, at, votes)
     return total, share
+
+
+def project_slice(
+    image: np.ndarray,
+    inside: np.ndarray,
+    fixed: np.ndarray,
+    guide: np.ndarray,
+    photo: tuple[np.ndarray, np.ndarray, np.ndarray],
+    schedule: Schedule,
+    iterations: int,
+    *,
+    turns: bool,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Patch synthesis in a single slice, by itself.
+
+    Args:
+        image: RGB in 0..1, [H, W, 3].
+        inside: Pixels of the object, bool [H, W].
+        fixed: Pixels that stay, bool [H, W].
+        guide: Guide value per pixel, [H, W].
+        photo: Photograph at the same pitch: image [h, w, 3], mask [h, w], guide [h, w].
+        schedule: Work settings.
+        iterations: Rounds of voting.
+        turns: Use the photograph turned and mirrored.
+        rng: Random generator.
+
+    Returns:
+        RGB [H, W, 3]; pixels that are fixed or outside are those of ``image``.
+    """
+    within = torch.from_numpy(inside[None])
+    place = torch.from_numpy(guide.astype(np.float32)[None, None])
+    shown = LevelPhoto(
+        rgb_to_lab100(torch.from_numpy(photo[0].astype(np.float32))),
+        torch.from_numpy(photo[1]),
+        torch.from_numpy(photo[2].astype(np.float32)[..., None]),
+    )
+    target = place[0][within][:, None]
+    wanted = min(schedule.bank, max(512, int(inside.sum()) // schedule.stride**2))
+    bank = Bank([shown], wanted, schedule.patch, schedule.patch, turns, target, rng)
+    lab = rgb_to_lab100(torch.from_numpy(image.astype(np.float32))).movedim(-1, 0)
+    level = SynthesisLevel(
+        lab[:, None], within, torch.from_numpy(fixed[None]), place, {0: bank}, None
+    )
+    synthesize_level(level, schedule, (iterations, 0), rng=rng)
+    made = lab_to_rgb(level.volume[:, 0].movedim(0, -1)).numpy()
+    return np.where((inside & ~fixed)[..., None], made, image).astype(np.float32)
