@@ -85,7 +85,9 @@ class Bank:
         pool, self.guide = pool[pick], guide[pick]
         self.part = own[pick]
         if turns:
-            pool = _turned(pool, torch.from_numpy(rng.integers(0, 8, count)).to(device))
+            pool = _turned(
+                pool, torch.from_numpy((rng.random(count) * 8).astype(np.int64)).to(device)
+            )
         self.whole = pool.reshape(count, -1)
         rim = (edge - compared) // 2
         inner = pool[:, rim : edge - rim, rim : edge - rim] if rim else pool

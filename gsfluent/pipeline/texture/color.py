@@ -17,7 +17,7 @@ _EDGE = 6.0 / 29.0
 
 
 def rgb_to_lab100(rgb: Tensor) -> Tensor:
-    """Lab / 100 of sRGB values in 0..1, [..., 3]."""
+    """Convert sRGB in 0..1, [..., 3], to Lab / 100."""
     rgb = rgb.clamp(0.0, 1.0)
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     xyz = linear @ torch.tensor(_TO_XYZ, dtype=rgb.dtype, device=rgb.device).T
@@ -28,7 +28,7 @@ def rgb_to_lab100(rgb: Tensor) -> Tensor:
 
 
 def lab_to_rgb(lab: Tensor) -> Tensor:
-    """sRGB in 0..1 of Lab / 100, [..., 3]; colours outside the gamut are clipped."""
+    """Convert Lab / 100 [..., 3] to sRGB in 0..1; colours outside the gamut are clipped."""
     light, a, b = lab.unbind(-1)
     y = (light + 0.16) / 1.16
     f = torch.stack([y + a / 5.0, y, y - b / 2.0], -1)

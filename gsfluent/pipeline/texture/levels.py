@@ -65,8 +65,7 @@ class Lattice:
         return out
 
     def read(self, volume: Tensor, points: Tensor) -> Tensor:
-        """Values [C, ...] of a volume [C, *shape] on this lattice at points [..., 3] given in the
-        solid's grid."""
+        """Values [C, ...] of a volume [C, *shape] at points [..., 3] of the solid's grid."""
         turn = torch.tensor(self.rotation, dtype=torch.float32, device=volume.device)
         center = torch.tensor(self.center, dtype=torch.float32, device=volume.device)
         corner = torch.tensor(self.corner, dtype=torch.float32, device=volume.device)
@@ -137,7 +136,7 @@ class ObjectFields:
         return self._lattice(first * pitch, pitch, last - first)
 
     def _finest(self) -> Lattice:
-        """Cells of the solid's own grid, or, when the object's axis is oblique, of the same size."""
+        """Cells of the solid's own grid; of the same size where the object's axis is oblique."""
         low = self.low
         if self.on_grid:
             # the lattice has to fall on the voxels; -0.0 and +0.0 alike

@@ -33,10 +33,17 @@ class Section:
         largest: Largest depth of the object [voxels].
         reach: Largest distance of matter to the axis [voxels].
         device: Where to compute.
+        closed: The core closes towards the poles (an apple's), because the depth decides all the
+            way in; otherwise it goes on from pole to pole (an orange's, a log's).
     """
 
     def __init__(
-        self, placed: PlacedPhoto, largest: float, reach: float, device: torch.device
+        self,
+        placed: PlacedPhoto,
+        largest: float,
+        reach: float,
+        device: torch.device,
+        closed: bool = False,
     ) -> None:
         from scipy import ndimage
 
@@ -74,17 +81,25 @@ class Section:
         distance = np.hypot(place[0], place[1])
         table = torch.empty(_TURNS, _RADII, _DEPTHS, device=device)
         want_r = torch.linspace(0, self.reach, _RADII, device=device)
-        want_d = self.skin * _skin_guide(torch.linspace(0, 1, _DEPTHS, device=device))
+        want_d = self._depth_guide(torch.linspace(0, 1, _DEPTHS, device=device), closed)
+        pull = (0.3 if closed else 2.0) / self.largest
         unit = torch.linspace(0, 1, _STEPS, device=device)
         for k in range(_TURNS):
             have_r = torch.from_numpy(distance[k]).float().to(device)
-            have_d = self.skin * _skin_guide(torch.from_numpy(depth[k]).float().to(device) / self.largest)
+            have_d = self._depth_guide(
+                torch.from_numpy(depth[k]).float().to(device) / self.largest, closed
+            )
             cost = ((want_d[:, None] - have_d) ** 2)[None] + (
-                ((want_r[:, None] - have_r) * (2.0 / self.largest)) ** 2
+                ((want_r[:, None] - have_r) * pull) ** 2
             )[:, None]
             # the weighted mean of near equals instead of the best one: no jumps
             table[k] = torch.softmax(-cost / 0.003, -1) @ unit
         self.table = torch.cat([table, table[:1]])[None]
+
+    def _depth_guide(self, relative: Tensor, closed: bool) -> Tensor:
+        """Steep in the outer tenth of the depth; below flat, or rising to the core."""
+        near = 12.0 * self.skin * (1.0 - torch.exp(-relative / 0.1))
+        return near + 4.0 * relative if closed else near
 
     def polar(self, image: Tensor, whole: bool) -> Tensor:
         """The structure of a picture that goes on along the axis, by azimuth and relative radius.
@@ -168,11 +183,6 @@ def _blur(image: Tensor, sigma: float, axis: int, mode: str) -> Tensor:
     pad = (0, 0, reach, reach) if axis == 2 else (reach, reach, 0, 0)
     padded = functional.pad(image, pad, mode=mode).movedim(1, 0)
     return functional.conv2d(padded, kernel).movedim(0, 1)
-
-
-def _skin_guide(relative: Tensor) -> Tensor:
-    """Steep in the outer tenth of the depth, flat below."""
-    return 12.0 * (1.0 - torch.exp(-relative / 0.1))
 
 
 def _pixel_of(placed: PlacedPhoto, place: np.ndarray) -> tuple[float, float]:

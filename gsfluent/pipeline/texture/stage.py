@@ -65,8 +65,8 @@ class Texture(Stage):
 
     Args:
         method: One of the above, or ``auto``.
-        exemplar: Photograph of the inside (path or array), a list of them, or one or a list per axis
-            ``{x: ..., z: ...}``.
+        exemplar: Photograph of the inside (path or array), a list of them, or one or a list per
+            axis ``{x: ..., z: ...}``.
         preset: Name of a procedural preset.
         prompt: Text for the diffusion model.
         model: Local folder or hub id of an inpainting pipeline.
@@ -88,6 +88,8 @@ class Texture(Stage):
             None works it out (exemplar method).
         surface: What the surface's colours are to the inside: ``auto``, ``keep``, ``copy`` or
             ``ignore`` (exemplar method, :func:`.exemplar.exemplar_texture`).
+        core: ``open`` or ``closed``: whether a core seen in a cut across the axis goes on from
+            pole to pole (guide ``axis``).
         device: Where the exemplar method computes; ``auto`` takes a CUDA device when there is one.
         seed: Seed of everything random.
 
@@ -117,6 +119,7 @@ class Texture(Stage):
         polish: bool = False,
         depth_scale: float | None = None,
         surface: str = "auto",
+        core: str = "open",
         device: str = "auto",
         seed: int = 0,
     ) -> None:
@@ -176,6 +179,7 @@ class Texture(Stage):
         self.polish = bool(polish)
         self.depth_scale = depth_scale
         self.surface = surface
+        self.core = core
         self.device = device
 
     def forward(
@@ -245,6 +249,7 @@ class Texture(Stage):
                 inclusions=self.inclusions,
                 depth_scale=self.depth_scale,
                 surface=self.surface,
+                core=self.core,
                 device=self.device,
                 seed=self.seed,
                 progress=progress,

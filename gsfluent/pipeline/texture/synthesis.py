@@ -34,8 +34,7 @@ class Schedule:
     """How much work to spend.
 
     Attributes:
-        iterations: Rounds of voting per pyramid level, coarse to fine; the last entries are used,
-            and the first one stands for all coarser levels.
+        iterations: Rounds of voting at the coarsest level, at those between, and at the finest.
         polish: Rounds of patch statistics at the end of a level, likewise.
         bank: Patches of the photographs kept per axis and level.
         samples: Queries that the transport weights are estimated from.
@@ -44,8 +43,8 @@ class Schedule:
         patch: Edge of a patch that votes [voxels], odd.
     """
 
-    iterations: tuple[int, ...] = (6, 4, 2)
-    polish: tuple[int, ...] = (8, 8, 4)
+    iterations: tuple[int, int, int] = (6, 4, 2)
+    polish: tuple[int, int, int] = (8, 8, 4)
     bank: int = 3072
     samples: int = 640
     sinkhorn: int = 3
@@ -53,12 +52,13 @@ class Schedule:
     patch: int = 5
 
     def at(self, level: int, levels: int) -> tuple[int, int]:
-        """Rounds of voting and of patch statistics at a level (0 is the coarsest)."""
-        back = levels - level
-        return (
-            self.iterations[max(0, len(self.iterations) - back)],
-            self.polish[max(0, len(self.polish) - back)],
-        )
+        """Rounds of voting and of patch statistics at a level (0 is the coarsest).
+
+        A coarse level gets the same work whatever follows, so that it comes out the same at every
+        resolution.
+        """
+        which = 0 if level == 0 else 2 if level == levels - 1 else 1
+        return self.iterations[which], self.polish[which]
 
 
 @dataclass

@@ -51,7 +51,8 @@ class Cells:
 def _quantiles(values: Tensor, rng: np.random.Generator, limit: int = 4096) -> Tensor:
     """Quantiles [K, D] of values [n, D], estimated from at most ``limit`` of them."""
     if len(values) > limit:
-        pick = torch.from_numpy(rng.integers(0, len(values), limit)).to(values.device)
+        pick = torch.from_numpy((rng.random(limit) * len(values)).astype(np.int64))
+        pick = pick.to(values.device)
         values = values[pick]
     ordered = values.sort(0).values
     place = torch.linspace(0, len(ordered) - 1, _KNOTS, device=values.device)
