@@ -22,6 +22,7 @@ from gsfluent.config.read import (
     section,
     several,
     text,
+    vector,
     whole,
 )
 from gsfluent.errors import InputError
@@ -145,6 +146,51 @@ class FillSettings:
         return values
 
 
+def _white(value: Any, place: Place) -> str | float | tuple[float, ...]:
+    if isinstance(value, str):
+        return str(choice("auto", "none", "skin")(value, place))
+    if isinstance(value, list | tuple):
+        return tuple(vector(3, 0.0, 255.0)(value, place))
+    return float(number(1000.0, 25000.0)(value, place))
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoSettings:
+    """``texture: photo:`` - what is done to exemplar photographs before their material is used."""
+
+    cutout: str | None = key(
+        choice("auto", "ground", "grabcut", "none"),
+        default=None,
+        doc="How the object is told from its ground; none takes the whole picture as material.",
+        example="auto",
+    )
+    rim: bool | None = key(
+        flag, default=None, doc="Take leftovers of the surroundings off the rim.", example="true"
+    )
+    holes: bool | None = key(
+        flag, default=None, doc="Paint open cavities in the colour of their walls.", example="true"
+    )
+    glints: bool | None = key(flag, default=None, doc="Paint over specular spots.", example="true")
+    shading: bool | None = key(
+        flag, default=None, doc="Even out a gradient of the light.", example="true"
+    )
+    white: str | float | tuple[float, ...] | None = key(
+        _white,
+        default=None,
+        doc="White balance: auto, none, skin (as the object's), kelvin, or [r, g, b] of a white.",
+        example="auto",
+    )
+    stain: bool | None = key(
+        flag,
+        default=None,
+        doc="Give stained (grey) parts the colour of the unstained ones.",
+        example="true",
+    )
+    palette: str | None = key(
+        text, default=None, doc="Take the colours of this preset instead.", example="apple"
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class TextureSettings:
     """``texture:`` - colours for the inside."""
@@ -206,17 +252,28 @@ class TextureSettings:
         doc="Find seeds and stones in the exemplar and place them (method exemplar).",
         example="true",
     )
+    photo: PhotoSettings | None = key(
+        nested(PhotoSettings),
+        default=None,
+        doc="Preparation of photographs (method exemplar).",
+        example="{stain: true}",
+    )
 
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
-        return given(self)
+        values = given(self)
+        if self.photo is not None:
+            values["photo"] = given(self.photo)
+        return values
 
 
 _TEXTURE_READERS = {
     "preset": ("procedural",),
     "prompt": ("diffusion",),
     "model": ("diffusion",),
-    **dict.fromkeys(("quality", "scale", "guide", "directional", "inclusions"), ("exemplar",)),
+    **dict.fromkeys(
+        ("quality", "scale", "guide", "directional", "inclusions", "photo"), ("exemplar",)
+    ),
 }
 """Keys of ``texture:`` that only these methods read."""
 

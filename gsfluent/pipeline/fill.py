@@ -30,6 +30,7 @@ from .fill_view import cut_view, surface_colors
 from .orient import orient
 from .solid_skin import grown_to_masks
 from .stage import Progress, Stage, report_progress
+from .voxels import distance_transform, nearest_empty
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Gaussians, Solid
@@ -161,7 +162,7 @@ class Fill(Stage):
         total = 5
         box, solid, report = self.inside(gaussians, capture, progress)
         report_progress(progress, 2, total, "depth")
-        solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel)
+        solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel, gaussians.device)
         report_progress(progress, 3, total, "interior Gaussians")
         surface = gaussians.replace(
             labels=torch.full(
@@ -260,7 +261,7 @@ class Fill(Stage):
         down = self.down
         if down is None and capture is not None:
             down = -np.asarray(orient(gaussians, capture).up, dtype=float)
-        solid, notes = self._decide(box, density, shell, capture, down)
+        solid, notes = self._decide(box, density, shell, capture, down, gaussians.device)
         return box, solid, notes | {"stray_gaussians": strays}
 
     def _decide(
@@ -270,6 +271,7 @@ class Fill(Stage):
         shell: np.ndarray,
         capture: Capture | None,
         down: np.ndarray | None,
+        device: torch.device,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Occupied voxels and what was noticed on the way."""
         from scipy import ndimage
@@ -285,7 +287,7 @@ class Fill(Stage):
         solid = inside | shell
         method = "vote"
         if views:
-            hull = visual_hull(box, views)
+            hull = visual_hull(box, views, device)
             # masks say what is not the object; rays cap the cone under objects seen only from above
             # (just outside a convex surface about half of the rays hit it)
             solid = hull & (shell | (vote.score >= 0.65))
@@ -301,19 +303,19 @@ class Fill(Stage):
         if vote.open_side is not None:
             leaks = max(leaks, 1)
         untrimmed = solid
-        solid = smooth_boundary(trim_outer_flank(solid, shell, density))
+        solid = smooth_boundary(trim_outer_flank(solid, shell, density, device))
         solid, more = keep_components(solid)
         offset = 0.0
         if self.match_masks and views and capture is not None:
             # what one sees reaches beyond the centres of the splats; the masks say how far
-            solid, offset = grown_to_masks(solid, hull, box, capture)
+            solid, offset = grown_to_masks(solid, hull, box, capture, device)
         inner = int((solid & ~shell).sum())
         if inner == 0:
             logger.warning(
                 "fill: the object is all shell at this resolution: nothing but thin parts"
             )
         # splats well below the surface hint at a cavity or an inner wall
-        depth = ndimage.distance_transform_edt(untrimmed)
+        depth = distance_transform(untrimmed, device)
         buried = float((shell & (depth > 5.0)).sum() / max(int(shell.sum()), 1))
         if vote.open_side is not None:
             logger.info(
@@ -334,13 +336,11 @@ class Fill(Stage):
         return solid, notes
 
     def _depth(
-        self, solid: np.ndarray, voxel: float
+        self, solid: np.ndarray, voxel: float, device: torch.device
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """Hollow the solid if asked; depth in world units and nearest outer voxel [3, X, Y, Z]."""
-        from scipy import ndimage
-
         # the grid has a rim of empty voxels, so every solid voxel has an outer one
-        distance, nearest = ndimage.distance_transform_edt(solid, return_indices=True)
+        distance, nearest = nearest_empty(solid, device)
         # voxel centres are half a voxel from the boundary that the transform measures to
         depth = np.where(solid, (distance - 0.5) * voxel, 0.0).astype(np.float32)
         if self.hollow is None:

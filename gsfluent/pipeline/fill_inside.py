@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from .fill_density import GridBox
+from .voxels import distance_transform
 
 __all__ = [
     "DIRECTIONS",
@@ -124,12 +126,17 @@ def cast_votes(
     return Vote(score, (float(side[0]), float(side[1]), float(side[2])), fraction)
 
 
-def trim_outer_flank(solid: np.ndarray, shell: np.ndarray, density: np.ndarray) -> np.ndarray:
+def trim_outer_flank(
+    solid: np.ndarray,
+    shell: np.ndarray,
+    density: np.ndarray,
+    device: torch.device | None = None,
+) -> np.ndarray:
     """Remove the outer half of the shell: the boundary then runs through the splat centres.
 
     A shell voxel belongs to the outer flank when the density still rises towards the inside of the
     object. A sheet one or two voxels thick may be all flank: a voxel goes only when some voxel
-    behind it, within four steps inward, stays.
+    behind it, within four steps inward, stays. ``device`` says where distances are computed.
     """
     from scipy import ndimage
 
@@ -149,7 +156,7 @@ def trim_outer_flank(solid: np.ndarray, shell: np.ndarray, density: np.ndarray) 
     loose = np.zeros(solid.shape, bool)
     loose[tuple(index[backed].T)] = True
     # only what can be peeled from outside: a second layer of splats below the skin is no boundary
-    loose &= ndimage.distance_transform_edt(solid) <= 3.0
+    loose &= distance_transform(solid, device) <= 3.0
     peeled = ndimage.binary_propagation(~solid, mask=~solid | loose)
     result: np.ndarray = ndimage.binary_fill_holes(~peeled)
     return result
@@ -250,7 +257,11 @@ def find_leaks(
     return {"leaks": int(openings), "leaking_voxels": int(wet.sum()), "leak_list": listed}
 
 
-def visual_hull(box: GridBox, views: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+def visual_hull(
+    box: GridBox,
+    views: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    device: torch.device | None = None,
+) -> np.ndarray:
     """Voxels whose centre falls inside the mask of (nearly) every view that sees it.
 
     One stray mask must not cut the object in two: from eight views on, two views have to agree
@@ -260,30 +271,27 @@ def visual_hull(box: GridBox, views: list[tuple[np.ndarray, np.ndarray, np.ndarr
         box: The grid.
         views: Per view ``(ground bool [H, W], viewmat [4, 4], K [3, 3])``: pixels known to show
             something else than the object; world to camera with OpenCV axes.
+        device: Where to compute.
 
     Returns:
         Hull bool [X, Y, Z]. Voxels outside every image are kept.
     """
     needed = 2 if len(views) >= 8 else 1
-    index = np.stack(np.meshgrid(*(np.arange(s) for s in box.shape), indexing="ij"), -1).reshape(
-        -1, 3
-    )
-    points = box.centers(index).astype(np.float32)
-    alive = np.arange(points.shape[0])
-    votes = np.zeros(points.shape[0], dtype=np.uint8)
+    axes = [torch.arange(n, device=device, dtype=torch.float32) + 0.5 for n in box.shape]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    points = grid * box.voxel + grid.new_tensor(box.origin)
+    alive = torch.arange(points.shape[0], device=device)
+    votes = torch.zeros(points.shape[0], dtype=torch.uint8, device=device)
     for ground, viewmat, intrinsics in views:
         height, width = ground.shape
-        camera = points[alive] @ viewmat[:3, :3].T.astype(np.float32) + viewmat[:3, 3].astype(
-            np.float32
-        )
+        pose, lens = points.new_tensor(viewmat), points.new_tensor(intrinsics)
+        camera = points @ pose[:3, :3].T + pose[:3, 3]
         z = camera[:, 2]
-        front = z > 1e-6
-        pixel = camera @ intrinsics.T.astype(np.float32)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = pixel[:, 0] / z, pixel[:, 1] / z
-        seen = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        column = np.where(seen, u, 0).astype(np.int32)
-        row = np.where(seen, v, 0).astype(np.int32)
-        votes[alive[seen & ground[row, column]]] += 1
-        alive = alive[votes[alive] < needed]
-    return (votes < needed).reshape(box.shape)
+        u, v = ((camera @ lens.T)[:, :2] / z[:, None]).unbind(1)
+        seen = (z > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        column, row = torch.where(seen, u, 0).long(), torch.where(seen, v, 0).long()
+        outside = seen & torch.from_numpy(ground).to(points.device)[row, column]
+        votes[alive] += outside
+        keep = votes[alive] < needed
+        alive, points = alive[keep], points[keep]
+    return (votes < needed).view(box.shape).cpu().numpy()

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Solid
+from gsfluent.pipeline.voxels import distance_transform
 
 __all__ = ["SignedDistance", "distances_of"]
 
@@ -136,20 +137,23 @@ class SignedDistance:
         )
 
 
-def distances_of(occupancy: np.ndarray, *, smooth: float = _SMOOTH) -> np.ndarray:
+def distances_of(
+    occupancy: np.ndarray, *, smooth: float = _SMOOTH, device: torch.device | None = None
+) -> np.ndarray:
     """Signed distance [voxels] to the boundary of voxels bool [X, Y, Z], float32.
 
     ``EDT(outside) - EDT(inside)``, each less the half voxel from a centre to the boundary, blurred
     by ``smooth`` voxels but moved by no more than 0.35, and shifted to the volume it had (a blur
-    shrinks what is round). No voxel changes sides: ``(result <= 0) == occupancy``.
+    shrinks what is round). No voxel changes sides: ``(result <= 0) == occupancy``. ``device`` says
+    where the transforms are computed.
     """
     from scipy import ndimage
 
     solid = np.asarray(occupancy, dtype=bool)
     if not solid.any() or solid.all():
         return np.full(solid.shape, -math.inf if solid.any() else math.inf, dtype=np.float32)
-    outer = np.maximum(ndimage.distance_transform_edt(~solid) - 0.5, 0.0)
-    inner = np.maximum(ndimage.distance_transform_edt(solid) - 0.5, 0.0)
+    outer = np.maximum(distance_transform(~solid, device) - 0.5, 0.0)
+    inner = np.maximum(distance_transform(solid, device) - 0.5, 0.0)
     signed = np.where(solid, -inner, outer).astype(np.float32)
     if smooth > 0:
         blurred = ndimage.gaussian_filter(signed, smooth, mode="nearest")

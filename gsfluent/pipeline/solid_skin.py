@@ -80,6 +80,7 @@ def match_outline(
     nearest, covered = [], []
     for camera, seen in outlines:
         on = seen.to(field.values)[None, None]
+        seen = seen.to(field.values.device)
         grown = functional.max_pool2d(on, 2 * _BAND + 1, 1, _BAND)
         kept = -functional.max_pool2d(-on, 2 * _BAND + 1, 1, _BAND)
         row, column = (grown > kept)[0, 0].nonzero().unbind(1)
@@ -96,7 +97,11 @@ def match_outline(
 
 
 def grown_to_masks(
-    occupied: np.ndarray, allowed: np.ndarray, box: GridBox, capture: Capture
+    occupied: np.ndarray,
+    allowed: np.ndarray,
+    box: GridBox,
+    capture: Capture,
+    device: torch.device | None = None,
 ) -> tuple[np.ndarray, float]:
     """Grow voxels until their outline is that of the masks.
 
@@ -105,16 +110,18 @@ def grown_to_masks(
         allowed: Where they may grow, bool [X, Y, Z].
         box: Their grid.
         capture: Photographs, some with masks.
+        device: Where to compute.
 
     Returns:
         The voxels and the offset [voxels]; nothing shrinks.
     """
-    values = torch.from_numpy(distances_of(occupied)) * box.voxel
-    field = SignedDistance(values, torch.tensor(box.origin), box.voxel, "density")
+    values = torch.from_numpy(distances_of(occupied, device=device)).to(device) * box.voxel
+    origin = torch.tensor(box.origin, device=device)
+    field = SignedDistance(values, origin, box.voxel, "density")
     field, offset = match_outline(field, mask_outlines(capture))
     if offset <= 0:
         return occupied, 0.0
-    return occupied | (field.inside.numpy() & allowed), offset
+    return occupied | (field.inside.cpu().numpy() & allowed), offset
 
 
 def _nearest_along(field: SignedDistance, camera: Camera, row: Tensor, column: Tensor) -> Tensor:
@@ -132,7 +139,7 @@ def _nearest_along(field: SignedDistance, camera: Camera, row: Tensor, column: T
     count = max(2, int(2.0 * reach / (_STEP * field.voxel)))
     along = torch.linspace(max(depth - reach, 1e-3 * reach), depth + reach, count).to(like)
     best = torch.full_like(x, float("inf"))
-    for part in along.split(32):
+    for part in along.split(32 if like.device.type == "cpu" else 256):
         points = eye + ray[:, None] * part[None, :, None]
         place = 2.0 * (points - field.origin.to(like)) / size - 1.0
         value = functional.grid_sample(

@@ -22,8 +22,7 @@ def _shell(count: int) -> Gaussians:
     means = direction * torch.tensor([1.0, 0.8, 0.7])
     scales = torch.exp(torch.randn(count, 3, generator=generator) - 4.0)
     quats = torch.randn(count, 4, generator=generator)
-    scales[:4] = torch.tensor([[1e-15, 1e-15, 1e-15], [1e9, 1e-9, 1.0], [1.0, 0, 0], [0, 0, 0]])
-    quats[:2] = 0.0
+    scales[:3] = torch.tensor([[1e-15, 1e-15, 1e-15], [1e9, 1e-9, 1.0], [1.0, 1e-20, 1e-20]])
     opacities = 0.2 + 0.7 * torch.rand(count, generator=generator)
     colors = torch.rand(count, 3, generator=generator)
     return Gaussians.from_colors(means, scales, colors, opacities=opacities, quats=quats)

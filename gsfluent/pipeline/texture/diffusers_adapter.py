@@ -1,10 +1,9 @@
 """One adapter for every inpainting pipeline of diffusers.
 
 Pipelines differ in the arguments they take and in what they do to known pixels. The adapter passes
-only arguments that the pipeline's ``__call__`` names, works at a size the model accepts, seeds
-every picture by itself, and puts known pixels back exactly (the VAE round trip changes them all).
-The safety checker is switched off: slices through fruit are not photographs of people, and its
-false alarms come back as black pictures.
+only arguments that the pipeline's ``__call__`` names, works at a size the model accepts with voxel
+edges on the edges of its 8-pixel latent cells, seeds every picture by itself, and puts known
+pixels back exactly (the VAE round trip changes them all).
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,81 +19,23 @@ import torch
 
 from gsfluent.errors import InputError, RunError
 
+from .diffusers_load import load_pipeline, lower_memory, pick_device
+from .inpaint_options import InpaintOptions
+from .inpaint_tiles import GROUND
+from .inpainter import MaskedInpainter, SliceContext
+from .photo import Exemplar
+
 __all__ = ["DiffusersInpainter", "InpaintOptions"]
 
 logger = logging.getLogger(__name__)
 
 _MAX_STRENGTH = 0.99  # at 1.0 SD-XL starts from pure noise and its known quality problem shows
+_MIN_STEPS = 4  # real denoising steps; fewer leave blocks
 _CPU_PARAMETERS = 200_000_000  # above this a CPU needs hours to days
+_MULTIPLE = 16  # SD and SD-XL want multiples of 8, SD 3 and FLUX of 16
 
 
-@dataclass(frozen=True)
-class InpaintOptions:
-    """Settings of the diffusion method.
-
-    Attributes:
-        slices: Slices per axis (fewer when the object has fewer voxels).
-        strength: Denoising strength of the first pass (X slices).
-        refine: Strengths of the following passes, each over X, Y and Z.
-        size: Edge of the picture given to the model [pixels]; None takes the model's own.
-        steps: Denoising steps at strength 1; raised where strength leaves fewer than four.
-        guidance: Classifier-free guidance scale; None keeps the pipeline's default.
-        negative_prompt: What the picture should not show.
-        batch: Pictures per call.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        dtype: ``auto`` (bfloat16 on CUDA, float32 on CPU), ``float32``, ``bfloat16``, ``float16``.
-        revision: Commit or tag of a hub model.
-        variant: File variant, for example ``fp16``.
-        pipeline_class: Name of a diffusers class; None finds it.
-        memory: ``high`` (all on the device), ``balanced`` (model offload, sliced VAE) or ``low``
-            (sequential offload, tiled VAE).
-        allow_slow: Run a full-size model on the CPU.
-    """
-
-    slices: int = 40
-    strength: float = 0.99
-    refine: tuple[float, ...] = (0.3, 0.2)
-    size: int | None = None
-    steps: int = 30
-    guidance: float | None = None
-    negative_prompt: str = "text, watermark, blurry"
-    batch: int = 1
-    device: str = "auto"
-    dtype: str = "auto"
-    revision: str | None = None
-    variant: str | None = None
-    pipeline_class: str | None = None
-    memory: str = "high"
-    allow_slow: bool = False
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        for name, value in [("strength", self.strength), *(("refine", r) for r in self.refine)]:
-            if not 0.0 < value <= 1.0:
-                raise InputError(
-                    f"texture: inpaint {name} must be in 0..1, got {value}",
-                    mend="0.99 for the first pass and 0.1 to 0.4 for the others are usual",
-                )
-        for name in ("slices", "steps", "batch"):
-            if getattr(self, name) < 1:
-                raise InputError(
-                    f"texture: inpaint {name} must be at least 1, got {getattr(self, name)}",
-                    mend="leave it out",
-                )
-        if self.dtype not in ("auto", "float32", "bfloat16", "float16"):
-            raise InputError(
-                f"texture: inpaint dtype must be auto, float32, bfloat16 or float16, "
-                f"got {self.dtype!r}",
-                mend="leave it at auto",
-            )
-        if self.memory not in ("high", "balanced", "low"):
-            raise InputError(
-                f"texture: inpaint memory must be high, balanced or low, got {self.memory!r}",
-                mend="use balanced when the GPU runs out of memory",
-            )
-
-
-class DiffusersInpainter:
+class DiffusersInpainter(MaskedInpainter):
     """A loaded inpainting pipeline.
 
     Args:
@@ -105,23 +44,23 @@ class DiffusersInpainter:
         options: Settings.
 
     Raises:
-        InputError: diffusers is missing, the weights are not there, or no inpainting pipeline
-            belongs to them.
+        InputError: diffusers is missing, the weights are not there, no inpainting pipeline
+            belongs to them, or the model is too large for a CPU.
     """
+
+    sequential = False
 
     def __init__(self, model: str | Path, options: InpaintOptions) -> None:
         self.options = options
-        self.device = _device(options.device)
-        self.pipe = _load(model, options, self.device)
+        self.device = pick_device(options.device)
+        self.memory = options.memory
+        self.calls = 0
+        self.pipe = load_pipeline(model, options, self.device)
+        self.name = type(self.pipe).__name__
         self.accepts = set(inspect.signature(type(self.pipe).__call__).parameters)
-        self.multiple = 16
         network = getattr(self.pipe, "unet", None) or getattr(self.pipe, "transformer", None)
-        if options.size is not None:
-            size = options.size
-        else:
-            latent = getattr(getattr(network, "config", None), "sample_size", None)
-            size = int(latent) * 8 if isinstance(latent, int) else 1024
-        self.size = max(self.multiple, size // self.multiple * self.multiple)
+        self.size = max(_MULTIPLE, (options.size or _own_size(self.pipe, network)))
+        self.size = self.size // _MULTIPLE * _MULTIPLE
         count = sum(p.numel() for p in network.parameters()) if network is not None else 0
         if self.device.type == "cpu" and count > _CPU_PARAMETERS and not options.allow_slow:
             raise InputError(
@@ -132,216 +71,213 @@ class DiffusersInpainter:
             logger.warning("%s takes no strength: every pass repaints fully", self.name)
         if getattr(getattr(network, "config", None), "in_channels", 9) == 4:
             logger.warning(
-                "%s: the model has no mask channels; expect seams along the mask", self.name
+                "%s: the model has no mask channels (4 inputs instead of 9); expect seams along "
+                "the mask. A model trained for inpainting does better",
+                self.name,
             )
 
-    @property
-    def name(self) -> str:
-        """Class name of the pipeline."""
-        return type(self.pipe).__name__
-
-    def __call__(
+    def paint(
         self,
-        images: np.ndarray,
-        masks: np.ndarray,
-        *,
+        slices: np.ndarray,
+        mask: np.ndarray,
         prompt: str,
+        exemplar: Exemplar | None,
         strength: float,
         seeds: list[int],
+        context: SliceContext,
     ) -> np.ndarray:
-        """Inpaint pictures.
-
-        Args:
-            images: float32 [B, H, W, 3] in 0..1.
-            masks: bool [B, H, W]; True is repainted, everything else comes back bit for bit.
-            prompt: Text.
-            strength: Denoising strength in 0..1.
-            seeds: One per picture: a picture does not depend on what shares its batch.
-
-        Returns:
-            float32 [B, H, W, 3].
+        """Run the pipeline in batches; smaller and thriftier ones when memory runs out.
 
         Raises:
-            RunError: The model returned NaN or a constant picture, or memory ran out.
+            RunError: The model returned NaN or a constant picture, its safety checker blanked
+                one, or memory ran out in the thriftiest mode.
         """
-        result = images.copy()
-        wanted = np.flatnonzero(masks.any((1, 2)))
+        made = np.empty_like(slices)
         batch = self.options.batch
         start = 0
-        while start < len(wanted):
-            part = wanted[start : start + batch]
+        while start < len(slices):
+            part = np.arange(start, min(start + batch, len(slices)))
             try:
-                made = self._run(
-                    images[part], masks[part], prompt, strength, [seeds[i] for i in part]
+                made[part] = self._run(
+                    slices[part],
+                    mask[part],
+                    prompt,
+                    exemplar,
+                    strength,
+                    [seeds[i] for i in part],
+                    context.take(part),
                 )
             except torch.OutOfMemoryError as error:
-                if batch == 1:
+                if batch > 1:
+                    batch = max(1, batch // 2)
+                    logger.warning("%s: out of memory, batch is now %d", self.name, batch)
+                    continue
+                lower = lower_memory(self.pipe, self.memory, self.device)
+                if lower is None:
                     raise RunError(
-                        f"{self.name}: out of GPU memory with one picture of {self.size} pixels",
-                        mend="set inpaint memory to balanced or low, or a smaller inpaint size",
+                        f"{self.name}: out of GPU memory with one picture of {self.size} pixels "
+                        f"in memory mode {self.memory}",
+                        mend="use a smaller inpaint size or model, or free the GPU",
                     ) from error
-                batch = max(1, batch // 2)
-                logger.warning("%s: out of memory, batch is now %d", self.name, batch)
+                self.memory = lower
+                logger.warning("%s: out of memory, memory mode is now %s", self.name, lower)
                 continue
-            result[part] = np.where(masks[part][..., None], made, images[part])
             start += len(part)
-        return result
+        return made
 
     def _run(
         self,
         images: np.ndarray,
         masks: np.ndarray,
         prompt: str,
+        exemplar: Exemplar | None,
         strength: float,
         seeds: list[int],
+        context: SliceContext,
     ) -> np.ndarray:
-        """One call of the pipeline on pictures padded to a square and enlarged."""
-        import cv2
-
-        count, height, width = masks.shape
-        edge = max(height, width)
-        big = np.full((count, edge, edge, 3), 0.5, np.float32)
-        hole = np.zeros((count, edge, edge), np.float32)
-        big[:, :height, :width], hole[:, :height, :width] = images, masks
-        size = (self.size, self.size)
-        picture = np.stack([cv2.resize(p, size, interpolation=cv2.INTER_LINEAR) for p in big])
-        mask = np.stack([cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in hole])
+        """One call of the pipeline on enlarged pictures."""
+        count = len(images)
+        frame = _Frame(masks.shape[1:], self.size)
         strength = min(strength, _MAX_STRENGTH)
-        steps = max(self.options.steps, math.ceil(4.0 / strength))
         arguments: dict[str, Any] = {
             "prompt": [prompt] * count,
             "negative_prompt": [self.options.negative_prompt] * count,
-            "image": torch.from_numpy(picture.clip(0, 1)).permute(0, 3, 1, 2).contiguous(),
-            "mask_image": torch.from_numpy(mask)[:, None].contiguous(),
-            "height": self.size,
-            "width": self.size,
+            "image": _tensor(frame.picture(images).clip(0, 1)),
+            "mask_image": torch.from_numpy(frame.mask(masks))[:, None].contiguous(),
+            "height": frame.height,
+            "width": frame.width,
             "strength": strength,
-            "num_inference_steps": steps,
+            "num_inference_steps": max(self.options.steps, math.ceil(_MIN_STEPS / strength)),
             "generator": [torch.Generator("cpu").manual_seed(s) for s in seeds],
             "output_type": "np",
         }
         if self.options.guidance is not None:
             arguments["guidance_scale"] = self.options.guidance
             arguments["true_cfg_scale"] = self.options.guidance
+        arguments |= self._conditions(exemplar, context, frame, count)
         arguments = {k: v for k, v in arguments.items() if k in self.accepts}
+        self.calls += 1
         with torch.inference_mode():
-            output = np.asarray(self.pipe(**arguments).images, dtype=np.float32)
-        if not np.isfinite(output).all() or bool((output.std((1, 2, 3)) < 1e-5).any()):
+            output = self.pipe(**arguments)
+        flagged = getattr(output, "nsfw_content_detected", None)
+        if flagged is not None and any(flagged):
+            raise RunError(
+                f"{self.name}: its safety checker blanked {sum(map(bool, flagged))} of {count} "
+                "slices",
+                mend="leave inpaint safety_checker off: it knows photographs, not slices",
+            )
+        pictures = np.asarray(output.images, dtype=np.float32)
+        if not np.isfinite(pictures).all() or bool((pictures.std((1, 2, 3)) < 1e-5).any()):
             raise RunError(
                 f"{self.name}: the model returned NaN or a constant picture",
                 mend="this is how a float16 VAE overflows: use inpaint dtype float32 or bfloat16, "
                 "or a model with the fp16-fixed VAE",
             )
-        target = (edge, edge)
-        small = [cv2.resize(o, target, interpolation=cv2.INTER_AREA) for o in output]
-        made: np.ndarray = np.stack(small)[:, :height, :width].clip(0.0, 1.0)
-        return made
+        return frame.back(pictures)
+
+    def _conditions(
+        self, exemplar: Exemplar | None, context: SliceContext, frame: _Frame, count: int
+    ) -> dict[str, Any]:
+        """Arguments that show the exemplar and the depth to the model."""
+        result: dict[str, Any] = {}
+        if self.options.ip_adapter is not None:
+            if exemplar is None:
+                raise InputError(
+                    "texture: ip_adapter needs an exemplar photograph to show to the model",
+                    mend="add exemplar: cut.jpg, or leave ip_adapter out",
+                )
+            result["ip_adapter_image"] = [_pil(exemplar)]
+        elif exemplar is not None and "image_reference" in self.accepts:
+            result["image_reference"] = _pil(exemplar)
+        if self.options.controlnet is not None:
+            depth = context.guide
+            if depth is None:
+                raise InputError(
+                    "texture: controlnet needs the depth of the slices", mend="leave it out"
+                )
+            near = 1.0 - depth / max(context.max_depth, float(depth.max()), 1e-6)
+            if context.inside is not None:  # depth maps are bright near and black far away
+                near = np.where(context.inside, near, 0.0)
+            shown = np.repeat(near[..., None].astype(np.float32), 3, -1)
+            result["control_image"] = _tensor(frame.picture(shown, ground=0.0))
+            result["controlnet_conditioning_scale"] = self.options.controlnet_scale
+        return result
 
 
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError("texture: inpaint device is cuda, but no GPU is there", mend="use auto")
-    return torch.device(name)
+class _Frame:
+    """How slices of any size sit on the model's canvas.
 
+    One slice pixel becomes a power of two of canvas pixels (8 where it fits: one voxel is then one
+    latent cell, and the mask's edges fall between cells). The rest of the canvas is ground.
+    """
 
-def _load(model: str | Path, options: InpaintOptions, device: torch.device) -> Any:
-    """Find the pipeline class and load the weights."""
-    try:
-        import diffusers
-        from diffusers.utils import is_transformers_available
-    except ImportError as error:
-        raise InputError(
-            "texture: method 'diffusion' needs the package diffusers, which is not installed",
-            mend="pip install diffusers transformers accelerate",
-        ) from error
-    if not is_transformers_available():
-        raise InputError(
-            "texture: method 'diffusion' needs the package transformers, which is not installed",
-            mend="pip install transformers accelerate",
-        )
-    diffusers.utils.logging.set_verbosity_error()
-    folder = Path(model)
-    local = folder.is_dir()
-    if local and not (folder / "model_index.json").is_file():
-        raise InputError(
-            f"{model}: not a diffusers model folder (no model_index.json)",
-            mend="give the folder that save_pretrained or a hub download made",
-        )
-    if not local and (str(model).startswith(("/", ".", "~")) or str(model).count("/") != 1):
-        raise InputError(
-            f"{model}: model folder not found",
-            mend="give an existing folder or a hub id (owner/name)",
-        )
-    offline = os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
-    source: dict[str, Any] = {"local_files_only": local or offline}
-    if options.revision is not None:
-        source["revision"] = options.revision
-    try:
-        config = diffusers.DiffusionPipeline.load_config(str(model), **source)
-        chosen = _pipeline_class(diffusers, str(config.get("_class_name", "")), options)
-        if options.variant is not None:
-            source["variant"] = options.variant
-        # the argument was renamed; older versions know only the long name
-        version = tuple(int(v) for v in diffusers.__version__.split(".")[:2])
-        source["dtype" if version >= (0, 42) else "torch_dtype"] = _dtype(options, device)
-        pipe = chosen.from_pretrained(str(model), use_safetensors=True, **source)
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        where = "the local cache, and HF_HUB_OFFLINE is set" if offline else "the hub"
-        raise InputError(
-            f"{model}: the inpainting model cannot be loaded from "
-            f"{'this folder' if local else where} ({str(error).strip().splitlines()[0]})",
-            mend="check the name, download it beforehand, or give a local folder with .safetensors",
-        ) from error
-    return _prepare(pipe, options, device)
+    def __init__(self, shape: tuple[int, ...], size: int) -> None:
+        self.shape = shape
+        edge = max(shape)
+        # the power of two that fills between 0.65 and 1.3 of the model's size
+        self.power = math.floor(math.log2(1.3 * size / edge))
+        scaled = [math.ceil(s * 2.0**self.power) for s in shape]
+        canvas = [max(size, s + -s % _MULTIPLE) for s in scaled]
+        self.height, self.width = canvas
+        self.scaled = scaled
 
+    def picture(self, images: np.ndarray, ground: float = GROUND) -> np.ndarray:
+        """Images [B, H, W, 3] enlarged onto canvases of ground."""
+        import cv2
 
-def _pipeline_class(diffusers: Any, name: str, options: InpaintOptions) -> Any:
-    """Class that inpaints with these weights."""
-    if options.pipeline_class is not None:
-        if not hasattr(diffusers, options.pipeline_class):
-            raise InputError(
-                f"texture: diffusers {diffusers.__version__} has no {options.pipeline_class}",
-                mend="leave pipeline_class out",
+        method = cv2.INTER_LINEAR if self.power >= 0 else cv2.INTER_AREA
+        out = np.full((len(images), self.height, self.width, 3), ground, np.float32)
+        size = (self.scaled[1], self.scaled[0])
+        for k, image in enumerate(images):
+            out[k, : size[1], : size[0]] = cv2.resize(image, size, interpolation=method)
+        return out
+
+    def mask(self, masks: np.ndarray) -> np.ndarray:
+        """Masks [B, H, W] as 0 or 1 on canvases; a canvas pixel is open when any voxel in it is."""
+        import cv2
+
+        out = np.zeros((len(masks), self.height, self.width), np.float32)
+        size = (self.scaled[1], self.scaled[0])
+        method = cv2.INTER_NEAREST if self.power >= 0 else cv2.INTER_AREA
+        for k, mask in enumerate(masks):
+            scaled = cv2.resize(mask.astype(np.float32), size, interpolation=method)
+            out[k, : size[1], : size[0]] = scaled > 0
+        return out
+
+    def back(self, pictures: np.ndarray) -> np.ndarray:
+        """The slices [B, H, W, 3] out of the model's pictures."""
+        import cv2
+
+        if pictures.shape[1:3] != (self.height, self.width):
+            raise RunError(
+                f"the model returned {pictures.shape[2]} x {pictures.shape[1]} pixels for a "
+                f"canvas of {self.width} x {self.height}",
+                mend="name a size the model knows (inpaint size)",
             )
-        return getattr(diffusers, options.pipeline_class)
-    if ("Inpaint" in name or "Fill" in name) and hasattr(diffusers, name):
-        return getattr(diffusers, name)
-    # classes outside AutoPipeline's table follow the naming rule
-    variant = name.replace("Pipeline", "InpaintPipeline")
-    from diffusers.pipelines.auto_pipeline import AUTO_INPAINT_PIPELINES_MAPPING
-
-    known = {c.__name__ for c in AUTO_INPAINT_PIPELINES_MAPPING.values()}
-    if variant in known or not hasattr(diffusers, variant):
-        return diffusers.AutoPipelineForInpainting
-    return getattr(diffusers, variant)
+        size = (self.shape[1], self.shape[0])
+        method = cv2.INTER_AREA if self.power >= 0 else cv2.INTER_LINEAR
+        cut = pictures[:, : self.scaled[0], : self.scaled[1]]
+        small = np.stack([cv2.resize(p, size, interpolation=method) for p in cut])
+        result: np.ndarray = small.clip(0.0, 1.0)
+        return result
 
 
-def _dtype(options: InpaintOptions, device: torch.device) -> torch.dtype:
-    if options.dtype == "auto":
-        return torch.bfloat16 if device.type == "cuda" else torch.float32
-    chosen: torch.dtype = getattr(torch, options.dtype)
-    return chosen
+def _own_size(pipe: Any, network: Any) -> int:
+    """Edge of the pictures that the model was made for [pixels]."""
+    latent = getattr(getattr(network, "config", None), "sample_size", None)
+    if latent is None:
+        latent = getattr(pipe, "default_sample_size", None)
+    factor = int(getattr(pipe, "vae_scale_factor", 8) or 8)
+    return int(latent) * factor if isinstance(latent, int) else 1024
 
 
-def _prepare(pipe: Any, options: InpaintOptions, device: torch.device) -> Any:
-    """Switches that every pipeline gets."""
-    if getattr(pipe, "safety_checker", None) is not None:
-        pipe.safety_checker = None
-    if getattr(pipe, "watermark", None) is not None:
-        pipe.watermark = None
-    pipe.set_progress_bar_config(disable=True)
-    if options.memory != "high" and hasattr(pipe, "vae"):
-        pipe.vae.enable_slicing()
-        if options.memory == "low":
-            pipe.vae.enable_tiling()
-    if device.type == "cpu" or options.memory == "high":
-        return pipe.to(device)
-    if options.memory == "low":
-        pipe.enable_sequential_cpu_offload(device=device)
-    else:
-        pipe.enable_model_cpu_offload(device=device)
-    return pipe
+def _tensor(pictures: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(pictures).permute(0, 3, 1, 2).contiguous()
+
+
+def _pil(exemplar: Exemplar) -> Any:
+    """The photograph as a picture, its ground made neutral."""
+    from PIL import Image
+
+    shown = np.where(exemplar.mask[..., None], exemplar.image, GROUND)
+    return Image.fromarray((shown.clip(0, 1) * 255).round().astype(np.uint8))

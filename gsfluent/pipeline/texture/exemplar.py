@@ -48,16 +48,22 @@ def load_exemplars(source: object) -> dict[int, Exemplar]:
                 f"texture: exemplar axes must be x, y, z, got {sorted(map(str, source))}",
                 mend="write exemplar: {x: a.jpg, z: b.jpg} or one file",
             )
-        loaded = {_AXES[key]: load_exemplar(value) for key, value in source.items()}
+        loaded = {_AXES[key]: _load(value) for key, value in source.items()}
         first = next(iter(loaded.values()))
         return {axis: loaded.get(axis, first) for axis in range(3)}
+    one = _load(source)
+    return {0: one, 1: one, 2: one}
+
+
+def _load(source: object) -> Exemplar:
+    if isinstance(source, Exemplar):
+        return source
     if not isinstance(source, str | Path | np.ndarray):
         raise InputError(
             f"texture: exemplar must be a file, an array or a mapping, got {type(source).__name__}",
             mend="give the path of a photograph",
         )
-    one = load_exemplar(source)
-    return {0: one, 1: one, 2: one}
+    return load_exemplar(source)
 
 
 def exemplar_texture(

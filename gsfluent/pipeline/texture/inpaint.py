@@ -1,8 +1,9 @@
 """Interior texture by inpainting slices: first along X, then X, Y and Z towards one volume.
 
 Two-stage schedule after GaussianFluent. Slices inpainted independently flicker along their axis,
-and averaging three such stacks destroys the texture; so every later pass starts from the fused
-volume at low strength, and each axis hands its result to the next.
+and averaging three such stacks destroys the texture; so every later round starts from the fused
+volume at low strength. With the schedule ``coupled`` the three axes work together from a quarter of
+the resolution on, where they can still agree on where things are.
 """
 
 from __future__ import annotations
@@ -10,143 +11,185 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
-from collections.abc import Callable
-from dataclasses import asdict
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gsfluent.errors import InputError
 
 from ..stage import Progress, report_progress
-from .diffusers_adapter import DiffusersInpainter, InpaintOptions
 from .domain import InteriorDomain, InteriorTexture
+from .inpaint_colors import initial_volume, match_slices, to_photo
+from .inpaint_command import CommandInpainter
+from .inpaint_levels import coarse_domain, enlarge, fuse_stacks, slice_positions
+from .inpaint_local import ColorDiffusionInpainter, ExemplarInpainter, TeleaInpainter
+from .inpaint_options import InpaintOptions
+from .inpaint_store import SliceStore
+from .inpaint_tiles import GROUND, TiledInpainter
+from .inpainter import Inpainter, SliceContext, slice_seed
 from .photo import Exemplar
-from .profile import depth_profile, match_colors, profile_volume, surface_profile
 
-__all__ = ["InpaintOptions", "Inpainter", "SliceStore", "diffusion_texture", "inpaint_volume"]
+__all__ = [
+    "InpaintOptions",
+    "Inpainter",
+    "SliceStore",
+    "diffusion_texture",
+    "inpaint_plan",
+    "inpaint_volume",
+    "make_inpainter",
+]
 
 logger = logging.getLogger(__name__)
 
-Inpainter = Callable[..., np.ndarray]
-"""``f(images, masks, *, prompt, strength, seeds) -> images``: see :class:`DiffusersInpainter`."""
 
-_GROUND = 0.5  # neutral grey around the object, kept known so that the model sees the silhouette
-_SHARE = 0.7  # of the new slices in the fused volume during refinement
+@dataclass(frozen=True)
+class _Pass:
+    """One pass: slices across ``axes``, all from the same volume, then fused."""
 
-
-class SliceStore:
-    """Finished slices on disk, so that an interrupted run goes on where it stopped.
-
-    Args:
-        folder: Where to keep them; None keeps nothing.
-        key: What the slices depend on; another key starts afresh.
-    """
-
-    def __init__(self, folder: Path | None, key: str) -> None:
-        self.folder = folder
-        self.loaded = 0
-        if folder is None:
-            return
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            marker = folder / "key.txt"
-            if not marker.is_file() or marker.read_text() != key:
-                stale = list(folder.glob("slice_*.npy"))
-                for path in stale:
-                    path.unlink()
-                if stale:
-                    logger.info("%s: settings changed, %d slices redone", folder, len(stale))
-                self._write(marker, key.encode())
-        except OSError as error:
-            raise InputError(
-                f"{folder}: slices cannot be kept here ({error})", mend="choose a writable folder"
-            ) from error
-
-    def _write(self, path: Path, content: bytes) -> None:
-        temporary = path.with_suffix(".part")
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-
-    def get(self, number: int, axis: int, index: int, shape: tuple[int, ...]) -> np.ndarray | None:
-        """Slice ``index`` across ``axis`` of pass ``number``, if it was finished."""
-        if self.folder is None:
-            return None
-        path = self.folder / f"slice_{number}_{axis}_{index:04d}.npy"
-        if not path.is_file():
-            return None
-        try:
-            image = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError, OSError):
-            return None  # cut off while writing: made again
-        if image.shape != shape:
-            return None
-        self.loaded += 1
-        return np.asarray(image, np.float32)
-
-    def put(self, number: int, axis: int, index: int, image: np.ndarray) -> None:
-        """Keep a finished slice."""
-        if self.folder is None:
-            return
-        path = self.folder / f"slice_{number}_{axis}_{index:04d}.npy"
-        temporary = path.with_suffix(".part.npy")
-        np.save(temporary, image.astype(np.float32))
-        os.replace(temporary, path)
+    factor: int
+    axes: tuple[int, ...]
+    strength: float
+    first: bool = False
 
 
 def diffusion_texture(
     domain: InteriorDomain,
-    model: str | Path,
+    model: str | Path | None,
     *,
     prompt: str,
     options: InpaintOptions,
-    exemplar: Exemplar | None = None,
+    exemplar: Exemplar | Mapping[int, Exemplar] | None = None,
     resume: Path | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> InteriorTexture:
-    """Texture by a diffusers inpainting pipeline.
+    """Texture by an inpainting backend (``options.backend``), diffusers by default.
 
     Args:
         domain: Voxels to fill.
-        model: Local folder or hub id.
+        model: Local folder or hub id, for the backend diffusers.
         prompt: What a slice shows, for example "cross section of a ripe watermelon".
         options: Settings.
-        exemplar: Photograph whose depth profile starts the volume and whose colours the slices
-            are brought back to.
+        exemplar: Photograph, or one per axis, whose depth profile starts the volume and whose
+            colours the slices are brought back to.
         resume: Folder for finished slices.
         seed: Seed; every slice derives its own from it.
         progress: Optional callback.
 
     Returns:
-        The texture; ``report`` holds slices, resumed_slices, model and axis_disagreement.
+        The texture; ``report`` holds slices, resumed_slices, passes, model, pipeline and
+        axis_disagreement.
 
     Raises:
         InputError: The model cannot be loaded.
         RunError: The model fails; finished slices stay in ``resume``.
     """
-    inpainter = DiffusersInpainter(model, options)
+    photos = _per_axis(exemplar)
+    inpainter = make_inpainter(options.backend, options, model, resume)
+    coarse = inpainter
+    if options.coarse and options.coarse != options.backend:
+        coarse = make_inpainter(options.coarse, options, model, resume, first=inpainter)
     digest = hashlib.sha256()
-    for field in (domain.inside, domain.skin[domain.shell]):
+    for field in (domain.inside, domain.depth, domain.skin[domain.shell]):
         digest.update(np.ascontiguousarray(field).tobytes())
-    if exemplar is not None:
-        digest.update(np.ascontiguousarray(exemplar.image).tobytes())
-    parts = [str(model), inpainter.size, prompt, seed, asdict(options), digest.hexdigest()]
+    for photo in photos.values():
+        digest.update(np.ascontiguousarray(photo.image).tobytes())
+    # what changes speed and memory, but not the slices, does not start a run afresh
+    settings = asdict(options)
+    for name in ("batch", "memory", "allow_slow", "offline"):
+        settings.pop(name)
+    size = getattr(inpainter, "size", None)
+    parts = [str(model), size, inpainter.name, prompt, seed, settings, digest.hexdigest()]
     store = SliceStore(resume, json.dumps(parts, sort_keys=True))
     texture = inpaint_volume(
         domain,
         inpainter,
         prompt=prompt,
         options=options,
-        exemplar=exemplar,
+        exemplar=photos,
+        coarse=coarse,
         store=store,
         seed=seed,
         progress=progress,
     )
-    texture.report["model"] = str(model)
+    texture.report["model"] = None if model is None else str(model)
     texture.report["pipeline"] = inpainter.name
+    texture.report["model_calls"] = getattr(inpainter, "calls", None)
     return texture
+
+
+def make_inpainter(
+    name: str,
+    options: InpaintOptions,
+    model: str | Path | None = None,
+    folder: Path | None = None,
+    first: Inpainter | None = None,
+) -> Inpainter:
+    """Backend of a name (:data:`~.inpaint_options.BACKENDS`).
+
+    Args:
+        name: Which.
+        options: Settings.
+        model: Local folder or hub id (diffusers).
+        folder: Where a command's windows are kept.
+        first: Who makes the first reference slice of a command.
+
+    Raises:
+        InputError: The backend lacks what it needs.
+    """
+    if name == "telea":
+        return TeleaInpainter()
+    if name == "color":
+        return ColorDiffusionInpainter()
+    if name == "exemplar":
+        return ExemplarInpainter()
+    if name == "command":
+        return CommandInpainter(
+            options.command,
+            window=options.window,
+            overlap=min(options.overlap, options.window - 1),
+            first=first,
+            folder=None if folder is None else folder / "command",
+        )
+    if model is None:
+        raise InputError(
+            "texture: method 'diffusion' needs a model",
+            mend="give a local folder or hub id, for example "
+            "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
+        )
+    from .diffusers_adapter import DiffusersInpainter
+
+    return DiffusersInpainter(model, options)
+
+
+def inpaint_plan(domain: InteriorDomain, options: InpaintOptions) -> dict[str, int]:
+    """How much work a run is, before it starts.
+
+    Returns:
+        passes, slices, model_calls and denoising_steps (per picture times pictures).
+    """
+    slices = calls = steps = 0
+    passes = _passes(domain, options)
+    for step in passes:
+        inside = coarse_domain(domain, step.factor).inside
+        for axis in step.axes:
+            count = len(slice_positions(inside, axis, options.slices))
+            pictures = math.ceil(count / options.tile**2)
+            real = max(options.steps, math.ceil(4 / min(step.strength, 0.99)))
+            slices += count
+            calls += math.ceil(pictures / options.batch)
+            steps += pictures * max(1, int(real * min(step.strength, 0.99)))
+    return {
+        "passes": len(passes),
+        "slices": slices,
+        "model_calls": calls,
+        "denoising_steps": steps,
+    }
 
 
 def inpaint_volume(
@@ -155,117 +198,208 @@ def inpaint_volume(
     *,
     prompt: str,
     options: InpaintOptions,
-    exemplar: Exemplar | None = None,
+    exemplar: Exemplar | Mapping[int, Exemplar] | None = None,
+    coarse: Inpainter | None = None,
     store: SliceStore | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> InteriorTexture:
-    """The two-stage loop around any inpainter; arguments as :func:`diffusion_texture`."""
+    """The two-stage loop around any inpainter.
+
+    Args:
+        domain: Voxels to fill.
+        inpainter: Backend.
+        prompt: What a slice shows.
+        options: Settings of the loop (schedule, slices, strength, refine, tile, batch,
+            match_colors).
+        exemplar: Photograph, or one per axis.
+        coarse: Backend of the first pass; None takes ``inpainter``.
+        store: Where finished slices are kept.
+        seed: Seed.
+        progress: Optional callback.
+
+    Returns:
+        The texture; ``report`` holds slices, resumed_slices, passes, schedule and
+        axis_disagreement (between the axes' proposals in the last round, before fusion).
+
+    Raises:
+        RunError: The backend failed; finished slices stay in the store.
+    """
     store = SliceStore(None, "") if store is None else store
-    if exemplar is not None and exemplar.silhouette:
-        position, color = depth_profile(exemplar)
-        relative = domain.depth * exemplar.max_depth / max(domain.max_depth, 1e-6)
-        volume = profile_volume(relative, position, color)
-    else:
-        volume = surface_profile(domain)
-    volume = np.where(domain.shell[..., None], domain.skin, volume)
-    passes = [(0, options.strength)]
-    passes += [(axis, strength) for strength in options.refine for axis in range(3)]
-    total = sum(len(_positions(domain, axis, options.slices)) for axis, _ in passes)
-    done, change = 0, 0.0
-    for number, (axis, strength) in enumerate(passes):
-        positions = _positions(domain, axis, options.slices)
-        made = []
-        for index in positions:
-            image = store.get(number, axis, index, np.take(volume, index, axis).shape)
-            if image is None:
-                image = _one_slice(
-                    volume, domain, inpainter, axis, index, number, prompt, strength, seed
-                )
-                store.put(number, axis, index, image)
-            made.append(image)
-            done += 1
-            report_progress(progress, done, total, f"slice {index} across {'xyz'[axis]}")
-        stack = _interpolate(np.stack(made), positions, domain.inside.shape[axis])
-        proposal = np.moveaxis(stack, 0, axis)
-        hole = (domain.inside & ~domain.shell)[..., None]
-        if number > 0:
-            change = float(np.sqrt(((proposal - volume)[hole[..., 0]] ** 2).mean()))
-            proposal = volume + _SHARE * (proposal - volume)
-        volume = np.where(hole, proposal, volume).astype(np.float32)
-        if exemplar is not None:
-            volume = _to_exemplar(volume, domain, exemplar, seed + number)
-    report = {
-        "slices": total,
+    run = _Run(domain, inpainter, coarse or inpainter, prompt, options, _per_axis(exemplar), store)
+    passes = _passes(domain, options)
+    run.seed, run.progress = seed, progress
+    run.total = inpaint_plan(domain, options)["slices"]
+    logger.info(
+        "inpainting with %s: %d slices in %d passes", inpainter.name, run.total, len(passes)
+    )
+    volume, level, disagreement = np.zeros((0, 0, 0, 3), np.float32), domain, 0.0
+    for number, step in enumerate(passes):
+        if number == 0 or step.factor != passes[number - 1].factor:
+            level = coarse_domain(domain, step.factor)
+            if number == 0:
+                volume = initial_volume(level, run.photos.get(0))
+            else:
+                volume = enlarge(volume, level.inside.shape)
+            volume = np.where(level.shell[..., None], level.skin, volume).astype(np.float32)
+        volume, disagreement = run.one_pass(volume, level, step, number)
+    report: dict[str, Any] = {
+        "slices": run.total,
         "resumed_slices": store.loaded,
         "passes": len(passes),
-        # how much the last axis still wanted to change: small when the axes agree
-        "axis_disagreement": change,
+        "schedule": options.schedule,
+        "axis_disagreement": disagreement,
     }
     return InteriorTexture(volume, np.zeros(domain.inside.shape, np.int32), report)
 
 
-def _positions(domain: InteriorDomain, axis: int, count: int) -> list[int]:
-    """Indices of the slices across an axis."""
-    filled = np.flatnonzero(domain.inside.any(tuple(i for i in range(3) if i != axis)))
-    number = min(count, len(filled))
-    picked = np.linspace(filled[0], filled[-1], number).round().astype(int)
-    return [int(p) for p in np.unique(picked)]
-
-
-def _one_slice(
-    volume: np.ndarray,
-    domain: InteriorDomain,
-    inpainter: Inpainter,
-    axis: int,
-    index: int,
-    number: int,
-    prompt: str,
-    strength: float,
-    seed: int,
-) -> np.ndarray:
-    """Inpaint one slice of the volume."""
-    inside = np.take(domain.inside, index, axis)
-    hole = inside & ~np.take(domain.shell, index, axis)
-    image = np.where(inside[..., None], np.take(volume, index, axis), _GROUND)
-    # the seed names the slice, not its place in a batch or in a resumed run
-    own = int.from_bytes(hashlib.sha256(f"{seed}/{number}/{axis}/{index}".encode()).digest()[:6])
-    made: np.ndarray = inpainter(
-        image[None].astype(np.float32), hole[None], prompt=prompt, strength=strength, seeds=[own]
-    )[0]
+def _passes(domain: InteriorDomain, options: InpaintOptions) -> list[_Pass]:
+    everything = (0, 1, 2)
+    if options.schedule == "paper":
+        first = [_Pass(1, (0,), options.strength, first=True)]
+        return first + [_Pass(1, everything, s) for s in options.refine]
+    factors = [f for f in (4, 2, 1) if min(domain.inside.shape) // f >= 10] or [1]
+    made = [_Pass(factors[0], everything, options.strength, first=True)]
+    for factor in factors:
+        made += [_Pass(factor, everything, s) for s in options.refine]
     return made
 
 
-def _interpolate(slices: np.ndarray, positions: list[int], count: int) -> np.ndarray:
-    """Linear interpolation of slices [K, ...] at ``positions`` to all 0..count-1."""
-    place = np.arange(count)
-    upper = np.searchsorted(positions, place).clip(1, max(len(positions) - 1, 1))
-    lower = upper - 1
-    upper = np.minimum(upper, len(positions) - 1)
-    known = np.asarray(positions, dtype=float)
-    gap = np.maximum(known[upper] - known[lower], 1e-9)
-    t = np.clip((place - known[lower]) / gap, 0.0, 1.0)[:, None, None, None]
-    mixed: np.ndarray = (1 - t) * slices[lower] + t * slices[upper]
-    return mixed
+@dataclass
+class _Run:
+    """What stays the same over a run."""
+
+    domain: InteriorDomain
+    inpainter: Inpainter
+    coarse: Inpainter
+    prompt: str
+    options: InpaintOptions
+    photos: dict[int, Exemplar]
+    store: SliceStore
+    seed: int = 0
+    progress: Progress | None = None
+    total: int = 0
+    done: int = 0
+    made: int = 0
+    spent: float = 0.0
+
+    def one_pass(
+        self, volume: np.ndarray, level: InteriorDomain, step: _Pass, number: int
+    ) -> tuple[np.ndarray, float]:
+        """Slices across the axes of a pass, all from one volume, fused."""
+        hole = level.inside & ~level.shell
+        stacks = []
+        for axis in step.axes:
+            positions = slice_positions(level.inside, axis, self.options.slices)
+            images = self._stack(volume, level, step, number, axis, positions)
+            if self.options.match_colors:
+                images = match_slices(
+                    images,
+                    level,
+                    axis,
+                    positions,
+                    self.photos.get(axis),
+                    slice_seed(self.seed, number, axis, -1),
+                )
+            stacks.append((axis, positions, images))
+        fused, variance = fuse_stacks(volume, stacks)
+        volume = np.where(hole[..., None], fused, volume).astype(np.float32)
+        if 0 in self.photos and hole.any():
+            # fusion takes contrast away; the volume gets the photograph's colours back
+            volume[hole] = to_photo(
+                volume[hole], level.depth[hole], level, self.photos[0], self.seed + number
+            )
+        return volume, float(np.sqrt(variance[hole].mean())) if hole.any() else 0.0
+
+    def _stack(
+        self,
+        volume: np.ndarray,
+        level: InteriorDomain,
+        step: _Pass,
+        number: int,
+        axis: int,
+        positions: list[int],
+    ) -> np.ndarray:
+        """Inpainted slices [K, ., ., 3] across one axis, in the order of ``positions``."""
+        backend = self.coarse if step.first else self.inpainter
+        group = self.options.tile**2
+        if group > 1:
+            backend = TiledInpainter(backend, self.options.tile)
+        chunk = len(positions) if backend.sequential else group * self.options.batch
+        # other neighbours share a canvas in every second pass
+        shift = 0 if backend.sequential or number % 2 == 0 else group // 2
+        order = positions[shift:] + positions[:shift]
+        shape = np.take(volume, 0, axis).shape
+        found: dict[int, np.ndarray] = {}
+        for start in range(0, len(order), max(chunk, 1)):
+            part = order[start : start + chunk]
+            for index in part:
+                kept = self.store.get(number, axis, index, shape)
+                if kept is not None:
+                    found[index] = kept
+            if any(index not in found for index in part):
+                began = time.perf_counter()
+                images = self._call(backend, volume, level, step, number, axis, part)
+                self._estimate(len(part), time.perf_counter() - began)
+                for index, image in zip(part, images, strict=True):
+                    found[index] = image
+                    self.store.put(number, axis, index, image)
+            self.done += len(part)
+            report_progress(
+                self.progress, self.done, self.total, f"slice {part[-1]} across {'xyz'[axis]}"
+            )
+        return np.stack([found[index] for index in positions])
+
+    def _estimate(self, slices: int, seconds: float) -> None:
+        """Say once, after the first call, how long the rest is going to take."""
+        self.made += slices
+        self.spent += seconds
+        rest = (self.total - self.done - slices) * self.spent / self.made
+        if self.made == slices and rest > 60.0:
+            logger.warning(
+                "texture: %d slices to go, about %.0f minutes (%.1f s per slice with %s)",
+                self.total - self.done - slices,
+                rest / 60.0,
+                self.spent / self.made,
+                self.inpainter.name,
+            )
+
+    def _call(
+        self,
+        backend: Inpainter,
+        volume: np.ndarray,
+        level: InteriorDomain,
+        step: _Pass,
+        number: int,
+        axis: int,
+        part: Sequence[int],
+    ) -> np.ndarray:
+        inside, shell, depth, colors = (
+            np.moveaxis(np.take(field, part, axis), axis, 0)
+            for field in (level.inside, level.shell, level.depth, volume)
+        )
+        images = np.where(inside[..., None], colors, GROUND).astype(np.float32)
+        return backend(
+            images,
+            inside & ~shell,
+            prompt=self.prompt,
+            exemplar=self.photos.get(axis),
+            strength=step.strength,
+            seeds=[slice_seed(self.seed, number, axis, index) for index in part],
+            context=SliceContext(
+                axis=axis,
+                offsets=tuple(part),
+                pitch=level.voxel,
+                inside=inside,
+                guide=depth,
+                max_depth=level.max_depth,
+            ),
+        )
 
 
-def _to_exemplar(
-    volume: np.ndarray, domain: InteriorDomain, exemplar: Exemplar, seed: int
-) -> np.ndarray:
-    """Bring the colours back to the exemplar's, within depth ranges when it has an outline."""
-    inner = domain.inside & ~domain.shell
-    if exemplar.silhouette:
-        depth = domain.depth[inner] * exemplar.max_depth / max(domain.max_depth, 1e-6)
-        own, bins = exemplar.depth[exemplar.mask], 8
-    else:
-        depth, own, bins = np.zeros(int(inner.sum())), np.zeros(int(exemplar.mask.sum())), 1
-    result = volume.copy()
-    result[inner] = match_colors(
-        volume[inner],
-        depth,
-        exemplar.image[exemplar.mask],
-        own,
-        bins=bins,
-        rng=np.random.default_rng(seed),
-    )
-    return result
+def _per_axis(exemplar: Exemplar | Mapping[int, Exemplar] | None) -> dict[int, Exemplar]:
+    if exemplar is None:
+        return {}
+    if isinstance(exemplar, Exemplar):
+        return dict.fromkeys(range(3), exemplar)
+    return dict(exemplar)

@@ -11,14 +11,14 @@ from .preset_tools import layers, mix, paint
 
 def watermelon(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Striped skin, pale rind, red flesh with pale fibres, dark seeds in a ring."""
-    wobble = 0.015 * value_noise(points, 4.0, seed)
+    wobble = 0.015 * fractal(points, 3.0, seed, 2)
     t = depth + wobble
     rgb = layers(
         t,
         [
-            (0.0, paint(0.13, 0.30, 0.10)),
-            (0.03, paint(0.30, 0.48, 0.18)),
-            (0.06, paint(0.74, 0.82, 0.55)),
+            (0.0, paint(0.25, 0.44, 0.17)),
+            (0.04, paint(0.36, 0.54, 0.22)),
+            (0.07, paint(0.74, 0.82, 0.55)),
             (0.13, paint(0.93, 0.93, 0.80)),
             (0.20, paint(0.96, 0.66, 0.58)),
             (0.28, paint(0.90, 0.29, 0.26)),
@@ -26,16 +26,20 @@ def watermelon(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.nda
             (1.0, paint(0.89, 0.24, 0.24)),
         ],
     )
+    angle = np.arctan2(points[:, 1], points[:, 0]) + 0.25 * fractal(points, 2.5, seed + 1, 2)
+    stripe = smoothstep((np.cos(9.0 * angle) + 0.2) / 0.5) * smoothstep((0.05 - t) / 0.02)
+    rgb = mix(rgb, paint(0.08, 0.21, 0.08), 0.9 * stripe)
     flesh = smoothstep((t - 0.18) / 0.12)
     patches = fractal(points, 2.2, seed + 3) * flesh
     rgb = mix(rgb, paint(0.97, 0.50, 0.46), 0.45 * np.clip(patches, 0, 1))
     rgb = mix(rgb, paint(0.70, 0.07, 0.10), 0.5 * np.clip(-patches, 0, 1))
     warp = np.stack([fractal(points, 2.5, seed + 4 + i, 2) for i in range(3)], 1)
-    fibre = np.abs(fractal(points + 0.25 * warp, 3.0, seed + 5, 2))
-    rgb = mix(rgb, paint(0.98, 0.70, 0.64), 0.4 * flesh * np.exp(-((fibre / 0.06) ** 2)))
-    grain = value_noise(points, 22.0, seed + 9)
+    fibre = np.abs(fractal(points + 0.25 * warp, 2.6, seed + 5, 2))
+    bundle = smoothstep(0.5 + fractal(points, 2.0, seed + 8, 1))
+    rgb = mix(rgb, paint(0.98, 0.66, 0.60), 0.45 * flesh * bundle * np.exp(-((fibre / 0.07) ** 2)))
+    grain = fractal(points, 16.0, seed + 9, 2)
     rgb = rgb * (1 + 0.05 * grain * flesh)[:, None]
-    return _seeds(points, depth, rgb, seed + 11, (0.32, 0.68), 0.34, (0.10, 0.055))
+    return _seeds(points, depth, rgb, seed + 11, (0.30, 0.66), 0.23, (0.080, 0.046))
 
 
 def _seeds(
@@ -100,78 +104,127 @@ def apple(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray,
 
 def orange(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Peel, white albedo, segments with juice vesicles between membranes, pith on the axis."""
+    own = np.random.default_rng([seed, 5])
+    segments = int(own.integers(9, 12))
     x, y, z = points.T
+    # the core is never quite in the middle, nor straight
+    x = x - 0.05 * own.uniform(-1, 1) - 0.03 * fractal(np.stack([0 * z, 0 * z, z], 1), 1.0, seed)
+    y = (
+        y
+        - 0.05 * own.uniform(-1, 1)
+        - 0.03 * fractal(np.stack([0 * z + 7, 0 * z, z], 1), 1.0, seed)
+    )
     radius = np.hypot(x, y)
-    angle = np.arctan2(y, x) + 0.1 * value_noise(points, 2.0, seed) + 0.13 * (1 + seed % 7)
-    segments = 10
-    sector = angle * segments / (2 * np.pi)
-    gap = np.abs(sector - np.round(sector)) * 2 * np.pi / segments * radius
-    stretched = np.stack([radius * 0.45, np.round(sector) * 3.0 + sector, z * 0.9], 1)
-    sac = cells(stretched, 7.0, seed + 1)
-    pulp = mix(
-        np.broadcast_to(paint(0.98, 0.62, 0.14), (len(points), 3)),
-        paint(0.93, 0.46, 0.05),
-        sac.random(2),
+    # and the segments wind a little, so that no flat cut follows a membrane for long
+    turn = own.uniform(0, 2 * np.pi) + own.choice([-0.3, 0.3]) * z
+    turn = turn + 0.16 * fractal(points, 1.3, seed + 1, 2)
+    sector = (np.arctan2(y, x) + turn) * segments / (2 * np.pi)
+    # uneven widths: a slow wave on the way round, closed after one turn
+    phase = 2 * np.pi * sector / segments
+    sector = sector + 0.22 * np.sin(2 * phase + own.uniform(0, 6)) + 0.12 * np.sin(3 * phase)
+    nearest = np.round(sector)
+    side = (sector - nearest) * 2 * np.pi / segments * radius
+    segment = np.floor(sector)
+    middle = (sector - segment - 0.5) * 2 * np.pi / segments * radius
+    number = np.mod(segment, segments)
+    # vesicles: spindles that point at the axis, wider outside
+    spindle = np.stack([0.34 * radius + 0.10 * np.abs(z), middle + 7.0 * number, 0.8 * z], 1)
+    sac = cells(spindle + 0.015 * fractal(points, 6.0, seed + 2, 1)[:, None], 11.0, seed + 3)
+    rgb = mix(paint(0.98, 0.60, 0.13), paint(0.94, 0.46, 0.06), sac.random(2))
+    rgb = mix(rgb, paint(1.0, 0.72, 0.30), 0.35 * smoothstep((0.35 - sac.first) / 0.3))
+    wall = smoothstep((0.10 - sac.second + sac.first) / 0.10)
+    rgb = mix(rgb, paint(0.99, 0.78, 0.40), 0.6 * wall)
+    skin = 0.013 + 0.006 * fractal(points, 5.0, seed + 4, 1)
+    rgb = mix(rgb, paint(0.98, 0.87, 0.64), 0.9 * smoothstep((skin - np.abs(side)) / 0.015 + 0.5))
+    # the pith reaches a little way into the membranes: a star, not a disc
+    core = 0.075 + 0.03 * fractal(points, 3.0, seed + 5, 2)
+    core = core + 0.05 * smoothstep((0.06 - np.abs(side)) / 0.05)
+    pith = mix(
+        paint(0.98, 0.94, 0.83), paint(0.95, 0.87, 0.70), 0.5 + fractal(points, 9.0, seed + 6)
     )
-    pulp = mix(pulp, paint(1.0, 0.80, 0.42), smoothstep((0.14 - sac.second + sac.first) / 0.14))
-    membrane = smoothstep((0.025 - gap) / 0.015)
-    rgb = mix(pulp, paint(0.98, 0.86, 0.62), 0.85 * membrane)
-    axis = 0.10 + 0.02 * value_noise(points, 3.0, seed + 2)
-    rgb = mix(rgb, paint(0.97, 0.92, 0.80), smoothstep((axis - radius) / 0.04 + 0.5))
-    peel = layers(
-        depth,
-        [
-            (0.0, paint(0.93, 0.47, 0.05)),
-            (0.05, paint(0.98, 0.62, 0.16)),
-            (0.075, paint(0.99, 0.93, 0.80)),
-            (1.0, paint(0.98, 0.93, 0.82)),
-        ],
-    )
-    rgb = mix(peel, rgb, smoothstep((depth - 0.13) / 0.02))
+    rgb = mix(rgb, pith, smoothstep((core - radius) / 0.04 + 0.5))
+    albedo = 0.125 + 0.025 * fractal(points, 2.5, seed + 7, 2)
+    rgb = mix(pith, rgb, smoothstep((depth - albedo) / 0.02 + 0.5))
+    peel = layers(depth, [(0.0, paint(0.91, 0.45, 0.05)), (0.05, paint(0.97, 0.60, 0.15))])
+    gland = cells(points, 15.0, seed + 8)
+    dark = smoothstep((0.28 - gland.first) / 0.1)
+    peel = mix(peel, paint(0.82, 0.38, 0.04), 0.6 * dark)
+    rgb = mix(rgb, peel, smoothstep((0.06 - depth) / 0.02 + 0.5))
     return rgb, np.zeros(len(points), np.int64)
 
 
 def bread(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Brown crust, cream crumb with pores of two sizes (dark, seen from above)."""
+    """Brown crust, cream crumb, pores from hardly seen to large (dark, seen from above)."""
+    own = np.random.default_rng([seed, 6])
+    toast, airy = own.uniform(-1, 1, 2)
+    t = depth * (1 - 0.1 * toast) + 0.025 * fractal(points, 3.0, seed, 3)
     rgb = layers(
-        depth + 0.02 * value_noise(points, 6.0, seed),
+        t,
         [
-            (0.0, paint(0.50, 0.26, 0.10)),
-            (0.05, paint(0.72, 0.46, 0.22)),
-            (0.12, paint(0.90, 0.79, 0.58)),
-            (1.0, paint(0.94, 0.87, 0.70)),
+            (0.0, paint(0.46, 0.22, 0.08)),
+            (0.04, paint(0.62, 0.35, 0.14)),
+            (0.08, paint(0.78, 0.56, 0.31)),
+            (0.14, paint(0.90, 0.79, 0.58)),
+            (0.30, paint(0.93, 0.86, 0.69)),
+            (1.0, paint(0.94, 0.87, 0.71)),
         ],
     )
-    rgb = rgb * (1 + 0.06 * fractal(points, 9.0, seed + 1))[:, None]
-    flat = points * [1.0, 1.0, 1.25]
-    crumb = smoothstep((depth - 0.08) / 0.06)
-    for frequency, size, dark in ((5.0, 0.30, 0.62), (11.0, 0.30, 0.75)):
-        pore = cells(flat, frequency, seed + int(frequency))
-        radius = size * (0.35 + pore.random(3))
-        hole = smoothstep((radius - pore.first) / 0.12) * crumb * (pore.random(4) < 0.7)
-        rgb = mix(rgb, rgb * np.float32(dark), hole)
+    rgb = (
+        rgb
+        * (1 + 0.05 * fractal(points, 5.0, seed + 1) + 0.05 * fractal(points, 17.0, seed + 2))[
+            :, None
+        ]
+    )
+    warp = np.stack([fractal(points, 5.0, seed + 3 + i, 2) for i in range(3)], 1)
+    bent = (points + 0.035 * warp) * [1.0, 1.0, 1.2]
+    crumb = smoothstep((t - 0.09) / 0.06)
+    open_ = smoothstep((t - 0.12) / 0.25)  # large holes keep away from the crust
+    # size over lattice pitch, how many of the sites are taken, how dark the bottom is
+    for pitch, share, dark in (
+        (0.36, 0.45, 0.54),
+        (0.19, 0.55, 0.60),
+        (0.11, 0.65, 0.68),
+        (0.065, 0.75, 0.76),
+    ):
+        pore = cells(bent, 1.0 / pitch, seed + int(1 / pitch), jitter=0.9)
+        size = (0.17 + 0.28 * pore.random(3) ** 2) * (1 + 0.1 * airy)
+        where = crumb if pitch < 0.15 else open_
+        taken = where * (pore.random(4) < share)
+        shadow = smoothstep((size - pore.first) / 0.14)
+        rim = smoothstep((0.1 - np.abs(pore.first - size - 0.04)) / 0.08)
+        rgb = mix(rgb, paint(0.98, 0.93, 0.80), 0.35 * rim * taken)
+        # deeper in the middle
+        floor = np.float32(dark) + np.float32(0.14) * smoothstep(pore.first / 0.4)[:, None]
+        rgb = mix(rgb, rgb * floor * paint(1.0, 0.96, 0.88), shadow * taken)
     return rgb, np.zeros(len(points), np.int64)
 
 
 def cake(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sponge with two layers of cream by height (z), icing all round."""
-    z = points[:, 2] + 0.05 * fractal(points * [1.0, 1.0, 0.4], 1.5, seed, 2)
-    base = 0.05 * np.random.default_rng(seed).uniform(-1.0, 1.0, 2)
-    sponge = mix(
-        paint(0.86, 0.66, 0.36), paint(0.76, 0.54, 0.27), 0.5 + 0.6 * fractal(points, 6.0, seed + 1)
-    )
-    for frequency, share in ((7.0, 0.5), (12.0, 0.6), (20.0, 0.7)):
-        pore = cells(points, frequency, seed + int(frequency))
-        radius = 0.22 + 0.22 * pore.random(3)
-        hole = smoothstep((radius - pore.first) / 0.15) * (pore.random(4) < share)
-        sponge = mix(sponge, sponge * np.float32(0.66), hole)
+    """Three sponges with cream and jam between, by height (z), and icing all round."""
+    own = np.random.default_rng([seed, 7])
+    z = points[:, 2] + 0.05 * fractal(points * [1.0, 1.0, 0.4], 1.2, seed, 3)
+    tint = 0.5 + 0.5 * fractal(points, 4.0, seed + 1) + 0.1 * own.uniform(-1, 1)
+    rgb = mix(paint(0.89, 0.70, 0.39), paint(0.80, 0.58, 0.29), tint)
+    rgb = rgb * (1 + 0.07 * fractal(points, 15.0, seed + 2, 2))[:, None]
+    bent = points * [1.0, 1.0, 1.15] + 0.03 * fractal(points, 7.0, seed + 3, 2)[:, None]
+    for pitch, share, dark in ((0.22, 0.25, 0.66), (0.11, 0.45, 0.72), (0.06, 0.6, 0.80)):
+        pore = cells(bent, 1.0 / pitch, seed + int(1 / pitch), jitter=0.9)
+        size = 0.14 + 0.26 * pore.random(3) ** 2
+        hole = smoothstep((size - pore.first) / 0.14) * (pore.random(4) < share)
+        rgb = mix(rgb, rgb * np.float32(dark), hole)
     cream = mix(
-        paint(0.97, 0.93, 0.85), paint(0.93, 0.87, 0.77), 0.5 + 0.5 * fractal(points, 5.0, seed + 2)
+        paint(0.98, 0.95, 0.89), paint(0.93, 0.88, 0.79), 0.4 + 0.5 * fractal(points, 3.0, seed + 4)
     )
-    rgb = sponge
-    for middle, offset in zip((-0.33, 0.33), base, strict=True):
-        away = np.abs(z - middle - offset)
-        rgb = mix(rgb, cream, smoothstep((0.10 - away) / 0.03))
-    icing = depth + 0.02 * value_noise(points, 4.0, seed + 3)
-    rgb = mix(rgb, cream, smoothstep((0.16 - icing) / 0.03))
+    jam = mix(
+        paint(0.70, 0.10, 0.14), paint(0.50, 0.04, 0.08), 0.5 + fractal(points, 8.0, seed + 5, 2)
+    )
+    places = np.array([-0.32, 0.32]) + 0.04 * own.uniform(-1, 1, 2)
+    for k, place in enumerate(places):
+        thick = 0.085 + 0.02 * fractal(points, 3.0, seed + 6 + k, 2)
+        away = z - place
+        rgb = mix(rgb, cream, smoothstep((thick - np.abs(away)) / 0.02 + 0.5))
+        smear = 0.035 + 0.025 * fractal(points, 4.0, seed + 8 + k, 2)
+        rgb = mix(rgb, jam, smoothstep((smear - np.abs(away + thick + 0.01)) / 0.02 + 0.5))
+    thickness = 0.14 + 0.03 * fractal(points, 2.5, seed + 10, 2)
+    rgb = mix(rgb, cream, smoothstep((thickness - depth) / 0.025 + 0.5))
     return rgb, np.zeros(len(points), np.int64)

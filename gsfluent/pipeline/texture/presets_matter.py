@@ -10,43 +10,56 @@ from .preset_tools import layers, mix, paint
 
 
 def wood(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Growth rings about a wandering pith, fibres along the axis, faint rays."""
+    """Growth rings about a wandering pith, fibres along the axis, rays, darker heart."""
+    own = np.random.default_rng([seed, 8])
     x, y, z = points.T
-    bend = np.stack([0.4 * z + 3.1, 0 * z, 0 * z + seed], 1)
-    x = x + 0.12 * value_noise(bend, 1.0, seed)
-    y = y + 0.12 * value_noise(bend + 9.0, 1.0, seed)
-    radius = np.hypot(x, y) + 0.035 * fractal(points * [1.5, 1.5, 0.3], 1.5, seed + 1)
-    ring = radius * 11.0
-    phase = ring - np.floor(ring)
-    late = smoothstep((phase - 0.55) / 0.4) * smoothstep((1.0 - phase) / 0.06)
-    tone = value_noise(np.stack([np.floor(ring), 0 * ring, 0 * ring], 1), 1.0, seed + 2)
-    rgb = mix(
-        np.broadcast_to(paint(0.85, 0.66, 0.43), (len(points), 3)),
-        paint(0.56, 0.34, 0.17),
-        late * (0.75 + 0.25 * tone),
-    )
-    fibre = fractal(points * [1.0, 1.0, 0.06], 24.0, seed + 3, 2)
+    # everything varies slowly along the grain
+    along = np.stack([0 * z, 0 * z, 0.35 * z], 1)
+    x = x + 0.10 * fractal(along, 1.0, seed, 2) + own.uniform(-0.15, 0.15)
+    y = y + 0.10 * fractal(along + 5.3, 1.0, seed, 2) + own.uniform(-0.15, 0.15)
     angle = np.arctan2(y, x)
-    ray = value_noise(np.stack([angle * 18, radius * 1.2, z * 3], 1), 1.0, seed + 4)
-    rgb = rgb * (1 + 0.06 * fibre + 0.05 * (ray > 0.62))[:, None]
+    radius = np.hypot(x, y)
+    lobes = np.stack([np.cos(angle), np.sin(angle), 0.25 * z], 1)
+    radius = radius * (1 + 0.05 * fractal(lobes, 0.9, seed + 1, 2))
+    radius = radius + 0.02 * fractal(points * [1.0, 1.0, 0.15], 2.5, seed + 2, 2)
+    # years differ in width
+    flat = np.stack([radius, 0 * radius, 0 * radius], 1)
+    ring = 6.5 * (radius + 0.11 * fractal(flat, 1.7, seed + 3, 2))
+    year = np.floor(ring)
+    phase = ring - year
+    late = smoothstep((phase - 0.25) / 0.65) ** 1.5 * smoothstep((1.0 - phase) / 0.10)
+    tone = value_noise(np.stack([year, 0 * ring, 0 * ring], 1) + 0.5, 1.0, seed + 4)
+    rgb = mix(paint(0.88, 0.71, 0.49), paint(0.60, 0.37, 0.19), late * (0.72 + 0.28 * tone))
+    heart = smoothstep((0.55 - radius) / 0.25)
+    rgb = mix(rgb, rgb * paint(0.93, 0.85, 0.78), heart)
+    rgb = mix(rgb, paint(0.45, 0.27, 0.14), smoothstep((0.045 - radius) / 0.02))
+    fibre = fractal(points * [1.0, 1.0, 0.05], 14.0, seed + 5, 3)
+    # rays: thin radial blades, short along the grain
+    blade = fractal(np.stack([9.0 * np.cos(angle), 9.0 * np.sin(angle), 1.6 * z], 1), 1.0, seed + 6)
+    ray = smoothstep((0.10 - np.abs(blade)) / 0.08) * smoothstep((radius - 0.08) / 0.1)
+    rgb = rgb * (1 + 0.07 * fibre)[:, None]
+    rgb = mix(rgb, paint(0.93, 0.79, 0.58), 0.28 * ray)
     return rgb, np.zeros(len(points), np.int64)
 
 
 def marble(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """White stone with clouds and two systems of grey veins; no layers."""
-    warp = np.stack([fractal(points, 1.3, seed + i, 3) for i in range(3)], 1)
-    bent = points + 0.35 * warp
-    cloud = fractal(bent, 1.6, seed + 4)
-    rgb = mix(
-        np.broadcast_to(paint(0.93, 0.92, 0.90), (len(points), 3)),
-        paint(0.76, 0.77, 0.79),
-        0.5 + 0.5 * cloud,
-    )
-    for k, (frequency, width, strength) in enumerate(((1.1, 0.035, 0.8), (2.6, 0.03, 0.45))):
-        sheet = np.abs(fractal(bent, frequency, seed + 11 + k, 3))
-        vein = np.exp(-((sheet / width) ** 2))
-        fade = 0.5 + 0.5 * value_noise(points, 1.7, seed + 20 + k)
-        rgb = mix(rgb, paint(0.36, 0.37, 0.41), strength * vein * fade)
+    """White stone with clouds, long grey veins and a net of finer ones; no layers."""
+    warp = np.stack([fractal(points, 1.1, seed + i, 3) for i in range(3)], 1)
+    bent = points + 0.30 * warp
+    cloud = fractal(bent, 1.6, seed + 4, 4)
+    rgb = mix(paint(0.94, 0.93, 0.91), paint(0.74, 0.75, 0.78), 0.45 + 0.6 * cloud)
+    # the long ones lean one way, as beds do
+    lean = bent * [1.0, 0.55, 0.8]
+    systems = ((lean, 1.7, 0.045, 0.85), (bent, 2.9, 0.045, 0.5), (bent, 5.5, 0.05, 0.3))
+    for k, (place, frequency, width, strength) in enumerate(systems):
+        sheet = np.abs(fractal(place, frequency, seed + 11 + 7 * k, 3))
+        swell = 0.55 + 0.45 * fractal(points, 2.3, seed + 31 + k, 2)
+        vein = np.exp(-((sheet / (width * np.clip(swell, 0.15, 1.5))) ** 2))
+        halo = np.exp(-((sheet / (5.0 * width)) ** 2))
+        fade = smoothstep(0.55 + 0.9 * fractal(points, 1.4, seed + 20 + k, 2))
+        rgb = mix(rgb, paint(0.62, 0.64, 0.68), 0.5 * strength * halo * fade)
+        rgb = mix(rgb, paint(0.33, 0.34, 0.38), strength * vein * fade)
+    rgb = rgb * (1 + 0.015 * fractal(points, 22.0, seed + 40, 2))[:, None]
     return rgb, np.zeros(len(points), np.int64)
 
 

@@ -17,8 +17,8 @@ from .preset_tools import Preset
 
 __all__ = ["PRESETS", "preset_names", "procedural_texture"]
 
-_CHUNK = 400_000
-"""Points evaluated at a time: a preset holds some fifty numbers per point."""
+_CHUNK = 32_000
+"""Points evaluated at a time: their fifty numbers each should stay in the cache."""
 
 PRESETS: dict[str, Preset] = {
     "apple": presets_food.apple,

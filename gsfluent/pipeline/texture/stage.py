@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from ..stage import Progress, Stage, report_progress
 from .baselines import color_copy, telea_slices
 from .domain import InteriorDomain, InteriorTexture, blend_skin
 from .exemplar import QUALITIES, exemplar_texture, load_exemplars
+from .inpaint_options import InpaintOptions
 from .metrics import (
     depth_profile_error,
     lab_histogram_distance,
@@ -24,20 +26,27 @@ from .metrics import (
     patch_distance,
     volume_slices,
 )
-from .photo import Exemplar
+from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
 from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
 
-    from .inpaint import InpaintOptions
-
 __all__ = ["METHODS", "Texture"]
 
 logger = logging.getLogger(__name__)
 
-METHODS = ("auto", "exemplar", "procedural", "diffusion", "profile", "color_copy", "telea")
+METHODS = (
+    "auto",
+    "exemplar",
+    "procedural",
+    "diffusion",
+    "inpaint",
+    "profile",
+    "color_copy",
+    "telea",
+)
 
 
 class Texture(Stage):
@@ -49,8 +58,10 @@ class Texture(Stage):
     Methods:
         ``exemplar``: guided patch synthesis from photographs of a cut object (the default when an
         exemplar is given); ``procedural``: a preset; ``diffusion``: slices inpainted by a diffusers
-        pipeline; ``profile``: surface colour fading to its mean (the default with nothing given,
-        with a warning); ``color_copy`` and ``telea``: baselines for comparison.
+        pipeline; ``inpaint``: slices inpainted by another backend (``inpaint={"backend": ...}``,
+        :class:`.inpaint_options.InpaintOptions`); ``profile``: surface colour fading to its mean
+        (the default with nothing given, with a warning); ``color_copy`` and ``telea``: baselines
+        for comparison.
 
     Args:
         method: One of the above, or ``auto``.
@@ -65,7 +76,9 @@ class Texture(Stage):
         directional: True for grained materials: the exemplar is not turned or mirrored.
         inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
-        inpaint: Settings of the diffusion method.
+        photo: What is done to photographs before their material is used (:class:`PhotoOptions`,
+            or its settings as a mapping); None for the defaults.
+        inpaint: Settings of the slice methods, or a mapping of them.
         resume: Folder in which the diffusion method keeps finished slices.
         seed: Seed of everything random.
 
@@ -89,7 +102,8 @@ class Texture(Stage):
         directional: bool = False,
         inclusions: bool = True,
         axis: tuple[float, float, float] | None = None,
-        inpaint: InpaintOptions | None = None,
+        photo: PhotoOptions | Mapping[str, Any] | None = None,
+        inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
         seed: int = 0,
     ) -> None:
@@ -124,9 +138,11 @@ class Texture(Stage):
                     f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
                     mend="choose one of these or give an exemplar photograph",
                 )
-        if method == "diffusion" and model is None:
+        options = InpaintOptions.of(inpaint)
+        slices = method in ("diffusion", "inpaint")
+        if slices and "diffusers" in (options.backend, options.coarse) and model is None:
             raise InputError(
-                "texture: method 'diffusion' needs a model",
+                f"texture: method {method!r} needs a model",
                 mend="give a local folder or hub id, for example "
                 "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
             )
@@ -141,7 +157,8 @@ class Texture(Stage):
         self.directional = directional
         self.inclusions = inclusions
         self.axis = None if axis is None else np.asarray(axis, dtype=float)
-        self.inpaint = inpaint
+        self.photo = PhotoOptions.of(photo)
+        self.inpaint = options
         self.resume = None if resume is None else Path(resume)
 
     def forward(
@@ -166,8 +183,13 @@ class Texture(Stage):
             InputError: The exemplar, preset or model cannot be used.
         """
         began = time.perf_counter()
-        exemplars = load_exemplars(self.exemplar) if self.exemplar is not None else None
         domain = InteriorDomain.from_solid(solid, self.axis)
+        exemplars = None
+        if self.exemplar is not None:
+            opened = open_exemplars(self.exemplar, self.photo)
+            if self.photo.white == "skin":
+                opened = with_skin(opened, domain.skin[domain.shell])
+            exemplars = load_exemplars(opened)
         if not domain.inside.any():
             raise InputError("texture: the solid is empty", mend="run fill first")
         texture = self._make(domain, exemplars, progress)
@@ -213,15 +235,15 @@ class Texture(Stage):
             return color_copy(domain)
         if self.method == "telea":
             return telea_slices(domain)
-        if self.method == "diffusion" and self.model is not None:
-            from .inpaint import InpaintOptions, diffusion_texture
+        if self.method in ("diffusion", "inpaint"):
+            from .inpaint import diffusion_texture
 
             return diffusion_texture(
                 domain,
                 self.model,
                 prompt=self.prompt,
-                options=self.inpaint or InpaintOptions(),
-                exemplar=None if exemplars is None else exemplars[0],
+                options=self.inpaint,
+                exemplar=exemplars,
                 resume=self.resume,
                 seed=self.seed,
                 progress=progress,
