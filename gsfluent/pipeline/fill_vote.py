@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from gsfluent.errors import InputError
 
@@ -24,6 +25,7 @@ from .fill_inside import (
 )
 from .inspect_shape import robust_box
 from .orient import orient
+from .voxels import distance_transform
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Gaussians
@@ -77,12 +79,15 @@ def evidence(gaussians: Gaussians) -> tuple[Gaussians, int]:
     a single one would hide the object from every camera and blow up every box.
     """
     scales = gaussians.scales
+    finite = torch.isfinite(gaussians.means).all(1) & torch.isfinite(scales).all(1)
+    finite &= torch.isfinite(gaussians.quats).all(1)
     fine = (scales > 0).all(1) & (gaussians.quats.norm(dim=1) > 1e-12)
     seen = gaussians.opacities > 0.05
-    if int((fine & seen).sum()) >= _FEW:
-        points = gaussians.means[fine & seen].detach().double().cpu().numpy()
+    if int((fine & seen & finite).sum()) >= _FEW:
+        points = gaussians.means[fine & seen & finite].detach().double().cpu().numpy()
         low, high = robust_box(points)
         fine &= scales.amax(1) <= _HUGE * float((high - low).max())
+    fine |= ~finite  # for validation to name
     return gaussians.select(fine), int((seen & ~fine).sum())
 
 
@@ -129,14 +134,12 @@ def vote_solid(
     down = options.down
     if down is None and capture is not None:
         down = -np.asarray(orient(gaussians, capture).up, dtype=float)
-    vote = cast_votes(
-        shell, rays=options.rays, down=down, close_open_side=options.close_underside
-    )
+    vote = cast_votes(shell, rays=options.rays, down=down, close_open_side=options.close_underside)
     loose = (vote.score >= options.agreement) | shell
     hull = None
     views = masked_views(capture) if options.masks else []
     if views:
-        hull = visual_hull(box, views)
+        hull = visual_hull(box, views, gaussians.device)
         # masks say what is not the object; rays cap the cone under objects seen only from above
         # (just outside a convex surface about half of the rays hit it)
         loose = hull & (shell | (vote.score >= 0.65))
@@ -147,9 +150,10 @@ def vote_solid(
             )
     loose, dropped = keep_components(loose)
     loose = ndimage.binary_fill_holes(loose)
-    solid, more = keep_components(smooth_boundary(trim_outer_flank(loose, shell, density)))
+    trimmed = trim_outer_flank(loose, shell, density, gaussians.device)
+    solid, more = keep_components(smooth_boundary(trimmed))
     # splats well below the surface hint at a cavity or an inner wall
-    deep = shell & (ndimage.distance_transform_edt(loose) > 5.0)
+    deep = shell & (distance_transform(loose, gaussians.device) > 5.0)
     if vote.open_side is not None:
         _log.info(
             "fill: nothing seen from side %s; closed there (%.0f %% of inner voxels look out)",
@@ -157,7 +161,7 @@ def vote_solid(
             100 * vote.open_fraction,
         )
     notes = {
-        "method": "vote" if hull is None else "hull and vote",
+        "closed_by": "vote" if hull is None else "hull and vote",
         "closed_side": None if vote.open_side is None else list(vote.open_side),
         "closed_side_open_fraction": vote.open_fraction,
         "components_dropped": dropped + more,

@@ -144,9 +144,7 @@ def mesh_to(
     photographs = None if capture is None else load_capture(capture)
     gaussians = None
     if source.is_dir():
-        field = find_solid(
-            None, load_capture(source), method=method, resolution=resolution
-        )
+        field = find_solid(None, load_capture(source), method=method, resolution=resolution)
     elif source.suffix.lower() in _MESHES or _has_faces(source):
         field = find_solid(mesh=source, method=method, resolution=resolution)
     elif method == "auto" and volume_path(source).is_file():

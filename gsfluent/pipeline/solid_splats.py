@@ -29,6 +29,7 @@ from gsfluent.pipeline.solid_tsdf import (
     ring_of_cameras,
     zoomed,
 )
+from gsfluent.pipeline.voxels import distance_transform
 
 __all__ = ["solid_of_splats"]
 
@@ -84,7 +85,7 @@ def solid_of_splats(
     notes["unusable_gaussians"] = unusable
     cameras, virtual = _lookers(capture, box, notes["closed_side"])
     notes |= {"cameras": len(cameras), "virtual_cameras": virtual}
-    field, note = None, ""
+    note = ""
     if method == "density":
         assert closed is not None
         field = SignedDistance.of_voxels(closed.solid, np.array(box.origin), box.voxel, "density")
@@ -204,7 +205,7 @@ def _cavities(solid: np.ndarray, depths: np.ndarray) -> np.ndarray:
     from scipy import ndimage
 
     differing = solid & (depths > 0)
-    deep = ndimage.distance_transform_edt(differing) > _SKIN
+    deep = distance_transform(differing) > _SKIN
     grown = ndimage.binary_dilation(deep, np.ones((3, 3, 3)), iterations=2)
     result: np.ndarray = grown & differing
     return result
