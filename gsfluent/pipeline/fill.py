@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gsfluent.errors import InputError
 
-from .fill_density import GridBox
-from .fill_interior import (
-    _INTERIOR_OPACITY,
-    interior_gaussians,
-    refine_opacity,
-)
+from .fill_interior import populate
+from .fill_refine import refine_opacity
 from .fill_skin import skin_gaussians
-from .fill_view import cut_view, surface_colors
+from .fill_view import cut_view
 from .fill_vote import VoteOptions, evidence
 from .solid_splats import has_masks
 from .stage import Progress, Stage, report_progress
@@ -69,8 +64,8 @@ class Fill(Stage):
         close_underside: Close the side that no photograph shows, at its rim.
         match_masks: Move the skin to the outline of the masks, or of the splats without masks.
         finer: Take smaller voxels where the walls found are thinner than five of them.
-        refine_iterations: Steps of the opacity fit (0 switches it off).
-        refine_image_size: Longest image side in the fit [pixels].
+        refine_views: Photographs asked about the interior (0 asks none).
+        refine_image_size: Longest image side then [pixels].
         seed: Seed of lattice jitter and view order.
 
     Raises:
@@ -94,7 +89,7 @@ class Fill(Stage):
         close_underside: bool = True,
         match_masks: bool = True,
         finer: bool = True,
-        refine_iterations: int = 24,
+        refine_views: int = 24,
         refine_image_size: int = 200,
         seed: int = 0,
     ) -> None:
@@ -135,7 +130,7 @@ class Fill(Stage):
         self.close_underside = close_underside
         self.match_masks = match_masks
         self.finer = finer
-        self.refine_iterations = int(refine_iterations)
+        self.refine_views = int(refine_views)
         self.refine_image_size = int(refine_image_size)
 
     def forward(
@@ -191,27 +186,30 @@ class Fill(Stage):
         surface = gaussians.replace(
             labels=torch.full((gaussians.count,), SURFACE, dtype=torch.int32, device=device)
         )
-        merged, inner = self._populate(surface, occupied, depth, nearest, box)
-        refined: dict[str, float] = {}
-        pruned = 0
-        if capture is not None and self.refine_iterations > 0 and bool(inner.any()):
-            opacity, refined = refine_opacity(
+        merged, inner, placed = populate(
+            surface,
+            occupied,
+            depth,
+            nearest,
+            box,
+            spacing=self.spacing,
+            max_interior=self.max_interior,
+            seed=self.seed,
+        )
+        refined: dict[str, Any] = {}
+        if capture is not None and self.refine_views > 0 and bool(inner.any()):
+            merged, inner, refined = refine_opacity(
                 merged,
                 inner,
                 capture,
-                iterations=self.refine_iterations,
+                views=self.refine_views,
                 image_size=self.refine_image_size,
-                seed=self.seed,
                 progress=progress,
             )
-            keep = ~inner | (opacity > 0.1)
-            pruned = int((~keep).sum())
-            merged = merged.replace(opacities=opacity).select(keep)
-            inner = inner[keep]
         report_progress(progress, total, total, "filled")
         report = {
             "interior_gaussians": int(inner.sum()),
-            "pruned": pruned,
+            "pruned": refined.pop("pruned", 0),
             "method": field.source,
             **field.report,
             "volume": float(occupied.sum() * box.voxel**3),
@@ -219,6 +217,7 @@ class Fill(Stage):
             "hollow_fraction": hollow,
             "grid": list(box.shape),
             "voxel": box.voxel,
+            **placed,
             **refined,
             "seconds": time.perf_counter() - began,
         }
@@ -308,44 +307,6 @@ class Fill(Stage):
         wall = solid & (depth <= self.hollow)
         removed = 1.0 - float(wall.sum()) / max(int(solid.sum()), 1)
         return wall, np.where(wall, depth, 0.0).astype(np.float32), nearest, removed
-
-    def _populate(
-        self,
-        surface: Gaussians,
-        solid: np.ndarray,
-        depth: np.ndarray,
-        nearest: np.ndarray,
-        box: GridBox,
-    ) -> tuple[Gaussians, Tensor]:
-        """Append interior Gaussians that wear the colour of the surface nearest to them."""
-        from gsfluent.data import INTERIOR, Gaussians
-
-        spacing = self.spacing
-        if spacing is None:
-            spacing = max(1.25, float(solid.sum() / max(self.max_interior, 1)) ** (1 / 3))
-        origin = np.asarray(box.origin)
-        centers, sigma = interior_gaussians(
-            solid, depth, origin, box.voxel, spacing * box.voxel, self.seed
-        )
-        count = centers.shape[0]
-        device, dtype = surface.means.device, surface.dtype
-        inner = torch.zeros(surface.count + count, dtype=torch.bool, device=device)
-        inner[surface.count :] = True
-        if count == 0:
-            return surface, inner
-        voxel = tuple(np.floor((centers - origin) / box.voxel).astype(int).T)
-        skin = np.stack([nearest[i][voxel] for i in range(3)], axis=1)
-        # few distinct skin voxels serve many Gaussians; asking the tree from deep inside is slow
-        unique, back = np.unique(skin, axis=0, return_inverse=True)
-        color = surface_colors(surface, box.centers(unique), box.voxel)[back.reshape(-1)]
-        interior = Gaussians.from_colors(
-            torch.from_numpy(centers).to(device, dtype),
-            torch.full((count,), sigma, dtype=dtype, device=device),
-            torch.from_numpy(color).to(device, dtype),
-            opacities=_INTERIOR_OPACITY,
-            label=INTERIOR,
-        )
-        return Gaussians.cat([surface.replace(normals=None), interior]), inner
 
 
 def _parse_hollow(hollow: str | float) -> float | None:

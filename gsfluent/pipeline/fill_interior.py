@@ -1,189 +1,242 @@
-"""Points and Gaussians inside a solid: jittered lattices and the opacity-only refinement."""
+"""Gaussians inside a solid: as fine as the splats of the skin where they meet it, coarser inward.
+
+Matter is cut into pieces that hold one Gaussian each. The pieces are stretches of a Hilbert curve
+(Skilling 2004) with equal shares of the wanted density, so the spacing follows depth smoothly, the
+result depends on nothing but the seed, and the work is one sort.
+"""
 
 from __future__ import annotations
 
-import logging
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .stage import Progress, report_progress
+from .fill_pieces import hilbert_code, sample, signed_depth, small_pieces
+from .fill_view import surface_colors
 
 if TYPE_CHECKING:
-    from gsfluent.data import Capture, Gaussians
+    from gsfluent.data import Gaussians
 
-__all__ = ["interior_gaussians", "jittered_lattice", "refine_opacity"]
+    from .fill_density import GridBox
 
-logger = logging.getLogger(__name__)
+__all__ = ["Placed", "interior_gaussians", "populate", "splat_sizes"]
 
-_SIGMA_PER_SPACING = 0.55  # neighbours overlap at 0.91 sigma: no gaps when the solid is cut open
-_INTERIOR_OPACITY = 0.95
+INTERIOR_OPACITY = 0.98
+_SIGMA_PER_SPACING = 0.5
+_CORE = 1.25  # voxels between Gaussians far from the skin: what a texture volume can show
+_FINEST = 0.5  # voxels; finer splats would repeat one colour of the volume
+_GROWTH = 0.3  # growth of the spacing per depth
+_FINER = 0.75  # of the skin's splats: leaves a narrower gap below the skin
+_STANDOFF = 1.25  # standard deviations between the outermost centres and the skin
+_ROOM = 0.5  # voxels; the largest stand-off
 
 
-def jittered_lattice(
-    inside: np.ndarray, spacing: float, *, seed: int, jitter: float = 1.0
-) -> np.ndarray:
-    """Stratified points: one per cube of edge ``spacing``, uniform inside it, kept where inside.
+class Placed(NamedTuple):
+    """Where interior Gaussians sit."""
 
-    Args:
-        inside: Voxels, bool [X, Y, Z].
-        spacing: Edge of a cube, in voxels.
-        seed: Seed of the jitter.
-        jitter: 0 puts points on cube centres, 1 anywhere in the cube.
-
-    Returns:
-        Positions float64 [M, 3] in voxel units (voxel (i, j, k) spans i..i+1).
-    """
-    if not spacing > 0:
-        raise ValueError(f"jittered_lattice: spacing must be > 0, got {spacing}")
-    occupied = np.argwhere(inside)
-    if occupied.shape[0] == 0:
-        return np.zeros((0, 3))
-    low, high = occupied.min(0), occupied.max(0) + 1
-    counts = np.maximum(np.ceil((high - low) / spacing).astype(int), 1)
-    # the lattice is centred on the box, so a symmetric solid gets a symmetric lattice
-    start = 0.5 * (low + high) - 0.5 * counts * spacing
-    rng = np.random.default_rng(seed)
-    found = []
-    for i in range(counts[0]):  # slab by slab: the full lattice of a large solid need not fit
-        cell = np.stack(
-            np.meshgrid([i], np.arange(counts[1]), np.arange(counts[2]), indexing="ij"), -1
-        ).reshape(-1, 3)
-        shift = 0.5 + jitter * (rng.random(cell.shape) - 0.5)
-        point = start + (cell + shift) * spacing
-        voxel = np.floor(point).astype(int)
-        valid = ((voxel >= 0) & (voxel < inside.shape)).all(1)
-        valid[valid] = inside[tuple(voxel[valid].T)]
-        found.append(point[valid])
-    return np.concatenate(found)
+    centers: Tensor
+    """World positions, float64 [M, 3]."""
+    sigmas: Tensor
+    """Standard deviations [world units], float64 [M]."""
+    depths: Tensor
+    """Depth below the skin [world units], float64 [M]."""
 
 
 def interior_gaussians(
-    inside: np.ndarray,
-    depth: np.ndarray,
-    origin: np.ndarray,
+    inside: Tensor,
+    depth: Tensor,
+    origin: Tensor,
     voxel: float,
-    spacing: float,
-    seed: int,
-) -> tuple[np.ndarray, float]:
-    """Centres of interior Gaussians: a jittered lattice, two standard deviations below the skin.
+    *,
+    skin: Tensor | float,
+    core: float | None = None,
+    max_count: int = 200_000,
+    seed: int = 0,
+) -> Placed:
+    """Spread Gaussians through matter, as fine as the skin's splats at the skin.
+
+    The spacing is ``min(core, skin + 0.3 depth)``; when that asks for more than ``max_count``
+    Gaussians, all spacings grow by one factor. The standard deviation is half the spacing, and
+    nowhere more than 0.8 of the depth, so that nothing sticks out.
 
     Args:
         inside: Voxels, bool [X, Y, Z].
-        depth: Distance below the surface [X, Y, Z], world units.
-        origin: Corner of voxel (0, 0, 0), world units.
+        depth: Depth below the surface [X, Y, Z], world units.
+        origin: Corner of voxel (0, 0, 0) [3], world units.
         voxel: Edge of a voxel, world units.
-        spacing: Lattice spacing, world units.
+        skin: Spacing at the skin, world units: one number, or for every voxel that of the skin
+            nearest to it [X, Y, Z]. Kept between half a voxel and ``core``.
+        core: Largest spacing, world units; None takes 1.25 voxels.
+        max_count: Upper bound on the number of Gaussians.
         seed: Seed of the jitter.
 
     Returns:
-        Centres float64 [M, 3] in world units and their common standard deviation.
+        Centres, standard deviations and depths, on the device of ``inside``.
+
+    Raises:
+        ValueError: ``core`` or ``max_count`` is not positive, or shapes differ.
     """
-    sigma = _SIGMA_PER_SPACING * spacing
-    # thin parts have no room for two sigma; one and a half voxels still keeps them filled
-    deep = inside & (depth > min(2.0 * sigma, 1.5 * voxel))
-    point = jittered_lattice(deep, spacing / voxel, seed=seed, jitter=0.6)
-    return origin + point * voxel, sigma
+    if inside.shape != depth.shape:
+        raise ValueError(
+            f"interior_gaussians: inside {list(inside.shape)} and depth {list(depth.shape)} differ"
+        )
+    widest = _CORE if core is None else core / voxel
+    if not (widest > 0 and max_count > 0):
+        raise ValueError(
+            f"interior_gaussians: core and max_count must be > 0, got {core}, {max_count}"
+        )
+    device = inside.device
+    field = signed_depth(inside, depth / voxel)
+    index = inside.nonzero()
+    near = torch.as_tensor(skin, dtype=torch.float32, device=device).expand(inside.shape)[inside]
+    near = (near / voxel).clamp(min=min(_FINEST, widest), max=widest)
+    wanted = _spacing(near, field[inside], widest)
+    # one factor for all spacings, so that the count stays below the bound
+    factor = max(1.0, float((wanted.double() ** -3).sum() / max_count) ** (1 / 3))
+    point, row, volume = small_pieces(index, factor * wanted, seed)
+    deep = sample(field, point)
+    reach = near[row]
+    # thin parts have no room for the whole stand-off
+    room = (_STANDOFF * _SIGMA_PER_SPACING * factor * reach).clamp(max=_ROOM)
+    kept = deep > room
+    point, reach = point[kept], reach[kept]
+    mass = volume[kept] * (factor * _spacing(reach, deep[kept], widest)) ** -3
+    if len(point) == 0:
+        none = point.new_zeros(0).double()
+        return Placed(point.double(), none, none)
+    # the stand-off left some matter out
+    better = max(1.0, factor * float(mass.double().sum() / max_count) ** (1 / 3))
+    mass, factor = mass * (factor / better) ** 3, better
+    bits = math.ceil(math.log2(8 * max(inside.shape)))
+    order = hilbert_code((point * 8.0).long(), bits).argsort(stable=True)
+    point, reach, mass = point[order].double(), reach[order].double(), mass[order].double()
+    total = mass.cumsum(0)
+    count = min(max(1, round(float(total[-1]))), max_count)
+    stretch = ((total - 0.5 * mass) * (count / float(total[-1]))).long().clamp(0, count - 1)
+    share = torch.zeros(count, dtype=torch.float64, device=device).index_add_(0, stretch, mass)
+
+    def mean(value: Tensor) -> Tensor:
+        """Averages over the stretches."""
+        sums = torch.zeros((count, *value.shape[1:]), dtype=torch.float64, device=device)
+        sums.index_add_(0, stretch, mass.view(-1, *[1] * (value.dim() - 1)) * value)
+        return sums[share > 0] / share[share > 0].view(-1, *[1] * (value.dim() - 1))
+
+    middle, skin_spacing = mean(point), mean(reach)
+    deep = sample(field, middle)
+    # the middle of a bent piece may lie outside a crevice that the piece goes around
+    kept = deep > 0
+    middle, deep, skin_spacing = middle[kept], deep[kept], skin_spacing[kept]
+    spread = _SIGMA_PER_SPACING * factor * _spacing(skin_spacing, deep, widest)
+    spread = torch.minimum(spread, (deep / _STANDOFF).clamp_min(0.1).double())
+    start = origin.to(device, torch.float64)
+    return Placed(start + middle * voxel, spread * voxel, deep.double() * voxel)
 
 
-def refine_opacity(
-    gaussians: Gaussians,
-    interior: Tensor,
-    capture: Capture,
-    *,
-    iterations: int,
-    image_size: int,
-    seed: int,
-    progress: Progress | None = None,
-) -> tuple[Tensor, dict[str, float]]:
-    """Lower the opacity of interior Gaussians that the photographs would show.
+def _spacing(skin: Tensor, depth: Tensor, widest: float) -> Tensor:
+    """Distance between Gaussians [voxels] at some depth, where the skin's splats are ``skin``."""
+    return (skin + _GROWTH * depth.to(skin)).clamp(max=widest)
 
-    Only the interior opacities move; everything else is frozen. During the fit the interior wears
-    the complement of the nearby surface colour, so whatever of it can be seen disagrees with the
-    photographs as much as possible.
+
+def splat_sizes(gaussians: Gaussians, points: np.ndarray) -> np.ndarray:
+    """Standard deviation along the surface of the splats around some points.
 
     Args:
-        gaussians: Surface and interior Gaussians.
-        interior: Mask bool [N] of the interior ones.
-        capture: Posed photographs.
-        iterations: Number of single-view steps.
-        image_size: Longest side of the images used [pixels].
-        seed: Seed of the view order.
-        progress: Optional callback.
+        gaussians: Splats; with labels, only the SURFACE ones are used.
+        points: [M, 3] world units.
 
     Returns:
-        New opacities [N] and a report with the loss of the first and the last round of views.
+        Geometric mean of the two larger scales, averaged over the eight nearest splats with their
+        opacity, float64 [M], world units.
     """
-    from gsfluent.geometry import rgb_to_sh0
-    from gsfluent.ops import rasterize
+    from scipy.spatial import cKDTree
 
-    device, dtype = gaussians.means.device, gaussians.dtype
-    surface = ~interior
-    colors = gaussians.colors().clone()
-    colors[interior] = 1.0 - colors[interior]
-    sh = gaussians.sh.clone()
-    sh[interior] = 0.0
-    sh[interior, 0] = rgb_to_sh0(colors[interior])
-    logit = torch.logit(gaussians.opacities[interior].clamp(0.02, 0.98)).requires_grad_(True)
-    optimizer = torch.optim.Adam([logit], lr=0.4)
-    frozen = gaussians.opacities.detach()
-    rng = np.random.default_rng(seed)
-    order: list[int] = []
-    losses: list[float] = []
-    for step in range(iterations):
-        if not order:
-            order = list(rng.permutation(len(capture.cameras)))
-        image, mask, camera = capture.image(int(order.pop()), max_size=image_size)
-        image = image.to(device, dtype)
-        opacity = frozen.clone()
-        opacity[interior] = torch.sigmoid(logit)
-        rendered = rasterize(
-            gaussians.means,
-            opacity,
-            camera.viewmat.to(device, dtype),
-            camera.K.to(device, dtype),
-            camera.width,
-            camera.height,
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            sh=sh,
-            depth=False,
-        )
-        if mask is None:
-            # without a mask the background is unknown: judge only where the surface itself is seen
-            with torch.no_grad():
-                weight = rasterize(
-                    gaussians.means[surface],
-                    frozen[surface],
-                    camera.viewmat.to(device, dtype),
-                    camera.K.to(device, dtype),
-                    camera.width,
-                    camera.height,
-                    quats=gaussians.quats[surface],
-                    scales=gaussians.scales[surface],
-                    sh=gaussians.sh[surface],
-                    depth=False,
-                ).alpha
-            loss = (weight[..., None] * (rendered.image - image) ** 2).mean()
-            loss = loss + ((1 - weight) * rendered.alpha**2).mean()
-        else:
-            target = mask.to(device, dtype)
-            loss = (target[..., None] * (rendered.image - image) ** 2).mean()
-            loss = loss + ((1 - target) * rendered.alpha**2).mean()
-        # what no photograph can see stays opaque: a weak pull towards the starting value
-        loss = loss + 1e-4 * ((torch.sigmoid(logit) - _INTERIOR_OPACITY) ** 2).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-        report_progress(progress, step + 1, iterations, "interior opacity")
-    views = min(len(capture.cameras), max(1, iterations // 2))
-    report = {
-        "opacity_loss_first": float(np.mean(losses[:views])),
-        "opacity_loss_last": float(np.mean(losses[-views:])),
+    from gsfluent.data import SURFACE
+
+    if gaussians.labels is not None:
+        gaussians = gaussians.select(gaussians.labels == SURFACE)
+    means = gaussians.means.detach().double().cpu().numpy()
+    scales = gaussians.scales.detach().double().sort(dim=1).values.cpu().numpy()
+    size = 0.5 * np.log(np.maximum(scales[:, 1] * scales[:, 2], 1e-300))
+    alpha = gaussians.opacities.detach().double().cpu().numpy() + 1e-4
+    count = min(8, len(means))
+    _, nearest = cKDTree(means).query(points, k=count)
+    nearest = nearest.reshape(-1, count)
+    weight = alpha[nearest]
+    result: np.ndarray = np.exp((weight * size[nearest]).sum(1) / weight.sum(1))
+    return result
+
+
+def populate(
+    surface: Gaussians,
+    solid: np.ndarray,
+    depth: np.ndarray,
+    nearest: np.ndarray,
+    box: GridBox,
+    *,
+    spacing: float | None,
+    max_interior: int,
+    seed: int,
+) -> tuple[Gaussians, Tensor, dict[str, Any]]:
+    """Append interior Gaussians that wear the colour of the surface nearest to them.
+
+    Args:
+        surface: Splats of the shell.
+        solid: Matter, bool [X, Y, Z].
+        depth: Depth below the surface [X, Y, Z], world units.
+        nearest: Index of the nearest outer voxel [3, X, Y, Z].
+        box: The grid.
+        spacing: Largest distance between interior Gaussians in voxels; None takes 1.25.
+        max_interior: Upper bound on their number.
+        seed: Seed of the jitter.
+
+    Returns:
+        All Gaussians, which of them are interior (bool [N]), and ``spacing_skin, spacing_core``
+        (5 % and 95 % quantiles, voxels) for the report.
+    """
+    from gsfluent.data import INTERIOR, Gaussians
+
+    device, dtype = surface.means.device, surface.dtype
+    index = np.argwhere(solid)
+    # few distinct skin voxels serve many voxels; asking the tree from deep inside is slow
+    skin = np.stack([axis[solid] for axis in nearest], axis=1)
+    flat, back = np.unique(np.ravel_multi_index(tuple(skin.T), solid.shape), return_inverse=True)
+    place = box.centers(np.stack(np.unravel_index(flat, solid.shape), axis=1))
+    size = np.zeros(solid.shape, np.float32)
+    if len(index):
+        wide = splat_sizes(surface, place) * (_FINER / _SIGMA_PER_SPACING)
+        size[solid] = wide[back.reshape(-1)]
+    placed = interior_gaussians(
+        torch.from_numpy(solid).to(device),
+        torch.from_numpy(depth).to(device),
+        torch.tensor(box.origin, dtype=torch.float64),
+        box.voxel,
+        skin=torch.from_numpy(size).to(device),
+        core=None if spacing is None else spacing * box.voxel,
+        max_count=max_interior,
+        seed=seed,
+    )
+    count = len(placed.centers)
+    inner = torch.zeros(surface.count + count, dtype=torch.bool, device=device)
+    inner[surface.count :] = True
+    if count == 0:
+        return surface, inner, {}
+    row = np.zeros(solid.shape, np.int64)
+    row[solid] = back.reshape(-1)
+    at = ((placed.centers.cpu().numpy() - np.asarray(box.origin)) / box.voxel).astype(np.int64)
+    color = surface_colors(surface, place, box.voxel)[row[tuple(at.T)]]
+    interior = Gaussians.from_colors(
+        placed.centers.to(device, dtype),
+        placed.sigmas.to(device, dtype),
+        torch.from_numpy(color).to(device, dtype),
+        opacities=INTERIOR_OPACITY,
+        label=INTERIOR,
+    )
+    ranked = (placed.sigmas / (_SIGMA_PER_SPACING * box.voxel)).sort().values
+    notes = {
+        "spacing_skin": float(ranked[count // 20]),
+        "spacing_core": float(ranked[count - 1 - count // 20]),
     }
-    result = frozen.clone()
-    result[interior] = torch.sigmoid(logit.detach()).to(dtype)
-    return result, report
+    return Gaussians.cat([surface.replace(normals=None), interior]), inner, notes

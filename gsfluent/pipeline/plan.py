@@ -97,7 +97,7 @@ def _stand_in(shot: Shot, warnings: list[str]) -> tuple[Solid, Frame, str]:
         gaussians = load(shot.splats).validated(shot.splats.name)
         frame = make_frame(gaussians, None, shot)
         options = shot.fill.given(frame.scale) | {"resolution": _STAND_IN_VOXELS}
-        solid = Fill(**options, refine_iterations=0)(gaussians)
+        solid = Fill(**options, refine_views=0)(gaussians)
         return _grey(solid), frame, f"the splat, filled at {_STAND_IN_VOXELS} voxels"
     if shot.capture is None:
         raise InputError("the shot has neither capture nor splats", "name one input")

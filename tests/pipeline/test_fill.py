@@ -17,7 +17,6 @@ from gsfluent.io import load_capture
 from gsfluent.pipeline.fill import Fill, cut_view
 from gsfluent.pipeline.fill_density import GridBox, density_field
 from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, count_leaks
-from gsfluent.pipeline.fill_interior import jittered_lattice, refine_opacity
 
 
 def _bottom_missing(points: torch.Tensor) -> torch.Tensor:
@@ -104,9 +103,8 @@ def test_bare_flood_fill_would_have_lost_the_object() -> None:
 
 
 def test_underside_stays_open_when_told() -> None:
-    filled = Fill(32, match_masks=False, close_underside=False)(
-        ellipsoid_shell(keep=_bottom_missing)
-    )
+    shell = ellipsoid_shell(keep=_bottom_missing)
+    filled = Fill(32, match_masks=False, close_underside=False)(shell)
     closed = Fill(32, match_masks=False)(shell)
     assert filled.volume < 0.9 * closed.volume
 
@@ -185,19 +183,6 @@ def test_hollow_wall() -> None:
     assert solid_again.report["hollow_fraction"] == 0.0
 
 
-def test_lattice_is_stratified() -> None:
-    inside = np.ones((12, 10, 8), bool)
-    points = jittered_lattice(inside, 2.0, seed=3)
-    # one point per cube of two voxels, in its own cube
-    assert len(points) == 6 * 5 * 4
-    assert len(np.unique(np.floor(points / 2.0), axis=0)) == len(points)
-    assert np.array_equal(points, jittered_lattice(inside, 2.0, seed=3))
-    assert not np.array_equal(points, jittered_lattice(inside, 2.0, seed=4))
-    centered = jittered_lattice(inside, 2.0, seed=3, jitter=0.0)
-    assert np.allclose(centered % 2.0, 1.0)
-    assert len(jittered_lattice(np.zeros((4, 4, 4), bool), 2.0, seed=0)) == 0
-
-
 def test_same_seed_same_solid() -> None:
     a, b = Fill(24, seed=5)(ellipsoid_shell(800)), Fill(24, seed=5)(ellipsoid_shell(800))
     assert torch.equal(a.gaussians.means, b.gaussians.means)
@@ -251,7 +236,7 @@ def test_masks_remove_what_is_not_the_object(tmp_path: Path) -> None:
     lump = ellipsoid_shell(400, (0.3, 0.3, 0.3))
     stray = lump.replace(means=lump.means + torch.tensor([0.0, 1.0, 0.0]))
     both = Gaussians.cat([ellipsoid_shell(), stray])
-    hull = Fill(40, method="hull", refine_iterations=0)(both, capture)
+    hull = Fill(40, method="hull", refine_views=0)(both, capture)
     vote = Fill(40, method="vote")(both)
     assert hull.report["closed_by"] == "hull and vote"
     assert iou(hull.occupancy.numpy(), ellipsoid_truth(hull)) > 0.93
@@ -260,32 +245,12 @@ def test_masks_remove_what_is_not_the_object(tmp_path: Path) -> None:
     )
 
 
-def test_opacity_fit_hides_what_the_photographs_would_show(tmp_path: Path) -> None:
-    capture = _silhouettes(tmp_path)
-    surface = ellipsoid_shell(1500)
-    spilled = torch.tensor([[0.0, 1.1, 0.0], [0.0, 0.0, 1.0], [0.3, -1.05, 0.1]])
-    hidden = torch.tensor([[0.0, 0.0, 0.0], [0.3, 0.1, 0.0], [-0.4, 0.0, 0.1]])
-    inner = Gaussians.from_colors(
-        torch.cat([spilled, hidden]),
-        torch.full((6,), 0.08),
-        torch.full((6, 3), 0.5),
-        opacities=0.95,
-    )
-    both = Gaussians.cat([surface, inner])
-    chosen = torch.arange(both.count) >= surface.count
-    opacity, report = refine_opacity(both, chosen, capture, iterations=24, image_size=60, seed=0)
-    assert torch.equal(opacity[~chosen], both.opacities[~chosen])
-    assert float(opacity[chosen][:3].max()) < 0.3
-    assert float(opacity[chosen][3:].min()) > 0.85
-    assert report["opacity_loss_last"] < report["opacity_loss_first"]
-
-
 def test_capture_prunes_and_reports(tmp_path: Path) -> None:
-    filled = Fill(24, refine_iterations=4, refine_image_size=48)(
+    filled = Fill(24, refine_views=4, refine_image_size=48)(
         ellipsoid_shell(800), _silhouettes(tmp_path)
     )
     assert filled.report["closed_by"] == "hull and vote"
-    assert "opacity_loss_last" in filled.report
+    assert filled.report["seen_after"] <= filled.report["seen_before"]
     inner = int((filled.gaussians.labels == INTERIOR).sum())
     assert inner == filled.report["interior_gaussians"]
     assert filled.report["leaks"] == 0
@@ -324,8 +289,6 @@ def test_errors() -> None:
     with pytest.raises(InputError, match="no voxel reaches"):
         Fill(24)(shell.replace(opacities=shell.opacities * 1e-3))
     filled = Fill(24)(shell)
-    with pytest.raises(ValueError, match="spacing"):
-        jittered_lattice(np.ones((4, 4, 4), bool), 0.0, seed=0)
     with pytest.raises(ValueError, match="axis"):
         cut_view(filled, "w")
 
@@ -362,7 +325,7 @@ def test_masks_say_how_far_the_skin_lies_from_the_centres_of_the_splats(tmp_path
     shares = {}
     for photographs in (None, capture):
         known = photographs is not None
-        solid = Fill(48, match_masks=known, refine_iterations=0)(sunk, photographs)
+        solid = Fill(48, match_masks=known, refine_views=0)(sunk, photographs)
         guess = solid.contains(points.float())
         shares[photographs is None] = float((guess & true).sum() / (guess | true).sum())
     assert solid.report["skin_offset"] > 0.2
