@@ -21,7 +21,19 @@ from gsfluent.errors import InputError
 from gsfluent.materials import Material
 
 Vector = tuple[float, float, float]
-_WHERE_KEYS = ("depth_below", "depth_above", "color_near", "tolerance", "box", "sphere", "region")
+_WHERE_KEYS = (
+    "depth_below",
+    "depth_above",
+    "color_near",
+    "tolerance",
+    "box",
+    "sphere",
+    "mask",
+    "labels",
+    "label_image",
+    "label",
+    "region",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +45,9 @@ class Part:
         where: Conditions that must all hold: ``depth_below`` / ``depth_above`` [m under the
             surface], ``color_near`` ([r, g, b] in 0..1, with ``tolerance``, default 0.15),
             ``box`` ([[x, y, z], [x, y, z]]) and ``sphere`` ([x, y, z, radius]) in scene metres
-            before any event moves the solid, ``region`` (number in ``Solid.regions``).
+            before any event moves the solid, ``mask`` (folder of masks), ``labels`` (segmentation
+            of the photographs) or ``label_image`` (picture, or pictures by axis) with ``label``
+            (name or number), ``region`` (number in ``Solid.regions``). See docs/regions.md.
         overrides: Material parameters of the region; ``material`` starts from another preset.
     """
 
@@ -60,6 +74,12 @@ class Part:
             )
         for key in where:
             known_key(f"part {name!r}, where", key, _WHERE_KEYS)
+        sources = [key for key in ("mask", "labels", "label_image") if key in where]
+        if len(sources) > 1:
+            raise InputError(
+                f"part {name!r}: 'where' has both {sources[0]} and {sources[1]}",
+                mend="keep one of them, or make two parts",
+            )
         for key in rest:
             known_key(
                 f"part {name!r}",

@@ -143,6 +143,7 @@ class Texture(Verb):
       gsfluent texture solid.ply -o textured.ply                       # from the skin's colours
       gsfluent texture solid.ply -o textured.ply --exemplar cut.jpg    # from a photo of a cut
       gsfluent texture solid.ply -o textured.ply --method diffusion --model PATH --prompt "flesh"
+      gsfluent texture solid.ply -o textured.ply --method inpaint --inpaint backend=telea tile=2
 
     Writes textured.ply with its volume, and textured.cuts.png with three cut views.
     """
@@ -152,7 +153,7 @@ class Texture(Verb):
     out: Out
     """The .ply to write."""
     method: str | None = None
-    """exemplar, diffusion, color_copy or procedural."""
+    """exemplar, diffusion, inpaint, color_copy or procedural."""
     exemplar: Path | None = None
     """Photograph of a cut through such an object."""
     preset: str | None = None
@@ -165,11 +166,18 @@ class Texture(Verb):
     """What the inside looks like, for diffusion."""
     model: str | None = None
     """Path or hub id of a diffusers SD-XL inpainting model."""
+    inpaint: tuple[str, ...] = ()
+    """Settings of the slice methods, name=value (see texture.inpaint in docs/shot.md)."""
+    resume: Path | None = None
+    """Folder for finished slices, found again after a kill."""
+    polish: bool = False
+    """Fit interior splats coarser than the voxels to slices of the colours."""
     capture: Path | None = None
     """Photographs that the splat was made from."""
 
     def execute(self) -> dict[str, Any]:
         """Texture and write."""
+        from gsfluent.config.settings_inpaint import read_inpaint
         from gsfluent.pipeline.run_single import texture_to
 
         existing(self.solid, "solid.ply", folder=False)
@@ -182,6 +190,9 @@ class Texture(Verb):
             "guide": self.guide,
             "prompt": self.prompt,
             "model": self.model,
+            "inpaint": read_inpaint(self.inpaint) or None,
+            "resume": self.resume,
+            "polish": self.polish or None,
         }
         options = {name: value for name, value in given.items() if value is not None}
         with self.progress("texture") as progress:
@@ -235,5 +246,4 @@ class Mesh(Verb):
             method=self.method,
             resolution=self.resolution,
             scale=self.scale,
-            seed=self.seed,
         )

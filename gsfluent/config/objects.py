@@ -47,6 +47,25 @@ def read_sphere(value: Any, place: Place) -> tuple[float, ...]:
     return numbers
 
 
+def read_label(value: Any, place: Place) -> str | int:
+    """Read the name or the number of a label."""
+    if isinstance(value, str):
+        return str(text(value, place))
+    number_: int = whole(1, 2**31 - 1)(value, place)
+    return number_
+
+
+def read_label_image(value: Any, place: Place) -> Path | dict[str, Path]:
+    """Read a file, or files by axis."""
+    if not isinstance(value, Mapping):
+        return existing_path(value, place)
+    images = mapping(value, place)
+    refuse_unknown(images, ("x", "y", "z"), place)
+    if not images:
+        raise place.error("name a file for x, y or z", value)
+    return {axis: existing_path(file, place.inside(axis)) for axis, file in images.items()}
+
+
 @dataclasses.dataclass(frozen=True)
 class Where:
     """``where:`` - which matter a part is made of; all conditions given must hold."""
@@ -77,6 +96,33 @@ class Where:
         read_sphere, default=None, doc="Inside this sphere, scene metres: x, y, z, radius.",
         example="[0, 0, 0.1, 0.05]",
     )  # fmt: skip
+    mask: Path | None = key(
+        existing_path,
+        default=None,
+        doc="Folder with a mask per photograph: white is this part.",
+        example="parts/stem",
+    )
+    labels: Path | None = key(
+        existing_path,
+        default=None,
+        doc="Segmentation of the photographs: label images, a folder of masks per label, "
+        "Segment Anything's folders or JSON, NumPy maps; picks label.",
+        example="segmentation",
+    )
+    label_image: Path | dict[str, Path] | None = key(
+        read_label_image,
+        default=None,
+        doc="Picture of labels projected along an axis (x, y, z) of the scene, or, without an "
+        "axis, of a cut whose labels follow depth; picks label.",
+        example="{x: side.png}",
+    )
+    label: str | int | None = key(
+        read_label,
+        default=None,
+        doc="Label in labels or label_image, by name, number or colour (any label if absent); "
+        "alone: a region that the solid has already (inclusion).",
+        example="leaf",
+    )
     region: int | None = key(
         whole(0, 2**31 - 1), default=None, doc="Part number in the solid's voxels.", example="1"
     )
@@ -223,6 +269,7 @@ def _parts(material: str, base: Mapping[str, Any], value: Any, place: Place) -> 
         _needs(
             chosen.tolerance, chosen.color_near, "tolerance", "color_near", where.inside("where")
         )
+        _one_source(chosen, where.inside("where"))
         if not chosen.given():
             raise InputError(
                 f"{where.path}.where must name a condition",
@@ -243,6 +290,18 @@ def _parts(material: str, base: Mapping[str, Any], value: Any, place: Place) -> 
             )
         parts.append(Part(name, chosen, overrides))
     return tuple(parts)
+
+
+def _one_source(chosen: Where, place: Place) -> None:
+    given_ = [name for name in ("mask", "labels", "label_image") if getattr(chosen, name)]
+    if len(given_) > 1:
+        raise InputError(
+            f"{place.path} has both {given_[0]} and {given_[1]}", "keep one of them, or two parts"
+        )
+    if chosen.mask is not None and chosen.label is not None:
+        raise InputError(
+            f"{place.inside('label').path} does nothing with mask", "remove it, or write labels"
+        )
 
 
 def _refuse_parameters(settings: Mapping[str, Any], extra: tuple[str, ...], place: Place) -> None:

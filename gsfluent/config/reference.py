@@ -21,6 +21,7 @@ from gsfluent.config.settings import (
     SolveSettings,
     TextureSettings,
 )
+from gsfluent.config.settings_inpaint import InpaintSettings
 from gsfluent.config.shot import Shot
 
 SECTIONS: dict[str, type[Any]] = {
@@ -28,6 +29,7 @@ SECTIONS: dict[str, type[Any]] = {
     "reconstruct": ReconstructSettings,
     "fill": FillSettings,
     "texture": TextureSettings,
+    "texture.inpaint": InpaintSettings,
     "texture.photo": PhotoSettings,
     "objects.NAME.select": Select,
     "objects.NAME.parts[].where": Where,

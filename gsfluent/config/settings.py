@@ -25,6 +25,7 @@ from gsfluent.config.read import (
     vector,
     whole,
 )
+from gsfluent.config.settings_inpaint import InpaintSettings
 from gsfluent.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -50,7 +51,15 @@ def _camera(value: Any, place: Place) -> str | int | Path:
     return index
 
 
-_TEXTURE_METHODS = ("exemplar", "diffusion", "color_copy", "procedural", "profile", "telea")
+_TEXTURE_METHODS = (
+    "exemplar",
+    "diffusion",
+    "inpaint",
+    "color_copy",
+    "procedural",
+    "profile",
+    "telea",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,19 +267,32 @@ class TextureSettings:
         doc="Preparation of photographs (method exemplar).",
         example="{stain: true}",
     )
+    inpaint: InpaintSettings | None = key(
+        nested(InpaintSettings),
+        default=None,
+        doc="How slices are inpainted (methods diffusion and inpaint).",
+        example="{tile: 2, memory: balanced}",
+    )
+    polish: bool | None = key(
+        flag,
+        default=None,
+        doc="Fit interior splats coarser than the voxels to slices of the colours.",
+        example="true",
+    )
 
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
         values = given(self)
         if self.photo is not None:
             values["photo"] = given(self.photo)
+        if self.inpaint is not None:
+            values["inpaint"] = self.inpaint.given()
         return values
 
 
 _TEXTURE_READERS = {
     "preset": ("procedural",),
-    "prompt": ("diffusion",),
-    "model": ("diffusion",),
+    **dict.fromkeys(("prompt", "model", "inpaint"), ("diffusion", "inpaint")),
     **dict.fromkeys(
         ("quality", "scale", "guide", "directional", "inclusions", "photo"), ("exemplar",)
     ),
@@ -290,9 +312,19 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
                 f"{place.inside(name).path} does nothing with method {method}",
                 f"remove it, or set method: {readers[0]}",
             )
-    needed = {"exemplar": "exemplar", "procedural": "preset", "diffusion": "model"}.get(
-        method or ""
-    )
+    inpaint = settings.inpaint
+    if (
+        method in ("diffusion", "inpaint")
+        and inpaint
+        and inpaint.backend not in (None, "diffusers")
+    ):
+        return settings
+    needed = {
+        "exemplar": "exemplar",
+        "procedural": "preset",
+        "diffusion": "model",
+        "inpaint": "model",
+    }.get(method or "")
     if needed is not None and getattr(settings, needed) is None:
         raise InputError(
             f"{place.inside(needed).path} is missing",

@@ -176,6 +176,8 @@ class Shot:
             raise InputError(
                 "floor: plane is found in a capture, got splats", "use auto, or its height"
             )
+        if shot.capture is None:
+            _refuse_photographs(shot.objects)
         if not shot.objects:
             shot = dataclasses.replace(shot, objects={"object": ObjectSettings("object")})
         if shot.floor == "none" and (shot.floor_mode, shot.floor_friction) != ("separate", 0.4):
@@ -199,6 +201,19 @@ class Shot:
         values["events"] = [event_dict(event) for event in self.events]
         values["colliders"] = [collider_dict(settings) for settings in self.colliders]
         return without_none(values)
+
+
+def _refuse_photographs(objects: Mapping[str, ObjectSettings]) -> None:
+    """Refuse parts that are told by photographs where there are none."""
+    for name, settings in objects.items():
+        for part in settings.parts or ():
+            for kind in ("mask", "labels"):
+                if getattr(part.where, kind) is not None:
+                    raise InputError(
+                        f"objects.{name}.parts.{part.name}.where.{kind} needs photographs, "
+                        "got splats",
+                        "start from the capture, or use label_image",
+                    )
 
 
 def load_shot(path: str | Path) -> Shot:

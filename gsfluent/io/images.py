@@ -166,6 +166,39 @@ def load_view(camera: Camera, max_size: int | None = None) -> View:
     )
 
 
+def pinhole_map(
+    camera: Camera, labels: NDArray[np.int32], max_size: int | None = None
+) -> tuple[Camera, NDArray[np.int32]]:
+    """Bring a label map of a photograph to the pinhole view that :func:`load_view` makes of it.
+
+    Args:
+        camera: Camera of the photograph.
+        labels: Label per pixel of the photograph, or of a resized copy, int32 [H, W].
+        max_size: Largest side in pixels, or None to keep the map's size.
+
+    Returns:
+        The pinhole camera and the map, nearest neighbour, -1 where the photograph does not reach.
+    """
+    import cv2
+
+    camera = camera.resized(labels.shape[1], labels.shape[0])
+    if max_size is not None:
+        camera = camera.scaled(min(1.0, max_size / max(labels.shape)))
+    size = (camera.width, camera.height)
+    if size != (labels.shape[1], labels.shape[0]):
+        # the pixel that holds the centre of the new one (OpenCV's own nearest takes the corner)
+        rows = ((np.arange(size[1]) + 0.5) * labels.shape[0] / size[1]).astype(np.int64)
+        columns = ((np.arange(size[0]) + 0.5) * labels.shape[1] / size[0]).astype(np.int64)
+        labels = labels[rows[:, None], columns[None, :]]
+    if any(camera.distortion):
+        pinhole = undistorted(camera)
+        exact = labels.astype(np.float64)  # OpenCV does not remap int32
+        moved, covered = _remap(exact, camera, pinhole, cv2.INTER_NEAREST)
+        labels = np.where(covered, moved, -1).astype(np.int32)
+        camera = pinhole
+    return camera.replace(distortion=()), np.ascontiguousarray(labels)
+
+
 def undistorted(camera: Camera) -> Camera:
     """Return the pinhole camera that :func:`load_view` resamples ``camera`` to, same size."""
     if not any(camera.distortion):
@@ -237,7 +270,7 @@ def _resize(values: NDArray[Any], width: int, height: int) -> NDArray[Any]:
 
 
 def _remap(
-    values: NDArray[Any], camera: Camera, pinhole: Camera
+    values: NDArray[Any], camera: Camera, pinhole: Camera, interpolation: int | None = None
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Resample to the pinhole image; also tell which pixels the photograph covers."""
     import cv2
@@ -258,7 +291,6 @@ def _remap(
         & (down >= -0.5)
         & (down <= camera.height - 0.5)
     )
-    moved = cv2.remap(
-        values, across, down, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    chosen = cv2.INTER_LINEAR if interpolation is None else interpolation
+    moved = cv2.remap(values, across, down, interpolation=chosen, borderMode=cv2.BORDER_REPLICATE)
     return moved, inside

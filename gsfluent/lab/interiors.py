@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsfluent.errors import InputError
 from gsfluent.pipeline.texture.domain import SHELL, InteriorDomain
 from gsfluent.pipeline.texture.procedural import procedural_texture
+
+if TYPE_CHECKING:
+    from gsfluent.data import Solid
 
 __all__ = ["KNOWN_INTERIORS", "KnownInterior", "known_interior", "upright"]
 
@@ -60,6 +63,30 @@ class KnownInterior:
             alpha = np.take(self.domain.inside, index, axis)[..., None].astype(np.float32)
             pictures[name] = upright(np.concatenate([color, alpha], -1))
         return pictures
+
+    def solid(self) -> Solid:
+        """The object as the stages know it: surface splats and voxels, nothing inside.
+
+        Eight coincident splats stand for every voxel of the shell, because the colour of the
+        surface is averaged over the eight nearest ones: the method is given the true colours.
+        """
+        import torch
+
+        from gsfluent.data import SURFACE, Gaussians, Solid
+
+        domain = self.domain
+        index = torch.from_numpy(np.argwhere(domain.shell)).repeat_interleave(8, 0)
+        colors = torch.from_numpy(self.rgb[domain.shell]).repeat_interleave(8, 0)
+        means = (index + 0.5).float() * domain.voxel
+        scales = torch.full_like(means, 0.5 * domain.voxel)
+        splats = Gaussians.from_colors(means, scales, colors, opacities=0.95, label=SURFACE)
+        return Solid(
+            gaussians=splats,
+            occupancy=torch.from_numpy(domain.inside),
+            depth=torch.from_numpy(domain.depth * np.float32(domain.voxel)),
+            origin=torch.zeros(3),
+            voxel=domain.voxel,
+        )
 
 
 def upright(plane: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from gsfluent.pipeline.texture.domain import InteriorDomain, InteriorTexture
 
 from .interiors import KnownInterior
 
-__all__ = ["Judge", "Plane", "held_out_planes", "judge", "sample_plane"]
+__all__ = ["Judge", "Plane", "crossing_error", "held_out_planes", "judge", "sample_plane"]
 
 Plane = tuple[np.ndarray, np.ndarray, np.ndarray]
 """A point on the plane and two unit vectors in it (columns, rows), voxel units."""
@@ -25,6 +25,8 @@ Plane = tuple[np.ndarray, np.ndarray, np.ndarray]
 _PLACES = ((0.34, 0.60), (0.34, 0.60), (0.22, 0.56))
 """Where the slices lie along x, y and z. Level ones pass through the same sponge in every cake: one
 that met the cream in some draws only would make the floor a matter of luck."""
+_PATCHES = 40000
+"""With fewer the draw of patches costs more than another object of the class."""
 _KEEP_OFF = 3.0
 """Held-out slices stay this far from a photographed one [voxels]."""
 
@@ -136,9 +138,9 @@ class Judge:
         change = metrics.neighbour_change(rgb, domain.inside)
         true_change = metrics.neighbour_change(self.known.rgb, self.known.domain.inside)
         return {
-            "patch": metrics.patch_distance(own, truth),
+            "patch": metrics.patch_distance(own, truth, samples=_PATCHES),
             "patch_coarse": metrics.patch_distance(
-                metrics.half_size(own), metrics.half_size(truth)
+                metrics.half_size(own), metrics.half_size(truth), samples=_PATCHES
             ),
             "hist": metrics.lab_histogram_distance(_colors(own), _colors(truth)),
             "profile": metrics.depth_profile_difference(
@@ -151,6 +153,44 @@ class Judge:
             "coherence": coherence,
             "coverage": coverage,
         }
+
+
+def crossing_error(known: KnownInterior, rgb: np.ndarray) -> float:
+    """Largest difference between slices across x, y and z along the lines where they cross.
+
+    The slices are read from the volume as pictures (:func:`sample_plane`) and compared pixel by
+    pixel: 0 says that what is seen in one slice is what is seen in another.
+    """
+    planes = held_out_planes(known)[:6]
+    pictures = [sample_plane(known.domain, rgb, plane) for plane in planes]
+    size = max(known.domain.inside.shape)
+
+    def pixel(number: int, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        point, u, v = planes[number]
+        column = (voxel + 0.5 - point) @ u + size // 2
+        row = size // 2 - (voxel + 0.5 - point) @ v
+        return np.rint(row).astype(int), np.rint(column).astype(int)
+
+    worst, pixels = 0.0, 0
+    for one in range(6):
+        for two in range(one + 1, 6):
+            a, b = one // 2, two // 2
+            if a == b:
+                continue
+            line = np.zeros((size, 3))
+            line[:, a] = planes[one][0][a] - 0.5
+            line[:, b] = planes[two][0][b] - 0.5
+            line[:, 3 - a - b] = np.arange(size)
+            first, second = pixel(one, line), pixel(two, line)
+            seen = np.ones(size, bool)
+            for place in (*first, *second):
+                seen &= (place >= 0) & (place < size)
+            first = (first[0][seen], first[1][seen])
+            second = (second[0][seen], second[1][seen])
+            both = pictures[one][1][first] & pictures[two][1][second]
+            apart = np.abs(pictures[one][0][first] - pictures[two][0][second])[both]
+            worst, pixels = max(worst, float(apart.max(initial=0.0))), pixels + int(both.sum())
+    return worst if pixels else float("nan")
 
 
 def _colors(slices: list[metrics.Slice]) -> np.ndarray:

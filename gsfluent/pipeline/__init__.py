@@ -14,6 +14,7 @@ _PUBLIC: dict[str, str] = {
     "Isolate": "gsfluent.pipeline.isolate",
     "Fill": "gsfluent.pipeline.fill",
     "Texture": "gsfluent.pipeline.texture",
+    "label_regions": "gsfluent.pipeline.regions",
     "Simulate": "gsfluent.pipeline.simulate",
     "Repair": "gsfluent.pipeline.repair",
     "Render": "gsfluent.pipeline.render",

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from .fill_pieces import hilbert_code, sample, signed_depth, small_pieces
-from .fill_skin import surface_colors
+from .fill_colors import surface_colors
 
 if TYPE_CHECKING:
     from gsfluent.data import Gaussians

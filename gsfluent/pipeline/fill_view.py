@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .draw import draw
-from .fill_skin import skin_colors, skin_weights
+from .fill_colors import skin_colors, skin_weights
 
 if TYPE_CHECKING:
     from gsfluent.data import Solid
@@ -85,7 +85,7 @@ def cut_view(
         tilt: Angle [degrees] by which the viewer stands above the normal of the plane, below 80.
         splats: Draw the skin behind the plane with the splats themselves; False takes averaged
             colours.
-        weights: From :func:`gsfluent.pipeline.fill_skin.skin_weights`, when there are several
+        weights: From :func:`gsfluent.pipeline.fill_colors.skin_weights`, when there are several
             views of one solid.
 
     Returns:

@@ -20,6 +20,7 @@ from gsfluent import materials
 from gsfluent.data import Frame, Particles, Solid
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
+from gsfluent.pipeline.regions_table import SOURCES, region_mask
 from gsfluent.scene import Body, Part, Scene
 from gsfluent.scene_parts import quaternion_to, turned
 
@@ -346,6 +347,10 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
         wanted = torch.tensor(where["color_near"], dtype=torch.float64)
         color = solid.color_at(on_device).cpu().to(torch.float64)
         mask &= (color - wanted).norm(dim=1) <= float(where.get("tolerance", 0.15))
+    if any(name in where for name in (*SOURCES, "label")):
+        chosen = torch.from_numpy(region_mask(solid, where, part.name))
+        voxel = solid.voxel_index(on_device)[0].cpu()
+        mask &= chosen[voxel[:, 0], voxel[:, 1], voxel[:, 2]]
     if "region" in where:
         if solid.regions is None:
             raise InputError(

@@ -10,7 +10,7 @@ import torch
 
 from gsfluent.data import Solid
 from gsfluent.io import save_image
-from gsfluent.pipeline.fill_skin import skin_weights
+from gsfluent.pipeline.fill_colors import skin_weights
 from gsfluent.pipeline.fill_view import cut_view
 
 _HEIGHT = 360

@@ -26,6 +26,7 @@ from gsfluent.pipeline.run_prepare import (
     texture_stage,
 )
 from gsfluent.pipeline.run_record import RunRecord
+from gsfluent.pipeline.run_regions import regions_stage
 from gsfluent.pipeline.run_show import export_stage, render_stage
 from gsfluent.pipeline.run_simulate import simulate_stage
 from gsfluent.pipeline.run_store import StageResult, StageStore
@@ -80,6 +81,7 @@ def run_shot(
         isolate_stage(context)
         fill_stage(context)
         texture_stage(context)
+        regions_stage(context)
         simulate_stage(context)
         render_stage(context)
         export_stage(context)

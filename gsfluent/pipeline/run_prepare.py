@@ -164,7 +164,8 @@ def texture_stage(context: RunContext) -> None:
         reports = []
         for name in shot.objects:
             solid = Solid.load(context.store.root / "fill" / f"{name}.ply")
-            stage = Texture(**options, seed=context.seed)
+            # slices finished before a kill are found again: the folder outlives it
+            stage = Texture(**options, resume=folder / f"{name}.slices", seed=context.seed)
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
             textured.save(folder / f"{name}.ply")
             save_cut_views(textured, folder / f"{name}.png")

@@ -15,6 +15,7 @@ from gsfluent.materials import Material
 from gsfluent.pipeline.rigid_splats import bare_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
+from gsfluent.pipeline.run_regions import load_solids
 from gsfluent.pipeline.run_store import content_digest, fingerprint
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.pipeline.solid_field import SignedDistance
@@ -62,12 +63,6 @@ def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
 
 def _material(settings: ObjectSettings) -> Material:
     return materials.get(settings.material).override(**dict(settings.overrides))
-
-
-def load_solids(context: RunContext) -> dict[str, Solid]:
-    """The textured solids of the run's objects, by name."""
-    folder = context.store.root / "texture"
-    return {name: Solid.load(folder / f"{name}.ply") for name in context.shot.objects}
 
 
 def simulate_stage(context: RunContext) -> None:

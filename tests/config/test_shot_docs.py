@@ -22,9 +22,10 @@ CASES = [
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name in ("melon.ply", "cut.jpg", "labels.npy", "bowl.obj"):
+    for name in ("melon.ply", "cut.jpg", "labels.npy", "bowl.obj", "side.png"):
         (tmp_path / name).write_bytes(b"")
-    (tmp_path / "captures/apple").mkdir(parents=True)
+    for name in ("captures/apple", "parts/stem", "segmentation"):
+        (tmp_path / name).mkdir(parents=True)
     return tmp_path
 
 

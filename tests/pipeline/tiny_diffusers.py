@@ -239,8 +239,10 @@ def save_controlnet(folder: Path) -> Path:
     shared = {k: v for k, v in _UNET.items() if k not in ("sample_size", "out_channels")}
     shared.pop("up_block_types")
     net = ControlNetModel(
-        in_channels=4, conditioning_embedding_out_channels=(8, 16), **shared, **_XL
+        in_channels=4, conditioning_embedding_out_channels=(4, 8, 8, 16), **shared, **_XL
     )
-    torch.nn.init.normal_(net.controlnet_mid_block.weight, std=0.5)
+    for weights in net.parameters():  # untrained it starts as zeros, and says nothing
+        if not weights.any():
+            torch.nn.init.normal_(weights, std=0.3)
     net.save_pretrained(folder)
     return folder

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..fill_skin import skin_colors
+from ..fill_colors import skin_colors
 
 if TYPE_CHECKING:
     from gsfluent.data import Solid

@@ -80,6 +80,8 @@ class Texture(Stage):
             or its settings as a mapping); None for the defaults.
         inpaint: Settings of the slice methods, or a mapping of them.
         resume: Folder in which the diffusion method keeps finished slices.
+        polish: Fit the colours of interior Gaussians that are coarser than the voxels to slices
+            of the volume, instead of sampling it at their centres (:mod:`.polish`).
         seed: Seed of everything random.
 
     Raises:
@@ -105,6 +107,7 @@ class Texture(Stage):
         photo: PhotoOptions | Mapping[str, Any] | None = None,
         inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
+        polish: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -160,6 +163,7 @@ class Texture(Stage):
         self.photo = PhotoOptions.of(photo)
         self.inpaint = options
         self.resume = None if resume is None else Path(resume)
+        self.polish = bool(polish)
 
     def forward(
         self,
@@ -194,8 +198,8 @@ class Texture(Stage):
             raise InputError("texture: the solid is empty", mend="run fill first")
         texture = self._make(domain, exemplars, progress)
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
-        colored = _color_interior(solid, replace(texture, rgb=rgb), domain)
-        report = self._report(domain, texture, exemplars)
+        colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
+        report = self._report(domain, texture, exemplars) | polished
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
         regions = solid.regions
@@ -292,20 +296,31 @@ class Texture(Stage):
         return report
 
 
-def _color_interior(solid: Solid, texture: InteriorTexture, domain: InteriorDomain) -> Any:
-    """Gaussians whose INTERIOR rows wear the volume's colour; all other rows are the same."""
+def _color_interior(
+    solid: Solid, texture: InteriorTexture, domain: InteriorDomain, polish: bool = False
+) -> tuple[Any, dict[str, Any]]:
+    """Gaussians whose INTERIOR rows wear the volume's colour, all others the same; a report."""
     from gsfluent.data import INTERIOR
     from gsfluent.geometry import rgb_to_sh0
 
     gaussians = solid.gaussians
     if gaussians.labels is None:
-        return gaussians
+        return gaussians, {}
     chosen = gaussians.labels == INTERIOR
     if not bool(chosen.any()):
-        return gaussians
+        return gaussians, {}
     means = gaussians.means[chosen].detach().double().cpu().numpy()
-    color = texture.sample((means - domain.origin) / domain.voxel, domain.inside)
+    place = (means - domain.origin) / domain.voxel
+    color = texture.sample(place, domain.inside)
+    report: dict[str, Any] = {}
+    if polish:
+        from .polish import polish_colors
+
+        color, figures = polish_colors(
+            domain, texture.rgb, place, color, device=solid.occupancy.device
+        )
+        report = {"polish": figures}
     sh = gaussians.sh.clone()
     sh[chosen] = 0.0
     sh[chosen, 0] = rgb_to_sh0(torch.from_numpy(color).to(sh))
-    return gaussians.replace(sh=sh)
+    return gaussians.replace(sh=sh), report

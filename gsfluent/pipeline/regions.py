@@ -1,0 +1,231 @@
+"""Regions: labels of photographs and pictures become parts of a solid, each with its material."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsfluent.data import Capture, Frame
+from gsfluent.errors import InputError
+from gsfluent.io.segmentation import Segmentation, load_masks, load_segmentation
+
+from .regions_associate import associate
+from .regions_image import image_labels
+from .regions_spread import UNSEEN, carry_inwards, decide, nearest_skin
+from .regions_table import FIRST_LABEL, source_key, source_paths, source_volume
+from .regions_vote import Skin, cast_votes, find_skin
+from .stage import Progress
+
+if TYPE_CHECKING:
+    from gsfluent.data import Solid
+    from gsfluent.scene_parts import Part
+
+__all__ = ["SkinLabels", "label_parts", "label_regions", "project_labels"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class SkinLabels:
+    """What the photographs say about a solid's skin.
+
+    Attributes:
+        skin: The voxels.
+        label: Label per voxel, int64 [S]: 0 for none, -1 where no photograph shows it.
+        share: Share of the votes that the label got, float32 [S]; 0 where it got none.
+        segmentation: The labels, linked between views.
+    """
+
+    skin: Skin
+    label: NDArray[np.int64]
+    share: NDArray[np.float32]
+    segmentation: Segmentation
+
+    def report(self) -> dict[str, Any]:
+        """Figures for ``region_sources``: views, what was seen, agreement per label."""
+        names = {0: "none", **self.segmentation.names}
+        agreement = {}
+        for number in names:
+            chosen = (self.label == number) & (self.share > 0)
+            if chosen.any():
+                agreement[str(number)] = float(self.share[chosen].mean())
+        return {
+            "views": len(self.segmentation.views),
+            "unseen": float((self.label == UNSEEN).mean()),
+            "agreement": agreement,
+            "notes": list(self.segmentation.notes),
+        }
+
+
+def project_labels(
+    solid: Solid,
+    segmentation: Segmentation,
+    *,
+    skin: Skin | None = None,
+    margin: float = 0.1,
+    reach: int = 3,
+    progress: Progress | None = None,
+) -> SkinLabels:
+    """Vote the labels of photographs onto a solid's skin.
+
+    Args:
+        solid: The solid, in the world of the photographs' cameras.
+        segmentation: Label maps; instances are linked between views first.
+        skin: What :func:`find_skin` found, when known.
+        margin: Lead that a label needs, as a share of a voxel's votes; below it, the neighbours
+            decide.
+        reach: How far labels spread over skin that no photograph shows [voxels].
+        progress: Optional callback.
+
+    Returns:
+        The labels.
+
+    Raises:
+        InputError: No labelled photograph shows the solid.
+    """
+    skin = find_skin(solid) if skin is None else skin
+    linked = associate(skin, segmentation, progress)
+    votes = cast_votes(skin, linked, progress)
+    column, share = decide(skin, votes, margin=margin, reach=reach)
+    numbers = np.array([0, *sorted(linked.names)], dtype=np.int64)
+    label = np.where(column == UNSEEN, UNSEEN, numbers[column.clip(min=0)])
+    return SkinLabels(skin, label, share, linked)
+
+
+def label_regions(
+    solid: Solid,
+    sources: Iterable[Mapping[str, Any]],
+    capture: Capture | None = None,
+    *,
+    frame: Frame | None = None,
+    progress: Progress | None = None,
+) -> Solid:
+    """Write the labels of photographs and pictures into ``Solid.regions``.
+
+    Inside, matter has the label of the skin nearest to it (through and through); a part that is
+    only skin-deep says so itself with ``depth_below``. Inclusions of the texture keep their numbers
+    and belong to no label.
+
+    Args:
+        solid: The filled solid, in the world of the capture.
+        sources: Each ``{"mask": folder}``, ``{"labels": path}`` or ``{"label_image": file}`` /
+            ``{"label_image": {axis: file}}``, as among a part's conditions; other keys are
+            ignored, sources named twice are read once.
+        capture: The photographs that masks and labels belong to.
+        frame: World to scene, for the axes of label images; default that of the solid.
+        progress: Optional callback.
+
+    Returns:
+        The solid with ``regions``, their table in ``report["regions"]``
+        (:mod:`gsfluent.pipeline.regions_table`) and figures per source in
+        ``report["region_sources"]``.
+
+    Raises:
+        InputError: A source cannot be read, fits no photograph, or needs a capture.
+    """
+    wanted = {key: where for where in sources if (key := source_key(where)) is not None}
+    if not wanted:
+        return solid
+    if capture is None and any("label_image" not in where for where in wanted.values()):
+        raise InputError(
+            "regions: masks and labels need the photographs they belong to, got no capture",
+            "give capture=load_capture(folder); in a shot, start from a capture",
+        )
+    reports = {
+        key: value
+        for key, value in (solid.report.get("region_sources") or {}).items()
+        if key not in wanted
+    }
+    volumes = {key: source_volume(solid, key) for key in reports}
+    skin: Skin | None = None
+    nearest: NDArray[np.int64] | None = None
+    for key, where in wanted.items():
+        paths = source_paths(where)
+        if "label_image" in where:
+            volume, names, notes = image_labels(solid, paths, frame)
+            volumes[key] = volume.astype(np.int64)
+            reports[key] = {"labels": {str(n): name for n, name in names.items()}, "notes": notes}
+            continue
+        assert capture is not None
+        read = load_masks if "mask" in where else load_segmentation
+        segmentation = read(paths[""], capture)
+        if skin is None:
+            skin = find_skin(solid)
+            nearest = nearest_skin(solid, skin)
+        assert nearest is not None
+        found = project_labels(solid, segmentation, skin=skin, progress=progress)
+        volumes[key] = carry_inwards(found.label, nearest).astype(np.int64)
+        names = found.segmentation.names
+        reports[key] = {"labels": {str(n): name for n, name in names.items()}, **found.report()}
+        for note in found.segmentation.notes:
+            _log.info("regions: %s: %s", segmentation.source, note)
+    return _written(solid, volumes, reports)
+
+
+def label_parts(
+    solid: Solid,
+    parts: Iterable[Part],
+    capture: Capture | None = None,
+    *,
+    frame: Frame | None = None,
+    progress: Progress | None = None,
+) -> Solid:
+    """Project what the conditions of parts need and the solid does not have yet.
+
+    Args:
+        solid: The solid.
+        parts: Parts of a body.
+        capture: The photographs; only needed for masks and labels not yet projected.
+        frame: World to scene.
+        progress: Optional callback.
+
+    Raises:
+        InputError: As :func:`label_regions`.
+    """
+    have = solid.report.get("region_sources") or {}
+    missing = [part.where for part in parts if source_key(part.where) not in (None, *have)]
+    return label_regions(solid, missing, capture, frame=frame, progress=progress)
+
+
+def _written(
+    solid: Solid, volumes: dict[str, NDArray[np.int64]], reports: dict[str, dict[str, Any]]
+) -> Solid:
+    """Number every combination of labels that occurs and keep the inclusions' numbers."""
+    keys = sorted(volumes)
+    before = None if solid.regions is None else solid.regions.cpu().numpy()
+    occupied = solid.occupancy.cpu().numpy()
+    if before is not None:
+        occupied = occupied & ~((before > 0) & (before < FIRST_LABEL))
+    stacked = np.stack([volumes[key][occupied] for key in keys], axis=1)
+    combos, back = np.unique(stacked, axis=0, return_inverse=True)
+    rank = np.cumsum(combos.any(axis=1))  # 0 for the combination without any label
+    numbers = np.where(combos.any(axis=1), FIRST_LABEL - 1 + rank, 0)
+    regions = np.zeros(occupied.shape, np.int32)
+    regions[occupied] = numbers[back.reshape(-1)]
+    table = {
+        number: entry
+        for number, entry in (solid.report.get("regions") or {}).items()
+        if int(number) < FIRST_LABEL
+    }
+    if before is not None:
+        inclusion = (before > 0) & (before < FIRST_LABEL)
+        regions[inclusion] = before[inclusion]
+    for combo, number in zip(combos.tolist(), numbers.tolist(), strict=True):
+        of = {
+            key: {"number": own, "name": reports[key]["labels"].get(str(own), str(own))}
+            for key, own in zip(keys, combo, strict=True)
+            if own
+        }
+        if of:
+            name = " + ".join(item["name"] for item in of.values())
+            table[str(number)] = {"name": name, "kind": "label", "of": of}
+    return solid.replace(
+        regions=torch.from_numpy(regions).to(solid.occupancy.device),
+        report={**solid.report, "regions": table, "region_sources": reports},
+    )

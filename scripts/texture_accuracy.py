@@ -1,0 +1,232 @@
+"""Judge texturing on six solids whose inside is known; enter docs/texture_accuracy.md.
+
+    python scripts/texture_accuracy.py [--size 128] [--only marble cake] [--methods default preview]
+        [--device cuda] [--model FOLDER] [--draws 5] [--write] [--sheets]
+
+Every run leaves one JSON line in docs/data/texture_accuracy.jsonl (the latest per class, size,
+method and device). ``--write`` enters the tables made of all lines, ``--sheets`` draws held-out
+planes side by side. ``default`` is what a user gets who gives a photograph and no method.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from page import enter
+from texture_sheets import draw_sheet
+
+from gsfluent.lab.interiors import KNOWN_INTERIORS, KnownInterior, known_interior
+from gsfluent.lab.interiors_judge import Judge, crossing_error
+from gsfluent.pipeline.texture import Texture
+from gsfluent.pipeline.texture.baselines import telea_slices
+from gsfluent.pipeline.texture.domain import blend_skin
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "texture_accuracy.md"
+LINES = ROOT / "docs" / "data" / "texture_accuracy.jsonl"
+METHODS = (
+    "color_copy",
+    "telea_x",
+    "telea",
+    "profile",
+    "procedural",
+    "preview",
+    "default",
+    "full",
+    "diffusion",
+)
+PATCH_BAR, PROFILE_BAR = 1.3, 0.05
+
+
+def texture(known: KnownInterior, method: str, device: str, model: str | None) -> dict[str, Any]:
+    """Run one method: its volume and report, CPU seconds and wall seconds."""
+    solid = known.solid().to(device)
+    photos = known.exemplars()
+    began, wall = time.process_time(), time.perf_counter()
+    if method == "telea_x":
+        rgb = blend_skin(known.domain, telea_slices(known.domain, (0,)).rgb)
+        report: dict[str, Any] = {"method": "telea_x"}
+    else:
+        done = stage(known, method, photos, model)(solid)
+        if device != "cpu":
+            torch.cuda.synchronize()
+        assert done.color is not None
+        rgb, report = done.color.float().cpu().numpy(), done.report
+    cpu, spent = time.process_time() - began, time.perf_counter() - wall
+    return {"rgb": rgb, "report": report, "cpu_seconds": cpu, "seconds": spent}
+
+
+def stage(
+    known: KnownInterior, method: str, photos: dict[str, np.ndarray], model: str | None
+) -> Texture:
+    """The texture stage as a user would set it for this class."""
+    if method == "procedural":
+        # another seed than the truth's: another object in the same skin
+        return Texture(preset=known.name, seed=known.seed + 1000)
+    if method in ("color_copy", "telea", "profile"):
+        return Texture(method)
+    if method == "diffusion":
+        prompt = f"cross section of {known.name}"
+        return Texture("diffusion", model=model, exemplar=photos, prompt=prompt)
+    quality = {"default": {}}.get(method, {"quality": method})
+    return Texture(exemplar=photos, **quality, **known.settings)
+
+
+def read_lines() -> dict[tuple[str, ...], dict[str, Any]]:
+    """All runs on file by class, size, method and device."""
+    if not LINES.is_file():
+        return {}
+    found = [json.loads(line) for line in LINES.read_text(encoding="utf-8").splitlines()]
+    return {key(line): line for line in found}
+
+
+def key(line: dict[str, Any]) -> tuple[str, ...]:
+    return (line["class"], str(line["size"]), line["method"], line["device"])
+
+
+def write_lines(lines: dict[tuple[str, ...], dict[str, Any]]) -> None:
+    LINES.parent.mkdir(exist_ok=True)
+    text = "".join(json.dumps(lines[k], sort_keys=True) + "\n" for k in sorted(lines))
+    LINES.write_text(text, encoding="utf-8")
+
+
+def rounded(value: Any) -> Any:
+    """Four significant digits, so that the file shows changes and not noise."""
+    if isinstance(value, float):
+        return float(f"{value:.4g}")
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    return {k: rounded(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+
+def passes(line: dict[str, Any]) -> bool:
+    """The issue's bars on likeness."""
+    ratio = line["figures"]["ratio"]
+    worst = max(ratio[k] for k in ("patch", "patch_coarse", "hist"))
+    return worst <= PATCH_BAR and line["figures"]["profile"] <= PROFILE_BAR
+
+
+def row(line: dict[str, Any]) -> str:
+    """One line of the large table."""
+    figures = line["figures"]
+    ratio = figures["ratio"]
+    distances = [f"{figures[k]:.2f} ({ratio[k]:.2f})" for k in ("patch", "patch_coarse", "hist")]
+    name = line["method"]
+    if line["used"] not in (name, "exemplar"):
+        name += f" = {line['used']}"
+    cells = [
+        name,
+        *distances,
+        f"{100 * figures['profile']:.1f}",
+        f"{figures['sharp']:.2f}",
+        "/".join(f"{v:.2f}" for v in figures["neighbour"]),
+        f"{figures['radial']:.2f}",
+        f"{ratio['coherence']:.2f}/{ratio['coverage']:.2f}",
+        f"{line['crossing']:g}",
+        f"{line['cpu_seconds' if line['device'] == 'cpu' else 'seconds']:.1f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def tables(lines: dict[tuple[str, ...], dict[str, Any]], size: int, device: str) -> str:
+    """The bars, then every figure, of one size and device."""
+    chosen = [v for v in lines.values() if v["size"] == size and v["device"] == device]
+    classes = [name for name in KNOWN_INTERIORS if any(v["class"] == name for v in chosen)]
+    unit = "CPU s" if device == "cpu" else "s"
+    head = (
+        "| method | patch | patch, half size | hist | profile % | sharp | neighbour x/y/z | radial "
+        f"| coherence/coverage | crossing | {unit} |\n" + "| --- " * 11 + "|"
+    )
+    short = [f"| class | used | patch | half size | hist | profile % | {unit} | within the bars |"]
+    short.append("| --- " * 8 + "|")
+    parts = []
+    for name in classes:
+        own = {v["method"]: v for v in chosen if v["class"] == name}
+        floor = next(iter(own.values()))["figures"]["floor"]
+        base = [f"{floor[k]:.2f} (1)" for k in ("patch", "patch_coarse", "hist")]
+        base += [f"{100 * floor['profile']:.1f}", f"{floor['sharp']:.2f}"]
+        base += ["/".join(f"{v:.2f}" for v in floor["neighbour"]), f"{floor['radial']:.2f}"]
+        rows = ["| *another draw (floor)* | " + " | ".join([*base, "1/1", "0", "-"]) + " |"]
+        rows += [row(own[m]) for m in METHODS if m in own]
+        parts.append(f"**{name}**\n\n{head}\n" + "\n".join(rows))
+        if "default" in own:
+            line = own["default"]
+            ratio = line["figures"]["ratio"]
+            cells = [name, line["used"]]
+            cells += [f"{ratio[k]:.2f}" for k in ("patch", "patch_coarse", "hist")]
+            cells.append(f"{100 * line['figures']['profile']:.1f}")
+            cells.append(f"{line['cpu_seconds' if device == 'cpu' else 'seconds']:.1f}")
+            cells.append("yes" if passes(line) else "no")
+            short.append("| " + " | ".join(cells) + " |")
+    return "\n".join(short) + "\n\n" + "\n\n".join(parts)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="\n".join(__doc__.splitlines()[2:])
+    )
+    parser.add_argument("--size", type=int, default=128, help="voxels along an edge")
+    parser.add_argument("--only", nargs="*", default=list(KNOWN_INTERIORS), metavar="CLASS")
+    parser.add_argument("--methods", nargs="*", default=None, choices=METHODS, metavar="METHOD")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--model", default=None, help="diffusers pipeline for method diffusion")
+    parser.add_argument("--seed", type=int, default=0, help="which object is the truth")
+    parser.add_argument("--draws", type=int, default=5, help="other draws that make the floor")
+    parser.add_argument("--write", action="store_true", help=f"enter tables into {PAGE.name}")
+    parser.add_argument("--sheets", action="store_true", help="draw docs/images/texture_*.jpg")
+    given = parser.parse_args(arguments)
+    methods = given.methods
+    if methods is None:
+        methods = [m for m in METHODS if m != "diffusion" or given.model]
+    lines = read_lines()
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
+    ).stdout.strip()
+    for name in given.only:
+        known = known_interior(name, given.size, given.seed)
+        others = [known_interior(name, given.size, given.seed + 1 + k) for k in range(given.draws)]
+        judge = Judge(known, others)
+        volumes = {}
+        for method in methods:
+            run = texture(known, method, given.device, given.model)
+            line = {
+                "class": name,
+                "size": given.size,
+                "method": method,
+                "used": run["report"]["method"],
+                "device": given.device,
+                "cpu_seconds": run["cpu_seconds"],
+                "seconds": run["seconds"],
+                "figures": judge(run["rgb"]),
+                "crossing": crossing_error(known, run["rgb"]),
+                "seed": given.seed,
+                "draws": given.draws,
+                "commit": commit,
+            }
+            lines[key(line)] = rounded(line)
+            volumes[method] = run["rgb"]
+            sys.stdout.write(f"{name:10s} {row(lines[key(line)])}\n")
+            sys.stdout.flush()
+        write_lines(lines)
+        if given.sheets:
+            draw_sheet(ROOT / "docs" / "images" / f"texture_{name}.jpg", judge, volumes)
+    if given.write:
+        text = PAGE.read_text(encoding="utf-8")
+        for size, device in sorted({(v["size"], v["device"]) for v in lines.values()}):
+            marker = f"texture {size} {device}"
+            heading = f"## {size}^3 on {'2 CPU cores' if device == 'cpu' else 'the GPU'}"
+            text = enter(text, marker, tables(lines, size, device), heading)
+        PAGE.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
