@@ -67,6 +67,8 @@ def surface_colors(
         rows, weight = rows[solid], weight[solid]
     means = gaussians.means.detach().double().cpu().numpy()[rows]
     colors = gaussians.colors().detach().double().cpu().numpy()[rows].clip(0.0, 1.0)
+    if len(points) == 0:
+        return np.zeros((0, 3), np.float32)
     count = min(_NEIGHBOURS, len(rows))
     tree = cKDTree(means)
     distance, nearest = tree.query(points, k=count)

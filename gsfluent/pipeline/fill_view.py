@@ -165,7 +165,7 @@ def _eye(
         + 0.5 * (along.min() + along.max()) * above
         + (points @ forward).mean() * forward
     )
-    count = (max(1, round(wide / pixel)), max(1, round(tall / pixel)))
+    count = (max(2, round(wide / pixel)), max(2, round(tall / pixel)))
     return _Eye(middle, right, above, forward, pixel, *count)
 
 
@@ -200,7 +200,10 @@ class _Trace:
     def shaded(self, splats: bool) -> tuple[Tensor, Tensor]:
         """Colours [N, 3] and coverage [N] of all pixels."""
         first = self.value(self.start)
-        face = (0.5 - first / self.pixel).clamp(0.0, 1.0)
+        # by its slope in the picture: a plane that grazes the surface has no half covered pixels
+        rows, columns = np.gradient(first.view(self.eye.height, self.eye.width).numpy())
+        slope = torch.from_numpy(np.hypot(rows, columns)).reshape(-1).clamp_min(1e-3 * self.pixel)
+        face = (0.5 - first / slope).clamp(0.0, 1.0)
         hit, nearest = self._march(first)
         skin = (0.5 - nearest / self.pixel).clamp(0.0, 1.0)
         skin = torch.where(hit >= 0, torch.ones_like(skin), skin)
