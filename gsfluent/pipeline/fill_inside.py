@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ __all__ = [
     "Vote",
     "cast_votes",
     "count_leaks",
+    "find_leaks",
     "keep_components",
     "smooth_boundary",
     "trim_outer_flank",
@@ -206,6 +208,27 @@ def count_leaks(shell: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
     Returns:
         Number of separate openings, and number of inner voxels that the flood would reach.
     """
+    found = find_leaks(shell, inside, np.zeros(3), 1.0)
+    return found["leaks"], found["leaking_voxels"]
+
+
+def find_leaks(
+    shell: np.ndarray, inside: np.ndarray, origin: np.ndarray, voxel: float, most: int = 16
+) -> dict[str, Any]:
+    """Openings through which a flood from outside would enter the object, and where they are.
+
+    Args:
+        shell: Surface voxels that hold water back, bool [X, Y, Z].
+        inside: Voxels decided to be inside.
+        origin: Corner of voxel (0, 0, 0) [3], world units.
+        voxel: Edge of a voxel, world units.
+        most: Openings listed, the largest first.
+
+    Returns:
+        ``leaks`` (separate openings), ``leaking_voxels`` (inner voxels that the flood would
+        reach) and ``leak_list``: ``center`` [world units] and ``area`` [square world units] of
+        each.
+    """
     from scipy import ndimage
 
     cross = ndimage.generate_binary_structure(3, 1)
@@ -214,13 +237,24 @@ def count_leaks(shell: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
     flooded = (labels == labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
     wet = flooded & inside & ~shell
     if not wet.any():
-        return 0, 0
+        return {"leaks": 0, "leaking_voxels": 0, "leak_list": []}
     # an opening: wet inner voxels that touch open space outside the object
     mouth = wet & ndimage.binary_dilation(~inside & ~shell, cross)
     # patches of one mouth a voxel or two apart are one opening
     merged = ndimage.binary_dilation(mouth, np.ones((3, 3, 3)))
-    _, openings = ndimage.label(merged, structure=np.ones((3, 3, 3)))
-    return int(openings), int(wet.sum())
+    label, openings = ndimage.label(merged, structure=np.ones((3, 3, 3)))
+    index = np.argwhere(mouth)
+    owner = label[tuple(index.T)]
+    sizes = np.bincount(owner, minlength=openings + 1)
+    largest = [int(i) for i in np.argsort(-sizes) if sizes[i] > 0][:most]
+    listed = [
+        {
+            "center": (origin + (index[owner == i].mean(0) + 0.5) * voxel).tolist(),
+            "area": float(sizes[i] * voxel**2),
+        }
+        for i in largest
+    ]
+    return {"leaks": int(openings), "leaking_voxels": int(wet.sum()), "leak_list": listed}
 
 
 def visual_hull(

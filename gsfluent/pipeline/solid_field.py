@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Solid
+from gsfluent.pipeline.fill_density import GridBox
 from gsfluent.pipeline.voxels import distance_transform
 
 __all__ = ["SignedDistance", "distances_of"]
@@ -58,6 +59,12 @@ class SignedDistance:
     def inside(self) -> Tensor:
         """Voxels whose centre is inside, bool [X, Y, Z]."""
         return self.values <= 0
+
+    @property
+    def box(self) -> GridBox:
+        """The grid of the values."""
+        x, y, z = self.origin.double().tolist()
+        return GridBox((x, y, z), float(self.voxel), tuple(self.values.shape))  # type: ignore[arg-type]
 
     @property
     def volume(self) -> float:

@@ -150,7 +150,7 @@ class ExemplarInpainter(MaskedInpainter):
         scale: float = 1.0,
     ) -> None:
         self.exemplar = exemplar
-        self.schedule = schedule or Schedule(iterations=(4, 3, 2), bank=1536, samples=400, stride=2)
+        self.schedule = schedule or Schedule(iterations=(4, 3, 2), bank=1536, samples=400)
         self.turns = turns
         self.scale = float(scale)
         self._fitted: dict[tuple[int, float, int], Exemplar] = {}
@@ -257,6 +257,8 @@ def _start(
     sorted_depth = photo.depth[photo.mask][order]
     colors = photo.image[photo.mask][order]
     wanted = depth[hole]
+    if len(wanted) == 0:  # too small a hole for this level
+        return image
     if float(np.ptp(wanted)) < 1e-6:
         place = rng.integers(0, len(colors), len(wanted))
     else:
