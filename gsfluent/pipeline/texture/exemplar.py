@@ -269,7 +269,7 @@ def _patches(
             for a, p in small.items()
         }
         if swept:
-            section = swept_color(inside, depth, domain.axis, small[0])
+            section = swept_color(inside, domain.axis, small[0])
             if step == 0:
                 rgb = np.where(inside[..., None], section, rgb)
             guides += list(_SWEEP_WEIGHT * np.moveaxis(_lowpass(section, inside), -1, 0))
