@@ -15,7 +15,7 @@ from gsfluent.pipeline.texture.structure import (
     take_apart,
     with_structure,
 )
-from gsfluent.pipeline.texture.sweep import Sweep, outline, swept_color
+from gsfluent.pipeline.texture.sweep import Sweep, outline
 
 RAW = PhotoOptions("auto", False, False, False, False, "none")
 FLESH = np.array([0.92, 0.86, 0.60])
@@ -53,6 +53,14 @@ def solid(shape: str, size: int = 48, axis: tuple[float, float, float] = (0, 0, 
     color = np.broadcast_to(FLESH, (*inside.shape, 3)).astype(np.float32).copy()
     domain = InteriorDomain(inside, depth, inside & (depth < 1.6), color, unit, 0.02, np.zeros(3))
     return domain, color, flat, height
+
+
+def swept(domain: InteriorDomain, photo: Exemplar, cut: str = "across") -> np.ndarray:
+    rgb = np.zeros((*domain.inside.shape, 3), np.float32)
+    center = np.argwhere(photo.mask).mean(0)
+    sweep = Sweep(domain.inside, domain.axis, cut)
+    rgb[domain.inside] = sweep.colors(photo.image, photo.mask, center)
+    return rgb
 
 
 def test_structure_is_what_depth_does_not_explain() -> None:
@@ -128,7 +136,7 @@ def test_a_sweep_of_the_middle_plane_is_the_photograph() -> None:
     image[(azimuth > 0.3) & (azimuth < 1.2) & (radius < 0.8)] = (0.1, 0.2, 0.9)
     photo = load_exemplar(image, mask, RAW).resized(44 / 160)
     domain, _, _, _ = solid("ball", 48)
-    rgb = swept_color(domain.inside, domain.axis, photo)
+    rgb = swept(domain, photo)
     plane = rgb[:, :, 24]
     again = np.swapaxes(plane, 0, 1)[::-1]  # columns along the first axis, rows up the second
     small = load_exemplar(image, mask, RAW).resized(44 / 0.92 / 160)
@@ -150,7 +158,7 @@ def test_a_cut_along_the_axis_keeps_up_and_down() -> None:
     image[80:] = (0.1, 0.1, 0.9)
     photo = load_exemplar(image, mask, RAW).resized(0.3)
     domain, _, _, height = solid("ball", 40)
-    rgb = swept_color(domain.inside, domain.axis, photo, "along")
+    rgb = swept(domain, photo, "along")
     red = rgb[..., 0] > rgb[..., 2]
     assert red[domain.inside & (height > 0.1)].mean() > 0.98
     assert red[domain.inside & (height < -0.1)].mean() < 0.02

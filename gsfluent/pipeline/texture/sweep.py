@@ -20,9 +20,8 @@ from gsfluent.errors import InputError
 
 from .domain import axis_frame
 from .noise import value_noise
-from .photo import Exemplar
 
-__all__ = ["CUTS", "Sweep", "outline", "swept_color"]
+__all__ = ["CUTS", "Sweep", "outline"]
 
 CUTS = ("across", "along")
 """How a photograph was cut, relative to the object's axis."""
@@ -132,26 +131,6 @@ class Sweep:
             for c in range(image.shape[2])
         ]
         return np.stack(channels, 1).astype(np.float32)
-
-
-def swept_color(
-    inside: np.ndarray, axis: np.ndarray, photo: Exemplar, cut: str = "across"
-) -> np.ndarray:
-    """Sweep a whole photograph about an axis.
-
-    Args:
-        inside: Voxels, bool [X, Y, Z].
-        axis: The object's axis [3].
-        photo: Photograph with an outline, at voxel pitch.
-        cut: ``across`` or ``along`` the axis.
-
-    Returns:
-        Colours float32 [X, Y, Z, 3]; zero outside.
-    """
-    rgb = np.zeros((*inside.shape, 3), np.float32)
-    center = np.argwhere(photo.mask).mean(0)
-    rgb[inside] = Sweep(inside, axis, cut).colors(photo.image, photo.mask, center)
-    return rgb
 
 
 def outline(mask: np.ndarray, center: np.ndarray, turns: int = 360) -> np.ndarray:
