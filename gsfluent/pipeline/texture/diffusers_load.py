@@ -68,6 +68,11 @@ def load_pipeline(model: str | Path, options: InpaintOptions, device: torch.devi
         extra: dict[str, Any] = {}
         if options.controlnet is not None:
             extra["controlnet"] = _controlnet(diffusers, options, dtype, offline)
+        # parts that were left out when the model was saved (SD 3 without its T5 encoder) must be
+        # named as left out
+        for name, kind in config.items():
+            if isinstance(kind, list | tuple) and len(kind) == 2 and kind[0] is None:
+                extra[name] = None
         if not options.safety_checker and "safety_checker" in config:
             extra["safety_checker"] = None
             extra["requires_safety_checker"] = False
