@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .fill_colors import surface_colors
 from .fill_pieces import hilbert_code, sample, signed_depth, small_pieces
-from .fill_view import surface_colors
 
 if TYPE_CHECKING:
     from gsfluent.data import Gaussians
