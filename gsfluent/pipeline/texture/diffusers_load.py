@@ -169,7 +169,9 @@ def _load_error(
         mend = f"leave variant ({options.variant}) out, or give the one that the files have"
     elif "AutoPipeline can't find" in str(error):
         mend = "use an inpainting model (SD-XL inpainting for example), or name pipeline_class"
-    return InputError(f"{model}: the inpainting model cannot be loaded from {where} ({first})", mend=mend)
+    return InputError(
+        f"{model}: the inpainting model cannot be loaded from {where} ({first})", mend=mend
+    )
 
 
 def _pipeline_class(diffusers: Any, name: str, options: InpaintOptions) -> Any:
