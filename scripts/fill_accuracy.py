@@ -31,7 +31,7 @@ def reconstructed(
     if path.is_file():
         return load_splats(path), capture, 0.0
     began = time.process_time()
-    stage = Reconstruct(given.steps, image_size=given.size, device=given.device)
+    stage = Reconstruct(given.steps, given.splats, image_size=given.size, device=given.device)
     gaussians, report = stage(capture)
     save_splats(gaussians, path)
     sys.stderr.write(f"{name}: {gaussians.count} splats, {report['psnr']:.2f} dB\n")
@@ -45,6 +45,7 @@ def main() -> int:
     parser.add_argument("--views", type=int, default=96)
     parser.add_argument("--size", type=int, default=640, help="side of a photograph [px]")
     parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--splats", type=int, default=100_000, help="at most")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--things", type=Path, default=None, help=".npz of the meshes")
     parser.add_argument("--reconstruct", action="store_true", help="stop before filling")

@@ -133,8 +133,9 @@ def capture_of(
     for camera in around(mesh, views, size):
         path = folder / camera.name
         if not path.is_file():
-            picture = photograph(mesh, camera).cpu().numpy()
-            Image.fromarray((255.0 * picture + 0.5).astype(np.uint8)).save(path)
+            pixels = photograph(mesh, camera).cpu().numpy()
+            picture = Image.fromarray((255.0 * pixels + 0.5).astype(np.uint8))
+            picture.save(path, quality=90, method=2)  # its alpha is lossless
         cameras.append(camera.replace(image_path=path))
     return Capture(cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder)
 

@@ -1,4 +1,4 @@
-"""Verbs that look and change nothing: doctor, inspect, plan."""
+"""Verbs that look and change nothing: doctor, inspect, plan, metrics."""
 
 from __future__ import annotations
 
@@ -122,3 +122,60 @@ class Plan(Verb):
 
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
         return plan_shot(shot, device=self.torch_device(), seed=self.seed)
+
+
+@dataclass(kw_only=True)
+class Metrics(Verb):
+    """Say how like a reference the inside of a solid, a picture or a folder of pictures is.
+
+    Examples:
+      gsfluent metrics melon.ply cut.jpg                # a textured solid against a photograph
+      gsfluent metrics renders/ photographs/ --json     # two folders of pictures
+      gsfluent metrics melon.ply cut.jpg --clip clip-vit-large-patch14 --prompt "a cut watermelon"
+
+    Always: distances of patches and colours, sharpness; 0 (sharpness 1) is likeness. CLIP score,
+    LPIPS, FID and KID need weights that you give: nothing is downloaded, and what is not given is
+    skipped with one line.
+    """
+
+    judged: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
+    """What is judged: picture, folder of pictures, or the .ply of a textured solid."""
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
+    """What it should be like, the same kinds."""
+    size: int = 256
+    """Longest side in pixels to which the objects are reduced before they are compared."""
+    clip: Path | None = None
+    """Folder of a CLIP model (or the hub id of one in the local cache)."""
+    prompt: str | None = None
+    """Text of the CLIP score."""
+    lpips: Path | None = None
+    """Folder with alexnet-owt-*.pth of torchvision and alex.pth of the lpips package."""
+    fid: Path | None = None
+    """TorchScript Inception network, inception-2015-12-05.pt, for FID and KID."""
+
+    def execute(self) -> dict[str, Any]:
+        """Compare the two sides."""
+        from gsfluent.pipeline.compare import compare
+
+        existing(self.judged, "A")
+        existing(self.reference, "B")
+        result = compare(
+            self.judged,
+            self.reference,
+            size=self.size,
+            clip=self.clip,
+            prompt=self.prompt,
+            lpips=self.lpips,
+            fid=self.fid,
+            device=self.torch_device(),
+            seed=self.seed,
+        )
+        if self.json:
+            return result
+        # for a person the reason stands where the number would
+        skipped = result.pop("skipped")
+        why = {name: f"skipped ({reason})" for name, reason in skipped.items()}
+        shown = {name: why.get(name, value) for name, value in result.items()}
+        if "clip_score" in skipped:
+            del shown["clip_score_reference"]
+        return shown

@@ -246,5 +246,4 @@ class Mesh(Verb):
             method=self.method,
             resolution=self.resolution,
             scale=self.scale,
-            seed=self.seed,
         )

@@ -94,7 +94,7 @@ def around(mesh: Mesh, count: int, size: int, *, fov: float = 35.0) -> list[Came
         cameras.append(
             Camera.look_at(
                 middle + far * away, middle, width=size, height=size, fov=fov, up=up,
-                name=f"{index:03d}.png",
+                name=f"{index:03d}.webp",
             )
         )  # fmt: skip
     return cameras

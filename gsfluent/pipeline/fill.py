@@ -11,46 +11,45 @@ import torch
 
 from gsfluent.errors import InputError
 
-from .fill_density import GridBox, choose_grid, density_field
-from .fill_inside import (
-    cast_votes,
-    count_leaks,
-    keep_components,
-    smooth_boundary,
-    trim_outer_flank,
-    visual_hull,
-)
 from .fill_interior import populate
 from .fill_refine import refine_opacity
+from .fill_skin import skin_gaussians
 from .fill_view import cut_view
-from .orient import orient
-from .solid_skin import grown_to_masks
+from .fill_vote import VoteOptions, evidence
+from .solid_splats import has_masks
 from .stage import Progress, Stage, report_progress
-from .voxels import distance_transform, nearest_empty
+from .voxels import nearest_empty
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    import trimesh
+
     from gsfluent.data import Capture, Gaussians, Solid
+
+    from .solid_field import SignedDistance
+
+    Source = SignedDistance | trimesh.Trimesh | str | Path
 
 __all__ = ["Fill", "cut_view"]
 
 logger = logging.getLogger(__name__)
 
-_METHODS = ("auto", "vote", "hull")
+_METHODS = ("auto", "vote", "density", "hull", "tsdf")
 
 
 class Fill(Stage):
     """Decide what is inside a splat cloud and put Gaussians there.
 
-    Steps: opacity density on a grid (GaussianFluent Eq. 2 with exact covariances); surface voxels
-    above ``threshold``; inside by a vote of rays, and by the visual hull where the capture has
-    masks; the outer half of the surface shell trimmed; largest component(s); distance transform;
-    interior Gaussians on a jittered lattice; with a capture, an opacity-only fit against the
-    photographs and pruning of what turned transparent.
+    Steps: what is matter (:func:`gsfluent.pipeline.find_solid`: splats and their depths, masks, or
+    a mesh); distance transform; interior Gaussians on a jittered lattice; with a capture, an
+    opacity-only fit against the photographs and pruning of what turned transparent.
 
     Args:
         resolution: Voxels along the longest side of the object.
-        method: ``auto`` (hull and vote when there are masks, else vote), ``vote`` or ``hull``
-            (needs masks).
+        method: Where the inside comes from (docs/filling.md): ``auto``; ``vote`` (rays among the
+            splats), ``hull`` (the same cut by the masks; masks alone without splats), ``density``
+            (``hull`` where there are masks, else ``vote``) or ``tsdf`` (depths alone).
         hollow: ``auto`` (solid; what points to a cavity is reported, nothing is guessed), ``none``
             (solid), or a wall thickness in world units.
         threshold: Density above which a voxel belongs to the surface shell (a lone opaque splat has
@@ -63,7 +62,8 @@ class Fill(Stage):
         down: Downward direction in world coordinates; None asks the capture, and without one finds
             an unseen side by itself.
         close_underside: Close the side that no photograph shows, at its rim.
-        match_masks: Grow the solid to the outline of the masks, where there are any.
+        match_masks: Move the skin to the outline of the masks, or of the splats without masks.
+        finer: Take smaller voxels where the walls found are thinner than five of them.
         refine_views: Photographs asked about the interior (0 asks none).
         refine_image_size: Longest image side then [pixels].
         seed: Seed of lattice jitter and view order.
@@ -88,6 +88,7 @@ class Fill(Stage):
         down: tuple[float, float, float] | None = None,
         close_underside: bool = True,
         match_masks: bool = True,
+        finer: bool = True,
         refine_views: int = 24,
         refine_image_size: int = 200,
         seed: int = 0,
@@ -128,25 +129,35 @@ class Fill(Stage):
         self.down = None if down is None else np.asarray(down, dtype=float)
         self.close_underside = close_underside
         self.match_masks = match_masks
+        self.finer = finer
         self.refine_views = int(refine_views)
         self.refine_image_size = int(refine_image_size)
 
     def forward(
         self,
-        gaussians: Gaussians,
+        gaussians: Gaussians | None = None,
         capture: Capture | None = None,
         progress: Progress | None = None,
+        *,
+        solid: Source | None = None,
     ) -> Solid:
-        """Fill a splat object.
+        """Fill an object.
 
         Args:
-            gaussians: Splats of one object (isolated from its background).
-            capture: The photographs it came from; enables the hull and the opacity fit.
+            gaussians: Splats of one object (isolated from its background). None: the skin gets
+                splats in the colours of the photographs, or grey ones.
+            capture: The photographs it came from: their cameras tell what is hollow, their masks
+                where the skin is, and the opacity fit looks at them.
             progress: Optional callback ``(done, total, note)``.
+            solid: What is matter, when that is known better: a
+                :class:`~gsfluent.pipeline.solid_field.SignedDistance`, a mesh of trimesh, or a
+                mesh file, in the frame of the splats.
 
         Returns:
-            The solid; ``report`` holds interior_gaussians, volume (world units cubed), leaks,
-            hollow_fraction, closed side and seconds.
+            The solid; ``report`` holds ``method`` and ``why``, ``interior_gaussians``, ``volume``
+            and ``cavity_volume`` (world units cubed), ``leaks`` and ``leak_list`` (centre and
+            area of each), ``closed_side``, ``wall`` (median and 5 % thickness), ``hollow``,
+            ``hollow_fraction``, ``unusable_gaussians`` (degenerate, left out) and ``seconds``.
 
         Raises:
             InputError: Values are not finite, or no inside was found.
@@ -154,20 +165,30 @@ class Fill(Stage):
         from gsfluent.data import SURFACE, Solid
 
         began = time.perf_counter()
-        gaussians = gaussians.validated()
+        unusable = 0
+        if gaussians is not None:
+            gaussians, unusable = evidence(gaussians)
+            gaussians = gaussians.validated("fill")
         total = 5
-        box, solid, report = self.inside(gaussians, capture, progress)
+        report_progress(progress, 0, total, "inside")
+        field = self.inside(gaussians, capture, solid)
         report_progress(progress, 2, total, "depth")
-        solid, depth, nearest, hollow_fraction = self._depth(solid, box.voxel, gaussians.device)
+        if gaussians is None:
+            gaussians = skin_gaussians(field, capture)
+        device = gaussians.means.device
+        box = field.box
+        occupied, depth, nearest, hollow = self._depth(
+            field.inside.cpu().numpy(), box.voxel, device
+        )
+        if float(depth.max()) < 1.5 * box.voxel:
+            logger.warning("fill: nothing but thin parts at this resolution")
         report_progress(progress, 3, total, "interior Gaussians")
         surface = gaussians.replace(
-            labels=torch.full(
-                (gaussians.count,), SURFACE, dtype=torch.int32, device=gaussians.means.device
-            )
+            labels=torch.full((gaussians.count,), SURFACE, dtype=torch.int32, device=device)
         )
         merged, inner, placed = populate(
             surface,
-            solid,
+            occupied,
             depth,
             nearest,
             box,
@@ -189,12 +210,13 @@ class Fill(Stage):
         report = {
             "interior_gaussians": int(inner.sum()),
             "pruned": refined.pop("pruned", 0),
-            "volume": float(solid.sum() * box.voxel**3),
-            "leaks": report.pop("leaks"),
-            "hollow_fraction": hollow_fraction,
+            "method": field.source,
+            **field.report,
+            "volume": float(occupied.sum() * box.voxel**3),
+            "unusable_gaussians": unusable,
+            "hollow_fraction": hollow,
             "grid": list(box.shape),
             "voxel": box.voxel,
-            **report,
             **placed,
             **refined,
             "seconds": time.perf_counter() - began,
@@ -203,13 +225,13 @@ class Fill(Stage):
             "fill: %d interior Gaussians, volume %.4g, %d leaks",
             report["interior_gaussians"],
             report["volume"],
-            report["leaks"],
+            report.get("leaks", 0),
         )
         return Solid(
             gaussians=merged,
-            occupancy=torch.from_numpy(solid).to(merged.device),
-            depth=torch.from_numpy(depth).to(merged.device),
-            origin=torch.tensor(box.origin, dtype=torch.float32, device=merged.device),
+            occupancy=torch.from_numpy(occupied).to(device),
+            depth=torch.from_numpy(depth).to(device),
+            origin=torch.tensor(box.origin, dtype=torch.float32, device=device),
             voxel=box.voxel,
             color=None,
             regions=None,
@@ -218,122 +240,54 @@ class Fill(Stage):
 
     def inside(
         self,
-        gaussians: Gaussians,
+        gaussians: Gaussians | None,
         capture: Capture | None = None,
-        progress: Progress | None = None,
-    ) -> tuple[GridBox, np.ndarray, dict[str, Any]]:
-        """Decide which voxels hold matter, and put nothing there.
+        solid: Source | None = None,
+    ) -> SignedDistance:
+        """Decide what is matter, and put nothing there.
 
         Args:
-            gaussians: Splats of one object.
-            capture: The photographs it came from; enables the hull.
-            progress: Optional callback ``(done, total, note)``.
+            gaussians: Splats of one object, or None.
+            capture: The photographs it came from.
+            solid: Distances or a mesh that already say what is matter.
 
         Returns:
-            The grid, the occupied voxels bool [X, Y, Z], and the notes ``method, leaks,
-            leaking_voxels, closed_side, closed_side_open_fraction, components_dropped,
-            buried_surface_fraction, stray_gaussians``.
+            Signed distances to its surface; ``report`` says where from and what was noticed.
 
         Raises:
-            InputError: Too few splats, or none reaches the density of a surface.
+            InputError: Nothing to decide from, or nothing is inside.
         """
-        if gaussians.count < 16:
-            raise InputError(
-                f"fill: needs at least 16 Gaussians, got {gaussians.count}",
-                mend="check that isolation kept the object",
-            )
-        report_progress(progress, 0, 5, "density")
-        box, strays = choose_grid(gaussians.means, gaussians.opacities, self.resolution)
-        density = (
-            density_field(
-                gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
-            )
-            .cpu()
-            .numpy()
-        )
-        shell = density >= self.threshold
-        if not shell.any():
-            raise InputError(
-                f"fill: no voxel reaches density {self.threshold:g} (largest {density.max():.3g})",
-                mend="lower threshold or resolution: the splats are transparent or sparse",
-            )
-        report_progress(progress, 1, 5, "inside")
-        down = self.down
-        if down is None and capture is not None:
-            down = -np.asarray(orient(gaussians, capture).up, dtype=float)
-        solid, notes = self._decide(box, density, shell, capture, down, gaussians.device)
-        return box, solid, notes | {"stray_gaussians": strays}
+        from .solid_field import SignedDistance
+        from .solid_source import find_solid
 
-    def _decide(
-        self,
-        box: GridBox,
-        density: np.ndarray,
-        shell: np.ndarray,
-        capture: Capture | None,
-        down: np.ndarray | None,
-        device: torch.device,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Occupied voxels and what was noticed on the way."""
-        from scipy import ndimage
-
-        vote = cast_votes(shell, rays=self.rays, down=down, close_open_side=self.close_underside)
-        views = _masked_views(capture) if self.method != "vote" else []
-        if self.method == "hull" and not views:
+        if isinstance(solid, SignedDistance):
+            if not bool(solid.inside.any()):
+                raise InputError("fill: nothing is inside the solid that was given", "check it")
+            return solid
+        if self.method == "hull" and not (capture is not None and has_masks(capture)):
             raise InputError(
                 "fill: method 'hull' needs a capture with masks",
                 mend="add masks or use method: vote",
             )
-        inside = vote.score >= self.agreement
-        solid = inside | shell
-        method = "vote"
-        if views:
-            hull = visual_hull(box, views, device)
-            # masks say what is not the object; rays cap the cone under objects seen only from above
-            # (just outside a convex surface about half of the rays hit it)
-            solid = hull & (shell | (vote.score >= 0.65))
-            method = "hull and vote"
-            if not solid.any():
-                raise InputError(
-                    "fill: masks and splats do not overlap",
-                    mend="check that masks are white on the object and belong to these cameras",
-                )
-        solid, dropped = keep_components(solid)
-        solid = ndimage.binary_fill_holes(solid)
-        leaks, wet = count_leaks(shell, solid)
-        if vote.open_side is not None:
-            leaks = max(leaks, 1)
-        untrimmed = solid
-        solid = smooth_boundary(trim_outer_flank(solid, shell, density, device))
-        solid, more = keep_components(solid)
-        offset = 0.0
-        if self.match_masks and views and capture is not None:
-            # what one sees reaches beyond the centres of the splats; the masks say how far
-            solid, offset = grown_to_masks(solid, hull, box, capture, device)
-        inner = int((solid & ~shell).sum())
-        if inner == 0:
-            logger.warning(
-                "fill: the object is all shell at this resolution: nothing but thin parts"
-            )
-        # splats well below the surface hint at a cavity or an inner wall
-        depth = distance_transform(untrimmed, device)
-        buried = float((shell & (depth > 5.0)).sum() / max(int(shell.sum()), 1))
-        if vote.open_side is not None:
-            logger.info(
-                "fill: nothing seen from side %s; closed there (%.0f %% of inner voxels look out)",
-                vote.open_side,
-                100 * vote.open_fraction,
-            )
-        notes = {
-            "method": method,
-            "leaks": leaks,
-            "leaking_voxels": wet,
-            "closed_side": None if vote.open_side is None else list(vote.open_side),
-            "closed_side_open_fraction": vote.open_fraction,
-            "components_dropped": dropped + more,
-            "buried_surface_fraction": buried,
-            "skin_offset": offset,
-        }
-        return solid, notes
+        method = {"vote": "density"}.get(self.method, self.method)
+        if method == "hull" and gaussians is not None:
+            method = "density"
+        if solid is not None:
+            method = "mesh"
+        options = VoteOptions(
+            self.threshold, self.agreement, self.rays, self.down, self.close_underside,
+            masks=self.method != "vote",
+        )  # fmt: skip
+        return find_solid(
+            gaussians,
+            capture,
+            solid,
+            method=method,
+            resolution=self.resolution,
+            options=options,
+            match_masks=self.match_masks,
+            finer=self.finer,
+        )
 
     def _depth(
         self, solid: np.ndarray, voxel: float, device: torch.device
@@ -372,33 +326,3 @@ def _parse_hollow(hollow: str | float) -> float | None:
             f"fill: hollow wall thickness must be positive, got {hollow}", mend="use hollow: none"
         )
     return float(hollow)
-
-
-def _masked_views(
-    capture: Capture | None, size: int = 400
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Background pixels and undistorted cameras of the views that have a mask."""
-    from scipy import ndimage
-
-    if capture is None:
-        return []
-    views = []
-    for i in range(len(capture.cameras)):
-        view = capture.view(i, max_size=size)
-        if view.mask is None:
-            continue
-        ground = view.mask < 0.5
-        if view.valid is not None:
-            ground = ground & view.valid
-        # one pixel of tolerance: masks and poses are never better than that
-        ground_pixels = ndimage.binary_erosion(
-            ground.cpu().numpy(), np.ones((3, 3)), border_value=1
-        )
-        views.append(
-            (
-                ground_pixels,
-                view.camera.viewmat.double().cpu().numpy(),
-                view.camera.K.double().cpu().numpy(),
-            )
-        )
-    return views

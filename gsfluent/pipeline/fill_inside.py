@@ -10,9 +10,11 @@ from __future__ import annotations
 import itertools
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from .fill_density import GridBox
 from .voxels import distance_transform
@@ -22,6 +24,7 @@ __all__ = [
     "Vote",
     "cast_votes",
     "count_leaks",
+    "find_leaks",
     "keep_components",
     "smooth_boundary",
     "trim_outer_flank",
@@ -66,12 +69,39 @@ def _blocked(hit: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.flip(out.transpose(np.argsort(order)), flips)
 
 
+def blocked_by_doubling(hit: Tensor, direction: np.ndarray) -> Tensor:
+    """As :func:`_blocked`, for a GPU: log2(n) shifts of the whole grid instead of a sweep.
+
+    After k rounds the first 2^k voxels along the direction are known.
+    """
+    step = [int(value) for value in direction]
+    seen, reach = _shifted(hit, step), 1
+    while reach < max(hit.shape):
+        seen = seen | _shifted(seen, [reach * value for value in step])
+        reach *= 2
+    return seen
+
+
+def _shifted(field: Tensor, step: list[int]) -> Tensor:
+    """``field[x + step]``, False beyond the grid."""
+    out = torch.zeros_like(field)
+    if any(abs(value) >= size for value, size in zip(step, field.shape, strict=True)):
+        return out
+    to, source = [], []
+    for value, size in zip(step, field.shape, strict=True):
+        to.append(slice(max(0, -value), size - max(0, value)))
+        source.append(slice(max(0, value), size - max(0, -value)))
+    out[tuple(to)] = field[tuple(source)]
+    return out
+
+
 def cast_votes(
     shell: np.ndarray,
     *,
     rays: int = 26,
     down: np.ndarray | None = None,
     close_open_side: bool = True,
+    device: torch.device | None = None,
 ) -> Vote:
     """Let every voxel look for the surface along 6 or 26 lattice directions.
 
@@ -84,13 +114,18 @@ def cast_votes(
         rays: 6 (axes) or 26 (axes and diagonals; narrower crevices stay open).
         down: Known downward direction [3]; None finds the open side by itself.
         close_open_side: False never leaves a side out.
+        device: Where to look along the rays.
 
     Returns:
         The vote; a voxel is inside when its score is high.
     """
     axes = np.abs(DIRECTIONS).sum(1) == 1
     chosen = DIRECTIONS[axes] if rays == 6 else DIRECTIONS
-    flags = np.stack([_blocked(shell, d) for d in chosen])
+    if device is None or device.type == "cpu":
+        flags = np.stack([_blocked(shell, d) for d in chosen])
+    else:
+        hit = torch.from_numpy(shell).to(device)
+        flags = torch.stack([blocked_by_doubling(hit, d) for d in chosen]).cpu().numpy()
     unit = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
     count = flags.sum(0, dtype=np.uint8)
     plain = count.astype(np.float32) / len(chosen)
@@ -206,6 +241,27 @@ def count_leaks(shell: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
     Returns:
         Number of separate openings, and number of inner voxels that the flood would reach.
     """
+    found = find_leaks(shell, inside, np.zeros(3), 1.0)
+    return found["leaks"], found["leaking_voxels"]
+
+
+def find_leaks(
+    shell: np.ndarray, inside: np.ndarray, origin: np.ndarray, voxel: float, most: int = 16
+) -> dict[str, Any]:
+    """Openings through which a flood from outside would enter the object, and where they are.
+
+    Args:
+        shell: Surface voxels that hold water back, bool [X, Y, Z].
+        inside: Voxels decided to be inside.
+        origin: Corner of voxel (0, 0, 0) [3], world units.
+        voxel: Edge of a voxel, world units.
+        most: Openings listed, the largest first.
+
+    Returns:
+        ``leaks`` (separate openings), ``leaking_voxels`` (inner voxels that the flood would
+        reach) and ``leak_list``: ``center`` [world units] and ``area`` [square world units] of
+        each.
+    """
     from scipy import ndimage
 
     cross = ndimage.generate_binary_structure(3, 1)
@@ -214,13 +270,24 @@ def count_leaks(shell: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
     flooded = (labels == labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
     wet = flooded & inside & ~shell
     if not wet.any():
-        return 0, 0
+        return {"leaks": 0, "leaking_voxels": 0, "leak_list": []}
     # an opening: wet inner voxels that touch open space outside the object
     mouth = wet & ndimage.binary_dilation(~inside & ~shell, cross)
     # patches of one mouth a voxel or two apart are one opening
     merged = ndimage.binary_dilation(mouth, np.ones((3, 3, 3)))
-    _, openings = ndimage.label(merged, structure=np.ones((3, 3, 3)))
-    return int(openings), int(wet.sum())
+    label, openings = ndimage.label(merged, structure=np.ones((3, 3, 3)))
+    index = np.argwhere(mouth)
+    owner = label[tuple(index.T)]
+    sizes = np.bincount(owner, minlength=openings + 1)
+    largest = [int(i) for i in np.argsort(-sizes) if sizes[i] > 0][:most]
+    listed = [
+        {
+            "center": (origin + (index[owner == i].mean(0) + 0.5) * voxel).tolist(),
+            "area": float(sizes[i] * voxel**2),
+        }
+        for i in largest
+    ]
+    return {"leaks": int(openings), "leaking_voxels": int(wet.sum()), "leak_list": listed}
 
 
 def visual_hull(

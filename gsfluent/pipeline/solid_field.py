@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Solid
+from gsfluent.pipeline.fill_density import GridBox
 from gsfluent.pipeline.voxels import distance_transform
 
 __all__ = ["SignedDistance", "distances_of"]
@@ -60,6 +61,12 @@ class SignedDistance:
         return self.values <= 0
 
     @property
+    def box(self) -> GridBox:
+        """The grid of the values."""
+        x, y, z = self.origin.double().tolist()
+        return GridBox((x, y, z), float(self.voxel), tuple(self.values.shape))  # type: ignore[arg-type]
+
+    @property
     def volume(self) -> float:
         """Volume [cubic world units]; voxels at the surface count by the share that is inside."""
         share = (0.5 - self.values.double() / self.voxel).clamp(0.0, 1.0)
@@ -83,6 +90,10 @@ class SignedDistance:
             index = torch.minimum(base + step, size - 1)
             total += weight * self.values[index[:, 0], index[:, 1], index[:, 2]]
         return total + (place - held).norm(dim=1) * self.voxel
+
+    def to(self, device: torch.device | str) -> SignedDistance:
+        """Return a copy whose values live on ``device``."""
+        return self.replace(values=self.values.to(device), origin=self.origin.to(device))
 
     def replace(self, **changes: Any) -> SignedDistance:
         """Return a copy with the named fields replaced."""
@@ -115,13 +126,16 @@ class SignedDistance:
         voxel: float,
         source: str,
         report: dict[str, Any] | None = None,
+        *,
+        device: torch.device | None = None,
     ) -> SignedDistance:
         """Distances to the boundary of whole voxels, bool [X, Y, Z], padded to an empty rim."""
         solid, start = _padded(np.asarray(occupancy, dtype=bool), np.asarray(origin), voxel)
-        values = torch.from_numpy(distances_of(solid) * np.float32(voxel))
-        return SignedDistance(
+        values = torch.from_numpy(distances_of(solid, device=device) * np.float32(voxel))
+        field = SignedDistance(
             values, torch.from_numpy(start).float(), float(voxel), source, dict(report or {})
         )
+        return field if device is None else field.to(device)
 
     @staticmethod
     def of_solid(solid: Solid) -> SignedDistance:

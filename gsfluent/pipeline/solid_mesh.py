@@ -14,7 +14,7 @@ from gsfluent.data import BACKGROUND, Gaussians, Solid
 from gsfluent.data.solid import volume_path
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import atomic_path, load, load_capture
-from gsfluent.pipeline.fill_view import surface_colors
+from gsfluent.pipeline.fill_colors import surface_colors
 from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.solid_source import find_solid
 
@@ -119,7 +119,6 @@ def mesh_to(
     method: str = "auto",
     resolution: int = 96,
     scale: float = 1.0,
-    seed: int = 0,
 ) -> dict[str, Any]:
     """A splat file, a solid, a masked capture or a mesh to a closed mesh.
 
@@ -130,7 +129,6 @@ def mesh_to(
         method: See :func:`gsfluent.pipeline.solid_source.find_solid`.
         resolution: Voxels along the longest side.
         scale: Units of the file per world unit.
-        seed: Seed.
 
     Returns:
         ``source`` (what the solid was taken from), ``why``, ``vertices``, ``faces``,
@@ -146,11 +144,9 @@ def mesh_to(
     photographs = None if capture is None else load_capture(capture)
     gaussians = None
     if source.is_dir():
-        field = find_solid(
-            None, load_capture(source), method=method, resolution=resolution, seed=seed
-        )
+        field = find_solid(None, load_capture(source), method=method, resolution=resolution)
     elif source.suffix.lower() in _MESHES or _has_faces(source):
-        field = find_solid(mesh=source, method=method, resolution=resolution, seed=seed)
+        field = find_solid(mesh=source, method=method, resolution=resolution)
     elif method == "auto" and volume_path(source).is_file():
         solid = Solid.load(source)
         field, gaussians = SignedDistance.of_solid(solid), solid.gaussians
@@ -159,7 +155,7 @@ def mesh_to(
         gaussians = load(source).validated(source.name)
         if gaussians.labels is not None and bool((gaussians.labels != BACKGROUND).any()):
             gaussians = gaussians.select(gaussians.labels != BACKGROUND)
-        field = find_solid(gaussians, photographs, method=method, resolution=resolution, seed=seed)
+        field = find_solid(gaussians, photographs, method=method, resolution=resolution)
     mesh = closed_mesh(field, gaussians)
     save_mesh(mesh, out, scale=scale)
     _log.info("mesh: %d faces from %s", len(mesh.faces), field.source)

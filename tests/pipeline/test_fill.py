@@ -25,7 +25,8 @@ def _bottom_missing(points: torch.Tensor) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def solid() -> Solid:
-    return Fill(40)(ellipsoid_shell())
+    # discs overhang: their drawn outline is wider than the surface that they lie on
+    return Fill(40, match_masks=False)(ellipsoid_shell())
 
 
 def test_density_equals_direct_sum() -> None:
@@ -62,7 +63,7 @@ def test_closed_shell_is_filled(solid: Solid) -> None:
 
 
 def test_depth_is_distance_to_surface() -> None:
-    ball = Fill(40)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
+    ball = Fill(40, match_masks=False)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
     centers = ball.voxel_centers()
     depth = ball.depth[ball.occupancy]
     error = (depth - (1.0 - centers.norm(dim=1))).abs()
@@ -71,7 +72,7 @@ def test_depth_is_distance_to_surface() -> None:
 
 
 def test_missing_underside_is_closed_and_reported() -> None:
-    filled = Fill(40)(ellipsoid_shell(keep=_bottom_missing))
+    filled = Fill(40, match_masks=False)(ellipsoid_shell(keep=_bottom_missing))
     truth = ellipsoid_truth(filled)
     z = float(filled.origin[2]) + (np.arange(truth.shape[2]) + 0.5) * filled.voxel
     truth &= (z > -0.5)[None, None]
@@ -86,7 +87,7 @@ def test_bare_flood_fill_would_have_lost_the_object() -> None:
     from scipy import ndimage
 
     gaussians = ellipsoid_shell(keep=_bottom_missing)
-    filled = Fill(40)(gaussians)
+    filled = Fill(40, match_masks=False)(gaussians)
     box = GridBox(
         tuple(float(v) for v in filled.origin), filled.voxel, tuple(filled.occupancy.shape)
     )
@@ -102,14 +103,15 @@ def test_bare_flood_fill_would_have_lost_the_object() -> None:
 
 
 def test_underside_stays_open_when_told() -> None:
-    filled = Fill(32, close_underside=False)(ellipsoid_shell(keep=_bottom_missing))
-    closed = Fill(32)(ellipsoid_shell(keep=_bottom_missing))
-    assert filled.occupancy.sum() < 0.9 * closed.occupancy.sum()
+    shell = ellipsoid_shell(keep=_bottom_missing)
+    filled = Fill(32, match_masks=False, close_underside=False)(shell)
+    closed = Fill(32, match_masks=False)(shell)
+    assert filled.volume < 0.9 * closed.volume
 
 
 def test_down_direction_closes_an_oblique_underside() -> None:
     down = torch.tensor([0.6, 0.0, -0.8])
-    filled = Fill(40, down=(0.6, 0.0, -0.8))(
+    filled = Fill(40, match_masks=False, down=(0.6, 0.0, -0.8))(
         ellipsoid_shell(keep=lambda p: p @ down.double() < 0.45)
     )
     truth = ellipsoid_truth(filled)
@@ -128,16 +130,17 @@ def test_degenerate_splats_and_floaters_change_little(solid: Solid) -> None:
         opacities=torch.tensor([0.9, 0.02, 0.9, 0.9]),
     )
     dirty = clean.replace(quats=clean.quats * torch.linspace(0.2, 3.0, clean.count)[:, None])
-    filled = Fill(40)(Gaussians.cat([dirty, junk]))
+    filled = Fill(40, match_masks=False)(Gaussians.cat([dirty, junk]))
     assert iou(filled.occupancy.numpy(), ellipsoid_truth(filled)) > 0.95
-    assert filled.report["stray_gaussians"] == 2
+    # far away, or as large as the object
+    assert filled.report["stray_gaussians"] + filled.report["unusable_gaussians"] == 2
 
 
 def test_crevice_stays_open() -> None:
     """Two balls a gap apart: what lies between them is not inside."""
     ball = ellipsoid_shell(1500, (0.5, 0.5, 0.5))
     shifted = ball.replace(means=ball.means + torch.tensor([1.15, 0.0, 0.0]))
-    filled = Fill(60)(Gaussians.cat([ball, shifted]))
+    filled = Fill(60, match_masks=False)(Gaussians.cat([ball, shifted]))
     assert filled.occupancy.any()
     middle = torch.tensor([[0.575, 0.0, 0.0], [0.575, 0.2, 0.1]])
     assert not bool(filled.contains(middle).any())
@@ -150,7 +153,7 @@ def test_thin_sheet_survives_trimming() -> None:
     points = torch.stack(torch.meshgrid(grid, grid, indexing="ij"), -1).reshape(-1, 2)
     means = torch.cat([points, torch.zeros(len(points), 1)], 1)
     sheet = Gaussians.from_colors(means, torch.full((len(means),), 0.02), torch.ones(len(means), 3))
-    filled = Fill(48, close_underside=False)(sheet)
+    filled = Fill(48, match_masks=False, close_underside=False)(sheet)
     layers = filled.occupancy.any(2)
     inner = layers[6:-6, 6:-6]
     assert float(inner.float().mean()) > 0.99
@@ -171,12 +174,12 @@ def test_interior_gaussians_fill_without_spilling(solid: Solid) -> None:
 
 
 def test_hollow_wall() -> None:
-    filled = Fill(48, hollow=0.15)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
+    filled = Fill(48, match_masks=False, hollow=0.15)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
     radius = filled.voxel_centers().norm(dim=1)
     assert float(radius.min()) > 0.8
     expected = 1 - (1 - 0.85**3)
     assert filled.report["hollow_fraction"] == pytest.approx(expected, abs=0.06)
-    solid_again = Fill(48)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
+    solid_again = Fill(48, match_masks=False)(ellipsoid_shell(2500, (1.0, 1.0, 1.0)))
     assert solid_again.report["hollow_fraction"] == 0.0
 
 
@@ -233,9 +236,9 @@ def test_masks_remove_what_is_not_the_object(tmp_path: Path) -> None:
     lump = ellipsoid_shell(400, (0.3, 0.3, 0.3))
     stray = lump.replace(means=lump.means + torch.tensor([0.0, 1.0, 0.0]))
     both = Gaussians.cat([ellipsoid_shell(), stray])
-    hull = Fill(40, refine_views=0)(both, capture)
+    hull = Fill(40, method="hull", refine_views=0)(both, capture)
     vote = Fill(40, method="vote")(both)
-    assert hull.report["method"] == "hull and vote"
+    assert hull.report["closed_by"] == "hull and vote"
     assert iou(hull.occupancy.numpy(), ellipsoid_truth(hull)) > 0.93
     assert iou(vote.occupancy.numpy(), ellipsoid_truth(vote)) < iou(
         hull.occupancy.numpy(), ellipsoid_truth(hull)
@@ -246,7 +249,7 @@ def test_capture_prunes_and_reports(tmp_path: Path) -> None:
     filled = Fill(24, refine_views=4, refine_image_size=48)(
         ellipsoid_shell(800), _silhouettes(tmp_path)
     )
-    assert filled.report["method"] == "hull and vote"
+    assert filled.report["closed_by"] == "hull and vote"
     assert filled.report["seen_after"] <= filled.report["seen_before"]
     inner = int((filled.gaussians.labels == INTERIOR).sum())
     assert inner == filled.report["interior_gaussians"]
@@ -278,11 +281,11 @@ def test_errors() -> None:
     with pytest.raises(InputError, match="resolution"):
         Fill(4)
     with pytest.raises(InputError, match="hollow"):
-        Fill(24, hollow="maybe")
+        Fill(24, match_masks=False, hollow="maybe")
     with pytest.raises(InputError, match="masks"):
         Fill(24, method="hull")(shell)
     with pytest.raises(InputError, match="thinner than a voxel"):
-        Fill(24, hollow=1e-4)(shell)
+        Fill(24, match_masks=False, hollow=1e-4)(shell)
     with pytest.raises(InputError, match="no voxel reaches"):
         Fill(24)(shell.replace(opacities=shell.opacities * 1e-3))
     filled = Fill(24)(shell)
@@ -321,8 +324,9 @@ def test_masks_say_how_far_the_skin_lies_from_the_centres_of_the_splats(tmp_path
     true = truth.inside(points)
     shares = {}
     for photographs in (None, capture):
-        solid = Fill(resolution=48, refine_views=0)(sunk, photographs)
+        known = photographs is not None
+        solid = Fill(48, match_masks=known, refine_views=0)(sunk, photographs)
         guess = solid.contains(points.float())
         shares[photographs is None] = float((guess & true).sum() / (guess | true).sum())
-    assert solid.report["skin_offset"] > 0.5
+    assert solid.report["skin_offset"] > 0.2
     assert shares[False] > shares[True] + 0.05 and shares[False] > 0.9

@@ -156,17 +156,16 @@ def test_matching_evens_out_the_slices_of_a_stack() -> None:
     assert change[True] < 0.6 * change[False]
 
 
-def test_fusion_interpolates_and_follows_the_nearer_proposal() -> None:
-    volume = np.zeros((5, 5, 5, 3), np.float32)
+def test_fusion_interpolates_and_takes_the_mean_of_the_axes() -> None:
     ramp = np.stack([np.full((5, 5, 3), v, np.float32) for v in (0.0, 1.0)])
-    fused, _ = fuse_stacks(volume, [(0, [0, 4], ramp)])
+    fused, variance = fuse_stacks((5, 5, 5), [(0, [0, 4], ramp)])
     assert np.allclose(fused[:, 0, 0, 0], [0, 0.25, 0.5, 0.75, 1.0])
-    near, far = np.full((5, 5, 5, 3), 0.1, np.float32), np.full((5, 5, 5, 3), 0.9, np.float32)
-    every = [0, 1, 2, 3, 4]
-    fused, variance = fuse_stacks(volume, [(0, every, near), (1, every, far)], softness=0.1)
-    weights = 1 / (0.01 + 0.01), 1 / (0.81 + 0.01)
-    assert fused[2, 2, 2, 0] == pytest.approx(np.average([0.1, 0.9], weights=weights), rel=1e-4)
-    assert variance[2, 2, 2] == pytest.approx(0.16, rel=1e-4)  # of two values 0.8 apart
+    assert np.allclose(variance, 0.0, atol=1e-6)
+    level = np.full((2, 5, 5, 3), 0.5, np.float32)
+    fused, variance = fuse_stacks((5, 5, 5), [(0, [0, 4], ramp), (1, [0, 4], level)])
+    assert np.allclose(fused[:, 2, 2, 0], [0.25, 0.375, 0.5, 0.625, 0.75])
+    # of two values d apart: d^2 / 4
+    assert variance[0, 2, 2] == pytest.approx(0.25 / 4) and variance[2, 2, 2] < 1e-6
 
 
 def test_coarse_domain_keeps_depth_in_its_own_voxels() -> None:

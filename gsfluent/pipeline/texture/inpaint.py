@@ -302,9 +302,9 @@ class _Run:
                     slice_seed(self.seed, number, axis, -1),
                 )
             stacks.append((axis, positions, images))
-        fused, variance = fuse_stacks(volume, stacks)
+        fused, variance = fuse_stacks(volume.shape[:3], stacks)
         volume = np.where(hole[..., None], fused, volume).astype(np.float32)
-        if 0 in self.photos and hole.any():
+        if self.options.match_colors and 0 in self.photos and hole.any():
             # fusion takes contrast away; the volume gets the photograph's colours back
             volume[hole] = to_photo(
                 volume[hole], level.depth[hole], level, self.photos[0], self.seed + number

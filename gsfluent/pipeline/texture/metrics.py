@@ -140,7 +140,7 @@ def draw_patches(slices: Sequence[Slice], patch: int, samples: int, seed: int) -
         lab = rgb_to_lab(image)
         rows = place[:, 1, None, None] + window[:, None]
         columns = place[:, 2, None, None] + window[None]
-        parts.append(lab[rows, columns].reshape(len(place), -1).astype(np.float32))
+        parts.append(lab[rows, columns].reshape(len(place), 3 * patch * patch).astype(np.float32))
     return np.concatenate(parts)
 
 
