@@ -378,11 +378,11 @@ class _Run:
         part: Sequence[int],
     ) -> np.ndarray:
         inside, shell, depth, colors = (
-            np.moveaxis(np.take(field, part, axis), axis, 0)
+            _upright(np.moveaxis(np.take(field, part, axis), axis, 0))
             for field in (level.inside, level.shell, level.depth, volume)
         )
         images = np.where(inside[..., None], colors, GROUND).astype(np.float32)
-        return backend(
+        made = backend(
             images,
             inside & ~shell,
             prompt=self.prompt,
@@ -398,6 +398,15 @@ class _Run:
                 max_depth=level.max_depth,
             ),
         )
+        return np.ascontiguousarray(np.swapaxes(made[:, ::-1], 1, 2))
+
+
+def _upright(slices: np.ndarray) -> np.ndarray:
+    """Slices [B, U, V, ...] of a volume as pictures [B, H, W, ...] with V (z where it can) up.
+
+    A model knows which way up a cake is, and so does a photograph of one.
+    """
+    return np.ascontiguousarray(np.swapaxes(slices, 1, 2)[:, ::-1])
 
 
 def _per_axis(exemplar: Photographs) -> dict[int, Exemplar]:
