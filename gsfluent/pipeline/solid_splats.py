@@ -206,8 +206,6 @@ def _cavities(solid: np.ndarray, depths: np.ndarray, device: torch.device) -> np
 
     The density knows the skin better; the depths know what is hollow.
     """
-    from scipy import ndimage
-
     differing = solid & (depths > 0)
     deep = distance_transform(differing, device) > _SKIN
     result: np.ndarray = grown(deep, 2) & differing
