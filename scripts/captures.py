@@ -32,7 +32,9 @@ SHOTS: dict[str, dict[str, Any]] = {
         "reconstruct": REDUCED,
         "texture": {
             "method": "exemplar",
-            "exemplar": "exemplars/apple_cross_sections/apple_cs_04.png",
+            "exemplar": "exemplars/apple_cross_sections/apple_cs_13.png",
+            "cut": "across",
+            "photo": {"stain": True},  # these apples were dipped in iodine
         },
         "objects": {"apple": {"material": "fruit.apple"}},
         "events": [{"type": "drop", "height": 1.0}],
@@ -41,7 +43,7 @@ SHOTS: dict[str, dict[str, Any]] = {
         "capture": "captures/skull",
         "size": 0.2,
         "reconstruct": REDUCED,
-        "texture": {"method": "color_copy"},
+        "texture": {"method": "procedural", "preset": "bone"},
         # as soft as a melon, so that a fall from a table breaks it within a short film
         "objects": {"skull": {"material": "fruit.watermelon"}},
         "events": [{"type": "drop", "height": 1.2}],
@@ -56,7 +58,7 @@ SHOTS: dict[str, dict[str, Any]] = {
     "plush_dog": {
         "splats": "splats/plush_dog/point_cloud_29999_clean.ply",
         "size": 0.3,
-        "texture": {"method": "color_copy"},
+        "texture": {"method": "procedural", "preset": "stuffing"},
         "objects": {"dog": {"material": "plush"}},
         "events": [{"type": "drop", "height": 1.0}],
     },
