@@ -67,7 +67,7 @@ def surface_verdict(
     surface_patch = _distance(_surface_patches(domain, skin_lab, rng), np.concatenate(both), rng)
     alike = surface_hist <= max(_ALLOWED * photo_hist, _EQUAL)
     if np.isfinite(surface_patch):
-        alike = alike and surface_patch <= max(_ALLOWED * photo_patch, _EQUAL)
+        alike = alike and surface_patch <= max(_ALLOWED * np.nan_to_num(photo_patch), _EQUAL)
     copy_radial, photo_radial = _radial(skin_lab, domain.depth, domain.inside), np.mean(radial)
     return {
         "surface_hist": surface_hist,

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..fill_colors import skin_colors
-
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
@@ -56,6 +54,9 @@ class InteriorDomain:
             axis: The object's own axis in world coordinates; None takes scene "up", else +z.
         """
         from scipy import ndimage
+
+        # brings the compiled renderer with it, which texturing itself does without
+        from ..fill_colors import skin_colors
 
         inside = solid.occupancy.cpu().numpy()
         depth = (solid.depth.float().cpu().numpy() / solid.voxel).astype(np.float32)
