@@ -152,8 +152,17 @@ def exemplar_texture(
             mend="cut the object out (RGBA) or use guide: none",
         )
     crop, back = _crop(domain)
+    if isinstance(guide, np.ndarray):
+        if guide.shape != domain.inside.shape or not np.isfinite(guide).all():
+            raise InputError(
+                f"texture: a guide array must be finite, of shape {list(domain.inside.shape)}, "
+                f"got {list(guide.shape)}",
+                mend="give one value per voxel of the solid",
+            )
+        guide = guide[back]
     shared = len({id(e) for e in everything}) == len(photos[min(photos)])
-    aligned = not directional and guide not in ("axis", "height") and shared
+    along = isinstance(guide, str) and guide in ("axis", "height")
+    aligned = shared and not (directional or along)
     fields = ObjectFields(crop, aligned, where)
     guided = not (guide == "none" if isinstance(guide, str) else False) and (
         outlined if isinstance(guide, str) else True

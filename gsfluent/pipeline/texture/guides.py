@@ -30,7 +30,7 @@ GUIDES = ("auto", "depth", "axis", "height", "none")
 
 _BINS, _SPOT = 32, 16  # depth ranges of the profile; pixels of a spot
 _SLOPE = 3.0  # guide per Lab / 100 that the mean colour changes
-_SLOPES = (0.4, 9.0)  # least and largest guide per largest depth
+_SLOPES = (0.4, 24.0)  # least and largest guide per largest depth
 _FIT = 0.88  # overlap of outline and section from which a photograph is laid into the object
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .domain import InteriorDomain
+from .domain import InteriorDomain, gradient
 from .guides import PlacedPhoto
 from .photo import Exemplar, rgb_to_lab
 
@@ -82,7 +82,7 @@ def find_inclusions(
     depth = exemplar.depth if exemplar.silhouette else np.zeros_like(exemplar.depth)
     found: list[tuple[float, ...]] = []
     colors: list[np.ndarray] = []
-    gradient = np.stack(np.gradient(ndimage.gaussian_filter(exemplar.depth, 1.5)), -1)
+    slopes = np.stack(np.gradient(ndimage.gaussian_filter(exemplar.depth, 1.5)), -1)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         if box is None:
             continue
@@ -99,7 +99,7 @@ def find_inclusions(
             continue
         middle = points.mean(0) + [box[0].start, box[1].start]
         row, column = np.rint(middle).astype(int)
-        slope = gradient[row, column]
+        slope = slopes[row, column]
         length = float(np.linalg.norm(slope))
         cosine = abs(float(vectors[:, 1] @ slope)) / length if length > 1e-6 else 0.64
         found.append(
@@ -230,7 +230,7 @@ def paint_inclusions(
     inside, pitch = domain.inside, placed.pitch
     result = rgb.copy()
     labels = np.zeros(inside.shape, np.int32)
-    gradient = np.stack(np.gradient(ndimage.gaussian_filter(domain.depth, 1.5)))
+    slope = gradient(ndimage.gaussian_filter(domain.depth, 1.5))
     reach = _RINGS[-1]
     number = 0
     for center, k, noise in _place(domain, placed, inclusions, anchor, rng):
@@ -238,7 +238,7 @@ def paint_inclusions(
         b = _SECTION_BIAS * inclusions.minor[k] * pitch
         a, b = max(a, 0.9), max(b, 0.7)
         voxel = tuple(np.floor(center).astype(int))
-        long = gradient[(slice(None), *voxel)] if inclusions.radial > 0.75 else np.zeros(3)
+        long = slope[(slice(None), *voxel)] if inclusions.radial > 0.75 else np.zeros(3)
         long = long + 0.15 * noise * max(float(np.linalg.norm(long)), 0.1)
         long /= max(float(np.linalg.norm(long)), 1e-9)
         low = np.maximum(np.floor(center - reach * a - 1).astype(int), 0)

@@ -96,7 +96,7 @@ def synthesize_pyramid(
         skin = rgb_to_lab100(here["skin"].movedim(0, -1)).movedim(-1, 0)
         volume = torch.where(fixed, skin, volume) * inside
         along = 0.0 if kind != "axis" else _FIBRE if directional else _LINES
-        level = SynthesisLevel(volume, inside, fixed, guide, banks, reference, along)
+        level = SynthesisLevel(volume, inside, fixed, guide, banks, reference, lattice.first, along)
         rounds = schedule.at(step, len(lattices))
         disagreement = synthesize_level(
             level, schedule, rounds, transport_last_only=kind == "none", rng=rng
@@ -143,8 +143,9 @@ def _banks(
     rng: np.random.Generator,
 ) -> dict[int, Bank]:
     """Patches per slice axis; axes with the same photographs share them."""
-    # more patches than queries cannot all be used
-    wanted = min(schedule.bank, max(512, len(target) // schedule.stride**2))
+    # more patches than queries cannot all be used; in powers of two, which a voxel does not change
+    queries = max(len(target) / schedule.stride**2, 1.0)
+    wanted = min(schedule.bank, max(512, 2 ** round(float(np.log2(queries)))))
     made: dict[tuple[int, ...], Bank] = {}
     banks = {}
     for axis, group in groups.items():
