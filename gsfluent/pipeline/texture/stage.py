@@ -14,6 +14,7 @@ import torch
 
 from gsfluent.errors import InputError
 
+from ..regions_table import with_inclusions
 from ..stage import Progress, Stage, report_progress
 from .baselines import color_copy, telea_slices
 from .domain import InteriorDomain, InteriorTexture, blend_skin
@@ -29,6 +30,8 @@ from .metrics import (
 from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
 from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
+from .structure import take_apart, with_structure
+from .sweep import CUTS
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
@@ -78,6 +81,10 @@ class Texture(Stage):
         directional: True for grained materials: the exemplar is not turned or mirrored.
         inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
+        cut: ``across`` or ``along`` when the (first) photograph was cut across the object's axis or
+            through it: structure seen in one place only (an apple's star, segments) is then swept
+            about the axis instead of being spread as material (:mod:`.structure`). None: it is
+            material like the rest.
         photo: What is done to photographs before their material is used (:class:`PhotoOptions`,
             or its settings as a mapping); None for the defaults.
         inpaint: Settings of the slice methods, or a mapping of them.
@@ -115,6 +122,7 @@ class Texture(Stage):
         directional: bool = False,
         inclusions: bool = True,
         axis: tuple[float, float, float] | None = None,
+        cut: str | None = None,
         photo: PhotoOptions | Mapping[str, Any] | None = None,
         inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
@@ -176,6 +184,12 @@ class Texture(Stage):
         self.directional = directional
         self.inclusions = inclusions
         self.axis = None if axis is None else np.asarray(axis, dtype=float)
+        if cut is not None and cut not in CUTS:
+            raise InputError(
+                f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
+                mend="leave it out when the structure does not follow the object's axis",
+            )
+        self.cut = cut
         self.photo = PhotoOptions.of(photo)
         self.inpaint = options
         self.resume = None if resume is None else Path(resume)
@@ -209,30 +223,33 @@ class Texture(Stage):
         """
         began = time.perf_counter()
         domain = InteriorDomain.from_solid(solid, self.axis)
-        exemplars = None
+        exemplars, shown, structure = None, None, None
         if self.exemplar is not None:
             opened = open_exemplars(self.exemplar, self.photo)
             if self.photo.white == "skin":
                 opened = with_skin(opened, domain.skin[domain.shell])
-            exemplars = load_exemplars(opened)
+            exemplars = shown = load_exemplars(opened)
+            if self.cut is not None:
+                opened, structure = take_apart(opened)
+                exemplars = load_exemplars(opened)
         if not domain.inside.any():
             raise InputError("texture: the solid is empty", mend="run fill first")
         texture = self._make(domain, exemplars, progress)
+        if structure is not None:
+            texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
-        report = self._report(domain, texture, exemplars) | polished
+        report = self._report(domain, texture, shown) | polished
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
-        regions = solid.regions
-        if texture.labels.any():
-            regions = torch.from_numpy(texture.labels).to(device)
+        regions, table = with_inclusions(solid, texture.labels)
         report_progress(progress, 1, 1, "textured")
         return replace(
             solid,
             gaussians=colored,
             color=torch.from_numpy(rgb).to(device, solid.depth.dtype),
             regions=regions,
-            report={**report, "fill": solid.report},
+            report={**report, **table, "fill": solid.report},
         )
 
     def _make(
