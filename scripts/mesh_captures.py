@@ -85,7 +85,7 @@ def things(names: list[str] | None = None) -> list[Thing]:
                 continue
             volumes.append(float(part.volume))
             label = f"{name} {len(volumes)}" if len(parts) > 1 else name
-            if names is None or any(label.startswith(wanted) for wanted in names):
+            if names is None or label in names or name in names:
                 found.append(_thing(label, part))
     return found
 
@@ -117,7 +117,7 @@ def unpack(path: Path, names: list[str] | None = None) -> list[Thing]:
         return [
             Thing(name, *(values[f"{name}/{p}"] for p in ("corners", "normals", "uv", "texture")))
             for name in known
-            if names is None or any(name.startswith(wanted) for wanted in names)
+            if names is None or name in names or name.split(" ")[0] in names
         ]
 
 
@@ -128,6 +128,11 @@ def capture_of(
     from PIL import Image
 
     folder.mkdir(parents=True, exist_ok=True)
+    kept = sorted(folder.glob("*.webp"))
+    if kept:  # what was photographed before, as many and as large as they were
+        views = len(kept)
+        with Image.open(kept[0]) as first:
+            size = first.width
     mesh = thing.mesh(device)
     cameras = []
     for camera in around(mesh, views, size):
