@@ -10,7 +10,7 @@ import tyro
 
 from gsfluent import __version__
 from gsfluent.cli.common import Verb
-from gsfluent.cli.verbs_look import Doctor, Inspect, Plan
+from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
 from gsfluent.cli.verbs_run import Demo, Export, Render, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
 
@@ -26,6 +26,7 @@ VERBS: dict[str, type[Verb]] = {
     "run": Run,
     "render": Render,
     "export": Export,
+    "metrics": Metrics,
 }
 
 _ABOUT = """\

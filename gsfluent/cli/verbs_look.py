@@ -1,4 +1,4 @@
-"""Verbs that look and change nothing: doctor, inspect, plan."""
+"""Verbs that look and change nothing: doctor, inspect, plan, metrics."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
+from gsfluent.errors import InputError
 
 
 @dataclass(kw_only=True)
@@ -30,27 +31,76 @@ class Doctor(Verb):
 
 @dataclass(kw_only=True)
 class Inspect(Verb):
-    """Say what is in a capture or a splat (size, up axis, floor, floaters) and draw one PNG.
+    """Say what is in a capture, a splat, a solid or a shot, and draw one PNG.
 
     Examples:
       gsfluent inspect captures/apple                    # a folder of posed photographs
       gsfluent inspect melon.ply -o melon.png            # a trained splat
       gsfluent inspect melon.ply --size 0.25             # its largest extent is 25 cm
+      gsfluent inspect textured.ply -o regions.png       # a solid with regions: which, how large
+      gsfluent inspect shot.yaml --run out -o parts.png  # the parts of a shot, before it is run
+
+    A capture or splat: size, up axis, floor, floaters, thin parts. A solid or shot: its parts with
+    material, volume, particles, depth and what share of the photographs agrees. For a shot the
+    stages up to the parts are done in the folder of the run, where `gsfluent run` goes on from.
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """Capture folder or splat .ply."""
+    """Capture folder, splat or solid .ply, or shot .yaml."""
     out: Out = Path("inspect.png")
     """Where the picture goes."""
     size: float | None = None
     """Largest extent of the object in metres, if known."""
+    run: Path | None = None
+    """Result folder of the shot."""
 
     def execute(self) -> dict[str, Any]:
         """Inspect the input and draw the picture."""
         from gsfluent.pipeline.inspect import inspect
 
         existing(self.input, "INPUT")
+        suffix = self.input.suffix.lower()
+        if suffix in (".yaml", ".yml"):
+            return self._shot()
+        if self.run is not None:
+            raise InputError("--run belongs to a shot", "name the shot's .yaml, or leave it out")
+        if suffix == ".ply" and (shown := _regions(self.input, self.out)) is not None:
+            return shown
         return inspect(self.input, out=self.out, size=self.size, device=self.torch_device())
+
+    def _shot(self) -> dict[str, Any]:
+        """Show the parts of a shot."""
+        from gsfluent.config import load_shot
+        from gsfluent.pipeline.inspect_shot import inspect_shot
+        from gsfluent.progress import reporter
+
+        if self.run is None:
+            raise InputError(
+                f"{self.input}: a shot is inspected in its result folder", "add --run FOLDER"
+            )
+        if self.size is not None:
+            raise InputError("--size does nothing with a shot", "set size in the shot")
+        shot = load_shot(self.input)
+        with reporter(quiet=self.json) as progress:
+            return inspect_shot(
+                shot,
+                self.run,
+                self.out,
+                device=self.torch_device(),
+                seed=self.seed,
+                reporter=progress,
+            )
+
+
+def _regions(path: Path, out: Path) -> dict[str, Any] | None:
+    """The regions of a solid; None for a splat, or a solid without any."""
+    from gsfluent.data import Solid
+    from gsfluent.data.solid import volume_path
+    from gsfluent.pipeline.inspect_shot import inspect_solid
+
+    if not volume_path(path).is_file() or Solid.load(path).regions is None:
+        return None
+    return inspect_solid(path, out)
 
 
 @dataclass(kw_only=True)
@@ -72,3 +122,60 @@ class Plan(Verb):
 
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
         return plan_shot(shot, device=self.torch_device(), seed=self.seed)
+
+
+@dataclass(kw_only=True)
+class Metrics(Verb):
+    """Say how like a reference the inside of a solid, a picture or a folder of pictures is.
+
+    Examples:
+      gsfluent metrics melon.ply cut.jpg                # a textured solid against a photograph
+      gsfluent metrics renders/ photographs/ --json     # two folders of pictures
+      gsfluent metrics melon.ply cut.jpg --clip clip-vit-large-patch14 --prompt "a cut watermelon"
+
+    Always: distances of patches and colours, sharpness; 0 (sharpness 1) is likeness. CLIP score,
+    LPIPS, FID and KID need weights that you give: nothing is downloaded, and what is not given is
+    skipped with one line.
+    """
+
+    judged: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
+    """What is judged: picture, folder of pictures, or the .ply of a textured solid."""
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
+    """What it should be like, the same kinds."""
+    size: int = 256
+    """Longest side in pixels to which the objects are reduced before they are compared."""
+    clip: Path | None = None
+    """Folder of a CLIP model (or the hub id of one in the local cache)."""
+    prompt: str | None = None
+    """Text of the CLIP score."""
+    lpips: Path | None = None
+    """Folder with alexnet-owt-*.pth of torchvision and alex.pth of the lpips package."""
+    fid: Path | None = None
+    """TorchScript Inception network, inception-2015-12-05.pt, for FID and KID."""
+
+    def execute(self) -> dict[str, Any]:
+        """Compare the two sides."""
+        from gsfluent.pipeline.compare import compare
+
+        existing(self.judged, "A")
+        existing(self.reference, "B")
+        result = compare(
+            self.judged,
+            self.reference,
+            size=self.size,
+            clip=self.clip,
+            prompt=self.prompt,
+            lpips=self.lpips,
+            fid=self.fid,
+            device=self.torch_device(),
+            seed=self.seed,
+        )
+        if self.json:
+            return result
+        # for a person the reason stands where the number would
+        skipped = result.pop("skipped")
+        why = {name: f"skipped ({reason})" for name, reason in skipped.items()}
+        shown = {name: why.get(name, value) for name, value in result.items()}
+        if "clip_score" in skipped:
+            del shown["clip_score_reference"]
+        return shown

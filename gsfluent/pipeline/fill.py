@@ -63,7 +63,7 @@ class Fill(Stage):
         down: Downward direction in world coordinates; None asks the capture, and without one finds
             an unseen side by itself.
         close_underside: Close the side that no photograph shows, at its rim.
-        match_masks: Move the skin to the outline of the masks, or of the splats without masks.
+        match_masks: Move the skin to the outline of the masks, where there are any.
         finer: Take smaller voxels where the walls found are thinner than five of them.
         refine_views: Photographs asked about the interior (0 asks none).
         refine_image_size: Longest image side then [pixels].
@@ -293,6 +293,7 @@ class Fill(Stage):
             resolution=self.resolution,
             options=options,
             match_masks=self.match_masks,
+            match_drawn=False,
             finer=self.finer,
         )
 

@@ -14,7 +14,7 @@ from gsfluent.data import BACKGROUND, Gaussians, Solid
 from gsfluent.data.solid import volume_path
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import atomic_path, load, load_capture
-from gsfluent.pipeline.fill_view import surface_colors
+from gsfluent.pipeline.fill_colors import surface_colors
 from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.solid_source import find_solid
 

@@ -46,6 +46,7 @@ def find_solid(
     resolution: int = 96,
     options: VoteOptions | None = None,
     match_masks: bool = True,
+    match_drawn: bool = True,
     finer: bool = True,
 ) -> SignedDistance:
     """Signed distances to the surface of an object, from whatever there is.
@@ -60,7 +61,9 @@ def find_solid(
             depths show to be free, else the hull.
         resolution: Voxels along the longest side of the object.
         options: Settings of the ray vote.
-        match_masks: Move the skin of splats to the outline that masks (or drawn splats) show.
+        match_masks: Move the skin of splats to the outline that masks show.
+        match_drawn: Without masks, half of the way to the outline of the drawn splats: right for
+            trained ones, whose centres lie too deep, too far for large discs.
         finer: Take smaller voxels where the walls found are thinner than five of them.
 
     Returns:
@@ -92,6 +95,7 @@ def find_solid(
             method="auto" if method == "auto" else chosen,
             options=options,
             match_masks=match_masks,
+            match_drawn=match_drawn,
             finer=finer,
         )
         why += note

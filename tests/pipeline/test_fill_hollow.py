@@ -25,13 +25,13 @@ from gsfluent.pipeline.winding import winding_numbers
 
 
 def discs(mesh: trimesh.Trimesh, count: int) -> Gaussians:
-    """Flat splats on the surface of a mesh, that just close it."""
+    """Flat splats on the surface of a mesh, that close it."""
     points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
     normal = torch.from_numpy(mesh.face_normals[face].copy()).float()
     quats = torch.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], 0 * normal[:, 0]], 1)
     quats[normal[:, 2] < -0.999] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     radius = math.sqrt(mesh.area / count)
-    scales = torch.tensor([0.5 * radius, 0.5 * radius, 0.15 * radius]).repeat(count, 1)
+    scales = torch.tensor([0.7 * radius, 0.7 * radius, 0.15 * radius]).repeat(count, 1)
     return Gaussians.from_colors(
         torch.from_numpy(points.copy()).float(),
         scales,
@@ -77,8 +77,15 @@ def test_a_cup_stays_empty_and_says_what_it_holds(cup: Solid) -> None:
     assert cup.report["cavity_volume"] == pytest.approx(math.pi * 0.85**2 * 1.05, rel=0.1)
     assert cup.report["wall"]["median"] == pytest.approx(0.15, rel=0.25)
     assert "look into" in cup.report["why"]
-    # a wall of four voxels and a bit asks for finer ones
-    assert cup.voxel < 2.0 / 56
+
+
+def test_thin_walls_take_finer_voxels() -> None:
+    splats = discs(lathe(CUP), 14_000)
+    fine = Fill(30, refine_views=0)(splats)  # the wall is two voxels of these
+    assert fine.report["finer"] > 1.5 and fine.voxel < 2.0 / 30 / 1.5
+    plain = Fill(30, finer=False, refine_views=0)(splats)
+    assert plain.voxel > 2.0 / 32
+    assert overlap(fine, in_cup) > overlap(plain, in_cup)
 
 
 def test_none_fills_it_and_a_number_hollows_it() -> None:

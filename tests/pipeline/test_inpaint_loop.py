@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,39 @@ def test_stages_strengths_and_context() -> None:
     assert plan["denoising_steps"] == 5 * 29 + 15 * 9 + 15 * 6
 
 
+def test_backends_see_slices_upright() -> None:
+    """Slices across x and y have z up, those across z have y up; the answer is turned back."""
+    domain = ball(16)
+    where = np.mgrid[:16, :16, :16] / 16.0
+    domain = replace(domain, skin=np.moveaxis(where, 0, -1).astype(np.float32))
+
+    class Look(Painter):
+        def paint(self, slices: np.ndarray, mask: np.ndarray, *rest: Any) -> np.ndarray:
+            context = rest[-1]
+            right, up = (i for i in range(3) if i != context.axis)
+            row, column = np.nonzero(context.inside[0] & ~mask[0])  # the shell, whose skin tells
+            low, high = row > row.mean(), row < row.mean()
+            color = slices[0][row, column]
+            assert color[high, up].mean() > color[low, up].mean() + 0.2
+            left = column < column.mean()
+            assert color[~left, right].mean() > color[left, right].mean() + 0.2
+            self.calls.append((0.0, context))
+            made = slices.copy()
+            made[:, : mask.shape[1] // 2] = 1.0  # the upper half white
+            return made
+
+    look = Look()
+    options = InpaintOptions(slices=6, refine=(), match_colors=False)
+    rgb = inpaint_volume(domain, look, prompt="", options=options).rgb
+    hole = domain.inside & ~domain.shell
+    middle = slice(6, 10)  # the outermost slices are all shell and not asked for
+    rgb, hole = rgb[middle], hole[middle]
+    assert (rgb[..., 8:, :][hole[..., 8:]] > 0.99).all()
+    assert not (rgb[..., :8, :][hole[..., :8]] > 0.99).all()
+    inpaint_volume(domain, look, prompt="", options=replace(options, refine=(0.3,)))
+    assert {c.axis for _, c in look.calls} == {0, 1, 2}
+
+
 def test_first_stage_can_be_another_backend() -> None:
     coarse, fine = Painter(), Painter()
     options = InpaintOptions(slices=4, refine=(0.3,))
@@ -156,17 +190,16 @@ def test_matching_evens_out_the_slices_of_a_stack() -> None:
     assert change[True] < 0.6 * change[False]
 
 
-def test_fusion_interpolates_and_follows_the_nearer_proposal() -> None:
-    volume = np.zeros((5, 5, 5, 3), np.float32)
+def test_fusion_interpolates_and_takes_the_mean_of_the_axes() -> None:
     ramp = np.stack([np.full((5, 5, 3), v, np.float32) for v in (0.0, 1.0)])
-    fused, _ = fuse_stacks(volume, [(0, [0, 4], ramp)])
+    fused, variance = fuse_stacks((5, 5, 5), [(0, [0, 4], ramp)])
     assert np.allclose(fused[:, 0, 0, 0], [0, 0.25, 0.5, 0.75, 1.0])
-    near, far = np.full((5, 5, 5, 3), 0.1, np.float32), np.full((5, 5, 5, 3), 0.9, np.float32)
-    every = [0, 1, 2, 3, 4]
-    fused, variance = fuse_stacks(volume, [(0, every, near), (1, every, far)], softness=0.1)
-    weights = 1 / (0.01 + 0.01), 1 / (0.81 + 0.01)
-    assert fused[2, 2, 2, 0] == pytest.approx(np.average([0.1, 0.9], weights=weights), rel=1e-4)
-    assert variance[2, 2, 2] == pytest.approx(0.16, rel=1e-4)  # of two values 0.8 apart
+    assert np.allclose(variance, 0.0, atol=1e-6)
+    level = np.full((2, 5, 5, 3), 0.5, np.float32)
+    fused, variance = fuse_stacks((5, 5, 5), [(0, [0, 4], ramp), (1, [0, 4], level)])
+    assert np.allclose(fused[:, 2, 2, 0], [0.25, 0.375, 0.5, 0.625, 0.75])
+    # of two values d apart: d^2 / 4
+    assert variance[0, 2, 2] == pytest.approx(0.25 / 4) and variance[2, 2, 2] < 1e-6
 
 
 def test_coarse_domain_keeps_depth_in_its_own_voxels() -> None:

@@ -129,6 +129,15 @@ def test_odd_sizes_work_without_seeds_and_context(inpainter: Inpainter) -> None:
     assert np.array_equal(made[~masks], images[~masks])
 
 
+def test_a_hole_of_one_pixel(inpainter: Inpainter) -> None:
+    images, _ = slices(2, 40, 40)
+    masks = np.zeros((2, 40, 40), bool)
+    masks[:, 11, 17] = True
+    where = SliceContext(0, (0, 1), 1.0, np.ones_like(masks), np.full(masks.shape, 2.0), 8.0)
+    made = call(inpainter, images, masks, context=where)
+    assert np.isfinite(made).all() and np.array_equal(made[~masks], images[~masks])
+
+
 def test_empty_mask_calls_no_model(inpainter: Inpainter, monkeypatch: pytest.MonkeyPatch) -> None:
     images, masks = slices()
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..fill_view import surface_colors
+from ..fill_colors import skin_colors
 
 if TYPE_CHECKING:
     from gsfluent.data import Solid
@@ -64,7 +64,7 @@ class InteriorDomain:
         index = np.argwhere(shell)
         color = np.zeros((*inside.shape, 3), np.float32)
         points = origin + (index + 0.5) * solid.voxel
-        color[shell] = surface_colors(solid.gaussians, points, solid.voxel)
+        color[shell] = skin_colors(solid, points)
         nearest = ndimage.distance_transform_edt(
             ~shell, return_distances=False, return_indices=True
         )

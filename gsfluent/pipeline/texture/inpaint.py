@@ -46,6 +46,9 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
+Photographs = Exemplar | Mapping[int, Exemplar | Sequence[Exemplar]] | None
+"""One photograph, or one or several per axis (the first counts)."""
+
 
 @dataclass(frozen=True)
 class _Pass:
@@ -63,7 +66,7 @@ def diffusion_texture(
     *,
     prompt: str,
     options: InpaintOptions,
-    exemplar: Exemplar | Mapping[int, Exemplar] | None = None,
+    exemplar: Photographs = None,
     resume: Path | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -198,7 +201,7 @@ def inpaint_volume(
     *,
     prompt: str,
     options: InpaintOptions,
-    exemplar: Exemplar | Mapping[int, Exemplar] | None = None,
+    exemplar: Photographs = None,
     coarse: Inpainter | None = None,
     store: SliceStore | None = None,
     seed: int = 0,
@@ -229,9 +232,15 @@ def inpaint_volume(
     run = _Run(domain, inpainter, coarse or inpainter, prompt, options, _per_axis(exemplar), store)
     passes = _passes(domain, options)
     run.seed, run.progress = seed, progress
-    run.total = inpaint_plan(domain, options)["slices"]
+    plan = inpaint_plan(domain, options)
+    run.total = plan["slices"]
     logger.info(
-        "inpainting with %s: %d slices in %d passes", inpainter.name, run.total, len(passes)
+        "inpainting with %s: %d slices in %d passes, %d calls, %d denoising steps if it denoises",
+        inpainter.name,
+        plan["slices"],
+        plan["passes"],
+        plan["model_calls"],
+        plan["denoising_steps"],
     )
     volume, level, disagreement = np.zeros((0, 0, 0, 3), np.float32), domain, 0.0
     for number, step in enumerate(passes):
@@ -302,9 +311,9 @@ class _Run:
                     slice_seed(self.seed, number, axis, -1),
                 )
             stacks.append((axis, positions, images))
-        fused, variance = fuse_stacks(volume, stacks)
+        fused, variance = fuse_stacks(volume.shape[:3], stacks)
         volume = np.where(hole[..., None], fused, volume).astype(np.float32)
-        if 0 in self.photos and hole.any():
+        if self.options.match_colors and 0 in self.photos and hole.any():
             # fusion takes contrast away; the volume gets the photograph's colours back
             volume[hole] = to_photo(
                 volume[hole], level.depth[hole], level, self.photos[0], self.seed + number
@@ -375,11 +384,11 @@ class _Run:
         part: Sequence[int],
     ) -> np.ndarray:
         inside, shell, depth, colors = (
-            np.moveaxis(np.take(field, part, axis), axis, 0)
+            _upright(np.moveaxis(np.take(field, part, axis), axis, 0))
             for field in (level.inside, level.shell, level.depth, volume)
         )
         images = np.where(inside[..., None], colors, GROUND).astype(np.float32)
-        return backend(
+        made = backend(
             images,
             inside & ~shell,
             prompt=self.prompt,
@@ -395,11 +404,21 @@ class _Run:
                 max_depth=level.max_depth,
             ),
         )
+        return np.ascontiguousarray(np.swapaxes(made[:, ::-1], 1, 2))
 
 
-def _per_axis(exemplar: Exemplar | Mapping[int, Exemplar] | None) -> dict[int, Exemplar]:
-    if exemplar is None:
-        return {}
-    if isinstance(exemplar, Exemplar):
-        return dict.fromkeys(range(3), exemplar)
-    return dict(exemplar)
+def _upright(slices: np.ndarray) -> np.ndarray:
+    """Slices [B, U, V, ...] of a volume as pictures [B, H, W, ...] with V (z where it can) up.
+
+    A model knows which way up a cake is, and so does a photograph of one.
+    """
+    return np.ascontiguousarray(np.swapaxes(slices, 1, 2)[:, ::-1])
+
+
+def _per_axis(exemplar: Photographs) -> dict[int, Exemplar]:
+    """One photograph per axis: the first of a list, and the first axis' where there is none."""
+    if exemplar is None or isinstance(exemplar, Exemplar):
+        return {} if exemplar is None else dict.fromkeys(range(3), exemplar)
+    found = {a: e if isinstance(e, Exemplar) else e[0] for a, e in sorted(exemplar.items())}
+    first = next(iter(found.values()), None)
+    return {} if first is None else {axis: found.get(axis, first) for axis in range(3)}

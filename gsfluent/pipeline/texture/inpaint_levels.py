@@ -67,43 +67,28 @@ def slice_positions(inside: np.ndarray, axis: int, count: int) -> list[int]:
 
 
 def fuse_stacks(
-    volume: np.ndarray,
-    stacks: Sequence[tuple[int, Sequence[int], np.ndarray]],
-    softness: float = 0.05,
+    shape: Sequence[int], stacks: Sequence[tuple[int, Sequence[int], np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One volume out of slices across several axes.
+    """One volume out of slices across several axes: their mean.
 
-    Slices between those made are interpolated. Where the axes disagree a voxel follows the
-    proposals nearer to what it was (weights 1 / (distance^2 + softness^2)), because the plain mean
-    of independent slices has no texture left.
+    Slices between those made are interpolated. On the lattice of the voxels the mean over the axes
+    is the least-squares answer (:func:`.fusion.fuse_colors` is the one for Gaussians anywhere).
 
     Args:
-        volume: Present colours, float32 [X, Y, Z, 3].
+        shape: Of the volume [3].
         stacks: Axis, slice indices [K] and slices [K, ., ., 3] each.
-        softness: Colour difference from which a proposal loses weight.
 
     Returns:
-        The volume, and the variance between the axes' proposals [X, Y, Z].
+        Colours float32 [X, Y, Z, 3], and the variance between the axes [X, Y, Z].
     """
-    if len(stacks) == 1:
-        axis, positions, images = stacks[0]
-        stack = _interpolate(images, positions, volume.shape[axis])
-        return np.moveaxis(stack, 0, axis).astype(np.float32), np.zeros(volume.shape[:3])
-    total = np.zeros_like(volume)
-    weight = np.zeros((*volume.shape[:3], 1), np.float32)
-    plain = np.zeros_like(volume)
-    square = np.zeros(volume.shape[:3], np.float32)
+    total = np.zeros((*shape, 3), np.float32)
+    square = np.zeros(tuple(shape), np.float32)
     for axis, positions, images in stacks:
-        stack = _interpolate(images, positions, volume.shape[axis])
-        proposal = np.moveaxis(stack, 0, axis).astype(np.float32)
-        distance = ((proposal - volume) ** 2).mean(-1, keepdims=True)
-        share = 1.0 / (distance + softness**2)
-        total += share * proposal
-        weight += share
-        plain += proposal / len(stacks)
+        stack = _interpolate(images, positions, int(shape[axis]))
+        proposal = np.moveaxis(stack, 0, axis)
+        total += proposal / len(stacks)
         square += (proposal**2).sum(-1) / len(stacks)
-    spread = (square - (plain**2).sum(-1)).clip(0.0) / 3.0
-    return total / weight, spread
+    return total, (square - (total**2).sum(-1)).clip(0.0) / 3.0
 
 
 def _interpolate(slices: np.ndarray, positions: Sequence[int], count: int) -> np.ndarray:
