@@ -1,6 +1,6 @@
 """Fill every mesh of the data folder after photographing and reconstructing it; docs/filling.md.
 
-    python scripts/fill_accuracy.py --cache out/fill [--only bowl skull] [--write]
+    python scripts/fill_accuracy.py --cache out/fill [--only bowl skull] [--write] [--cuts]
 
 The meshes come from GSFLUENT_DATA, or ../shared/data beside the checkout. Photographs and splats
 are kept in the cache folder and made only once; --device cuda and more --views, --size, --steps
@@ -127,14 +127,13 @@ def sheet(cuts: dict[str, np.ndarray], path: Path) -> None:
 
     tiles = []
     for name, picture in cuts.items():
-        named = np.ascontiguousarray(picture)
+        named = np.ascontiguousarray((255 * picture.clip(0, 1)).astype(np.uint8))
         cv2.putText(named, name, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, 16)
         tiles.append(named)
-    tiles += [np.ones_like(tiles[0])] * (-len(tiles) % 6)
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % 6)
     rows = [np.concatenate(tiles[i : i + 6], 1) for i in range(0, len(tiles), 6)]
-    picture = (255 * np.concatenate(rows, 0).clip(0, 1)).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture).quantize(64).save(path)
+    Image.fromarray(np.concatenate(rows, 0)).quantize(64).save(path)
 
 
 def main() -> int:
@@ -152,6 +151,7 @@ def main() -> int:
     parser.add_argument("--things", type=Path, default=None, help=".npz of the meshes")
     parser.add_argument("--reconstruct", action="store_true", help="stop before filling")
     parser.add_argument("--write", action="store_true", help="enter the table into the docs")
+    parser.add_argument("--cuts", action="store_true", help="make the picture of the docs")
     given = parser.parse_args()
     if given.things is not None and given.things.is_file():
         found = unpack(given.things, given.only)
@@ -181,6 +181,7 @@ def main() -> int:
     sys.stdout.write(table + "\n")
     if given.write:
         PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), "accuracy", table))
+    if given.cuts:
         sheet(cuts, SHEET)
     return 0
 
