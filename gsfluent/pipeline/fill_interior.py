@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["Placed", "interior_gaussians", "populate", "splat_sizes"]
 
 INTERIOR_OPACITY = 0.98
-_SIGMA_PER_SPACING = 0.5
+_SIGMA_PER_SPACING = 0.45
 _CORE = 1.25  # voxels between Gaussians far from the skin: what a texture volume can show
 _FINEST = 0.5  # voxels; finer splats would repeat one colour of the volume
 _GROWTH = 0.3  # growth of the spacing per depth
@@ -59,7 +59,7 @@ def interior_gaussians(
     """Spread Gaussians through matter, as fine as the skin's splats at the skin.
 
     The spacing is ``min(core, skin + 0.3 depth)``; when that asks for more than ``max_count``
-    Gaussians, all spacings grow by one factor. The standard deviation is half the spacing, and
+    Gaussians, all spacings grow by one factor. The standard deviation is 0.45 of it, and
     nowhere more than 0.8 of the depth, so that nothing sticks out.
 
     Args:

@@ -27,7 +27,7 @@ __all__ = ["Testimony", "refine_opacity", "witness"]
 
 logger = logging.getLogger(__name__)
 
-_CONTRADICTED = 3e-4  # share of its size that a Gaussian may show in the wrong place or colour
+_CONTRADICTED = 2e-4  # share of its size that a Gaussian may show in the wrong place or colour
 _OFF = 6.0  # no colour excuses what stands beside the object
 _ODD = 4.0  # squared colour difference (three channels) of 1 / 4 counts once
 _ROUNDS = 2  # what the first round lays bare is asked again
