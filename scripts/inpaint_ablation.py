@@ -97,7 +97,7 @@ def sheet(pictures: dict[str, list[np.ndarray]], path: Path) -> None:
     """One row per method, one column per plane."""
     from PIL import Image, ImageDraw
 
-    edge, label, gap = 150, 190, 4
+    edge, label, gap = 132, 190, 3
     rows = len(pictures)
     width = label + len(SHOWN) * (edge + gap)
     paper = Image.new("RGB", (width, rows * (edge + gap)), "white")
@@ -127,7 +127,9 @@ def ablate(
 
     def shown(rgb: np.ndarray) -> list[np.ndarray]:
         planes = judge.slices(known, np.where(inside[..., None], rgb, 1.0))
-        return [np.where(mask[..., None], image, 1.0) for image, mask in (planes[i] for i in SHOWN)]
+        seen = [np.where(mask[..., None], image, 1.0) for image, mask in planes]
+        rim = max(1, round(0.08 * size))
+        return [seen[i][rim:-rim, rim:-rim] for i in SHOWN]
 
     pictures["truth"] = shown(known.rgb)
     rows = [row("*another draw (floor)*", judge.floor, None)]

@@ -25,9 +25,10 @@ from texture_sheets import draw_sheet
 
 from gsfluent.lab.interiors import KNOWN_INTERIORS, KnownInterior, known_interior
 from gsfluent.lab.interiors_judge import Judge, crossing_error
-from gsfluent.pipeline.texture import Texture
+from gsfluent.pipeline.texture import Texture, load_exemplar
 from gsfluent.pipeline.texture.baselines import telea_slices
 from gsfluent.pipeline.texture.domain import blend_skin
+from gsfluent.pipeline.texture.profile import depth_profile, profile_volume
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "texture_accuracy.md"
@@ -37,6 +38,7 @@ METHODS = (
     "telea_x",
     "telea",
     "profile",
+    "photo_profile",
     "procedural",
     "preview",
     "default",
@@ -53,7 +55,12 @@ def texture(known: KnownInterior, method: str, device: str, model: str | None) -
     began, wall = time.process_time(), time.perf_counter()
     if method == "telea_x":
         rgb = blend_skin(known.domain, telea_slices(known.domain, (0,)).rgb)
-        report: dict[str, Any] = {"method": "telea_x"}
+        report: dict[str, Any] = {"method": method}
+    elif method == "photo_profile":
+        photo = load_exemplar(next(iter(photos.values())))
+        # photographs of known interiors have one pixel per voxel: depths are equal
+        rgb = blend_skin(known.domain, profile_volume(known.domain.depth, *depth_profile(photo)))
+        report = {"method": method}
     else:
         done = stage(known, method, photos, model)(solid)
         if device != "cpu":
@@ -78,6 +85,14 @@ def stage(
         return Texture("diffusion", model=model, exemplar=photos, prompt=prompt)
     quality = {"default": {}}.get(method, {"quality": method})
     return Texture(exemplar=photos, **quality, **known.settings)
+
+
+def used(report: dict[str, Any]) -> str:
+    """What the stage did in the end: the method, and what it made of the surface."""
+    surface = report.get("surface")
+    if surface == "copy":
+        return "color_copy"
+    return report["method"] + (" from the surface" if surface == "keep" else "")
 
 
 def read_lines() -> dict[tuple[str, ...], dict[str, Any]]:
@@ -179,7 +194,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--model", default=None, help="diffusers pipeline for method diffusion")
     parser.add_argument("--seed", type=int, default=0, help="which object is the truth")
-    parser.add_argument("--draws", type=int, default=5, help="other draws that make the floor")
+    parser.add_argument(
+        "--draws",
+        type=int,
+        default=5,
+        help="other draws that make the floor; 0 only times the methods",
+    )
     parser.add_argument("--write", action="store_true", help=f"enter tables into {PAGE.name}")
     parser.add_argument("--sheets", action="store_true", help="draw docs/images/texture_*.jpg")
     given = parser.parse_args(arguments)
@@ -193,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in given.only:
         known = known_interior(name, given.size, given.seed)
         others = [known_interior(name, given.size, given.seed + 1 + k) for k in range(given.draws)]
-        judge = Judge(known, others)
+        judge = Judge(known, others) if others else None
         volumes = {}
         for method in methods:
             run = texture(known, method, given.device, given.model)
@@ -201,22 +221,26 @@ def main(arguments: list[str] | None = None) -> int:
                 "class": name,
                 "size": given.size,
                 "method": method,
-                "used": run["report"]["method"],
+                "used": used(run["report"]),
                 "device": given.device,
                 "cpu_seconds": run["cpu_seconds"],
                 "seconds": run["seconds"],
-                "figures": judge(run["rgb"]),
+                "figures": judge(run["rgb"]) if judge else None,
                 "crossing": crossing_error(known, run["rgb"]),
                 "seed": given.seed,
                 "draws": given.draws,
                 "commit": commit,
             }
+            spent = f"{line['cpu_seconds']:.1f} CPU s, {line['seconds']:.1f} s"
+            if judge is None:
+                sys.stdout.write(f"{name:10s} {method}: {spent}\n")
+                continue
             lines[key(line)] = rounded(line)
             volumes[method] = run["rgb"]
-            sys.stdout.write(f"{name:10s} {row(lines[key(line)])}\n")
+            sys.stdout.write(f"{name:10s} {row(lines[key(line)])} {spent}\n")
             sys.stdout.flush()
         write_lines(lines)
-        if given.sheets:
+        if given.sheets and judge is not None:
             draw_sheet(ROOT / "docs" / "images" / f"texture_{name}.jpg", judge, volumes)
     if given.write:
         text = PAGE.read_text(encoding="utf-8")

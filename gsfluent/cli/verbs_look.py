@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
+from gsfluent.errors import InputError
 
 
 @dataclass(kw_only=True)
@@ -30,27 +31,76 @@ class Doctor(Verb):
 
 @dataclass(kw_only=True)
 class Inspect(Verb):
-    """Say what is in a capture or a splat (size, up axis, floor, floaters) and draw one PNG.
+    """Say what is in a capture, a splat, a solid or a shot, and draw one PNG.
 
     Examples:
       gsfluent inspect captures/apple                    # a folder of posed photographs
       gsfluent inspect melon.ply -o melon.png            # a trained splat
       gsfluent inspect melon.ply --size 0.25             # its largest extent is 25 cm
+      gsfluent inspect textured.ply -o regions.png       # a solid with regions: which, how large
+      gsfluent inspect shot.yaml --run out -o parts.png  # the parts of a shot, before it is run
+
+    A capture or splat: size, up axis, floor, floaters, thin parts. A solid or shot: its parts with
+    material, volume, particles, depth and what share of the photographs agrees. For a shot the
+    stages up to the parts are done in the folder of the run, where `gsfluent run` goes on from.
     """
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """Capture folder or splat .ply."""
+    """Capture folder, splat or solid .ply, or shot .yaml."""
     out: Out = Path("inspect.png")
     """Where the picture goes."""
     size: float | None = None
     """Largest extent of the object in metres, if known."""
+    run: Path | None = None
+    """Result folder of the shot."""
 
     def execute(self) -> dict[str, Any]:
         """Inspect the input and draw the picture."""
         from gsfluent.pipeline.inspect import inspect
 
         existing(self.input, "INPUT")
+        suffix = self.input.suffix.lower()
+        if suffix in (".yaml", ".yml"):
+            return self._shot()
+        if self.run is not None:
+            raise InputError("--run belongs to a shot", "name the shot's .yaml, or leave it out")
+        if suffix == ".ply" and (shown := _regions(self.input, self.out)) is not None:
+            return shown
         return inspect(self.input, out=self.out, size=self.size, device=self.torch_device())
+
+    def _shot(self) -> dict[str, Any]:
+        """Show the parts of a shot."""
+        from gsfluent.config import load_shot
+        from gsfluent.pipeline.inspect_shot import inspect_shot
+        from gsfluent.progress import reporter
+
+        if self.run is None:
+            raise InputError(
+                f"{self.input}: a shot is inspected in its result folder", "add --run FOLDER"
+            )
+        if self.size is not None:
+            raise InputError("--size does nothing with a shot", "set size in the shot")
+        shot = load_shot(self.input)
+        with reporter(quiet=self.json) as progress:
+            return inspect_shot(
+                shot,
+                self.run,
+                self.out,
+                device=self.torch_device(),
+                seed=self.seed,
+                reporter=progress,
+            )
+
+
+def _regions(path: Path, out: Path) -> dict[str, Any] | None:
+    """The regions of a solid; None for a splat, or a solid without any."""
+    from gsfluent.data import Solid
+    from gsfluent.data.solid import volume_path
+    from gsfluent.pipeline.inspect_shot import inspect_solid
+
+    if not volume_path(path).is_file() or Solid.load(path).regions is None:
+        return None
+    return inspect_solid(path, out)
 
 
 @dataclass(kw_only=True)

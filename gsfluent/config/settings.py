@@ -261,6 +261,12 @@ class TextureSettings:
         doc="Find seeds and stones in the exemplar and place them (method exemplar).",
         example="true",
     )
+    cut: str | None = key(
+        choice("across", "along"),
+        default=None,
+        doc="The photograph was cut across or along the object's axis: sweep its structure.",
+        example="across",
+    )
     photo: PhotoSettings | None = key(
         nested(PhotoSettings),
         default=None,
@@ -294,7 +300,7 @@ _TEXTURE_READERS = {
     "preset": ("procedural",),
     **dict.fromkeys(("prompt", "model", "inpaint"), ("diffusion", "inpaint")),
     **dict.fromkeys(
-        ("quality", "scale", "guide", "directional", "inclusions", "photo"), ("exemplar",)
+        ("quality", "scale", "guide", "directional", "inclusions", "cut", "photo"), ("exemplar",)
     ),
 }
 """Keys of ``texture:`` that only these methods read."""

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from .draw import draw
+from .neighbours import nearest
 
 if TYPE_CHECKING:
     from gsfluent.data import Gaussians, Solid
@@ -58,8 +59,6 @@ def surface_colors(
     Raises:
         InputError: There are no surface splats.
     """
-    from scipy.spatial import cKDTree
-
     from gsfluent.data import SURFACE
     from gsfluent.errors import InputError
 
@@ -74,38 +73,35 @@ def surface_colors(
     solid = weight > (_FAINT if weights is None else 0.0)
     if solid.sum() >= min(_NEIGHBOURS, len(rows)):
         rows, weight = rows[solid], weight[solid]
-    means = gaussians.means.detach().double().cpu().numpy()[rows]
+    means = gaussians.means.detach()[torch.from_numpy(rows).to(gaussians.device)]
     colors = gaussians.colors().detach().double().cpu().numpy()[rows].clip(0.0, 1.0)
     if len(points) == 0:
         return np.zeros((0, 3), np.float32)
     count = min(_NEIGHBOURS, len(rows))
-    tree = cKDTree(means)
-    distance, nearest = tree.query(points, k=count)
-    result = _robust_mean(distance, nearest, weight, colors, width)
-    away = np.asarray(distance).reshape(len(points), -1)[:, 0] > _REACH * width
+    distance, rank = nearest(means, points, count, width)
+    result = _robust_mean(distance, rank, weight, colors, width)
+    away = distance[:, 0] > _REACH * width
     if away.any() and len(rows) > count:
         # from every direction at about the same distance, or the nearest rim would draw rays
         wide = min(16 * _NEIGHBOURS, len(rows))
-        distance, nearest = tree.query(np.asarray(points)[away], k=wide)
-        near = distance.reshape(-1, wide)[:, :1]
-        result[away] = _robust_mean(distance, nearest, weight, colors, 0.35 * near + width)
+        distance, rank = nearest(means, np.asarray(points)[away], wide, 4.0 * width)
+        spread = 0.35 * distance[:, :1] + width
+        result[away] = _robust_mean(distance, rank, weight, colors, spread)
     return result.astype(np.float32)
 
 
 def _robust_mean(
     distance: np.ndarray,
-    nearest: np.ndarray,
+    rank: np.ndarray,
     weight: np.ndarray,
     colors: np.ndarray,
     width: float | np.ndarray,
 ) -> np.ndarray:
     """Weighted mean colours [M, 3] of neighbours [M, K], odd ones counting less."""
-    distance = distance.reshape(len(distance), -1)
-    nearest = nearest.reshape(distance.shape)
     # relative to the nearest one, so that points farther away still get a defined colour
     spread = (distance - distance[:, :1]) / width
-    share = (weight[nearest] + 1e-6) * np.exp(-0.5 * spread**2)
-    color = colors[nearest]
+    share = (weight[rank] + 1e-6) * np.exp(-0.5 * spread**2)
+    color = colors[rank]
     mean = np.einsum("nk,nkc->nc", share / share.sum(1, keepdims=True), color)
     for _ in range(2):
         odd = ((color - mean[:, None]) ** 2).sum(-1)

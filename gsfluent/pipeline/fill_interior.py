@@ -16,6 +16,7 @@ from torch import Tensor
 
 from .fill_colors import surface_colors
 from .fill_pieces import hilbert_code, sample, signed_depth, small_pieces
+from .neighbours import nearest
 
 if TYPE_CHECKING:
     from gsfluent.data import Gaussians
@@ -140,32 +141,28 @@ def _spacing(skin: Tensor, depth: Tensor, widest: float) -> Tensor:
     return (skin + _GROWTH * depth.to(skin)).clamp(max=widest)
 
 
-def splat_sizes(gaussians: Gaussians, points: np.ndarray) -> np.ndarray:
+def splat_sizes(gaussians: Gaussians, points: np.ndarray, cell: float) -> np.ndarray:
     """Standard deviation along the surface of the splats around some points.
 
     Args:
         gaussians: Splats; with labels, only the SURFACE ones are used.
         points: [M, 3] world units.
+        cell: About the distance of the nearest splats, world units.
 
     Returns:
         Geometric mean of the two larger scales, averaged over the eight nearest splats with their
         opacity, float64 [M], world units.
     """
-    from scipy.spatial import cKDTree
-
     from gsfluent.data import SURFACE
 
     if gaussians.labels is not None:
         gaussians = gaussians.select(gaussians.labels == SURFACE)
-    means = gaussians.means.detach().double().cpu().numpy()
     scales = gaussians.scales.detach().double().sort(dim=1).values.cpu().numpy()
     size = 0.5 * np.log(np.maximum(scales[:, 1] * scales[:, 2], 1e-300))
     alpha = gaussians.opacities.detach().double().cpu().numpy() + 1e-4
-    count = min(8, len(means))
-    _, nearest = cKDTree(means).query(points, k=count)
-    nearest = nearest.reshape(-1, count)
-    weight = alpha[nearest]
-    result: np.ndarray = np.exp((weight * size[nearest]).sum(1) / weight.sum(1))
+    _, rank = nearest(gaussians.means, points, min(8, gaussians.count), cell)
+    weight = alpha[rank]
+    result: np.ndarray = np.exp((weight * size[rank]).sum(1) / weight.sum(1))
     return result
 
 
@@ -206,7 +203,7 @@ def populate(
     place = box.centers(np.stack(np.unravel_index(flat, solid.shape), axis=1))
     size = np.zeros(solid.shape, np.float32)
     if len(index):
-        wide = splat_sizes(surface, place) * (_FINER / _SIGMA_PER_SPACING)
+        wide = splat_sizes(surface, place, box.voxel) * (_FINER / _SIGMA_PER_SPACING)
         size[solid] = wide[back.reshape(-1)]
     placed = interior_gaussians(
         torch.from_numpy(solid).to(device),

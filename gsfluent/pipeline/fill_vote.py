@@ -134,7 +134,13 @@ def vote_solid(
     down = options.down
     if down is None and capture is not None:
         down = -np.asarray(orient(gaussians, capture).up, dtype=float)
-    vote = cast_votes(shell, rays=options.rays, down=down, close_open_side=options.close_underside)
+    vote = cast_votes(
+        shell,
+        rays=options.rays,
+        down=down,
+        close_open_side=options.close_underside,
+        device=gaussians.device,
+    )
     loose = (vote.score >= options.agreement) | shell
     hull = None
     views = masked_views(capture) if options.masks else []

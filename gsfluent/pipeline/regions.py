@@ -17,7 +17,7 @@ from gsfluent.io.segmentation import Segmentation, load_masks, load_segmentation
 
 from .regions_associate import associate
 from .regions_image import image_labels
-from .regions_spread import UNSEEN, carry_inwards, decide, nearest_skin
+from .regions_spread import UNSEEN, carry_inwards, decide, label_field, nearest_skin
 from .regions_table import FIRST_LABEL, source_key, source_paths, source_volume
 from .regions_vote import Skin, cast_votes, find_skin
 from .stage import Progress
@@ -39,13 +39,34 @@ class SkinLabels:
         skin: The voxels.
         label: Label per voxel, int64 [S]: 0 for none, -1 where no photograph shows it.
         share: Share of the votes that the label got, float32 [S]; 0 where it got none.
+        field: What the inside is labelled from (:func:`label_field`), float32 [S, L + 2].
         segmentation: The labels, linked between views.
     """
 
     skin: Skin
     label: NDArray[np.int64]
     share: NDArray[np.float32]
+    field: NDArray[np.float32]
     segmentation: Segmentation
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """Label of each column of votes: 0, then the segmentation's in order."""
+        return np.array([0, *sorted(self.segmentation.names)], dtype=np.int64)
+
+    def inside(
+        self,
+        solid: Solid,
+        nearest: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None,
+    ) -> NDArray[np.int64]:
+        """Label per voxel of the solid, int64 [X, Y, Z], each that of the skin nearest to it.
+
+        Args:
+            solid: The solid whose skin this is.
+            nearest: What :func:`nearest_skin` found, when known.
+        """
+        found = nearest_skin(solid, self.skin) if nearest is None else nearest
+        return self.numbers[carry_inwards(solid, self.field, found)]
 
     def report(self) -> dict[str, Any]:
         """Figures for ``region_sources``: views, what was seen, agreement per label."""
@@ -95,7 +116,7 @@ def project_labels(
     column, share = decide(skin, votes, margin=margin, reach=reach)
     numbers = np.array([0, *sorted(linked.names)], dtype=np.int64)
     label = np.where(column == UNSEEN, UNSEEN, numbers[column.clip(min=0)])
-    return SkinLabels(skin, label, share, linked)
+    return SkinLabels(skin, label, share, label_field(skin, votes, column), linked)
 
 
 def label_regions(
@@ -144,7 +165,7 @@ def label_regions(
     }
     volumes = {key: source_volume(solid, key) for key in reports}
     skin: Skin | None = None
-    nearest: NDArray[np.int64] | None = None
+    nearest: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
     for key, where in wanted.items():
         paths = source_paths(where)
         if "label_image" in where:
@@ -158,9 +179,8 @@ def label_regions(
         if skin is None:
             skin = find_skin(solid)
             nearest = nearest_skin(solid, skin)
-        assert nearest is not None
         found = project_labels(solid, segmentation, skin=skin, progress=progress)
-        volumes[key] = carry_inwards(found.label, nearest).astype(np.int64)
+        volumes[key] = found.inside(solid, nearest)
         names = found.segmentation.names
         reports[key] = {"labels": {str(n): name for n, name in names.items()}, **found.report()}
         for note in found.segmentation.notes:

@@ -12,10 +12,12 @@ from .regions_vote import Skin
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
-__all__ = ["UNSEEN", "carry_inwards", "decide", "nearest_skin"]
+__all__ = ["UNSEEN", "carry_inwards", "decide", "label_field", "nearest_skin"]
 
 UNSEEN = -1
 _POOL = 0.25  # weight of a neighbour's votes: single voxels are noise, rows of them are not
+_NEAREST = 8  # skin voxels that label a voxel inside
+_SOFT = 0.3  # voxels farther than the nearest at which one counts 1/e
 _LEAST = 0.02  # of the mean votes of a voxel: below, it was not seen
 
 
@@ -72,32 +74,68 @@ def _grown(
     return result, bool(found.any())
 
 
-def nearest_skin(solid: Solid, skin: Skin) -> NDArray[np.int64]:
-    """Row of the nearest skin for every voxel of matter, int64 [X, Y, Z], -1 outside.
+def label_field(
+    skin: Skin, votes: NDArray[np.float32], label: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """How much of each skin voxel every label has: the votes where they agree with the decision.
+
+    The inside is labelled from this: a border runs between the centres of two voxels, and votes say
+    where. What the neighbours decided, and what nobody saw, is one label (or unseen) alone.
+
+    Returns:
+        Shares [S, L + 1], the last column for unseen.
+    """
+    pooled = votes + _POOL * (skin.neighbours @ votes)
+    total = pooled.sum(axis=1)
+    field = np.zeros((len(skin), votes.shape[1] + 1), np.float32)
+    agree = (total > 0) & (pooled.argmax(axis=1) == label)
+    field[agree, :-1] = pooled[agree] / total[agree, None]
+    field[~agree, label[~agree]] = 1.0  # UNSEEN is the last column
+    return field
+
+
+def nearest_skin(solid: Solid, skin: Skin) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The skin nearest to every voxel of matter.
 
     Nearest to the surface as found between voxels: far inside, where much skin is about equally
     near, distances to voxel centres would decide by rounding. The ball around a voxel that touches
     its nearest skin lies in the body, so the straight way there is the shortest way inside it, too:
     labels never jump over a gap.
+
+    Returns:
+        Rows of the skin [M, k] for the occupied voxels in row-major order, and weights [M, k] that
+        fall with what each is farther than the nearest.
     """
     from scipy.spatial import cKDTree
 
-    occupied = solid.occupancy.cpu().numpy()
-    row = np.full(occupied.shape, -1, dtype=np.int64)
-    centers = solid.voxel_centers().cpu().numpy()
-    row[occupied] = cKDTree(skin.surface).query(centers)[1]
-    row[tuple(skin.index.T)] = np.arange(len(skin))
-    return row
+    count = min(_NEAREST, len(skin))
+    distance, row = cKDTree(skin.surface).query(solid.voxel_centers().cpu().numpy(), k=count)
+    distance, row = distance.reshape(-1, count), row.reshape(-1, count)
+    weight = np.exp((distance[:, :1] - distance) / (_SOFT * solid.voxel))
+    return row.astype(np.int64), weight.astype(np.float32)
 
 
-def carry_inwards(label: NDArray[np.int64], nearest: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Give every voxel of matter the label of the skin nearest to it.
+def carry_inwards(
+    solid: Solid,
+    field: NDArray[np.float32],
+    nearest: tuple[NDArray[np.int64], NDArray[np.float32]],
+) -> NDArray[np.int64]:
+    """Give every voxel of matter the label that has most of the skin nearest to it.
 
     Args:
-        label: Label per skin voxel [S], :data:`UNSEEN` where unseen.
-        nearest: What :func:`nearest_skin` found [X, Y, Z].
+        solid: The solid.
+        field: What :func:`label_field` made, [S, L + 1].
+        nearest: What :func:`nearest_skin` found.
 
     Returns:
-        Label per voxel, int32 [X, Y, Z]; 0 outside and below unseen skin.
+        Column of the votes per voxel, int64 [X, Y, Z]; 0 outside and below unseen skin.
     """
-    return np.where(nearest >= 0, label[nearest.clip(min=0)].clip(min=0), 0).astype(np.int32)
+    row, weight = nearest
+    total = np.zeros((len(row), field.shape[1]), np.float32)
+    for k in range(row.shape[1]):
+        total += weight[:, k, None] * field[row[:, k]]
+    best = total.argmax(axis=1)
+    occupied = solid.occupancy.cpu().numpy()
+    result = np.zeros(occupied.shape, np.int64)
+    result[occupied] = np.where(best == field.shape[1] - 1, 0, best)
+    return result

@@ -91,6 +91,10 @@ class SignedDistance:
             total += weight * self.values[index[:, 0], index[:, 1], index[:, 2]]
         return total + (place - held).norm(dim=1) * self.voxel
 
+    def to(self, device: torch.device | str) -> SignedDistance:
+        """Return a copy whose values live on ``device``."""
+        return self.replace(values=self.values.to(device), origin=self.origin.to(device))
+
     def replace(self, **changes: Any) -> SignedDistance:
         """Return a copy with the named fields replaced."""
         return dataclasses.replace(self, **changes)
@@ -122,13 +126,16 @@ class SignedDistance:
         voxel: float,
         source: str,
         report: dict[str, Any] | None = None,
+        *,
+        device: torch.device | None = None,
     ) -> SignedDistance:
         """Distances to the boundary of whole voxels, bool [X, Y, Z], padded to an empty rim."""
         solid, start = _padded(np.asarray(occupancy, dtype=bool), np.asarray(origin), voxel)
-        values = torch.from_numpy(distances_of(solid) * np.float32(voxel))
-        return SignedDistance(
+        values = torch.from_numpy(distances_of(solid, device=device) * np.float32(voxel))
+        field = SignedDistance(
             values, torch.from_numpy(start).float(), float(voxel), source, dict(report or {})
         )
+        return field if device is None else field.to(device)
 
     @staticmethod
     def of_solid(solid: Solid) -> SignedDistance:

@@ -88,7 +88,9 @@ def solid_of_splats(
     note = ""
     if method == "density":
         assert closed is not None
-        field = SignedDistance.of_voxels(closed.solid, np.array(box.origin), box.voxel, "density")
+        field = SignedDistance.of_voxels(
+            closed.solid, np.array(box.origin), box.voxel, "density", device=gaussians.device
+        )
     elif closed is None or (not virtual and len(cameras) >= _ENOUGH):
         field, fused = _seen(visible, cameras, box, closed)
         notes["unseen_surface"] = _unseen(field, fused)
@@ -159,7 +161,7 @@ def _seen(
         body[(slice(None),) * axis + ([0, -1],)] = False
     body, dropped = keep_components(body)
     body = _without_bubbles(body)
-    field = _field_of(body, fused, np.array(box.origin), box.voxel)
+    field = _field_of(body, fused, np.array(box.origin), box.voxel, visible.device)
     return field.replace(report={"components_dropped": dropped}), fused
 
 
@@ -176,7 +178,7 @@ def _carved(
     box, solid = closed.box, closed.solid
     where = ndimage.binary_dilation(solid, np.ones((3, 3, 3)), iterations=3)
     fused = fuse_depths(visible, cameras, box, where)
-    cavity = _cavities(solid, fused.values)
+    cavity = _cavities(solid, fused.values, visible.device)
     share = float(cavity.sum() / max(1, int(solid.sum())))
     notes["cavity_share"] = share
     source, note, report = "density", "", {}
@@ -189,15 +191,17 @@ def _carved(
         report["components_dropped"] = notes["components_dropped"] + dropped
         source = "density and tsdf"
         note = f"; cameras look into {100 * share:.0f} % of what the ray vote closed"
-        field = _field_of(solid, fused, np.array(box.origin), box.voxel)
+        field = _field_of(solid, fused, np.array(box.origin), box.voxel, visible.device)
     else:
-        field = SignedDistance.of_voxels(solid, np.array(box.origin), box.voxel, source)
+        field = SignedDistance.of_voxels(
+            solid, np.array(box.origin), box.voxel, source, device=visible.device
+        )
         if notes["closed_side"] is not None and virtual:
             note = "; one side is open and was closed: if it is no hole, choose tsdf"
     return field.replace(source=source, report=report), note
 
 
-def _cavities(solid: np.ndarray, depths: np.ndarray) -> np.ndarray:
+def _cavities(solid: np.ndarray, depths: np.ndarray, device: torch.device) -> np.ndarray:
     """Parts of the solid that fused depths [voxels] call free, where these go deeper than a skin.
 
     The density knows the skin better; the depths know what is hollow.
@@ -205,20 +209,22 @@ def _cavities(solid: np.ndarray, depths: np.ndarray) -> np.ndarray:
     from scipy import ndimage
 
     differing = solid & (depths > 0)
-    deep = distance_transform(differing) > _SKIN
+    deep = distance_transform(differing, device) > _SKIN
     grown = ndimage.binary_dilation(deep, np.ones((3, 3, 3)), iterations=2)
     result: np.ndarray = grown & differing
     return result
 
 
-def _field_of(body: np.ndarray, fused: Fused, origin: np.ndarray, voxel: float) -> SignedDistance:
+def _field_of(
+    body: np.ndarray, fused: Fused, origin: np.ndarray, voxel: float, device: torch.device
+) -> SignedDistance:
     """Distances to the boundary of voxels; near it those of the depths, which are finer."""
-    values = distances_of(body)
+    values = distances_of(body, device=device)
     finer = (np.abs(fused.values) < 1.0) & ((fused.values <= 0) == body) & (fused.near > 0)
     values = np.where(finer, fused.values, values)
     return SignedDistance(
-        torch.from_numpy((values * voxel).astype(np.float32)),
-        torch.from_numpy(origin).float(),
+        torch.from_numpy((values * voxel).astype(np.float32)).to(device),
+        torch.from_numpy(origin).float().to(device),
         voxel,
         "tsdf",
     )
@@ -251,7 +257,7 @@ def _unseen(field: SignedDistance, fused: Fused) -> float:
 def _inside_on(field: SignedDistance, box: GridBox) -> np.ndarray:
     """The inside of a field at the voxel centres of a grid, bool [X, Y, Z]."""
     centers = box.centers(np.argwhere(np.ones(box.shape, dtype=bool)))
-    inside: np.ndarray = (field.at(torch.from_numpy(centers).float()) <= 0).numpy()
+    inside: np.ndarray = (field.at(torch.from_numpy(centers).float()) <= 0).cpu().numpy()
     return inside.reshape(box.shape)
 
 
@@ -277,13 +283,14 @@ def _finer(
         return field, ""
     voxel = coarse / factor
     shape = (size * factor).ceil().long().tolist()
-    origin = field.origin.double().numpy()
+    device = field.values.device
+    origin = field.origin.double().cpu().numpy()
     box = GridBox(
         (float(origin[0]), float(origin[1]), float(origin[2])),
         voxel,
         (int(shape[0]), int(shape[1]), int(shape[2])),
     )
-    near = np.abs(field.values.numpy()) < _BAND * coarse
+    near = (field.values.abs() < _BAND * coarse).cpu().numpy()
     if closed is not None and closed.shell.shape == near.shape:
         near |= ndimage.binary_dilation(closed.shell)
     axes = [
@@ -297,12 +304,12 @@ def _finer(
     cameras, _ = _lookers(capture, box, notes["closed_side"], pixels, 2 * _MOST_CAMERAS)
     limit = _LIM * factor
     found = fuse(points.to(visible.means), depth_views(visible, cameras), voxel, limit)
-    before = (field.at(points) / voxel).numpy()
+    before = (field.at(points) / voxel).cpu().numpy()
     # far from the coarse skin the depths only repeat it; hidden is hidden
     values = np.where((found.known > 0) | (before > 0), found.values, before)
     if closed is not None:
         values = np.maximum(values, before - _BAND * factor)
-    inside = field.inside.numpy()[np.ix_(*axes)]
+    inside = field.inside.cpu().numpy()[np.ix_(*axes)]
     body = inside.copy()
     body[band] = values <= 0
     body, dropped = keep_components(body)
@@ -312,7 +319,7 @@ def _finer(
         grid = np.full(box.shape, rest, dtype=np.float32)
         grid[band] = column
         grids.append(grid)
-    result = _field_of(body, Fused(grids[0], grids[1], grids[1], grids[1]), origin, voxel)
+    result = _field_of(body, Fused(grids[0], grids[1], grids[1], grids[1]), origin, voxel, device)
     report = field.report | {
         "components_dropped": field.report.get("components_dropped", 0) + dropped,
         "finer": round(factor, 2),
@@ -342,9 +349,10 @@ def _matched(
     if offset > 0 and closed is not None and closed.hull is not None:
         # what was added must lie in the masks as well
         bound = SignedDistance.of_voxels(
-            closed.hull, np.array(closed.box.origin), closed.box.voxel, "hull"
-        )
-        axes = [torch.arange(n) + 0.5 for n in field.values.shape]
+            closed.hull, np.array(closed.box.origin), closed.box.voxel, "hull",
+            device=values.device,
+        )  # fmt: skip
+        axes = [torch.arange(n, device=values.device) + 0.5 for n in field.values.shape]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         allowed = bound.at(field.origin + grid * field.voxel).reshape(values.shape)
         values = torch.maximum(values, torch.minimum(allowed, field.values))

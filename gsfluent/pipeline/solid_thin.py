@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.pipeline.solid_field import SignedDistance
+from gsfluent.pipeline.voxels import distance_transform
 
 __all__ = ["thin_shells", "wall_thickness"]
 
@@ -133,10 +134,8 @@ def thin_shells(
 
 def _from_core(field: SignedDistance, points: Tensor, depth: float) -> Tensor:
     """Distance of points [M, 3] from what lies deeper than ``depth``; infinite without any."""
-    from scipy import ndimage
-
     core = (field.values <= -depth).cpu().numpy()
     if not core.any():
         return torch.full_like(points[:, 0], math.inf)
-    distance = ndimage.distance_transform_edt(~core) * field.voxel
+    distance = distance_transform(~core, field.values.device) * field.voxel
     return field.replace(values=torch.from_numpy(distance).to(field.values)).at(points)

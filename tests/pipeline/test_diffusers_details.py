@@ -257,18 +257,34 @@ def test_safety_checker_is_off_unless_kept(tmp_path: Path) -> None:
         paint(kept, 1)
 
 
-def test_flux_fill_is_found_outside_the_table(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_flux_fill_is_found_outside_the_table(tmp_path: Path) -> None:
     import tiny_diffusers
 
-    folder = tiny_diffusers.save_flux_fill(tmp_path)
+    folder = tiny_diffusers.save_flux(tmp_path)
     with pytest.raises(ValueError, match="AutoPipeline can't find"):
         diffusers.AutoPipelineForInpainting.from_pretrained(folder, local_files_only=True)
     flux = DiffusersInpainter(folder, OPTIONS)
     assert flux.name == "FluxFillPipeline"
     assert "negative_prompt" not in flux.accepts  # and is not passed
     paint(flux)
+
+
+def test_kontext_sees_the_exemplar_and_keeps_the_size(tmp_path: Path) -> None:
+    import tiny_diffusers
+
+    folder = tiny_diffusers.save_flux(tmp_path, "FluxKontextPipeline")
+    kontext = DiffusersInpainter(folder, OPTIONS)
+    assert kontext.name == "FluxKontextInpaintPipeline"  # its default size is a megapixel
+    plain, red, dark = (paint(kontext, 1, exemplar=e) for e in (None, photo(0.9), photo(0.1)))
+    assert not np.array_equal(plain, red) and not np.array_equal(red, dark)
+
+
+def test_stable_diffusion_3(tmp_path: Path) -> None:
+    import tiny_diffusers
+
+    third = DiffusersInpainter(tiny_diffusers.save_sd3(tmp_path), OPTIONS)
+    assert third.name == "StableDiffusion3InpaintPipeline"
+    paint(third)
 
 
 @pytest.mark.parametrize(
@@ -408,7 +424,7 @@ def test_offline_is_respected_and_named(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(diffusers.DiffusionPipeline, "load_config", watch)
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     monkeypatch.delenv("TRANSFORMERS_OFFLINE", raising=False)
-    with pytest.raises(InputError, match="not in the hub"):
+    with pytest.raises(InputError, match="cannot be loaded from the hub"):
         load_pipeline("owner/name", OPTIONS, torch.device("cpu"))
     with pytest.raises(InputError, match="offline is set, so the hub was not asked"):
         load_pipeline("owner/name", replace(OPTIONS, offline=True), torch.device("cpu"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,39 @@ def test_stages_strengths_and_context() -> None:
     assert plan["slices"] == 35 and plan["passes"] == 3 and plan["model_calls"] == 35
     # 29 steps of 30 at 0.99; 9 of 30 at 0.3; 6 of 30 at 0.2
     assert plan["denoising_steps"] == 5 * 29 + 15 * 9 + 15 * 6
+
+
+def test_backends_see_slices_upright() -> None:
+    """Slices across x and y have z up, those across z have y up; the answer is turned back."""
+    domain = ball(16)
+    where = np.mgrid[:16, :16, :16] / 16.0
+    domain = replace(domain, skin=np.moveaxis(where, 0, -1).astype(np.float32))
+
+    class Look(Painter):
+        def paint(self, slices: np.ndarray, mask: np.ndarray, *rest: Any) -> np.ndarray:
+            context = rest[-1]
+            right, up = (i for i in range(3) if i != context.axis)
+            row, column = np.nonzero(context.inside[0] & ~mask[0])  # the shell, whose skin tells
+            low, high = row > row.mean(), row < row.mean()
+            color = slices[0][row, column]
+            assert color[high, up].mean() > color[low, up].mean() + 0.2
+            left = column < column.mean()
+            assert color[~left, right].mean() > color[left, right].mean() + 0.2
+            self.calls.append((0.0, context))
+            made = slices.copy()
+            made[:, : mask.shape[1] // 2] = 1.0  # the upper half white
+            return made
+
+    look = Look()
+    options = InpaintOptions(slices=6, refine=(), match_colors=False)
+    rgb = inpaint_volume(domain, look, prompt="", options=options).rgb
+    hole = domain.inside & ~domain.shell
+    middle = slice(6, 10)  # the outermost slices are all shell and not asked for
+    rgb, hole = rgb[middle], hole[middle]
+    assert (rgb[..., 8:, :][hole[..., 8:]] > 0.99).all()
+    assert not (rgb[..., :8, :][hole[..., :8]] > 0.99).all()
+    inpaint_volume(domain, look, prompt="", options=replace(options, refine=(0.3,)))
+    assert {c.axis for _, c in look.calls} == {0, 1, 2}
 
 
 def test_first_stage_can_be_another_backend() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsfluent.pipeline.fill_inside import DIRECTIONS, _blocked, blocked_by_doubling
 from gsfluent.pipeline.voxels import _separable, distance_transform, nearest_empty
 
 SHAPES = [(7, 9, 5), (30, 41, 22), (1, 1, 17), (64, 3, 3)]
@@ -28,6 +29,15 @@ def test_separable_minima_are_exact(shape: tuple[int, int, int], share: float) -
     assert not occupied[tuple(found)].any()
     here = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"))
     np.testing.assert_array_equal(((found - here) ** 2).sum(0), squared.numpy())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rays_by_doubling_are_the_sweeps(shape: tuple[int, int, int]) -> None:
+    hit = ~_occupied(shape, 0.97)
+    for direction in DIRECTIONS:
+        swept = _blocked(hit, direction)
+        doubled = blocked_by_doubling(torch.from_numpy(hit), direction)
+        np.testing.assert_array_equal(doubled.numpy(), swept)
 
 
 @pytest.mark.cuda

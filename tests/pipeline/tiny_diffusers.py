@@ -160,19 +160,15 @@ def _vision() -> dict[str, Any]:
     }
 
 
-def save_flux_fill(folder: Path) -> Path:
-    """FLUX.1 Fill: outside AutoPipeline's table, without strength and negative prompt."""
-    from diffusers import (
-        FlowMatchEulerDiscreteScheduler,
-        FluxFillPipeline,
-        FluxTransformer2DModel,
-    )
+def save_flux(folder: Path, kind: str = "FluxFillPipeline") -> Path:
+    """FLUX.1 Fill or Kontext: outside AutoPipeline's table, each with arguments of its own."""
+    import diffusers
     from transformers import CLIPTextModel, T5Config, T5EncoderModel
 
     torch.manual_seed(0)
     clip, t5 = clip_tokenizer(), _t5_tokenizer()
-    transformer = FluxTransformer2DModel(
-        in_channels=16 * 4 * 2 + 256,
+    transformer = diffusers.FluxTransformer2DModel(
+        in_channels=16 * 4 * 2 + 256 if kind == "FluxFillPipeline" else 64,
         out_channels=64,
         num_layers=1,
         num_single_layers=1,
@@ -184,13 +180,49 @@ def save_flux_fill(folder: Path) -> Path:
         guidance_embeds=True,
     )
     encoder = T5Config(vocab_size=len(t5), d_model=32, d_kv=8, d_ff=37, num_layers=1, num_heads=4)
-    pipe = FluxFillPipeline(
-        scheduler=FlowMatchEulerDiscreteScheduler(),
+    pipe = getattr(diffusers, kind)(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
         vae=_vae(16, use_quant_conv=False, use_post_quant_conv=False, shift_factor=0.1),
         text_encoder=CLIPTextModel(_text_config(len(clip))),
         tokenizer=clip,
         text_encoder_2=T5EncoderModel(encoder),
         tokenizer_2=t5,
+        transformer=transformer,
+    )
+    pipe.save_pretrained(folder)
+    return folder
+
+
+def save_sd3(folder: Path) -> Path:
+    """Stable Diffusion 3 without its T5 encoder, as it is often used."""
+    import diffusers
+    from transformers import CLIPTextModelWithProjection
+
+    torch.manual_seed(0)
+    clip = clip_tokenizer()
+    text = _text_config(len(clip))
+    transformer = diffusers.SD3Transformer2DModel(
+        sample_size=8,
+        patch_size=2,
+        in_channels=16,
+        num_layers=1,
+        attention_head_dim=8,
+        num_attention_heads=4,
+        joint_attention_dim=64,
+        caption_projection_dim=32,
+        pooled_projection_dim=64,
+        out_channels=16,
+        pos_embed_max_size=16,
+    )
+    pipe = diffusers.StableDiffusion3Pipeline(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
+        vae=_vae(16, use_quant_conv=False, use_post_quant_conv=False, shift_factor=0.1),
+        text_encoder=CLIPTextModelWithProjection(text),
+        tokenizer=clip,
+        text_encoder_2=CLIPTextModelWithProjection(text),
+        tokenizer_2=clip,
+        text_encoder_3=None,
+        tokenizer_3=None,
         transformer=transformer,
     )
     pipe.save_pretrained(folder)

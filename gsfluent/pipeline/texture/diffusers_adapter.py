@@ -150,6 +150,9 @@ class DiffusersInpainter(MaskedInpainter):
             "num_inference_steps": max(self.options.steps, math.ceil(_MIN_STEPS / strength)),
             "generator": [torch.Generator("cpu").manual_seed(s) for s in seeds],
             "output_type": "np",
+            # Kontext would scale every picture to a megapixel of its own choice
+            "max_area": frame.height * frame.width,
+            "_auto_resize": False,
         }
         if self.options.guidance is not None:
             arguments["guidance_scale"] = self.options.guidance

@@ -68,6 +68,11 @@ def load_pipeline(model: str | Path, options: InpaintOptions, device: torch.devi
         extra: dict[str, Any] = {}
         if options.controlnet is not None:
             extra["controlnet"] = _controlnet(diffusers, options, dtype, offline)
+        # parts that were left out when the model was saved (SD 3 without its T5 encoder) must be
+        # named as left out
+        for name, kind in config.items():
+            if isinstance(kind, list | tuple) and len(kind) == 2 and kind[0] is None:
+                extra[name] = None
         if not options.safety_checker and "safety_checker" in config:
             extra["safety_checker"] = None
             extra["requires_safety_checker"] = False
@@ -164,7 +169,9 @@ def _load_error(
         mend = f"leave variant ({options.variant}) out, or give the one that the files have"
     elif "AutoPipeline can't find" in str(error):
         mend = "use an inpainting model (SD-XL inpainting for example), or name pipeline_class"
-    return InputError(f"{model}: the inpainting model is not in {where} ({first})", mend=mend)
+    return InputError(
+        f"{model}: the inpainting model cannot be loaded from {where} ({first})", mend=mend
+    )
 
 
 def _pipeline_class(diffusers: Any, name: str, options: InpaintOptions) -> Any:

@@ -1,43 +1,52 @@
-"""Texture from photographs of a cut object: preview (noise) and guided patch synthesis."""
+"""Texture from photographs of a cut object: guided patch synthesis on object-anchored levels."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
 from gsfluent.errors import InputError
 
-from ..stage import Progress, report_progress
+from ..stage import Progress
+from .choice import surface_verdict
 from .domain import InteriorDomain, InteriorTexture
+from .guides import GUIDES, PlacedPhoto, explained, place_photo
 from .inclusions import Inclusions, find_inclusions, paint_inclusions, remove_inclusions
+from .levels import ObjectFields
 from .photo import Exemplar, load_exemplar
-from .profile import band_noise, depth_profile, match_colors, profile_volume
-from .sweep import swept_color
-from .synthesis import Schedule, SynthesisLevel, synthesize_level
+from .pyramid import synthesize_pyramid, to_grid
+from .synthesis import Schedule
 
-__all__ = ["QUALITIES", "exemplar_texture", "load_exemplars"]
+__all__ = ["CORES", "QUALITIES", "SURFACES", "exemplar_texture", "load_exemplars"]
 
 logger = logging.getLogger(__name__)
 
-QUALITIES: dict[str, Schedule | None] = {
-    "preview": None,
+QUALITIES: dict[str, Schedule] = {
+    "preview": Schedule(iterations=(3, 2, 0), polish=(4, 4, 1), bank=1536),
     "fast": Schedule(),
     "full": Schedule(iterations=(8, 5, 3), bank=6144, samples=2000, sinkhorn=5, stride=2),
 }
-_GUIDE_WEIGHT = 10.0  # a guide difference of 0.1 weighs like a colour difference of 1
-_SWEEP_WEIGHT = 3.0  # against the 75 pixel values of a patch: structure leads, texture decides
+SURFACES = ("auto", "keep", "copy", "ignore")
+CORES = ("open", "closed")
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
-def load_exemplars(source: object) -> dict[int, Exemplar]:
+def load_exemplars(source: object) -> dict[int, list[Exemplar]]:
     """Photographs per slice axis.
 
     Args:
-        source: One image (path or array) for all axes, or a mapping from ``x``, ``y``, ``z`` to
-            images; axes not named use the first one given.
+        source: One image (path or array) or a list of them for all axes, or a mapping from ``x``,
+            ``y``, ``z`` (axes of the object, z its own axis) to images or lists.
+
+    Returns:
+        Photographs by axis; only the axes that were named, or all three with the same list.
 
     Raises:
         InputError: An axis is unknown or an image cannot be used.
@@ -48,33 +57,39 @@ def load_exemplars(source: object) -> dict[int, Exemplar]:
                 f"texture: exemplar axes must be x, y, z, got {sorted(map(str, source))}",
                 mend="write exemplar: {x: a.jpg, z: b.jpg} or one file",
             )
-        loaded = {_AXES[key]: _load(value) for key, value in source.items()}
-        first = next(iter(loaded.values()))
-        return {axis: loaded.get(axis, first) for axis in range(3)}
-    one = _load(source)
+        return {_AXES[key]: _load_list(source[key]) for key in sorted(source)}
+    one = _load_list(source)
     return {0: one, 1: one, 2: one}
 
 
-def _load(source: object) -> Exemplar:
+def _load_list(source: object) -> list[Exemplar]:
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        if not source:
+            raise InputError("texture: the list of exemplars is empty", mend="name a photograph")
+        return [item for part in source for item in _load_list(part)]
     if isinstance(source, Exemplar):
-        return source
+        return [source]
     if not isinstance(source, str | Path | np.ndarray):
         raise InputError(
             f"texture: exemplar must be a file, an array or a mapping, got {type(source).__name__}",
             mend="give the path of a photograph",
         )
-    return load_exemplar(source)
+    return [load_exemplar(source)]
 
 
 def exemplar_texture(
     domain: InteriorDomain,
-    exemplars: dict[int, Exemplar],
+    exemplars: Mapping[int, Exemplar | Sequence[Exemplar]],
     *,
     quality: str = "fast",
     scale: float = 1.0,
-    guide: str = "auto",
+    guide: str | np.ndarray = "auto",
     directional: bool = False,
     inclusions: bool = True,
+    depth_scale: float | None = None,
+    surface: str = "auto",
+    core: str = "open",
+    device: str | torch.device = "auto",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> InteriorTexture:
@@ -82,73 +97,92 @@ def exemplar_texture(
 
     Args:
         domain: Voxels to fill.
-        exemplars: Photograph per axis (:func:`load_exemplars`).
-        quality: ``preview`` (profile, noise and inclusions), ``fast`` or ``full`` (patch
-            synthesis).
-        scale: Size of the photographed structure relative to the automatic choice, which makes the
-            deepest point of the photograph as deep as the object's (or, for a patch of material,
-            the photograph as wide as the object).
-        guide: ``depth``; ``axis`` (depth, and the photograph is a cut across the object's axis
-            whose structure is swept along it); ``none``; or ``auto`` (depth when the photographs
-            show an outline).
-        directional: True for grained materials: the photographs are not turned or mirrored.
+        exemplars: Photographs per axis of the object (:func:`load_exemplars`).
+        quality: ``preview``, ``fast`` or ``full``.
+        scale: Size of the photographed structure relative to the automatic choice, which lays the
+            photograph into the object (or, for a patch of material, makes the photograph as wide
+            as the object).
+        guide: ``depth``; ``axis`` (depth, distance to the object's axis, and a cut across it whose
+            structure is carried along it); ``height`` (depth, and height along the axis); ``none``;
+            an array [X, Y, Z] of the user's own coordinate; or ``auto``, which takes what explains
+            the photographs' colours.
+        directional: True for grained materials: the photographs are not turned or mirrored, and
+            slices across an axis without a photograph are not matched.
         inclusions: Find seeds and stones and place them as labelled ellipsoids.
-        seed: Seed.
+        depth_scale: Depth of the photograph's deepest point in units of the object's largest
+            depth; None works it out.
+        surface: What the surface's colours are to the inside: ``keep`` them fixed and grow the
+            inside from them, ``copy`` them inwards, ``ignore`` them, or ``auto``: copied where that
+            gives the photograph's statistics without streaks, kept where the material is unlayered
+            and its surface looks like the photograph, else ignored (:mod:`.choice`).
+        core: With guide ``axis``: ``open``, the core goes on from pole to pole (orange, log), or
+            ``closed``, it ends below the surface (apple).
+        device: Where to compute; ``auto`` takes a CUDA device when there is one.
+        seed: Seed. The same seed gives the same texture on the same kind of device.
         progress: Optional callback.
 
     Returns:
-        The texture; ``report`` holds quality, guide, inclusions and axis_consistency.
+        The texture; ``report`` holds quality, guide, photographs, inclusions, levels and
+        axis_disagreement.
 
     Raises:
-        InputError: Unknown quality or guide, or a scale that is not positive.
+        InputError: Unknown quality or guide, a guide that needs an outline, a scale that is not
+            positive, or an empty solid.
     """
-    if quality not in QUALITIES:
+    _check(quality, scale, guide, depth_scale)
+    for name, value, allowed in (("surface", surface, SURFACES), ("core", core, CORES)):
+        if value not in allowed:
+            raise InputError(
+                f"texture: {name} must be one of {', '.join(allowed)}, got {value!r}",
+                mend=f"leave it at {allowed[0]}",
+            )
+    began = time.process_time()
+    where = _device(device)
+    photos = {a: [e] if isinstance(e, Exemplar) else list(e) for a, e in exemplars.items()}
+    everything = [e for group in photos.values() for e in group]
+    outlined = all(e.silhouette for e in everything)
+    if isinstance(guide, str) and guide in ("axis", "height") and not outlined:
         raise InputError(
-            f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
-            mend="leave it at fast",
-        )
-    if guide not in ("auto", "depth", "axis", "none"):
-        raise InputError(
-            f"texture: guide must be auto, depth, axis or none, got {guide!r}",
-            mend="leave it at auto",
-        )
-    if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"texture: scale must be positive, got {scale}", mend="1 is neutral")
-    rng = np.random.default_rng(seed)
-    crop, back = _crop(domain)
-    if guide == "axis" and not all(e.silhouette for e in exemplars.values()):
-        raise InputError(
-            "texture: guide 'axis' needs a photograph with an outline",
+            f"texture: guide {guide!r} needs a photograph with an outline",
             mend="cut the object out (RGBA) or use guide: none",
         )
-    guided = guide in ("depth", "axis") or (
-        guide == "auto" and all(e.silhouette for e in exemplars.values())
+    crop, back = _crop(domain)
+    shared = len({id(e) for e in everything}) == len(photos[min(photos)])
+    aligned = not directional and guide not in ("axis", "height") and shared
+    fields = ObjectFields(crop, aligned, where)
+    guided = not (guide == "none" if isinstance(guide, str) else False) and (
+        outlined if isinstance(guide, str) else True
     )
-    fitted: dict[int, tuple[Exemplar, Exemplar, float]] = {}
-    found: dict[int, Inclusions | None] = {}
-    for axis, photo in exemplars.items():
-        same = next((a for a in fitted if exemplars[a] is photo), None)
-        if same is not None:
-            fitted[axis], found[axis] = fitted[same], found[same]
-            continue
-        fitted[axis], found[axis] = _fit(photo, crop, scale, guided, inclusions)
-    schedule = QUALITIES[quality]
-    if schedule is None:
-        rgb = _preview(crop, fitted[0][0], guided, rng)
-        consistency, levels = 0.0, 0
+    rng = np.random.default_rng([seed, 99])
+    prepared, blobs = _prepare(
+        photos, fields, guided, scale, depth_scale, inclusions, shared, guide
+    )
+    kind = guide if isinstance(guide, str) else "array"
+    if kind == "auto":
+        kind = choose_guide(prepared) if guided else "none"
+    verdict, surface = _surface(crop, prepared, kind, surface, seed)
+    if surface == "copy":
+        rgb, figures = crop.skin, {"levels": 0, "axis_disagreement": 0.0}
     else:
-        photos = {a: f[0] for a, f in fitted.items()}
-        rgb, consistency, levels = _patches(
-            crop, photos, schedule, guided, guide == "axis", directional, rng, progress
+        volume, lattice, figures = synthesize_pyramid(
+            fields,
+            prepared,
+            QUALITIES[quality],
+            kind,
+            own=guide if isinstance(guide, np.ndarray) else None,
+            directional=directional,
+            keep=surface == "keep",
+            closed=core == "closed",
+            seed=seed,
+            progress=progress,
         )
+        rgb = to_grid(volume, lattice, fields)
     labels = np.zeros(crop.inside.shape, np.int32)
     count = 0
-    axis = max(found, key=lambda a: 0 if (f := found[a]) is None else f.count)
-    blobs = found[axis]
-    if blobs is not None:
-        _, original, pitch = fitted[axis]
+    if blobs is not None and surface != "copy":
+        found, original, pitch = blobs
         rgb, labels, count = paint_inclusions(
-            rgb, crop.inside, crop.depth, original, blobs, pitch, rng
+            rgb, crop.inside, crop.depth, original, found, pitch, rng
         )
     full = np.zeros((*domain.inside.shape, 3), np.float32)
     full[back] = np.where(crop.inside[..., None], rgb, 0.0)
@@ -156,212 +190,158 @@ def exemplar_texture(
     full_labels[back] = labels
     report = {
         "quality": quality,
-        "guide": "axis" if guide == "axis" else "depth" if guided else "none",
-        "exemplar_mask": exemplars[0].note,
+        "guide": kind,
+        "exemplar_mask": everything[0].note,
+        "exemplars": len({id(e) for e in everything}),
+        "laid_into_object": all(p.fitted for group in prepared.values() for p in group),
         "inclusions": count,
-        "levels": levels,
-        "axis_disagreement": consistency,
+        "photo_pitch": next(iter(prepared.values()))[0].pitch,
+        "surface": surface,
+        **verdict,
+        "device": str(where),
+        "cpu_seconds": time.process_time() - began,
+        **figures,
     }
     return InteriorTexture(full, full_labels, report)
 
 
+def _surface(
+    domain: InteriorDomain,
+    prepared: dict[int, list[PlacedPhoto]],
+    kind: str,
+    wanted: str,
+    seed: int,
+) -> tuple[dict[str, Any], str]:
+    """What the surface is to the inside, and why."""
+    placed = list({id(p): p for group in prepared.values() for p in group}.values())
+    verdict = surface_verdict(domain, placed, seed)
+    alike = verdict["surface_like_interior"]
+    if wanted != "auto":
+        return verdict | {"why": f"surface: {wanted} was asked for"}, wanted
+    if verdict["copy_suffices"]:
+        why = "the surface copied inwards has the photograph's colours and patches and no streaks"
+        choice = "copy"
+    elif alike and kind == "none":
+        why = "the surface looks like the photograph; copied inwards it would make streaks: kept"
+        choice = "keep"
+    elif alike:
+        why = "the surface looks like the photograph, but the inside follows a guide: synthesised"
+        choice = "ignore"
+    else:
+        why = "the surface does not look like the photograph: synthesised"
+        choice = "ignore"
+    logger.info("texture: %s", why)
+    return verdict | {"why": why}, choice
+
+
+def _check(quality: str, scale: float, guide: str | np.ndarray, depth_scale: float | None) -> None:
+    if quality not in QUALITIES:
+        raise InputError(
+            f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
+            mend="leave it at fast",
+        )
+    if isinstance(guide, str) and guide not in GUIDES:
+        raise InputError(
+            f"texture: guide must be one of {', '.join(GUIDES)}, got {guide!r}",
+            mend="leave it at auto",
+        )
+    for name, value in (("scale", scale), ("depth_scale", depth_scale)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"texture: {name} must be positive, got {value}", mend="1 is neutral")
+
+
+def _device(device: str | torch.device) -> torch.device:
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(device)
+
+
 def _crop(domain: InteriorDomain) -> tuple[InteriorDomain, tuple[slice, ...]]:
     """The domain without its empty rim, and where it sits."""
-    from dataclasses import replace
-
-    index = np.argwhere(domain.inside)
-    if len(index) == 0:
+    if not domain.inside.any():
         raise InputError("texture: the solid is empty", mend="run fill first")
-    box = tuple(slice(int(a), int(b) + 1) for a, b in zip(index.min(0), index.max(0), strict=True))
-    return (
-        replace(
-            domain,
-            inside=domain.inside[box],
-            depth=domain.depth[box],
-            shell=domain.shell[box],
-            skin=domain.skin[box],
-        ),
-        box,
+    box = []
+    for k in range(3):
+        used = np.flatnonzero(domain.inside.any(tuple(i for i in range(3) if i != k)))
+        box.append(slice(int(used[0]), int(used[-1]) + 1))
+    where = tuple(box)
+    cropped = replace(
+        domain,
+        inside=np.ascontiguousarray(domain.inside[where]),
+        depth=np.ascontiguousarray(domain.depth[where]),
+        shell=np.ascontiguousarray(domain.shell[where]),
+        skin=np.ascontiguousarray(domain.skin[where]),
     )
+    return cropped, where
 
 
-def _fit(
-    photo: Exemplar, domain: InteriorDomain, scale: float, guided: bool, inclusions: bool
-) -> tuple[tuple[Exemplar, Exemplar, float], Inclusions | None]:
-    """Photograph at voxel pitch without inclusions, its detailed form, and that form's pitch."""
-    if guided:
-        factor = scale * domain.max_depth / max(photo.max_depth, 1.0)
-    else:
-        factor = scale * max(domain.inside.shape) / max(photo.mask.shape)
-    # inclusions are looked for at up to four pixels per voxel: finer is sensor noise
-    detail = min(1.0, 4.0 * factor) if factor < 1 else 1.0
-    original = photo.resized(detail) if detail < 1.0 else photo
-    pitch = factor / detail
-    blobs = find_inclusions(original) if inclusions else None
-    clean = original if blobs is None else remove_inclusions(original, blobs)
-    fitted = clean.resized(pitch) if abs(pitch - 1.0) > 1e-3 else clean
-    return (fitted, original, pitch), blobs
+Blobs = tuple[Inclusions, Exemplar, float]
 
 
-def _preview(
-    domain: InteriorDomain, photo: Exemplar, guided: bool, rng: np.random.Generator
-) -> np.ndarray:
-    """Depth profile plus multi-band noise, colours transported within depth ranges."""
-    depth = domain.depth if guided else np.zeros_like(domain.depth)
-    position, color = depth_profile(photo)
-    if not guided:
-        position, color = np.array([0.0]), photo.image[photo.mask].mean(0, keepdims=True)
-    rgb = profile_volume(depth, position, color)
-    photo_depth = photo.depth if guided else np.zeros_like(photo.depth)
-    residual = photo.image - profile_volume(photo_depth, position, color)
-    rgb = rgb + band_noise(photo, residual, domain.inside.shape, rng)
-    rgb[domain.inside] = match_colors(
-        rgb[domain.inside].clip(0, 1),
-        depth[domain.inside],
-        photo.image[photo.mask],
-        photo_depth[photo.mask],
-        bins=10 if guided else 1,
-        rng=rng,
-    )
-    return rgb.clip(0.0, 1.0)
-
-
-def _guide(depth: np.ndarray, largest: float) -> np.ndarray:
-    """Saturating depth guide: steep near the skin, where layers are thin, flat in the core."""
-    t = depth / max(largest, 1e-6)
-    result: np.ndarray = _GUIDE_WEIGHT * 0.3 * (1.0 - np.exp(-t * 0.45 / 0.3))
-    return result
-
-
-def _patches(
-    domain: InteriorDomain,
-    photos: dict[int, Exemplar],
-    schedule: Schedule,
+def _prepare(
+    photos: dict[int, list[Exemplar]],
+    fields: ObjectFields,
     guided: bool,
-    swept: bool,
-    directional: bool,
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> tuple[np.ndarray, float, int]:
-    """Coarse-to-fine patch synthesis; returns colours, disagreement of the axes, levels."""
-    factors = [f for f in (4, 2, 1) if min(domain.inside.shape) // f >= 10] or [1]
-    iterations = schedule.iterations[-len(factors) :]
-    # skin unlike the photographed material (crust, paint) must not leak into the patches
-    keep_shell = not guided and _skin_is_material(domain, photos[0])
-    rgb = np.zeros((0, 0, 0, 3), np.float32)
-    disagreement = 0.0
-    for step, (factor, rounds) in enumerate(zip(factors, iterations, strict=True)):
-        report_progress(progress, step, len(factors), f"patches at 1/{factor}")
-        inside, depth, shell, skin = _coarse(domain, factor)
-        small = _shrunk(photos, factor)
-        largest = float(depth.max())
-        if step == 0:
-            level_domain = InteriorDomain(
-                inside, depth, shell, skin, domain.axis, domain.voxel * factor, domain.origin
-            )
-            rgb = _preview(level_domain, small[0], guided, rng)
-        else:
-            rgb = _upsample(rgb, inside.shape)
-        fixed = shell if keep_shell else np.zeros_like(shell)
-        guides = [_guide(depth, largest) if guided else np.zeros_like(depth)]
-        seen = {
-            a: [_guide(p.depth, p.max_depth) if guided else np.zeros_like(p.depth)]
-            for a, p in small.items()
-        }
-        if swept:
-            section = swept_color(inside, depth, domain.axis, small[0])
-            if step == 0:
-                rgb = np.where(inside[..., None], section, rgb)
-            guides += list(_SWEEP_WEIGHT * np.moveaxis(_lowpass(section, inside), -1, 0))
-            for axis, photo in small.items():
-                blurred = _lowpass(photo.image, np.ones(photo.mask.shape, bool))
-                seen[axis] += list(_SWEEP_WEIGHT * np.moveaxis(blurred, -1, 0))
-        rgb = np.where(fixed[..., None], skin, rgb).astype(np.float32)
-        level = SynthesisLevel(
-            rgb=rgb,
-            inside=inside,
-            fixed=fixed,
-            guide=np.stack(guides, -1),
-            exemplars={a: (p, np.stack(seen[a], -1)) for a, p in small.items()},
-            depth=depth if guided else None,
-        )
-        disagreement = synthesize_level(
-            level,
-            schedule,
-            rounds,
-            turns=not directional,
-            transport_last_only=not guided,
-            rng=rng,
-        )
-        rgb = level.rgb
-    report_progress(progress, len(factors), len(factors), "patches")
-    return rgb, disagreement, len(factors)
+    scale: float,
+    depth_scale: float | None,
+    inclusions: bool,
+    shared: bool,
+    guide: str | np.ndarray,
+) -> tuple[dict[int, list[PlacedPhoto]], Blobs | None]:
+    """Photographs without inclusions, placed in the object; and the richest set of inclusions."""
+    made: dict[int, PlacedPhoto] = {}
+    best: Blobs | None = None
+    result: dict[int, list[PlacedPhoto]] = {}
+    # one photograph for everything: across the axis if that is what carries the structure
+    home = 2 if isinstance(guide, str) and guide == "axis" else 0
+    for axis, group in photos.items():
+        result[axis] = []
+        for photo in group:
+            if id(photo) not in made:
+                own = home if shared else axis
+                placed = place_photo(
+                    photo, fields, own, guided=guided, scale=scale, depth_scale=depth_scale
+                )
+                if inclusions:
+                    placed, found = _without_inclusions(placed, fields, guided, scale, depth_scale)
+                    if found is not None and (best is None or found[0].count > best[0].count):
+                        best = found
+                made[id(photo)] = placed
+            result[axis].append(made[id(photo)])
+    return result, best
 
 
-def _lowpass(image: np.ndarray, mask: np.ndarray, sigma: float = 1.0) -> np.ndarray:
-    """Blur of the pixels or voxels in a mask, not diluted by those outside."""
-    from scipy import ndimage
-
-    share = ndimage.gaussian_filter(mask.astype(np.float32), sigma)
-    sums = [
-        ndimage.gaussian_filter(image[..., c] * mask, sigma) / np.maximum(share, 1e-3)
-        for c in range(3)
-    ]
-    return np.stack(sums, -1).astype(np.float32)
-
-
-def _skin_is_material(domain: InteriorDomain, photo: Exemplar) -> bool:
-    from .metrics import lab_histogram_distance
-
-    skin = domain.skin[domain.shell]
-    return lab_histogram_distance(skin, photo.image[photo.mask]) < 8.0
-
-
-def _shrunk(photos: dict[int, Exemplar], factor: int) -> dict[int, Exemplar]:
-    """Photographs reduced by a factor; equal ones stay one object."""
-    if factor == 1:
-        return photos
-    made: dict[int, Exemplar] = {}
-    result = {}
-    for axis, photo in photos.items():
-        if id(photo) not in made:
-            made[id(photo)] = photo.resized(1.0 / factor)
-        result[axis] = made[id(photo)]
-    return result
+def _without_inclusions(
+    placed: PlacedPhoto,
+    fields: ObjectFields,
+    guided: bool,
+    scale: float,
+    depth_scale: float | None,
+) -> tuple[PlacedPhoto, Blobs | None]:
+    photo = placed.photo
+    # inclusions are looked for at up to four pixels per voxel: finer is sensor noise
+    detail = min(1.0, 4.0 * placed.pitch)
+    original = photo.resized(detail) if detail < 0.98 else photo
+    found = find_inclusions(original)
+    if found is None:
+        return placed, None
+    clean = remove_inclusions(original, found)
+    placed = place_photo(
+        clean, fields, placed.axis, guided=guided, scale=scale, depth_scale=depth_scale
+    )
+    return placed, (found, original, placed.pitch)
 
 
-def _coarse(
-    domain: InteriorDomain, factor: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Inside, depth [coarse voxels], shell and skin at 1/factor resolution."""
-    if factor == 1:
-        return domain.inside, domain.depth, domain.shell, domain.skin
-    pads = [(0, -s % factor) for s in domain.inside.shape]
-
-    def blocks(field: np.ndarray) -> np.ndarray:
-        padded = np.pad(field.astype(np.float32), pads + [(0, 0)] * (field.ndim - 3))
-        x, y, z = (s // factor for s in padded.shape[:3])
-        split = padded.reshape(x, factor, y, factor, z, factor, *padded.shape[3:])
-        result: np.ndarray = split.mean((1, 3, 5))
-        return result
-
-    share = blocks(domain.inside)
-    inside = share > 0.4
-    depth = np.where(inside, blocks(domain.depth) / np.maximum(share, 1e-3) / factor, 0.0)
-    shell_share = blocks(domain.shell)
-    shell = inside & (shell_share > 0) & (depth <= 1.0)
-    skin = blocks(domain.skin * domain.shell[..., None]) / np.maximum(shell_share, 1e-3)[..., None]
-    return inside, depth.astype(np.float32), shell, skin.astype(np.float32)
-
-
-def _upsample(rgb: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Trilinear enlargement by two, cropped to ``shape``."""
-    import torch
-
-    tensor = torch.from_numpy(np.moveaxis(rgb, -1, 0)[None].astype(np.float32))
-    size = tuple(2 * s for s in rgb.shape[:3])
-    big = torch.nn.functional.interpolate(tensor, size=size, mode="trilinear", align_corners=False)
-    out = np.moveaxis(big[0].numpy(), 0, -1)
-    grown = [max(0, s - t) for s, t in zip(shape, out.shape[:3], strict=True)]
-    out = np.pad(out, [(0, g) for g in grown] + [(0, 0)], mode="edge")
-    return np.ascontiguousarray(out[: shape[0], : shape[1], : shape[2]])
+def choose_guide(prepared: dict[int, list[PlacedPhoto]]) -> str:
+    """Height when it explains the colours of cuts along the axis clearly better than depth does."""
+    height, depth = [], []
+    for axis, group in prepared.items():
+        for placed in group:
+            if axis == 2 or placed.axis == 2 or not placed.fitted:
+                continue
+            color = placed.image[placed.mask]
+            height.append(explained(placed.local[placed.mask][:, 2], color))
+            depth.append(explained(placed.depth[placed.mask], color))
+    if height and np.mean(height) > np.mean(depth) + 0.1:
+        return "height"
+    return "depth"

@@ -46,6 +46,9 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
+Photographs = Exemplar | Mapping[int, Exemplar | Sequence[Exemplar]] | None
+"""One photograph, or one or several per axis (the first counts)."""
+
 
 @dataclass(frozen=True)
 class _Pass:
@@ -63,7 +66,7 @@ def diffusion_texture(
     *,
     prompt: str,
     options: InpaintOptions,
-    exemplar: Exemplar | Mapping[int, Exemplar] | None = None,
+    exemplar: Photographs = None,
     resume: Path | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -198,7 +201,7 @@ def inpaint_volume(
     *,
     prompt: str,
     options: InpaintOptions,
-    exemplar: Exemplar | Mapping[int, Exemplar] | None = None,
+    exemplar: Photographs = None,
     coarse: Inpainter | None = None,
     store: SliceStore | None = None,
     seed: int = 0,
@@ -375,11 +378,11 @@ class _Run:
         part: Sequence[int],
     ) -> np.ndarray:
         inside, shell, depth, colors = (
-            np.moveaxis(np.take(field, part, axis), axis, 0)
+            _upright(np.moveaxis(np.take(field, part, axis), axis, 0))
             for field in (level.inside, level.shell, level.depth, volume)
         )
         images = np.where(inside[..., None], colors, GROUND).astype(np.float32)
-        return backend(
+        made = backend(
             images,
             inside & ~shell,
             prompt=self.prompt,
@@ -395,11 +398,21 @@ class _Run:
                 max_depth=level.max_depth,
             ),
         )
+        return np.ascontiguousarray(np.swapaxes(made[:, ::-1], 1, 2))
 
 
-def _per_axis(exemplar: Exemplar | Mapping[int, Exemplar] | None) -> dict[int, Exemplar]:
-    if exemplar is None:
-        return {}
-    if isinstance(exemplar, Exemplar):
-        return dict.fromkeys(range(3), exemplar)
-    return dict(exemplar)
+def _upright(slices: np.ndarray) -> np.ndarray:
+    """Slices [B, U, V, ...] of a volume as pictures [B, H, W, ...] with V (z where it can) up.
+
+    A model knows which way up a cake is, and so does a photograph of one.
+    """
+    return np.ascontiguousarray(np.swapaxes(slices, 1, 2)[:, ::-1])
+
+
+def _per_axis(exemplar: Photographs) -> dict[int, Exemplar]:
+    """One photograph per axis: the first of a list, and the first axis' where there is none."""
+    if exemplar is None or isinstance(exemplar, Exemplar):
+        return {} if exemplar is None else dict.fromkeys(range(3), exemplar)
+    found = {a: e if isinstance(e, Exemplar) else e[0] for a, e in sorted(exemplar.items())}
+    first = next(iter(found.values()), None)
+    return {} if first is None else {axis: found.get(axis, first) for axis in range(3)}

@@ -8,7 +8,7 @@ from gsfluent.errors import InputError
 
 from .inpainter import MaskedInpainter, SliceContext
 from .photo import Exemplar
-from .synthesis import Schedule, SynthesisLevel, synthesize_level
+from .synthesis import Schedule, project_slice
 
 __all__ = ["ColorDiffusionInpainter", "ExemplarInpainter", "TeleaInpainter"]
 
@@ -213,29 +213,14 @@ class ExemplarInpainter(MaskedInpainter):
                 image = _start(image, open_, below, fitted, rng)
             elif step > 0:
                 image = np.where(open_[..., None], _enlarged(rgb, open_.shape), image)
-            guide = 3.0 * _saturating(below, largest / shrink)
-            level = SynthesisLevel(
-                rgb=np.ascontiguousarray(image[None], np.float32),
-                inside=within[None],
-                fixed=(within & ~open_)[None],
-                guide=guide[None, ..., None].astype(np.float32),
-                exemplars={
-                    0: (fitted, 3.0 * self._photo_guide(fitted, depth is not None)[..., None])
-                },
-                depth=None if depth is None else below[None],
-            )
+            rgb = image
             if open_.any():
-                synthesize_level(
-                    level,
-                    self.schedule,
-                    rounds,
-                    axes=(0,),
-                    turns=self.turns,
-                    # one slice is too small a sample of the colours to be matched every round
-                    transport_bins=0,
-                    rng=rng,
-                )
-            rgb = level.rgb[0]
+                shown = self._photo_guide(fitted, depth is not None)
+                rgb = project_slice(
+                    image, within, within & ~open_, 3.0 * _saturating(below, largest / shrink),
+                    (fitted.image, fitted.mask, 3.0 * shown), self.schedule, rounds,
+                    turns=self.turns, rng=rng,
+                )  # fmt: skip
         return rgb
 
     def _photo(self, photo: Exemplar, factor: float, shrink: int) -> Exemplar:

@@ -230,8 +230,10 @@ def _prepare(
     if options.rim and silhouette:
         mask = done(trim_rim(image, mask))
     depth = _depth(mask) if silhouette else None
+    cavities = None
     if options.holes and depth is not None:
-        image = done(fill_holes(image, mask, depth, _ground(image, mask)))
+        image, cavities, note = fill_holes(image, mask, depth, _ground(image, mask))
+        notes += [] if note is None else [note]
     if options.glints:
         image = done(remove_glints(image, mask))
     if options.shading:
@@ -239,7 +241,7 @@ def _prepare(
     if options.white != "skin":
         image = done(remove_tint(image, mask, options.white))
     if options.stain:
-        image = done(remove_stain(image, mask))
+        image = done(remove_stain(image, mask, cavities))
     if options.palette is not None:
         layers = _depth(mask) if depth is None else depth
         image = recolor(image, mask, layers, _palette(options.palette))

@@ -10,12 +10,12 @@ from .photo_color import lab_to_rgb, rgb_to_lab
 __all__ = ["fill_holes", "grey_share", "remove_stain", "recolor"]
 
 _GREY = 8.0  # Lab chroma below which a pixel counts as grey
-_CAVITY = 0.45  # light at the bottom of a small cavity relative to its rim
+_CAVITY = 0.65  # light at the bottom of a small cavity relative to its rim
 
 
 def fill_holes(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray, ground: np.ndarray | None
-) -> tuple[np.ndarray, str | None]:
+) -> tuple[np.ndarray, np.ndarray, str | None]:
     """Give open cavities of the core the colour of their walls.
 
     Where a cut face has a hole (the carpels of an apple), the camera sees the ground through it, or
@@ -30,7 +30,7 @@ def fill_holes(
         ground: Lab colour around the object, or None.
 
     Returns:
-        The picture, and a sentence when holes were found.
+        The picture, the cavities bool [H, W], and a sentence when there are any.
     """
     import cv2
     from scipy import ndimage
@@ -43,8 +43,9 @@ def fill_holes(
     if ground is not None and np.linalg.norm(ground - face) > 25.0:
         dark |= np.linalg.norm(lab - ground, axis=2) < 10.0
     labels, count = ndimage.label(dark & mask)
+    none = np.zeros(mask.shape, bool)
     if count == 0:
-        return image, None
+        return image, none, None
     number = np.arange(1, count + 1)
     pixels = ndimage.sum_labels(np.ones_like(labels), labels, number)
     inner = ndimage.mean(depth, labels, number) / max(largest, 1e-6)
@@ -55,26 +56,25 @@ def fill_holes(
     boxes = [np.prod([s.stop - s.start for s in box]) for box in ndimage.find_objects(labels)]
     seeds = (pixels > 2e-4 * area) & (inner <= 0.66) & (inner > 0.1)
     if (seeds & (pixels > 0.6 * np.array(boxes))).sum() >= 4:
-        return image, None
+        return image, none, None
     hole = good[labels]
     share = float(hole.sum()) / area
     if share < 1e-3:
-        return image, None
+        return image, none, None
     # the blurred edge of a hole is neither hole nor flesh
     rim = max(1, round(0.004 * np.sqrt(area)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1,) * 2)
     wide = cv2.dilate(hole.astype(np.uint8), kernel)
     bytes_ = (image * 255).round().astype(np.uint8)
-    wall = cv2.inpaint(bytes_, wide, 3 * rim, cv2.INPAINT_TELEA).astype(np.float32) / 255.0
+    # and next to it lies its shadow
+    shadow = cv2.dilate(wide, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (6 * rim + 1,) * 2))
+    wall = cv2.inpaint(bytes_, shadow, 3 * rim, cv2.INPAINT_TELEA).astype(np.float32) / 255.0
     wall = np.asarray(cv2.GaussianBlur(wall, (0, 0), 2.0 * rim))
-    far = ndimage.distance_transform_edt(wide) / (0.012 * np.sqrt(area))
-    shade = 1.0 - (1.0 - _CAVITY) * smoothstep(far)
-    done: np.ndarray = np.where(wide[..., None] > 0, wall * shade[..., None], image).astype(
-        np.float32
-    )
-    return done.astype(
-        np.float32
-    ), f"holes: {100 * share:.1f} % of the face is open; painted as cavities"
+    far = smoothstep(ndimage.distance_transform_edt(wide) / (0.012 * np.sqrt(area)))[..., None]
+    # light that went back and forth between the walls is dimmer and more of their colour
+    cavity = wall ** (1.0 + far) * (1.0 - (1.0 - _CAVITY) * far)
+    done = np.where(wide[..., None] > 0, cavity, image).astype(np.float32)
+    return done, wide > 0, f"holes: {100 * share:.1f} % of the face is open; painted as cavities"
 
 
 def grey_share(image: np.ndarray, mask: np.ndarray) -> float:
@@ -83,7 +83,9 @@ def grey_share(image: np.ndarray, mask: np.ndarray) -> float:
     return float((np.hypot(lab[:, 1], lab[:, 2]) < _GREY).mean())
 
 
-def remove_stain(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str | None]:
+def remove_stain(
+    image: np.ndarray, mask: np.ndarray, keep: np.ndarray | None = None
+) -> tuple[np.ndarray, str | None]:
     """Take a grey stain out of a coloured material.
 
     For faces stained for a test (iodine turns starch blue-black) that show some unstained material:
@@ -91,10 +93,18 @@ def remove_stain(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str |
     replaced by that of the unstained part, and the texture is scaled to the contrast it has there.
     Small coloured things (seeds, veins) are above the local mean's scale and stay.
 
+    Args:
+        image: float32 [H, W, 3] in 0..1.
+        mask: The face.
+        keep: Pixels that are not stained whatever their colour (cavities), bool [H, W].
+
     Returns:
         The picture, and a sentence when something was stained.
     """
     from scipy import ndimage
+
+    if keep is not None:
+        mask = mask & ~keep
 
     lab = rgb_to_lab(image).astype(np.float64)
     width = 0.015 * float(np.sqrt(mask.sum()))

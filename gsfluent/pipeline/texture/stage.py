@@ -29,6 +29,8 @@ from .metrics import (
 from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
 from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
+from .structure import take_apart, with_structure
+from .sweep import CUTS
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
@@ -65,23 +67,36 @@ class Texture(Stage):
 
     Args:
         method: One of the above, or ``auto``.
-        exemplar: Photograph of the inside (path or array), or one per axis ``{x: ..., z: ...}``.
+        exemplar: Photograph of the inside (path or array), a list of them, or one or a list per
+            axis ``{x: ..., z: ...}``.
         preset: Name of a procedural preset.
         prompt: Text for the diffusion model.
         model: Local folder or hub id of an inpainting pipeline.
         quality: ``preview``, ``fast`` or ``full`` (exemplar method).
         scale: Size of the exemplar's structure relative to the automatic choice.
-        guide: ``auto``, ``depth``, ``none``, or ``axis`` when the photograph is a cut across the
-            object's axis (exemplar method).
+        guide: What the structure follows: ``auto``, ``depth``, ``axis`` (a cut across the object's
+            axis shows what goes on along it), ``height`` (layers along the axis) or ``none``
+            (exemplar method).
         directional: True for grained materials: the exemplar is not turned or mirrored.
         inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
+        cut: ``across`` or ``along`` when the (first) photograph was cut across the object's axis or
+            through it: structure seen in one place only (an apple's star, segments) is then swept
+            about the axis instead of being spread as material (:mod:`.structure`). None: it is
+            material like the rest.
         photo: What is done to photographs before their material is used (:class:`PhotoOptions`,
             or its settings as a mapping); None for the defaults.
         inpaint: Settings of the slice methods, or a mapping of them.
         resume: Folder in which the diffusion method keeps finished slices.
         polish: Fit the colours of interior Gaussians that are coarser than the voxels to slices
             of the volume, instead of sampling it at their centres (:mod:`.polish`).
+        depth_scale: Depth of the photograph's deepest point in units of the object's largest depth;
+            None works it out (exemplar method).
+        surface: What the surface's colours are to the inside: ``auto``, ``keep``, ``copy`` or
+            ``ignore`` (exemplar method, :func:`.exemplar.exemplar_texture`).
+        core: ``open`` or ``closed``: whether a core seen in a cut across the axis goes on from
+            pole to pole (guide ``axis``).
+        device: Where the exemplar method computes; ``auto`` takes a CUDA device when there is one.
         seed: Seed of everything random.
 
     Raises:
@@ -104,10 +119,15 @@ class Texture(Stage):
         directional: bool = False,
         inclusions: bool = True,
         axis: tuple[float, float, float] | None = None,
+        cut: str | None = None,
         photo: PhotoOptions | Mapping[str, Any] | None = None,
         inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
         polish: bool = False,
+        depth_scale: float | None = None,
+        surface: str = "auto",
+        core: str = "open",
+        device: str = "auto",
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -160,10 +180,20 @@ class Texture(Stage):
         self.directional = directional
         self.inclusions = inclusions
         self.axis = None if axis is None else np.asarray(axis, dtype=float)
+        if cut is not None and cut not in CUTS:
+            raise InputError(
+                f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
+                mend="leave it out when the structure does not follow the object's axis",
+            )
+        self.cut = cut
         self.photo = PhotoOptions.of(photo)
         self.inpaint = options
         self.resume = None if resume is None else Path(resume)
         self.polish = bool(polish)
+        self.depth_scale = depth_scale
+        self.surface = surface
+        self.core = core
+        self.device = device
 
     def forward(
         self,
@@ -188,18 +218,23 @@ class Texture(Stage):
         """
         began = time.perf_counter()
         domain = InteriorDomain.from_solid(solid, self.axis)
-        exemplars = None
+        exemplars, shown, structure = None, None, None
         if self.exemplar is not None:
             opened = open_exemplars(self.exemplar, self.photo)
             if self.photo.white == "skin":
                 opened = with_skin(opened, domain.skin[domain.shell])
-            exemplars = load_exemplars(opened)
+            exemplars = shown = load_exemplars(opened)
+            if self.cut is not None:
+                opened, structure = take_apart(opened)
+                exemplars = load_exemplars(opened)
         if not domain.inside.any():
             raise InputError("texture: the solid is empty", mend="run fill first")
         texture = self._make(domain, exemplars, progress)
+        if structure is not None:
+            texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
-        report = self._report(domain, texture, exemplars) | polished
+        report = self._report(domain, texture, shown) | polished
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
         regions = solid.regions
@@ -217,7 +252,7 @@ class Texture(Stage):
     def _make(
         self,
         domain: InteriorDomain,
-        exemplars: dict[int, Exemplar] | None,
+        exemplars: dict[int, list[Exemplar]] | None,
         progress: Progress | None,
     ) -> InteriorTexture:
         """Run the chosen method."""
@@ -230,6 +265,10 @@ class Texture(Stage):
                 guide=self.guide,
                 directional=self.directional,
                 inclusions=self.inclusions,
+                depth_scale=self.depth_scale,
+                surface=self.surface,
+                core=self.core,
+                device=self.device,
                 seed=self.seed,
                 progress=progress,
             )
@@ -247,7 +286,7 @@ class Texture(Stage):
                 self.model,
                 prompt=self.prompt,
                 options=self.inpaint,
-                exemplar=exemplars,
+                exemplar=None if exemplars is None else _one_per_axis(exemplars),
                 resume=self.resume,
                 seed=self.seed,
                 progress=progress,
@@ -259,7 +298,7 @@ class Texture(Stage):
         self,
         domain: InteriorDomain,
         texture: InteriorTexture,
-        exemplars: dict[int, Exemplar] | None,
+        exemplars: dict[int, list[Exemplar]] | None,
     ) -> dict[str, Any]:
         """Figures for ``run.json``; distances are to the exemplar and null without one."""
         ratios = neighbour_slice_ratio(texture.rgb, domain.inside)
@@ -273,8 +312,10 @@ class Texture(Stage):
             **texture.report,
         }
         if exemplars is not None:
-            photo = exemplars[0]
-            if photo.silhouette:
+            photo = _one_per_axis(exemplars)[0]
+            if "photo_pitch" in texture.report:
+                factor = texture.report["photo_pitch"] / self.scale
+            elif photo.silhouette:
                 factor = domain.max_depth / max(photo.max_depth, 1.0)
             else:
                 factor = max(domain.inside.shape) / max(photo.mask.shape)
@@ -285,15 +326,13 @@ class Texture(Stage):
             report["color_distance"] = lab_histogram_distance(interior, photo.image[photo.mask])
             if photo.silhouette:
                 report["depth_profile_error"] = depth_profile_error(domain, texture.rgb, photo)
-            skin = lab_histogram_distance(domain.skin[domain.shell], photo.image[photo.mask])
-            report["surface_like_interior"] = skin < 3.0
-            if skin < 3.0:
-                logger.info(
-                    "texture: the surface looks like the exemplar already (Lab distance %.1f); "
-                    "color_copy would do as well",
-                    skin,
-                )
         return report
+
+
+def _one_per_axis(exemplars: dict[int, list[Exemplar]]) -> dict[int, Exemplar]:
+    """The first photograph of every axis; axes without one share the first of all."""
+    first = next(iter(exemplars.values()))
+    return {axis: exemplars.get(axis, first)[0] for axis in range(3)}
 
 
 def _color_interior(

@@ -1,14 +1,15 @@
-"""Structure that follows the object's axis: a photographed cross-section swept through the solid.
+"""A photographed cut swept about the object's axis.
 
 A cut across the middle of an apple or an orange shows a star or segments that depth alone does not
-know about. Every voxel is given the place in the photograph with the same azimuth about the axis
-and the same relative depth: the middle plane repeats the photograph, and towards the poles its core
-narrows with the solid. In a solid of constant cross-section (a trunk, a sausage) depth is measured
-across the axis instead, so that rings run through to the ends.
+know about. Every voxel is given a place in the photograph: the same azimuth about the axis, and the
+same share of the way from the axis to the surface in its plane. Every cut across the axis then
+repeats the photograph, as wide as the solid is there: segments and rings run through to the ends.
+A core (carpels) is a spindle instead: it is as wide as photographed in the middle plane and closes
+above and below, so that a cut along the axis shows the almonds of an apple's core.
 
-A photograph cut along the axis is turned about it: every voxel is given the place with the same
-elevation above the middle and the same relative depth, on the right half of the photograph on one
-side of the object and on the left half on the other, blended in between.
+A photograph cut along the axis is turned about it: the same elevation above the middle, the same
+share of the way from the core to the surface; the right half of the photograph serves one side of
+the object and the left half the other, blended in between.
 """
 
 from __future__ import annotations
@@ -18,157 +19,188 @@ import numpy as np
 from gsfluent.errors import InputError
 
 from .domain import axis_frame
-from .photo import Exemplar
+from .noise import value_noise
 
-__all__ = ["CUTS", "axial_depth", "is_prism", "swept_color"]
+__all__ = ["CUTS", "Sweep", "outline"]
 
 CUTS = ("across", "along")
-"""How a photograph for ``guide="axis"`` was cut, relative to the object's axis."""
+"""How a photograph was cut, relative to the object's axis."""
 
-_TURNS = 360
-_STEPS = 96
-_PRISM = 0.85  # volume over (largest cross-section times length): ball 0.67, cylinder 1
+_TURNS, _STEPS, _LEVELS = 72, 36, 48
+_SPINDLE = 1.5  # height of a core over its width
 
 
-def swept_color(
-    inside: np.ndarray,
-    depth: np.ndarray,
-    axis: np.ndarray,
-    photo: Exemplar,
-    cut: str = "across",
-) -> np.ndarray:
-    """Sweep a photograph about an axis.
+class Sweep:
+    """Places of voxels in a photograph.
 
     Args:
         inside: Voxels, bool [X, Y, Z].
-        depth: Distance below the surface [voxels], [X, Y, Z]; for a prism :func:`axial_depth`.
-        axis: Unit vector [3], the object's axis.
-        photo: Photograph with an outline. Cut along, its upper edge is where the axis points.
-        cut: ``across`` or ``along`` the axis.
+        axis: The object's axis [3].
+        cut: ``across`` or ``along`` it. Cut along, the photograph's upper edge is where the axis
+            points.
+        core: Radius of a core relative to the photograph's, or None when the structure is none;
+            the spindle is one and a half times as high as wide.
 
-    Returns:
-        Colours float32 [X, Y, Z, 3]; zero outside.
+    Attributes:
+        way: Share of the way from the axis (cut along: the core) to the surface [n], 0..1.
+        tip: How far a voxel is towards the tips of the core [n], 0 middle, 1 tip.
 
     Raises:
         InputError: Unknown cut.
     """
-    if cut not in CUTS:
-        raise InputError(
-            f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}", mend="leave it at across"
-        )
-    table = _ray_table(photo)
-    index = np.argwhere(inside)
-    relative = depth[inside] / max(float(depth.max()), 1e-6)
-    core = index[relative > 0.9].mean(0)
-    local = (index - core) @ axis_frame(axis).T
-    # image rows run down, the second object axis up
-    azimuth = np.arctan2(local[:, 1], local[:, 0])
-    rgb = np.zeros((*inside.shape, 3), np.float32)
-    if cut == "across":
-        rgb[inside] = _look_up(photo, table, azimuth, relative)
-        return rgb
-    elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
-    right = _look_up(photo, table, elevation, relative)
-    left = _look_up(photo, table, np.pi - elevation, relative)
-    # a narrow seam: half-way between two halves that differ there is only a blur of both
-    share = np.clip(0.5 + 1.5 * np.cos(azimuth), 0.0, 1.0)[:, None]
-    rgb[inside] = share * right + (1.0 - share) * left
-    return rgb
+
+    def __init__(
+        self,
+        inside: np.ndarray,
+        axis: np.ndarray,
+        cut: str = "across",
+        core: float | None = None,
+    ) -> None:
+        if cut not in CUTS:
+            raise InputError(
+                f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
+                mend="across: the photograph was cut across the axis; along: through it",
+            )
+        self.cut, self.inside = cut, inside
+        index = np.argwhere(inside)
+        frame = axis_frame(axis)
+        middle = _core(inside, index)
+        local = (index - middle) @ frame.T
+        self.azimuth = np.arctan2(local[:, 1], local[:, 0])
+        flat, height = np.hypot(local[:, 0], local[:, 1]), local[:, 2]
+        self.elevation = np.arctan2(height, flat)
+        self.tip = np.zeros(len(index))
+        if cut == "along":
+            rise = (np.arange(_STEPS) + 0.5) / _STEPS * np.pi - np.pi / 2
+            rays = _rays(frame, rise)
+            reach = _reach(inside, np.repeat(middle[None], len(rays), 0), rays)
+            row = (self.elevation + np.pi / 2) / np.pi * _STEPS - 0.5
+            far = _read(_smooth(reach.reshape(_STEPS, _TURNS)), row, self.azimuth)
+            self.way = np.clip(np.linalg.norm(local, axis=1) / far, 0.0, 1.0)
+            return
+        low, high = float(height.min()), float(height.max())
+        levels = np.zeros(1) if core is not None else np.linspace(low + 0.5, high - 0.5, _LEVELS)
+        start = np.repeat(middle + levels[:, None] * frame[2], _TURNS, 0)
+        rays = np.tile(_rays(frame, np.zeros(1)), (len(levels), 1))
+        table = _smooth(_reach(inside, start, rays).reshape(len(levels), _TURNS))
+        row = (height - low) / max(high - low, 1e-6) * (len(levels) - 1)
+        far = _read(table, row, self.azimuth)
+        if core is not None:
+            room = _reach(inside, np.stack([middle, middle]), np.stack([frame[2], -frame[2]]))
+            half = min(_SPINDLE * core * float(table.mean()), 0.75 * float(room.min()))
+            self.tip = np.clip(np.abs(height) / max(half, 1.0), 0.0, 1.0)
+            far = far * np.sqrt(np.maximum(1.0 - self.tip**2, 1e-4))
+        # nothing grows dead straight: away from the middle plane the structure wanders a little
+        away = np.abs(height) / max(-low, high)
+        points = (local / max(-low, high)).astype(np.float32)
+        far = far * (1.0 + 0.25 * away * value_noise(points, 3.0, 1))
+        self.azimuth = self.azimuth + 0.5 * away * value_noise(points, 2.0, 2)
+        self.way = np.clip(flat / far, 0.0, 1.0)
+
+    def colors(self, image: np.ndarray, mask: np.ndarray, center: np.ndarray) -> np.ndarray:
+        """Values of a picture at the voxels' places.
+
+        Args:
+            image: [H, W, C].
+            mask: The face, bool [H, W].
+            center: Row and column of the core.
+
+        Returns:
+            float32 [n, C], in the order of ``argwhere(inside)``.
+        """
+        edge = outline(mask, center)
+        if self.cut == "across":
+            return self._look(image, edge, center, self.azimuth)
+        right = self._look(image, edge, center, self.elevation)
+        left = self._look(image, edge, center, np.pi - self.elevation)
+        # a narrow seam: half-way between two halves that differ there is only a blur of both
+        share = np.clip(0.5 + 1.5 * np.cos(self.azimuth), 0.0, 1.0)[:, None]
+        return share * right + (1.0 - share) * left
+
+    def _look(
+        self, image: np.ndarray, edge: np.ndarray, center: np.ndarray, angle: np.ndarray
+    ) -> np.ndarray:
+        from scipy import ndimage
+
+        turn = np.mod(angle / (2 * np.pi) * len(edge), len(edge))
+        radius = self.way * np.interp(turn, np.arange(len(edge) + 1), np.append(edge, edge[0]))
+        # image rows run down, the second object axis up
+        place = [center[0] - radius * np.sin(angle), center[1] + radius * np.cos(angle)]
+        channels = [
+            ndimage.map_coordinates(image[..., c], place, order=1, mode="nearest")
+            for c in range(image.shape[2])
+        ]
+        return np.stack(channels, 1).astype(np.float32)
 
 
-def _look_up(
-    photo: Exemplar, table: np.ndarray, angle: np.ndarray, relative: np.ndarray
-) -> np.ndarray:
-    """Colours [n, 3] of the photograph at angles [n] and relative depths [n]."""
-    from scipy import ndimage
+def outline(mask: np.ndarray, center: np.ndarray, turns: int = 360) -> np.ndarray:
+    """Distance from a point to the edge of a mask at equal steps of azimuth [pixels].
 
-    turn = (angle / (2 * np.pi) * _TURNS) % _TURNS
-    step = np.clip(relative, 0.0, 1.0) * (_STEPS - 1)
-    coordinates = np.stack([turn, step])
-    wrapped = np.concatenate([table, table[:1]])
-    place = [
-        ndimage.map_coordinates(wrapped[..., k], coordinates, order=1, mode="nearest")
-        for k in range(2)
-    ]
-    channels = [
-        ndimage.map_coordinates(photo.image[..., c], place, order=1, mode="nearest")
-        for c in range(3)
-    ]
-    return np.stack(channels, 1)
-
-
-def is_prism(inside: np.ndarray, axis: np.ndarray) -> bool:
-    """Whether the cross-section across the axis hardly changes (trunk, loaf, disc)."""
-    height = np.argwhere(inside) @ (axis / np.linalg.norm(axis))
-    low, high = np.quantile(height, [0.005, 0.995])
-    bins = max(4, min(32, int(high - low)))
-    area = np.histogram(height, bins, (low, high))[0]
-    # the mean of the upper half rather than the maximum: one slice with a branch decides nothing
-    return bool(area.mean() > _PRISM * np.sort(area)[bins // 2 :].mean())
-
-
-def axial_depth(inside: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Distance to the outline within the planes across the axis [voxels], [X, Y, Z].
-
-    Axes along the grid are exact; for others the voxels are turned there and back.
+    Azimuth 0 points along the columns, a quarter turn up the picture.
     """
     from scipy import ndimage
 
-    unit = axis / np.linalg.norm(axis)
-    nearest = int(np.abs(unit).argmax())
-    if abs(unit[nearest]) > 0.999:
-        return _plane_depth(inside, nearest)
-    rotation = axis_frame(unit)
-    size = int(np.ceil(np.linalg.norm(inside.shape))) + 2
-    middle = (np.array(inside.shape) - 1) / 2.0
-    center = np.full(3, (size - 1) / 2.0)
-    turned = ndimage.affine_transform(
-        inside.astype(np.float32),
-        rotation.T,
-        offset=middle - rotation.T @ center,
-        output_shape=(size,) * 3,
-        order=1,
-    )
-    deep = _plane_depth(turned > 0.5, 2)
-    back = ndimage.affine_transform(
-        deep, rotation, offset=center - rotation @ middle, output_shape=inside.shape, order=1
-    )
-    return np.where(inside, np.maximum(back, 0.5), 0.0).astype(np.float32)
+    angle = 2 * np.pi * np.arange(turns) / turns
+    reach = float(np.hypot(*mask.shape))
+    radius = np.arange(0.0, reach, 0.5)
+    place = [
+        center[0] - np.sin(angle)[:, None] * radius,
+        center[1] + np.cos(angle)[:, None] * radius,
+    ]
+    hit = ndimage.map_coordinates(mask.astype(np.float32), place, order=1, mode="constant") > 0.5
+    last = hit.shape[1] - 1 - hit[:, ::-1].argmax(1)
+    far = np.where(hit.any(1), radius[last], 1.0)
+    return np.asarray(ndimage.gaussian_filter1d(np.maximum(far, 1.0), turns / 120, mode="wrap"))
 
 
-def _plane_depth(inside: np.ndarray, axis: int) -> np.ndarray:
-    """Distance to the outline within each slice across a grid axis."""
+def _core(inside: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """The centroid, or the deepest voxel when the centroid is not well inside (a ring, a bow)."""
     from scipy import ndimage
 
-    depth = np.zeros(inside.shape, np.float32)
-    slices, result = np.moveaxis(inside, axis, 0), np.moveaxis(depth, axis, 0)
-    for k, plane in enumerate(slices):
-        if plane.any():
-            result[k] = ndimage.distance_transform_edt(np.pad(plane, 1))[1:-1, 1:-1] - 0.5
-    return np.where(inside, depth, 0.0).astype(np.float32)
+    depth = ndimage.distance_transform_edt(inside)
+    middle = index.mean(0)
+    if depth[tuple(np.rint(middle).astype(int))] > 0.4 * depth.max():
+        return np.asarray(middle)
+    return np.asarray(np.unravel_index(int(depth.argmax()), depth.shape), dtype=float)
 
 
-def _ray_table(photo: Exemplar) -> np.ndarray:
-    """Photograph position (row, column) per azimuth and relative depth, [_TURNS, _STEPS, 2]."""
+def _rays(frame: np.ndarray, rise: np.ndarray) -> np.ndarray:
+    """Unit vectors of all azimuths at each elevation [len(rise) * _TURNS, 3]."""
+    turn = 2 * np.pi * np.arange(_TURNS) / _TURNS
+    e, a = (v.reshape(-1) for v in np.meshgrid(rise, turn, indexing="ij"))
+    local = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1)
+    return np.asarray(local @ frame)
+
+
+def _reach(inside: np.ndarray, start: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Way from each start along its ray to the first point outside [voxels]."""
     from scipy import ndimage
 
-    smooth = ndimage.gaussian_filter(photo.depth, 1.0)
-    rows, columns = np.nonzero(photo.depth >= 0.95 * photo.max_depth)
-    center = np.array([rows.mean(), columns.mean()])
-    reach = float(np.hypot(*photo.mask.shape))
-    radius = np.linspace(0.0, reach, 4 * int(reach))
-    table = np.zeros((_TURNS, _STEPS, 2))
-    wanted = np.linspace(0.0, 1.0, _STEPS)
-    for k in range(_TURNS):
-        angle = 2 * np.pi * k / _TURNS
-        direction = np.array([-np.sin(angle), np.cos(angle)])
-        line = center[:, None] + direction[:, None] * radius
-        profile = ndimage.map_coordinates(smooth, line, order=1, mode="constant")
-        inner = np.flatnonzero(profile > 0)
-        last = int(inner[-1]) + 1 if len(inner) else 1
-        # depth grows inward; small dents on the way are levelled so that it can be inverted
-        rising = np.maximum.accumulate(profile[:last][::-1])
-        rising = rising / max(float(rising[-1]), 1e-6) + 1e-9 * np.arange(last)
-        distance = np.interp(wanted, rising, radius[:last][::-1])
-        table[k] = center + distance[:, None] * direction
-    return table
+    steps = np.arange(0.0, float(np.linalg.norm(inside.shape)), 0.5)
+    solid = inside.astype(np.float32)
+    far = np.zeros(len(rays))
+    going = np.ones(len(rays), bool)
+    for step in steps:
+        place = (start[going] + step * rays[going]).T
+        still = ndimage.map_coordinates(solid, place, order=1, mode="constant") > 0.5
+        rows = np.flatnonzero(going)
+        far[rows[still]] = step + 0.5
+        going[rows[~still]] = False
+        if not going.any():
+            break
+    return np.maximum(far, 1.0)
+
+
+def _smooth(table: np.ndarray) -> np.ndarray:
+    from scipy import ndimage
+
+    return np.asarray(ndimage.gaussian_filter(table, (1.0, 1.0), mode=("nearest", "wrap")))
+
+
+def _read(table: np.ndarray, row: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """Values of a table [rows, _TURNS] at fractional rows and azimuths."""
+    from scipy import ndimage
+
+    wrapped = np.concatenate([table, table[:, :1]], 1)
+    turn = np.mod(azimuth / (2 * np.pi) * _TURNS, _TURNS)
+    return np.asarray(ndimage.map_coordinates(wrapped, [row, turn], order=1, mode="nearest"))

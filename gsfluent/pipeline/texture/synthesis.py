@@ -1,10 +1,8 @@
-"""Guided patch synthesis of a solid texture from one photograph.
+"""Guided patch synthesis of a solid texture from photographs.
 
 After Kopf et al. 2007 (solid texture synthesis from 2-D exemplars), with two changes that matter:
-patches are matched together with their depth below the surface, so rind meets rind; and the nearest
-patch is searched under the dual weights of a semi-discrete optimal transport, so that every patch
-of the photograph is used about equally often. Without the weights a few smooth patches win
-everywhere and the material washes out.
+patches are matched together with their place in the object (depth below the surface, ...), so rind
+meets rind; and all patches of the photographs are used about equally often (:mod:`.bank`).
 """
 
 from __future__ import annotations
@@ -15,17 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from .photo import Exemplar
-from .profile import match_colors
+from .bank import Bank, LevelPhoto
+from .color import lab_to_rgb, rgb_to_lab100
+from .levels import nearest_inside
+from .transport import match_near, polish_patches
 
-__all__ = ["Schedule", "SynthesisLevel", "synthesize_level"]
+__all__ = ["Schedule", "SynthesisLevel", "project_slice", "synthesize_level"]
 
 logger = logging.getLogger(__name__)
 
-_DIMENSIONS = 24  # principal components of a patch that are compared
 _FALLOFF = 0.45  # vote window: standard deviation over half the patch width
-_QUERY_CHUNK = 4096
+_ALONE = 0.3  # of the median squared distance
+_CHUNK = 1 << 17  # patches gathered at once
 
 
 @dataclass(frozen=True)
@@ -33,20 +34,31 @@ class Schedule:
     """How much work to spend.
 
     Attributes:
-        iterations: Rounds per pyramid level, coarse to fine.
-        bank: Patches of the photograph kept per level.
+        iterations: Rounds of voting at the coarsest level, at those between, and at the finest.
+        polish: Rounds of patch statistics at the end of a level, likewise.
+        bank: Patches of the photographs kept per axis and level.
         samples: Queries that the transport weights are estimated from.
         sinkhorn: Steps of that estimate.
         stride: Distance between patch centres within a slice [voxels].
-        patch: Edge of a patch [voxels], odd.
+        patch: Edge of a patch that votes [voxels], odd.
     """
 
-    iterations: tuple[int, ...] = (6, 4, 2)
+    iterations: tuple[int, int, int] = (6, 4, 2)
+    polish: tuple[int, int, int] = (8, 8, 4)
     bank: int = 3072
     samples: int = 640
     sinkhorn: int = 3
     stride: int = 3
     patch: int = 5
+
+    def at(self, level: int, levels: int) -> tuple[int, int]:
+        """Rounds of voting and of patch statistics at a level (0 is the coarsest).
+
+        A coarse level gets the same work whatever follows, so that it comes out the same at every
+        resolution.
+        """
+        which = 0 if level == 0 else 2 if level == levels - 1 else 1
+        return self.iterations[which], self.polish[which]
 
 
 @dataclass
@@ -54,202 +66,139 @@ class SynthesisLevel:
     """One pyramid level.
 
     Attributes:
-        rgb: Volume, float32 [X, Y, Z, 3]; updated by :func:`synthesize_level`.
+        volume: Lab / 100, [3, X, Y, Z]; updated by :func:`synthesize_level`.
         inside: Voxels to synthesise, bool [X, Y, Z].
         fixed: Voxels whose colour stays, bool [X, Y, Z].
-        guide: Guide values per voxel, float32 [X, Y, Z, G], already weighted; the first one grows
-            with depth (zeros when there is no guide).
-        exemplars: Photograph per axis, at this level's pitch, with its guide image [H, W, G].
-        depth: Depth [voxels of this level] for the colour transport; None without a guide.
+        guide: Guide values [G, X, Y, Z].
+        banks: Patches per slice axis.
+        reference: Colours [m, 3] and guide values [m, G] of the photographs' pixels; None
+            leaves the colours to the patches.
+        along: Standard deviation [voxels] of a smoothing along the third axis (fibres).
     """
 
-    rgb: np.ndarray
-    inside: np.ndarray
-    fixed: np.ndarray
-    guide: np.ndarray
-    exemplars: dict[int, tuple[Exemplar, np.ndarray]]
-    depth: np.ndarray | None
-
-
-class _Bank:
-    """Patches of one photograph with their descriptors."""
-
-    def __init__(
-        self,
-        exemplar: Exemplar,
-        guide: np.ndarray,
-        schedule: Schedule,
-        turns: bool,
-        queries: int,
-        rng: np.random.Generator,
-    ) -> None:
-        half = schedule.patch // 2
-        size = schedule.patch
-        image = np.pad(exemplar.image, ((half, half), (half, half), (0, 0)), mode="edge")
-        rows, columns = np.nonzero(exemplar.mask)
-        # more patches than queries cannot all be used
-        wanted = min(schedule.bank, max(512, queries))
-        pick = rng.permutation(len(rows))
-        # a small photograph gives each patch several times, each time turned differently
-        pick = np.resize(pick, wanted) if len(pick) * 8 > wanted else np.tile(pick, 8)
-        rows, columns = rows[pick], columns[pick]
-        window = np.arange(size)
-        patches = image[rows[:, None, None] + window[:, None], columns[:, None, None] + window]
-        if turns:
-            turn = rng.integers(0, 8, len(patches))
-            for k in range(8):
-                chosen = turn == k
-                turned = np.rot90(patches[chosen], k % 4, axes=(1, 2))
-                patches[chosen] = turned[:, :, ::-1] if k >= 4 else turned
-        self.patches = torch.from_numpy(patches.reshape(len(patches), -1).astype(np.float32))
-        self.mean = self.patches.mean(0)
-        centered = self.patches - self.mean
-        covariance = centered.T @ centered / max(len(centered), 1)
-        _, vectors = torch.linalg.eigh(covariance)
-        self.basis = vectors[:, -_DIMENSIONS:]
-        self.guide = torch.from_numpy(guide[rows, columns].astype(np.float32))
-        self.descriptor = torch.cat([centered @ self.basis, self.guide], 1)
-        self.norm = (self.descriptor**2).sum(1)
-        layer = self.guide[:, 0]
-        order = layer.argsort()
-        bins = 12 if float(layer.std()) > 1e-6 else 1
-        self.bin = torch.empty(len(order), dtype=torch.long)
-        self.bin[order] = torch.arange(len(order)) * bins // len(order)
-        self.bins = bins
-        starts = torch.arange(bins) * len(order) // bins
-        self.edges = layer[order][starts[1:]].contiguous()
-        self.dual = torch.zeros(len(order))
-
-    def describe(self, patches: Tensor, guide: Tensor) -> Tensor:
-        """Descriptors [n, 24 + G] of patches [n, P] with guide values [n, G]."""
-        return torch.cat([(patches - self.mean) @ self.basis, guide], 1)
-
-    def balance(self, query: Tensor, steps: int) -> None:
-        """Estimate the dual weights so that patches of a depth bin share its queries equally.
-
-        Sinkhorn steps on the sampled cost matrix; only the exemplar side is enforced, because
-        every query takes exactly one patch anyway.
-        """
-        cost = (self.norm - 2 * query @ self.descriptor.T).add_((query**2).sum(1)[:, None])
-        cost.clamp_(min=0)
-        nearest = cost.min(1).values
-        softness = float(nearest.median()) * 0.5 + 1e-4
-        share = torch.bincount(
-            torch.bucketize(query[:, self.basis.shape[1]].contiguous(), self.edges),
-            minlength=self.bins,
-        ).float()
-        population = torch.bincount(self.bin, minlength=self.bins).float()
-        target = ((share + 0.5) / (share + 0.5).sum() / population)[self.bin]
-        dual = torch.zeros(len(self.norm))
-        for _ in range(steps):
-            usage = torch.softmax((dual - cost) / softness, dim=1).mean(0)
-            dual -= softness * torch.log((usage + 1e-9) / target)
-        # far outside the cost scale a weight would override likeness altogether
-        spread = 3.0 * float(nearest.mean()) + 1e-4
-        self.dual = (dual - dual.mean()).clamp_(-spread, spread)
-
-    def nearest(self, query: Tensor) -> tuple[Tensor, Tensor]:
-        """Best patch [n] under the weights, and its plain squared distance [n]."""
-        best = torch.empty(len(query), dtype=torch.long)
-        offset = self.norm - self.dual
-        for start in range(0, len(query), _QUERY_CHUNK):
-            part = query[start : start + _QUERY_CHUNK]
-            score = torch.addmm(offset, part, self.descriptor.T, alpha=-2.0)
-            best[start : start + _QUERY_CHUNK] = score.argmin(1)
-        distance = ((query - self.descriptor[best]) ** 2).sum(1)
-        return best, distance
+    volume: Tensor
+    inside: Tensor
+    fixed: Tensor
+    guide: Tensor
+    banks: dict[int, Bank]
+    reference: tuple[Tensor, Tensor] | None
+    along: float = 0.0
 
 
 def synthesize_level(
     level: SynthesisLevel,
     schedule: Schedule,
-    iterations: int,
+    rounds: tuple[int, int],
     *,
-    axes: tuple[int, ...] = (0, 1, 2),
-    turns: bool = True,
-    transport_bins: int = 10,
     transport_last_only: bool = False,
     rng: np.random.Generator,
 ) -> float:
     """Improve one level in place.
 
     Args:
-        level: Volume, masks, guide and photographs.
+        level: Volume, masks, guide and patches.
         schedule: Work settings.
-        iterations: Rounds.
-        axes: Slice directions that take part.
-        turns: Use the photograph turned and mirrored (off for grained materials).
-        transport_bins: Depth ranges of the colour transport.
+        rounds: Rounds of voting and of patch statistics.
         transport_last_only: Transport colours only in the last round (unlayered materials).
         rng: Random generator.
 
     Returns:
         Root mean square over voxels of the disagreement between the axes' proposals in the last
-        round: it falls as the three directions settle on one volume.
+        round: it falls as the three directions settle on one volume. One voxel has one colour, so
+        that what disagrees is opinions, never slices.
     """
-    pad = schedule.patch // 2 + 1
-    shape = tuple(s + 2 * pad for s in level.inside.shape)
-    strides = (shape[1] * shape[2], shape[2], 1)
-    padded = np.pad(level.inside, pad)
-    volume = torch.from_numpy(
-        np.pad(level.rgb, ((pad, pad),) * 3 + ((0, 0),)).reshape(-1, 3).astype(np.float32)
-    )
-    target, source = _extension(padded, pad)
-    queries = int(level.inside.sum()) // schedule.stride**2
-    banks = {
-        axis: _Bank(*level.exemplars[axis], schedule, turns, queries, rng)
-        for axis in axes
-        if axis in level.exemplars
-    }
-    coordinates = torch.from_numpy(np.argwhere(padded))
-    flat = coordinates @ torch.tensor(strides)
-    guide = torch.from_numpy(level.guide[level.inside].astype(np.float32))
-    fixed = torch.from_numpy(np.pad(level.fixed, pad).reshape(-1)[flat.numpy()])
+    # a rim of empty cells, so that no patch reaches beyond the array
+    pad = schedule.patch // 2 + 2
+    rim = (pad,) * 6
+    inside = functional.pad(level.inside, rim)
+    shape = inside.shape
+    volume = functional.pad(level.volume, rim).reshape(3, -1).T.contiguous()
+    flat = inside.reshape(-1).nonzero()[:, 0]
+    guide = functional.pad(level.guide, rim).reshape(len(level.guide), -1)[:, flat].T.contiguous()
+    fixed = functional.pad(level.fixed, rim).reshape(-1)[flat]
     kept = volume[flat[fixed]].clone()
-    reference = level.exemplars[axes[0]][0]
+    target, source = nearest_inside(inside, pad - 1)
+    coordinates = torch.stack(
+        [flat // (shape[1] * shape[2]), flat // shape[2] % shape[1], flat % shape[2]], 1
+    )
     disagreement = 0.0
-    for iteration in range(iterations):
+    for iteration in range(rounds[0]):
         volume[target] = volume[source]
         total = torch.zeros_like(volume)
-        weight = torch.zeros(len(volume))
-        square = torch.zeros(len(volume))
-        for axis, bank in banks.items():
+        weight = volume.new_zeros(len(volume))
+        square = volume.new_zeros(len(volume))
+        for axis, bank in level.banks.items():
             votes, share = _axis_votes(
-                volume, flat, coordinates, guide, axis, strides, bank, schedule, rng
+                volume, flat, coordinates, guide, axis, shape, bank, schedule, rng
             )
             total += votes
             weight += share
             # each axis' own opinion, for the agreement figure
-            opinion = votes[flat] / share[flat].clamp(min=1e-9)[:, None]
-            square[flat] += share[flat] * (opinion**2).sum(1)
+            square += (votes**2).sum(1) / share.clamp(min=1e-9)
         voted = weight[flat] > 0
         mean = total[flat] / weight[flat].clamp(min=1e-9)[:, None]
         variance = square[flat] / weight[flat].clamp(min=1e-9) - (mean**2).sum(1)
         disagreement = float((variance[voted].clamp(min=0).mean() / 3).sqrt())
-        rgb = torch.where(voted[:, None], mean, volume[flat])
-        if transport_bins > 0 and (not transport_last_only or iteration == iterations - 1):
-            values = rgb.numpy()
-            depth = (
-                np.zeros(len(values))
-                if level.depth is None
-                else level.depth[level.inside].astype(np.float64)
-            )
-            moved = match_colors(
-                values,
-                depth,
-                reference.image[reference.mask],
-                np.zeros(int(reference.mask.sum()))
-                if level.depth is None
-                else reference.depth[reference.mask],
-                bins=transport_bins if level.depth is not None else 1,
-                rng=rng,
-                rounds=2,
-            )
-            rgb = torch.from_numpy(moved)
-        volume[flat] = rgb
+        colors = torch.where(voted[:, None], mean, volume[flat])
+        last = iteration == rounds[0] - 1
+        if level.reference is not None and (last or not transport_last_only):
+            colors = match_near(colors, guide, *level.reference, rng)
+        volume[flat] = colors
+        if level.along > 0:
+            volume = _smoothed_along(volume, inside, level.along)
         volume[flat[fixed]] = kept
-    level.rgb[level.inside] = volume[flat].numpy()
+    if rounds[1]:
+        volume[target] = volume[source]
+        grid = volume.T.reshape(3, *shape)
+        grid = _polished(level, grid, inside, functional.pad(level.fixed, rim), rim, rounds[1], rng)
+        volume = grid.reshape(3, -1).T.contiguous()
+        if level.along > 0:
+            volume = _smoothed_along(volume, inside, level.along)
+        if level.reference is not None:
+            volume[flat] = match_near(volume[flat], guide, *level.reference, rng)
+        volume[flat[fixed]] = kept
+    inner = slice(pad, -pad)
+    grid = volume.T.reshape(3, *shape)
+    level.volume = grid[:, inner, inner, inner] * level.inside
     return disagreement
+
+
+def _smoothed_along(volume: Tensor, inside: Tensor, sigma: float) -> Tensor:
+    """Volume [V, 3] blurred along the third axis, by inside voxels only."""
+    reach = max(1, int(2.5 * sigma))
+    line = torch.arange(-reach, reach + 1, device=volume.device).float()
+    kernel = torch.exp(-0.5 * (line / sigma) ** 2).reshape(1, 1, -1)
+    share = inside.float()
+    values = torch.cat([volume.T.reshape(3, *inside.shape) * share, share[None]])
+    lines = values.reshape(4, -1, inside.shape[2]).movedim(0, 1).reshape(-1, 1, inside.shape[2])
+    blurred = functional.conv1d(lines, kernel, padding=reach)
+    blurred = blurred.reshape(-1, 4, inside.shape[2]).movedim(1, 0).reshape(4, -1)
+    smooth = (blurred[:3] / blurred[3].clamp(min=1e-6)).T
+    return torch.where(inside.reshape(-1, 1), smooth, volume)
+
+
+def _polished(
+    level: SynthesisLevel,
+    volume: Tensor,
+    inside: Tensor,
+    fixed: Tensor,
+    rim: tuple[int, ...],
+    rounds: int,
+    rng: np.random.Generator,
+) -> Tensor:
+    """Patch statistics matched (:func:`polish_patches`)."""
+    whole, banks = {}, {}
+    outside = (~inside).float()[None, None]
+    for axis, bank in level.banks.items():
+        edge = round((bank.whole.shape[1] / 3) ** 0.5)
+        window = [edge] * 3
+        window[axis] = 1
+        reach = [w // 2 for w in window]
+        touched = functional.max_pool3d(outside, window, 1, reach)[0, 0]
+        whole[axis] = inside & (touched == 0)
+        banks[axis] = (bank.whole, bank.guide)
+    guide = functional.pad(level.guide, rim)
+    return polish_patches(volume, whole, guide, banks, inside & ~fixed, rng, rounds=rounds)
 
 
 def _axis_votes(
@@ -258,12 +207,13 @@ def _axis_votes(
     coordinates: Tensor,
     guide: Tensor,
     axis: int,
-    strides: tuple[int, int, int],
-    bank: _Bank,
+    shape: torch.Size,
+    bank: Bank,
     schedule: Schedule,
     rng: np.random.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Weighted patch votes [V, 3] and weights [V] of the slices across one axis."""
+    strides = (shape[1] * shape[2], shape[2], 1)
     rows, columns = (i for i in range(3) if i != axis)
     stride = schedule.stride
     # staggered from slice to slice, so that neighbours do not share patch borders
@@ -271,33 +221,81 @@ def _axis_votes(
     along = coordinates[:, axis]
     chosen = (coordinates[:, rows] + along + int(shift[0])) % stride == 0
     chosen &= (coordinates[:, columns] + 2 * along + int(shift[1])) % stride == 0
-    center = flat[chosen]
+    picked = chosen.nonzero()[:, 0]
     half = schedule.patch // 2
-    window = torch.arange(-half, half + 1)
+    window = torch.arange(-half, half + 1, device=volume.device)
     offset = (window[:, None] * strides[rows] + window[None] * strides[columns]).reshape(-1)
-    index = center[:, None] + offset[None]
-    patches = volume[index].reshape(len(center), -1)
-    query = bank.describe(patches, guide[chosen])
-    sample = torch.from_numpy(rng.integers(0, len(query), min(schedule.samples, len(query))))
-    bank.balance(query[sample], schedule.sinkhorn)
-    best, distance = bank.nearest(query)
+
+    def describe(which: Tensor) -> Tensor:
+        return bank.describe(volume[flat[which][:, None] + offset], guide[which])
+
+    draw = rng.random(schedule.samples)
+    total = torch.zeros_like(volume)
+    share = volume.new_zeros(len(volume))
+    if len(picked) == 0:
+        return total, share
+    sample = torch.from_numpy((draw * len(picked)).astype(np.int64)).to(picked.device)
+    query = describe(picked[sample])
+    bank.balance(query, schedule.sinkhorn)
+    # a patch that fits perfectly must not be alone: the lattice of centres would show
+    floor = _ALONE * float(bank.nearest(query)[1].median()) + 1e-4
     gauss = torch.exp(-0.5 * (window.float() / (_FALLOFF * half)) ** 2)
     falloff = (gauss[:, None] * gauss[None]).reshape(-1)
-    weight = falloff[None] / (distance[:, None] + 1e-4)
-    proposal = bank.patches[best].view(len(center), -1, 3) * weight[..., None]
-    total = torch.zeros_like(volume)
-    total.index_add_(0, index.reshape(-1), proposal.reshape(-1, 3))
-    share = torch.zeros(len(volume))
-    share.index_add_(0, index.reshape(-1), weight.reshape(-1))
+    for part in picked.split(_CHUNK):
+        best, distance = bank.nearest(describe(part))
+        weight = 1.0 / (distance + floor)
+        center = flat[part]
+        for k in range(len(offset)):
+            # within one offset no voxel is met twice: the sums are the same in every run
+            at = center + offset[k]
+            votes = weight * falloff[k]
+            total.index_add_(0, at, bank.patches[best, k] * votes[:, None])
+            share.index_add_(0, at, votes)
     return total, share
 
 
-def _extension(padded: np.ndarray, reach: int) -> tuple[Tensor, Tensor]:
-    """Flat indices of voxels just outside and of the inside voxel nearest to each."""
-    from scipy import ndimage
+def project_slice(
+    image: np.ndarray,
+    inside: np.ndarray,
+    fixed: np.ndarray,
+    guide: np.ndarray,
+    photo: tuple[np.ndarray, np.ndarray, np.ndarray],
+    schedule: Schedule,
+    iterations: int,
+    *,
+    turns: bool,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Patch synthesis in a single slice, by itself.
 
-    distance, nearest = ndimage.distance_transform_edt(~padded, return_indices=True)
-    near = (distance > 0) & (distance <= reach * 1.5)
-    target = np.flatnonzero(near.reshape(-1))
-    source = np.ravel_multi_index(tuple(nearest[:, near]), padded.shape)
-    return torch.from_numpy(target), torch.from_numpy(source)
+    Args:
+        image: RGB in 0..1, [H, W, 3].
+        inside: Pixels of the object, bool [H, W].
+        fixed: Pixels that stay, bool [H, W].
+        guide: Guide value per pixel, [H, W].
+        photo: Photograph at the same pitch: image [h, w, 3], mask [h, w], guide [h, w].
+        schedule: Work settings.
+        iterations: Rounds of voting.
+        turns: Use the photograph turned and mirrored.
+        rng: Random generator.
+
+    Returns:
+        RGB [H, W, 3]; pixels that are fixed or outside are those of ``image``.
+    """
+    within = torch.from_numpy(inside[None])
+    place = torch.from_numpy(guide.astype(np.float32)[None, None])
+    shown = LevelPhoto(
+        rgb_to_lab100(torch.from_numpy(photo[0].astype(np.float32))),
+        torch.from_numpy(photo[1]),
+        torch.from_numpy(photo[2].astype(np.float32)[..., None]),
+    )
+    target = place[0][within][:, None]
+    wanted = min(schedule.bank, max(512, int(inside.sum()) // schedule.stride**2))
+    bank = Bank([shown], wanted, schedule.patch, schedule.patch, turns, target, rng)
+    lab = rgb_to_lab100(torch.from_numpy(image.astype(np.float32))).movedim(-1, 0)
+    level = SynthesisLevel(
+        lab[:, None], within, torch.from_numpy(fixed[None]), place, {0: bank}, None
+    )
+    synthesize_level(level, schedule, (iterations, 0), rng=rng)
+    made = lab_to_rgb(level.volume[:, 0].movedim(0, -1)).numpy()
+    return np.where((inside & ~fixed)[..., None], made, image).astype(np.float32)
