@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -91,6 +92,18 @@ class Capture:
         from gsfluent.io.images import load_view
 
         return load_view(self.cameras[index], max_size)
+
+    def views(self, indices: Iterable[int], max_size: int | None = None) -> list[View]:
+        """Read several photographs as :meth:`view` does, by as many threads as there are cores.
+
+        Raises:
+            InputError: As :meth:`view`.
+        """
+        import os
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
+            return list(pool.map(lambda index: self.view(index, max_size), indices))
 
     def image(
         self, index: int, max_size: int | None = None

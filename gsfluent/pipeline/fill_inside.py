@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from .fill_density import GridBox
-from .voxels import distance_transform
+from .voxels import distance_transform, grown
 
 __all__ = [
     "DIRECTIONS",
@@ -274,7 +274,7 @@ def find_leaks(
     # an opening: wet inner voxels that touch open space outside the object
     mouth = wet & ndimage.binary_dilation(~inside & ~shell, cross)
     # patches of one mouth a voxel or two apart are one opening
-    merged = ndimage.binary_dilation(mouth, np.ones((3, 3, 3)))
+    merged = grown(mouth, 1)
     label, openings = ndimage.label(merged, structure=np.ones((3, 3, 3)))
     index = np.argwhere(mouth)
     owner = label[tuple(index.T)]

@@ -21,9 +21,12 @@ from .draw import draw
 from .stage import Progress, report_progress
 
 if TYPE_CHECKING:
-    from gsfluent.data import Capture, Gaussians
+    from collections.abc import Sequence
 
-__all__ = ["Testimony", "refine_opacity", "witness"]
+    from gsfluent.data import Capture, Gaussians
+    from gsfluent.data.capture import View
+
+__all__ = ["Testimony", "asked_views", "refine_opacity", "witness"]
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +61,7 @@ def witness(
     *,
     views: int = 24,
     image_size: int = 200,
+    photographs: Sequence[View] | None = None,
     progress: Progress | None = None,
 ) -> Testimony:
     """Ask photographs about Gaussians, in one forward and one backward pass per view.
@@ -67,16 +71,17 @@ def witness(
         capture: Posed photographs; masks are used where there are any.
         views: Number of photographs asked, evenly chosen.
         image_size: Their longest side [pixels].
+        photographs: What :func:`asked_views` read, when there are several calls.
         progress: Optional callback.
 
     Returns:
         The sums, float64, on the device of the Gaussians.
     """
-    names = torch.linspace(0, len(capture) - 1, max(1, min(views, len(capture)))).round().int()
+    if photographs is None:
+        photographs = asked_views(capture, views, image_size)
     own = gaussians.colors().clamp(0.0, 1.0).double()
     total = torch.zeros(gaussians.count, 4, dtype=torch.float64, device=gaussians.device)
-    for done, name in enumerate(names.unique().tolist()):
-        view = capture.view(int(name), image_size)
+    for done, view in enumerate(photographs):
         photo = view.image.to(gaussians.means)
         judged = torch.ones_like(photo[..., 0]) if view.valid is None else view.valid.to(photo)
         on = judged if view.mask is None else judged * view.mask.to(photo)
@@ -97,9 +102,15 @@ def witness(
         # |photo - own|^2 = |photo|^2 - 2 photo own + |own|^2
         cross = (sums[:, 3:] * own).sum(1)
         total[:, 3] += sums[:, 2] - 2.0 * cross + own.square().sum(1) * sums[:, 1]
-        report_progress(progress, done + 1, len(names), "interior opacity")
+        report_progress(progress, done + 1, len(photographs), "interior opacity")
     size, seen, off, odd = total.clamp_min(0.0).unbind(1)
     return Testimony(size, seen, off, odd)
+
+
+def asked_views(capture: Capture, views: int, image_size: int) -> list[View]:
+    """Read evenly chosen photographs, at most ``views`` of them."""
+    names = torch.linspace(0, len(capture) - 1, max(1, min(views, len(capture)))).round().int()
+    return capture.views(names.unique().tolist(), image_size)
 
 
 def _unhidden(gaussians: Gaussians, viewmat: Tensor, K: Tensor) -> Tensor:
@@ -139,8 +150,9 @@ def refine_opacity(
         the object or in the wrong colour.
     """
     report: dict[str, Any] = {"pruned": 0}
+    photographs = asked_views(capture, views, image_size)
     for round_ in range(_ROUNDS + 1):
-        said = witness(gaussians, capture, views=views, image_size=image_size, progress=progress)
+        said = witness(gaussians, capture, photographs=photographs, progress=progress)
         wrong = interior & (said.contradiction > _CONTRADICTED)
         seen = float(said.seen[interior].sum()) / max(float(said.seen.sum()), 1e-12)
         share = int(wrong.sum()) / max(int(interior.sum()), 1)

@@ -29,7 +29,7 @@ from gsfluent.pipeline.solid_tsdf import (
     ring_of_cameras,
     zoomed,
 )
-from gsfluent.pipeline.voxels import distance_transform
+from gsfluent.pipeline.voxels import distance_transform, grown
 
 __all__ = ["solid_of_splats"]
 
@@ -149,7 +149,7 @@ def _seen(
 
     where = None
     if closed is not None:
-        where = ndimage.binary_dilation(closed.loose, np.ones((3, 3, 3)), iterations=3)
+        where = grown(closed.loose, 3)
     fused = fuse_depths(visible, cameras, box, where)
     body = fused.values <= 0
     if closed is not None:
@@ -176,7 +176,7 @@ def _carved(
     from scipy import ndimage
 
     box, solid = closed.box, closed.solid
-    where = ndimage.binary_dilation(solid, np.ones((3, 3, 3)), iterations=3)
+    where = grown(solid, 3)
     fused = fuse_depths(visible, cameras, box, where)
     cavity = _cavities(solid, fused.values, visible.device)
     share = float(cavity.sum() / max(1, int(solid.sum())))
@@ -206,12 +206,9 @@ def _cavities(solid: np.ndarray, depths: np.ndarray, device: torch.device) -> np
 
     The density knows the skin better; the depths know what is hollow.
     """
-    from scipy import ndimage
-
     differing = solid & (depths > 0)
     deep = distance_transform(differing, device) > _SKIN
-    grown = ndimage.binary_dilation(deep, np.ones((3, 3, 3)), iterations=2)
-    result: np.ndarray = grown & differing
+    result: np.ndarray = grown(deep, 2) & differing
     return result
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["distance_transform", "nearest_empty"]
+__all__ = ["distance_transform", "grown", "nearest_empty"]
 
 _FAR = 1 << 14  # voxels: farther than any grid is long; its square still fits in int32
 _CHUNK = 1 << 27  # sums of a parabola and a value at a time, int32
@@ -47,6 +47,15 @@ def nearest_empty(
     squared, flat = _separable(torch.from_numpy(np.ascontiguousarray(occupied)).to(device))
     index = torch.stack(torch.unravel_index(flat, squared.shape)).int()
     return squared.float().sqrt().cpu().numpy(), index.cpu().numpy()
+
+
+def grown(occupied: np.ndarray, steps: int) -> np.ndarray:
+    """Dilation of bool [X, Y, Z] by ``steps`` voxels in all 26 directions, one axis at a time."""
+    from scipy import ndimage
+
+    found = np.ascontiguousarray(occupied).view(np.uint8)
+    result: np.ndarray = ndimage.maximum_filter(found, 2 * steps + 1, mode="constant")
+    return result.view(bool)
 
 
 def _separable(occupied: Tensor) -> tuple[Tensor, Tensor]:
