@@ -29,7 +29,7 @@ _VIEWS = 16
 _SIZE = 200  # pixels of the pictures that tell which splats show
 _OUT, _IN = 1.5, 3.0  # voxels outside and below the skin that still belong to it
 _HIDDEN = 0.02  # share of its size below which a splat says nothing about the skin
-_SHOWS = 0.01  # share of its size by which an interior Gaussian shows from outside: it is skin
+_SHOWS = 0.003  # share of its size by which an interior Gaussian shows from outside: it is skin
 _REACH = 2.0  # voxels; farther from every splat, a wider surrounding gives the colour
 
 
@@ -208,7 +208,7 @@ def keep_skin(solid: Solid, colored: Gaussians) -> Gaussians:
         colored: Its Gaussians after texturing.
 
     Returns:
-        The Gaussians; colours fade from the skin's, where a hundredth of the size shows, to their
+        The Gaussians; colours fade from the skin's, where three thousandths of the size show, to their
         own, where nothing does.
     """
     from gsfluent.data import INTERIOR

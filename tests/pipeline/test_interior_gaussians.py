@@ -97,8 +97,8 @@ def test_count_is_bounded(bound: int) -> None:
 def test_a_slab_through_the_cut_is_opaque() -> None:
     found = placed()
     middle = 0.5 * SIZE * VOXEL
-    # four spacings of matter behind the plane, seen from the front
-    slab = (found.centers[:, 0] >= middle) & (found.centers[:, 0] < middle + 0.6)
+    # five spacings of matter behind the plane, seen from the front
+    slab = (found.centers[:, 0] >= middle) & (found.centers[:, 0] < middle + 0.75)
     splats = Gaussians.from_colors(
         found.centers[slab].float(),
         found.sigmas[slab].float(),
