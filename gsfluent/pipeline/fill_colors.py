@@ -208,8 +208,8 @@ def keep_skin(solid: Solid, colored: Gaussians) -> Gaussians:
         colored: Its Gaussians after texturing.
 
     Returns:
-        The Gaussians; colours fade from the skin's, where three thousandths of the size show, to their
-        own, where nothing does.
+        The Gaussians; colours fade from the skin's, where three thousandths of the size show, to
+        their own, where nothing does.
     """
     from gsfluent.data import INTERIOR
     from gsfluent.geometry import rgb_to_sh0
@@ -220,10 +220,10 @@ def keep_skin(solid: Solid, colored: Gaussians) -> Gaussians:
     share = torch.from_numpy(weights).to(colored.means) / _SHOWS
     share = torch.where(colored.labels == INTERIOR, share.clamp(max=1.0), 0.0)
     rows = (share > 0.05).nonzero()[:, 0]
-    weights[stray_splats(solid)] = 0.0
+    weights[stray_splats(solid.replace(gaussians=colored))] = 0.0
     weights[weights < _HIDDEN] = 0.0
     points = colored.means[rows].double().cpu().numpy()
-    skin = surface_colors(solid.gaussians, points, solid.voxel, weights=weights)
+    skin = surface_colors(colored, points, solid.voxel, weights=weights)
     part = share[rows, None]
     mixed = (1.0 - part) * colored.colors()[rows] + part * torch.from_numpy(skin).to(part)
     sh = colored.sh.clone()

@@ -190,8 +190,9 @@ def populate(
         seed: Seed of the jitter.
 
     Returns:
-        All Gaussians, which of them are interior (bool [N]), and ``spacing_skin, spacing_core``
-        (5 % and 95 % quantiles, voxels) for the report.
+        All Gaussians, which of them are interior (bool [N]), and for the report ``spacing_skin,
+        spacing_core`` (5 % and 95 % quantiles, voxels) and ``stray_splats``: how many splats of the
+        shell hang two voxels or more outside the solid.
     """
     from gsfluent.data import INTERIOR, Gaussians
 
@@ -235,5 +236,18 @@ def populate(
     notes = {
         "spacing_skin": float(ranked[count // 20]),
         "spacing_core": float(ranked[count - 1 - count // 20]),
+        "stray_splats": _strays(surface, solid, box),
     }
     return Gaussians.cat([surface.replace(normals=None), interior]), inner, notes
+
+
+def _strays(surface: Gaussians, solid: np.ndarray, box: GridBox) -> int:
+    """Splats two voxels or more outside the solid; what is off the grid is outside."""
+    from scipy import ndimage
+
+    near = ndimage.binary_dilation(solid, np.ones((3, 3, 3)), iterations=2)
+    means = surface.means.detach().double().cpu().numpy()
+    index = np.floor((means - np.asarray(box.origin)) / box.voxel).astype(np.int64)
+    held = ((index >= 0) & (index < solid.shape)).all(1)
+    inside = near[tuple(index[held].T)]
+    return int(len(index) - inside.sum())
