@@ -142,6 +142,7 @@ class Texture(Verb):
     Examples:
       gsfluent texture solid.ply -o textured.ply                       # from the skin's colours
       gsfluent texture solid.ply -o textured.ply --exemplar cut.jpg    # from a photo of a cut
+      gsfluent texture solid.ply -o textured.ply --exemplar apple.jpg --cut across
       gsfluent texture solid.ply -o textured.ply --method diffusion --model PATH --prompt "flesh"
       gsfluent texture solid.ply -o textured.ply --method inpaint --inpaint backend=telea tile=2
 
@@ -162,6 +163,10 @@ class Texture(Verb):
     """Effort of the exemplar method: preview, fast or full."""
     guide: str | None = None
     """What patches are matched by: auto, depth, axis (a cut across the axis) or none."""
+    cut: str | None = None
+    """The photograph was cut across or along the axis: its star or segments are swept about it."""
+    stain: bool = False
+    """The photographed face is stained grey (iodine): take the colour of its unstained part."""
     prompt: str | None = None
     """What the inside looks like, for diffusion."""
     model: str | None = None
@@ -188,6 +193,8 @@ class Texture(Verb):
             "preset": self.preset,
             "quality": self.quality,
             "guide": self.guide,
+            "cut": self.cut,
+            "photo": {"stain": True} if self.stain else None,
             "prompt": self.prompt,
             "model": self.model,
             "inpaint": read_inpaint(self.inpaint) or None,

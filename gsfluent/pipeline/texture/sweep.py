@@ -89,7 +89,7 @@ class Sweep:
             room = _reach(inside, np.stack([middle, middle]), np.stack([frame[2], -frame[2]]))
             half = min(_SPINDLE * core * float(table.mean()), 0.75 * float(room.min()))
             self.tip = np.clip(np.abs(height) / max(half, 1.0), 0.0, 1.0)
-            far = far * np.sqrt(np.maximum(1.0 - self.tip**2, 1e-4))
+            far = far * np.maximum(1.0 - self.tip**2, 1e-2)
         # nothing grows dead straight: away from the middle plane the structure wanders a little
         away = np.abs(height) / max(-low, high)
         points = (local / max(-low, high)).astype(np.float32)
