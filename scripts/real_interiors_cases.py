@@ -226,8 +226,8 @@ CASES = {
             "across",
             {"guide": "depth"},
         ),
-        Case("kiwi", _kiwi, _ball, (0.35, 0.25, 0.13), (2,), "across", {"guide": "depth"}),
-        Case("orange", _orange, _ball, (0.93, 0.50, 0.08), (2,), "across", {"guide": "depth"}),
+        Case("kiwi", _kiwi, _ball, (0.35, 0.25, 0.13), (2,)),
+        Case("orange", _orange, _ball, (0.93, 0.50, 0.08), (2,), None, {"guide": "axis"}),
         Case(
             "pine",
             _pine,
