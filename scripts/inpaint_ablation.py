@@ -24,6 +24,7 @@ from gsfluent.lab.interiors_judge import Judge
 from gsfluent.pipeline.texture.baselines import color_copy, telea_slices
 from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
 from gsfluent.pipeline.texture.inpaint import InpaintOptions, diffusion_texture
+from gsfluent.pipeline.texture.metrics import lab_histogram_distance, patch_distance
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "inpainting.md"
@@ -93,6 +94,16 @@ def row(name: str, figures: dict[str, Any], seconds: float | None) -> str:
     return f"| {name} | {cells[0]} | {ratio:.1f} | {' | '.join(cells[1:])} | {near} | {cost} |"
 
 
+def photograph(known: KnownInterior, judge: Judge) -> str:
+    """The line of the photographs alone: what they know is all that a method can take from them."""
+    cut = [(p[..., :3], p[..., 3] > 0.5) for p in known.exemplars().values()]
+    colors = [np.concatenate([image[mask] for image, mask in set_]) for set_ in (cut, judge.truth)]
+    patch = patch_distance(cut, judge.truth)
+    ratio = patch / judge.floor["patch"]
+    hist = lab_histogram_distance(*colors)
+    return f"| *the photograph itself* | {patch:.2f} | {ratio:.1f} | {hist:.2f} | - | - | - | - |"
+
+
 def sheet(pictures: dict[str, list[np.ndarray]], path: Path) -> None:
     """One row per method, one column per plane."""
     from PIL import Image, ImageDraw
@@ -133,7 +144,8 @@ def ablate(
 
     pictures["truth"] = shown(known.rgb)
     rows = [row("*another draw (floor)*", judge.floor, None)]
-    print(rows[0], flush=True)
+    rows.append(photograph(known, judge))
+    print(*rows, sep="\n", flush=True)
     for label, make in makers.items():
         began = time.process_time()
         rgb = make(known)

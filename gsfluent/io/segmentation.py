@@ -232,16 +232,25 @@ def _sam_items(
     max_size: int | None,
     least: float,
 ) -> Segmentation:
-    maps = {}
+    maps, kinds = {}, {}
     for name, found in items.items():
         index = names.find(name)
         if index is None:
             continue
-        masks = sam.json_masks(found, f"{source}: {name}", least)
+        masks, labels = sam.json_masks(found, f"{source}: {name}", least)
         if masks:
             maps[index] = sam.painted(masks, f"{source}: {name}")
+            kinds[index] = labels
     if not maps:
         raise names.no_match(source, items)
+    known = sorted({label for labels in kinds.values() for label in labels if label is not None})
+    if known and all(None not in labels for labels in kinds.values()):
+        # every mask says what it shows (COCO's categories): the same number in all photographs
+        number = {label: k for k, label in enumerate(known, 1)}
+        for index, labels in kinds.items():
+            maps[index] = np.array([0, *(number[str(label)] for label in labels)])[maps[index]]
+        names_of = {k: label for label, k in number.items()}
+        return _finished(source, maps, capture, names_of, True, [], max_size)
     return _finished(source, maps, capture, {}, False, [], max_size)
 
 

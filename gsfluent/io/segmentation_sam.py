@@ -164,7 +164,8 @@ def read_json(path: Path) -> dict[str, list[Mapping[str, Any]]]:
     """Read masks per image from JSON: image name -> annotations.
 
     Understood: the generator's own list (image name = file name), ``{image, annotations}`` as in
-    SA-1B, ``{name: [annotations]}``, and COCO's ``{images, annotations}``.
+    SA-1B, ``{name: [annotations]}``, and COCO's ``{images, annotations}``, whose ``categories``
+    become the annotations' ``label``.
 
     Raises:
         InputError: No JSON, or none of these.
@@ -183,13 +184,20 @@ def read_json(path: Path) -> dict[str, list[Mapping[str, Any]]]:
                 for item in data["images"]
                 if isinstance(item, Mapping)
             }
+            kinds = {
+                item.get("id"): str(item.get("name", item.get("id")))
+                for item in data.get("categories") or ()
+                if isinstance(item, Mapping)
+            }
             result: dict[str, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
             for index, item in enumerate(found):
                 if not isinstance(item, Mapping) or item.get("image_id") not in names:
                     raise InputError(
                         f"{path}: annotations[{index}] belongs to no image", "export it again"
                     )
-                result[names[item["image_id"]]].append(item)
+                kind = kinds.get(item.get("category_id"))
+                named = item if kind is None else {**item, "label": kind}
+                result[names[item["image_id"]]].append(named)
             return result
         if isinstance(found, list):
             image = data.get("image")
@@ -203,13 +211,15 @@ def read_json(path: Path) -> dict[str, list[Mapping[str, Any]]]:
     )
 
 
-def json_masks(items: list[Mapping[str, Any]], where: str, least: float = 0.0) -> list[Mask]:
-    """Masks of the annotations of one image that are good enough.
+def json_masks(
+    items: list[Mapping[str, Any]], where: str, least: float = 0.0
+) -> tuple[list[Mask], list[str | None]]:
+    """Masks of the annotations of one image that are good enough, and their labels if any.
 
     Raises:
         InputError: An annotation without a mask, or whose area is not that of its mask.
     """
-    masks = []
+    masks, labels = [], []
     for index, item in enumerate(items):
         place = f"{where}[{index}]"
         if not isinstance(item, Mapping) or "segmentation" not in item:
@@ -222,13 +232,14 @@ def json_masks(items: list[Mapping[str, Any]], where: str, least: float = 0.0) -
                 f"{place}: is a polygon or a plain array", "export with output_mode 'coco_rle'"
             )
         masks.append(decode_rle(code, place))
+        labels.append(item.get("label"))
         area = item.get("area")
         if isinstance(area, int) and area != int(masks[-1].sum()):
             raise InputError(
                 f"{place}: says area {area}, its mask has {int(masks[-1].sum())} pixels",
                 "the masks were exported for another size; export them again",
             )
-    return masks
+    return masks, labels
 
 
 def _good(item: Mapping[str, Any], least: float, where: str) -> bool:

@@ -51,7 +51,8 @@ def inspect_shot(
 
     Returns:
         ``objects``: per object the rows of :class:`PartMap` as ``parts``, ``sources`` (what the
-        photographs said), ``warnings`` and ``picture``.
+        photographs said), ``warnings``, ``picture`` and, where a segmentation has several labels,
+        ``labels_picture`` of them all.
 
     Raises:
         InputError: The shot is wrong, or a part asks for what the solid does not have.
@@ -75,7 +76,7 @@ def inspect_shot(
         path = out
         if out is not None and len(scene.bodies) > 1:
             path = out.with_name(f"{out.stem}_{body.name}{out.suffix}")
-        objects[body.name] = _shown(body_parts(body, dx), path, body.name)
+        objects[body.name] = _shown(body_parts(body, dx), path, body.name, all_labels=True)
     return {"kind": "shot", "run": str(run), "objects": objects}
 
 
@@ -91,10 +92,17 @@ def inspect_solid(path: Path, out: Path | None = None) -> dict[str, Any]:
     return _shown(solid_regions(solid), out, path.name)
 
 
-def _shown(parts: PartMap, out: Path | None, title: str) -> dict[str, Any]:
+def _shown(
+    parts: PartMap, out: Path | None, title: str, *, all_labels: bool = False
+) -> dict[str, Any]:
     sources = parts.solid.report.get("region_sources") or {}
     report: dict[str, Any] = {"parts": parts.rows, "sources": sources, "warnings": parts.warnings}
     if out is not None:
         save_parts_picture(parts, out, title)
         report["picture"] = str(out)
+        if all_labels and any(len(source["labels"]) > 1 for source in sources.values()):
+            # which of a segmenter's parts is which, before they are called by name
+            beside = out.with_name(f"{out.stem}_labels{out.suffix}")
+            save_parts_picture(solid_regions(parts.solid), beside, f"{title}: every label")
+            report["labels_picture"] = str(beside)
     return report

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from gsfluent.errors import InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from gsfluent.data import Solid
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "source_key",
     "source_paths",
     "source_volume",
+    "with_inclusions",
 ]
 
 FIRST_LABEL = 100_001
@@ -55,6 +58,31 @@ def source_paths(where: Mapping[str, Any]) -> dict[str, Path]:
             given = value if isinstance(value, Mapping) else {"": value}
             return {str(axis): Path(path).resolve() for axis, path in given.items()}
     return {}
+
+
+def with_inclusions(
+    solid: Solid, inclusions: NDArray[np.int32]
+) -> tuple[Tensor | None, dict[str, Any]]:
+    """Regions of a solid after inclusions were placed in it; labels elsewhere stay.
+
+    Args:
+        solid: The solid before.
+        inclusions: Number per voxel from 1, int32 [X, Y, Z]; 0 for none.
+
+    Returns:
+        The regions, and the parts of the report that say what they mean.
+    """
+    import torch
+
+    kept = ("regions", "region_sources")
+    table: dict[str, Any] = {key: solid.report[key] for key in kept if key in solid.report}
+    if not inclusions.any():
+        return solid.regions, table
+    placed = torch.from_numpy(inclusions).to(solid.occupancy.device)
+    if solid.regions is None:
+        return placed, table
+    labels = torch.where(solid.regions >= FIRST_LABEL, solid.regions, 0)
+    return torch.where(placed > 0, placed, labels).to(torch.int32), table
 
 
 def region_entry(solid: Solid, number: int) -> dict[str, Any]:

@@ -36,6 +36,7 @@ def test_a_shot_shows_its_parts_and_the_run_goes_on(
     assert rest["share"] == pytest.approx(right["share"], abs=0.05)
     assert crust["mean_depth"] < right["mean_depth"] and crust["particles"] > 0
     assert Image.open(out).size[0] > 1000
+    assert Image.open(report["labels_picture"]).size[0] > 1000
     assert main(["run", str(shot), "-o", str(tmp_path / "run"), "--json"]) == 0
     run = json.loads(capsys.readouterr().out)
     done = {stage["name"]: stage["resumed"] for stage in run["stages"]}

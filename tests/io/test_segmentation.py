@@ -246,6 +246,30 @@ def test_sam_json_in_its_forms(tmp_path: Path) -> None:
             assert np.array_equal(view.labels, np.array([1, 2, 3])[truth])
 
 
+def test_coco_categories_are_labels(tmp_path: Path) -> None:
+    truth = labels()
+    first, second = annotations(truth == 1), annotations(truth == 2)
+    data = {
+        "images": [{"id": 1, "file_name": "a.jpg"}, {"id": 2, "file_name": "b.jpg"}],
+        "categories": [{"id": 5, "name": "rind"}, {"id": 6, "name": "leaf"}],
+        "annotations": [
+            {**first[0], "image_id": 1, "category_id": 5},
+            {**second[0], "image_id": 1, "category_id": 6},
+            {**second[0], "image_id": 2, "category_id": 6},
+        ],
+    }
+    (tmp_path / "coco.json").write_text(json.dumps(data))
+    found = load_segmentation(tmp_path / "coco.json", capture())
+    assert found.linked and sorted(found.names.values()) == ["leaf", "rind"]
+    one, two = found.views
+    assert np.array_equal(one.labels == found.number("rind"), truth == 1)
+    assert np.array_equal(two.labels == found.number("leaf"), truth == 2)
+    data["annotations"][0]["image_id"] = 9
+    (tmp_path / "coco.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="belongs to no image"):
+        load_segmentation(tmp_path / "coco.json", capture())
+
+
 def test_sam_folders(tmp_path: Path) -> None:
     truth = labels()
     folder = tmp_path / "a"

@@ -416,21 +416,23 @@ def test_a_missing_folder_never_becomes_a_download(
 
 def test_offline_is_respected_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[bool] = []
+    pinned = replace(OPTIONS, revision="115134f")
 
     def watch(_: str, **given: Any) -> Any:
         seen.append(given["local_files_only"])
+        assert given.get("revision") == "115134f"
         raise OSError("x does not appear to have a file named model_index.json")
 
     monkeypatch.setattr(diffusers.DiffusionPipeline, "load_config", watch)
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     monkeypatch.delenv("TRANSFORMERS_OFFLINE", raising=False)
     with pytest.raises(InputError, match="cannot be loaded from the hub"):
-        load_pipeline("owner/name", OPTIONS, torch.device("cpu"))
+        load_pipeline("owner/name", pinned, torch.device("cpu"))
     with pytest.raises(InputError, match="offline is set, so the hub was not asked"):
-        load_pipeline("owner/name", replace(OPTIONS, offline=True), torch.device("cpu"))
+        load_pipeline("owner/name", replace(pinned, offline=True), torch.device("cpu"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     with pytest.raises(InputError, match="HF_HUB_OFFLINE=1, so the hub was not asked"):
-        load_pipeline("owner/name", OPTIONS, torch.device("cpu"))
+        load_pipeline("owner/name", pinned, torch.device("cpu"))
     assert seen == [False, True, True] and offline_asked(OPTIONS)
 
 

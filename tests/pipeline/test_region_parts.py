@@ -20,6 +20,7 @@ from gsfluent.pipeline.inspect_parts import body_parts, solid_regions
 from gsfluent.pipeline.inspect_parts_picture import part_colors, save_parts_picture
 from gsfluent.pipeline.particles import build_matter, grid_spacing
 from gsfluent.pipeline.regions import label_regions
+from gsfluent.pipeline.regions_table import with_inclusions
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_record import RunRecord
 from gsfluent.pipeline.run_regions import load_solids, regions_stage
@@ -206,3 +207,32 @@ def test_a_shot_with_labels_reads_back(tmp_path: Path) -> None:
     again = Shot.from_dict(shot.resolved(), tmp_path / "elsewhere")
     assert again.resolved() == shot.resolved()
     assert again.objects["ball"].parts == shot.objects["ball"].parts
+
+
+def test_the_shot_of_the_page_is_a_shot(tmp_path: Path) -> None:
+    import re
+
+    import yaml
+
+    page = Path(__file__).resolve().parents[2] / "docs" / "regions.md"
+    found = re.search(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert found is not None
+    for name in ("captures/apple", "parts/stem", "segmentation"):
+        (tmp_path / name).mkdir(parents=True)
+    shot = Shot.from_dict(yaml.safe_load(found.group(1)), tmp_path)
+    parts = shot.objects["apple"].parts or ()
+    assert [part.name for part in parts] == ["skin", "stem", "leaf", "core"]
+    assert parts[2].where.label == "leaf"
+
+
+def test_inclusions_placed_later_leave_the_labels(tmp_path: Path) -> None:
+    labels = stripes(tmp_path / "side.png")
+    solid = label_regions(bar(), [{"label_image": {"y": labels}}])
+    stones = np.zeros(tuple(solid.occupancy.shape), np.int32)
+    stones[5:7, 5:7, 5:7] = 3
+    regions, table = with_inclusions(solid, stones)
+    assert regions is not None and solid.regions is not None
+    assert (regions[5:7, 5:7, 5:7] == 3).all() and int((regions == 3).sum()) == 8
+    assert torch.equal(regions[10:], solid.regions[10:]) and table["regions"]
+    again, _ = with_inclusions(solid.replace(regions=regions), np.roll(stones, 10, axis=0))
+    assert again is not None and int((again[5:7, 5:7, 5:7] == 3).sum()) == 0  # placed anew

@@ -232,9 +232,15 @@ def inpaint_volume(
     run = _Run(domain, inpainter, coarse or inpainter, prompt, options, _per_axis(exemplar), store)
     passes = _passes(domain, options)
     run.seed, run.progress = seed, progress
-    run.total = inpaint_plan(domain, options)["slices"]
+    plan = inpaint_plan(domain, options)
+    run.total = plan["slices"]
     logger.info(
-        "inpainting with %s: %d slices in %d passes", inpainter.name, run.total, len(passes)
+        "inpainting with %s: %d slices in %d passes, %d calls, %d denoising steps if it denoises",
+        inpainter.name,
+        plan["slices"],
+        plan["passes"],
+        plan["model_calls"],
+        plan["denoising_steps"],
     )
     volume, level, disagreement = np.zeros((0, 0, 0, 3), np.float32), domain, 0.0
     for number, step in enumerate(passes):

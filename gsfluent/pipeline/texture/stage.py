@@ -14,6 +14,7 @@ import torch
 
 from gsfluent.errors import InputError
 
+from ..regions_table import with_inclusions
 from ..stage import Progress, Stage, report_progress
 from .baselines import color_copy, telea_slices
 from .domain import InteriorDomain, InteriorTexture, blend_skin
@@ -237,16 +238,14 @@ class Texture(Stage):
         report = self._report(domain, texture, shown) | polished
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
-        regions = solid.regions
-        if texture.labels.any():
-            regions = torch.from_numpy(texture.labels).to(device)
+        regions, table = with_inclusions(solid, texture.labels)
         report_progress(progress, 1, 1, "textured")
         return replace(
             solid,
             gaussians=colored,
             color=torch.from_numpy(rgb).to(device, solid.depth.dtype),
             regions=regions,
-            report={**report, "fill": solid.report},
+            report={**report, **table, "fill": solid.report},
         )
 
     def _make(
