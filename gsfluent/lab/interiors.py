@@ -161,7 +161,7 @@ _CLASSES = {
     # the segments stand around the axis: one cut across it shows them all
     "orange": _Class(_ellipsoid((0.97, 0.97, 0.94), 0.03), "z", {"guide": "axis"}),
     "bread": _Class(_loaf, "x", {}),
-    "wood": _Class(_block, "xyz", {"guide": "none", "directional": True}),
+    "wood": _Class(_block, "xyz", {"guide": "axis", "directional": True}),
     "marble": _Class(_bumpy_ball, "x", {"guide": "none"}),
     "cake": _Class(_disc, "xy", {"directional": True}),
 }
