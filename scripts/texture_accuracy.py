@@ -25,9 +25,11 @@ from texture_sheets import draw_sheet
 
 from gsfluent.lab.interiors import KNOWN_INTERIORS, KnownInterior, known_interior
 from gsfluent.lab.interiors_judge import Judge, crossing_error
-from gsfluent.pipeline.texture import Texture, load_exemplar
+from gsfluent.pipeline.texture import InteriorTexture, Texture, load_exemplar
 from gsfluent.pipeline.texture.baselines import telea_slices
 from gsfluent.pipeline.texture.domain import blend_skin
+from gsfluent.pipeline.texture.exemplar import load_exemplars
+from gsfluent.pipeline.texture.photo import open_exemplars
 from gsfluent.pipeline.texture.profile import depth_profile, profile_volume
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,30 +51,38 @@ PATCH_BAR, PROFILE_BAR = 1.3, 0.05
 
 
 def texture(known: KnownInterior, method: str, device: str, model: str | None) -> dict[str, Any]:
-    """Run one method: its volume and report, CPU seconds and wall seconds."""
-    solid = known.solid().to(device)
+    """Run one method: its volume and report, CPU seconds and wall seconds.
+
+    The steps of ``Texture.forward``, with the true colours of the surface in place of those read
+    off splats, so that the texture is judged and not the reconstruction.
+    """
     photos = known.exemplars()
     began, wall = time.process_time(), time.perf_counter()
     if method == "telea_x":
-        rgb = blend_skin(known.domain, telea_slices(known.domain, (0,)).rgb)
-        report: dict[str, Any] = {"method": method}
+        made = telea_slices(known.domain, (0,))
     elif method == "photo_profile":
         photo = load_exemplar(next(iter(photos.values())))
         # photographs of known interiors have one pixel per voxel: depths are equal
-        rgb = blend_skin(known.domain, profile_volume(known.domain.depth, *depth_profile(photo)))
-        report = {"method": method}
+        rgb = profile_volume(known.domain.depth, *depth_profile(photo))
+        made = InteriorTexture(rgb, known.labels, {})
     else:
-        done = stage(known, method, photos, model)(solid)
+        chosen = stage(known, method, photos, model, device)
+        shown = chosen.exemplar
+        opened = None if shown is None else load_exemplars(open_exemplars(shown, chosen.photo))
+        made = chosen._make(known.domain, opened, None)
         if device != "cpu":
             torch.cuda.synchronize()
-        assert done.color is not None
-        rgb, report = done.color.float().cpu().numpy(), done.report
+    rgb = blend_skin(known.domain, made.rgb.clip(0.0, 1.0))
     cpu, spent = time.process_time() - began, time.perf_counter() - wall
-    return {"rgb": rgb, "report": report, "cpu_seconds": cpu, "seconds": spent}
+    return {"rgb": rgb, "used": used(made.report), "cpu_seconds": cpu, "seconds": spent}
 
 
 def stage(
-    known: KnownInterior, method: str, photos: dict[str, np.ndarray], model: str | None
+    known: KnownInterior,
+    method: str,
+    photos: dict[str, np.ndarray],
+    model: str | None,
+    device: str,
 ) -> Texture:
     """The texture stage as a user would set it for this class."""
     if method == "procedural":
@@ -84,15 +94,15 @@ def stage(
         prompt = f"cross section of {known.name}"
         return Texture("diffusion", model=model, exemplar=photos, prompt=prompt)
     quality = {"default": {}}.get(method, {"quality": method})
-    return Texture(exemplar=photos, **quality, **known.settings)
+    return Texture(exemplar=photos, device=device, **quality, **known.settings)
 
 
 def used(report: dict[str, Any]) -> str:
-    """What the stage did in the end: the method, and what it made of the surface."""
+    """What the exemplar method made of the surface; empty for the other methods."""
     surface = report.get("surface")
     if surface == "copy":
         return "color_copy"
-    return report["method"] + (" from the surface" if surface == "keep" else "")
+    return "" if surface is None else "exemplar" + " from the surface" * (surface == "keep")
 
 
 def read_lines() -> dict[tuple[str, ...], dict[str, Any]]:
@@ -221,7 +231,7 @@ def main(arguments: list[str] | None = None) -> int:
                 "class": name,
                 "size": given.size,
                 "method": method,
-                "used": used(run["report"]),
+                "used": run["used"] or method,
                 "device": given.device,
                 "cpu_seconds": run["cpu_seconds"],
                 "seconds": run["seconds"],

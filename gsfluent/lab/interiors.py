@@ -65,18 +65,14 @@ class KnownInterior:
         return pictures
 
     def solid(self) -> Solid:
-        """The object as the stages know it: surface splats and voxels, nothing inside.
-
-        Eight coincident splats stand for every voxel of the shell, because the colour of the
-        surface is averaged over the eight nearest ones: the method is given the true colours.
-        """
+        """The object as the stages know it: a splat per voxel of the shell, nothing inside."""
         import torch
 
         from gsfluent.data import SURFACE, Gaussians, Solid
 
         domain = self.domain
-        index = torch.from_numpy(np.argwhere(domain.shell)).repeat_interleave(8, 0)
-        colors = torch.from_numpy(self.rgb[domain.shell]).repeat_interleave(8, 0)
+        index = torch.from_numpy(np.argwhere(domain.shell))
+        colors = torch.from_numpy(self.rgb[domain.shell])
         means = (index + 0.5).float() * domain.voxel
         scales = torch.full_like(means, 0.5 * domain.voxel)
         splats = Gaussians.from_colors(means, scales, colors, opacities=0.95, label=SURFACE)
@@ -165,7 +161,7 @@ _CLASSES = {
     # the segments stand around the axis: one cut across it shows them all
     "orange": _Class(_ellipsoid((0.97, 0.97, 0.94), 0.03), "z", {"guide": "axis"}),
     "bread": _Class(_loaf, "x", {}),
-    "wood": _Class(_block, "xyz", {"guide": "none", "directional": True}),
+    "wood": _Class(_block, "xyz", {"guide": "axis", "directional": True}),
     "marble": _Class(_bumpy_ball, "x", {"guide": "none"}),
     "cake": _Class(_disc, "xy", {"directional": True}),
 }

@@ -287,3 +287,31 @@ def test_options_and_backends_are_checked() -> None:
         make_inpainter("diffusers", InpaintOptions())
     names = [make_inpainter(n, InpaintOptions()).name for n in ("telea", "color", "exemplar")]
     assert names == ["telea", "color", "exemplar"]
+
+
+def test_a_program_does_the_first_pass(tmp_path: Path) -> None:
+    """MVInpainter's place: the ordered X stack goes to a command, the rest to another backend."""
+    import json
+
+    from test_inpainter_contract import program
+
+    from gsfluent.pipeline.texture.inpaint import diffusion_texture
+
+    options = InpaintOptions(
+        backend="telea", coarse="command", command=program(tmp_path), window=4, overlap=1,
+        slices=9, refine=(0.3,), tile=1,
+    )  # fmt: skip
+    texture = diffusion_texture(
+        ball(), None, prompt="flesh", options=options, resume=tmp_path / "kept"
+    )
+    log = [json.loads(line) for line in (tmp_path / "runs.txt").read_text().splitlines()]
+    assert {m["axis"] for m in log} == {"x"} and all(m["reference"] for m in log)
+    offsets = [o for m in log for o in m["offsets"]]
+    assert sorted(set(offsets)) == offsets[:4] + [o for m in log[1:] for o in m["offsets"][1:]]
+    assert texture.report["pipeline"] == "telea" and texture.report["model"] is None
+    again = diffusion_texture(
+        ball(), None, prompt="flesh", options=options, resume=tmp_path / "kept"
+    )
+    assert again.report["resumed_slices"] == again.report["slices"]
+    assert np.array_equal(again.rgb, texture.rgb)
+    assert len((tmp_path / "runs.txt").read_text().splitlines()) == len(log)

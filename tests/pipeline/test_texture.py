@@ -220,23 +220,6 @@ def test_axis_guide_keeps_the_star_across_the_axis() -> None:
     assert np.mean([star("depth", seed) for seed in (1, 2)]) < 0.05
 
 
-def test_sweep_repeats_the_photograph_in_the_middle_plane() -> None:
-    from gsfluent.pipeline.texture.sweep import swept_color
-
-    grid = np.stack(np.meshgrid(*[np.arange(40)] * 3, indexing="ij"), -1) + 0.5 - 20
-    inside = (grid**2).sum(-1) <= 18**2
-    depth = np.where(inside, ndimage.distance_transform_edt(inside) - 0.5, 0)
-    photo = load_exemplar(_star_photo())
-    rgb = swept_color(inside, depth, np.array([0.0, 0.0, 1.0]), photo)
-    # x runs along photograph columns, y against its rows
-    plane = rgb[:, :, 20].transpose(1, 0, 2)[::-1]
-    small = photo.resized(18 / 90)
-    offset = (40 - small.mask.shape[0]) // 2
-    mine = plane[offset : offset + small.mask.shape[0], offset : offset + small.mask.shape[1]]
-    clear = ndimage.binary_erosion(small.mask, iterations=2)
-    assert np.abs(mine - small.image)[clear].mean() < 0.1
-
-
 @pytest.mark.parametrize("preset", preset_names())
 def test_presets_are_point_functions(preset: str) -> None:
     domain = _domain(24)

@@ -63,12 +63,8 @@ class Bank:
         target: Tensor,
         rng: np.random.Generator,
     ) -> None:
-        patches, guides = [], []
-        for photo in photos:
-            taken, guide = _draw(photo, 2 * wanted // len(photos) + 1, edge, rng)
-            patches.append(taken)
-            guides.append(guide)
-        pool, guide = torch.cat(patches), torch.cat(guides)
+        drawn = [_draw(photo, 2 * wanted // len(photos) + 1, edge, rng) for photo in photos]
+        pool, guide, number = (torch.cat(parts) for parts in zip(*drawn, strict=True))
         device = pool.device
         self.cells = Cells(guide, _PARTS, rng)
         parts = len(self.cells.centers)
@@ -77,17 +73,16 @@ class Bank:
         need = torch.bincount(self.cells.of(target), minlength=parts).float()
         need = need / need.sum().clamp(min=1.0)
         ratio = need / (population / population.sum()).clamp(min=1e-9)
-        mass = ratio.clamp(0.2, 5.0)[own].double().cumsum(0)
-        # systematic sampling: patches next to each other in the photograph's order are not lumped
+        # weighted drawing by a race of exponentials (Efraimidis & Spirakis 2006): a patch's lot is
+        # its own, so that a pixel more or less in the picture does not change the others'
         count = min(wanted, len(pool))
-        place = (torch.arange(count, device=device) + float(rng.random())) / count * mass[-1]
-        pick = torch.searchsorted(mass, place).clamp(max=len(pool) - 1)
+        lot = ((number * 2654435761 & 0xFFFFFFFF).double() + 0.5) / 2.0**32
+        race = -lot.log() / ratio.clamp(0.2, 5.0)[own].double()
+        pick = race.argsort(stable=True)[:count]
         pool, self.guide = pool[pick], guide[pick]
         self.part = own[pick]
         if turns:
-            pool = _turned(
-                pool, torch.from_numpy((rng.random(count) * 8).astype(np.int64)).to(device)
-            )
+            pool = _turned(pool, (number[pick] * 40503 >> 7) % 8)
         self.whole = pool.reshape(count, -1)
         rim = (edge - compared) // 2
         inner = pool[:, rim : edge - rim, rim : edge - rim] if rim else pool
@@ -145,8 +140,11 @@ class Bank:
 
 def _draw(
     photo: LevelPhoto, count: int, edge: int, rng: np.random.Generator
-) -> tuple[Tensor, Tensor]:
-    """Patches [n, E, E, 3] at places that do not depend on the picture's exact pixel count."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Patches [n, E, E, 3], their guide values and the number of each place.
+
+    Both hardly depend on the picture's exact pixel count.
+    """
     height, width = photo.mask.shape
     # Halton points (Halton 1960) shifted by a random vector: even coverage, few misses
     number = np.arange(1, 64 * count)
@@ -154,16 +152,18 @@ def _draw(
     place = (place + rng.random(2)) % 1.0
     index = torch.from_numpy(np.floor(place * [height, width]).astype(np.int64))
     index = index.to(photo.mask.device)
-    index = index[photo.mask[index[:, 0], index[:, 1]]][:count]
+    usable = photo.mask[index[:, 0], index[:, 1]].nonzero()[:count, 0]
+    index, usable = index[usable], usable + 1
     if len(index) == 0:  # a mask of very few pixels
         index = photo.mask.nonzero()
+        usable = torch.arange(1, len(index) + 1, device=index.device)
     half = edge // 2
     image = functional.pad(photo.image.permute(2, 0, 1)[None], (half,) * 4, mode="replicate")[0]
     window = torch.arange(edge, device=image.device)
     rows = index[:, 0, None, None] + window[:, None]
     columns = index[:, 1, None, None] + window
     patches = image[:, rows, columns].permute(1, 2, 3, 0)
-    return patches, photo.guide[index[:, 0], index[:, 1]]
+    return patches, photo.guide[index[:, 0], index[:, 1]], usable
 
 
 def _halton(number: np.ndarray, base: int) -> np.ndarray:

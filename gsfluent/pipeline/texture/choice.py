@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .domain import InteriorDomain
+from .domain import InteriorDomain, gradient
 from .guides import PlacedPhoto
 from .metrics import lab_histogram_distance
 from .photo import rgb_to_lab
@@ -21,7 +21,7 @@ from .photo import rgb_to_lab
 __all__ = ["surface_verdict"]
 
 _PATCH = 5
-_ALLOWED = 1.3  # times the distance between the halves of the photograph
+_ALLOWED = 1.5  # times the distance between the halves of the photograph
 _EQUAL = 0.6  # Lab units that nobody sees
 _STREAKS = 0.75  # least share of the photograph's change along the depth
 
@@ -58,7 +58,9 @@ def surface_verdict(
             halves[k].append(_patches(lab, part, rng))
             colors[k].append(image[part])
         radial.append(_radial(lab, depth, mask))
-    photo_hist = lab_histogram_distance(np.concatenate(colors[0]), np.concatenate(colors[1]))
+    first, second = (np.concatenate(c) for c in colors)
+    # a picture smaller than a tile has one half only
+    photo_hist = lab_histogram_distance(first, second) if len(first) and len(second) else 0.0
     both = [np.concatenate(h) for h in halves]
     photo_patch = _distance(both[0], both[1], rng)
     shown = np.concatenate(colors[0] + colors[1])
@@ -67,7 +69,7 @@ def surface_verdict(
     surface_patch = _distance(_surface_patches(domain, skin_lab, rng), np.concatenate(both), rng)
     alike = surface_hist <= max(_ALLOWED * photo_hist, _EQUAL)
     if np.isfinite(surface_patch):
-        alike = alike and surface_patch <= max(_ALLOWED * photo_patch, _EQUAL)
+        alike = alike and surface_patch <= max(_ALLOWED * np.nan_to_num(photo_patch), _EQUAL)
     copy_radial, photo_radial = _radial(skin_lab, domain.depth, domain.inside), np.mean(radial)
     return {
         "surface_hist": surface_hist,
@@ -93,7 +95,7 @@ def _patches(
     window = np.arange(-half, half + 1)
     rows = centers[:, 0, None, None] + window[:, None]
     columns = centers[:, 1, None, None] + window
-    found: np.ndarray = lab[rows, columns].reshape(len(centers), -1)
+    found: np.ndarray = lab[rows, columns].reshape(len(centers), 3 * _PATCH**2)
     return found
 
 
@@ -101,7 +103,7 @@ def _surface_patches(
     domain: InteriorDomain, skin: np.ndarray, rng: np.random.Generator, limit: int = 1500
 ) -> np.ndarray:
     """Patches [n, 75] of the surface where it faces along an axis of the grid."""
-    slope = np.stack(np.gradient(domain.depth))
+    slope = gradient(domain.depth)
     length = np.linalg.norm(slope, axis=0)
     near = domain.inside & (domain.depth > 1.0) & (domain.depth < 3.0)
     half = _PATCH // 2
@@ -121,7 +123,7 @@ def _surface_patches(
         index[columns] = index[columns] + window
         place = tuple(np.broadcast_arrays(*index))
         whole = domain.inside[place].all((1, 2))
-        result.append(skin[place].reshape(len(centers), -1)[whole][:limit])
+        result.append(skin[place].reshape(len(centers), 3 * _PATCH**2)[whole][:limit])
     return np.concatenate(result)
 
 
@@ -140,7 +142,7 @@ def _distance(first: np.ndarray, second: np.ndarray, rng: np.random.Generator) -
 def _radial(lab: np.ndarray, depth: np.ndarray, inside: np.ndarray) -> float:
     """Mean change of colour along the depth over that across it; 1 when there is no change."""
     dimensions = depth.ndim
-    slope = np.stack(np.gradient(depth))
+    slope = gradient(depth)
     length = np.linalg.norm(slope, axis=0)
     steep = inside & (length > 0.5) & (depth > 2.0)
     if not steep.any():
@@ -148,7 +150,7 @@ def _radial(lab: np.ndarray, depth: np.ndarray, inside: np.ndarray) -> float:
     normal = (slope / np.maximum(length, 1e-6))[:, steep]
     along, total = 0.0, 0.0
     for c in range(3):
-        change = np.stack(np.gradient(lab[..., c]))[:, steep]
+        change = gradient(lab[..., c])[:, steep]
         part = (change * normal).sum(0)
         along += float((part**2).sum())
         total += float((change**2).sum())

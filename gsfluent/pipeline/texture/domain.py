@@ -7,12 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..fill_colors import skin_colors
-
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
-__all__ = ["InteriorDomain", "InteriorTexture", "axis_frame", "blend_skin", "smoothstep"]
+__all__ = [
+    "InteriorDomain",
+    "InteriorTexture",
+    "axis_frame",
+    "blend_skin",
+    "gradient",
+    "smoothstep",
+]
 
 SHELL = 1.6
 """Depth [voxels] down to which the colour is that of the surface splats."""
@@ -56,6 +61,9 @@ class InteriorDomain:
             axis: The object's own axis in world coordinates; None takes scene "up", else +z.
         """
         from scipy import ndimage
+
+        # brings the compiled renderer with it, which texturing itself does without
+        from ..fill_colors import skin_colors
 
         inside = solid.occupancy.cpu().numpy()
         depth = (solid.depth.float().cpu().numpy() / solid.voxel).astype(np.float32)
@@ -117,6 +125,15 @@ def axis_frame(axis: np.ndarray) -> np.ndarray:
     x = helper - (helper @ z) * z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
+
+
+def gradient(field: np.ndarray) -> np.ndarray:
+    """Gradient [D, ...] of a field [...]; 0 along axes of a single cell."""
+    parts = [
+        np.gradient(field, axis=k) if field.shape[k] > 1 else np.zeros_like(field)
+        for k in range(field.ndim)
+    ]
+    return np.stack(parts)
 
 
 def smoothstep(x: np.ndarray) -> np.ndarray:

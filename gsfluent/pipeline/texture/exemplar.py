@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from .domain import InteriorDomain, InteriorTexture
 from .guides import GUIDES, PlacedPhoto, explained, place_photo
 from .inclusions import Inclusions, find_inclusions, paint_inclusions, remove_inclusions
 from .levels import ObjectFields
+from .parts import read_parts, resized_parts
 from .photo import Exemplar, load_exemplar
 from .pyramid import synthesize_pyramid, to_grid
 from .synthesis import Schedule
@@ -29,7 +30,7 @@ __all__ = ["CORES", "QUALITIES", "SURFACES", "exemplar_texture", "load_exemplars
 logger = logging.getLogger(__name__)
 
 QUALITIES: dict[str, Schedule] = {
-    "preview": Schedule(iterations=(3, 2, 0), polish=(4, 4, 1), bank=1536),
+    "preview": Schedule(iterations=(3, 2, 0), polish=(4, 4, 0), bank=1536),
     "fast": Schedule(),
     "full": Schedule(iterations=(8, 5, 3), bank=6144, samples=2000, sinkhorn=5, stride=2),
 }
@@ -86,6 +87,7 @@ def exemplar_texture(
     guide: str | np.ndarray = "auto",
     directional: bool = False,
     inclusions: bool = True,
+    parts: object = None,
     depth_scale: float | None = None,
     surface: str = "auto",
     core: str = "open",
@@ -109,6 +111,9 @@ def exemplar_texture(
         directional: True for grained materials: the photographs are not turned or mirrored, and
             slices across an axis without a photograph are not matched.
         inclusions: Find seeds and stones and place them as labelled ellipsoids.
+        parts: What shows the inclusions of the first photograph, where they shall not be guessed: a
+            label image (file or array: 0 is matter, each other number one part; or a mask), or a
+            colour as three values in 0..1.
         depth_scale: Depth of the photograph's deepest point in units of the object's largest
             depth; None works it out.
         surface: What the surface's colours are to the inside: ``keep`` them fixed and grow the
@@ -147,16 +152,30 @@ def exemplar_texture(
             mend="cut the object out (RGBA) or use guide: none",
         )
     crop, back = _crop(domain)
+    if isinstance(guide, np.ndarray):
+        if guide.shape != domain.inside.shape or not np.isfinite(guide).all():
+            raise InputError(
+                f"texture: a guide array must be finite, of shape {list(domain.inside.shape)}, "
+                f"got {list(guide.shape)}",
+                mend="give one value per voxel of the solid",
+            )
+        guide = guide[back]
     shared = len({id(e) for e in everything}) == len(photos[min(photos)])
-    aligned = not directional and guide not in ("axis", "height") and shared
+    along = isinstance(guide, str) and guide in ("axis", "height")
+    aligned = shared and not (directional or along)
     fields = ObjectFields(crop, aligned, where)
     guided = not (guide == "none" if isinstance(guide, str) else False) and (
         outlined if isinstance(guide, str) else True
     )
     rng = np.random.default_rng([seed, 99])
-    prepared, blobs = _prepare(
-        photos, fields, guided, scale, depth_scale, inclusions, shared, guide
-    )
+
+    def place(photo: Exemplar, axis: int) -> PlacedPhoto:
+        return place_photo(photo, fields, axis, guided=guided, scale=scale, depth_scale=depth_scale)
+
+    # one photograph for everything: across the axis if that is what carries the structure
+    across = isinstance(guide, str) and guide == "axis"
+    home = None if not shared else 2 if across else 0
+    prepared, blobs = _prepare(photos, place, home, inclusions, parts)
     kind = guide if isinstance(guide, str) else "array"
     if kind == "auto":
         kind = choose_guide(prepared) if guided else "none"
@@ -180,10 +199,8 @@ def exemplar_texture(
     labels = np.zeros(crop.inside.shape, np.int32)
     count = 0
     if blobs is not None and surface != "copy":
-        found, original, pitch = blobs
-        rgb, labels, count = paint_inclusions(
-            rgb, crop.inside, crop.depth, original, found, pitch, rng
-        )
+        anchor = (fields.rotation, fields.center, fields.size)
+        rgb, labels, count = paint_inclusions(rgb, crop, blobs[1], blobs[0], anchor, rng)
     full = np.zeros((*domain.inside.shape, 3), np.float32)
     full[back] = np.where(crop.inside[..., None], rgb, 0.0)
     full_labels = np.zeros(domain.inside.shape, np.int32)
@@ -275,61 +292,47 @@ def _crop(domain: InteriorDomain) -> tuple[InteriorDomain, tuple[slice, ...]]:
     return cropped, where
 
 
-Blobs = tuple[Inclusions, Exemplar, float]
+Blobs = tuple[Inclusions, PlacedPhoto]
 
 
 def _prepare(
     photos: dict[int, list[Exemplar]],
-    fields: ObjectFields,
-    guided: bool,
-    scale: float,
-    depth_scale: float | None,
-    inclusions: bool,
-    shared: bool,
-    guide: str | np.ndarray,
+    place: Callable[[Exemplar, int], PlacedPhoto],
+    home: int | None,
+    find: bool,
+    parts: object,
 ) -> tuple[dict[int, list[PlacedPhoto]], Blobs | None]:
-    """Photographs without inclusions, placed in the object; and the richest set of inclusions."""
+    """Photographs without inclusions, placed in the object; and the richest set of inclusions.
+
+    Args:
+        photos: Photographs per axis.
+        place: Places one of them, given the axis it is a cut across.
+        home: That axis when every slice axis shares the photographs; None takes their own.
+        find: Look for inclusions.
+        parts: What shows the inclusions of the first photograph (:func:`.parts.read_parts`).
+    """
     made: dict[int, PlacedPhoto] = {}
     best: Blobs | None = None
-    result: dict[int, list[PlacedPhoto]] = {}
-    # one photograph for everything: across the axis if that is what carries the structure
-    home = 2 if isinstance(guide, str) and guide == "axis" else 0
     for axis, group in photos.items():
-        result[axis] = []
         for photo in group:
-            if id(photo) not in made:
-                own = home if shared else axis
-                placed = place_photo(
-                    photo, fields, own, guided=guided, scale=scale, depth_scale=depth_scale
-                )
-                if inclusions:
-                    placed, found = _without_inclusions(placed, fields, guided, scale, depth_scale)
-                    if found is not None and (best is None or found[0].count > best[0].count):
-                        best = found
-                made[id(photo)] = placed
-            result[axis].append(made[id(photo)])
-    return result, best
-
-
-def _without_inclusions(
-    placed: PlacedPhoto,
-    fields: ObjectFields,
-    guided: bool,
-    scale: float,
-    depth_scale: float | None,
-) -> tuple[PlacedPhoto, Blobs | None]:
-    photo = placed.photo
-    # inclusions are looked for at up to four pixels per voxel: finer is sensor noise
-    detail = min(1.0, 4.0 * placed.pitch)
-    original = photo.resized(detail) if detail < 0.98 else photo
-    found = find_inclusions(original)
-    if found is None:
-        return placed, None
-    clean = remove_inclusions(original, found)
-    placed = place_photo(
-        clean, fields, placed.axis, guided=guided, scale=scale, depth_scale=depth_scale
-    )
-    return placed, (found, original, placed.pitch)
+            if id(photo) in made:
+                continue
+            placed = place(photo, axis if home is None else home)
+            shown = None if parts is None or made else read_parts(parts, photo)
+            if find and (shown is not None or parts is None):
+                # inclusions are looked for at up to four pixels per voxel: finer is sensor noise
+                detail = min(1.0, 4.0 * placed.pitch)
+                original = photo.resized(detail) if detail < 0.98 else photo
+                if shown is not None:
+                    shown = resized_parts(shown, original.mask.shape)
+                found = find_inclusions(original, parts=shown)
+                if found is not None:
+                    whole = place(original, placed.axis)
+                    if best is None or found.count > best[0].count:
+                        best = found, whole
+                    placed = place(remove_inclusions(original, found), placed.axis)
+            made[id(photo)] = placed
+    return {axis: [made[id(photo)] for photo in group] for axis, group in photos.items()}, best
 
 
 def choose_guide(prepared: dict[int, list[PlacedPhoto]]) -> str:
@@ -339,9 +342,11 @@ def choose_guide(prepared: dict[int, list[PlacedPhoto]]) -> str:
         for placed in group:
             if axis == 2 or placed.axis == 2 or not placed.fitted:
                 continue
-            color = placed.image[placed.mask]
-            height.append(explained(placed.local[placed.mask][:, 2], color))
-            depth.append(explained(placed.depth[placed.mask], color))
+            # below the rim: an icing follows the depth whatever it encloses
+            inner = placed.mask & (placed.depth > 0.25 * placed.depth.max())
+            color = placed.image[inner]
+            height.append(explained(placed.local[inner][:, 2], color))
+            depth.append(explained(placed.depth[inner], color))
     if height and np.mean(height) > np.mean(depth) + 0.1:
         return "height"
     return "depth"

@@ -9,23 +9,28 @@ scaled, deepest point to deepest point.
 
 from __future__ import annotations
 
+import itertools
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from .color import rgb_to_lab100
 from .levels import Lattice, ObjectFields, trilinear
 from .photo import Exemplar
 
-__all__ = ["GUIDES", "PlacedPhoto", "depth_guide", "explained", "place_photo"]
+__all__ = ["GUIDES", "DepthGuide", "PlacedPhoto", "explained", "place_photo"]
 
 logger = logging.getLogger(__name__)
 
 GUIDES = ("auto", "depth", "axis", "height", "none")
 
-_DEPTH_WEIGHT = 10.0  # a guide difference of 0.1 weighs like a Lab difference of 100
+_BINS, _SPOT = 32, 16  # depth ranges of the profile; pixels of a spot
+_SLOPE = 3.0  # guide per Lab / 100 that the mean colour changes
+_SLOPES = (0.4, 24.0)  # least and largest guide per largest depth
 _FIT = 0.88  # overlap of outline and section from which a photograph is laid into the object
 
 
@@ -177,9 +182,47 @@ def place_photo(
     return PlacedPhoto(photo, axis, pitch * scale, depth, local, fitted)
 
 
-def depth_guide(depth: Tensor, largest: float) -> Tensor:
-    """Saturating guide: steep near the skin, where layers are thin, flat in the core."""
-    return _DEPTH_WEIGHT * 0.3 * (1.0 - torch.exp(-depth / max(largest, 1e-6) * 0.45 / 0.3))
+class DepthGuide:
+    """Depth, stretched where the photographs' colours change with it.
+
+    Layers below the skin must meet their like to the voxel; in a core of one material depth says
+    nothing, and holding on to it would repeat the photograph's spots at their depth, all around.
+
+    Args:
+        photos: Photographs, placed.
+        largest: Largest depth of the object [voxels].
+    """
+
+    def __init__(self, photos: Sequence[PlacedPhoto], largest: float) -> None:
+        self.largest = max(largest, 1e-6)
+        depth = np.concatenate([p.depth[p.mask] for p in photos]) / self.largest
+        image = np.concatenate([p.image[p.mask] for p in photos]).astype(np.float32)
+        color = rgb_to_lab100(torch.from_numpy(image)).numpy()
+        order = np.argsort(depth, kind="stable")
+        # bins fine near the skin, where layers are thin, and none without pixels
+        edges = np.unique((len(order) * np.linspace(0, 1, _BINS + 1)).astype(int))
+        bins = [order[i:j] for i, j in itertools.pairwise(edges) if j > i]
+        place = np.array([depth[b].mean() for b in bins])
+        mean = np.stack([color[b].mean(0) for b in bins])
+        # neighbouring pixels are alike: a spot counts as one sample
+        noise = np.array([color[b].var(0).sum() * _SPOT / max(len(b), _SPOT) for b in bins])
+        step = ((mean[1:] - mean[:-1]) ** 2).sum(1) - 2.0 * (noise[1:] + noise[:-1])
+        gap = np.maximum(np.diff(place), 1e-4)
+        slope = np.clip(_SLOPE * np.sqrt(np.maximum(step, 0.0)) / gap, *_SLOPES)
+        self.place = np.concatenate([[0.0], 0.5 * (place[1:] + place[:-1]), [1.5]])
+        rates = np.concatenate([slope[:1], slope, slope[-1:]])
+        values = np.diff(self.place) * 0.5 * (rates[1:] + rates[:-1])
+        self.value = np.concatenate([[0.0], values.cumsum()])
+
+    def __call__(self, depth: Tensor) -> Tensor:
+        """Guide values of depths [voxels of the solid]."""
+        knots = torch.from_numpy(self.place).to(depth)
+        values = torch.from_numpy(self.value).to(depth)
+        at = (depth / self.largest).clamp(0.0, 1.5)
+        right = torch.searchsorted(knots, at.contiguous()).clamp(1, len(knots) - 1)
+        low, high = knots[right - 1], knots[right]
+        share = (at - low) / (high - low).clamp(min=1e-9)
+        return values[right - 1] + share * (values[right] - values[right - 1])
 
 
 def explained(value: np.ndarray, color: np.ndarray, bins: int = 24) -> float:

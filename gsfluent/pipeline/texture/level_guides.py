@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from .bank import LevelPhoto
 from .color import rgb_to_lab100
-from .guides import PlacedPhoto, depth_guide
+from .guides import DepthGuide, PlacedPhoto
 from .levels import Lattice, ObjectFields, trilinear
 from .sections import Section
 
@@ -29,6 +29,7 @@ class LevelGuides:
         lattice: The level.
         section: The cut across the axis (kind ``axis``).
         own: The user's coordinate [X, Y, Z] on the solid's grid (kind ``array``).
+        depth_guide: Weight of the depth.
         directional: The section is carried along whole (fibres), not only its lines.
     """
 
@@ -40,7 +41,9 @@ class LevelGuides:
         section: Section | None,
         own: np.ndarray | None,
         directional: bool,
+        depth_guide: DepthGuide,
     ) -> None:
+        self.depth_guide = depth_guide
         self.directional = directional
         self._polar: Tensor | None = None
         self.kind, self.fields, self.lattice, self.section = kind, fields, lattice, section
@@ -54,7 +57,7 @@ class LevelGuides:
         if self.kind == "none":
             return torch.zeros_like(depth)[None]
         layered = 1.0 if self.section is None else self.section.skin
-        values = [layered * depth_guide(depth, self.fields.max_depth)]
+        values = [layered * self.depth_guide(depth)]
         if self.kind == "height":
             values.append((_PER_VOXEL / pitch * local[2]).expand_as(depth))
         if self.kind == "axis" and picture is not None:
@@ -82,8 +85,8 @@ class LevelGuides:
         """Half a cell of this level, in guide values."""
         if self.own is not None:
             return [0.05]
-        near_skin = 4.5 * self.lattice.pitch / max(self.fields.max_depth, 1e-6)
-        return [0.5 * near_skin, 0.5 * _PER_VOXEL]
+        per_voxel = self.lattice.pitch / max(self.fields.max_depth, 1e-6)
+        return [0.5 * min(2.0 * per_voxel, 0.2), 0.5 * _PER_VOXEL]
 
     def base(self, guide: Tensor, reference: tuple[Tensor, Tensor], inside: Tensor) -> Tensor:
         """What the guide alone says about the colours, [3, X, Y, Z]."""

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from .domain import InteriorDomain, axis_frame
 
-__all__ = ["Lattice", "ObjectFields", "hashed_noise", "nearest_inside", "pad_edges"]
+__all__ = ["Lattice", "ObjectFields", "hashed", "hashed_noise", "nearest_inside", "pad_edges"]
 
 _COARSEST = 16.0  # voxels per object size (cube root of the volume) at the first level
 _SLAB = 1 << 21  # points sampled at once
@@ -40,6 +40,12 @@ class Lattice:
     shape: tuple[int, int, int]
     rotation: np.ndarray
     center: np.ndarray
+
+    @property
+    def first(self) -> tuple[int, int, int]:
+        """Number of cell (0, 0, 0), counted from the object's centre."""
+        a, b, c = (round(v / self.pitch) for v in self.corner)
+        return a, b, c
 
     def local(self, device: torch.device) -> list[Tensor]:
         """Coordinates of the cell centres in the object's frame, broadcastable [X, 1, 1] etc."""
@@ -182,24 +188,28 @@ class ObjectFields:
 
 def hashed_noise(lattice: Lattice, channels: int, seed: int, device: torch.device) -> Tensor:
     """White normal noise [C, X, Y, Z] that depends on the cell's place in the object only."""
-    first = [round(c / lattice.pitch) for c in lattice.corner]
-    lines = [torch.arange(n, device=device) + f for n, f in zip(lattice.shape, first, strict=True)]
+    lines = [
+        torch.arange(n, device=device) + f
+        for n, f in zip(lattice.shape, lattice.first, strict=True)
+    ]
     x, y, z = torch.meshgrid(*lines, indexing="ij")
-    mask = 0xFFFFFFFF
     out = torch.empty((channels, *lattice.shape), device=device)
     for c in range(channels):
-        uniform = []
-        for part in range(2):
-            h = (x * 0x8DA6B343) ^ (y * 0xD8163841) ^ (z * 0xCB1AB31F)
-            h = (h ^ ((seed * 2 * channels + 2 * c + part) * 0x9E3779B1)) & mask
-            for shift, factor in ((16, 0x7FEB352D), (15, 0x6CA68B49), (16, 0x31848BAB)):
-                h = ((h ^ (h >> shift)) * factor) & mask
-            h = h ^ (h >> 16)
-            uniform.append((h.double() + 0.5) / 2.0**32)
+        salt = seed * 2 * channels + 2 * c
+        first, second = ((hashed(x, y, z, salt + k).double() + 0.5) / 2.0**32 for k in range(2))
         # Box and Muller 1958
-        radius = (-2.0 * uniform[0].log()).sqrt()
-        out[c] = (radius * (2.0 * torch.pi * uniform[1]).cos()).float()
+        out[c] = ((-2.0 * first.log()).sqrt() * (2.0 * torch.pi * second).cos()).float()
     return out
+
+
+def hashed(x: Tensor, y: Tensor, z: Tensor, salt: int) -> Tensor:
+    """Well mixed number below 2^32 (int64) for each integer place."""
+    mask = 0xFFFFFFFF
+    h = (x * 0x8DA6B343) ^ (y * 0xD8163841) ^ (z * 0xCB1AB31F)
+    h = (h ^ (salt * 0x9E3779B1 & mask)) & mask
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x6CA68B49), (16, 0x31848BAB)):
+        h = ((h ^ (h >> shift)) * factor) & mask
+    return h ^ (h >> 16)
 
 
 def nearest_inside(inside: Tensor, reach: int) -> tuple[Tensor, Tensor]:

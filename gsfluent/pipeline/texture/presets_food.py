@@ -39,7 +39,7 @@ def watermelon(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.nda
     rgb = mix(rgb, paint(0.98, 0.66, 0.60), 0.45 * flesh * bundle * np.exp(-((fibre / 0.07) ** 2)))
     grain = fractal(points, 16.0, seed + 9, 2)
     rgb = rgb * (1 + 0.05 * grain * flesh)[:, None]
-    return _seeds(points, depth, rgb, seed + 11, (0.30, 0.66), 0.23, (0.080, 0.046))
+    return _seeds(points, depth, rgb, seed + 11, (0.30, 0.66), 0.17, (0.058, 0.034))
 
 
 def _seeds(

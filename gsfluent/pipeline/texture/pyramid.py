@@ -13,7 +13,7 @@ from torch.nn import functional
 from ..stage import Progress, report_progress
 from .bank import Bank, LevelPhoto
 from .color import lab_to_rgb, rgb_to_lab100
-from .guides import PlacedPhoto
+from .guides import DepthGuide, PlacedPhoto
 from .level_guides import LevelGuides
 from .levels import Lattice, ObjectFields, hashed_noise, pad_edges
 from .sections import Section
@@ -64,6 +64,10 @@ def synthesize_pyramid(
     if not directional:
         first = next(iter(prepared.values()))
         groups = {axis: prepared.get(axis, first) for axis in range(3)}
+    placed = list({id(p): p for group in prepared.values() for p in group}.values())
+    depth_guide = DepthGuide(placed, fields.max_depth)
+    # a cut along the axis shows more of the core than the object holds
+    typical = [id(p) for p in (placed if section is None else [section.placed])]
     lattices = fields.lattices()
     before: _Done | None = None
     disagreement = 0.0
@@ -73,12 +77,12 @@ def synthesize_pyramid(
         inside = here["inside"]
         # every level has its own random numbers: how many a coarser one took does not matter
         rng = np.random.default_rng([seed, step])
-        guides = LevelGuides(kind, fields, lattice, section, own, directional)
+        guides = LevelGuides(kind, fields, lattice, section, own, directional, depth_guide)
         guide = guides.of_volume(here)
         photos = {id(p): guides.of_photo(p) for group in groups.values() for p in group}
         reference = (
-            torch.cat([p.image[p.mask] for p in photos.values()]),
-            torch.cat([p.guide[p.mask] for p in photos.values()]),
+            torch.cat([photos[k].image[photos[k].mask] for k in typical]),
+            torch.cat([photos[k].guide[photos[k].mask] for k in typical]),
         )
         target = guide.reshape(len(guide), -1)[:, inside.reshape(-1)].T
         banks = _banks(groups, photos, target, schedule, directional, rng)
@@ -92,7 +96,7 @@ def synthesize_pyramid(
         skin = rgb_to_lab100(here["skin"].movedim(0, -1)).movedim(-1, 0)
         volume = torch.where(fixed, skin, volume) * inside
         along = 0.0 if kind != "axis" else _FIBRE if directional else _LINES
-        level = SynthesisLevel(volume, inside, fixed, guide, banks, reference, along)
+        level = SynthesisLevel(volume, inside, fixed, guide, banks, reference, lattice.first, along)
         rounds = schedule.at(step, len(lattices))
         disagreement = synthesize_level(
             level, schedule, rounds, transport_last_only=kind == "none", rng=rng
@@ -139,8 +143,9 @@ def _banks(
     rng: np.random.Generator,
 ) -> dict[int, Bank]:
     """Patches per slice axis; axes with the same photographs share them."""
-    # more patches than queries cannot all be used
-    wanted = min(schedule.bank, max(512, len(target) // schedule.stride**2))
+    # more patches than queries cannot all be used; in powers of two, which a voxel does not change
+    queries = max(len(target) / schedule.stride**2, 1.0)
+    wanted = min(schedule.bank, max(512, 2 ** round(float(np.log2(queries)))))
     made: dict[tuple[int, ...], Bank] = {}
     banks = {}
     for axis, group in groups.items():

@@ -14,6 +14,7 @@ import torch
 
 from gsfluent.errors import InputError
 
+from ..fill_colors import keep_skin
 from ..regions_table import with_inclusions
 from ..stage import Progress, Stage, report_progress
 from .baselines import color_copy, telea_slices
@@ -32,6 +33,7 @@ from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
 from .structure import take_apart, with_structure
 from .sweep import CUTS
+from .unseen_skin import mend_unseen_skin
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
@@ -91,6 +93,8 @@ class Texture(Stage):
         resume: Folder in which the diffusion method keeps finished slices.
         polish: Fit the colours of interior Gaussians that are coarser than the voxels to slices
             of the volume, instead of sampling it at their centres (:mod:`.polish`).
+        parts: Label image or mask (file or array) that shows the inclusions of the first
+            photograph, or their colour; None finds them (exemplar method).
         depth_scale: Depth of the photograph's deepest point in units of the object's largest depth;
             None works it out (exemplar method).
         surface: What the surface's colours are to the inside: ``auto``, ``keep``, ``copy`` or
@@ -125,6 +129,7 @@ class Texture(Stage):
         inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
         polish: bool = False,
+        parts: object = None,
         depth_scale: float | None = None,
         surface: str = "auto",
         core: str = "open",
@@ -191,6 +196,7 @@ class Texture(Stage):
         self.inpaint = options
         self.resume = None if resume is None else Path(resume)
         self.polish = bool(polish)
+        self.parts = parts
         self.depth_scale = depth_scale
         self.surface = surface
         self.core = core
@@ -219,6 +225,7 @@ class Texture(Stage):
         """
         began = time.perf_counter()
         domain = InteriorDomain.from_solid(solid, self.axis)
+        domain, mended = mend_unseen_skin(domain, solid.report.get("closed_side"))
         exemplars, shown, structure = None, None, None
         if self.exemplar is not None:
             opened = open_exemplars(self.exemplar, self.photo)
@@ -235,7 +242,9 @@ class Texture(Stage):
             texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
+        colored = keep_skin(solid, colored)
         report = self._report(domain, texture, shown) | polished
+        report["skin_mended"] = mended
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
         regions, table = with_inclusions(solid, texture.labels)
@@ -264,6 +273,7 @@ class Texture(Stage):
                 guide=self.guide,
                 directional=self.directional,
                 inclusions=self.inclusions,
+                parts=self.parts,
                 depth_scale=self.depth_scale,
                 surface=self.surface,
                 core=self.core,

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from .bank import Bank, LevelPhoto
 from .color import lab_to_rgb, rgb_to_lab100
-from .levels import nearest_inside
+from .levels import hashed, nearest_inside
 from .transport import match_near, polish_patches
 
 __all__ = ["Schedule", "SynthesisLevel", "project_slice", "synthesize_level"]
@@ -73,6 +73,7 @@ class SynthesisLevel:
         banks: Patches per slice axis.
         reference: Colours [m, 3] and guide values [m, G] of the photographs' pixels; None
             leaves the colours to the patches.
+        first: Cell of the object's lattice that is cell (0, 0, 0) here.
         along: Standard deviation [voxels] of a smoothing along the third axis (fibres).
     """
 
@@ -82,6 +83,7 @@ class SynthesisLevel:
     guide: Tensor
     banks: dict[int, Bank]
     reference: tuple[Tensor, Tensor] | None
+    first: tuple[int, int, int] = (0, 0, 0)
     along: float = 0.0
 
 
@@ -121,6 +123,8 @@ def synthesize_level(
     coordinates = torch.stack(
         [flat // (shape[1] * shape[2]), flat // shape[2] % shape[1], flat % shape[2]], 1
     )
+    # counted from the object's centre, so that another grid draws the same places
+    coordinates = coordinates + torch.tensor(level.first, device=flat.device) - pad
     disagreement = 0.0
     for iteration in range(rounds[0]):
         volume[target] = volume[source]
@@ -229,13 +233,14 @@ def _axis_votes(
     def describe(which: Tensor) -> Tensor:
         return bank.describe(volume[flat[which][:, None] + offset], guide[which])
 
-    draw = rng.random(schedule.samples)
+    salt = int(rng.integers(1 << 31))
     total = torch.zeros_like(volume)
     share = volume.new_zeros(len(volume))
     if len(picked) == 0:
         return total, share
-    sample = torch.from_numpy((draw * len(picked)).astype(np.int64)).to(picked.device)
-    query = describe(picked[sample])
+    x, y, z = coordinates[picked].unbind(1)
+    order = hashed(x, y, z, salt).argsort(stable=True)
+    query = describe(picked[order[: schedule.samples]])
     bank.balance(query, schedule.sinkhorn)
     # a patch that fits perfectly must not be alone: the lattice of centres would show
     floor = _ALONE * float(bank.nearest(query)[1].median()) + 1e-4

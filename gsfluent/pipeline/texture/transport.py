@@ -66,7 +66,7 @@ def _shift(values: Tensor, have: Tensor, want: Tensor) -> Tensor:
     """How far values [n, D] move when quantiles ``have`` become ``want`` (both [K, D])."""
     knots = have.T.contiguous()
     # equal quantiles (flat colour) would make the inverse ambiguous
-    knots = knots + 1e-7 * torch.arange(_KNOTS, device=values.device)
+    knots = knots + 1e-5 * torch.arange(_KNOTS, device=values.device)
     moves = (want - have).T.contiguous()
     at = values.T.contiguous()
     right = torch.searchsorted(knots, at).clamp_(1, _KNOTS - 1)
