@@ -347,3 +347,21 @@ def test_matter_that_shows_keeps_the_colour_of_the_skin() -> None:
     assert torch.allclose(colored[-2], torch.tensor([0.1, 0.8, 0.1]), atol=0.05)
     assert torch.equal(colored[:-2], both.colors()[:-2])
     assert torch.allclose(colored[-1], torch.zeros(3), atol=1e-6)
+
+
+def test_walls_of_two_voxels_are_not_smoothed_away() -> None:
+    line = torch.arange(SIZE) + 0.5 - 0.5 * SIZE
+    radius = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).norm(dim=-1)
+    wall = (radius < 15.0) & (radius > 12.9)
+    solid = block()
+    shell_ = replace(
+        solid,
+        occupancy=wall,
+        depth=wall.float(),
+        color=torch.tensor([1.0, 0.0, 0.0]).expand(*wall.shape, 3).contiguous(),
+        origin=torch.tensor([-2.0, -2.0, -2.0]),
+    )
+    image = cut_view(shell_, "x", size=200)
+    red = (image[..., 0] - image[..., 1]).clip(0.0)
+    area = float(red.sum()) * (35.0 / 200) ** 2
+    assert area == pytest.approx(np.pi * (15.0**2 - 12.9**2), rel=0.15)
