@@ -54,7 +54,7 @@ def strip(textured: gf.data.Solid, size: int = 330) -> np.ndarray:
 def show(name: str, shell: gf.data.Solid, **settings: Any) -> None:
     began = time.process_time()
     textured = gf.pipeline.Texture(**settings)(shell)
-    keys = ("method", "guide", "cut", "swept", "core", "exemplar_mask")
+    keys = ("method", "guide", "cut", "swept", "core", "skin_mended", "exemplar_mask")
     figures = {k: textured.report[k] for k in keys if k in textured.report}
     sys.stdout.write(f"{name}: {time.process_time() - began:.1f} CPU s {figures}\n")
     pixels = (strip(textured)[..., ::-1] * 255).round().astype(np.uint8)

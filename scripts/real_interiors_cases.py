@@ -112,10 +112,14 @@ def _raw(path: Path) -> np.ndarray:
     return np.asarray(picture[..., ::-1].astype(np.float32) / 255.0)
 
 
+_APPLES = ("09", "03", "04", "01", "06", "12", "13", "15")
+"""Cross-sections: the one that goes in, then those held out."""
+
+
 def _apples(**options: Any) -> Callable[[Path], Photographs]:
     def read(folder: Path) -> Photographs:
         where = folder / "apple_cross_sections"
-        first, *others = (where / f"apple_cs_{n}.png" for n in ("09", "03", "04", "12", "13"))
+        first, *others = (where / f"apple_cs_{n}.png" for n in _APPLES)
         chosen = PhotoOptions(**options)
         held = [load_exemplar(path, options=chosen) for path in others]
         return load_exemplar(first, options=chosen), held, _raw(first)
@@ -226,8 +230,8 @@ CASES = {
             "across",
             {"guide": "depth"},
         ),
-        Case("kiwi", _kiwi, _ball, (0.35, 0.25, 0.13), (2,), "across", {"guide": "depth"}),
-        Case("orange", _orange, _ball, (0.93, 0.50, 0.08), (2,), "across", {"guide": "depth"}),
+        Case("kiwi", _kiwi, _ball, (0.35, 0.25, 0.13), (2,)),
+        Case("orange", _orange, _ball, (0.93, 0.50, 0.08), (2,), None, {"guide": "axis"}),
         Case(
             "pine",
             _pine,

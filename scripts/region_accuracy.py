@@ -204,6 +204,11 @@ def joined(labels: np.ndarray, rng: np.random.Generator, percent: int) -> np.nda
     return segmented(labels, rng, 50)
 
 
+def wandering(labels: np.ndarray, rng: np.random.Generator, pixels: int) -> np.ndarray:
+    """As :func:`joined` in 20 % of the views, of masks that are grown or shrunk as well."""
+    return joined(grown_or_shrunk(labels, rng, pixels), rng, 20)
+
+
 def matched(found: SkinLabels, truth: Truth) -> tuple[np.ndarray, int]:
     """IoU of each patch with the part that fits it best, and the number of parts."""
     true = truth.at(found.skin.centers)
@@ -231,6 +236,7 @@ def error_table(resolution: int) -> str:
         ("labels exchanged", flipped, "in {} % of the views", (10, 20, 30, 40), True),
         ("instances without identity, cut up", segmented, "{} % of the masks", (0, 50, 100), False),
         ("half cut up, and pairs joined", joined, "in {} % of the views", (20, 40), False),
+        ("the same in 20 %, grown or shrunk", wandering, "{} px", (2, 4, 8), False),
     ]
     for name, mistake, form, amounts, linked in cases:
         for amount in amounts:

@@ -13,7 +13,14 @@ from .neighbours import nearest
 if TYPE_CHECKING:
     from gsfluent.data import Gaussians, Solid
 
-__all__ = ["outer_weights", "skin_colors", "skin_weights", "stray_splats", "surface_colors"]
+__all__ = [
+    "keep_skin",
+    "outer_weights",
+    "skin_colors",
+    "skin_weights",
+    "stray_splats",
+    "surface_colors",
+]
 
 _NEIGHBOURS = 12
 _FAINT = 0.1  # opacity below which a splat is fuzz
@@ -21,6 +28,8 @@ _OUTLIER = 0.2  # colour difference at which a splat counts half
 _VIEWS = 16
 _SIZE = 200  # pixels of the pictures that tell which splats show
 _OUT, _IN = 1.5, 3.0  # voxels outside and below the skin that still belong to it
+_HIDDEN = 0.02  # share of its size below which a splat says nothing about the skin
+_SHOWS = 0.003  # share of its size by which an interior Gaussian shows from outside: it is skin
 _REACH = 2.0  # voxels; farther from every splat, a wider surrounding gives the colour
 
 
@@ -184,5 +193,40 @@ def skin_weights(solid: Solid) -> np.ndarray:
     """How much each splat of a solid says about the colour of its skin, float64 [N]."""
     weight = outer_weights(solid.gaussians)
     weight[stray_splats(solid)] = 0.0
-    weight[weight < 0.02] = 0.0
+    weight[weight < _HIDDEN] = 0.0
     return weight
+
+
+def keep_skin(solid: Solid, colored: Gaussians) -> Gaussians:
+    """Give interior Gaussians that show from outside the colour of the skin.
+
+    Trained skins let a few percent of light through. Seen from outside, matter close below shows
+    through them; in the colour of the inside it would stain the skin.
+
+    Args:
+        solid: A filled object.
+        colored: Its Gaussians after texturing.
+
+    Returns:
+        The Gaussians; colours fade from the skin's, where three thousandths of the size show, to
+        their own, where nothing does.
+    """
+    from gsfluent.data import INTERIOR
+    from gsfluent.geometry import rgb_to_sh0
+
+    if colored.labels is None or not bool((colored.labels == INTERIOR).any()):
+        return colored
+    weights = outer_weights(colored)
+    share = torch.from_numpy(weights).to(colored.means) / _SHOWS
+    share = torch.where(colored.labels == INTERIOR, share.clamp(max=1.0), 0.0)
+    rows = (share > 0.05).nonzero()[:, 0]
+    weights[stray_splats(solid.replace(gaussians=colored))] = 0.0
+    weights[weights < _HIDDEN] = 0.0
+    points = colored.means[rows].double().cpu().numpy()
+    skin = surface_colors(colored, points, solid.voxel, weights=weights)
+    part = share[rows, None]
+    mixed = (1.0 - part) * colored.colors()[rows] + part * torch.from_numpy(skin).to(part)
+    sh = colored.sh.clone()
+    sh[rows] = 0.0
+    sh[rows, 0] = rgb_to_sh0(mixed)
+    return colored.replace(sh=sh)

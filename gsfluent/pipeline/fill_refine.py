@@ -30,7 +30,7 @@ __all__ = ["Testimony", "asked_views", "refine_opacity", "witness"]
 
 logger = logging.getLogger(__name__)
 
-_CONTRADICTED = 3e-4  # share of its size that a Gaussian may show in the wrong place or colour
+_CONTRADICTED = 2e-4  # share of its size that a Gaussian may show in the wrong place or colour
 _OFF = 6.0  # no colour excuses what stands beside the object
 _ODD = 4.0  # squared colour difference (three channels) of 1 / 4 counts once
 _ROUNDS = 2  # what the first round lays bare is asked again
@@ -133,7 +133,7 @@ def refine_opacity(
 ) -> tuple[Gaussians, Tensor, dict[str, Any]]:
     """Remove the interior Gaussians that the photographs contradict; all others stay as they are.
 
-    Two rounds at most, each one pass over the photographs; a third pass measures what is left.
+    Two rounds at most, each one pass over the photographs: what the first lays bare is asked again.
 
     Args:
         gaussians: Surface and interior Gaussians.
@@ -145,21 +145,23 @@ def refine_opacity(
 
     Returns:
         The Gaussians that are left, their mask ``interior``, and the report: ``pruned``;
-        ``seen_before, seen_after``: share of all that is seen of the object that is interior;
-        ``contradicted_before, contradicted_after``: share of the interior Gaussians that show off
-        the object or in the wrong colour.
+        ``seen_before, seen_after``: share of all that is seen of the object that is interior, in
+        the first pass and, of what is left, in the last; ``contradicted_before,
+        contradicted_after``: share of the interior Gaussians that show off the object or in the
+        wrong colour, in the first and in the last pass.
     """
     report: dict[str, Any] = {"pruned": 0}
-    photographs = asked_views(capture, views, image_size)
-    for round_ in range(_ROUNDS + 1):
-        said = witness(gaussians, capture, photographs=photographs, progress=progress)
+    for round_ in range(_ROUNDS):
+        said = witness(gaussians, capture, views=views, image_size=image_size, progress=progress)
         wrong = interior & (said.contradiction > _CONTRADICTED)
+        left = interior & ~wrong
         seen = float(said.seen[interior].sum()) / max(float(said.seen.sum()), 1e-12)
+        after = float(said.seen[left].sum()) / max(float(said.seen[~wrong].sum()), 1e-12)
         share = int(wrong.sum()) / max(int(interior.sum()), 1)
         if round_ == 0:
             report |= {"seen_before": seen, "contradicted_before": share}
-        report |= {"seen_after": seen, "contradicted_after": share}
-        if round_ == _ROUNDS or not bool(wrong.any()):
+        report |= {"seen_after": after, "contradicted_after": share}
+        if not bool(wrong.any()):
             break
         report["pruned"] += int(wrong.sum())
         gaussians, interior = gaussians.select(~wrong), interior[~wrong]

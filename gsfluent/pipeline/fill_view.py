@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 __all__ = ["cut_view"]
 
 _GREY = 0.55  # of matter without colour
-_SMOOTH = 2.0  # voxels; whole voxels seen at their own size are stairs and terraces
+_SMOOTH = 3.0  # voxels; whole voxels seen at their own size are stairs and terraces
 _MOST = 1.0  # voxels by which smoothing may move the outline
 _SHEET = 0.005  # share of the matter; thin parts larger than this are walls, smaller ones fuzz
-_WALL = 0.35  # voxels by which smoothing may move the outline of a wall
+_WALL = 0.1  # voxels by which smoothing may move the outline of a wall
 _HIT = 0.02  # voxels
 _STEPS = 160
 _FAR = 60.0  # object sizes to the camera that draws the splats: nearly parallel rays

@@ -1,10 +1,10 @@
 """One part in all views: instances of single photographs linked through the skin they share.
 
 A class-agnostic segmenter (Segment Anything) numbers its masks anew in every photograph and may cut
-a part in two or join two parts. Two neighbouring voxels of the skin belong together when the
-photographs that show both mostly put them into one mask; agglomeration by the mean of that over the
-border of two clusters (average linkage on the region adjacency graph) finds the parts, and every
-mask then gets the number of the part that it mostly covers.
+a part in two or join two parts. Two voxels of the skin a little apart belong together when the
+photographs that show both mostly put them into one mask; agglomeration by the mean of that between
+two clusters (average linkage) finds the parts, and every mask then gets the number of the part that
+it mostly covers.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ __all__ = ["associate"]
 _AGREE = 0.5  # share of the photographs that must put two clusters into one mask
 _COVER = 0.6  # share of a mask that must lie on one part for it to vote
 _SMALL = 0.002  # of the skin: smaller parts are crumbs between masks
+_NEAR = 3.0  # least distance [voxels] at which voxels are compared
+_FAR, _LEAST_FAR = 0.15, 6.0  # largest, as a share of the object and in voxels
 _SEEN = 0.05  # votes of a view from which it shows a voxel
 _DOUBT = 1.0  # photographs of doubt: a border seen once is joined after one seen often
 
@@ -84,27 +86,62 @@ def _instances(
 
 def _parts(skin: Skin, shown: NDArray[np.int32]) -> NDArray[np.int64]:
     """Part of each skin voxel from 1, the largest first; 0 where no mask shows it."""
-    from scipy.sparse import triu
-
-    edges = triu(skin.neighbours, k=1).tocoo()
-    first, second = edges.row.astype(np.int64), edges.col.astype(np.int64)
+    block = _blocks(skin)
+    count = int(block.max()) + 1
+    first, second = _pairs(skin, block)
     same, both = np.zeros(len(first)), np.zeros(len(first))
     for row in shown:
         a, b = row[first], row[second]
         seen = (a > 0) & (b > 0)
         both += seen
         same += seen & (a == b)
-    keep = both > 0
-    cluster = _agglomerated(len(skin), first[keep], second[keep], same[keep], both[keep])
+    one = np.minimum(block[first], block[second])
+    other = np.maximum(block[first], block[second])
+    keep = (both > 0) & (one != other)
+    pair, place = np.unique(one[keep] * count + other[keep], return_inverse=True)
+    cluster = _agglomerated(
+        count,
+        pair // count,
+        pair % count,
+        np.bincount(place, weights=same[keep], minlength=len(pair)).astype(np.float64),
+        np.bincount(place, weights=both[keep], minlength=len(pair)).astype(np.float64),
+    )[block]
     seen_at_all = (shown > 0).any(axis=0)
-    sizes = np.bincount(cluster[seen_at_all], minlength=len(skin))
+    sizes = np.bincount(cluster[seen_at_all], minlength=count)
     large = np.flatnonzero(sizes >= max(4.0, _SMALL * len(skin)))
     if not large.size:
         large = np.array([int(sizes.argmax())])
-    order = large[np.argsort(-sizes[large], kind="stable")]  # ties: the first voxel's
-    number = np.zeros(len(skin), np.int64)
+    order = large[np.argsort(-sizes[large], kind="stable")]  # ties: the first block's
+    number = np.zeros(count, np.int64)
     number[order] = np.arange(1, len(order) + 1)
     return np.where(seen_at_all, number[cluster], 0)
+
+
+def _blocks(skin: Skin) -> NDArray[np.int64]:
+    """Cube of 2 x 2 x 2 voxels that each skin voxel lies in, numbered in order, [S]."""
+    corner = skin.index // 2
+    size = corner.max(axis=0) + 1
+    flat = (corner[:, 0] * size[1] + corner[:, 1]) * size[2] + corner[:, 2]
+    return np.unique(flat, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def _pairs(skin: Skin, block: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Voxels some way apart on the same side of the surface, one of each block.
+
+    Not next to each other: borders of masks wander by pixels from photograph to photograph, so that
+    hardly any one of them runs between two given neighbours.
+    """
+    from scipy.spatial import cKDTree
+
+    chosen = np.unique(block, return_index=True)[1]
+    index, normals = skin.index[chosen], skin.normals[chosen]
+    far = max(_LEAST_FAR, _FAR * float(np.ptp(skin.index, axis=0).max()))
+    pair = cKDTree(index).query_pairs(far, output_type="ndarray")
+    step = index[pair[:, 0]] - index[pair[:, 1]]
+    keep = (step**2).sum(axis=1) >= _NEAR**2
+    keep &= (normals[pair[:, 0]] * normals[pair[:, 1]]).sum(axis=1) > 0.0
+    pair = chosen[pair[keep]]
+    return pair[:, 0].astype(np.int64), pair[:, 1].astype(np.int64)
 
 
 def _agglomerated(
@@ -114,10 +151,10 @@ def _agglomerated(
     same: NDArray[np.float64],
     both: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Join clusters with the highest mean agreement along their border until it falls below half.
+    """Join clusters with the highest mean agreement between them until it falls below half.
 
     Returns:
-        For each voxel the lowest voxel of its cluster, [count].
+        For each of ``count`` blocks the lowest block of its cluster.
     """
     border: list[dict[int, tuple[float, float]]] = [{} for _ in range(count)]
     for a, b, s, n in zip(

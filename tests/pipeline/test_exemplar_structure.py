@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from gsfluent.pipeline.texture.structure import (
     with_structure,
 )
 from gsfluent.pipeline.texture.sweep import Sweep, outline
+from gsfluent.pipeline.texture.unseen_skin import mend_unseen_skin
 
 RAW = PhotoOptions("auto", False, False, False, False, "none")
 FLESH = np.array([0.92, 0.86, 0.60])
@@ -191,3 +194,19 @@ def test_what_cannot_be_swept_is_refused() -> None:
     assert done.report["levels"] == 1
     assert done.report["cut"] == "across"
     assert np.isfinite(done.rgb).all()
+
+
+def test_the_black_skin_of_a_closed_underside_is_mended_and_nothing_else() -> None:
+    domain, _, _, height = solid("ball", 40)
+    red, black = np.array([0.7, 0.12, 0.1]), np.array([0.02, 0.02, 0.02])
+    shaded = np.where((height < -0.6)[..., None], black, red).astype(np.float32)
+    given = replace(domain, skin=shaded)
+    mended, share = mend_unseen_skin(given, (0.0, 0.0, -1.0))
+    assert 0.1 < share < 0.4
+    assert np.abs(mended.skin[domain.inside] - red).max() < 1e-6
+    for side in (None, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)):
+        same, none = mend_unseen_skin(given, side)
+        assert none == 0.0
+        assert np.array_equal(same.skin, given.skin)
+    dark = replace(domain, skin=np.broadcast_to(black, shaded.shape).astype(np.float32))
+    assert mend_unseen_skin(dark, (0.0, 0.0, -1.0))[1] == 0.0  # black all round is black

@@ -10,13 +10,15 @@ import pytest
 import torch
 
 from gsfluent import demo
-from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians
+from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
 from gsfluent.io import load_capture
 from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.fill_colors import keep_skin, skin_colors, stray_splats
 from gsfluent.pipeline.fill_interior import INTERIOR_OPACITY, interior_gaussians
 from gsfluent.pipeline.fill_pieces import hilbert_code, small_pieces
 from gsfluent.pipeline.fill_refine import refine_opacity, witness
+from gsfluent.pipeline.fill_view import cut_view
 
 SIZE = 40
 RADIUS = 15.0
@@ -97,8 +99,8 @@ def test_count_is_bounded(bound: int) -> None:
 def test_a_slab_through_the_cut_is_opaque() -> None:
     found = placed()
     middle = 0.5 * SIZE * VOXEL
-    # four spacings of matter behind the plane, seen from the front
-    slab = (found.centers[:, 0] >= middle) & (found.centers[:, 0] < middle + 0.6)
+    # five spacings of matter behind the plane, seen from the front
+    slab = (found.centers[:, 0] >= middle) & (found.centers[:, 0] < middle + 0.75)
     splats = Gaussians.from_colors(
         found.centers[slab].float(),
         found.sigmas[slab].float(),
@@ -263,3 +265,103 @@ def test_photographs_of_a_filled_melon_stay_what_they_are(tmp_path: Path) -> Non
         errors.append(total)
     loss = 10.0 * np.log10(errors[1] / errors[0])
     assert loss < 0.1
+
+
+def block(length: int = 24, *, hairs: bool = False) -> Solid:
+    """A cube of matter, red inside, with a green skin of splats; ``hairs`` stand on its top."""
+    occupied = torch.zeros(length + 12, length + 12, length + 12, dtype=torch.bool)
+    occupied[6:-6, 6:-6, 6:-6] = True
+    if hairs:
+        occupied[10:-10:4, 10:-10:4, -6:-3] = True
+    line = torch.linspace(6.5, length + 5.5, length)
+    u, v = (x.reshape(-1) for x in torch.meshgrid(line, line, indexing="ij"))
+    faces = []
+    for axis in range(3):
+        for side in (6.0, length + 6.0):
+            points = torch.stack([u, v], 1)
+            height = torch.full_like(u, side)[:, None]
+            faces.append(torch.cat([points[:, :axis], height, points[:, axis:]], 1))
+    points = torch.cat(faces)
+    green = torch.tensor([0.1, 0.8, 0.1]).repeat(len(points), 1)
+    splats = Gaussians.from_colors(
+        points, torch.full((len(points),), 1.2), green, opacities=0.99, label=SURFACE
+    )
+    color = torch.zeros((*occupied.shape, 3))
+    color[..., 0] = 1.0
+    depth = occupied.float()
+    return Solid(splats, occupied, depth, torch.zeros(3), 1.0, color)
+
+
+def test_fuzz_does_not_colour_the_skin() -> None:
+    solid = block()
+    point = np.array([[18.0, 18.0, 30.0], [12.0, 20.0, 30.0]])
+    clean = skin_colors(solid, point)
+    assert np.allclose(clean, [0.1, 0.8, 0.1], atol=0.02)
+    box = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
+    box = box * torch.tensor([12.0, 12.0, 1.5]) + torch.tensor([12.0, 12.0, 27.0])
+    # opaque black splats below the face that nobody can see, and black fuzz above it
+    for lifted, alpha, strays in ((0.5, 1.0, 0), (5.5, 0.3, 300)):
+        places = box + torch.tensor([0.0, 0.0, lifted])
+        black = Gaussians.from_colors(
+            places, torch.full((300,), 0.3), torch.zeros(300, 3), opacities=alpha, label=SURFACE
+        )
+        stained = replace(solid, gaussians=Gaussians.cat([solid.gaussians, black]))
+        assert np.abs(skin_colors(stained, point) - clean).max() < 0.1
+        assert int(stray_splats(stained).sum()) == strays
+
+
+def test_colour_goes_on_where_no_splat_is() -> None:
+    solid = block()
+    bottom = solid.gaussians.select(solid.gaussians.means[:, 2] > 10.0)
+    colors = skin_colors(replace(solid, gaussians=bottom), np.array([[18.0, 18.0, 6.0]]))
+    assert np.allclose(colors, [0.1, 0.8, 0.1], atol=0.05)
+
+
+@pytest.mark.parametrize(("hairs", "extent"), [(False, 24.0), (True, 27.0)])
+def test_outline_of_a_cut_is_sharp_and_hairs_are_not_in_it(hairs: bool, extent: float) -> None:
+    image = cut_view(block(hairs=hairs), "x", size=144)
+    # the cut face of a cube: a square of 24 voxels with rounded corners; nothing else is red
+    red = image[..., 0] - image[..., 1]
+    pixel = (extent + 5.0) / 144  # two and a half voxels of border
+    assert float(red.clip(0.0).sum()) * pixel**2 == pytest.approx(24.0**2, rel=0.05)
+
+
+def test_cut_aslant_shows_face_and_skin() -> None:
+    image = cut_view(block(), (1.0, 0.2, 0.0), size=96, tilt=30.0)
+    red = (image[..., 0] > 0.9) & (image[..., 1] < 0.1)
+    green = (image[..., 1] > 2.0 * image[..., 0]) & (image[..., 0] < 0.2)
+    assert red.mean() > 0.3 and green.mean() > 0.1
+    # the viewer stands above: the top of the block lies above the face
+    assert np.argwhere(green)[:, 0].min() < np.argwhere(red)[:, 0].min()
+    with pytest.raises(ValueError, match="tilt"):
+        cut_view(block(), "x", tilt=90.0)
+    with pytest.raises(ValueError, match="axis"):
+        cut_view(block(), (0.0, 0.0, 0.0))
+
+
+def test_matter_that_shows_keeps_the_colour_of_the_skin() -> None:
+    solid = block()
+    places = [[18.0, 18.0, 30.6], [18.0, 18.0, 18.0]]
+    both = with_inner(solid.gaussians, places, 0.0)
+    colored = keep_skin(replace(solid, gaussians=both), both).colors()
+    assert torch.allclose(colored[-2], torch.tensor([0.1, 0.8, 0.1]), atol=0.05)
+    assert torch.equal(colored[:-2], both.colors()[:-2])
+    assert torch.allclose(colored[-1], torch.zeros(3), atol=1e-6)
+
+
+def test_walls_of_two_voxels_are_not_smoothed_away() -> None:
+    line = torch.arange(SIZE) + 0.5 - 0.5 * SIZE
+    radius = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1).norm(dim=-1)
+    wall = (radius < 15.0) & (radius > 12.9)
+    solid = block()
+    shell_ = replace(
+        solid,
+        occupancy=wall,
+        depth=wall.float(),
+        color=torch.tensor([1.0, 0.0, 0.0]).expand(*wall.shape, 3).contiguous(),
+        origin=torch.tensor([-2.0, -2.0, -2.0]),
+    )
+    image = cut_view(shell_, "x", size=200)
+    red = (image[..., 0] - image[..., 1]).clip(0.0)
+    area = float(red.sum()) * (35.0 / 200) ** 2
+    assert area == pytest.approx(np.pi * (15.0**2 - 12.9**2), rel=0.15)

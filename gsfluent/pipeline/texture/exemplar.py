@@ -30,7 +30,7 @@ __all__ = ["CORES", "QUALITIES", "SURFACES", "exemplar_texture", "load_exemplars
 logger = logging.getLogger(__name__)
 
 QUALITIES: dict[str, Schedule] = {
-    "preview": Schedule(iterations=(3, 2, 0), polish=(4, 4, 1), bank=1536),
+    "preview": Schedule(iterations=(3, 2, 0), polish=(4, 4, 0), bank=1536),
     "fast": Schedule(),
     "full": Schedule(iterations=(8, 5, 3), bank=6144, samples=2000, sinkhorn=5, stride=2),
 }

@@ -32,6 +32,7 @@ from .procedural import PRESETS, preset_names, procedural_texture
 from .profile import surface_profile
 from .structure import take_apart, with_structure
 from .sweep import CUTS
+from .unseen_skin import mend_unseen_skin
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
@@ -223,6 +224,7 @@ class Texture(Stage):
         """
         began = time.perf_counter()
         domain = InteriorDomain.from_solid(solid, self.axis)
+        domain, mended = mend_unseen_skin(domain, solid.report.get("closed_side"))
         exemplars, shown, structure = None, None, None
         if self.exemplar is not None:
             opened = open_exemplars(self.exemplar, self.photo)
@@ -239,7 +241,12 @@ class Texture(Stage):
             texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
+        # brings the compiled renderer with it, which texturing itself does without
+        from ..fill_colors import keep_skin
+
+        colored = keep_skin(solid, colored)
         report = self._report(domain, texture, shown) | polished
+        report["skin_mended"] = mended
         report["seconds"] = time.perf_counter() - began
         device = solid.occupancy.device
         regions, table = with_inclusions(solid, texture.labels)
