@@ -14,7 +14,6 @@ import torch
 
 from gsfluent.errors import InputError
 
-from ..fill_colors import keep_skin
 from ..regions_table import with_inclusions
 from ..stage import Progress, Stage, report_progress
 from .baselines import color_copy, telea_slices
@@ -242,6 +241,9 @@ class Texture(Stage):
             texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
+        # brings the compiled renderer with it, which texturing itself does without
+        from ..fill_colors import keep_skin
+
         colored = keep_skin(solid, colored)
         report = self._report(domain, texture, shown) | polished
         report["skin_mended"] = mended
