@@ -97,30 +97,35 @@ class Fill(Verb):
 
     Examples:
       gsfluent fill melon.ply -o solid.ply
-      gsfluent fill melon.ply -o solid.ply --capture captures/melon    # refine by photographs
-      gsfluent fill cup.ply -o cup_solid.ply --hollow auto
+      gsfluent fill melon.ply -o solid.ply --capture captures/melon    # masks, depths, refinement
+      gsfluent fill pepper.ply -o solid.ply --hollow 0.004             # a wall of 4 mm in metres
+      gsfluent fill melon.ply -o solid.ply --solid scan.obj            # a scan says what is matter
+      gsfluent fill scan.obj -o solid.ply                              # a mesh alone
+      gsfluent fill captures/melon -o solid.ply                        # masks alone: visual hull
 
     Writes solid.ply (opens in any splat viewer) and solid.volume.npz (the voxels) beside it.
     """
 
-    model: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="model.ply")]
-    """Splat to fill."""
+    model: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """Splat .ply, mesh file, or capture folder with masks."""
     out: Out
     """The .ply to write."""
     capture: Path | None = None
     """Photographs that the splat was made from."""
+    solid: Path | None = None
+    """Mesh file that says what is matter, in the frame of the splat."""
     resolution: int | None = None
-    """Voxels along the longest side of the density field."""
-    method: str | None = None
+    """Voxels along the longest side; thin walls take more."""
+    method: Literal["auto", "vote", "density", "hull", "tsdf"] | None = None
     """How the inside is found; auto decides."""
     hollow: str | None = None
-    """Whether the object is hollow: auto, none, or a wall thickness."""
+    """auto (what cameras look into stays empty), none (solid through), or a wall thickness."""
 
     def execute(self) -> dict[str, Any]:
         """Fill and write."""
         from gsfluent.pipeline.run_single import fill_to
 
-        existing(self.model, "model.ply", folder=False)
+        existing(self.model, "INPUT")
         given = {"resolution": self.resolution, "method": self.method, "hollow": self.hollow}
         options = {name: value for name, value in given.items() if value is not None}
         with self.progress("fill") as progress:
@@ -128,6 +133,7 @@ class Fill(Verb):
                 self.model,
                 _ply(self.out),
                 capture=self.capture,
+                solid=self.solid,
                 device=self.torch_device(),
                 seed=self.seed,
                 progress=progress,

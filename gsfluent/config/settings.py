@@ -125,14 +125,14 @@ class FillSettings:
     """``fill:`` - a shell of splats to a solid."""
 
     method: str = key(
-        choice("auto", "vote", "hull"), default="auto",
-        doc="How the inside is found: by rays, by masks, or both.",
+        choice("auto", "vote", "density", "hull", "tsdf"), default="auto",
+        doc="How the inside is found: rays (vote), with masks (hull, density), depths (tsdf).",
         example="auto",
     )  # fmt: skip
     hollow: str | float = key(
         either(choice("auto", "none"), number(above=0.0)),
         default="auto",
-        doc="Whether the object is hollow: auto, none, or a wall thickness [m].",
+        doc="auto: seen cavities stay empty; none: solid through; or a wall thickness [m].",
         example="auto",
     )
     resolution: int | None = key(

@@ -11,12 +11,15 @@ import torch
 
 from gsfluent.errors import InputError
 
+from .fill_hollow import cavity_volume
 from .fill_interior import populate
 from .fill_refine import refine_opacity
 from .fill_skin import skin_gaussians
 from .fill_view import cut_view
 from .fill_vote import VoteOptions, evidence
+from .solid_field import SignedDistance
 from .solid_splats import has_masks
+from .solid_thin import walls
 from .stage import Progress, Stage, report_progress
 from .voxels import nearest_empty
 
@@ -26,8 +29,6 @@ if TYPE_CHECKING:
     import trimesh
 
     from gsfluent.data import Capture, Gaussians, Solid
-
-    from .solid_field import SignedDistance
 
     Source = SignedDistance | trimesh.Trimesh | str | Path
 
@@ -50,8 +51,8 @@ class Fill(Stage):
         method: Where the inside comes from (docs/filling.md): ``auto``; ``vote`` (rays among the
             splats), ``hull`` (the same cut by the masks; masks alone without splats), ``density``
             (``hull`` where there are masks, else ``vote``) or ``tsdf`` (depths alone).
-        hollow: ``auto`` (solid; what points to a cavity is reported, nothing is guessed), ``none``
-            (solid), or a wall thickness in world units.
+        hollow: ``auto`` (cavities that depths show stay empty; nothing is guessed of closed ones),
+            ``none`` (solid through, a cup as well), or the wall thickness in world units.
         threshold: Density above which a voxel belongs to the surface shell (a lone opaque splat has
             1 at its centre).
         agreement: Fraction of rays that must hit the surface.
@@ -62,7 +63,7 @@ class Fill(Stage):
         down: Downward direction in world coordinates; None asks the capture, and without one finds
             an unseen side by itself.
         close_underside: Close the side that no photograph shows, at its rim.
-        match_masks: Move the skin to the outline of the masks, or of the splats without masks.
+        match_masks: Move the skin to the outline of the masks, where there are any.
         finer: Take smaller voxels where the walls found are thinner than five of them.
         refine_views: Photographs asked about the interior (0 asks none).
         refine_image_size: Longest image side then [pixels].
@@ -121,6 +122,7 @@ class Fill(Stage):
         self.resolution = int(resolution)
         self.method = method
         self.hollow = _parse_hollow(hollow)
+        self.solid_through = hollow == "none"
         self.threshold = float(threshold)
         self.agreement = float(agreement)
         self.rays = rays
@@ -213,6 +215,12 @@ class Fill(Stage):
             "method": field.source,
             **field.report,
             "volume": float(occupied.sum() * box.voxel**3),
+            "cavity_volume": cavity_volume(occupied, box.voxel),
+            "wall": walls(
+                field
+                if self.hollow is None
+                else SignedDistance.of_voxels(occupied, np.array(box.origin), box.voxel, "hollow")
+            ),
             "unusable_gaussians": unusable,
             "hollow_fraction": hollow,
             "grid": list(box.shape),
@@ -257,7 +265,6 @@ class Fill(Stage):
         Raises:
             InputError: Nothing to decide from, or nothing is inside.
         """
-        from .solid_field import SignedDistance
         from .solid_source import find_solid
 
         if isinstance(solid, SignedDistance):
@@ -270,7 +277,7 @@ class Fill(Stage):
                 mend="add masks or use method: vote",
             )
         method = {"vote": "density"}.get(self.method, self.method)
-        if method == "hull" and gaussians is not None:
+        if gaussians is not None and (method == "hull" or self.solid_through):
             method = "density"
         if solid is not None:
             method = "mesh"
@@ -286,6 +293,7 @@ class Fill(Stage):
             resolution=self.resolution,
             options=options,
             match_masks=self.match_masks,
+            match_drawn=False,
             finer=self.finer,
         )
 

@@ -37,6 +37,7 @@ _log = logging.getLogger(__name__)
 _FEW = 16  # splats
 _HUGE = 0.5  # of the object's longest side: a standard deviation above it is no surface
 _MASK_SIZE = 400  # pixels
+_BURIED = 3.5  # voxels below the closed surface
 _SAMPLE = 100_000
 
 
@@ -161,7 +162,7 @@ def vote_solid(
     trimmed = trim_outer_flank(loose, shell, density, gaussians.device)
     solid, more = keep_components(smooth_boundary(trimmed))
     # splats well below the surface hint at a cavity or an inner wall
-    deep = shell & (distance_transform(loose, gaussians.device) > 5.0)
+    deep = shell & (distance_transform(loose, gaussians.device) > _BURIED)
     if vote.open_side is not None:
         _log.info(
             "fill: nothing seen from side %s; closed there (%.0f %% of inner voxels look out)",

@@ -161,9 +161,16 @@ def _distance(nodes: np.ndarray, triangles: np.ndarray, spacing: float) -> np.nd
     return result
 
 
-def surface_samples(triangles: np.ndarray, spacing: float) -> np.ndarray:
-    """Points [M, 3] on triangles [F, 3, 3], nowhere farther than ``spacing`` apart."""
-    return _samples(triangles, spacing)[0]
+def oriented_samples(triangles: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points on triangles [F, 3, 3], no farther than ``spacing`` apart, and how they face.
+
+    Returns:
+        Points [M, 3], and the outward normal of each times the area it stands for [M, 3].
+    """
+    points, owner = _samples(triangles, spacing)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    share = np.bincount(owner, minlength=len(triangles)).clip(1)
+    return points, (0.5 * cross / share[:, None])[owner]
 
 
 def _samples(triangles: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.reconstruct import Reconstruct
 from gsfluent.pipeline.reconstruct_report import write_report
 from gsfluent.pipeline.render_cuts import save_cut_views
+from gsfluent.pipeline.solid_mesh import is_mesh
 from gsfluent.pipeline.stage import Progress
 from gsfluent.pipeline.texture import Texture
 
@@ -62,23 +63,32 @@ def fill_to(
     out: Path,
     *,
     capture: Path | None = None,
+    solid: Path | None = None,
     device: torch.device,
     seed: int = 0,
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, Any]:
-    """A splat file to a solid: ``out`` and its ``.volume.npz``; arguments as above.
+    """A splat file, a mesh or a masked capture to a solid: ``out`` and its ``.volume.npz``.
+
+    Arguments as above, and ``solid``: a mesh that says what is matter, in the splats' frame.
 
     Raises:
-        InputError: The splat cannot be read or has no inside.
+        InputError: The input cannot be read or has no inside.
         RunError: The disk is full.
     """
-    gaussians = load(model).validated(model.name).to(device)
+    gaussians, photographs = None, _photographs(capture)
+    if model.is_dir():
+        photographs = load_capture(model)
+    elif is_mesh(model):
+        solid = model
+    else:
+        gaussians = load(model).to(device)
     start = time.perf_counter()
     stage = Fill(**options, seed=seed)
-    solid = stage(gaussians, _photographs(capture), progress=progress)
-    solid.save(out)
-    return dict(solid.report) | {"seconds": time.perf_counter() - start, "output": str(out)}
+    filled = stage(gaussians, photographs, progress=progress, solid=solid)
+    filled.save(out)
+    return dict(filled.report) | {"seconds": time.perf_counter() - start, "output": str(out)}
 
 
 def texture_to(

@@ -21,7 +21,7 @@ from gsfluent.pipeline.solid_source import find_solid
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["FORMATS", "closed_mesh", "mesh_to", "save_mesh"]
+__all__ = ["FORMATS", "closed_mesh", "is_mesh", "mesh_to", "save_mesh"]
 
 _log = logging.getLogger(__name__)
 
@@ -103,8 +103,12 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path, *, scale: float = 1.0) ->
         mesh.export(part, file_type=kind)
 
 
-def _has_faces(path: Path) -> bool:
-    """Whether a .ply holds a mesh rather than splats."""
+def is_mesh(path: Path) -> bool:
+    """Whether a file holds a mesh rather than splats."""
+    if path.suffix.lower() in _MESHES:
+        return True
+    if path.suffix.lower() != ".ply":
+        return False
     with open(path, "rb") as stream:
         head = stream.read(4096).split(b"end_header")[0]
     found = re.search(rb"element\s+face\s+(\d+)", head)
@@ -145,7 +149,7 @@ def mesh_to(
     gaussians = None
     if source.is_dir():
         field = find_solid(None, load_capture(source), method=method, resolution=resolution)
-    elif source.suffix.lower() in _MESHES or _has_faces(source):
+    elif is_mesh(source):
         field = find_solid(mesh=source, method=method, resolution=resolution)
     elif method == "auto" and volume_path(source).is_file():
         solid = Solid.load(source)

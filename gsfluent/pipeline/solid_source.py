@@ -13,14 +13,15 @@ import torch
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.fill_density import GridBox
-from gsfluent.pipeline.fill_inside import cast_votes, count_leaks, keep_components
+from gsfluent.pipeline.fill_inside import find_leaks, keep_components
 from gsfluent.pipeline.fill_inside import visual_hull as centre_hull
 from gsfluent.pipeline.fill_vote import VoteOptions
-from gsfluent.pipeline.mesh_distance import load_mesh, signed_distances, surface_samples
+from gsfluent.pipeline.mesh_distance import load_mesh, oriented_samples, signed_distances
 from gsfluent.pipeline.reconstruct_init import visual_hull
 from gsfluent.pipeline.reconstruct_views import read_views
 from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.solid_splats import has_masks, solid_of_splats
+from gsfluent.pipeline.winding import winding_numbers
 
 if TYPE_CHECKING:
     import trimesh
@@ -31,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 METHODS = ("auto", "hull", "density", "tsdf", "mesh")
 _HULL_SIZE = 400  # pixels of the masks
-_AGREE = 0.7  # share of the rays that must meet an open mesh
+_HALF = 0.5  # winding number from which a place is inside an open mesh
 _BAND = 3.0  # voxels around a mesh with exact distances
 _FEW_VIEWS = 8  # cameras below which a hull is a cone
 
@@ -45,6 +46,7 @@ def find_solid(
     resolution: int = 96,
     options: VoteOptions | None = None,
     match_masks: bool = True,
+    match_drawn: bool = True,
     finer: bool = True,
 ) -> SignedDistance:
     """Signed distances to the surface of an object, from whatever there is.
@@ -59,7 +61,9 @@ def find_solid(
             depths show to be free, else the hull.
         resolution: Voxels along the longest side of the object.
         options: Settings of the ray vote.
-        match_masks: Move the skin of splats to the outline that masks (or drawn splats) show.
+        match_masks: Move the skin of splats to the outline that masks show.
+        match_drawn: Without masks, half of the way to the outline of the drawn splats: right for
+            trained ones, whose centres lie too deep, too far for large discs.
         finer: Take smaller voxels where the walls found are thinner than five of them.
 
     Returns:
@@ -91,6 +95,7 @@ def find_solid(
             method="auto" if method == "auto" else chosen,
             options=options,
             match_masks=match_masks,
+            match_drawn=match_drawn,
             finer=finer,
         )
         why += note
@@ -156,7 +161,7 @@ def _of_hull(capture: Capture, resolution: int) -> SignedDistance:
 
 
 def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
-    """Exact distances to a closed mesh; an open one is voxelised and closed by a ray vote."""
+    """Exact distances to a closed mesh; an open one is closed by its winding numbers."""
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     extent = float((high - low).max())
@@ -170,12 +175,23 @@ def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
         values = signed_distances(triangles, origin + 0.5 * voxel, voxel, size, _BAND)
         start = torch.from_numpy(origin).float()
         return SignedDistance(torch.from_numpy(values), start, voxel, "mesh", notes)
+    samples, areas = oriented_samples(triangles, 0.7 * voxel)
     shell = np.zeros(size, dtype=bool)
-    samples = surface_samples(triangles, 0.5 * voxel)
     shell[tuple(np.floor((samples - origin) / voxel).astype(int).T)] = True
-    vote = cast_votes(shell)
-    solid, dropped = keep_components(shell | (vote.score >= _AGREE))
-    leaks, wet = count_leaks(shell, solid)
-    notes |= {"leaks": leaks, "leaking_voxels": wet, "components_dropped": dropped}
-    notes["closed_side"] = None if vote.open_side is None else list(vote.open_side)
+    axes = [torch.arange(int(n)) + 0.5 for n in size]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    winding = winding_numbers(
+        torch.from_numpy(origin).float() + grid * voxel,
+        torch.from_numpy(samples).float(),
+        torch.from_numpy(areas).float(),
+        soft=0.35 * voxel,
+    )
+    number = winding.reshape(tuple(size)).numpy()
+    if -float(number.min()) > float(number.max()):
+        number = -number  # wound inward
+    solid, dropped = keep_components(number > _HALF)
+    if not solid.any():  # a sheet encloses nothing: it is as thick as a voxel
+        solid, dropped = keep_components(shell)
+    notes |= find_leaks(shell, solid, origin, voxel) | {"components_dropped": dropped}
+    notes |= {"closed_side": None, "closed_by": "winding numbers"}
     return SignedDistance.of_voxels(solid, origin, voxel, "mesh", notes)

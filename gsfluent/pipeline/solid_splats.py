@@ -15,6 +15,7 @@ import torch
 
 from gsfluent.data import Camera, Capture, Gaussians
 from gsfluent.pipeline.fill_density import GridBox, choose_grid
+from gsfluent.pipeline.fill_hollow import hidden_cavity
 from gsfluent.pipeline.fill_inside import find_leaks, keep_components
 from gsfluent.pipeline.fill_vote import Closed, VoteOptions, evidence, vote_solid
 from gsfluent.pipeline.solid_field import SignedDistance, distances_of
@@ -37,6 +38,7 @@ _log = logging.getLogger(__name__)
 
 _FAINT = 0.05  # opacity below which a splat is no matter
 _DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/solid.md)
+_INNER = 0.05  # share of the surface below the closed one that makes an inner wall
 _ENOUGH = 12  # photographs from which depths decide where the skin is
 _MOST_CAMERAS = 48  # evenly chosen; more say the same again
 _SKIN = 1.5  # voxels; density and depths may disagree by so much about where the skin is
@@ -58,6 +60,7 @@ def solid_of_splats(
     method: str = "auto",
     options: VoteOptions | None = None,
     match_masks: bool = True,
+    match_drawn: bool = True,
     finer: bool = True,
 ) -> tuple[SignedDistance, str]:
     """Signed distances to the skin of splats, and a word on how they came about.
@@ -69,7 +72,8 @@ def solid_of_splats(
         method: ``density`` (what the splats enclose), ``tsdf`` (fused depths alone) or ``auto``
             (both).
         options: Settings of the vote.
-        match_masks: Move the skin to the outline in the masks, or that of the drawn splats.
+        match_masks: Move the skin to the outline in the masks.
+        match_drawn: Without masks, half of the way to the outline of the drawn splats.
         finer: Raise the resolution where walls are thinner than five voxels.
     """
     options = options or VoteOptions()
@@ -83,7 +87,10 @@ def solid_of_splats(
         closed = vote_solid(gaussians, capture, resolution, options)
         box, notes = closed.box, dict(closed.notes)
     notes["unusable_gaussians"] = unusable
-    cameras, virtual = _lookers(capture, box, notes["closed_side"])
+    open_side = notes["closed_side"]
+    if notes.get("buried_surface_fraction", 0.0) > _INNER:
+        open_side = None  # there is a skin inside: the opening is one, not a side nobody saw
+    cameras, virtual = _lookers(capture, box, open_side)
     notes |= {"cameras": len(cameras), "virtual_cameras": virtual}
     note = ""
     if method == "density":
@@ -106,9 +113,9 @@ def solid_of_splats(
         if closed.notes["closed_side"] is not None:
             notes["leaks"] = max(1, notes["leaks"])
     if finer and method != "density" and field.source != "density":
-        field, word = _finer(field, visible, capture, closed, notes)
+        field, word = _finer(field, visible, capture, closed, open_side)
         note += word
-    if match_masks:
+    if match_masks and (match_drawn or (capture is not None and has_masks(capture))):
         field = _matched(field, visible, capture, cameras, closed)
     return field.replace(report=notes | field.report), note
 
@@ -161,8 +168,11 @@ def _seen(
         body[(slice(None),) * axis + ([0, -1],)] = False
     body, dropped = keep_components(body)
     body = _without_bubbles(body)
+    report: dict[str, Any] = {"components_dropped": dropped}
+    if closed is not None:
+        body, report["hollow"] = _hollowed(body, closed, fused, visible.device)
     field = _field_of(body, fused, np.array(box.origin), box.voxel, visible.device)
-    return field.replace(report={"components_dropped": dropped}), fused
+    return field.replace(report=report), fused
 
 
 def _carved(
@@ -181,7 +191,8 @@ def _carved(
     cavity = _cavities(solid, fused.values, visible.device)
     share = float(cavity.sum() / max(1, int(solid.sum())))
     notes["cavity_share"] = share
-    source, note, report = "density", "", {}
+    source, note = "density", ""
+    report: dict[str, Any] = {}
     if share > _CAVITY:
         if share > 0.5:  # mostly a shell: both of its sides are the depths' to tell
             body = ndimage.binary_dilation(solid) & (fused.values <= 0)
@@ -191,6 +202,7 @@ def _carved(
         report["components_dropped"] = notes["components_dropped"] + dropped
         source = "density and tsdf"
         note = f"; cameras look into {100 * share:.0f} % of what the ray vote closed"
+        solid, report["hollow"] = _hollowed(solid, closed, fused, visible.device)
         field = _field_of(solid, fused, np.array(box.origin), box.voxel, visible.device)
     else:
         field = SignedDistance.of_voxels(
@@ -199,6 +211,23 @@ def _carved(
         if notes["closed_side"] is not None and virtual:
             note = "; one side is open and was closed: if it is no hole, choose tsdf"
     return field.replace(source=source, report=report), note
+
+
+def _hollowed(
+    body: np.ndarray, closed: Closed, fused: Fused, device: torch.device
+) -> tuple[np.ndarray, str | None]:
+    """Without what is hidden behind an opening, and a word on it."""
+    hidden, found = hidden_cavity(body, closed.loose, fused.near > 0, device)
+    if not found:
+        return body, None
+    wall = found["wall"] * closed.box.voxel
+    share = found["hidden"] / (found["hidden"] + found["seen"])
+    word = (
+        f"cameras see {100 * (1 - share):.0f} % of the cavity's wall, {wall:.3g} thick; "
+        "the rest is taken to be as thick"
+    )
+    _log.info("solid: %s", word)
+    return body & ~hidden, word
 
 
 def _cavities(solid: np.ndarray, depths: np.ndarray, device: torch.device) -> np.ndarray:
@@ -263,7 +292,7 @@ def _finer(
     visible: Gaussians,
     capture: Capture | None,
     closed: Closed | None,
-    notes: dict[str, Any],
+    open_side: Sequence[float] | None,
 ) -> tuple[SignedDistance, str]:
     """The field on a finer grid where its walls ask for one; only its skin is looked at again."""
     from scipy import ndimage
@@ -298,7 +327,7 @@ def _finer(
     index = np.argwhere(band)
     points = torch.from_numpy(box.centers(index)).float()
     pixels = int(min(2.5 * max(shape), 640))
-    cameras, _ = _lookers(capture, box, notes["closed_side"], pixels, 2 * _MOST_CAMERAS)
+    cameras, _ = _lookers(capture, box, open_side, pixels, 2 * _MOST_CAMERAS)
     limit = _LIM * factor
     found = fuse(points.to(visible.means), depth_views(visible, cameras), voxel, limit)
     before = (field.at(points) / voxel).cpu().numpy()
@@ -342,6 +371,10 @@ def _matched(
         return grown.replace(report=field.report | notes)
     assert capture is not None
     grown, offset = match_outline(field, mask_outlines(capture))
+    if offset < 0:
+        # an outline is the envelope of all bumps; half of what it asks for is theirs
+        offset = round(_DRAWN * offset, 3)
+        grown = field.replace(values=field.values - offset * field.voxel)
     values = grown.values
     if offset > 0 and closed is not None and closed.hull is not None:
         # what was added must lie in the masks as well

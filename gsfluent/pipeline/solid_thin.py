@@ -11,7 +11,7 @@ from torch import Tensor
 from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.voxels import distance_transform
 
-__all__ = ["thin_shells", "wall_thickness"]
+__all__ = ["thin_shells", "wall_thickness", "walls"]
 
 _STEP = 0.25  # voxels of a march
 _FIRST = 0.75  # voxels below the surface where it starts: within a wall of one and a half
@@ -62,6 +62,26 @@ def wall_thickness(field: SignedDistance, most: float) -> tuple[Tensor, Tensor]:
         alive = alive[~through]
         depth += _STEP * field.voxel
     return surface, thickness.clamp_max(most)
+
+
+def walls(field: SignedDistance, most: float = 12.0) -> dict[str, float | None]:
+    """How thick the walls of a solid are, over its surface.
+
+    Args:
+        field: The solid.
+        most: Thickness [voxels] from which something is no wall; None stands for that.
+
+    Returns:
+        ``median`` and ``p5``, the 5 % quantile [world units].
+    """
+    _, thickness = wall_thickness(field, most * field.voxel)
+    found: dict[str, float | None] = {"median": None, "p5": None}
+    if len(thickness):
+        chosen = thickness[:: max(1, len(thickness) // 100_000)].double()
+        for name, share in (("median", 0.5), ("p5", 0.05)):
+            value = float(chosen.quantile(share))
+            found[name] = value if value < 0.999 * most * field.voxel else None
+    return found
 
 
 def thin_shells(
