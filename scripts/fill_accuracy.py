@@ -1,6 +1,6 @@
 """Fill every mesh of the data folder after photographing and reconstructing it; docs/filling.md.
 
-    python scripts/fill_accuracy.py --cache out/fill [--only bowl skull] [--write] [--cuts]
+    PYTHONPATH=. python scripts/fill_accuracy.py --cache out/fill [--only bowl] [--write] [--cuts]
 
 The meshes come from GSFLUENT_DATA, or ../shared/data beside the checkout. Photographs and splats
 are kept in the cache folder and made only once; --device cuda and more --views, --size, --steps

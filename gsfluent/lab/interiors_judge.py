@@ -131,6 +131,32 @@ class Judge:
         ratio = {key: figures[key] / max(self.floor[key], 1e-9) for key in distances}
         return {**figures, "floor": self.floor, "ratio": ratio}
 
+    def photograph(self) -> dict[str, Any]:
+        """Figures of the photographs themselves: how well one cut represents the others.
+
+        Figures that need a volume are None. A cut through the middle shows less skin than the
+        planes do, which a method makes up for by the depth; but what a method is shown of seeds and
+        veins is no better a sample than this.
+        """
+        truth = self.truth
+        own = [(p[..., :3], p[..., 3] > 0.5) for p in self.known.exemplars().values()]
+        coherence, coverage = metrics.patch_neighbours(own, truth)
+        halves = metrics.half_size(own), metrics.half_size(truth)
+        figures: dict[str, Any] = {
+            "patch": metrics.patch_distance(own, truth, samples=_PATCHES),
+            "patch_coarse": metrics.patch_distance(*halves, samples=_PATCHES),
+            "hist": metrics.lab_histogram_distance(_colors(own), _colors(truth)),
+            "profile": None,
+            "sharp": metrics.sharpness(own) / max(metrics.sharpness(truth), 1e-9),
+            "neighbour": None,
+            "radial": None,
+            "coherence": coherence,
+            "coverage": coverage,
+        }
+        distances = ("patch", "patch_coarse", "hist", "coherence", "coverage")
+        ratio = {key: figures[key] / max(self.floor[key], 1e-9) for key in distances}
+        return {**figures, "floor": self.floor, "ratio": ratio}
+
     def _figures(self, known: KnownInterior, rgb: np.ndarray) -> dict[str, Any]:
         domain, truth = known.domain, self.truth
         own = self.slices(known, rgb)

@@ -134,7 +134,7 @@ def test_height_guide_keeps_layers_straight_and_is_found() -> None:
 def test_section_is_carried_along_an_oblique_axis() -> None:
     v, u = np.mgrid[:120, :120] + 0.5 - 60
     radius = np.hypot(u, v) / 56
-    rings = 0.5 + 0.4 * np.cos(2 * np.pi * radius * 4)
+    rings = 0.5 + 0.4 * np.cos(2 * np.pi * radius * 2.5)
     picture = np.stack([rings, rings, rings, radius < 1], -1).astype(np.float32)
     axis = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
     domain = _domain(_ball(44, radii=(1, 1, 1)), axis=axis)
@@ -144,7 +144,7 @@ def test_section_is_carried_along_an_oblique_axis() -> None:
     place = np.argwhere(domain.depth > 3) + 0.5 - 22
     along = place @ axis
     distance = np.linalg.norm(place - along[:, None] * axis, axis=1) / 20
-    wanted = 0.5 + 0.4 * np.cos(2 * np.pi * distance * 4)
+    wanted = 0.5 + 0.4 * np.cos(2 * np.pi * distance * 2.5)
     tone = texture.rgb[domain.depth > 3].mean(1)
     # far from the middle the rim follows the surface, as a peel does
     near = np.abs(along) < 8

@@ -180,7 +180,11 @@ def _ring_profile(image: np.ndarray, labels: np.ndarray, numbers: list[int]) -> 
             sums[k] += pixels.sum(0)
             counts[k] += len(pixels)
     profile = sums / np.maximum(counts, 1)[:, None]
-    profile[counts == 0] = profile[counts > 0][0]
+    for empty in np.flatnonzero(counts == 0).tolist():
+        # small blobs have no pixel in some rings: the nearest on the same side of the outline
+        beside = (counts > 0) & ((_RINGS > 1.0) == (_RINGS[empty] > 1.0))
+        filled = np.flatnonzero(beside if beside.any() else counts > 0)
+        profile[empty] = profile[filled[np.abs(_RINGS[filled] - _RINGS[empty]).argmin()]]
     return profile.astype(np.float32)
 
 

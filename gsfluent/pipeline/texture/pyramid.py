@@ -18,9 +18,11 @@ from .level_guides import LevelGuides
 from .levels import Lattice, ObjectFields, hashed_noise, pad_edges
 from .sections import Section
 from .synthesis import Schedule, SynthesisLevel, synthesize_level
+from .transport import Cells
 
 __all__ = ["synthesize_pyramid", "to_grid"]
 
+_PARTS = 96  # parts of the guide's space over which the photographs' pixels are spread
 _PATCH = 7  # patches whose statistics are matched
 _FIBRE, _LINES = 2.0, 0.7  # voxels of smoothing along the axis: fibres; lines among cells
 
@@ -87,6 +89,7 @@ def synthesize_pyramid(
         target = guide.reshape(len(guide), -1)[:, inside.reshape(-1)].T
         banks = _banks(groups, photos, target, schedule, directional, rng)
         base = guides.base(guide, reference, inside)
+        reference = _as_in(target, reference, rng)
         if before is None:
             volume = _initial(lattice, inside, guide, reference, seed)
         else:
@@ -110,6 +113,26 @@ def synthesize_pyramid(
         "axes_matched": sorted("xyz"[a] for a in groups),
     }
     return before.volume, lattices[-1], figures
+
+
+def _as_in(
+    target: Tensor, reference: tuple[Tensor, Tensor], rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:
+    """Pixels drawn so that their guide values are spread as the voxels' are.
+
+    A solid holds more shallow places than its cut shows, also within a part of the guide's space.
+    """
+    color, place = reference
+    cells = Cells(place, _PARTS, rng)
+    own = cells.of(place)
+    have = torch.bincount(own, minlength=len(cells.centers)).double()
+    want = torch.bincount(cells.of(target), minlength=len(cells.centers)).double()
+    ratio = (want / want.sum().clamp(min=1.0)) / (have / have.sum()).clamp(min=1e-9)
+    mass = ratio.clamp(0.1, 10.0)[own].cumsum(0)
+    count = min(max(len(color), 1 << 14), 1 << 17)
+    steps = torch.arange(count, device=color.device).double() + float(rng.random())
+    pick = torch.searchsorted(mass, steps / count * mass[-1]).clamp(max=len(color) - 1)
+    return color[pick], place[pick]
 
 
 @dataclass(frozen=True)
