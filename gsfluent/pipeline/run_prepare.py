@@ -165,7 +165,12 @@ def texture_stage(context: RunContext) -> None:
         for name in shot.objects:
             solid = Solid.load(context.store.root / "fill" / f"{name}.ply")
             # slices finished before a kill are found again: the folder outlives it
-            stage = Texture(**options, resume=folder / f"{name}.slices", seed=context.seed)
+            stage = Texture(
+                **options,
+                device=str(context.device),
+                resume=folder / f"{name}.slices",
+                seed=context.seed,
+            )
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
             textured.save(folder / f"{name}.ply")
             save_cut_views(textured, folder / f"{name}.png")
