@@ -106,8 +106,9 @@ def hidden_cavity(
         device: Where distances are computed.
 
     Returns:
-        Voxels to take out, and ``{}`` or ``wall`` (thickness [voxels]), ``seen`` and ``hidden``
-        (voxels of the cavity's wall).
+        Voxels to take out, and ``{}`` or ``wall`` (thickness [voxels]), ``spread`` (its 75 % over
+        its 25 % quantile), ``seen`` and ``hidden`` (voxels of the cavity's wall), ``free`` (voxels
+        that were looked into).
     """
     from scipy import ndimage
 
@@ -124,11 +125,16 @@ def hidden_cavity(
     counts = {"seen": int(known.sum()), "hidden": int(hidden.sum())}
     if counts["seen"] < _SEEN or counts["hidden"] < _HIDDEN * (counts["seen"] + counts["hidden"]):
         return none, {}
-    thickness = float(np.median(depth[known]))
+    low, thickness, high = (float(q) for q in np.quantile(depth[known], (0.25, 0.5, 0.75)))
     behind = body & ~seen & (depth > thickness)
     label, _ = ndimage.label(behind)
     touched = np.unique(label[ndimage.binary_dilation(hidden, iterations=2) & behind])
     taken = np.isin(label, touched[touched > 0])
     if not taken.any():
         return none, {}
-    return taken, {"wall": thickness, **counts}
+    return taken, {
+        "wall": thickness,
+        "spread": high / max(low, 1e-9),
+        "free": int(free.sum()),
+        **counts,
+    }

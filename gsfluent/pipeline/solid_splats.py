@@ -49,6 +49,8 @@ _THIN = 0.2  # share of the skin that may stand on thinner walls
 _FINER = 2.6  # times: finer than that depths say nothing new
 _MOST_VOXELS = 24_000_000
 _LIM = 2.0
+_MOUTH = 0.5  # of what is hidden: less was a dimple, not the mouth of a vessel
+_EVEN = 1.6  # quartiles of a wall's thickness: what varies more is no wall
 _BAND = 2.5  # coarse voxels around the skin that are looked at again
 
 
@@ -216,12 +218,20 @@ def _carved(
 def _hollowed(
     body: np.ndarray, closed: Closed, fused: Fused, device: torch.device
 ) -> tuple[np.ndarray, str | None]:
-    """Without what is hidden behind an opening, and a word on it."""
+    """Without what is hidden behind an opening, and a word on it.
+
+    Only a vessel is hollowed on: what was looked into is at least half as large as what would be
+    taken, its wall is of one thickness, and no side of the object is unseen. A dimple, or a ragged
+    rim above an underside that nobody photographed, is no mouth.
+    """
     hidden, found = hidden_cavity(body, closed.loose, fused.near > 0, device)
     if not found:
         return body, None
     wall = found["wall"] * closed.box.voxel
     share = found["hidden"] / (found["hidden"] + found["seen"])
+    vessel = found["free"] >= _MOUTH * int(hidden.sum()) and found["spread"] <= _EVEN
+    if closed.notes["closed_side"] is not None or not vessel:
+        return body, f"solid where no camera looked; hollow: {wall:.3g} would take that out"
     word = (
         f"cameras see {100 * (1 - share):.0f} % of the cavity's wall, {wall:.3g} thick; "
         "the rest is taken to be as thick"

@@ -19,8 +19,12 @@ from gsfluent.errors import InputError
 from gsfluent.io import load_capture
 from gsfluent.pipeline import find_solid
 from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.fill_density import GridBox
 from gsfluent.pipeline.fill_hollow import cavity_volume, hidden_cavity
 from gsfluent.pipeline.fill_inside import find_leaks
+from gsfluent.pipeline.fill_vote import Closed
+from gsfluent.pipeline.solid_splats import _hollowed
+from gsfluent.pipeline.solid_tsdf import Fused
 from gsfluent.pipeline.winding import winding_numbers
 
 
@@ -143,6 +147,32 @@ def test_behind_a_mouth_the_wall_goes_on_as_thick_as_it_was_seen() -> None:
     # all of it seen: nothing is guessed
     assert hidden_cavity(body, closed, np.ones_like(closed))[1] == {}
     assert hidden_cavity(closed, closed, seen)[1] == {}
+
+
+def _dimpled(depth: int, closed_side: list[float] | None) -> tuple[np.ndarray, str | None]:
+    """A block with a pit of some depth whose floor nobody saw, after the guess about it."""
+    closed = np.zeros((40, 40, 60), bool)
+    closed[4:36, 4:36, 4:56] = True
+    body = closed.copy()
+    body[8:32, 8:32, 56 - depth : 56] = False
+    near = np.zeros_like(closed)
+    near[:, :, 57 - depth :] = True
+    box = GridBox((0.0, 0.0, 0.0), 1.0, (40, 40, 60))
+    notes = {"closed_side": closed_side}
+    fused = Fused(np.zeros(body.shape, np.float32), near, near, near)
+    block = Closed(box, closed, closed, closed, None, notes)
+    result, word = _hollowed(body, block, fused, torch.device("cpu"))
+    return body & ~result, word
+
+
+def test_a_vessel_is_hollowed_on_and_a_dimple_is_not() -> None:
+    taken, word = _dimpled(18, None)
+    assert taken.any() and word is not None and "as thick" in word
+    # an apple: its dimple's floor was hidden, or its underside was never photographed
+    for depth, side in ((10, None), (18, [0.0, 0.0, -1.0])):
+        taken, word = _dimpled(depth, side)
+        assert not taken.any()
+        assert word is not None and "solid where no camera looked" in word
 
 
 def test_leaks_are_told_with_place_and_size() -> None:
