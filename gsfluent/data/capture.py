@@ -71,6 +71,14 @@ class Capture:
         """Whether any photograph has a mask file (an alpha channel shows only on reading)."""
         return any(camera.mask_path is not None for camera in self.cameras)
 
+    def shows_masks(self) -> bool:
+        """Tell whether there are masks, as files or as the alpha channel of the first photograph.
+
+        Raises:
+            InputError: That photograph cannot be read.
+        """
+        return self.has_masks or self.view(0, 64).mask is not None
+
     def split(self, every: int = 8) -> tuple[Capture, Capture | None]:
         """Hold out every ``every``-th photograph: (train, held out or None when there are too few).
 

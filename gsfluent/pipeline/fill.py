@@ -18,7 +18,6 @@ from .fill_skin import skin_gaussians
 from .fill_view import cut_view
 from .fill_vote import VoteOptions, evidence
 from .solid_field import SignedDistance
-from .solid_splats import has_masks
 from .solid_thin import walls
 from .stage import Progress, Stage, report_progress
 from .voxels import nearest_empty
@@ -43,8 +42,8 @@ class Fill(Stage):
     """Decide what is inside a splat cloud and put Gaussians there.
 
     Steps: what is matter (:func:`gsfluent.pipeline.find_solid`: splats and their depths, masks, or
-    a mesh); distance transform; interior Gaussians on a jittered lattice; with a capture, an
-    opacity-only fit against the photographs and pruning of what turned transparent.
+    a mesh); distance transform; interior Gaussians as fine as the skin's splats where they meet
+    it; with a capture, removal of those that the photographs contradict.
 
     Args:
         resolution: Voxels along the longest side of the object.
@@ -271,7 +270,7 @@ class Fill(Stage):
             if not bool(solid.inside.any()):
                 raise InputError("fill: nothing is inside the solid that was given", "check it")
             return solid
-        if self.method == "hull" and not (capture is not None and has_masks(capture)):
+        if self.method == "hull" and not (capture is not None and capture.shows_masks()):
             raise InputError(
                 "fill: method 'hull' needs a capture with masks",
                 mend="add masks or use method: vote",

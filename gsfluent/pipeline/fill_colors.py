@@ -132,6 +132,9 @@ def outer_weights(gaussians: Gaussians) -> np.ndarray:
     middle, radius = 0.5 * (low + high), 0.55 * float((high - low).norm())
     best = torch.zeros(gaussians.count, dtype=torch.float64, device=gaussians.device)
     flat = torch.zeros_like(gaussians.means[:, :1])
+    # the smaller two scales: a disc seen edge on still counts fully
+    scale = gaussians.scales.sort(dim=1).values
+    size = scale[:, 0] * scale[:, 1]
     for near in ring_of_cameras(middle, max(radius, 1e-9), _VIEWS):
         camera = near.resized(_SIZE, _SIZE)
         shown = draw(gaussians, camera, colors=flat, contribution=True).contribution
@@ -139,9 +142,7 @@ def outer_weights(gaussians: Gaussians) -> np.ndarray:
         focal = float(camera.K[0, 0])
         view = camera.viewmat.to(gaussians.means)
         z = (gaussians.means @ view[2, :3] + view[2, 3]).clamp_min(1e-9)
-        scale = gaussians.scales.sort(dim=1).values
-        # the smaller two scales: a disc seen edge on still counts fully
-        area = scale[:, 0] * scale[:, 1] * (focal / z) ** 2 + 0.3
+        area = size * (focal / z) ** 2 + 0.3
         best = torch.maximum(best, (shown / (2.0 * np.pi * area)).double())
     result: np.ndarray = best.clamp(0.0, 1.0).cpu().numpy()
     return result
@@ -189,9 +190,14 @@ def skin_colors(
     return surface_colors(solid.gaussians, points, solid.voxel, weights=weights)
 
 
-def skin_weights(solid: Solid) -> np.ndarray:
-    """How much each splat of a solid says about the colour of its skin, float64 [N]."""
-    weight = outer_weights(solid.gaussians)
+def skin_weights(solid: Solid, shown: np.ndarray | None = None) -> np.ndarray:
+    """How much each splat of a solid says about the colour of its skin, float64 [N].
+
+    Args:
+        solid: A filled object.
+        shown: :func:`outer_weights` of its Gaussians, where they are known.
+    """
+    weight = outer_weights(solid.gaussians) if shown is None else shown.copy()
     weight[stray_splats(solid)] = 0.0
     weight[weight < _HIDDEN] = 0.0
     return weight
@@ -216,12 +222,11 @@ def keep_skin(solid: Solid, colored: Gaussians) -> Gaussians:
 
     if colored.labels is None or not bool((colored.labels == INTERIOR).any()):
         return colored
-    weights = outer_weights(colored)
-    share = torch.from_numpy(weights).to(colored.means) / _SHOWS
+    shown = outer_weights(colored)
+    share = torch.from_numpy(shown).to(colored.means) / _SHOWS
     share = torch.where(colored.labels == INTERIOR, share.clamp(max=1.0), 0.0)
     rows = (share > 0.05).nonzero()[:, 0]
-    weights[stray_splats(solid.replace(gaussians=colored))] = 0.0
-    weights[weights < _HIDDEN] = 0.0
+    weights = skin_weights(solid.replace(gaussians=colored), shown)
     points = colored.means[rows].double().cpu().numpy()
     skin = surface_colors(colored, points, solid.voxel, weights=weights)
     part = share[rows, None]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .voxels import distance_transform
+from .voxels import distance_transform, grown
 
 __all__ = ["cavity_volume", "hidden_cavity"]
 
@@ -117,7 +117,7 @@ def hidden_cavity(
     deep = distance_transform(free, device) > _SKIN if free.any() else none
     if not deep.any():
         return none, {}
-    free = ndimage.binary_dilation(deep, np.ones((3, 3, 3)), iterations=2) & free
+    free = grown(deep, 2) & free
     depth = distance_transform(np.pad(closed, 1), device)[1:-1, 1:-1, 1:-1]
     wall = body & ndimage.binary_dilation(free) & (depth > 1.0)
     known = wall & seen

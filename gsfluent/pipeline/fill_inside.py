@@ -23,7 +23,6 @@ __all__ = [
     "DIRECTIONS",
     "Vote",
     "cast_votes",
-    "count_leaks",
     "find_leaks",
     "keep_components",
     "smooth_boundary",
@@ -229,20 +228,6 @@ def keep_components(solid: np.ndarray, *, relative: float = 0.1) -> tuple[np.nda
     sizes[0] = 0
     wanted = sizes >= relative * sizes.max()
     return wanted[labels], int(count - wanted.sum())
-
-
-def count_leaks(shell: np.ndarray, inside: np.ndarray) -> tuple[int, int]:
-    """Openings through which a flood from outside would enter the object.
-
-    Args:
-        shell: Surface voxels that hold water back, bool [X, Y, Z].
-        inside: Voxels decided to be inside.
-
-    Returns:
-        Number of separate openings, and number of inner voxels that the flood would reach.
-    """
-    found = find_leaks(shell, inside, np.zeros(3), 1.0)
-    return found["leaks"], found["leaking_voxels"]
 
 
 def find_leaks(

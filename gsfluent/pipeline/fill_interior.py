@@ -17,6 +17,7 @@ from torch import Tensor
 from .fill_colors import surface_colors
 from .fill_pieces import hilbert_code, sample, signed_depth, small_pieces
 from .neighbours import nearest
+from .voxels import grown
 
 if TYPE_CHECKING:
     from gsfluent.data import Gaussians
@@ -243,9 +244,7 @@ def populate(
 
 def _strays(surface: Gaussians, solid: np.ndarray, box: GridBox) -> int:
     """Splats two voxels or more outside the solid; what is off the grid is outside."""
-    from scipy import ndimage
-
-    near = ndimage.binary_dilation(solid, np.ones((3, 3, 3)), iterations=2)
+    near = grown(solid, 2)
     means = surface.means.detach().double().cpu().numpy()
     index = np.floor((means - np.asarray(box.origin)) / box.voxel).astype(np.int64)
     held = ((index >= 0) & (index < solid.shape)).all(1)

@@ -99,7 +99,6 @@ def vote_solid(
     capture: Capture | None,
     resolution: int,
     options: VoteOptions,
-    box: GridBox | None = None,
 ) -> Closed:
     """Close a shell of splats.
 
@@ -108,7 +107,6 @@ def vote_solid(
         capture: Photographs; with masks, their visual hull is cut out of the result.
         resolution: Voxels along the longest side of the object.
         options: Settings of the vote.
-        box: The grid; chosen when None.
 
     Raises:
         InputError: Too few splats, none reaches the density of a surface, or the masks do not
@@ -121,9 +119,7 @@ def vote_solid(
             f"fill: needs at least {_FEW} Gaussians, got {gaussians.count}",
             mend="check that isolation kept the object",
         )
-    strays = 0
-    if box is None:
-        box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
+    box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
     field = density_field(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
     )

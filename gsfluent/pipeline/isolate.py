@@ -156,7 +156,7 @@ class Isolate(Stage):
             return "labels"
         if capture is None:
             return "all"
-        return "masks" if _has_masks(capture) else "plane"
+        return "masks" if capture.shows_masks() else "plane"
 
     def _standing(self, gaussians: Gaussians, capture: Capture) -> Tensor:
         """Splats above the support plane, in the focus region, connected to its middle."""
@@ -246,10 +246,6 @@ def find_plane(points: Tensor, cameras: Tensor, tolerance: float, seed: int = 0)
         offset = float(center @ normal)
     share = float((np.abs(cloud @ normal - offset) < tolerance).mean())
     return Plane(torch.from_numpy(normal.copy()), offset, share)
-
-
-def _has_masks(capture: Capture) -> bool:
-    return capture.has_masks or capture.view(0, 64).mask is not None
 
 
 def _focus_radius(capture: Capture, middle: Tensor) -> float:

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from gsfluent.data import Camera, Capture, Gaussians
 from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.fill_density import GridBox
-from gsfluent.pipeline.solid_field import SignedDistance, distances_of
+from gsfluent.pipeline.solid_field import SignedDistance
 
-__all__ = ["Outline", "drawn_outlines", "grown_to_masks", "mask_outlines", "match_outline"]
+__all__ = ["Outline", "drawn_outlines", "mask_outlines", "match_outline"]
 
 _SIZE = 400  # pixels of the pictures
 _CAMERAS = 8  # evenly chosen
@@ -94,34 +92,6 @@ def match_outline(
     wrong = torch.stack([((distance <= float(c)) != inside).sum() for c in tried])
     offset = round(trust * float(tried[int(wrong.argmin())]), 3)
     return field.replace(values=field.values - offset * field.voxel), offset
-
-
-def grown_to_masks(
-    occupied: np.ndarray,
-    allowed: np.ndarray,
-    box: GridBox,
-    capture: Capture,
-    device: torch.device | None = None,
-) -> tuple[np.ndarray, float]:
-    """Grow voxels until their outline is that of the masks.
-
-    Args:
-        occupied: Voxels, bool [X, Y, Z], with an empty rim of three.
-        allowed: Where they may grow, bool [X, Y, Z].
-        box: Their grid.
-        capture: Photographs, some with masks.
-        device: Where to compute.
-
-    Returns:
-        The voxels and the offset [voxels]; nothing shrinks.
-    """
-    values = torch.from_numpy(distances_of(occupied, device=device)).to(device) * box.voxel
-    origin = torch.tensor(box.origin, device=device)
-    field = SignedDistance(values, origin, box.voxel, "density")
-    field, offset = match_outline(field, mask_outlines(capture))
-    if offset <= 0:
-        return occupied, 0.0
-    return occupied | (field.inside.cpu().numpy() & allowed), offset
 
 
 def _nearest_along(field: SignedDistance, camera: Camera, row: Tensor, column: Tensor) -> Tensor:

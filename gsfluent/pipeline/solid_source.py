@@ -20,7 +20,7 @@ from gsfluent.pipeline.mesh_distance import load_mesh, oriented_samples, signed_
 from gsfluent.pipeline.reconstruct_init import visual_hull
 from gsfluent.pipeline.reconstruct_views import read_views
 from gsfluent.pipeline.solid_field import SignedDistance
-from gsfluent.pipeline.solid_splats import has_masks, solid_of_splats
+from gsfluent.pipeline.solid_splats import solid_of_splats
 from gsfluent.pipeline.winding import winding_numbers
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def _choose(
     mesh: Any,
 ) -> tuple[str, str]:
     """Which source, and why."""
-    masks = capture is not None and has_masks(capture)
+    masks = capture is not None and capture.shows_masks()
     needs = {"hull": masks, "density": gaussians is not None, "tsdf": gaussians is not None}
     if method != "auto":
         if not needs.get(method, mesh is not None):

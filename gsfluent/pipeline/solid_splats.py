@@ -117,7 +117,7 @@ def solid_of_splats(
     if finer and method != "density" and field.source != "density":
         field, word = _finer(field, visible, capture, closed, open_side)
         note += word
-    if match_masks and (match_drawn or (capture is not None and has_masks(capture))):
+    if match_masks and (match_drawn or (capture is not None and capture.shows_masks())):
         field = _matched(field, visible, capture, cameras, closed)
     return field.replace(report=notes | field.report), note
 
@@ -374,7 +374,7 @@ def _matched(
     closed: Closed | None,
 ) -> SignedDistance:
     """The field with the outline that masks show, or the splats when there are none."""
-    masked = capture is not None and has_masks(capture)
+    masked = capture is not None and capture.shows_masks()
     if not masked:
         grown, offset = match_outline(field, drawn_outlines(visible, cameras), trust=_DRAWN)
         notes = {"skin_offset": offset, "skin_from": "splats"}
@@ -398,8 +398,3 @@ def _matched(
         values = torch.maximum(values, torch.minimum(allowed, field.values))
     notes = {"skin_offset": offset, "skin_from": "masks"}
     return grown.replace(values=values, report=field.report | notes)
-
-
-def has_masks(capture: Capture) -> bool:
-    """Whether the photographs show what is the object."""
-    return capture.has_masks or capture.view(0, 64).mask is not None

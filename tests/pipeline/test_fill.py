@@ -16,7 +16,7 @@ from gsfluent.errors import InputError
 from gsfluent.io import load_capture
 from gsfluent.pipeline.fill import Fill, cut_view
 from gsfluent.pipeline.fill_density import GridBox, density_field
-from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, count_leaks
+from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, find_leaks
 
 
 def _bottom_missing(points: torch.Tensor) -> torch.Tensor:
@@ -197,14 +197,15 @@ def test_votes_of_a_box_and_of_a_cup() -> None:
     shell[3:11, 3:11, 3:11] = False
     assert cast_votes(shell).score[7, 7, 7] == 1.0
     assert cast_votes(shell).score[0, 0, 0] < 0.4
-    assert count_leaks(shell, cast_votes(shell).score > 0.8) == (0, 0)
+    found = find_leaks(shell, cast_votes(shell).score > 0.8, np.zeros(3), 1.0)
+    assert (found["leaks"], found["leaking_voxels"]) == (0, 0)
     cup = shell.copy()
     cup[3:11, 3:11, 11] = False
     vote = cast_votes(cup)
     assert vote.open_side == (0.0, 0.0, 1.0)
     assert vote.score[7, 7, 9] == 1.0
-    leaks, wet = count_leaks(cup, vote.score > 0.8)
-    assert leaks == 1 and wet > 400
+    found = find_leaks(cup, vote.score > 0.8, np.zeros(3), 1.0)
+    assert found["leaks"] == 1 and found["leaking_voxels"] > 400
     assert len(DIRECTIONS) == 26
 
 

@@ -7,9 +7,7 @@ import numpy as np
 from .domain import InteriorDomain
 from .photo import Exemplar
 
-__all__ = ["band_noise", "depth_profile", "match_colors", "profile_volume", "surface_profile"]
-
-_BANDS = (0.0, 0.8, 1.6, 3.2, 6.4)  # voxels; bands are differences of these Gaussian blurs
+__all__ = ["depth_profile", "match_colors", "profile_volume", "surface_profile"]
 
 
 def depth_profile(exemplar: Exemplar, bins: int = 48) -> tuple[np.ndarray, np.ndarray]:
@@ -34,59 +32,6 @@ def profile_volume(depth: np.ndarray, position: np.ndarray, color: np.ndarray) -
     """Colour [..., 3] at depths [...] of a profile (positions [B], colours [B, 3])."""
     channels = [np.interp(depth, position, color[:, c]) for c in range(3)]
     return np.stack(channels, -1).astype(np.float32)
-
-
-def band_noise(
-    exemplar: Exemplar,
-    residual: np.ndarray,
-    shape: tuple[int, ...],
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Noise volume whose bands have the colour covariance of the photograph's residual bands.
-
-    Args:
-        exemplar: The photograph at voxel pitch (its mask says which pixels count).
-        residual: Photograph minus its depth profile [H, W, 3].
-        shape: Volume shape.
-        rng: Random generator.
-
-    Returns:
-        float32 [*shape, 3], mean about zero (Heeger & Bergen 1995, without the histogram step).
-    """
-    from scipy import ndimage
-
-    mask = exemplar.mask
-    volume = np.zeros((*shape, 3), np.float32)
-    for low, high in zip(_BANDS, (*_BANDS[1:], None), strict=True):
-        if high is not None and 2.5 * high > min(shape):
-            high = None
-        band = _band(residual, low, high)
-        pixels = band[mask]
-        covariance = pixels.T @ pixels / max(len(pixels), 1)
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(values.clip(0.0))
-        # two thirds of the finest band is sensor noise and pixel edges rather than material
-        gain = 0.6 if low == 0.0 else 1.0
-        white = rng.standard_normal((*shape, 3), dtype=np.float32)
-        noise = np.stack([_band1(white[..., c], low, high, ndimage) for c in range(3)], -1)
-        noise /= max(float(noise.std()), 1e-9)
-        volume += (gain * noise @ root.T).astype(np.float32)
-        if high is None:
-            break
-    return volume
-
-
-def _band(image: np.ndarray, low: float, high: float | None) -> np.ndarray:
-    from scipy import ndimage
-
-    return np.stack([_band1(image[..., c], low, high, ndimage) for c in range(3)], -1)
-
-
-def _band1(field: np.ndarray, low: float, high: float | None, ndimage: object) -> np.ndarray:
-    blur = ndimage.gaussian_filter  # type: ignore[attr-defined]
-    fine = blur(field, low, mode="nearest") if low > 0 else field
-    result: np.ndarray = fine if high is None else fine - blur(field, high, mode="nearest")
-    return result
 
 
 def match_colors(
