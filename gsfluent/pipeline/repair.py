@@ -34,11 +34,22 @@ class Repaired(NamedTuple):
         gaussians: The carried splats, then the transition splats.
         groups: Sibling group of each splat, int32 [M + T]; -1 for splats without siblings.
         added: Number T of transition splats.
+        ids: Number of each splat that it keeps as long as it lives, int64 [M + T]: the row of a
+            carried splat, M and more for transition splats.
+        anchor: Material point each splat follows, int64 [M + T].
     """
 
     gaussians: Gaussians
     groups: Tensor
     added: int
+    ids: Tensor
+    anchor: Tensor
+
+    @classmethod
+    def none(cls, carried: Gaussians, anchor: Tensor) -> Repaired:
+        """Carried splats to which nothing was added."""
+        rows = torch.arange(carried.count, device=carried.device)
+        return cls(carried, torch.full_like(rows, -1, dtype=torch.int32), 0, rows, anchor)
 
 
 class Repair(Stage):
@@ -82,7 +93,7 @@ class Repair(Stage):
             graph = self._graph = _CrackGraph(carry, self.radius, self.neighbour_radius)
         parent, side = graph.pairs(motion)
         if parent.numel() == 0:
-            return Repaired(moved, none, 0)
+            return Repaired.none(moved, motion.anchor)
         center, shape = graph.lenses(parent, side)
         rest = carry.gaussians
         # Rigid with the unbroken side: its rotation about its own centre.
@@ -102,7 +113,11 @@ class Repair(Stage):
         )
         groups = torch.cat([none, parent.to(torch.int32)])
         groups[parent] = parent.to(torch.int32)
-        return Repaired(Gaussians.cat([moved, added]), groups, parent.numel())
+        # a pair of splats names its transition splat for good, in whatever order they are born
+        ids = torch.arange(moved.count, device=moved.device)
+        ids = torch.cat([ids, moved.count * (parent + 1) + side])
+        anchor = torch.cat([motion.anchor, motion.anchor[side]])
+        return Repaired(Gaussians.cat([moved, added]), groups, parent.numel(), ids, anchor)
 
 
 class _CrackGraph:

@@ -38,6 +38,16 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
     return Gaussians.cat(groups) if groups else None
 
 
+def bare_points(particles: Particles, scene: Scene) -> Tensor:
+    """Material point of each splat of :func:`bare_splats`, int64."""
+    rows = [
+        (particles.body == number).nonzero()[:, 0]
+        for number, body in enumerate(scene.bodies)
+        if body.solid is None
+    ]
+    return torch.cat(rows) if rows else particles.body.new_empty(0, dtype=torch.int64)
+
+
 def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
     """Steel-grey splats on the surfaces of the rigid things but endless planes, or None.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ from gsfluent.data import Gaussians
 from gsfluent.errors import RunError
 from gsfluent.io import atomic_path
 
-_HALF = ("quats", "opacities", "sh", "damage")
+_HALF = ("quats", "opacities", "sh", "damage", "velocity")
+_SPLATS = ("groups", "ids", "anchor")
+_POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "material")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +37,17 @@ class SavedFrame:
         groups: Siblings for nearest-only compositing, int32 [N], -1 for none.
         carried: How many of them came from the solids; the rest, at the end, are transition splats
             of the repair.
+        ids: Number of each splat that it keeps from frame to frame as long as it lives, int64 [N]:
+            0 and up for those of the solids and the repair, negative for those of bullets, liquids
+            and rigid things.
+        anchor: Material point each splat follows, int32 [N], -1 for splats of rigid things.
         positions: Material points [m], [P, 3].
         volumes: Their volumes [m^3], [P].
         damage: 0 intact to 1 broken, [P].
         fragments: Fragment number per point, int32 [P].
+        velocity: Velocity of each point [m/s], [P, 3].
+        body: Number of each point's body in the scene, int32 [P].
+        material: Row of each point in the scene's table of materials, int32 [P].
         facts: Plain figures of the frame (energies, counts).
     """
 
@@ -47,26 +56,21 @@ class SavedFrame:
     gaussians: Gaussians
     groups: Tensor
     carried: int
+    ids: Tensor
+    anchor: Tensor
     positions: Tensor
     volumes: Tensor
     damage: Tensor
     fragments: Tensor
+    velocity: Tensor
+    body: Tensor
+    material: Tensor
     facts: dict[str, Any]
 
     def to(self, device: torch.device) -> SavedFrame:
         """The same frame on another device."""
-        return SavedFrame(
-            self.index,
-            self.time,
-            self.gaussians.to(device),
-            self.groups.to(device),
-            self.carried,
-            self.positions.to(device),
-            self.volumes.to(device),
-            self.damage.to(device),
-            self.fragments.to(device),
-            self.facts,
-        )
+        moved = {name: getattr(self, name).to(device) for name in (*_SPLATS, *_POINTS)}
+        return replace(self, gaussians=self.gaussians.to(device), **moved)
 
 
 def frame_path(folder: Path, index: int) -> Path:
@@ -85,7 +89,7 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
         arrays[name] = _packed(name, getattr(frame.gaussians, name))
     if frame.gaussians.labels is not None:
         arrays["labels"] = frame.gaussians.labels.cpu().numpy().astype(np.int8)
-    for name in ("groups", "positions", "volumes", "damage", "fragments"):
+    for name in (*_SPLATS, *_POINTS):
         arrays[name] = _packed(name, getattr(frame, name))
     head = {
         "index": frame.index,
@@ -112,16 +116,12 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
             arrays = {name: data[name] for name in data.files}
         head = json.loads(str(arrays["head"]))
         return SavedFrame(
-            head["index"],
-            head["time"],
-            _gaussians(arrays),
-            _tensor(arrays["groups"]),
-            head["carried"],
-            _tensor(arrays["positions"]),
-            _tensor(arrays["volumes"]),
-            _tensor(arrays["damage"]),
-            _tensor(arrays["fragments"]),
-            head["facts"],
+            index=head["index"],
+            time=head["time"],
+            carried=head["carried"],
+            facts=head["facts"],
+            gaussians=_gaussians(arrays),
+            **{name: _tensor(arrays[name]) for name in (*_SPLATS, *_POINTS)},
         )
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         mend = "run the shot again; only this stage is redone (use --force if it is not)"

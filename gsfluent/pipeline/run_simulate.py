@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsfluent import materials
 from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
-from gsfluent.pipeline.rigid_splats import bare_splats, rigid_splats
+from gsfluent.pipeline.rigid_splats import bare_points, bare_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
 from gsfluent.pipeline.run_regions import load_solids
@@ -149,30 +150,42 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
 
     Splats of the solids, then of bullets, liquids and rigid things, then transitions.
     """
-    gaussians, groups = frame.gaussians, frame.groups
-    if groups is None:
-        groups = torch.full((gaussians.count,), -1, dtype=torch.int32, device=gaussians.device)
-    carried = frame.carried.count
+    repaired = frame.repaired
+    gaussians, groups, ids = repaired.gaussians, repaired.groups, repaired.ids
+    anchor, carried, others = repaired.anchor, frame.carried.count, 0
+    points = bare_points(frame.particles, scene)
     bare = bare_splats(frame.particles, scene)
     steel = rigid_splats(frame.rigid, frame.colliders)
-    for extra in (bare, steel):
+    for extra, follows in ((bare, points), (steel, None)):
         if extra is None:
             continue
-        first = torch.arange(gaussians.count, device=gaussians.device) < carried
-        parts = [gaussians.select(first), extra, gaussians.select(~first)]
-        alone = torch.full((extra.count,), -1, dtype=torch.int32, device=groups.device)
-        gaussians = Gaussians.cat(parts)
-        groups = torch.cat([groups[:carried], alone, groups[carried:]])
-        carried += extra.count
+        alone = torch.full((extra.count,), -1, dtype=torch.int64, device=ids.device)
+        numbers = -1 - others - torch.arange(extra.count, device=ids.device)
+        first = torch.arange(gaussians.count, device=ids.device) < carried
+        gaussians = Gaussians.cat([gaussians.select(first), extra, gaussians.select(~first)])
+        groups = _insert(groups, carried, alone)
+        ids = _insert(ids, carried, numbers)
+        anchor = _insert(anchor, carried, alone if follows is None else follows)
+        carried, others = carried + extra.count, others + extra.count
+    particles = frame.particles
     return SavedFrame(
         index=frame.index,
         time=frame.time,
         gaussians=gaussians,
         groups=groups,
         carried=carried,
-        positions=frame.particles.position,
-        volumes=frame.particles.volume,
+        ids=ids,
+        anchor=anchor.to(torch.int32),
+        positions=particles.position,
+        volumes=particles.volume,
         damage=frame.damage,
         fragments=frame.fragments,
+        velocity=particles.velocity,
+        body=particles.body,
+        material=particles.material,
         facts=dict(frame.stats) | {"energy": dict(frame.energy)},
     )
+
+
+def _insert(values: Tensor, row: int, more: Tensor) -> Tensor:
+    return torch.cat([values[:row], more.to(values), values[row:]])

@@ -83,8 +83,7 @@ class SimulationFrame:
         last.
         """
         if self._repair is None:
-            none = torch.full((self.carried.count,), -1, dtype=torch.int32)
-            return Repaired(self.carried, none.to(self.carried.device), 0)
+            return Repaired.none(self.carried, self.motion.anchor)
         return self._repair(self._binding(), self.motion, self.carried)
 
     @property

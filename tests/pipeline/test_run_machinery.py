@@ -132,10 +132,15 @@ def make_frame(index: int = 0) -> SavedFrame:
         gaussians=gaussians.replace(labels=labels),
         groups=torch.tensor([-1, -1, -1, 0, 0, 0, 1], dtype=torch.int32),
         carried=5,
+        ids=torch.tensor([0, 1, 2, 3, -1, 31, 2**40]),
+        anchor=torch.tensor([0, 1, 2, 3, -1, 3, 3], dtype=torch.int32),
         positions=torch.rand(4, 3, generator=generator),
         volumes=torch.full((4,), 1e-6),
         damage=torch.tensor([0.0, 0.25, 0.5, 1.0]),
         fragments=torch.tensor([0, 0, 1, -1], dtype=torch.int32),
+        velocity=torch.tensor([[0.5, 0.0, -1.0]]).repeat(4, 1),
+        body=torch.tensor([0, 0, 1, 1], dtype=torch.int32),
+        material=torch.tensor([0, 2, 1, 1], dtype=torch.int32),
         facts={"fragments": 2},
     )
 
@@ -147,7 +152,8 @@ def test_frame_comes_back_as_it_was(tmp_path: Path) -> None:
     assert (back.index, back.time, back.carried, back.facts) == (3, 0.1, 5, {"fragments": 2})
     for name in ("means", "scales", "labels"):
         assert torch.equal(getattr(back.gaussians, name), getattr(frame.gaussians, name))
-    for name in ("groups", "positions", "volumes", "damage", "fragments"):
+    splats, points = ("groups", "ids", "anchor"), ("positions", "volumes", "damage", "fragments")
+    for name in (*splats, *points, "velocity", "body", "material"):
         assert torch.equal(getattr(back, name), getattr(frame, name))
     torch.testing.assert_close(back.gaussians.sh, frame.gaussians.sh, atol=2e-3, rtol=1e-3)
 
