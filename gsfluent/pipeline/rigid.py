@@ -29,6 +29,8 @@ THINNEST = 2.0
 BACKED = 6.0
 """Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
 it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
+AWAY = 1e4
+"""How far up a free body waits for its start [m]."""
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -74,8 +76,9 @@ class RigidSet:
             torch.stack(rows) if rows else torch.zeros(0, columns.COLLIDER_COLUMNS).double()
         )
         self._motion = self.start[:, [10, 11, 12, 20, 21, 22]].clone()
+        self._begin = self.start
         self.start = self.scheduled(self.start, 0.0).to(device)
-        self._motion = self._motion.to(device)
+        self._motion, self._begin = self._motion.to(device), self._begin.to(device)
         self.sdf = torch.cat(self._grids).to(device) if self._grids else None
         self._pull = math.hypot(*scene.gravity)
         self._free = [
@@ -95,16 +98,25 @@ class RigidSet:
     @property
     def moves(self) -> bool:
         """Whether any of them ever moves."""
-        return bool((self._motion != 0).any() or (self.start[:, columns.MASS] > 0).any())
+        return bool((self._motion != 0).any()) or self.frees
 
     def scheduled(self, rows: Tensor, time: float) -> Tensor:
-        """Rows with the velocities that hold from ``time`` on; free bodies keep theirs."""
+        """Rows with the velocities that hold from ``time`` on; free bodies keep theirs.
+
+        A free body that starts later waits out of reach, as a row without mass.
+        """
         if all(c is None or _steady(c) for c in self._colliders):
             return rows
         rows = rows.clone()
         for i, c in enumerate(self._colliders):
             if c is not None and not _steady(c):
                 on = c.start <= time < c.stop
+                if c.mass is not None:
+                    if not on:
+                        rows[i] = _waiting(self._begin[i])
+                    elif rows[i, columns.MASS] == 0.0:
+                        rows[i] = self._begin[i]
+                    continue
                 motion = self._motion[i] if on else torch.zeros_like(self._motion[i])
                 rows[i, 10:13], rows[i, 20:23] = motion[:3], motion[3:]
         return rows
@@ -243,7 +255,9 @@ class RigidSet:
             Points [P, 3] and normals [P, 3] in scene metres, and the largest spacing [m].
         """
         found, normals, widest = [], [], 0.0
-        for row in map(self._drawn, self._colliders, rows):
+        for c, row in zip(self._colliders, map(self._drawn, self._colliders, rows), strict=True):
+            if c is not None and c.mass is not None and row[columns.MASS] == 0.0:
+                continue  # waiting
             bound = self._bound(row)
             if not math.isfinite(bound):
                 continue
@@ -292,13 +306,6 @@ class RigidSet:
         volume, inertia, extra = self._shape(c)
         mass = c.mass or 0.0
         point, velocity = list(c.point), list(c.velocity)
-        if c.mass is not None:
-            # It passes its point at its start: where it comes from follows from free flight.
-            velocity = [v - g * c.start for v, g in zip(velocity, self._gravity, strict=True)]
-            point = [
-                x - v * c.start - 0.5 * g * c.start**2
-                for x, v, g in zip(point, velocity, self._gravity, strict=True)
-            ]
         shape: dict[str, Any] = {"point": point, "orientation": c.orientation} | extra
         if c.backed:
             half = 0.5 * max(c.size[2], BACKED * self.dx)
@@ -399,9 +406,19 @@ def _kinetic(rows: Tensor) -> Tensor:
     return 0.5 * (rows[:, columns.MASS] * (rows[:, 10:13] ** 2).sum(dim=1) + spin)
 
 
+def _waiting(row: Tensor) -> Tensor:
+    """A free body before its start: out of reach, without mass."""
+    row = row.clone()
+    row[5] += AWAY
+    row[columns.ANGULAR_VELOCITY : columns.EXTENT] = 0.0
+    row[10:13] = 0.0
+    row[columns.MASS] = 0.0
+    return row
+
+
 def _steady(c: Collider) -> bool:
-    """Whether a collider needs no schedule: free, or moving (or standing) for ever."""
-    return c.mass is not None or (c.start <= 0.0 and math.isinf(c.stop))
+    """Whether a collider needs no schedule: moving (or standing, or free) from the start on."""
+    return c.start <= 0.0 and math.isinf(c.stop)
 
 
 def _matrix(q: tuple[float, float, float, float]) -> Tensor:

@@ -273,7 +273,7 @@ class Simulate(Stage):
             with torch.no_grad():
                 if not run.advance_to(index, self.step_hook):
                     return
-                frame = _frame(run, index, carry, repair)
+                frame = frame_of(run, index, carry, repair)
             report_progress(progress, index + 1, count, f"t = {frame.time:.3f} s")
             yield frame
 
@@ -298,15 +298,18 @@ class Simulate(Stage):
         return self._run.report()
 
 
-def _frame(run: Run, index: int, carry: Carry | None, repair: Repair | None) -> SimulationFrame:
-    """Measure the present state of a run and wrap it up as a frame."""
-    now, pieces, stats = run.record(index)
+def frame_of(
+    run: Run, index: int, carry: Carry | None, repair: Repair | None, time: float | None = None
+) -> SimulationFrame:
+    """Measure the present state of a run and wrap it up as a frame (``time``: index / fps)."""
+    time = index / run.fps if time is None else time
+    now, pieces, stats = run.record(index, time)
     peak, start = run.state.peak, run.matter.particles.alpha
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
     damage = torch.where(run.matter.brittle, damage, 0.0)
     return SimulationFrame(
         index=index,
-        time=index / run.fps,
+        time=time,
         particles=run.state.particles,
         damage=damage.clamp(0.0, 1.0),
         fragments=pieces.labels,

@@ -16,6 +16,7 @@ from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
 from gsfluent.pipeline.simulate_figures import Figures
 from gsfluent.pipeline.simulate_health import CHECK_EVERY, Ledger, Watch, figures_of
+from gsfluent.pipeline.simulate_kick import Kicks
 from gsfluent.pipeline.simulate_solver import Counters, Unhealthy
 from gsfluent.pipeline.simulate_state import State, load_state, save_state
 from gsfluent.pipeline.simulate_step import Stepper
@@ -48,7 +49,9 @@ class Run:
         max_rollbacks: int,
     ) -> None:
         self.scene, self.matter, self.fps = scene, matter, fps
+        self.options = options
         self.stepper = Stepper(scene, matter, **options)
+        self.kicks = Kicks(scene, matter)
         self.state = self.stepper.initial()
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
@@ -72,11 +75,17 @@ class Run:
         """Number of the first frame that has not been made."""
         return len(self.per_frame)
 
-    def advance_to(self, frame: int, hook: Hook | None) -> bool:
-        """Advance to the time of a frame; return False when the run had to be given up."""
+    def advance_to(self, frame: int, hook: Hook | None, time: float | None = None) -> bool:
+        """Advance to the time of a frame; return False when the run had to be given up.
+
+        Args:
+            frame: Its number.
+            hook: See :class:`gsfluent.pipeline.Simulate`.
+            time: Its time [s]; ``frame / fps`` when absent.
+        """
         begun = clock.perf_counter()
         state, stepper, watch = self.state, self.stepper, self.watch
-        until = frame / self.fps
+        until = frame / self.fps if time is None else time
         # A frame is a clean start: what follows does not depend on what was cached before it, so a
         # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
         stepper.reset()
@@ -88,7 +97,9 @@ class Run:
             trouble: Unhealthy | None = None
             try:
                 left = CHECK_EVERY - (state.step - checked)
-                now = stepper.advance(state, until, 1 if hook is not None else left)
+                state = self.kicks.given(state)
+                stop = min(until, self.kicks.next_change(state))
+                now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
                     trouble = watch.check(state, stepper)
@@ -146,14 +157,16 @@ class Run:
             near = near & ~cut_apart(state.cut[a], state.cut[b])
         return links[near]
 
-    def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:
-        """Measure the present state and add it to the per-frame records."""
+    def record(
+        self, index: int, time: float | None = None
+    ) -> tuple[Figures, Fragments, dict[str, Any]]:
+        """Measure the present state and add it to the per-frame records (``time``: of it)."""
         state, matter = self.state, self.matter
         now = figures_of(matter, state, self.scene.gravity)
         self.figures = now
         pieces = self._fragments(state)
         stats = {
-            "time": index / self.fps,
+            "time": index / self.fps if time is None else time,
             "kinetic": now.kinetic,
             "elastic": now.elastic,
             "dissipated": self.start.total - now.total,
