@@ -79,15 +79,21 @@ class Events(RigidThings):
         Raises:
             InputError: A number out of range or an unknown body.
         """
+        if number("throw at", at, low=0.0) > 0.0:
+            self.kick(velocity, spin, object, at)
+            return
         moved, turned_ = vector("throw velocity", velocity), vector("throw spin", spin)
-        at = number("throw at", at, low=0.0)
         for index in self._targets(object):
-            if at > 0.0:
-                self.kicks.append(Kick(index, moved, turned_, at))
-                continue
             self.bodies[index] = dataclasses.replace(
                 self.bodies[index], velocity=moved, angular_velocity=turned_
             )
+
+    def kick(
+        self, velocity: Sequence[float], spin: Sequence[float], object: str | None, at: float
+    ) -> None:
+        """Add to the motion of a solid at a time: what :meth:`throw` does after time 0."""
+        kick = Kick(0, vector("throw velocity", velocity), vector("throw spin", spin), at)
+        self.kicks += [dataclasses.replace(kick, body=index) for index in self._targets(object)]
 
     def collide(
         self,

@@ -13,6 +13,7 @@ from gsfluent import materials
 from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
+from gsfluent.pipeline.particles import grid_spacing
 from gsfluent.pipeline.rigid_splats import bare_points, bare_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
@@ -90,7 +91,7 @@ def simulate_stage(context: RunContext) -> None:
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        shot.solve.quality,
+        [shot.solve.quality, shot.solve.cells, shot.solve.standing],
         shot.output.fps,
         shot.output.seconds,
     ]
@@ -98,10 +99,13 @@ def simulate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         scene = build_scene(shot, load_solids(context), context.frame)
+        cells = shot.solve.cells
         stage = Simulate(
             quality=shot.solve.quality,
             seed=context.seed,
             device=context.device,
+            dx=None if cells is None else grid_spacing(scene, cells),
+            standing=shot.solve.standing,
             deterministic=shot.solve.deterministic,
         )
         state = folder / _STATE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import time as clock
 from collections.abc import Callable
@@ -48,10 +49,9 @@ class Run:
         options: dict[str, Any],
         max_rollbacks: int,
     ) -> None:
-        self.scene, self.matter, self.fps = scene, matter, fps
-        self.options = options
+        self.fps, self._options = fps, options
         self.stepper = Stepper(scene, matter, **options)
-        self.kicks = Kicks(scene, matter)
+        self._set(scene, matter)
         self.state = self.stepper.initial()
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
@@ -64,11 +64,39 @@ class Run:
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""
-        self._links = rest_links(matter.rest, matter.ranges, matter.spacing)
+        self.links = rest_links(matter.rest, matter.ranges, matter.spacing)
+        self._pieces: tuple[State, Fragments] | None = None
+
+    def _set(self, scene: Scene, matter: Matter) -> None:
+        self.scene, self.matter = scene, matter
+        self.kicks = Kicks(scene, matter)
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
-        self._pieces: tuple[State, Fragments] | None = None
+
+    def fit(self, scene: Scene, matter: Matter) -> None:
+        """Go on with another scene and its matter; see :mod:`gsfluent.pipeline.simulate_grow`."""
+        before = self.stepper
+        self.stepper = Stepper(scene, matter, **self._options, flights=before.flights)
+        self.stepper.resume(before.counters)
+        self.stepper.field_limit, self.stepper.dt_scale = before.field_limit, before.dt_scale
+        self._set(scene, matter)
+        self._pieces = None
+        self.watch.matter, self.watch.names = matter, [body.name for body in scene.bodies]
+
+    def twin(self) -> Run:
+        """A run of its own that goes on from here."""
+        other = copy.copy(self)
+        other.per_frame = list(self.per_frame)
+        other.watch, other.ledger = self.watch.twin(), copy.copy(self.ledger)
+        other.ledger.held = list(self.ledger.held)
+        other.stepper = Stepper(
+            self.scene, self.matter, **self._options, flights=self.stepper.flights
+        )
+        other.stepper.resume(dataclasses.replace(self.stepper.counters))
+        other.stepper.field_limit = self.stepper.field_limit
+        other.stepper.dt_scale = self.stepper.dt_scale
+        return other
 
     @property
     def next_frame(self) -> int:
@@ -129,7 +157,7 @@ class Run:
         """The pieces of a state; those of the last one asked for are kept."""
         if self._pieces is None or self._pieces[0] is not state:
             found = find_fragments(
-                self._links,
+                self.links,
                 self.matter.rest,
                 state.particles.position,
                 (state.peak >= 0) | self._flowing,
@@ -149,7 +177,7 @@ class Run:
 
     def _holding(self, state: State) -> Tensor:
         """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
-        links = self._links.to(state.position.device)
+        links = self.links.to(state.position.device)
         a, b = links.unbind(dim=1)
         rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
         near = now <= STRETCH_LIMIT * rest
