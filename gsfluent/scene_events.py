@@ -52,6 +52,11 @@ class Events(RigidThings):
             lowest = float(body.bounds()[0][2])
             self._shift(index, (0.0, 0.0, (self.floor or 0.0) + height - lowest))
 
+    def lift(self, height: float) -> None:
+        """Move all solids up together by ``height`` [m]."""
+        for index in self._targets(None):
+            self._shift(index, (0.0, 0.0, number("lift height", height)))
+
     def throw(
         self,
         velocity: Sequence[float],

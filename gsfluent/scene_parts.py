@@ -186,6 +186,9 @@ class Collider:
         stop: When it stands still [s].
         backed: A box that meets matter with its face (own +z) only: the grid may see it thicker
             behind.
+        appears: From when it is there [s].
+        vanishes: Until when it is there [s].
+        shown: Whether it is drawn.
     """
 
     name: str
@@ -206,6 +209,13 @@ class Collider:
     start: float = 0.0
     stop: float = math.inf
     backed: bool = False
+    appears: float = 0.0
+    vanishes: float = math.inf
+    shown: bool = True
+
+    def there(self, time: float) -> bool:
+        """Whether it is there at a time [s]."""
+        return self.appears <= time < self.vanishes
 
 
 @dataclasses.dataclass(frozen=True)

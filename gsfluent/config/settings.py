@@ -399,9 +399,17 @@ class LightSettings:
 class OutputSettings:
     """``output:`` - what is made of the simulation."""
 
-    fps: float = key(number(1.0, 1000.0), default=30.0, doc="Frames per second.", example="30")
+    fps: float = key(
+        number(1.0, 10000.0), default=30.0, doc="Frames per simulated second.", example="30"
+    )
     seconds: float = key(
         number(0.0, 3600.0, above=0.0), default=2.0, doc="Simulated time [s].", example="2"
+    )
+    slow: float = key(
+        number(0.01, 1000.0),
+        default=1.0,
+        doc="How many times slower than it happened the video plays: 10 shows 0.2 s in 2 s.",
+        example="10",
     )
     size: tuple[int, int] = key(
         _size, default=(1280, 720), doc="Width and height of the video [pixels].",
@@ -422,3 +430,8 @@ class OutputSettings:
         default=("mp4",),
         doc="What to write.", example="[mp4, ply-seq]",
     )  # fmt: skip
+
+    @property
+    def video_fps(self) -> float:
+        """Frames per second at which the video plays."""
+        return self.fps / self.slow

@@ -29,6 +29,7 @@ THINNEST = 2.0
 BACKED = 6.0
 """Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
 it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
+_NOTHING = columns.TYPES["nothing"]
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -74,6 +75,7 @@ class RigidSet:
             torch.stack(rows) if rows else torch.zeros(0, columns.COLLIDER_COLUMNS).double()
         )
         self._motion = self.start[:, [10, 11, 12, 20, 21, 22]].clone()
+        self._types = self.start[:, columns.TYPE].tolist()
         self.start = self.scheduled(self.start, 0.0).to(device)
         self._motion = self._motion.to(device)
         self.sdf = torch.cat(self._grids).to(device) if self._grids else None
@@ -94,11 +96,13 @@ class RigidSet:
 
     @property
     def moves(self) -> bool:
-        """Whether any of them ever moves."""
+        """Whether any of them ever moves, comes or goes."""
+        if not all(c is None or c.mass is not None or _steady(c) for c in self._colliders):
+            return True
         return bool((self._motion != 0).any() or (self.start[:, columns.MASS] > 0).any())
 
     def scheduled(self, rows: Tensor, time: float) -> Tensor:
-        """Rows with the velocities that hold from ``time`` on; free bodies keep theirs."""
+        """Rows from ``time`` on: their velocities (free bodies keep theirs), and who is there."""
         if all(c is None or _steady(c) for c in self._colliders):
             return rows
         rows = rows.clone()
@@ -107,10 +111,11 @@ class RigidSet:
                 on = c.start <= time < c.stop
                 motion = self._motion[i] if on else torch.zeros_like(self._motion[i])
                 rows[i, 10:13], rows[i, 20:23] = motion[:3], motion[3:]
+                rows[i, columns.TYPE] = self._types[i] if c.there(time) else _NOTHING
         return rows
 
     def next_change(self, time: float) -> float:
-        """The next time after ``time`` at which a plate starts or stops [s], or infinity."""
+        """The next time after ``time`` at which one starts or stops [s], or infinity."""
         changes = [t for c in self._colliders if c is not None for t in (c.start, c.stop)]
         return min((t for t in changes if t > time), default=math.inf)
 
@@ -163,8 +168,14 @@ class RigidSet:
         return self.speeds(rows).max() if self.count else rows.new_zeros(())
 
     def moving(self, rows: Tensor) -> Tensor:
-        """Colliders that move, or that gravity is about to move: their rows, [K, 32]."""
+        """Colliders that move, that gravity is about to move, or that will go: rows, [K, 32].
+
+        What leans on something that will go must not sleep: nobody would wake it.
+        """
         active = self.speeds(rows) > 0.0
+        for i, c in enumerate(self._colliders):
+            if c is not None and math.isfinite(c.vanishes):
+                active[i] |= rows[i, columns.TYPE] != _NOTHING
         for i in self._free if self._pull > 0.0 else ():
             bottom = float(rows[i, 5]) - self._reach(i, rows)
             active[i] |= self.floor is None or bottom > self.floor + 1e-9
@@ -243,7 +254,10 @@ class RigidSet:
             Points [P, 3] and normals [P, 3] in scene metres, and the largest spacing [m].
         """
         found, normals, widest = [], [], 0.0
-        for row in map(self._drawn, self._colliders, rows):
+        for collider, one in zip(self._colliders, rows, strict=True):
+            if collider is not None and not collider.shown:
+                continue
+            row = self._drawn(collider, one)
             bound = self._bound(row)
             if not math.isfinite(bound):
                 continue

@@ -40,18 +40,28 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     """
     scene = Scene(
         floor=None if shot.floor == "none" else 0.0,
+        gravity=shot.gravity,
         floor_mode=shot.floor_mode,
         floor_friction=shot.floor_friction,
     )
     for name, settings in shot.objects.items():
         parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
         scene.add(solids[name], _material(settings), frame=frame, parts=parts, name=name)
+    if shot.floor == "auto":
+        _lift(scene)
     for collider in shot.colliders:
         keys = collider_dict(collider)
         scene.add_collider(keys.pop("type"), **keys)
     for event in shot.events:
         scene.add_event(event_dict(event))
     return scene
+
+
+def _lift(scene: Scene) -> None:
+    """Put objects on a floor that was found for them: a filled solid reaches below its splats."""
+    lowest = min(float(body.bounds()[0][2]) for body in scene.bodies)
+    if scene.floor is not None and lowest < scene.floor:
+        scene.lift(scene.floor - lowest)
 
 
 def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
@@ -78,7 +88,7 @@ def simulate_stage(context: RunContext) -> None:
         objects,
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
-        [shot.floor, shot.floor_mode, shot.floor_friction],
+        [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
         shot.solve.quality,
         shot.output.fps,
         shot.output.seconds,
