@@ -136,29 +136,3 @@ class Render(Verb):
                 device=self.torch_device(),
                 progress=progress,
             )
-
-
-@dataclass(kw_only=True)
-class Export(Verb):
-    """Write a finished simulation in other programs' formats.
-
-    Examples:
-      gsfluent export out --to ply-seq        # frames/frame_0001.ply ..., for any splat viewer
-      gsfluent export out --to vtk            # particles/particles_0001.vtk ..., for ParaView
-      gsfluent export out --to ply-seq,mp4,vtk
-    """
-
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder that `gsfluent run` wrote."""
-    to: str
-    """Comma-separated: mp4, ply-seq, vtk."""
-
-    def execute(self) -> dict[str, Any]:
-        """Export."""
-        from gsfluent.pipeline.export import export
-
-        existing(self.out, "OUT", folder=True)
-        with self.progress("export") as progress:
-            return export(
-                self.out, self.to.split(","), device=self.torch_device(), progress=progress
-            )
