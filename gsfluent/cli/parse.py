@@ -13,6 +13,7 @@ from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
 from gsfluent.cli.verbs_run import Demo, Export, Render, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
+from gsfluent.cli.verbs_view import View
 
 VERBS: dict[str, type[Verb]] = {
     "doctor": Doctor,
@@ -25,6 +26,7 @@ VERBS: dict[str, type[Verb]] = {
     "plan": Plan,
     "run": Run,
     "render": Render,
+    "view": View,
     "export": Export,
     "metrics": Metrics,
 }

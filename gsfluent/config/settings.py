@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from gsfluent.config.read import (
     Place,
@@ -337,29 +337,6 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
             f"method {method} needs it; or choose another",
         )
     return settings
-
-
-@dataclasses.dataclass(frozen=True)
-class SolveSettings:
-    """``solve:`` - how accurately."""
-
-    LATER: ClassVar[dict[str, str]] = {
-        "error": "choosing the setting by an error bound",
-        "seconds_per_frame": "choosing the setting by a time budget",
-    }
-    quality: str = key(
-        choice("preview", "shot", "hero"),
-        default="shot",
-        doc="Size of the cells of the grid.",
-        example="preview",
-    )
-    deterministic: bool = key(
-        flag,
-        default=False,
-        doc="Insist on the same bits from the same input on the same device. The solver gives them "
-        "anyway; a blade at work on a GPU does not, and is refused then.",
-        example="true",
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import copy
 import logging
 import math
 from collections.abc import Sequence
@@ -213,6 +214,12 @@ class Watch:
         cause, mend = CAUSES[self.kind]
         return f"frame {frame}: {self.reasons[-1]}; likely cause: {cause}; mend: {mend}"
 
+    def twin(self) -> Watch:
+        """A watch of its own that knows what this one knows."""
+        other = copy.copy(self)
+        other.reasons, other._ring = list(self.reasons), self._ring.copy()
+        return other
+
     def state(self) -> dict[str, float | int | list[str]]:
         """Return what a resumed run needs."""
         return {
@@ -258,6 +265,25 @@ class Ledger:
         self.worst = 0.0
         # Two bodies thrown at each other have no momentum together, but a scale of it.
         self.scale = max(float(self.start.norm()), (2.0 * self.mass * start.kinetic) ** 0.5)
+
+    def change(
+        self, mass: float, momentum: Tensor, time: float, waits: Sequence[tuple[float, float]]
+    ) -> None:
+        """Enter matter that comes or leaves.
+
+        Args:
+            mass: What comes [kg]; negative for what leaves.
+            momentum: Of what comes [N s], [3]; likewise.
+            time: Now [s].
+            waits: Mass and time of what waits at first.
+        """
+        self.start = self.start + momentum - self.gravity * (mass * time)
+        for weight, until in self.held:  # what waits no longer is a constant
+            self.start = self.start - self.gravity * (weight * until if until <= time else 0.0)
+        self.held = [(weight, until) for weight, until in self.held if until > time]
+        self.held += waits
+        self.start = self.start + self.gravity * (sum(weight for weight, _ in waits) * time)
+        self.mass += mass
 
     def error(self, state: State, now: Figures) -> float:
         """Return the relative error of the balance at this moment.
