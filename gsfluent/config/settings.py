@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from gsfluent.config.read import (
     Place,
@@ -346,29 +346,6 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class SolveSettings:
-    """``solve:`` - how accurately."""
-
-    LATER: ClassVar[dict[str, str]] = {
-        "error": "choosing the setting by an error bound",
-        "seconds_per_frame": "choosing the setting by a time budget",
-    }
-    quality: str = key(
-        choice("preview", "shot", "hero"),
-        default="shot",
-        doc="Size of the cells of the grid.",
-        example="preview",
-    )
-    deterministic: bool = key(
-        flag,
-        default=False,
-        doc="Insist on the same bits from the same input on the same device. The solver gives them "
-        "anyway; a blade at work on a GPU does not, and is refused then.",
-        example="true",
-    )
-
-
-@dataclasses.dataclass(frozen=True)
 class KeyLight:
     """``light.key:`` - the directional light."""
 
@@ -405,9 +382,17 @@ class LightSettings:
 class OutputSettings:
     """``output:`` - what is made of the simulation."""
 
-    fps: float = key(number(1.0, 1000.0), default=30.0, doc="Frames per second.", example="30")
+    fps: float = key(
+        number(1.0, 10000.0), default=30.0, doc="Frames per simulated second.", example="30"
+    )
     seconds: float = key(
         number(0.0, 3600.0, above=0.0), default=2.0, doc="Simulated time [s].", example="2"
+    )
+    slow: float = key(
+        number(0.01, 1000.0),
+        default=1.0,
+        doc="How many times slower than it happened the video plays: 10 shows 0.2 s in 2 s.",
+        example="10",
     )
     size: tuple[int, int] = key(
         _size, default=(1280, 720), doc="Width and height of the video [pixels].",
@@ -429,3 +414,8 @@ class OutputSettings:
         default=("mp4",),
         doc="What to write.", example="[mp4, ply-seq]",
     )  # fmt: skip
+
+    @property
+    def video_fps(self) -> float:
+        """Frames per second at which the video plays."""
+        return self.fps / self.slow

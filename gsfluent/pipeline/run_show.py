@@ -151,7 +151,7 @@ def render_stage(context: RunContext) -> None:
     shot = context.shot
     light = light_of(shot)
     output = [list(shot.output.size), str(shot.output.camera), shot.output.fps]
-    output.append(shot.output.backdrop)
+    output += [shot.output.slow, shot.output.backdrop]
     path = shot.output.camera
     camera_key = content_digest(path) if isinstance(path, Path) else None
     key = fingerprint("render", context.key(context.source_key, repr(light), output, camera_key))
@@ -180,7 +180,9 @@ def render_stage(context: RunContext) -> None:
                 report_progress(progress, index + 1, len(film), "")
                 yield picture
 
-        write_video(folder / "video.mp4", pictures(), fps=shot.output.fps, size=shot.output.size)
+        write_video(
+            folder / "video.mp4", pictures(), fps=shot.output.video_fps, size=shot.output.size
+        )
         report["seconds_per_frame"] = drawing / len(film)
         report["poster_frame"] = poster_frame(counts, shot.output.fps)
         best = film.frame(report["poster_frame"])
@@ -300,7 +302,7 @@ def render_again(
             yield to_bytes(film.picture(film.frame(index)))
             report_progress(progress, index + 1, len(film), "")
 
-    count = write_video(target, pictures(), fps=shot.output.fps, size=shot.output.size)
+    count = write_video(target, pictures(), fps=shot.output.video_fps, size=shot.output.size)
     seconds = (time.perf_counter() - start) / count
     return {"output": str(target), "frames": count, "seconds_per_frame": seconds}
 
