@@ -24,9 +24,9 @@ from gsfluent.config.settings import (
     LightSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
 )
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot, load_shot
 
 __all__ = [

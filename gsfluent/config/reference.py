@@ -18,10 +18,10 @@ from gsfluent.config.settings import (
     OutputSettings,
     PhotoSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
 )
 from gsfluent.config.settings_inpaint import InpaintSettings
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot
 
 SECTIONS: dict[str, type[Any]] = {

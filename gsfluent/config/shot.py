@@ -32,11 +32,11 @@ from gsfluent.config.settings import (
     LightSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
     Vector,
     read_texture,
 )
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.errors import InputError
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
