@@ -42,9 +42,15 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
     return sides
 
 
+EXPORTS = (
+    "ply-seq", "spz", "splat", "glb", "usd", "vtk", "points", "vti",
+)  # fmt: skip
+"""What a run can write beside the video; ``gsfluent export`` writes these and more."""
+
+
 def _camera(value: Any, place: Place) -> str | int | Path:
-    if value == "orbit":
-        return "orbit"
+    if value in ("orbit", "turntable", "dolly"):
+        return str(value)
     if isinstance(value, str):
         return existing_path(value, place)
     index: int = whole(0, 10**9)(value, place)
@@ -394,7 +400,8 @@ class OutputSettings:
     )  # fmt: skip
     camera: str | int | Path = key(
         _camera, default="orbit",
-        doc="orbit, the number of a photograph (0 is the first), or a JSON file with a path.",
+        doc="orbit, turntable, dolly, the number of a photograph (0 is the first), or a path: "
+        "a JSON file, a transforms.json or a COLMAP folder.",
         example="orbit",
     )  # fmt: skip
     backdrop: str = key(
@@ -403,7 +410,7 @@ class OutputSettings:
         example="captured",
     )  # fmt: skip
     what: tuple[str, ...] = key(
-        several(choice("mp4", "ply-seq", "vtk", later=("usd", "png-seq", "spz", "gltf"))),
+        several(choice("mp4", *EXPORTS)),
         default=("mp4",),
         doc="What to write.", example="[mp4, ply-seq]",
     )  # fmt: skip

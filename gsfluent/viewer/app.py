@@ -56,6 +56,7 @@ class App:
         playback: The clock.
         index: Frame shown.
         follow: Whether each new frame is shown as it comes.
+        lock: Held while the frame shown changes.
         shift: Scene position = position in the browser + shift [m]; changes while the view follows
             the object.
 
@@ -93,7 +94,7 @@ class App:
         self.shift = (0.0, 0.0, 0.0)
         self._anchor = self._center(self.index)
         self._problem = ""
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         self._done = threading.Event()
         self.browser = BrowserSplats(self.timeline) if splats else None
         self.server = start_server(host, port, f"gsfluent · {source.title}")
@@ -125,7 +126,7 @@ class App:
 
     def show(self, index: int) -> None:
         """Go to frame ``index``."""
-        with self._lock:
+        with self.lock:
             self.index = max(0, min(index, self.timeline.count - 1))
             if self.tracking:
                 center = self._center(self.index)
@@ -164,7 +165,7 @@ class App:
 
     def track(self, on: bool) -> None:
         """Whether the view travels with the matter; nothing jumps when this changes."""
-        with self._lock:
+        with self.lock:
             center = self._center(self.index)
             x, y, z = (c - s for c, s in zip(center, self.shift, strict=True))
             self._anchor, self.tracking = (x, y, z), on
