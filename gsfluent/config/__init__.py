@@ -20,12 +20,16 @@ from gsfluent.config.events import (
 from gsfluent.config.objects import ObjectSettings, Part, Select, Where
 from gsfluent.config.settings import (
     FillSettings,
-    KeyLight,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
     SolveSettings,
     TextureSettings,
+)
+from gsfluent.config.settings_light import (
+    EnvironmentSettings,
+    KeyLight,
+    LampSettings,
+    LightSettings,
 )
 from gsfluent.config.shot import Shot, load_shot
 
@@ -37,9 +41,11 @@ __all__ = [
     "Collide",
     "ColliderSettings",
     "Drop",
+    "EnvironmentSettings",
     "Event",
     "FillSettings",
     "KeyLight",
+    "LampSettings",
     "LightSettings",
     "ObjectSettings",
     "OutputSettings",

@@ -29,7 +29,6 @@ from gsfluent.config.read import (
 )
 from gsfluent.config.settings import (
     FillSettings,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
     SolveSettings,
@@ -37,6 +36,7 @@ from gsfluent.config.settings import (
     Vector,
     read_texture,
 )
+from gsfluent.config.settings_light import LightSettings
 from gsfluent.errors import InputError
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
