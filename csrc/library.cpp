@@ -91,6 +91,13 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "bool depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, "
       "Tensor, Tensor, Tensor, Tensor, Tensor)");
 
+  // --- shade: light per pixel, from what the rasterizer blended to display values ---
+  m.def(
+      "shade(Tensor image, Tensor alpha, Tensor depth, Tensor normal, Tensor? gloss, "
+      "Tensor viewmat, Tensor K, Tensor lamps, Tensor environment, Tensor background, "
+      "Tensor? map_depth, Tensor? map_alpha, Tensor? map_cameras, Tensor? occupancy, "
+      "Tensor? grid_frame, int nodes, float occlusion, Tensor? studio) -> Tensor");
+
   // --- ssim: structural similarity, the photometric loss of training ---
   m.def("ssim(Tensor image, Tensor target, bool inside) -> Tensor");
   m.def("ssim_backward(Tensor grad, Tensor image, Tensor target, bool inside) -> Tensor");

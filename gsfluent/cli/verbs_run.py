@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from gsfluent.cli.common import Out, Verb, existing, parse_size
+from gsfluent.errors import InputError
 
 
 @dataclass(kw_only=True)
@@ -20,6 +21,7 @@ class Run(Verb):
       gsfluent run shot.yaml -o out            # again: only what changed or was cut short
       gsfluent run shot.yaml -o out --force    # redo everything
       gsfluent run shot.yaml -o out --json     # run.json on stdout
+      gsfluent run MODEL --config c.json -o out     # a PhysGaussian model folder and its config
 
     The smallest useful shot.yaml:
       capture: captures/apple
@@ -28,9 +30,13 @@ class Run(Verb):
     """
 
     shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
-    """The shot file."""
+    """The shot file, or with --config a model folder of the INRIA trainer."""
     out: Out
     """Folder for the results; made when missing."""
+    config: Path | None = None
+    """PhysGaussian's JSON config of the model; see docs/physgaussian.md."""
+    write_shot: bool = False
+    """With --config: only write OUT/physgaussian/shot.yaml and say what became of every key."""
     force: bool = False
     """Redo every stage."""
 
@@ -40,12 +46,25 @@ class Run(Verb):
         from gsfluent.pipeline.run import run_shot
         from gsfluent.progress import reporter
 
-        shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        if self.config is None:
+            if self.write_shot:
+                raise InputError("--write-shot does nothing without --config", "drop it")
+            path, facts = existing(self.shot, "SHOT.yaml", folder=False), None
+        else:
+            from gsfluent.config.physgaussian import convert
+
+            folder = self.out / "physgaussian"
+            made = convert(existing(self.shot, "MODEL", folder=True), self.config, folder)
+            path, facts = folder / "shot.yaml", {"physgaussian": made.report()}
+            if self.write_shot:
+                return {"shot": str(path), **facts["physgaussian"]}
+        shot = load_shot(path)
         device = self.torch_device()
         with reporter(quiet=self.json) as report:
             return run_shot(
-                shot, self.out, device=device, seed=self.seed, force=self.force, reporter=report
-            )
+                shot, self.out, device=device, seed=self.seed, force=self.force, reporter=report,
+                facts=facts,
+            )  # fmt: skip
 
 
 @dataclass(kw_only=True)
@@ -162,30 +181,4 @@ class Render(Verb):
                 frame=self.frame,
                 device=self.torch_device(),
                 progress=progress,
-            )
-
-
-@dataclass(kw_only=True)
-class Export(Verb):
-    """Write a finished simulation in other programs' formats.
-
-    Examples:
-      gsfluent export out --to ply-seq        # frames/frame_0001.ply ..., for any splat viewer
-      gsfluent export out --to vtk            # particles/particles_0001.vtk ..., for ParaView
-      gsfluent export out --to ply-seq,mp4,vtk
-    """
-
-    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder that `gsfluent run` wrote."""
-    to: str
-    """Comma-separated: mp4, ply-seq, vtk."""
-
-    def execute(self) -> dict[str, Any]:
-        """Export."""
-        from gsfluent.pipeline.export import export
-
-        existing(self.out, "OUT", folder=True)
-        with self.progress("export") as progress:
-            return export(
-                self.out, self.to.split(","), device=self.torch_device(), progress=progress
             )

@@ -22,7 +22,6 @@ from gsfluent.config.settings import (
     FillSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
 )
 from gsfluent.config.settings_light import (
@@ -31,6 +30,7 @@ from gsfluent.config.settings_light import (
     LampSettings,
     LightSettings,
 )
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot, load_shot
 
 __all__ = [

@@ -16,7 +16,6 @@ from gsfluent.config.settings import (
     OutputSettings,
     PhotoSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
 )
 from gsfluent.config.settings_inpaint import InpaintSettings
@@ -26,6 +25,7 @@ from gsfluent.config.settings_light import (
     LampSettings,
     LightSettings,
 )
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot
 
 SECTIONS: dict[str, type[Any]] = {

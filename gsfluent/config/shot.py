@@ -31,12 +31,12 @@ from gsfluent.config.settings import (
     FillSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
     Vector,
     read_texture,
 )
 from gsfluent.config.settings_light import LightSettings
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.errors import InputError
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

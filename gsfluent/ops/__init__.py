@@ -37,6 +37,7 @@ _PUBLIC: dict[str, str] = {
     "mvee_lens": "gsfluent.ops.mvee",
     "Rendered": "gsfluent.ops.raster",
     "rasterize": "gsfluent.ops.raster",
+    "shade": "gsfluent.ops.shade",
     "Photometric": "gsfluent.ops.losses",
     "photometric_loss": "gsfluent.ops.losses",
     "ssim": "gsfluent.ops.losses",

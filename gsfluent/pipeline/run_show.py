@@ -84,12 +84,14 @@ class Film:
                 floor, (x, y), float(action.radius[0]), 1.3 * float(action.radius.amax())
             )
         needs_capture = shot.capture is not None and isinstance(shot.output.camera, int)
+        isolated = out / "stages" / "isolate"
+        frame = read_frame(isolated) if (isolated / "frame.json").is_file() else None
         cameras = cameras_for(
             str(shot.output.camera),
             action,
             shot.output.size,
             capture=load_capture(shot.capture) if needs_capture and shot.capture else None,
-            frame=read_frame(out / "stages" / "isolate") if needs_capture else None,
+            frame=frame,
         )
         backdrop = None
         if shot.output.backdrop == "captured":

@@ -55,6 +55,8 @@ MAP = 15
 STUDIO = 13
 DIRECTIONAL, POINT = 0.0, 1.0
 ALPHA_FLOOR = 1e-4
+OPAQUE = 0.999
+FADED = 1e-6
 DISPLAY_GAMMA = 2.2
 _TINY = 1e-12
 
@@ -242,7 +244,8 @@ def shade_image(
                 eye, rays, studio, lamps, environment, maps=maps, grid=grid, occlusion=occlusion
             )
         )
-    cover = alpha[..., None]
+    # what lies behind nearly opaque pixels need not be worked out
+    cover = torch.where(alpha > OPAQUE, 1.0, alpha)[..., None]
     return (front * cover + behind * (1.0 - cover)).clamp(0.0, 1.0)
 
 
@@ -280,7 +283,8 @@ def shade_studio(
     bare = arriving(center, up.new_tensor((0.0, 0.0, 1.0)), lamps, environment, None, None)
     floor = paint * arrives / bare.mean().clamp(min=1e-3)
     away = (points[..., :2] - studio[1:3]).norm(dim=-1) / studio[3]
-    keep = (torch.exp(-away.square()) * hits)[..., None]
+    keep = torch.exp(-away.square())
+    keep = (keep * (hits & (keep > FADED)))[..., None]
     return keep * floor + (1.0 - keep) * wall
 
 
