@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -84,8 +85,8 @@ class LookPanel:
     def _build_cut(self, gui: viser.GuiApi) -> None:
         reach = 1.3 * self._app.timeline.radius
         self._unit, self._factor = ("cm", 100.0) if reach < 1.0 else ("m", 1.0)
-        span = round(reach * self._factor, 2)
-        step = round(max(0.01, 2.0 * span / _STEPS), 2)
+        step = float(f"{2.0 * reach * self._factor / _STEPS:.1g}")
+        span = round(step * math.ceil(reach * self._factor / step), 6)
         with gui.add_folder("Cut plane", expand_by_default=False):
             self._cut = gui.add_checkbox("Cut open", False)
             self._axis = gui.add_dropdown("Across", (*look.AXES, _FREE), initial_value="y")
