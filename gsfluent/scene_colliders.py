@@ -15,6 +15,7 @@ from gsfluent.scene_parts import (
     Blade,
     Body,
     Collider,
+    Kick,
     Vector,
     add,
     known_key,
@@ -38,6 +39,7 @@ class RigidThings:
         self.bodies: list[Body] = []
         self.colliders: list[Collider] = []
         self.blades: list[Blade] = []
+        self.kicks: list[Kick] = []
 
     def press(
         self,

@@ -29,14 +29,14 @@ from gsfluent.config.read import (
 )
 from gsfluent.config.settings import (
     FillSettings,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
     Vector,
     read_texture,
 )
+from gsfluent.config.settings_light import LightSettings
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.errors import InputError
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
