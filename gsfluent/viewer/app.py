@@ -111,6 +111,8 @@ class App:
         self.look = self._look_panel.look()
         self._plots = PlotPanel(self.server, self.timeline)
         self._set_first_camera()
+        if self.browser is not None:
+            self.browser.prepare(self.server)
         for add_panel in panels:
             add_panel(self.server, self)
         self._artist = Artist(self._paint)
@@ -270,15 +272,22 @@ class App:
         """The clock: plays, and looks for new frames."""
         looked = time.monotonic()
         while not self._done.wait(_TICK):
-            if self.playback.playing:
-                index = self.playback.index(self.timeline.count, self.timeline.fps())
-                if index != self.index:
-                    self.show(index)
-                elif not self.playback.playing:
-                    self._time_panel.update()
-            if time.monotonic() - looked > _LOOK_FOR_FRAMES:
-                self.refresh()
-                looked = time.monotonic()
+            try:
+                if self.playback.playing:
+                    self._play()
+                if time.monotonic() - looked > _LOOK_FOR_FRAMES:
+                    looked = time.monotonic()
+                    self.refresh()
+            except Exception:
+                _log.exception("viewer: the clock stumbled")  # and goes on
+
+    def _play(self) -> None:
+        """One tick of playing."""
+        index = self.playback.index(self.timeline.count, self.timeline.fps())
+        if index != self.index:
+            self.show(index)
+        elif not self.playback.playing:
+            self._time_panel.update()
 
     def refresh(self) -> None:
         """Look for new frames now."""
@@ -297,11 +306,11 @@ class App:
 
     def _first_index(self) -> int:
         """The most telling frame of a finished run, the newest of a running one."""
-        last = self.timeline.count - 1
-        if self.source.running:
-            return last
-        counts = [int(row.get("fragments") or 1) for row in self.timeline.facts()]
-        return poster_frame(counts, self.timeline.fps()) if len(counts) > 1 else 0
+        index = self.timeline.count - 1
+        if not self.source.running and index > 0:
+            counts = [int(row.get("fragments") or 1) for row in self.timeline.facts()]
+            index = poster_frame(counts, self.timeline.fps())
+        return self.timeline.readable(index)
 
     def _center(self, index: int) -> tuple[float, float, float]:
         try:
