@@ -9,9 +9,9 @@ from gsfluent.data import INTERIOR, SURFACE, Gaussians, Solid
 RADIUS = 0.1
 
 
-def ball(splats: int = 4000) -> Solid:
+def ball(splats: int = 1500) -> Solid:
     """The ball, centred at the origin."""
-    side, voxel = 26, 2 * RADIUS / 22
+    side, voxel = 18, 2 * RADIUS / 14
     axis = (torch.arange(side) + 0.5 - side / 2) * voxel
     grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
     level = grid.norm(dim=-1)
@@ -23,10 +23,10 @@ def ball(splats: int = 4000) -> Solid:
     angle = row * 2.399963
     ring = (1 - z**2).sqrt()
     skin = RADIUS * torch.stack([ring * angle.cos(), ring * angle.sin(), z], 1)
-    inside = grid[level < RADIUS - 0.008].reshape(-1, 3)
+    inside = grid[level < RADIUS - 0.012].reshape(-1, 3)
     inside = inside + 0.3 * voxel * (torch.rand(inside.shape) - 0.5)
     means = torch.cat([skin, inside])
-    sizes = torch.full((len(means), 3), 0.55 * voxel)
+    sizes = torch.full((len(means), 3), 0.45 * voxel)
     colors = torch.cat([green.expand(len(skin), 3), red.expand(len(inside), 3)])
     labels = torch.full((len(means),), INTERIOR, dtype=torch.int32)
     labels[: len(skin)] = SURFACE

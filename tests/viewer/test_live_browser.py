@@ -35,7 +35,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LivePlayer,
     home = tmp_path_factory.mktemp("live")
     ball().save(home / "ball.ply")
     stage = open_stage(home / "ball.ply", material="fruit.watermelon")
-    session = LiveSession(stage.scene, dx=0.02, slow=10.0)
+    session = LiveSession(stage.scene, dx=0.025, slow=4.0)
     player = LivePlayer(session, stage.shot)
     panel = PokePanel(player, home)
     app = App(LiveSource(player, "ball", stage.shot), torch.device("cpu"), port=0, panels=[panel])
@@ -67,15 +67,15 @@ def press(chrome: Any, label: str) -> None:
 
 def test_shoot_breaks_the_object_in_the_picture_and_reset_mends_it(page) -> None:
     player, app, chrome = page
-    whole = until(chrome, lambda p: greens(p) > 5000)
+    whole = until(chrome, lambda p: greens(p) > 5000, seconds=60.0)
     assert player.status.state == AT_REST and "at rest" in chrome.page_source
     assert reds(whole) < 0.02 * greens(whole)
     press(chrome, "Shoot")
-    until(chrome, lambda p: reds(p) > 0.05 * greens(whole), seconds=40.0)
+    until(chrome, lambda p: reds(p) > 0.05 * greens(whole), seconds=60.0)
     assert player.status.state == RUNNING
     assert "× real time" in chrome.page_source
     assert player.session.pokes[0]["type"] == "bullet"
     assert app.index > 0
     press(chrome, "Reset")
-    mended = until(chrome, lambda p: reds(p) < 0.02 * greens(whole) < greens(p))
+    mended = until(chrome, lambda p: reds(p) < 0.02 * greens(whole) < greens(p), seconds=60.0)
     assert abs(greens(mended) - greens(whole)) < 0.05 * greens(whole)
