@@ -18,7 +18,6 @@ from gsfluent.config.read import (
     key,
     nested,
     number,
-    read_direction,
     section,
     several,
     text,
@@ -42,9 +41,15 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
     return sides
 
 
+EXPORTS = (
+    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti",
+)  # fmt: skip
+"""What a run can write beside the video; ``gsfluent export`` writes these and more."""
+
+
 def _camera(value: Any, place: Place) -> str | int | Path:
-    if value == "orbit":
-        return "orbit"
+    if value in ("orbit", "turntable", "dolly"):
+        return str(value)
     if isinstance(value, str):
         return existing_path(value, place)
     index: int = whole(0, 10**9)(value, place)
@@ -340,39 +345,6 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class KeyLight:
-    """``light.key:`` - the directional light."""
-
-    direction: Vector = key(
-        read_direction, default=(1.0, -1.0, 2.0),
-        doc="From the scene towards the light; +z is up.", example="[1, -1, 2]",
-    )  # fmt: skip
-    shadow: bool = key(
-        flag, default=True, doc="Whether the object shadows itself and the floor.", example="true"
-    )
-    intensity: float | None = key(number(0.0, 1e3), default=None, doc="Strength.", example="0.6")
-
-
-@dataclasses.dataclass(frozen=True)
-class LightSettings:
-    """``light:``."""
-
-    ambient: float | None = key(
-        number(0.0, 1e3), default=None, doc="Light from everywhere.", example="0.4"
-    )
-    specular: float | None = key(
-        number(0.0, 1e3), default=None, doc="Strength of highlights.", example="0.2"
-    )
-    # Last, because from here on ``key`` names this field.
-    key: KeyLight = key(
-        nested(KeyLight),
-        default=KeyLight(),
-        doc="The directional light.",
-        example="{direction: [1, -1, 2]}",
-    )
-
-
-@dataclasses.dataclass(frozen=True)
 class OutputSettings:
     """``output:`` - what is made of the simulation."""
 
@@ -394,7 +366,8 @@ class OutputSettings:
     )  # fmt: skip
     camera: str | int | Path = key(
         _camera, default="orbit",
-        doc="orbit, the number of a photograph (0 is the first), or a JSON file with a path.",
+        doc="orbit, turntable, dolly, the number of a photograph (0 is the first), or a path: "
+        "a JSON file, a transforms.json or a COLMAP folder.",
         example="orbit",
     )  # fmt: skip
     backdrop: str = key(
@@ -403,7 +376,7 @@ class OutputSettings:
         example="captured",
     )  # fmt: skip
     what: tuple[str, ...] = key(
-        several(choice("mp4", "ply-seq", "vtk", later=("usd", "png-seq", "spz", "gltf"))),
+        several(choice("mp4", *EXPORTS)),
         default=("mp4",),
         doc="What to write.", example="[mp4, ply-seq]",
     )  # fmt: skip

@@ -56,6 +56,7 @@ class App:
         playback: The clock.
         index: Frame shown.
         follow: Whether each new frame is shown as it comes.
+        lock: Held while the frame shown changes.
         shift: Scene position = position in the browser + shift [m]; changes while the view follows
             the object.
 
@@ -93,7 +94,7 @@ class App:
         self.shift = (0.0, 0.0, 0.0)
         self._anchor = self._center(self.index)
         self._problem = ""
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         self._done = threading.Event()
         self.browser = BrowserSplats(self.timeline) if splats else None
         self.server = start_server(host, port, f"gsfluent · {source.title}")
@@ -108,6 +109,8 @@ class App:
         self.look = self._look_panel.look()
         self._plots = PlotPanel(self.server, self.timeline)
         self._set_first_camera()
+        if self.browser is not None:
+            self.browser.prepare(self.server)
         for add_panel in panels:
             add_panel(self.server, self)
         self._artist = Artist(self._paint)
@@ -125,7 +128,7 @@ class App:
 
     def show(self, index: int) -> None:
         """Go to frame ``index``."""
-        with self._lock:
+        with self.lock:
             self.index = max(0, min(index, self.timeline.count - 1))
             if self.tracking:
                 center = self._center(self.index)
@@ -164,7 +167,7 @@ class App:
 
     def track(self, on: bool) -> None:
         """Whether the view travels with the matter; nothing jumps when this changes."""
-        with self._lock:
+        with self.lock:
             center = self._center(self.index)
             x, y, z = (c - s for c, s in zip(center, self.shift, strict=True))
             self._anchor, self.tracking = (x, y, z), on
@@ -265,15 +268,22 @@ class App:
         """The clock: plays, and looks for new frames."""
         looked = time.monotonic()
         while not self._done.wait(_TICK):
-            if self.playback.playing:
-                index = self.playback.index(self.timeline.count, self.timeline.fps())
-                if index != self.index:
-                    self.show(index)
-                elif not self.playback.playing:
-                    self._time_panel.update()
-            if time.monotonic() - looked > _LOOK_FOR_FRAMES:
-                self.refresh()
-                looked = time.monotonic()
+            try:
+                if self.playback.playing:
+                    self._play()
+                if time.monotonic() - looked > _LOOK_FOR_FRAMES:
+                    looked = time.monotonic()
+                    self.refresh()
+            except Exception:
+                _log.exception("viewer: the clock stumbled")  # and goes on
+
+    def _play(self) -> None:
+        """One tick of playing."""
+        index = self.playback.index(self.timeline.count, self.timeline.fps())
+        if index != self.index:
+            self.show(index)
+        elif not self.playback.playing:
+            self._time_panel.update()
 
     def refresh(self) -> None:
         """Look for new frames now."""
@@ -292,11 +302,11 @@ class App:
 
     def _first_index(self) -> int:
         """The most telling frame of a finished run, the newest of a running one."""
-        last = self.timeline.count - 1
-        if self.source.running:
-            return last
-        counts = [int(row.get("fragments") or 1) for row in self.timeline.facts()]
-        return poster_frame(counts, self.timeline.fps()) if len(counts) > 1 else 0
+        index = self.timeline.count - 1
+        if not self.source.running and index > 0:
+            counts = [int(row.get("fragments") or 1) for row in self.timeline.facts()]
+            index = poster_frame(counts, self.timeline.fps())
+        return self.timeline.readable(index)
 
     def _center(self, index: int) -> tuple[float, float, float]:
         try:

@@ -34,6 +34,7 @@ _DISTINCT = (
 _DAMAGE = ((0.0, (0.33, 0.44, 0.60)), (0.5, (0.98, 0.82, 0.36)), (1.0, (0.78, 0.10, 0.12)))
 _DECADES = 4.0  # of the logarithmic energy scale
 _LISTED = 8  # entries of a legend
+_PALER = 0.4  # toward white, for broken matter on a piece
 _STOPS = 24  # of a scale in the page
 
 
@@ -130,18 +131,24 @@ def _depth(frame: SavedFrame, timeline: Timeline) -> tuple[Tensor, Legend]:
     depth = timeline.depth(frame)
     top = max(float(timeline.depth(timeline.first).max()), 1e-6)
     unit, factor = ("mm", 1e3) if top < 0.03 else ("cm", 1e2) if top < 1.0 else ("m", 1.0)
-    ramp = _library_ramp("DEEPGREEN")[::-1].copy()
+    ramp = _library_ramp("PLASMA")
     ticks = ("0 skin", _text(factor * top / 2), _text(factor * top))
     return _mapped(depth / top, ramp), Legend(f"Depth below the skin [{unit}]", ramp, ticks)
 
 
 def _fragment(frame: SavedFrame, timeline: Timeline) -> tuple[Tensor, Legend]:
-    slots = timeline.piece_slots(frame.fragments)
-    return _counted(slots, frame.volumes, "Fragments", "piece", rest="debris", offset=1)
+    slots, broken = timeline.pieces.of(frame)
+    colors, legend = _counted(slots, frame.volumes, "Fragments", "piece", rest="debris", offset=1)
+    paler = broken & (slots >= 0)
+    colors[paler] = colors[paler].lerp(torch.ones_like(colors[paler]), _PALER)
+    if bool(paler.any()):
+        note = Legend(legend.title + ", paler where broken", entries=legend.entries)
+        return colors, note
+    return colors, legend
 
 
 def _material(frame: SavedFrame, timeline: Timeline) -> tuple[Tensor, Legend]:
-    return _counted(frame.material.long(), frame.volumes, "Rows of the material table", "row")
+    return _counted(frame.material.long(), frame.volumes, "Materials", "material", offset=1)
 
 
 def _body(frame: SavedFrame, timeline: Timeline) -> tuple[Tensor, Legend]:

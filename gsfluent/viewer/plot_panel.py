@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from gsfluent.viewer.timeline import Timeline
 
-_HEIGHT = 150
+_HEIGHT = 118
 _WIDTH = 300.0
 _EVERY = 0.1  # seconds between two moves of the line while playing
 
@@ -80,4 +80,5 @@ def _chart(server: viser.ViserServer, plot: Plot, now: float) -> Any:
         axes=axes,  # type: ignore[arg-type]
         legend={"live": False},
         height=_HEIGHT,
+        padding=(8, 20, 0, 0),
     )

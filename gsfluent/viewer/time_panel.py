@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
 
 _SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1 (real time)": 1.0, "2": 2.0}
 _FIRST_SPEED = "1/4"
+_HELD = 0.4  # seconds for which a slider counts as held after it was moved
 
 
 class TimePanel:
@@ -24,6 +26,7 @@ class TimePanel:
     def __init__(self, server: viser.ViserServer, app: App) -> None:
         gui = server.gui
         self._app = app
+        self._held = 0.0
         with gui.add_folder("Time"):
             self._slider: Any = gui.add_slider("Frame", 0, 1, 1, 0)
             self._facts = gui.add_html("")
@@ -38,9 +41,13 @@ class TimePanel:
 
         @self._slider.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:  # a person moved it, not the clock
-                app.pause()
-                app.follow = False
+            if event.client is None:  # the clock moved it, not a person
+                return
+            self._held = time.monotonic()
+            app.playback.pause()
+            app.follow = False
+            # several of these may run at once; the last one to get in shows the newest place
+            with app.lock:
                 app.show(int(self._slider.value))
 
         @self._play.on_click
@@ -49,7 +56,7 @@ class TimePanel:
 
         @self._step.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
-            app.pause()
+            app.playback.pause()
             app.follow = False
             last = app.timeline.count - 1
             now = app.index
@@ -77,8 +84,11 @@ class TimePanel:
         last = app.timeline.count - 1
         # a slider needs two places
         self._slider.max = max(1, last)
-        self._slider.disabled = self._play.disabled = self._step.disabled = last < 1
-        self._slider.value = app.index
+        self._slider.disabled = self._play.disabled = last < 1
+        self._step.visible = last >= 1
+        # not under a person's finger, where it may have gone farther meanwhile
+        if time.monotonic() - self._held > _HELD:
+            self._slider.value = app.index
         self._play.label = "Pause" if app.playback.playing else "Play"
         self._follow.visible = app.source.running
         self._follow.value = app.follow

@@ -12,9 +12,11 @@ from torch import Tensor
 
 from gsfluent.data import SURFACE
 from gsfluent.errors import GsfluentError, RunError
+from gsfluent.pipeline.neighbours import nearest
 from gsfluent.pipeline.render_camera import Action
 from gsfluent.pipeline.render_normals import occupancy_cell
 from gsfluent.pipeline.run_frames import SavedFrame
+from gsfluent.viewer.pieces import Pieces
 from gsfluent.viewer.source import Source
 
 _CACHE_BYTES = 1 << 30  # of frames kept ready
@@ -71,7 +73,7 @@ class Timeline:
         self._bytes = 0
         self._facts: dict[int, dict[str, Any]] = {}
         self._surveys: dict[int, Survey] = {}
-        self._slots: dict[int, int] = {}
+        self.pieces = Pieces()
         self.count, self.running = 0, self.source.running
         self.refresh()
         self.first = self._first_readable()
@@ -178,19 +180,15 @@ class Timeline:
         known[:shared] = self._depth[:shared].to(known)
         return known
 
-    def piece_slots(self, labels: Tensor) -> Tensor:
-        """Small numbers for fragment labels [P] that stay with a fragment for good, int64 [P].
-
-        Debris, label -1, is -1.
-        """
-        with self._lock:
-            found, inverse, sizes = labels.unique(return_inverse=True, return_counts=True)
-            for row in sizes.argsort(descending=True).tolist():
-                label = int(found[row])
-                if label >= 0 and label not in self._slots:
-                    self._slots[label] = len(self._slots)
-            slots = [self._slots.get(label, -1) for label in found.tolist()]
-            return torch.tensor(slots, device=labels.device)[inverse]
+    def readable(self, index: int) -> int:
+        """The readable frame nearest to ``index``."""
+        for other in sorted(range(self.count), key=lambda i: abs(i - index)):
+            try:
+                self.frame(other)
+            except GsfluentError:
+                continue
+            return other
+        return self.first.index
 
     def _first_readable(self) -> SavedFrame:
         problem: GsfluentError | None = None
@@ -205,22 +203,21 @@ class Timeline:
         """Give the pieces of the last frame their numbers first, largest first: clear colours."""
         for index in (self.count - 1, self.first.index):
             try:
-                self.piece_slots(self.frame(index).fragments)
+                self.pieces.of(self.frame(index))
             except GsfluentError:
                 continue
 
 
 def _depth_of_points(frame: SavedFrame) -> Tensor:
     """Distance from each material point to the nearest splat of the skin [m], [P]."""
-    from scipy.spatial import cKDTree
-
     labels = frame.gaussians.labels
     means = frame.gaussians.means
     skin = means if labels is None else means[labels == SURFACE]
     if skin.shape[0] == 0:
         return torch.zeros(frame.positions.shape[0])
-    distance, _ = cKDTree(skin.cpu().numpy()).query(frame.positions.cpu().numpy())
-    return torch.from_numpy(distance).float()
+    spacing = max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)
+    distance, _ = nearest(skin, frame.positions.double().cpu().numpy(), 1, 4.0 * spacing)
+    return torch.from_numpy(distance[:, 0]).float()
 
 
 def _size(frame: SavedFrame) -> int:
