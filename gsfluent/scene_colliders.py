@@ -15,6 +15,7 @@ from gsfluent.scene_parts import (
     Blade,
     Body,
     Collider,
+    Kick,
     Vector,
     add,
     known_key,
@@ -38,6 +39,7 @@ class RigidThings:
         self.bodies: list[Body] = []
         self.colliders: list[Collider] = []
         self.blades: list[Blade] = []
+        self.kicks: list[Kick] = []
 
     def press(
         self,
@@ -182,6 +184,9 @@ class RigidThings:
         velocity: Sequence[float] = (0.0, 0.0, 0.0),
         spin: Sequence[float] = (0.0, 0.0, 0.0),
         mass: float | None = None,
+        appears: float = 0.0,
+        vanishes: float | None = None,
+        shown: bool = True,
         name: str | None = None,
     ) -> str:
         """Add a rigid thing that matter cannot enter.
@@ -202,6 +207,9 @@ class RigidThings:
             spin: Angular velocity [rad/s].
             mass: None: it moves as told. A number [kg]: it takes the impulse of what it hits and
                 falls.
+            appears: From when it is there, and moves [s].
+            vanishes: Until when it is there [s]; None: for ever.
+            shown: Whether it is drawn.
             name: Name; default: the shape.
 
         Returns:
@@ -223,6 +231,16 @@ class RigidThings:
             raise InputError(f"{where}: no file {str(mesh)!r}", mend="give the mesh's file")
         if shape == "plane" and mass is not None:
             raise InputError(f"{where}: a plane has no mass", mend="use a box")
+        appears = number(f"{where}: appears", appears, low=0.0)
+        gone = math.inf if vanishes is None else number(f"{where}: vanishes", vanishes)
+        if not gone > appears:
+            raise InputError(f"{where}: it vanishes at {gone:g} s, before it appears at "
+                             f"{appears:g} s", mend="let it vanish later")  # fmt: skip
+        if mass is not None and (appears > 0.0 or math.isfinite(gone)):
+            raise InputError(
+                f"{where}: one with a mass is there all the time",
+                mend="leave out its mass, or appears and vanishes",
+            )
         edges = (0.0, 0.0, 0.0) if size is None else vector(f"{where}: size", size)
         for edge in edges if shape == "box" else ():
             number(f"{where}: size", edge, low=1e-9)
@@ -243,6 +261,11 @@ class RigidThings:
                 velocity=vector(f"{where}: velocity", velocity),
                 angular_velocity=vector(f"{where}: spin", spin),
                 mass=None if mass is None else number(f"{where}: mass", mass, low=1e-9),
+                start=appears,
+                stop=gone,
+                appears=appears,
+                vanishes=gone,
+                shown=bool(shown),
             )
         )
         return self.colliders[-1].name

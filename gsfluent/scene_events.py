@@ -17,6 +17,7 @@ from gsfluent.scene_colliders import RigidThings
 from gsfluent.scene_parts import (
     Body,
     Collider,
+    Kick,
     Vector,
     add,
     known_key,
@@ -52,19 +53,47 @@ class Events(RigidThings):
             lowest = float(body.bounds()[0][2])
             self._shift(index, (0.0, 0.0, (self.floor or 0.0) + height - lowest))
 
+    def lift(self, height: float) -> None:
+        """Move all solids up together by ``height`` [m]."""
+        for index in self._targets(None):
+            self._shift(index, (0.0, 0.0, number("lift height", height)))
+
     def throw(
         self,
         velocity: Sequence[float],
         spin: Sequence[float] = (0.0, 0.0, 0.0),
         object: str | None = None,
+        at: float = 0.0,
     ) -> None:
-        """Give a solid a velocity [m/s] and a spin [rad/s] about its centre of mass at time 0."""
+        """Give a solid a velocity and a spin about its centre of mass.
+
+        At time 0 they are what the solid starts with. Later they are added to the motion of all its
+        matter, broken off or not: a kick of ``mass * velocity``.
+
+        Args:
+            velocity: [m/s], [3].
+            spin: Angular velocity [rad/s], [3].
+            object: Name of the body; default: every solid.
+            at: When [s].
+
+        Raises:
+            InputError: A number out of range or an unknown body.
+        """
+        if number("throw at", at, low=0.0) > 0.0:
+            self.kick(velocity, spin, object, at)
+            return
+        moved, turned_ = vector("throw velocity", velocity), vector("throw spin", spin)
         for index in self._targets(object):
             self.bodies[index] = dataclasses.replace(
-                self.bodies[index],
-                velocity=vector("throw velocity", velocity),
-                angular_velocity=vector("throw spin", spin),
+                self.bodies[index], velocity=moved, angular_velocity=turned_
             )
+
+    def kick(
+        self, velocity: Sequence[float], spin: Sequence[float], object: str | None, at: float
+    ) -> None:
+        """Add to the motion of a solid at a time: what :meth:`throw` does after time 0."""
+        kick = Kick(0, vector("throw velocity", velocity), vector("throw spin", spin), at)
+        self.kicks += [dataclasses.replace(kick, body=index) for index in self._targets(object)]
 
     def collide(
         self,
@@ -139,8 +168,7 @@ class Events(RigidThings):
             speed: Speed at time ``at`` [m/s].
             radius: Radius [m].
             density: Density [kg/m^3].
-            at: Time [s] at which it passes ``start``; before that it is in free flight on its way
-                there.
+            at: Time [s] at which it leaves ``start``; before that it is not there.
             rigid: Whether it is rigid.
 
         Returns:
@@ -183,7 +211,9 @@ class Events(RigidThings):
             sources={"young_modulus": "derived: wave speed of the stiffest target"},
         )  # fmt: skip
         self.bodies.append(
-            Body(name, ball, offset=origin, velocity=velocity, radius=radius, start=at)
+            Body(
+                name, ball, offset=origin, velocity=velocity, radius=radius, start=at, held=at > 0.0
+            )
         )
         return name
 

@@ -86,6 +86,7 @@ class Part:
                 key,
                 [
                     *materials.PARAMETERS,
+                    *materials.LOOKS,
                     "variation",
                     "grain",
                     "material",
@@ -181,11 +182,14 @@ class Collider:
         velocity: Of the point from ``start`` to ``stop`` [m/s].
         angular_velocity: From ``start`` to ``stop`` [rad/s].
         mass: None: it moves as told and nothing stops it. A number: it takes the impulse of what
-            it hits [kg]; it passes ``point`` at ``start`` and is in free flight before.
+            it hits [kg]; it passes ``point`` at ``start``; before that it is not there.
         start: When it begins to move [s].
         stop: When it stands still [s].
         backed: A box that meets matter with its face (own +z) only: the grid may see it thicker
             behind.
+        appears: From when it is there [s].
+        vanishes: Until when it is there [s].
+        shown: Whether it is drawn.
     """
 
     name: str
@@ -206,6 +210,13 @@ class Collider:
     start: float = 0.0
     stop: float = math.inf
     backed: bool = False
+    appears: float = 0.0
+    vanishes: float = math.inf
+    shown: bool = True
+
+    def there(self, time: float) -> bool:
+        """Whether it is there at a time [s]."""
+        return self.appears <= time < self.vanishes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,6 +240,23 @@ class Blade:
     thickness: float
     speed: float
     start: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Kick:
+    """A velocity given to all matter of a body at a moment after the start.
+
+    Args:
+        body: Number of the body.
+        velocity: Added to the velocity of every point [m/s], [3].
+        spin: Angular velocity about the centre of mass that is added [rad/s], [3].
+        start: When [s].
+    """
+
+    body: int
+    velocity: Vector
+    spin: Vector
+    start: float
 
 
 def known_key(where: str, key: Any, known: Any) -> None:

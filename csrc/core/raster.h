@@ -22,7 +22,7 @@ struct RasterArgs {
   const T* covars;
   const T* sh;  // [N, (degree + 1)^2, 3], or colors [N, channels]
   const T* colors;
-  const T* normals;       // [N, 3]
+  const T* normals;       // [N, vectors]: x, y, z and what else is blended
   const T* background;    // [channels], or [C, channels] with background_stride = channels
   const T* offset;        // [C, N, 2]
   const int32_t* groups;  // [N]
@@ -31,9 +31,10 @@ struct RasterArgs {
   int64_t count;          // N
   int cameras;            // C
   int sh_degree, channels, features, stride, background_stride;
+  int vectors;  // columns of `normals`, 0 without
   int width, height;
   int tile, tiles_x, tiles_y;  // tile edge [px] of the lists, tiles of one camera's image
-  bool antialiased, has_normals, has_depth;
+  bool antialiased, has_depth;
   T near, far;
 
   // Saved for the adjoint; the layout of the first three is the backend's own.
@@ -48,7 +49,7 @@ struct RasterArgs {
   T* alpha;         // [C, H, W]
   T* depth;         // [C, H, W], when has_depth
   T* median;        // [C, H, W] or null
-  T* normal;        // [C, H, W, 3], when has_normals
+  T* normal;        // [C, H, W, vectors]
   T* contribution;  // [N] or null
 
   GSF_HOST_DEVICE int64_t splat_count() const { return count * cameras; }
@@ -153,11 +154,9 @@ GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const SplatCamera<T>
       good = good && drawable(feature[ch]);
     }
   }
-  if (a.has_normals) {
-    for (int j = 0; j < 3; ++j) {
-      feature[a.channels + j] = a.normals[3 * i + j];
-      good = good && drawable(feature[a.channels + j]);
-    }
+  for (int j = 0; j < a.vectors; ++j) {
+    feature[a.channels + j] = a.normals[a.vectors * i + j];
+    good = good && drawable(feature[a.channels + j]);
   }
   if (a.has_depth) feature[a.features - 1] = depth;
   return good;

@@ -22,9 +22,10 @@ void with_variant(int features, bool groups, const F& f) {
       f.template operator()<kF, false>();
   };
   if constexpr (sizeof(T) == sizeof(float)) {
-    if (features == 3) return choose.template operator()<3>();  // rgb
-    if (features == 4) return choose.template operator()<4>();  // rgb, depth
-    if (features == 7) return choose.template operator()<7>();  // rgb, normal, depth
+    if (features == 3) return choose.template operator()<3>();    // rgb
+    if (features == 4) return choose.template operator()<4>();    // rgb, depth
+    if (features == 7) return choose.template operator()<7>();    // rgb, normal, depth
+    if (features == 10) return choose.template operator()<10>();  // and what light asks of a splat
   }
   choose.template operator()<0>();
 }
@@ -82,7 +83,7 @@ struct RasterCpu {
     std::atomic<bool> unsound{false};
     GradSlots<T> slots;
     slots.unsound = &unsound;
-    slots.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
+    slots.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? a.vectors : 0);
     slots.width = kGradFeatures + slots.active + (b.grad_absolute ? 2 : 0);
     const Scratch<T> rows(static_cast<size_t>(a.instance_count) * slots.width);
     slots.rows = rows.get();

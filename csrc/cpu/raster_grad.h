@@ -83,10 +83,10 @@ void blend_tile_backward(const RasterGradArgs<T>& b, int64_t tile, const GradSlo
       total += g * read(a.image + pixel * a.channels + c, a.channels);
       if (background) background[c] += pack_sum<T>(g * left);
     }
-    for (int c = 0; c < 3 && b.grad_normal; ++c) {
-      const Pack<T> g = read(b.grad_normal + 3 * pixel + c, 3);
+    for (int c = 0; c < a.vectors && b.grad_normal; ++c) {
+      const Pack<T> g = read(b.grad_normal + a.vectors * pixel + c, a.vectors);
       grad[a.channels + c][block] = g;
-      total += g * read(a.normal + 3 * pixel + c, 3);
+      total += g * read(a.normal + a.vectors * pixel + c, a.vectors);
     }
     Pack<T> grad_alpha = b.grad_alpha ? read(b.grad_alpha + pixel, 1) : Pack<T>{};
     if (b.grad_depth) {
@@ -179,7 +179,7 @@ void clear_gradient(const RasterGradArgs<T>& b, int64_t i) {
   clear(b.grad_covars, 6);
   if (a.sh) clear(b.grad_sh, 3 * sh_coefficients(a.sh_degree));
   clear(b.grad_colors, a.channels);
-  clear(b.grad_normals, 3);
+  clear(b.grad_normals, a.vectors);
 }
 
 // Sums the rows of Gaussian `i` camera by camera, turns moments into gradients of the projected
@@ -226,8 +226,9 @@ void gaussian_backward(const RasterGradArgs<T>& b, const std::vector<SplatCamera
       for (int c = 0; c < std::min(a.channels, slots.active); ++c)
         b.grad_colors[a.channels * i + c] += feature[c];
     }
-    if (slots.active >= a.channels + 3 && a.has_normals)
-      for (int k = 0; k < 3; ++k) b.grad_normals[3 * i + k] += feature[a.channels + k];
+    if (slots.active >= a.channels + a.vectors)
+      for (int k = 0; k < a.vectors; ++k)
+        b.grad_normals[a.vectors * i + k] += feature[a.channels + k];
   }
   if (any) store_gaussian_gradient(b, i, total);
 }

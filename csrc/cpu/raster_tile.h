@@ -244,8 +244,8 @@ void blend_tile(const RasterArgs<T>& a, int64_t tile, const T* depth, T* slots) 
     write(alpha, a.alpha + pixel, 1);
     for (int c = 0; c < a.channels; ++c)
       write(sum[c][block] + left * background[c], a.image + pixel * a.channels + c, a.channels);
-    if (a.has_normals)
-      for (int c = 0; c < 3; ++c) write(sum[a.channels + c][block], a.normal + 3 * pixel + c, 3);
+    for (int c = 0; c < a.vectors; ++c)
+      write(sum[a.channels + c][block], a.normal + a.vectors * pixel + c, a.vectors);
     if (a.has_depth)
       write(alpha > T(0) ? sum[features - 1][block] / alpha : Pack<T>{}, a.depth + pixel, 1);
     if (has_median) write(median[block], a.median + pixel, 1);

@@ -78,8 +78,8 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
       for (int f = 0; f < kF; ++f) {
         if (inside && f < a.channels)
           a.image[pixel * a.channels + f] = color(f);
-        else if (inside && a.has_normals && f < a.channels + 3)
-          a.normal[3 * pixel + f - a.channels] = sum[p][f];
+        else if (inside && f < a.channels + a.vectors)
+          a.normal[a.vectors * pixel + f - a.channels] = sum[p][f];
         else if (inside && a.has_depth && f == a.features - 1)
           a.depth[pixel] = covered > T(0) ? sum[p][f] / covered : T(0);
       }

@@ -82,7 +82,7 @@ __global__ void __launch_bounds__(kRowThreads, 5)
   if (b.grad_colors)
     for (int c = 0; c < a.channels; ++c) b.grad_colors[a.channels * i + c] = T(0);
   if (b.grad_normals)
-    for (int c = 0; c < 3; ++c) b.grad_normals[3 * i + c] = T(0);
+    for (int c = 0; c < a.vectors; ++c) b.grad_normals[a.vectors * i + c] = T(0);
   for (int camera = 0; camera < a.cameras; ++camera) {
     const int64_t m = camera * a.count + i;
     const SplatGeometry<T> s = splat_geometry(a)[m];
@@ -109,7 +109,8 @@ __global__ void __launch_bounds__(kRowThreads, 5)
       for (int c = 0; c < a.channels; ++c)
         b.grad_colors[a.channels * i + c] += sum(sums.features + c);
     if (b.grad_normals && sums.active > a.channels)
-      for (int c = 0; c < 3; ++c) b.grad_normals[3 * i + c] += sum(sums.features + a.channels + c);
+      for (int c = 0; c < a.vectors; ++c)
+        b.grad_normals[a.vectors * i + c] += sum(sums.features + a.channels + c);
   }
   store_gaussian_gradient(b, i, total);
 }

@@ -143,10 +143,10 @@ __global__ void __launch_bounds__(kBlockThreads)
             g = b.grad_image[pixel * a.channels + f];
             value = a.image[pixel * a.channels + f];
           }
-        } else if (a.has_normals && f < a.channels + 3) {
+        } else if (f < a.channels + a.vectors) {
           if (b.grad_normal) {
-            g = b.grad_normal[3 * pixel + f - a.channels];
-            value = a.normal[3 * pixel + f - a.channels];
+            g = b.grad_normal[a.vectors * pixel + f - a.channels];
+            value = a.normal[a.vectors * pixel + f - a.channels];
           }
         } else if (b.grad_depth && alpha > T(0)) {
           const T gd = b.grad_depth[pixel];
@@ -235,7 +235,7 @@ SplatSums<T> raster_sums(const RasterGradArgs<T>& b, T* own) {
   const RasterArgs<T>& a = b.forward;
   SplatSums<T> s{};
   // Features are colours, normal, depth: those behind the last wanted one are left out.
-  s.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? 3 : 0);
+  s.active = b.grad_depth ? a.features : a.channels + (b.grad_normal ? a.vectors : 0);
   s.features = kGradFeatures + (b.grad_absolute ? 2 : 0);
   const int room = a.covars ? 3 + 6 + 1 : 3 + 4 + 3;
   // Up to four features are added in one round, in which every lane knows its word's place.

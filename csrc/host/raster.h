@@ -51,7 +51,7 @@ inline void prepare_raster_inputs(RasterInputs& in) {
   check_raster_tensor("covars", in.covars, in.means, {n, 6});
   check_raster_tensor("sh", in.sh, in.means, {n, -1, 3});
   check_raster_tensor("colors", in.colors, in.means, {n, -1});
-  check_raster_tensor("normals", in.normals, in.means, {n, 3});
+  check_raster_tensor("normals", in.normals, in.means, {n, -1});
   check_raster_tensor("means2d_offset", in.offset, in.means, per_camera(in, {n, 2}));
   check_raster_tensor("means2d_absgrad", in.absolute, in.means, per_camera(in, {n, 2}));
   STD_TORCH_CHECK(in.covars ? !in.quats && !in.scales : in.quats && in.scales, kRasterOp,
@@ -110,9 +110,13 @@ RasterArgs<T> raster_args(const RasterInputs& in, int64_t width, int64_t height,
   } else {
     check_raster_tensor("background", in.background, in.means, {a.channels});
   }
-  a.has_normals = in.normals.has_value();
+  a.vectors = in.normals ? static_cast<int>(in.normals->size(1)) : 0;
+  STD_TORCH_CHECK(!in.normals || (a.vectors >= 3 && a.channels + a.vectors < kMaxFeatures),
+                  "rasterize: normals must have at least 3 columns, and at most ",
+                  kMaxFeatures - 1 - a.channels, " beside ", a.channels, " channels, got ",
+                  a.vectors);
   a.has_depth = depth;
-  a.features = a.channels + (a.has_normals ? 3 : 0) + (depth ? 1 : 0);
+  a.features = a.channels + a.vectors + (depth ? 1 : 0);
   a.stride = Backend::stride(a.features);
   a.width = static_cast<int>(width);
   a.height = static_cast<int>(height);
@@ -158,7 +162,7 @@ struct RasterOps {
       };
       Tensor image = pixels(a.channels);
       Tensor alpha = plane(true), depths = plane(depth), median = plane(median_depth);
-      Tensor normal = a.has_normals ? pixels(3) : gsf::new_empty(like, {0}, real);
+      Tensor normal = a.vectors ? pixels(a.vectors) : gsf::new_empty(like, {0}, real);
       Tensor sums = gsf::new_zeros(like, {contribution ? n : 0}, real);
       Tensor radii = gsf::new_empty(like, per_camera(in, {n}), ScalarType::Int);
       Tensor splats = gsf::new_empty(like, {a.splat_count(), a.stride}, real);
@@ -170,7 +174,7 @@ struct RasterOps {
       a.alpha = mptr<T>(alpha);
       a.depth = depth ? mptr<T>(depths) : nullptr;
       a.median = median_depth ? mptr<T>(median) : nullptr;
-      a.normal = a.has_normals ? mptr<T>(normal) : nullptr;
+      a.normal = a.vectors ? mptr<T>(normal) : nullptr;
       a.contribution = contribution ? mptr<T>(sums) : nullptr;
       a.radii = mptr<int32_t>(radii);
       a.splats = mptr<T>(splats);
@@ -212,7 +216,7 @@ struct RasterOps {
       const int64_t h = a.height, w = a.width;
       const std::vector<int64_t> pixels = per_camera(in, {h, w, a.channels});
       const std::vector<int64_t> plane = per_camera(in, {h, w}), none{0};
-      const std::vector<int64_t> vectors = a.has_normals ? per_camera(in, {h, w, 3}) : none;
+      const std::vector<int64_t> vectors = a.vectors ? per_camera(in, {h, w, a.vectors}) : none;
       check_raster_tensor("image", image, like, pixels);
       check_raster_tensor("alpha", alpha, like, plane);
       check_raster_tensor("depth", depth, like, has_depth ? plane : none);
@@ -227,7 +231,7 @@ struct RasterOps {
       }
       STD_TORCH_CHECK(instances.numel() <= INT32_MAX, kRasterOp, ": too many instances");
       if (!has_depth) grad_depth.reset();
-      if (!a.has_normals) grad_normal.reset();
+      if (!a.vectors) grad_normal.reset();
       for (OptTensor* g : {&grad_image, &grad_alpha, &grad_depth, &grad_normal})
         if (*g) *g = gsf::contiguous(**g);
       check_raster_tensor("grad_image", grad_image, like, pixels);
@@ -242,7 +246,7 @@ struct RasterOps {
       a.image = const_cast<T*>(cptr<T>(saved[0]));  // read only in the adjoint
       a.alpha = const_cast<T*>(cptr<T>(saved[1]));
       a.depth = has_depth ? const_cast<T*>(cptr<T>(saved[2])) : nullptr;
-      a.normal = a.has_normals ? const_cast<T*>(cptr<T>(saved[3])) : nullptr;
+      a.normal = a.vectors ? const_cast<T*>(cptr<T>(saved[3])) : nullptr;
       a.splats = const_cast<T*>(cptr<T>(saved[4]));
       a.order = Backend::kSavesOrder ? const_cast<int32_t*>(cptr<int32_t>(lists[0])) : nullptr;
       a.tile_start = const_cast<int32_t*>(cptr<int32_t>(lists[1]));

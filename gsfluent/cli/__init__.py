@@ -38,6 +38,7 @@ _USER_ERRNO = (
     errno.EROFS,
 )
 _INTERRUPTED = 130
+_READER_GONE = 141
 
 _log = logging.getLogger("gsfluent")
 
@@ -48,7 +49,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program's name; the process's own by default.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _command(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # whoever read our words has gone (`| head`); what is left of them goes nowhere, in silence
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _READER_GONE
+    return code
+
+
+def _command(arguments: list[str]) -> int:
+    """Parse and run one command line."""
     as_json = "--json" in arguments
     from gsfluent.cli.parse import parse
 

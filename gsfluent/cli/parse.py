@@ -10,9 +10,11 @@ import tyro
 
 from gsfluent import __version__
 from gsfluent.cli.common import Verb
+from gsfluent.cli.verbs_export import Export
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
-from gsfluent.cli.verbs_run import Demo, Export, Render, Run
+from gsfluent.cli.verbs_run import Demo, Render, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
+from gsfluent.cli.verbs_view import View
 
 VERBS: dict[str, type[Verb]] = {
     "doctor": Doctor,
@@ -25,6 +27,7 @@ VERBS: dict[str, type[Verb]] = {
     "plan": Plan,
     "run": Run,
     "render": Render,
+    "view": View,
     "export": Export,
     "metrics": Metrics,
 }

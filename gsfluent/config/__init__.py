@@ -20,13 +20,17 @@ from gsfluent.config.events import (
 from gsfluent.config.objects import ObjectSettings, Part, Select, Where
 from gsfluent.config.settings import (
     FillSettings,
-    KeyLight,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
 )
+from gsfluent.config.settings_light import (
+    EnvironmentSettings,
+    KeyLight,
+    LampSettings,
+    LightSettings,
+)
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot, load_shot
 
 __all__ = [
@@ -37,9 +41,11 @@ __all__ = [
     "Collide",
     "ColliderSettings",
     "Drop",
+    "EnvironmentSettings",
     "Event",
     "FillSettings",
     "KeyLight",
+    "LampSettings",
     "LightSettings",
     "ObjectSettings",
     "OutputSettings",

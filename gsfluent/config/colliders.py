@@ -12,6 +12,7 @@ from gsfluent.config.read import (
     Place,
     choice,
     existing_path,
+    flag,
     key,
     number,
     plain,
@@ -43,6 +44,18 @@ class ColliderSettings:
     )
     spin: Vector = key(
         vector(3), default=(0.0, 0.0, 0.0), doc="Angular velocity [rad/s].", example="[0, 0, 3]"
+    )
+    appears: float = key(
+        number(0.0), default=0.0,
+        doc="When it comes to be, and begins to move [s]; nothing touches it before.",
+        example="0.5",
+    )  # fmt: skip
+    vanishes: float | None = key(
+        number(above=0.0), default=None,
+        doc="When it is gone [s]; never when absent.", example="1.5",
+    )  # fmt: skip
+    shown: bool = key(
+        flag, default=True, doc="Whether it is drawn (an endless plane never is).", example="false"
     )
 
 

@@ -44,7 +44,7 @@ class Drop:
 class Throw:
     """``type: throw`` - give an object a velocity."""
 
-    velocity: Vector = key(vector(3), doc="Velocity at the start [m/s].", example="[2, 0, 1]")
+    velocity: Vector = key(vector(3), doc="Velocity [m/s].", example="[2, 0, 1]")
     spin: Vector = key(
         vector(3),
         default=(0.0, 0.0, 0.0),
@@ -54,6 +54,12 @@ class Throw:
     object: str | None = key(
         text, default=None, doc="Which object; all when absent.", example="melon"
     )
+    at: float = key(
+        number(0.0),
+        default=0.0,
+        doc="When [s]; after the start the velocity is added to that of all its matter.",
+        example="0.5",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,14 +67,14 @@ class Bullet:
     """``type: bullet`` - fire a dense ball."""
 
     start: Vector = key(
-        vector(3), name="from", doc="Where it is at time `at` [m].", example="[2, 0, 0.2]"
+        vector(3), name="from", doc="Where it starts, at time `at` [m].", example="[2, 0, 0.2]"
     )
     toward: Vector = key(vector(3), doc="Point it flies towards [m].", example="[0, 0, 0.1]")
     speed: float = key(number(above=0.0), doc="Speed [m/s].", example="60")
     radius: float = key(number(above=0.0), default=0.008, doc="Radius [m].", example="0.008")
     density: float = key(number(1.0), default=7800.0, doc="Density [kg/m^3].", example="7800")
     at: float = key(
-        number(0.0), default=0.0, doc="Time at which it passes `from` [s].", example="0.4"
+        number(0.0), default=0.0, doc="Time at which it leaves `from` [s].", example="0.4"
     )
     rigid: bool = key(
         flag,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -263,8 +264,14 @@ def either(words: Reader, other: Reader) -> Reader:
 
 
 def existing_path(value: Any, place: Place) -> Path:
-    """Read a path relative to the shot file, which must exist."""
-    path = (place.folder / Path(text(value, place)).expanduser()).resolve()
+    """Read a path relative to the shot file, which must exist; ``$NAME`` is replaced."""
+    written = os.path.expandvars(text(value, place))
+    if "$" in written:
+        raise InputError(
+            f"{place.path}: {value} names an environment variable that is not set",
+            "set it, or write the path out",
+        )
+    path = (place.folder / Path(written).expanduser()).resolve()
     if not path.exists():
         raise InputError(
             f"{place.path}: {path} does not exist",

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from gsfluent.config.read import (
     Place,
@@ -18,7 +18,6 @@ from gsfluent.config.read import (
     key,
     nested,
     number,
-    read_direction,
     section,
     several,
     text,
@@ -42,9 +41,15 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
     return sides
 
 
+EXPORTS = (
+    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti",
+)  # fmt: skip
+"""What a run can write beside the video; ``gsfluent export`` writes these and more."""
+
+
 def _camera(value: Any, place: Place) -> str | int | Path:
-    if value == "orbit":
-        return "orbit"
+    if value in ("orbit", "turntable", "dolly"):
+        return str(value)
     if isinstance(value, str):
         return existing_path(value, place)
     index: int = whole(0, 10**9)(value, place)
@@ -340,68 +345,20 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class SolveSettings:
-    """``solve:`` - how accurately."""
-
-    LATER: ClassVar[dict[str, str]] = {
-        "error": "choosing the setting by an error bound",
-        "seconds_per_frame": "choosing the setting by a time budget",
-    }
-    quality: str = key(
-        choice("preview", "shot", "hero"),
-        default="shot",
-        doc="Size of the cells of the grid.",
-        example="preview",
-    )
-    deterministic: bool = key(
-        flag,
-        default=False,
-        doc="Insist on the same bits from the same input on the same device. The solver gives them "
-        "anyway; a blade at work on a GPU does not, and is refused then.",
-        example="true",
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class KeyLight:
-    """``light.key:`` - the directional light."""
-
-    direction: Vector = key(
-        read_direction, default=(1.0, -1.0, 2.0),
-        doc="From the scene towards the light; +z is up.", example="[1, -1, 2]",
-    )  # fmt: skip
-    shadow: bool = key(
-        flag, default=True, doc="Whether the object shadows itself and the floor.", example="true"
-    )
-    intensity: float | None = key(number(0.0, 1e3), default=None, doc="Strength.", example="0.6")
-
-
-@dataclasses.dataclass(frozen=True)
-class LightSettings:
-    """``light:``."""
-
-    ambient: float | None = key(
-        number(0.0, 1e3), default=None, doc="Light from everywhere.", example="0.4"
-    )
-    specular: float | None = key(
-        number(0.0, 1e3), default=None, doc="Strength of highlights.", example="0.2"
-    )
-    # Last, because from here on ``key`` names this field.
-    key: KeyLight = key(
-        nested(KeyLight),
-        default=KeyLight(),
-        doc="The directional light.",
-        example="{direction: [1, -1, 2]}",
-    )
-
-
-@dataclasses.dataclass(frozen=True)
 class OutputSettings:
     """``output:`` - what is made of the simulation."""
 
-    fps: float = key(number(1.0, 1000.0), default=30.0, doc="Frames per second.", example="30")
+    fps: float = key(
+        number(1.0, 10000.0), default=30.0, doc="Frames per simulated second.", example="30"
+    )
     seconds: float = key(
         number(0.0, 3600.0, above=0.0), default=2.0, doc="Simulated time [s].", example="2"
+    )
+    slow: float = key(
+        number(0.01, 1000.0),
+        default=1.0,
+        doc="How many times slower than it happened the video plays: 10 shows 0.2 s in 2 s.",
+        example="10",
     )
     size: tuple[int, int] = key(
         _size, default=(1280, 720), doc="Width and height of the video [pixels].",
@@ -409,7 +366,8 @@ class OutputSettings:
     )  # fmt: skip
     camera: str | int | Path = key(
         _camera, default="orbit",
-        doc="orbit, the number of a photograph (0 is the first), or a JSON file with a path.",
+        doc="orbit, turntable, dolly, the number of a photograph (0 is the first), or a path: "
+        "a JSON file, a transforms.json or a COLMAP folder.",
         example="orbit",
     )  # fmt: skip
     backdrop: str = key(
@@ -418,7 +376,12 @@ class OutputSettings:
         example="captured",
     )  # fmt: skip
     what: tuple[str, ...] = key(
-        several(choice("mp4", "ply-seq", "vtk", later=("usd", "png-seq", "spz", "gltf"))),
+        several(choice("mp4", *EXPORTS)),
         default=("mp4",),
         doc="What to write.", example="[mp4, ply-seq]",
     )  # fmt: skip
+
+    @property
+    def video_fps(self) -> float:
+        """Frames per second at which the video plays."""
+        return self.fps / self.slow

@@ -24,18 +24,19 @@ from gsfluent.config.read import (
     plain,
     read_direction,
     section,
+    vector,
     without_none,
 )
 from gsfluent.config.settings import (
     FillSettings,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
-    SolveSettings,
     TextureSettings,
     Vector,
     read_texture,
 )
+from gsfluent.config.settings_light import LightSettings
+from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.errors import InputError
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -97,6 +98,18 @@ class Shot:
     )  # fmt: skip
     floor_friction: float = key(
         number(0.0), default=0.4, doc="Coulomb friction of the floor.", example="0.6"
+    )
+    origin: str = key(
+        choice("auto", "input"), default="auto",
+        doc="Where the scene's z axis stands: auto (in the middle of the object) or input (where "
+        "the input has its own origin).",
+        example="input",
+    )  # fmt: skip
+    gravity: Vector = key(
+        vector(3),
+        default=(0.0, 0.0, -9.81),
+        doc="Acceleration that pulls everything [m/s^2].",
+        example="[0, 0, -1.62]",
     )
     reconstruct: ReconstructSettings = key(
         nested(ReconstructSettings),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
 from gsfluent.io.colmap import find_model, read_model
 from gsfluent.io.images import IMAGE_SUFFIXES
-from gsfluent.io.transforms import read_transforms
+from gsfluent.io.transforms import read_poses, read_transforms
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
@@ -45,6 +46,34 @@ def load_capture(path: str | Path) -> Capture:
     for name in _TRANSFORMS:
         if (path / name).is_file():
             return read_transforms(path / name)
+    raise _nothing_found(path)
+
+
+def load_poses(path: str | Path) -> list[Camera]:
+    """Read the cameras of a capture whose photographs need not be there, as a camera path.
+
+    Args:
+        path: Folder with a COLMAP model or a ``transforms.json``, or that file itself.
+
+    Returns:
+        The cameras: of a ``transforms.json`` in its order, of a model in the order of the names.
+
+    Raises:
+        InputError: Nothing usable there, a damaged model, an unsupported lens, a pose missing.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such camera path", "check the path")
+    if path.is_file():
+        return read_poses(path)
+    model = find_model(path)
+    if model is None and (path / "images.txt").is_file():
+        model = path
+    if model is not None:
+        return read_model(model, path, photographs=False).cameras
+    for name in _TRANSFORMS:
+        if (path / name).is_file():
+            return read_poses(path / name)
     raise _nothing_found(path)
 
 

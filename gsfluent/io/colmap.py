@@ -91,8 +91,13 @@ def find_model(root: Path) -> Path | None:
     return max(found, key=lambda item: item[0])[1] if found else None
 
 
-def read_model(model: Path, root: Path) -> Capture:
+def read_model(model: Path, root: Path, *, photographs: bool = True) -> Capture:
     """Read the COLMAP model in folder ``model`` with the photographs below ``root``.
+
+    Args:
+        model: Folder with ``cameras`` and ``images``.
+        root: Folder of the capture.
+        photographs: Whether these must be there.
 
     Raises:
         InputError: A damaged file, an unsupported lens model, no registered image, or a photograph
@@ -116,7 +121,7 @@ def read_model(model: Path, root: Path) -> Capture:
             f"{model / f'images{suffix}'}: no image has a pose",
             "the posing failed; run COLMAP again",
         )
-    folder = _image_folder(root, [name for name, _, _ in poses])
+    folder = _image_folder(root, [name for name, _, _ in poses]) if photographs else root
     cameras = []
     for name, lens_id, viewmat in sorted(poses, key=lambda pose: pose[0]):
         if lens_id not in lenses:

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError
+from gsfluent.io.morton import morton_order
 
 _CHUNK = 256
 _LIMITS = ("x", "y", "z", "scale_x", "scale_y", "scale_z")
+_PLACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # what is kept of wxyz
+_LOG_SCALE_LIMIT = 20.0
 
 
 def is_compressed(data: dict[str, NDArray[Any]]) -> bool:
@@ -91,7 +94,7 @@ def _unpack_rotation(packed: NDArray[Any]) -> NDArray[Any]:
     small = (small - 0.5) * np.sqrt(2.0)
     largest = (packed >> 30).astype(np.int64)
     quats = np.zeros((len(packed), 4))
-    places = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    places = _PLACES[largest]
     np.put_along_axis(quats, places, small, axis=1)
     missing = np.sqrt(np.clip(1.0 - (small**2).sum(axis=1), 0.0, None))
     np.put_along_axis(quats, largest[:, None], missing[:, None], axis=1)
@@ -109,3 +112,80 @@ def _rest(path: Path, rows: NDArray[Any]) -> NDArray[Any]:
     fraction = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
     values = (fraction - 0.5) * 8
     return values.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)
+
+
+def encode_compressed(gaussians: Gaussians, *, keep_order: bool = False) -> dict[str, NDArray[Any]]:
+    """Encode splats as the elements ``chunk``, ``vertex`` and, above SH degree 0, ``sh``.
+
+    A chunk's limits span 256 rows, so neighbours in the file should be neighbours in space.
+
+    Args:
+        gaussians: What to encode.
+        keep_order: Leave the rows as they are; otherwise they are put along a Z-order curve.
+
+    Returns:
+        Elements for :func:`gsfluent.io.write_ply`, in the order that readers expect.
+    """
+    host = gaussians.to("cpu", torch.float64)
+    if not keep_order:
+        host = host.select(torch.from_numpy(morton_order(host.means.numpy())))
+    count = host.count
+    first = np.arange(0, count, _CHUNK)
+    log_scale = host.scales.log().clamp(-_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT).numpy()
+    values = {
+        ("x", "y", "z"): host.means.numpy(),
+        ("scale_x", "scale_y", "scale_z"): log_scale,
+        ("r", "g", "b"): host.sh[:, 0].numpy() * geometry.SH0 + 0.5,
+    }
+    chunk = np.zeros(
+        len(first),
+        dtype=[
+            (f"{side}_{n}", "<f4") for names in values for side in ("min", "max") for n in names
+        ],
+    )
+    fractions = []
+    for names, value in values.items():
+        low, high = np.minimum.reduceat(value, first), np.maximum.reduceat(value, first)
+        for axis, name in enumerate(names):
+            chunk[f"min_{name}"], chunk[f"max_{name}"] = low[:, axis], high[:, axis]
+        span = np.where(high > low, high - low, 1.0)
+        rows = np.arange(count) // _CHUNK
+        fractions.append((value - low[rows]) / span[rows])
+    quats = geometry.normalize_quaternions(host.quats).numpy()
+    opacity = host.opacities.numpy()[:, None]
+    vertex = np.zeros(
+        count,
+        dtype=[(f"packed_{n}", "<u4") for n in ("position", "rotation", "scale", "color")],
+    )
+    vertex["packed_position"] = _pack(fractions[0], (11, 10, 11))
+    vertex["packed_rotation"] = _pack_rotation(quats)
+    vertex["packed_scale"] = _pack(fractions[1], (11, 10, 11))
+    vertex["packed_color"] = _pack(np.concatenate([fractions[2], opacity], axis=1), (8, 8, 8, 8))
+    data = {"chunk": chunk, "vertex": vertex}
+    if host.sh.shape[1] > 1:
+        rest = host.sh[:, 1:].transpose(1, 2).reshape(count, -1).numpy()
+        columns = [(f"f_rest_{index}", "u1") for index in range(rest.shape[1])]
+        level = np.ascontiguousarray(np.clip(np.trunc((rest / 8 + 0.5) * 256), 0, 255), np.uint8)
+        data["sh"] = level.view(columns)[:, 0]
+    return data
+
+
+def _pack(fractions: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Fractions 0..1 [N, C] as whole numbers of so many bits, the first one highest."""
+    packed = np.zeros(len(fractions), dtype=np.uint32)
+    for column, width in enumerate(bits):
+        level = np.floor(fractions[:, column] * ((1 << width) - 1) + 0.5)
+        packed = (packed << np.uint32(width)) | np.clip(level, 0, (1 << width) - 1).astype(
+            np.uint32
+        )
+    return packed
+
+
+def _pack_rotation(quats: NDArray[Any]) -> NDArray[np.uint32]:
+    """Unit quaternions ``wxyz`` without their largest component, which is made positive."""
+    largest = np.abs(quats).argmax(axis=1)
+    rows = np.arange(len(quats))
+    quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+    small = np.take_along_axis(quats, _PLACES[largest], axis=1)
+    packed = _pack(small / np.sqrt(2.0) + 0.5, (10, 10, 10))
+    return packed | (largest.astype(np.uint32) << np.uint32(30))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io.compressed import decode_compressed, is_compressed
+from gsfluent.io.compressed import decode_compressed, encode_compressed, is_compressed
 from gsfluent.io.ply import read_ply, write_ply
 
 logger = logging.getLogger(__name__)
@@ -83,7 +83,14 @@ def load_splats(path: str | Path) -> Gaussians:
     return gaussians.validated(str(path))
 
 
-def save_splats(gaussians: Gaussians, path: str | Path) -> None:
+def save_splats(
+    gaussians: Gaussians,
+    path: str | Path,
+    *,
+    compressed: bool = False,
+    keep_order: bool = False,
+    extra: dict[str, NDArray[Any]] | None = None,
+) -> None:
     """Write Gaussians as an INRIA-layout 3DGS ``.ply`` that other viewers open, atomically.
 
     ``nx, ny, nz`` hold the normals (zero without); labels, when present, go into one extra float
@@ -92,12 +99,18 @@ def save_splats(gaussians: Gaussians, path: str | Path) -> None:
     Args:
         gaussians: What to write; the values are checked first.
         path: Output file, ``.ply``.
+        compressed: SuperSplat's layout of 16 bytes a splat instead, without normals and labels.
+        keep_order: Leave the rows of a compressed file in their order, at some loss of precision.
+        extra: More float properties [N] to put at the end; a compressed file has none.
 
     Raises:
         InputError: NaN, zero scale or no rows; nothing is written.
         RunError: The disk is full or the folder cannot be written.
     """
     gaussians.validated(f"save to {path}")
+    if compressed:
+        write_ply(path, encode_compressed(gaussians, keep_order=keep_order), ("gsfluent",))
+        return
     host = gaussians.to("cpu", torch.float64)
     count, rest = host.count, host.sh[:, 1:].transpose(1, 2).reshape(host.count, -1).numpy()
     opacity = host.opacities.numpy()
@@ -116,6 +129,7 @@ def save_splats(gaussians: Gaussians, path: str | Path) -> None:
     ]
     if host.labels is not None:
         blocks.append((["label"], host.labels.numpy()[:, None]))
+    blocks += [([name], np.asarray(values)[:, None]) for name, values in (extra or {}).items()]
     rows = np.zeros(count, dtype=[(name, "<f4") for names, _ in blocks for name in names])
     table = np.concatenate([values for _, values in blocks], axis=1).astype("<f4")
     rows = np.ascontiguousarray(table).view(rows.dtype)[:, 0]

@@ -38,12 +38,7 @@ def read_transforms(path: Path) -> Capture:
         InputError: Not JSON, no frames, a frame without pose or image, an unsupported lens.
     """
     data = _read_json(path)
-    frames = data.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise InputError(
-            f"{path}: 'frames' must be a list with at least one frame", "export the capture again"
-        )
-    cameras = [_camera(path, data, frame, index) for index, frame in enumerate(frames)]
+    cameras = [_camera(path, data, frame, index) for index, frame in enumerate(_frames(path, data))]
     cameras.sort(key=lambda camera: camera.name)
     missing = [
         camera for camera in cameras if camera.image_path is None or not camera.image_path.is_file()
@@ -56,6 +51,29 @@ def read_transforms(path: Path) -> Capture:
         )
     points, colors = _points(path, data)
     return Capture(cameras, points, colors, path.parent)
+
+
+def read_poses(path: Path) -> list[Camera]:
+    """Read the cameras of a ``transforms.json`` in its order; the images need not be there.
+
+    Raises:
+        InputError: Not JSON, no frames, a frame without pose or size, an unsupported lens.
+    """
+    data = _read_json(path)
+    frames = [
+        {"file_path": str(index)} | frame if isinstance(frame, dict) else frame
+        for index, frame in enumerate(_frames(path, data))
+    ]
+    return [_camera(path, data, frame, index) for index, frame in enumerate(frames)]
+
+
+def _frames(path: Path, data: dict[str, Any]) -> list[Any]:
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(
+            f"{path}: 'frames' must be a list with at least one frame", "export the capture again"
+        )
+    return frames
 
 
 def _read_json(path: Path) -> dict[str, Any]:

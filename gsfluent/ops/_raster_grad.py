@@ -109,7 +109,7 @@ def _(*inputs: Any) -> tuple[Tensor, ...]:
         real(*plane),
         real(*plane) if depth else real(0),
         real(*plane) if median_depth else real(0),
-        real(*plane, 3) if normals is not None else real(0),
+        real(*plane, normals.shape[1]) if normals is not None else real(0),
         real(n if contribution else 0),
         whole(*leading, n),
         real(unknown(), unknown()),

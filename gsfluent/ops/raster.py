@@ -19,6 +19,7 @@ from gsfluent.ops._raster_grad import Rasterize
 
 _OP = "rasterize"
 _MAX_CHANNELS = 32
+_MAX_VALUES = 35  # colours and normals together
 _TENSORS = 14
 _MAX_SIZE = 65536
 _SH_COEFFICIENTS = (1, 4, 9, 16)
@@ -41,7 +42,7 @@ class Rendered(NamedTuple):
     """Expected camera z [world units], divided by alpha; 0 where alpha is 0. Shape [H, W]; None
     when not wanted."""
     normal: Tensor | None
-    """Blended (not normalised) normals, shape [H, W, 3]; None unless normals were given."""
+    """Blended (not normalised) normals, shape [H, W, K]; None unless normals were given."""
     contribution: Tensor | None
     """Sum of blend weights over all pixels of all cameras, shape [N]; None unless asked for. No
     gradient."""
@@ -105,7 +106,9 @@ def rasterize(
             black when None.
         antialiased: Scale opacity by sqrt(det / det_blurred), at least 0.005, so that the low-pass
             does not thicken splats smaller than a pixel.
-        normals: Vectors to blend along with the colours, shape [N, 3].
+        normals: Vectors to blend along with the colours, shape [N, K] with K >= 3; columns beyond
+            the third are further values per splat (occlusion, gloss). Channels and K together at
+            most 35.
         groups: Sibling group per Gaussian, int32, shape [N]; -1 for none. Per pixel only the
             nearest member of a group contributes (the last 8 contributing groups are remembered).
         means2d_offset: Added to the projected centres [px], shape [N, 2] or [C, N, 2]. Zeros that
@@ -247,15 +250,20 @@ def _checked(
     _check_shape_arguments(means, quats, scales, covars)
     channels = _check_color_arguments(means, sh, colors)
     per_camera = isinstance(background, Tensor) and background.dim() == 2
-    optional: tuple[tuple[str, Tensor | None, tuple[int, ...]], ...] = (
+    optional: tuple[tuple[str, Tensor | None, tuple[int | str, ...]], ...] = (
         ("background", background, (*leading, channels) if per_camera else (channels,)),
-        ("normals", normals, (n, 3)),
+        ("normals", normals, (n, "K")),
         ("means2d_offset", means2d_offset, (*leading, n, 2)),
         ("means2d_absgrad", means2d_absgrad, (*leading, n, 2)),
     )
     for name, value, shape in optional:
         if value is not None:
             check_tensor(_OP, name, value, shape=shape, like=means)
+    if normals is not None and not 3 <= normals.shape[1] <= _MAX_VALUES - channels:
+        raise ValueError(
+            f"{_OP}: normals must have 3 to {_MAX_VALUES - channels} columns beside {channels} "
+            f"channels, got {list(normals.shape)}"
+        )
     if groups is not None:
         check_tensor(_OP, "groups", groups, shape=(n,), dtype=torch.int32, like=means)
     if not 0.0 < near < far:

@@ -1,105 +1,141 @@
-"""A finished simulation in other programs' formats: 3DGS .ply sequence, VTK point sequence, mp4."""
+"""A finished simulation in other programs' formats; docs/export.md says which reads what."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import importlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
+from gsfluent.config.read import nearest
 from gsfluent.errors import InputError
-from gsfluent.io import atomic_path, save_splats
-from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame
-from gsfluent.pipeline.stage import Progress, report_progress
+from gsfluent.pipeline.export_frames import Reel
+from gsfluent.pipeline.export_job import ExportOptions, Job
+from gsfluent.pipeline.export_unpack import DeltaReel
+from gsfluent.pipeline.stage import Progress
 
-FORMATS = ("mp4", "ply-seq", "vtk")
+
+@dataclass(frozen=True)
+class Format:
+    """One thing that can be written.
+
+    Attributes:
+        what: Files and who reads them, in one line.
+        module: Module of the writer, below ``gsfluent.pipeline``.
+        function: The writer: takes a :class:`Job`, returns what was written.
+        pictures: Rendered; needs the shot's camera and light.
+        splats_only: Needs splats and nothing else, so it can be made of a ``.gsd`` file.
+        key: Name in the report.
+    """
+
+    what: str
+    module: str
+    function: str
+    pictures: bool = False
+    splats_only: bool = False
+    key: str = ""
+
+
+FORMATS: dict[str, Format] = {
+    "mp4": Format("H.264 video", "export_pictures", "mp4", pictures=True, key="video"),
+    "gif": Format("animated GIF", "export_pictures", "gif", pictures=True),
+    "webp": Format("animated WebP, also with alpha", "export_pictures", "webp", pictures=True),
+    "png": Format("PNG sequence, also with alpha", "export_pictures", "png", pictures=True),
+    "ply-seq": Format(
+        "3DGS .ply per frame: SuperSplat, Blender, Houdini, Unity",
+        "export_splats",
+        "ply_sequence",
+        splats_only=True,
+    ),
+    "spz": Format(
+        ".spz per frame: phones, web viewers", "export_splats", "spz_sequence", splats_only=True
+    ),
+    "splat": Format(
+        ".splat per frame: the first web viewers",
+        "export_splats",
+        "splat_sequence",
+        splats_only=True,
+    ),
+    "glb": Format(
+        "glTF with KHR_gaussian_splatting per frame",
+        "export_splats",
+        "glb_sequence",
+        splats_only=True,
+    ),
+    "delta": Format(
+        "one small .gsd file: gsfluent.io.DeltaReader, gsfluent export",
+        "export_delta",
+        "delta",
+        splats_only=True,
+    ),
+    "usd": Format("one USD file with time samples: Houdini, usdview", "export_splats", "usd"),
+    "vtk": Format("material points per frame: ParaView, VisIt", "export_points", "vtk"),
+    "points": Format("material points as .ply: Houdini, Blender", "export_points", "points"),
+    "vti": Format("density and damage volume per frame: ParaView", "export_points", "vti"),
+}
 
 
 def export(
-    out: Path, kinds: list[str], *, device: torch.device, progress: Progress | None = None
+    out: Path,
+    kinds: list[str],
+    *,
+    device: torch.device,
+    to: Path | None = None,
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write formats, also the video again.
+    """Write a finished simulation in some formats.
 
     Args:
-        out: Folder of a run.
+        out: Folder of the run, or a ``.gsd`` file of one.
         kinds: Some of :data:`FORMATS`.
-        device: Where the video is rendered.
+        device: Where pictures are rendered and light is baked.
+        to: Folder to write to; by default ``out``, or one named like the file.
+        options: How.
         progress: Called per frame.
 
     Returns:
-        Format to what was written, relative to ``out``.
+        Format to what was written, relative to ``to``.
 
     Raises:
-        InputError: An unknown format, or no simulated frames.
+        InputError: An unknown format or option, an extra that is not installed, or no frames.
         RunError: The disk is full.
     """
-    kinds = [kind.strip() for kind in kinds]
+    options = options or ExportOptions()
+    kinds = [kind.strip() for kind in kinds if kind.strip()]
     for kind in kinds:
         if kind not in FORMATS:
-            raise InputError(
-                f"--to {kind}: gsfluent cannot write that", f"choose from {', '.join(FORMATS)}"
-            )
-    written = write_exports(out, [kind for kind in kinds if kind != "mp4"], progress=progress)
-    if "mp4" in kinds:
-        from gsfluent.pipeline.run_show import render_again
-
-        render_again(out, to=out / "video.mp4", device=device, progress=progress)
-        written["video"] = "video.mp4"
-    return written
+            raise InputError(f"--to {kind}: gsfluent cannot write that", nearest(kind, FORMATS))
+    if not kinds:
+        raise InputError("--to names no format", f"choose from {', '.join(FORMATS)}")
+    reel: Reel
+    if out.is_file():
+        reel = DeltaReel(out, frames=options.frames, sh=options.sh, up=options.up)
+        for kind in kinds:
+            if not FORMATS[kind].splats_only:
+                raise InputError(f"--to {kind}: {out} holds splats only", "export from the run")
+        to = to or out.with_suffix("")
+    else:
+        reel = Reel(out, frames=options.frames, sh=options.sh, up=options.up)
+    job = Job(out, to or out, reel, options, options.fps or reel.rate(), device, progress)
+    return _write(job, kinds)
 
 
 def write_exports(
     out: Path, kinds: list[str], *, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write the formats that need no rendering; see :func:`export`."""
-    folder = out / "stages" / "simulate"
-    count = count_frames(folder)
-    if count == 0:
-        raise InputError(f"{out}: no simulated frames", "run the shot first: gsfluent run")
+    """Write the formats that need no rendering, with the usual options; see :func:`export`."""
+    reel = Reel(out)
+    rate, cpu = reel.rate(), torch.device("cpu")
+    return _write(Job(out, out, reel, ExportOptions(), rate, cpu, progress), kinds)
+
+
+def _write(job: Job, kinds: list[str]) -> dict[str, Any]:
+    job.folder.mkdir(parents=True, exist_ok=True)
     written: dict[str, Any] = {}
     for kind in kinds:
-        where, name, write = _WRITERS[kind]
-        (out / where).mkdir(exist_ok=True)
-        for index in range(count):
-            write(out / where / name.format(index + 1), load_frame(folder, index))
-            report_progress(progress, index + 1, count, kind)
-        written[kind] = f"{where}/{name.format(1)} to {name.format(count)}"
+        module = importlib.import_module(f"gsfluent.pipeline.{FORMATS[kind].module}")
+        written[FORMATS[kind].key or kind] = getattr(module, FORMATS[kind].function)(job)
     return written
-
-
-def write_ply_frame(path: Path, frame: SavedFrame) -> None:
-    """One frame as a standard INRIA 3DGS .ply, scene coordinates in metres."""
-    save_splats(frame.gaussians, path)
-
-
-def write_vtk_frame(path: Path, frame: SavedFrame) -> None:
-    """The material points of one frame as legacy binary VTK, with damage, volume and fragment."""
-    points = frame.positions.cpu().numpy().astype(">f4")
-    count = points.shape[0]
-    fields: list[tuple[str, str, np.ndarray]] = [
-        ("damage", "float", frame.damage.cpu().numpy().astype(">f4")),
-        ("volume", "float", frame.volumes.cpu().numpy().astype(">f4")),
-        ("fragment", "int", frame.fragments.cpu().numpy().astype(">i4")),
-    ]
-    vertices = np.empty((count, 2), dtype=">i4")
-    vertices[:, 0], vertices[:, 1] = 1, np.arange(count)
-    with atomic_path(path) as part, part.open("wb") as stream:
-        title = f"gsfluent frame {frame.index + 1}, time {frame.time:.6g} s"
-        kind_of_file = f"# vtk DataFile Version 3.0\n{title}\nBINARY\nDATASET POLYDATA\n"
-        stream.write(f"{kind_of_file}POINTS {count} float\n".encode())
-        stream.write(points.tobytes())
-        stream.write(f"\nVERTICES {count} {2 * count}\n".encode())
-        stream.write(vertices.tobytes())
-        stream.write(f"\nPOINT_DATA {count}\n".encode())
-        for name, kind, values in fields:
-            stream.write(f"SCALARS {name} {kind} 1\nLOOKUP_TABLE default\n".encode())
-            stream.write(values.tobytes() + b"\n")
-
-
-_Writer = Callable[[Path, SavedFrame], None]
-_WRITERS: dict[str, tuple[str, str, _Writer]] = {
-    "ply-seq": ("frames", "frame_{:04d}.ply", write_ply_frame),
-    "vtk": ("particles", "particles_{:04d}.vtk", write_vtk_frame),
-}

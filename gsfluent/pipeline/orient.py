@@ -108,7 +108,7 @@ def make_frame(
     Args:
         gaussians: The object's splats (background removed), world coordinates.
         capture: The photographs, used for the up axis.
-        shot: Settings ``up``, ``floor``, ``scale`` and ``size``; automatic without.
+        shot: Settings ``up``, ``floor``, ``origin``, ``scale`` and ``size``; automatic without.
 
     Raises:
         InputError: No splats, or all in one point; or no support plane where one is asked for.
@@ -140,6 +140,8 @@ def make_frame(
             )
         ground = stance.floor
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, ground])
+    if shot is not None and shot.origin == "input":
+        base = np.array([0.0, 0.0, 0.0 if shot.floor == "none" else ground])
     return Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
 
 

@@ -1,4 +1,4 @@
-"""Cameras of a video: an orbit that follows the action, a photograph's pose, or a path file."""
+"""Cameras of a video: an orbit that follows the action, a photograph's pose, or a path."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Capture, Frame
 from gsfluent.errors import InputError
+from gsfluent.pipeline.render_path import dolly, holds_poses, through, turntable
+
+PATHS = ("orbit", "turntable", "dolly")
+"""Camera paths that go by a name."""
 
 _FIELD_OF_VIEW = (
     32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
@@ -77,11 +81,16 @@ def _vertical_fov(size: tuple[int, int]) -> float:
     return math.degrees(2.0 * math.atan(half * height / min(width, height)))
 
 
-def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
+def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
     The distance shows nine tenths of the matter, but the whole object at least and 3.6 times the
     object at most: a spray of crumbs must not shrink the subject to a dot.
+
+    Args:
+        action: Where the matter is.
+        size: (width, height) [px].
+        sweep: Degrees of azimuth from the first frame to the last.
     """
     count = action.center.shape[0]
     shown = _shown(action)
@@ -89,7 +98,7 @@ def orbit(action: Action, size: tuple[int, int]) -> list[Camera]:
     centers = _follow(action, shown)
     steps = [i / max(1, count - 1) for i in range(count)]
     return [
-        look_at(centers[i], float(distance[i]), _START + _SWEEP * step, _ELEVATION, size)
+        look_at(centers[i], float(distance[i]), _START + sweep * step, _ELEVATION, size)
         for i, step in enumerate(steps)
     ]
 
@@ -143,22 +152,26 @@ def cameras_for(
     """One camera per frame for ``output.camera``.
 
     Args:
-        choice: ``orbit``, the index of a photograph, or a JSON file (see :func:`read_path`).
+        choice: One of :data:`PATHS`, the index of a photograph, a JSON file (see
+            :func:`read_path`), or a ``transforms.json`` or COLMAP folder whose poses are followed.
         action: Where the matter is; its length is the number of frames.
         size: (width, height) [px].
         capture: The photographs, needed for an index.
-        frame: World to scene, needed for an index.
+        frame: World to scene, needed for an index and for poses.
 
     Raises:
         InputError: No such photograph, or an unreadable file.
     """
     count = action.center.shape[0]
-    if str(choice) == "orbit":
-        return orbit(action, size)
+    if str(choice) in PATHS:
+        return _named_path(str(choice), action, size)
     try:
         index = int(str(choice))
     except ValueError:
-        return read_path(Path(str(choice)), count, size)
+        path = Path(str(choice))
+        if holds_poses(path):
+            return [framed(camera, size) for camera in through(path, count, frame)]
+        return read_path(path, count, size)
     if capture is None or frame is None:
         raise InputError(
             f"output.camera: {index}",
@@ -171,6 +184,14 @@ def cameras_for(
         )
     photograph = capture.view(index).camera  # undistorted
     return [framed(photograph.transformed(frame), size)] * count
+
+
+def _named_path(name: str, action: Action, size: tuple[int, int]) -> list[Camera]:
+    if name == "orbit":
+        return orbit(action, size)
+    still = orbit(action, size, sweep=0.0)
+    centers = _follow(action, _shown(action))
+    return turntable(still, centers) if name == "turntable" else dolly(still, centers)
 
 
 def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
@@ -191,7 +212,8 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
         field = float(data.get("fov", _FIELD_OF_VIEW))
     except OSError as error:
         raise InputError(
-            f"output.camera: {path}: {error.strerror}", "give orbit, an index, or a file"
+            f"output.camera: {path}: {error.strerror}",
+            f"give {', '.join(PATHS)}, an index, or a file",
         ) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"output.camera: {path}: {error!r}", mend) from error

@@ -29,6 +29,7 @@ THINNEST = 2.0
 BACKED = 6.0
 """Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
 it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
+_NOTHING = columns.TYPES["nothing"]
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -74,8 +75,10 @@ class RigidSet:
             torch.stack(rows) if rows else torch.zeros(0, columns.COLLIDER_COLUMNS).double()
         )
         self._motion = self.start[:, [10, 11, 12, 20, 21, 22]].clone()
+        self._begin = self.start
+        self._types = self.start[:, columns.TYPE].tolist()
         self.start = self.scheduled(self.start, 0.0).to(device)
-        self._motion = self._motion.to(device)
+        self._motion, self._begin = self._motion.to(device), self._begin.to(device)
         self.sdf = torch.cat(self._grids).to(device) if self._grids else None
         self._pull = math.hypot(*scene.gravity)
         self._free = [
@@ -94,23 +97,35 @@ class RigidSet:
 
     @property
     def moves(self) -> bool:
-        """Whether any of them ever moves."""
-        return bool((self._motion != 0).any() or (self.start[:, columns.MASS] > 0).any())
+        """Whether any of them ever moves, comes or goes."""
+        if self.frees or not all(c is None or _steady(c) for c in self._colliders):
+            return True
+        return bool((self._motion != 0).any())
 
     def scheduled(self, rows: Tensor, time: float) -> Tensor:
-        """Rows with the velocities that hold from ``time`` on; free bodies keep theirs."""
+        """Rows from ``time`` on: their velocities (free bodies keep theirs), and who is there.
+
+        A free body that starts later is a row of nothing, without mass, until then.
+        """
         if all(c is None or _steady(c) for c in self._colliders):
             return rows
         rows = rows.clone()
         for i, c in enumerate(self._colliders):
             if c is not None and not _steady(c):
                 on = c.start <= time < c.stop
+                if c.mass is not None:
+                    if not on:
+                        rows[i] = _waiting(self._begin[i])
+                    elif rows[i, columns.TYPE] == _NOTHING:
+                        rows[i] = self._begin[i]
+                    continue
                 motion = self._motion[i] if on else torch.zeros_like(self._motion[i])
                 rows[i, 10:13], rows[i, 20:23] = motion[:3], motion[3:]
+                rows[i, columns.TYPE] = self._types[i] if c.there(time) else _NOTHING
         return rows
 
     def next_change(self, time: float) -> float:
-        """The next time after ``time`` at which a plate starts or stops [s], or infinity."""
+        """The next time after ``time`` at which one starts or stops [s], or infinity."""
         changes = [t for c in self._colliders if c is not None for t in (c.start, c.stop)]
         return min((t for t in changes if t > time), default=math.inf)
 
@@ -163,8 +178,14 @@ class RigidSet:
         return self.speeds(rows).max() if self.count else rows.new_zeros(())
 
     def moving(self, rows: Tensor) -> Tensor:
-        """Colliders that move, or that gravity is about to move: their rows, [K, 32]."""
+        """Colliders that move, that gravity is about to move, or that will go: rows, [K, 32].
+
+        What leans on something that will go must not sleep: nobody would wake it.
+        """
         active = self.speeds(rows) > 0.0
+        for i, c in enumerate(self._colliders):
+            if c is not None and math.isfinite(c.vanishes):
+                active[i] |= rows[i, columns.TYPE] != _NOTHING
         for i in self._free if self._pull > 0.0 else ():
             bottom = float(rows[i, 5]) - self._reach(i, rows)
             active[i] |= self.floor is None or bottom > self.floor + 1e-9
@@ -243,7 +264,10 @@ class RigidSet:
             Points [P, 3] and normals [P, 3] in scene metres, and the largest spacing [m].
         """
         found, normals, widest = [], [], 0.0
-        for row in map(self._drawn, self._colliders, rows):
+        for collider, one in zip(self._colliders, rows, strict=True):
+            if collider is not None and not collider.shown:
+                continue
+            row = self._drawn(collider, one)
             bound = self._bound(row)
             if not math.isfinite(bound):
                 continue
@@ -292,13 +316,6 @@ class RigidSet:
         volume, inertia, extra = self._shape(c)
         mass = c.mass or 0.0
         point, velocity = list(c.point), list(c.velocity)
-        if c.mass is not None:
-            # It passes its point at its start: where it comes from follows from free flight.
-            velocity = [v - g * c.start for v, g in zip(velocity, self._gravity, strict=True)]
-            point = [
-                x - v * c.start - 0.5 * g * c.start**2
-                for x, v, g in zip(point, velocity, self._gravity, strict=True)
-            ]
         shape: dict[str, Any] = {"point": point, "orientation": c.orientation} | extra
         if c.backed:
             half = 0.5 * max(c.size[2], BACKED * self.dx)
@@ -358,7 +375,7 @@ class RigidSet:
         self._grids.append(torch.nn.functional.pad(values, (0, pad)))
         offset = self._grid_values
         self._grid_values += values.shape[0] + pad
-        turn = _matrix(c.orientation)
+        turn = geometry.quaternion_to_matrix(torch.tensor([c.orientation]).double())[0]
         axes = torch.from_numpy(body.axes.copy())
         extra = {
             "point": (turn @ torch.from_numpy(body.center.copy())).tolist(),
@@ -399,22 +416,19 @@ def _kinetic(rows: Tensor) -> Tensor:
     return 0.5 * (rows[:, columns.MASS] * (rows[:, 10:13] ** 2).sum(dim=1) + spin)
 
 
+def _waiting(row: Tensor) -> Tensor:
+    """A free body before its start."""
+    row = row.clone()
+    row[columns.TYPE] = _NOTHING
+    for first, last in ((10, 13), (columns.ANGULAR_VELOCITY, columns.EXTENT)):
+        row[first:last] = 0.0
+    row[columns.MASS] = 0.0
+    return row
+
+
 def _steady(c: Collider) -> bool:
-    """Whether a collider needs no schedule: free, or moving (or standing) for ever."""
-    return c.mass is not None or (c.start <= 0.0 and math.isinf(c.stop))
-
-
-def _matrix(q: tuple[float, float, float, float]) -> Tensor:
-    """Rotation matrix of a unit quaternion w, x, y, z."""
-    w, x, y, z = q
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+    """Whether a collider needs no schedule: moving (or standing, or free) from the start on."""
+    return c.start <= 0.0 and math.isinf(c.stop)
 
 
 def quaternion_of(matrix: Tensor) -> list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ def run_shot(
     reporter: Reporter | None = None,
     before: StageResult | None = None,
     after: AfterRun | None = None,
+    facts: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Run a shot into a folder.
 
@@ -59,6 +60,7 @@ def run_shot(
         reporter: Receives progress; log lines by default.
         before: A stage done already, to stand first in ``run.json``.
         after: Called when all stages are done; what it returns is added to ``run.json``.
+        facts: What is known before and belongs into ``run.json``.
 
     Returns:
         The content of ``run.json``.
@@ -74,6 +76,7 @@ def run_shot(
     if before is not None:
         store.results.append(before)
     record = RunRecord(out / "run.json", shot.resolved(), device, seed)
+    record.values.update(facts or {})
     context = RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
     start = time.perf_counter()
     try:

@@ -124,8 +124,7 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
             **{name: _tensor(arrays[name]) for name in (*_SPLATS, *_POINTS)},
         )
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        mend = "run the shot again; only this stage is redone (use --force if it is not)"
-        raise RunError(f"{path}: no readable frame ({error})", "the other frames", mend) from error
+        raise _unreadable(path, error) from error
 
 
 def count_frames(folder: Path) -> int:
@@ -134,6 +133,33 @@ def count_frames(folder: Path) -> int:
     while frame_path(folder, count).is_file():
         count += 1
     return count
+
+
+def frame_time(folder: Path, index: int) -> float:
+    """Simulated time [s] of a frame, without reading the rest of it.
+
+    Raises:
+        RunError: The frame is missing or damaged.
+    """
+    path = frame_path(folder, index)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return float(json.loads(str(data["head"]))["time"])
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, error) from error
+
+
+def frame_rate(folder: Path, default: float = 30.0) -> float:
+    """Frames per second of simulated time; ``default`` where there are not two frames."""
+    if count_frames(folder) < 2:
+        return default
+    step = frame_time(folder, 1) - frame_time(folder, 0)
+    return round(1.0 / step, 6) if step > 0 else default
+
+
+def _unreadable(path: Path, error: Exception) -> RunError:
+    mend = "run the shot again; only this stage is redone (use --force if it is not)"
+    return RunError(f"{path}: no readable frame ({error})", "the other frames", mend)
 
 
 def _packed(name: str, value: Tensor) -> np.ndarray:

@@ -64,6 +64,7 @@ def isolate_stage(context: RunContext) -> None:
     else:
         source = context.store.root / "reconstruct" / "model.ply"
     placing = {"scale": shot.scale, "size": shot.size, "up": shot.up, "floor": shot.floor}
+    placing["origin"] = shot.origin
     captured = shot.output.backdrop == "captured"
     key = fingerprint("isolate", context.key(context.source_key, placing))
 

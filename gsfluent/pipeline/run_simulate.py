@@ -13,6 +13,7 @@ from gsfluent import materials
 from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
+from gsfluent.pipeline.particles import grid_spacing
 from gsfluent.pipeline.rigid_splats import bare_points, bare_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
@@ -21,10 +22,11 @@ from gsfluent.pipeline.run_store import content_digest, fingerprint
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.solid_thin import thin_shells
-from gsfluent.scene import Scene
+from gsfluent.scene import Body, Scene
 
 _log = logging.getLogger(__name__)
 _STATE = "state.pt"
+_STEEL_ROWS = 2**40
 
 
 def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
@@ -40,18 +42,28 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     """
     scene = Scene(
         floor=None if shot.floor == "none" else 0.0,
+        gravity=shot.gravity,
         floor_mode=shot.floor_mode,
         floor_friction=shot.floor_friction,
     )
     for name, settings in shot.objects.items():
         parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
         scene.add(solids[name], _material(settings), frame=frame, parts=parts, name=name)
+    if shot.floor == "auto":
+        _lift(scene)
     for collider in shot.colliders:
         keys = collider_dict(collider)
         scene.add_collider(keys.pop("type"), **keys)
     for event in shot.events:
         scene.add_event(event_dict(event))
     return scene
+
+
+def _lift(scene: Scene) -> None:
+    """Put objects on a floor that was found for them: a filled solid reaches below its splats."""
+    lowest = min(float(body.bounds()[0][2]) for body in scene.bodies)
+    if scene.floor is not None and lowest < scene.floor:
+        scene.lift(scene.floor - lowest)
 
 
 def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
@@ -66,20 +78,25 @@ def _material(settings: ObjectSettings) -> Material:
     return materials.get(settings.material).override(**dict(settings.overrides))
 
 
+def _moving(settings: ObjectSettings) -> dict[str, Any]:
+    """The settings of an object that a simulation hangs on: all but its highlights."""
+    return {k: v for k, v in settings.to_dict().items() if k not in materials.LOOKS}
+
+
 def simulate_stage(context: RunContext) -> None:
     """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
     shot = context.shot
     objects = {
         # the numbers of a preset, not its name: a retuned preset is another simulation
-        name: [settings.to_dict(), repr(_material(settings))]
+        name: [_moving(settings), repr(_material(settings))]
         for name, settings in shot.objects.items()
     }
     settings = [
         objects,
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
-        [shot.floor, shot.floor_mode, shot.floor_friction],
-        shot.solve.quality,
+        [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
+        [shot.solve.quality, shot.solve.cells, shot.solve.standing],
         shot.output.fps,
         shot.output.seconds,
     ]
@@ -87,10 +104,13 @@ def simulate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         scene = build_scene(shot, load_solids(context), context.frame)
+        cells = shot.solve.cells
         stage = Simulate(
             quality=shot.solve.quality,
             seed=context.seed,
             device=context.device,
+            dx=None if cells is None else grid_spacing(scene, cells),
+            standing=shot.solve.standing,
             deterministic=shot.solve.deterministic,
         )
         state = folder / _STATE
@@ -152,7 +172,7 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
     """
     repaired = frame.repaired
     gaussians, groups, ids = repaired.gaussians, repaired.groups, repaired.ids
-    anchor, carried, others = repaired.anchor, frame.carried.count, 0
+    anchor, carried = repaired.anchor, frame.carried.count
     points = bare_points(frame.particles, scene)
     bare = bare_splats(frame.particles, scene)
     steel = rigid_splats(frame.rigid, frame.colliders)
@@ -160,14 +180,21 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         if extra is None:
             continue
         alone = torch.full((extra.count,), -1, dtype=torch.int64, device=ids.device)
-        numbers = -1 - others - torch.arange(extra.count, device=ids.device)
+        # those of matter by its point, those of steel beyond all of them
+        numbers = torch.arange(extra.count, device=ids.device) + _STEEL_ROWS
+        numbers = -1 - (numbers if follows is None else follows)
         first = torch.arange(gaussians.count, device=ids.device) < carried
         gaussians = Gaussians.cat([gaussians.select(first), extra, gaussians.select(~first)])
         groups = _insert(groups, carried, alone)
         ids = _insert(ids, carried, numbers)
         anchor = _insert(anchor, carried, alone if follows is None else follows)
-        carried, others = carried + extra.count, others + extra.count
+        carried += extra.count
     particles = frame.particles
+    waiting = [n for n, body in enumerate(scene.bodies) if _waits(body, frame.time)]
+    if waiting:  # a bullet that has not been fired is not seen
+        them = torch.isin(particles.body, particles.body.new_tensor(waiting))
+        unseen = (anchor >= 0) & them[anchor.clamp(min=0).long()]
+        gaussians = gaussians.replace(opacities=gaussians.opacities.masked_fill(unseen, 0.0))
     return SavedFrame(
         index=frame.index,
         time=frame.time,
@@ -183,8 +210,16 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         velocity=particles.velocity,
         body=particles.body,
         material=particles.material,
-        facts=dict(frame.stats) | {"energy": dict(frame.energy)},
+        facts=dict(frame.stats)
+        | {
+            "energy": dict(frame.energy),
+            "bodies": [[body.name, body.material.name] for body in scene.bodies],
+        },
     )
+
+
+def _waits(body: Body, time: float) -> bool:
+    return body.held and body.length == 0.0 and body.start > time + 1e-12
 
 
 def _insert(values: Tensor, row: int, more: Tensor) -> Tensor:

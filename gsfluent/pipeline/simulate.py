@@ -139,6 +139,8 @@ class Simulate(Stage):
             is for comparison: the composed operators then look for contact at every node.
         deterministic: Refuse what cannot give the same bits from the same input on the same
             device: the composed operators on a GPU, whose sums have no order.
+        standing: Let what stands still on the floor at time 0 sleep, without a strain, until
+            something comes near; else its weight begins to act then.
         repair: Add transition splats along cracks to ``frame.gaussians``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
         return_map: Options of :func:`gsfluent.ops.return_mapping`.
@@ -173,6 +175,7 @@ class Simulate(Stage):
         deterministic: bool = False,
         repair: bool = True,
         splats: bool = True,
+        standing: bool = False,
         return_map: dict[str, float | bool] | None = None,
         max_rollbacks: int = 6,
         max_particles: int = 8_000_000,
@@ -202,6 +205,7 @@ class Simulate(Stage):
             "law_kernels": law_kernels,
             "contact_near": contact_near,
             "deterministic": deterministic,
+            "standing": standing,
             "return_map": return_map,
         }
         self._run: Run | None = None
@@ -251,7 +255,7 @@ class Simulate(Stage):
                 mend="for example fps=30, seconds=2",
             )
         count = max(1, round(fps * seconds))
-        run = Run(scene, self.prepare(scene), fps, self._options, self.max_rollbacks)
+        run = self.run_of(scene, fps)
         if resume is not None:
             run.resume(resume)
         self._run = run
@@ -260,6 +264,10 @@ class Simulate(Stage):
             carry = Carry.bind(scene, run.matter)
             repair = Repair() if self.with_repair else None
         return self._frames(run, count, carry, repair, progress)
+
+    def run_of(self, scene: Scene, fps: float) -> Run:
+        """A run of a scene at time 0, to be advanced by hand."""
+        return Run(scene, self.prepare(scene), fps, self._options, self.max_rollbacks)
 
     def _frames(
         self,
@@ -273,7 +281,7 @@ class Simulate(Stage):
             with torch.no_grad():
                 if not run.advance_to(index, self.step_hook):
                     return
-                frame = _frame(run, index, carry, repair)
+                frame = frame_of(run, index, carry, repair)
             report_progress(progress, index + 1, count, f"t = {frame.time:.3f} s")
             yield frame
 
@@ -298,15 +306,18 @@ class Simulate(Stage):
         return self._run.report()
 
 
-def _frame(run: Run, index: int, carry: Carry | None, repair: Repair | None) -> SimulationFrame:
-    """Measure the present state of a run and wrap it up as a frame."""
-    now, pieces, stats = run.record(index)
+def frame_of(
+    run: Run, index: int, carry: Carry | None, repair: Repair | None, time: float | None = None
+) -> SimulationFrame:
+    """Measure the present state of a run and wrap it up as a frame (``time``: index / fps)."""
+    time = index / run.fps if time is None else time
+    now, pieces, stats = run.record(index, time)
     peak, start = run.state.peak, run.matter.particles.alpha
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
     damage = torch.where(run.matter.brittle, damage, 0.0)
     return SimulationFrame(
         index=index,
-        time=index / run.fps,
+        time=time,
         particles=run.state.particles,
         damage=damage.clamp(0.0, 1.0),
         fragments=pieces.labels,

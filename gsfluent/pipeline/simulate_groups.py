@@ -7,6 +7,7 @@ is decided here is who may leave; :mod:`gsfluent.pipeline.simulate_step` decides
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from torch import Tensor
@@ -226,6 +227,15 @@ class Leaving:
             dissipated=state.dissipated + lost,
             group=state.group.index_fill(0, rows, int(rows.min())),
         )
+
+
+def lay_down(state: State, matter: Matter, rigid: RigidSet, gravity: Tensor, unit: Tensor) -> State:
+    """Put to sleep at once what does not move and is held up; arguments as of :class:`Leaving`."""
+    p = state.particles
+    still = (p.velocity == 0).all(dim=1) & (p.affine == 0).all(dim=2).all(dim=1)
+    calm = torch.where(still, CALM_FRAMES, state.calm).to(state.calm)
+    leaving = Leaving(matter, rigid, gravity, sleep=True, fly=False)
+    return leaving(state._replace(calm=calm), unit, math.inf)
 
 
 def _kinetic(state: State, rows: Tensor, dx: float) -> Tensor:

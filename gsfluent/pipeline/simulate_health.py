@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import copy
 import logging
 import math
 from collections.abc import Sequence
@@ -26,6 +27,8 @@ VOLUME_RATIO = (0.02, 50.0)
 ENERGY_SLACK = 0.05
 """How far mechanical energy may rise above its start, in units of the largest kinetic plus elastic
 energy so far. Contact and breaking only take energy away."""
+ROUNDING = 1e-7
+"""Of gravity's energy: places are rounded, and what is held still has no other energy."""
 RING = 2
 LEAST_SCALE = 2.0**-12
 """Factor on the time step at which a run is given up."""
@@ -162,7 +165,7 @@ class Watch:
         given = self.energy + float(state.work)
         self.scale = max(self.scale, min(now.kinetic + now.elastic, max(given - now.gravity, 0.0)))
         excess = now.total - given
-        if not excess <= ENERGY_SLACK * self.scale + 1e-9:
+        if not excess <= ENERGY_SLACK * self.scale + ROUNDING * abs(now.gravity) + 1e-9:
             speed = p.velocity.norm(dim=1)
             return Unhealthy(
                 f"energy rose by {excess:.3g} J over the {given:.3g} J it had and was given",
@@ -211,6 +214,12 @@ class Watch:
         cause, mend = CAUSES[self.kind]
         return f"frame {frame}: {self.reasons[-1]}; likely cause: {cause}; mend: {mend}"
 
+    def twin(self) -> Watch:
+        """A watch of its own that knows what this one knows."""
+        other = copy.copy(self)
+        other.reasons, other._ring = list(self.reasons), self._ring.copy()
+        return other
+
     def state(self) -> dict[str, float | int | list[str]]:
         """Return what a resumed run needs."""
         return {
@@ -256,6 +265,25 @@ class Ledger:
         self.worst = 0.0
         # Two bodies thrown at each other have no momentum together, but a scale of it.
         self.scale = max(float(self.start.norm()), (2.0 * self.mass * start.kinetic) ** 0.5)
+
+    def change(
+        self, mass: float, momentum: Tensor, time: float, waits: Sequence[tuple[float, float]]
+    ) -> None:
+        """Enter matter that comes or leaves.
+
+        Args:
+            mass: What comes [kg]; negative for what leaves.
+            momentum: Of what comes [N s], [3]; likewise.
+            time: Now [s].
+            waits: Mass and time of what waits at first.
+        """
+        self.start = self.start + momentum - self.gravity * (mass * time)
+        for weight, until in self.held:  # what waits no longer is a constant
+            self.start = self.start - self.gravity * (weight * until if until <= time else 0.0)
+        self.held = [(weight, until) for weight, until in self.held if until > time]
+        self.held += waits
+        self.start = self.start + self.gravity * (sum(weight for weight, _ in waits) * time)
+        self.mass += mass
 
     def error(self, state: State, now: Figures) -> float:
         """Return the relative error of the balance at this moment.

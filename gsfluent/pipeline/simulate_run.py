@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import time as clock
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.simulate_fields import breakable, cut_bodies, units
 from gsfluent.pipeline.simulate_figures import Figures
 from gsfluent.pipeline.simulate_health import CHECK_EVERY, Ledger, Watch, figures_of
+from gsfluent.pipeline.simulate_kick import Kicks
 from gsfluent.pipeline.simulate_solver import Counters, Unhealthy
 from gsfluent.pipeline.simulate_state import State, load_state, save_state
 from gsfluent.pipeline.simulate_step import Stepper
@@ -47,8 +49,9 @@ class Run:
         options: dict[str, Any],
         max_rollbacks: int,
     ) -> None:
-        self.scene, self.matter, self.fps = scene, matter, fps
+        self.fps, self._options = fps, options
         self.stepper = Stepper(scene, matter, **options)
+        self._set(scene, matter)
         self.state = self.stepper.initial()
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
@@ -61,22 +64,56 @@ class Run:
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""
-        self._links = rest_links(matter.rest, matter.ranges, matter.spacing)
+        self.links = rest_links(matter.rest, matter.ranges, matter.spacing)
+        self._pieces: tuple[State, Fragments] | None = None
+
+    def _set(self, scene: Scene, matter: Matter) -> None:
+        self.scene, self.matter = scene, matter
+        self.kicks = Kicks(scene, matter)
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
-        self._pieces: tuple[State, Fragments] | None = None
+
+    def fit(self, scene: Scene, matter: Matter) -> None:
+        """Go on with another scene and its matter; see :mod:`gsfluent.pipeline.simulate_grow`."""
+        before = self.stepper
+        self.stepper = Stepper(scene, matter, **self._options, flights=before.flights)
+        self.stepper.resume(before.counters)
+        self.stepper.field_limit, self.stepper.dt_scale = before.field_limit, before.dt_scale
+        self._set(scene, matter)
+        self._pieces = None
+        self.watch.matter, self.watch.names = matter, [body.name for body in scene.bodies]
+
+    def twin(self) -> Run:
+        """A run of its own that goes on from here."""
+        other = copy.copy(self)
+        other.per_frame = list(self.per_frame)
+        other.watch, other.ledger = self.watch.twin(), copy.copy(self.ledger)
+        other.ledger.held = list(self.ledger.held)
+        other.stepper = Stepper(
+            self.scene, self.matter, **self._options, flights=self.stepper.flights
+        )
+        other.stepper.resume(dataclasses.replace(self.stepper.counters))
+        other.stepper.field_limit = self.stepper.field_limit
+        other.stepper.dt_scale = self.stepper.dt_scale
+        return other
 
     @property
     def next_frame(self) -> int:
         """Number of the first frame that has not been made."""
         return len(self.per_frame)
 
-    def advance_to(self, frame: int, hook: Hook | None) -> bool:
-        """Advance to the time of a frame; return False when the run had to be given up."""
+    def advance_to(self, frame: int, hook: Hook | None, time: float | None = None) -> bool:
+        """Advance to the time of a frame; return False when the run had to be given up.
+
+        Args:
+            frame: Its number.
+            hook: See :class:`gsfluent.pipeline.Simulate`.
+            time: Its time [s]; ``frame / fps`` when absent.
+        """
         begun = clock.perf_counter()
         state, stepper, watch = self.state, self.stepper, self.watch
-        until = frame / self.fps
+        until = frame / self.fps if time is None else time
         # A frame is a clean start: what follows does not depend on what was cached before it, so a
         # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
         stepper.reset()
@@ -88,7 +125,9 @@ class Run:
             trouble: Unhealthy | None = None
             try:
                 left = CHECK_EVERY - (state.step - checked)
-                now = stepper.advance(state, until, 1 if hook is not None else left)
+                state = self.kicks.given(state)
+                stop = min(until, self.kicks.next_change(state))
+                now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
                     trouble = watch.check(state, stepper)
@@ -118,7 +157,7 @@ class Run:
         """The pieces of a state; those of the last one asked for are kept."""
         if self._pieces is None or self._pieces[0] is not state:
             found = find_fragments(
-                self._links,
+                self.links,
                 self.matter.rest,
                 state.particles.position,
                 (state.peak >= 0) | self._flowing,
@@ -138,7 +177,7 @@ class Run:
 
     def _holding(self, state: State) -> Tensor:
         """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
-        links = self._links.to(state.position.device)
+        links = self.links.to(state.position.device)
         a, b = links.unbind(dim=1)
         rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
         near = now <= STRETCH_LIMIT * rest
@@ -146,14 +185,16 @@ class Run:
             near = near & ~cut_apart(state.cut[a], state.cut[b])
         return links[near]
 
-    def record(self, index: int) -> tuple[Figures, Fragments, dict[str, Any]]:
-        """Measure the present state and add it to the per-frame records."""
+    def record(
+        self, index: int, time: float | None = None
+    ) -> tuple[Figures, Fragments, dict[str, Any]]:
+        """Measure the present state and add it to the per-frame records (``time``: of it)."""
         state, matter = self.state, self.matter
         now = figures_of(matter, state, self.scene.gravity)
         self.figures = now
         pieces = self._fragments(state)
         stats = {
-            "time": index / self.fps,
+            "time": index / self.fps if time is None else time,
             "kinetic": now.kinetic,
             "elastic": now.elastic,
             "dissipated": self.start.total - now.total,

@@ -163,8 +163,9 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
     """
     if not rigid.frees:
         return True
+    mass = rows[:, columns.MASS]
     touched = float(matter.params[:, 6].max()) * rigid.touchable(rows)
-    return bool((rows[:, columns.MASS] >= OUTWEIGHS * touched).all())
+    return bool(((mass >= OUTWEIGHS * touched) | (mass == 0.0)).all())  # 0: standing, or waiting
 
 
 class Resident:

@@ -16,7 +16,7 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.particles import Matter
 
-VERSION = 5
+VERSION = 6
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
 _POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm")
 _WHOLE = ("impulse", "colliders", "work", "dissipated")
@@ -51,6 +51,7 @@ class State(NamedTuple):
         calm: Frames in a row during which the point hardly moved, int16 [N].
         dissipated: Kinetic energy of vibration and of creep that went when groups left the grid
             [J], float64 [].
+        kicked: How many of the scene's kicks have been given.
     """
 
     particles: Particles
@@ -69,6 +70,7 @@ class State(NamedTuple):
     asleep: Tensor
     calm: Tensor
     dissipated: Tensor
+    kicked: int = 0
 
     @staticmethod
     def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...]) -> State:
@@ -122,6 +124,7 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
+        "kicked": state.kicked,
         "extra": extra,
     }
     with atomic_path(path) as temporary:
@@ -160,6 +163,7 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
         time=float(values["time"]),
         step=int(values["step"]),
         landed=tuple(bool(v) for v in values["landed"]),
+        kicked=int(values["kicked"]),
         **tensors,
     )
     return state, values["extra"]

@@ -8,6 +8,7 @@ call ends when something may come close to a group, which then joins the grid.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -20,7 +21,14 @@ from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_composed import FIELDS, Composed
 from gsfluent.pipeline.simulate_fields import LIMIT, MOST, number_fields
 from gsfluent.pipeline.simulate_flight import Flight
-from gsfluent.pipeline.simulate_groups import LANDING, Group, Leaving, count_calm, grid_mask
+from gsfluent.pipeline.simulate_groups import (
+    LANDING,
+    Group,
+    Leaving,
+    count_calm,
+    grid_mask,
+    lay_down,
+)
 from gsfluent.pipeline.simulate_near import box_gaps, boxes, distance, time_to_meet
 from gsfluent.pipeline.simulate_solver import (
     CFL,
@@ -63,6 +71,8 @@ class Stepper:
         deterministic: Whether the composed operators are refused on a GPU.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
+        standing: Whether what stands still at time 0 sleeps from then on.
+        flights: The first flights of the first bodies, when they are known.
     """
 
     def __init__(
@@ -81,6 +91,8 @@ class Stepper:
         contact_near: bool = True,
         deterministic: bool = False,
         return_map: dict[str, Any] | None = None,
+        standing: bool = False,
+        flights: Sequence[Flight] = (),
     ) -> None:
         self.scene, self.matter = scene, matter
         self.free_flight, self.separate_fragments = free_flight, separate_fragments
@@ -90,6 +102,7 @@ class Stepper:
         self.counters = Counters()
         self.dt_scale = 1.0
         self.field_limit = LIMIT
+        self._standing = standing
         self._reach = reach_of(matter)
         device = matter.particles.device
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
@@ -99,8 +112,9 @@ class Stepper:
         self.leaving = Leaving(
             matter, self.rigid, self._gravity, sleep=sleep, fly=piece_flight and free_flight
         )
-        self.flights = []
-        for body, (a, b) in zip(scene.bodies, matter.ranges, strict=True):
+        self.flights = list(flights)
+        known = len(self.flights)
+        for body, (a, b) in zip(scene.bodies[known:], matter.ranges[known:], strict=True):
             points = matter.particles.select(torch.arange(a, b, device=device))
             held = body.start if body.held else 0.0
             self.flights.append(
@@ -128,7 +142,10 @@ class Stepper:
         landed = (not self.free_flight,) * len(self.flights)
         state = State.start(self.matter, self.rigid.start, landed)
         self._take(state)
-        return self._land(state)[0]
+        state = self._land(state)[0]
+        if not self._standing:
+            return state
+        return lay_down(state, self.matter, self.rigid, self._gravity, self._unit)
 
     def regroup(self, state: State, unit: Tensor, frame: float, *, at_frame: bool = True) -> State:
         """Give units fields of their own and let what may leave the grid do so.

@@ -1,12 +1,12 @@
-"""Video on disk, written whole or not at all.
+"""Video and animated pictures on disk, written whole or not at all.
 
 H.264 through imageio-ffmpeg (a wheel that carries its own ffmpeg), because a browser plays H.264
-with yuv420p and little else.
+with yuv420p and little else; GIF and WebP through Pillow.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +83,54 @@ def write_video(
         # ffmpeg can end without an exception and without a file when the disk is full
         if not part.is_file() or part.stat().st_size == 0:
             raise _encoder_stopped(path)
+    return count
+
+
+def write_animation(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> int:
+    """Write uint8 frames as an endless GIF or WebP, atomically.
+
+    GIF counts time in hundredths of a second and browsers slow down below two of them, so its
+    rate is the nearest that can be shown, 50 a second at most; each frame has a palette of its
+    own.
+
+    Args:
+        path: Ends in ``.gif`` ([H, W, 3] only) or ``.webp`` ([H, W, 3], or [H, W, 4] with alpha).
+        frames: Images of the same size, consumed one at a time.
+        fps: Frames per second.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        InputError: Another ending, or no frame.
+        RunError: The disk is full.
+    """
+    from PIL import Image
+
+    kind = path.suffix.lower()
+    if kind not in (".gif", ".webp"):
+        raise InputError(f"{path}: not an animation", "end the name with .gif or .webp")
+    count = 0
+
+    def pictures() -> Iterator[Image.Image]:
+        nonlocal count
+        for frame in frames:
+            count += 1
+            picture = Image.fromarray(frame)
+            if kind == ".gif":
+                picture = picture.quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
+            yield picture
+
+    images = pictures()
+    first = next(images, None)
+    if first is None:
+        raise InputError("animation: no frame at all", "give at least one image")
+    if kind == ".gif":
+        options = {"duration": max(2, round(100.0 / fps)) * 10, "optimize": False, "disposal": 1}
+    else:
+        options = {"duration": max(1, round(1000.0 / fps)), "quality": 85, "method": 4}
+    with atomic_path(path) as part:
+        first.save(part, save_all=True, append_images=images, loop=0, **options)  # type: ignore[arg-type]
     return count
 
 

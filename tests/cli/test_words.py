@@ -46,7 +46,16 @@ def test_no_word_at_all_shows_the_verbs(capsys: pytest.CaptureFixture[str]) -> N
     assert main([]) == 0
     text = capsys.readouterr().out
     assert all(verb in text for verb in VERBS)
-    assert not any(f"• {later}" in text for later in ("view", "chart", "stability"))
+    assert not any(f"• {later}" in text for later in ("chart", "stability"))
+
+
+def test_reader_that_leaves_early_sees_no_traceback() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "gsfluent", "run", "--help"]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert done.returncode == 141 and done.stderr == ""
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

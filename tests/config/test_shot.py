@@ -157,7 +157,6 @@ def test_unknown_keys_name_their_path_and_the_nearest(
     [
         {"solve": {"error": 0.03}},
         {"solve": {"seconds_per_frame": 0.5}},
-        {"output": {"what": ["usd"]}},
     ],
 )
 def test_what_would_do_nothing_yet_is_refused(folder: Path, keys: dict[str, Any]) -> None:

@@ -61,6 +61,12 @@ def variants() -> dict[str, tuple[dict[str, Tensor], dict[str, Any]]]:
         "no normals": (plain | {"sh": full["sh"], "background": full["background"]}, {}),
         "five channels": (plain | {"colors": features(5), "background": features(5)[0]}, {}),
         "six features": (plain | {"colors": features(2), "normals": full["normals"]}, {}),
+        "light": (full | {"normals": torch.cat([full["normals"], features(3)], 1)}, {}),
+        "much beside": (full | {"normals": torch.cat([full["normals"], features(29)], 1)}, {}),
+        "light, groups": (
+            full | {"normals": torch.cat([full["normals"], features(3)], 1)},
+            {"groups": groups},
+        ),
         "single": ({k: v if k == "background" else v[:1] for k, v in full.items()}, {}),
     }
 

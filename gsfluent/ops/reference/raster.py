@@ -207,5 +207,5 @@ def rasterize(
         image = image + left[..., None] * background
     covered = alpha > 0
     depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1.0), 0.0)
-    normal = blended[..., channels : channels + 3] if normals is not None else None
+    normal = blended[..., channels:-1] if normals is not None else None
     return image, alpha, depth, normal, contribution, median

@@ -1,0 +1,106 @@
+"""The verb that hands a finished simulation to other programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from gsfluent.cli.common import Verb, existing, parse_size
+from gsfluent.errors import InputError
+
+
+@dataclass(kw_only=True)
+class Export(Verb):
+    """Write a finished simulation in other programs' formats.
+
+    Examples:
+      gsfluent export out --to ply-seq                       # out/frames/frame_0001.ply ...
+      gsfluent export out --to ply-seq --compressed --up=-y  # for SuperSplat: drop the folder on it
+      gsfluent export out --to spz,glb --frames 40           # one moment, for a web page
+      gsfluent export out --to delta                         # one small file: out/splats.gsd
+      gsfluent export splats.gsd --to ply-seq                # and back, for any viewer
+      gsfluent export out --to usd -o cut_07                 # Houdini, usdview: one scene.usdc
+      gsfluent export out --to vtk,vti                       # ParaView: open particles.vtk.series
+      gsfluent export out --to mp4 --camera freeze           # time stands still, once around
+      gsfluent export out --to webp --alpha --size 480x270   # to lay over a web page
+
+    Formats (docs/export.md says who reads what, and how large it gets):
+      ply-seq  3DGS .ply per frame     spz, splat, glb  the same as smaller or newer files
+      delta    all frames in one small file, read by gsfluent.io.DeltaReader
+      usd      all frames in one file: splats, particles with velocity and damage
+      vtk, points, vti                 the material points: .vtk, .ply, density volume
+      mp4, gif, webp, png              pictures, along any camera path (docs/render.md)
+
+    An interrupted sequence goes on where it stopped when the command is given again.
+    """
+
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder that `gsfluent run` wrote, or a .gsd file."""
+    to: str
+    """Formats, comma-separated."""
+    folder: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Where the files go; OUT by default."""
+    frames: str | None = None
+    """Which frames, as in Python: 12, 10:40, ::2 (0 is the first)."""
+    sh: Literal[0, 1, 2, 3] = 0
+    """Highest degree of spherical harmonics kept; 3 makes a .ply 3.5 times as large."""
+    up: Literal["z", "y", "-y"] = "z"
+    """Axis that points up: -y for splat viewers, y for Houdini and Unity (ply-seq, splat, usd)."""
+    compressed: bool = False
+    """ply-seq: SuperSplat's 16 bytes a splat instead of 68."""
+    constant: bool = False
+    """The same splats in the same order in every frame; absent ones have opacity 0."""
+    attributes: bool = False
+    """ply-seq: properties fragment and material."""
+    key_every: int = 30
+    """delta: frames from one that stands alone to the next; fewer: faster jumps, larger file."""
+    spz_version: Literal[2, 3] = 3
+    """spz: 2 for old readers, with coarser rotations."""
+    usd_ending: Literal["usdc", "usda", "usdz"] = "usdc"
+    """usd: binary, text or zipped."""
+    usd_parts: str = "splats,particles"
+    """usd: what goes in."""
+    camera: str | None = None
+    """Pictures: orbit, turntable, dolly, freeze[:FRAME], a photograph's index, or a path's file."""
+    size: str | None = None
+    """Pictures: such as 1280x720."""
+    fps: float | None = None
+    """Pictures and usd: frames shown per second; the simulation's own by default."""
+    alpha: bool = False
+    """png, webp: nothing behind the object."""
+
+    def execute(self) -> dict[str, Any]:
+        """Export."""
+        from gsfluent.pipeline.export import ExportOptions, export
+
+        existing(self.out, "OUT")
+        if self.fps is not None and not 0.1 <= self.fps <= 1000.0:
+            raise InputError(f"--fps {self.fps:g}", "give a number from 0.1 to 1000")
+        options = ExportOptions(
+            frames=self.frames,
+            sh=self.sh,
+            up=self.up,
+            compressed=self.compressed,
+            constant=self.constant,
+            attributes=self.attributes,
+            key_every=self.key_every,
+            spz_version=self.spz_version,
+            usd_ending=self.usd_ending,
+            camera=self.camera,
+            size=parse_size(self.size) if self.size else None,
+            fps=self.fps,
+            alpha=self.alpha,
+            usd_parts=tuple(part.strip() for part in self.usd_parts.split(",")),
+        )
+        with self.progress("export") as progress:
+            return export(
+                self.out,
+                self.to.split(","),
+                to=self.folder,
+                options=options,
+                device=self.torch_device(),
+                progress=progress,
+            )

@@ -1,0 +1,44 @@
+"""``solve:`` of a shot."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from gsfluent.config.read import choice, flag, key, whole
+
+
+@dataclasses.dataclass(frozen=True)
+class SolveSettings:
+    """``solve:`` - how accurately."""
+
+    LATER: ClassVar[dict[str, str]] = {
+        "error": "choosing the setting by an error bound",
+        "seconds_per_frame": "choosing the setting by a time budget",
+    }
+    quality: str = key(
+        choice("preview", "shot", "hero"),
+        default="shot",
+        doc="Size of the cells of the grid.",
+        example="preview",
+    )
+    cells: int | None = key(
+        whole(8, 1024),
+        default=None,
+        doc="Cells along the longest side of the largest solid, instead of those of `quality`.",
+        example="32",
+    )
+    standing: bool = key(
+        flag,
+        default=False,
+        doc="What stands still on the floor sleeps from the start, without a strain, until "
+        "something comes near; else its weight begins to act at the start.",
+        example="true",
+    )
+    deterministic: bool = key(
+        flag,
+        default=False,
+        doc="Insist on the same bits from the same input on the same device. The solver gives them "
+        "anyway; a blade at work on a GPU does not, and is refused then.",
+        example="true",
+    )

@@ -1,0 +1,127 @@
+"""Splats of a simulation as files of other programs: PLY sequence, SPZ, .splat, GLB, USD."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from gsfluent.data import Gaussians
+from gsfluent.errors import InputError
+from gsfluent.io.gltf import save_glb
+from gsfluent.io.splat import save_splat
+from gsfluent.io.splats import save_splats
+from gsfluent.io.spz import save_spz
+from gsfluent.io.usd import open_usd
+from gsfluent.pipeline.export_constant import Constant
+from gsfluent.pipeline.export_frames import Moment
+from gsfluent.pipeline.export_job import Job, span
+
+_USD_PARTS = ("splats", "particles")
+
+
+def _sequence(
+    job: Job, kind: str, name: str, write: Callable[[Path, Moment], None], up: str | None = None
+) -> str:
+    """One file per frame, in a folder called like the format."""
+    if up is not None:
+        job = replace(job, reel=job.reel.turned(up))
+    frames = Constant(job.reel, job.progress) if job.options.constant else None
+    return span(kind, job.write_each(kind, kind, name, write, frames=frames))
+
+
+def ply_sequence(job: Job) -> str:
+    """``frames/frame_0001.ply``: the INRIA layout, or SuperSplat's compressed one."""
+    options = job.options
+
+    def write(path: Path, moment: Moment) -> None:
+        extra = None
+        if options.attributes:
+            extra = {
+                "fragment": moment.fragment.cpu().numpy(),
+                "material": moment.material.cpu().numpy(),
+            }
+        save_splats(
+            bare(moment.gaussians),
+            path,
+            compressed=options.compressed,
+            keep_order=options.constant,
+            extra=extra,
+        )
+
+    # not in one folder: a player would take both for one sequence
+    folder = "frames_compressed" if options.compressed else "frames"
+    name = "frame_{:04d}.compressed.ply" if options.compressed else "frame_{:04d}.ply"
+    frames = Constant(job.reel, job.progress) if options.constant else None
+    return span(folder, job.write_each("ply-seq", folder, name, write, frames=frames))
+
+
+def bare(gaussians: Gaussians) -> Gaussians:
+    """The splats without our own label column."""
+    return gaussians.replace(labels=None)
+
+
+def spz_sequence(job: Job) -> str:
+    """``spz/frame_0001.spz``, +y up as the format has it."""
+    version = job.options.spz_version
+
+    def write(path: Path, moment: Moment) -> None:
+        save_spz(moment.gaussians, path, version=version)
+
+    return _sequence(job, "spz", "frame_{:04d}.spz", write, up="y")
+
+
+def splat_sequence(job: Job) -> str:
+    """``splat/frame_0001.splat``."""
+
+    def write(path: Path, moment: Moment) -> None:
+        save_splat(moment.gaussians, path)
+
+    return _sequence(job, "splat", "frame_{:04d}.splat", write)
+
+
+def glb_sequence(job: Job) -> str:
+    """``glb/frame_0001.glb``, +y up as the format has it."""
+
+    def write(path: Path, moment: Moment) -> None:
+        save_glb(moment.gaussians, path)
+
+    return _sequence(job, "glb", "frame_{:04d}.glb", write, up="y")
+
+
+def usd(job: Job) -> str:
+    """``scene.usdc`` (or ``.usdz``): all frames as time samples.
+
+    Raises:
+        InputError: An unknown part, or an up axis that USD has not.
+    """
+    parts = job.options.usd_parts
+    for part in parts:
+        if part not in _USD_PARTS:
+            raise InputError(f"--usd-parts {part}", f"choose from {', '.join(_USD_PARTS)}")
+    name = f"scene.{job.options.usd_ending}"
+    # many readers cannot follow a changing number of splats
+    frames: Iterable[Moment] = job.reel
+    if job.options.constant or "splats" in parts:
+        frames = Constant(job.reel, job.progress)
+    with open_usd(job.folder / name, fps=job.fps, up=job.reel.up) as stage:
+        for place, moment in enumerate(frames):
+            saved, code = moment.saved, float(moment.number)
+            if "splats" in parts:
+                stage.splats(code, moment.gaussians)
+            if "particles" in parts and saved.positions.shape[0]:
+                properties = {
+                    "damage": saved.damage.cpu().numpy(),
+                    "fragment": saved.fragments.cpu().numpy(),
+                    "material": saved.material.cpu().numpy(),
+                    "body": saved.body.cpu().numpy(),
+                }
+                stage.points(
+                    code,
+                    saved.positions.cpu().numpy(),
+                    saved.volumes.cpu().numpy(),
+                    saved.velocity.cpu().numpy(),
+                    properties,
+                )
+            job.report(place + 1, len(job.reel), "usd")
+    return name

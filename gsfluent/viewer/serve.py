@@ -1,0 +1,77 @@
+"""``gsfluent view``: serve a run until Ctrl-C, or draw one picture of it to see that all works."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.io import save_image
+from gsfluent.viewer.app import App
+from gsfluent.viewer.source import RunSource
+
+_log = logging.getLogger(__name__)
+_CHECK_SIZE = (960, 720)
+
+
+def view_run(
+    out: Path,
+    *,
+    device: torch.device,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    splats: bool = False,
+    check: bool = False,
+    to: Path | None = None,
+    browser: bool = True,
+) -> dict[str, Any]:
+    """Serve the viewer of a run.
+
+    Args:
+        out: Folder of the run.
+        device: Where pictures are drawn.
+        host: Address to listen on.
+        port: First port to try, 0 for any.
+        splats: Let the browser draw the splats.
+        check: Serve, draw one picture as a browser would get it, write it and stop.
+        to: Where that picture goes; ``view.png`` in ``out`` by default.
+        browser: Open the page where there is a desktop.
+
+    Returns:
+        ``url`` and ``frames``; with ``check`` also ``output`` and ``frame``.
+
+    Raises:
+        InputError: Not a run, no viser, no port, too many splats.
+        RunError: No frame can be read.
+    """
+    source = RunSource(out)
+    app = App(source, device, host=host, port=0 if check else port, splats=splats)
+    result: dict[str, Any] = {"url": app.url, "frames": app.timeline.count}
+    try:
+        if check:
+            target = to or out / "view.png"
+            camera = app.maker.camera(app.index, *_CHECK_SIZE)
+            picture = app.maker.picture(app.index, camera, app.look)
+            save_image(torch.from_numpy(picture).float() / 255.0, target)
+            return result | {"output": str(target), "frame": app.index}
+        _log.info("viewer: %s (Ctrl-C ends)", app.url)
+        if browser and has_desktop():
+            webbrowser.open(app.url)
+        app.wait()
+    except KeyboardInterrupt:
+        _log.info("viewer: ended")
+    finally:
+        app.close()
+    return result
+
+
+def has_desktop() -> bool:
+    """Whether a browser could show a window: never over a bare ssh line."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
