@@ -1,6 +1,6 @@
 """Time of a lit picture and of its parts.
 
-    python scripts/bench_light.py                         # 1080p, 1 M Gaussians, GPU if there is one
+    python scripts/bench_light.py                    # 1080p, 1 M Gaussians, GPU if there is one
     python scripts/bench_light.py --device cpu --gaussians 100000 --size 640x360
 
 A solid ball of matter breaks in four above a floor, under one soft key light. On the GPU times are
@@ -10,6 +10,7 @@ medians of CUDA events around calls that run back to back; on the CPU they are t
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import statistics
@@ -62,7 +63,7 @@ def clock(work: Callable[[], Any], device: torch.device, repeats: int) -> float:
         work()
         mark.record()
     torch.cuda.synchronize()
-    return statistics.median(a.elapsed_time(b) for a, b in zip(marks, marks[1:], strict=False))
+    return statistics.median(a.elapsed_time(b) for a, b in itertools.pairwise(marks))
 
 
 def measure(
