@@ -18,7 +18,8 @@ from gsfluent.data import Camera, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
-from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.light import Light, Lighting
+from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
 from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_backdrop import (
     Backdrop,
@@ -43,18 +44,6 @@ _POSTER_DELAY = 0.08
 _RESIDUE = 4.0  # voxels around a solid in which no background is believed
 
 
-def light_of(shot: Shot) -> Light:
-    """The shot's light; what it leaves out keeps the default."""
-    given = {
-        "direction": shot.light.key.direction,
-        "shadow": shot.light.key.shadow,
-        "intensity": shot.light.key.intensity,
-        "ambient": shot.light.ambient,
-        "specular": shot.light.specular,
-    }
-    return Light(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
-
-
 class Film:
     """Cameras, light and studio of one video over the frames of a simulation.
 
@@ -62,16 +51,18 @@ class Film:
         folder: ``OUT/stages/simulate``.
         cameras: One per frame; made by :meth:`of`.
         render: The render stage.
+        shot: What the objects are made of.
         device: Where to render.
     """
 
     def __init__(
-        self, folder: Path, cameras: list[Camera], render: Render, device: torch.device
+        self, folder: Path, cameras: list[Camera], render: Render, shot: Shot, device: torch.device
     ) -> None:
         self.folder, self.cameras, self.render, self.device = folder, cameras, render, device
+        self.shot = shot
 
     @classmethod
-    def of(cls, out: Path, shot: Shot, light: Light, device: torch.device) -> Film:
+    def of(cls, out: Path, shot: Shot, light: Light | Lighting, device: torch.device) -> Film:
         """Set up the film of a finished simulation.
 
         Raises:
@@ -111,7 +102,7 @@ class Film:
             backdrop=backdrop,
             normal_cell=occupancy_cell(first.gaussians),
         )
-        return cls(folder, cameras, render, device)
+        return cls(folder, cameras, render, shot, device)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -124,7 +115,10 @@ class Film:
     def picture(self, frame: SavedFrame) -> torch.Tensor:
         """The picture [H, W, 3] of a frame."""
         camera = self.cameras[frame.index]
-        return self.render(frame.gaussians, camera, groups=frame.groups)
+        gloss = gloss_of(self.shot, frame)
+        return self.render(
+            frame.gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time
+        )
 
 
 def captured_backdrop(stages: Path, objects: list[str], device: torch.device) -> Backdrop:
@@ -245,11 +239,9 @@ def render_again(
     to: Path | None = None,
     camera: str | None = None,
     size: tuple[int, int] | None = None,
-    direction: tuple[float, float, float] | None = None,
-    ambient: float | None = None,
-    specular: float | None = None,
     frame: int | None = None,
     progress: Progress | None = None,
+    **light: Any,
 ) -> dict[str, Any]:
     """Render a finished simulation with another camera, light or size.
 
@@ -259,11 +251,9 @@ def render_again(
         to: Video (.mp4) or picture (.png); ``render.mp4`` or ``render.png`` in ``out`` by default.
         camera: ``orbit``, a photograph's index, or a JSON file; the shot's own by default.
         size: (width, height) [px].
-        direction: Toward the light.
-        ambient: Ambient light.
-        specular: Strength of highlights.
         frame: Only this frame.
         progress: Called per frame.
+        light: Changes to the light, as :func:`gsfluent.pipeline.light_shot.changed` takes them.
 
     Returns:
         ``output``, ``frames`` and ``seconds_per_frame``.
@@ -279,10 +269,7 @@ def render_again(
     if size is not None:
         output = replace(output, size=size)
     shot = replace(shot, output=output)
-    light = light_of(shot)
-    changes = {"direction": direction, "ambient": ambient, "specular": specular}
-    light = replace(light, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
-    film = Film.of(out, shot, light, device)
+    film = Film.of(out, shot, changed(light_of(shot), **light), device)
     target = to or out / ("render.mp4" if frame is None else "render.png")
     start = time.perf_counter()
     if frame is not None:
