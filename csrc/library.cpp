@@ -91,6 +91,12 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "bool depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, "
       "Tensor, Tensor, Tensor, Tensor, Tensor)");
 
+  // --- density: occupancy of space by splats, and normals from its gradient ---
+  m.def("occupancy(Tensor means, Tensor frame, int nodes, float full) -> Tensor");
+  m.def(
+      "density_normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame, "
+      "int nodes) -> Tensor");
+
   // --- shade: light per pixel, from what the rasterizer blended to display values ---
   m.def(
       "shade(Tensor image, Tensor alpha, Tensor depth, Tensor normal, Tensor? gloss, "

@@ -86,6 +86,7 @@ class Part:
                 key,
                 [
                     *materials.PARAMETERS,
+                    *materials.LOOKS,
                     "variation",
                     "grain",
                     "material",

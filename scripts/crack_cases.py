@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsfluent import demo, geometry, materials, ops
 from gsfluent.data import SURFACE, Gaussians, Solid
-from gsfluent.demo.fruit import OBJECTS
+from gsfluent.demo.catalogue import OBJECTS
 from gsfluent.lab.fracture_pictures import PARTED, TrueCloud
 from gsfluent.lab.interiors import known_interior
 from gsfluent.pipeline.carry import Carry

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gsfluent.cli.common import Out, Verb, existing, parse_size, parse_vector
+from gsfluent.cli.common import Out, Verb, existing, parse_size
 from gsfluent.errors import InputError
 
 
@@ -75,6 +75,7 @@ class Demo(Verb):
       gsfluent demo                            # into demo_out/, a few minutes on two cores
       gsfluent demo watermelon -o out          # the same by name
       gsfluent demo --size preview             # small and quick, for a check
+      gsfluent demo cake --photographs examples/data/cake   # only its photographs and a cut
 
     Nothing is downloaded: gsfluent draws the photographs itself from an object whose inside it
     knows, so run.json can say how far the reconstructed inside is from the truth.
@@ -86,13 +87,20 @@ class Demo(Verb):
     """Folder for the results."""
     size: Literal["full", "preview"] = "full"
     """full, or a small quick one."""
+    photographs: Path | None = None
+    """Only photograph the object into this folder: photographs/, cut.png, truth.npz."""
     force: bool = False
     """Redo every stage."""
 
     def execute(self) -> dict[str, Any]:
         """Run the demo."""
-        from gsfluent.pipeline.run_demo import run_demo
+        from gsfluent.pipeline.run_demo import SIZES, photograph_demo, run_demo
         from gsfluent.progress import reporter
+
+        if self.photographs is not None:
+            scale, seed = SIZES[self.size], self.seed
+            with self.progress("photograph") as progress:
+                return photograph_demo(self.name, self.photographs, scale, seed, progress)
 
         device = self.torch_device()
         with reporter(quiet=self.json) as report:
@@ -117,6 +125,9 @@ class Render(Verb):
       gsfluent render out --camera 3                        # from the pose of photograph 3
       gsfluent render out --camera path.json                # eyes and targets, see docs/render.md
       gsfluent render out --light=-1,-1,3 --ambient 0.3     # harder light from the left
+      gsfluent render out --light studio.yaml               # a light: section, see docs/light.md
+      gsfluent render out --lamp 'point=0.3,-0.3,0.5;intensity=0.4;color=1,0.8,0.6'
+      gsfluent render out --environment sky --spin 90       # the key light goes round
       gsfluent render out --frame 20 -o still.png           # one picture
     """
 
@@ -129,11 +140,27 @@ class Render(Verb):
     size: str | None = None
     """Such as 1280x720."""
     light: str | None = None
-    """Direction toward the light, such as 1,-1,2."""
+    """Direction toward the key light, such as 1,-1,2, or a YAML file with a light: section."""
+    lamp: Annotated[tuple[str, ...], tyro.conf.arg(metavar="LAMP")] = ()
+    """More lamps, such as 'point=0.3,0,0.5;intensity=2' or 'sun=-1,1,1;size=10'."""
+    intensity: float | None = None
+    """Strength of the key light."""
+    lamp_size: float | None = None
+    """Width of the key light [degrees]: how soft its shadows are."""
+    spin: float | None = None
+    """Turn of the key light about the vertical [degrees per second]."""
+    environment: str | None = None
+    """Light from everywhere by direction: an equirectangular picture, sky, or none."""
     ambient: float | None = None
     """Ambient light."""
     specular: float | None = None
-    """Strength of highlights."""
+    """Strength of highlights on everything."""
+    shininess: float | None = None
+    """Narrowness of highlights on everything."""
+    occlusion: float | None = None
+    """How much of the light from everywhere matter hides, 0 to 1."""
+    delight: float | None = None
+    """Share of the captured shading that is divided out, 0 to 1."""
     frame: int | None = None
     """Render this frame only (0 is the first)."""
 
@@ -148,9 +175,17 @@ class Render(Verb):
                 to=self.to,
                 camera=self.camera,
                 size=parse_size(self.size) if self.size else None,
-                direction=parse_vector(self.light, "--light") if self.light else None,
+                light=self.light,
+                lamps=self.lamp,
+                intensity=self.intensity,
+                lamp_size=self.lamp_size,
+                spin=self.spin,
+                surroundings=self.environment,
                 ambient=self.ambient,
                 specular=self.specular,
+                shininess=self.shininess,
+                occlusion=self.occlusion,
+                delight=self.delight,
                 frame=self.frame,
                 device=self.torch_device(),
                 progress=progress,

@@ -20,11 +20,15 @@ from gsfluent.config.events import (
 from gsfluent.config.objects import ObjectSettings, Part, Select, Where
 from gsfluent.config.settings import (
     FillSettings,
-    KeyLight,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
     TextureSettings,
+)
+from gsfluent.config.settings_light import (
+    EnvironmentSettings,
+    KeyLight,
+    LampSettings,
+    LightSettings,
 )
 from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot, load_shot
@@ -37,9 +41,11 @@ __all__ = [
     "Collide",
     "ColliderSettings",
     "Drop",
+    "EnvironmentSettings",
     "Event",
     "FillSettings",
     "KeyLight",
+    "LampSettings",
     "LightSettings",
     "ObjectSettings",
     "OutputSettings",

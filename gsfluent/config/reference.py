@@ -13,14 +13,18 @@ from gsfluent.config.objects import Select, Where
 from gsfluent.config.read import key_name, plain
 from gsfluent.config.settings import (
     FillSettings,
-    KeyLight,
-    LightSettings,
     OutputSettings,
     PhotoSettings,
     ReconstructSettings,
     TextureSettings,
 )
 from gsfluent.config.settings_inpaint import InpaintSettings
+from gsfluent.config.settings_light import (
+    EnvironmentSettings,
+    KeyLight,
+    LampSettings,
+    LightSettings,
+)
 from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot
 
@@ -38,6 +42,8 @@ SECTIONS: dict[str, type[Any]] = {
     "solve": SolveSettings,
     "light": LightSettings,
     "light.key": KeyLight,
+    "light.lights[]": LampSettings,
+    "light.environment": EnvironmentSettings,
     "output": OutputSettings,
 }
 
@@ -58,7 +64,11 @@ def tables() -> str:
 def parameters() -> str:
     """Markdown: the material parameters that an object or part may override."""
     laws = ", ".join(f"`{law}`" for law in materials.LAWS)
-    return f"`law` ({laws}), " + ", ".join(f"`{name}`" for name in materials.PARAMETERS) + ".\n"
+    return (
+        f"`law` ({laws}), "
+        + ", ".join(f"`{name}`" for name in (*materials.PARAMETERS, *materials.LOOKS))
+        + ".\n"
+    )
 
 
 def _keys(cls: type[Any]) -> Iterator[tuple[str, str, str, str]]:

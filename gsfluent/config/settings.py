@@ -18,7 +18,6 @@ from gsfluent.config.read import (
     key,
     nested,
     number,
-    read_direction,
     section,
     several,
     text,
@@ -43,7 +42,7 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
 
 
 EXPORTS = (
-    "ply-seq", "spz", "splat", "glb", "usd", "vtk", "points", "vti",
+    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti",
 )  # fmt: skip
 """What a run can write beside the video; ``gsfluent export`` writes these and more."""
 
@@ -343,39 +342,6 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
             f"method {method} needs it; or choose another",
         )
     return settings
-
-
-@dataclasses.dataclass(frozen=True)
-class KeyLight:
-    """``light.key:`` - the directional light."""
-
-    direction: Vector = key(
-        read_direction, default=(1.0, -1.0, 2.0),
-        doc="From the scene towards the light; +z is up.", example="[1, -1, 2]",
-    )  # fmt: skip
-    shadow: bool = key(
-        flag, default=True, doc="Whether the object shadows itself and the floor.", example="true"
-    )
-    intensity: float | None = key(number(0.0, 1e3), default=None, doc="Strength.", example="0.6")
-
-
-@dataclasses.dataclass(frozen=True)
-class LightSettings:
-    """``light:``."""
-
-    ambient: float | None = key(
-        number(0.0, 1e3), default=None, doc="Light from everywhere.", example="0.4"
-    )
-    specular: float | None = key(
-        number(0.0, 1e3), default=None, doc="Strength of highlights.", example="0.2"
-    )
-    # Last, because from here on ``key`` names this field.
-    key: KeyLight = key(
-        nested(KeyLight),
-        default=KeyLight(),
-        doc="The directional light.",
-        example="{direction: [1, -1, 2]}",
-    )
 
 
 @dataclasses.dataclass(frozen=True)

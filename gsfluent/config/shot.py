@@ -29,13 +29,13 @@ from gsfluent.config.read import (
 )
 from gsfluent.config.settings import (
     FillSettings,
-    LightSettings,
     OutputSettings,
     ReconstructSettings,
     TextureSettings,
     Vector,
     read_texture,
 )
+from gsfluent.config.settings_light import LightSettings
 from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.errors import InputError
 

@@ -21,11 +21,13 @@ from gsfluent.materials.brittle import BRITTLE
 from gsfluent.materials.flows import GRAINS, LIQUIDS, METALS
 from gsfluent.materials.hard import HARD
 from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, RANGES, READS
-from gsfluent.materials.material import SCATTER, UNBROKEN, Field, Material, nearest
+from gsfluent.materials.looks import LOOK
+from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, Field, Material, nearest
 
 __all__ = [
     "DEFAULTS",
     "LAWS",
+    "LOOKS",
     "PARAMETERS",
     "RANGES",
     "READS",
@@ -38,7 +40,10 @@ __all__ = [
     "names",
 ]
 
-_PRESETS: dict[str, Material] = {m.name: m for m in (*BRITTLE, *HARD, *GRAINS, *METALS, *LIQUIDS)}
+_PRESETS: dict[str, Material] = {
+    m.name: m.override(**dict(zip(LOOKS, LOOK[m.name], strict=True))) if m.name in LOOK else m
+    for m in (*BRITTLE, *HARD, *GRAINS, *METALS, *LIQUIDS)
+}
 
 fruit = SimpleNamespace(
     **{

@@ -23,6 +23,11 @@ SCATTER: dict[str, tuple[float, float, str]] = {
     "variation": (0.0, 1.0, "no unit"),
     "grain": (0.0, math.inf, "m"),
 }
+LOOKS: dict[str, tuple[float, float, str]] = {
+    "specular": (0.0, 10.0, "no unit"),
+    "shininess": (1.0, 10_000.0, "no unit"),
+}
+"""What only a picture needs: range and unit. No part of a simulation."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
 
@@ -57,6 +62,8 @@ class Material:
             random factor on ``alpha0``); natural solids have weak and strong places, and that
             decides where cracks run and how many pieces survive a harder landing.
         grain: Length over which the strength varies [m].
+        specular: Strength of its highlights, k_s of Blinn-Phong.
+        shininess: Narrowness of its highlights, n_s of Blinn-Phong.
         parts: Default parts (for :meth:`gsfluent.Scene.add`), e.g. the rind of a melon.
         sources: Field name -> where the number is from. A field that is not named was chosen by
             eye.
@@ -84,6 +91,9 @@ class Material:
     tait_exponent: Field | None = None
     variation: float = 0.0
     grain: float = 0.025
+    # not in the repr, from which a simulation is known again
+    specular: float = dataclasses.field(default=0.03, repr=False)
+    shininess: float = dataclasses.field(default=24.0, repr=False)
     parts: tuple[Mapping[str, Any], ...] = ()
     sources: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -109,7 +119,7 @@ class Material:
                 )
             if value is not None:
                 _check_number(self.name, field, value, low, high, unit)
-        for field, (low, high, unit) in SCATTER.items():
+        for field, (low, high, unit) in (SCATTER | LOOKS).items():
             value = getattr(self, field)
             if isinstance(value, Tensor):
                 raise InputError(f"material {self.name!r}: {field} must be one number")
@@ -135,7 +145,7 @@ class Material:
             InputError: An unknown field, a number outside its range, a parameter the law does not
                 read, or one that it needs and this material does not have.
         """
-        known = [*PARAMETERS, *SCATTER, "law", "name", "parts"]
+        known = [*PARAMETERS, *SCATTER, *LOOKS, "law", "name", "parts"]
         for key in changes:
             if key not in known:
                 raise InputError(
@@ -152,7 +162,7 @@ class Material:
 
     def source(self, field: str) -> str:
         """Say where a number is from: ``measured: ...``, ``derived: ...`` or ``chosen by eye``."""
-        if field not in (*PARAMETERS, *SCATTER):
+        if field not in (*PARAMETERS, *SCATTER, *LOOKS):
             raise InputError(
                 f"material {self.name!r}: unknown parameter {field!r}",
                 mend=nearest(field, PARAMETERS),

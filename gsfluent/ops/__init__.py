@@ -37,6 +37,8 @@ _PUBLIC: dict[str, str] = {
     "mvee_lens": "gsfluent.ops.mvee",
     "Rendered": "gsfluent.ops.raster",
     "rasterize": "gsfluent.ops.raster",
+    "occupancy": "gsfluent.ops.density",
+    "density_normals": "gsfluent.ops.density",
     "shade": "gsfluent.ops.shade",
     "Photometric": "gsfluent.ops.losses",
     "photometric_loss": "gsfluent.ops.losses",

@@ -1,37 +1,197 @@
-"""One directional light: Blinn-Phong on linear radiance, with a shadow map of our rasterizer.
+"""Lamps and the light from everywhere: what :class:`gsfluent.pipeline.Render` lights a scene with.
 
-equations.md section 16: ``L = c_0 (I_a + T I_L (D + S))`` with ``D = max(0, n.l)``,
-``S = k_s max(0, n.h)^{n_s}`` and ``h = (l + v) / |l + v|``. The captured colour ``c_0`` already
-holds the light of the photographs, so the default is mild: a surface that faces the light keeps its
-colour, the far side loses about a fifth of its display value.
-
-The shadow transmittance ``T`` comes from a depth-and-opacity image seen from the light (the derived
-alternative to counting neighbours in a cone, which is quadratic). The light is directional; a
-perspective camera far away stands in for the orthographic one.
+The captured colour already holds the light of the photographs, so the default is mild: a surface
+that faces the key light keeps its colour, the far side loses about a fifth of its display value.
+The shading itself is :mod:`gsfluent.pipeline.shade`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from gsfluent import geometry, ops
-from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
+from gsfluent.pipeline.shade import DIRECTIONAL, LAMP, POINT, to_display, to_linear
+from gsfluent.pipeline.shade_shadow import disc
 
-# Distance of the light's camera in scene radii; at 40 the rays differ by 1.4 degrees from parallel.
-_LIGHT_DISTANCE = 40.0
-_DISPLAY_GAMMA = 2.2
-# Free border of the map, as a share of the scene's radius: the blurred shadow must fade out before
-# the map ends.
-_BORDER = 1.3
+__all__ = ["Lamp", "Light", "Lighting", "lighting_of", "to_display", "to_linear"]
+
+Vector = tuple[float, float, float]
+AMBIENT, INTENSITY, SPECULAR, SHININESS = 0.6, 0.55, 0.03, 24.0
+SOFTNESS = 4.0
+"""Apparent width [degrees] of a directional lamp: a large lamp of a studio; the sun has 0.53."""
+_BAND0 = 3.5449077018110318  # constant coefficient of an environment that is 1 everywhere
+_MOST_SAMPLES = 64
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A directional or a point lamp.
+
+    Attributes:
+        direction: From the scene toward a directional lamp, scene frame; any length but zero.
+        position: Where a point lamp is [m]; None for a directional one.
+        color: Linear colour.
+        intensity: I_L: what a white surface that faces the lamp sends back. Of a point lamp, at
+            ``distance``.
+        distance: Distance [m] at which a point lamp has its intensity.
+        falloff: Exponent e of a point lamp's falloff ``(distance / r)^e``; 2 is nature's.
+        size: Apparent width of a directional lamp [degrees], diameter of a point lamp [m]; how
+            soft its shadows are.
+        shadow: Whether matter blocks it.
+        samples: Parts that the lamp is drawn in, each with a shadow map; more make wide penumbrae
+            right where blockers at several depths overlap, and cost as much.
+        spin: Turn of the lamp about +z through the scene's origin [degrees per second].
+    """
+
+    direction: Vector = (1.0, -1.0, 2.0)
+    position: Vector | None = None
+    color: Vector = (1.0, 1.0, 1.0)
+    intensity: float = INTENSITY
+    distance: float = 1.0
+    falloff: float = 2.0
+    size: float | None = None
+    shadow: bool = True
+    samples: int = 1
+    spin: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        length = math.hypot(*self.direction)
+        if not 0.0 < length < math.inf:
+            raise InputError(
+                f"light.key.direction: {list(self.direction)}", "give three numbers, not all zero"
+            )
+        for name in ("color", "position"):
+            value = getattr(self, name)
+            least = 0.0 if name == "color" else -math.inf
+            if value is not None and not all(least <= v < math.inf for v in value):
+                raise InputError(f"light: {name} {list(value)}", "give three finite numbers")
+        for name, low in (("intensity", 0.0), ("falloff", 0.0), ("size", 0.0), ("distance", 1e-9)):
+            value = getattr(self, name)
+            if value is not None and not low <= value < math.inf:
+                raise InputError(f"light.{name}: {value}", f"give a number of at least {low:g}")
+        if self.position is None and self.size is not None and not self.size < 120.0:
+            raise InputError(f"light.size: {self.size}", "a directional lamp is below 120 degrees")
+        if not 1 <= self.samples <= _MOST_SAMPLES:
+            raise InputError(f"light.samples: {self.samples}", f"give 1 to {_MOST_SAMPLES}")
+        if not math.isfinite(self.spin):
+            raise InputError(f"light.spin: {self.spin}", "give degrees per second")
+
+    @property
+    def softness(self) -> float:
+        """Tangent of half the angle of a directional lamp, or radius [m] of a point lamp."""
+        if self.position is not None:
+            return 0.5 * (0.0 if self.size is None else self.size)
+        return math.tan(math.radians(0.5 * (SOFTNESS if self.size is None else self.size)))
+
+    @property
+    def toward(self) -> Vector:
+        """Unit vector toward a directional lamp."""
+        length = math.hypot(*self.direction)
+        x, y, z = (part / length for part in self.direction)
+        return (x, y, z)
+
+    def at(self, time: float) -> Lamp:
+        """The lamp at ``time`` [s]."""
+        if self.spin == 0.0 or time == 0.0:
+            return self
+        angle = math.radians(self.spin * time)
+        moved = {"direction": _turned(self.direction, angle)}
+        if self.position is not None:
+            moved["position"] = _turned(self.position, angle)
+        return replace(self, **moved)  # type: ignore[arg-type]
+
+    def parts(self) -> list[Lamp]:
+        """The lamps it is drawn as: itself, or ``samples`` smaller ones over its disc."""
+        if self.samples == 1 or self.softness == 0.0 or not self.shadow:
+            return [self]
+        across, upward = _axes(self.toward)
+        share = replace(self, samples=1, intensity=self.intensity / self.samples)
+        width = 1.0 / math.sqrt(self.samples)
+        found = []
+        for a, b in disc(self.samples):
+            offset = [self.softness * (a * p + b * q) for p, q in zip(across, upward, strict=True)]
+            if self.position is None:
+                x, y, z = (t + o for t, o in zip(self.toward, offset, strict=True))
+                size = math.degrees(2.0 * math.atan(self.softness * width))
+                found.append(replace(share, direction=(x, y, z), size=size))
+            else:
+                x, y, z = (p + o for p, o in zip(self.position, offset, strict=True))
+                found.append(replace(share, position=(x, y, z), size=2.0 * self.softness * width))
+        return found
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Lamps, the light from everywhere, and how surfaces answer.
+
+    Attributes:
+        lamps: Any number of lamps.
+        ambient: I_a, light from everywhere, the same in all directions.
+        environment: Irradiance over pi in spherical harmonics of degree 2, 9 x 3, added to
+            ``ambient``; see :mod:`gsfluent.pipeline.environment`.
+        occlusion: How much of the light from everywhere matter hides, 0 (none) to 1.
+        specular: k_s of Blinn-Phong on everything; None takes each material's own.
+        shininess: n_s of Blinn-Phong on everything; None takes each material's own.
+        resolution: Texels along the side of a shadow map; from the picture's size when None.
+        delight: Share of the captured shading that is divided out first, 0 to 1
+            (:mod:`gsfluent.pipeline.delight`).
+    """
+
+    lamps: tuple[Lamp, ...] = (Lamp(),)
+    ambient: float = AMBIENT
+    environment: tuple[Vector, ...] | None = None
+    occlusion: float = 1.0
+    specular: float | None = None
+    shininess: float | None = None
+    resolution: int | None = None
+    delight: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        limits = {"ambient": math.inf, "specular": math.inf, "shininess": math.inf}
+        for name, most in {**limits, "occlusion": 1.0, "delight": 1.0}.items():
+            value = getattr(self, name)
+            if value is not None and not (0.0 <= value <= most and value < math.inf):
+                mend = "of at least 0" if most == math.inf else "from 0 to 1"
+                raise InputError(f"light.{name}: {value}", f"give a number {mend}")
+        given = self.environment
+        if given is not None:
+            fine = len(given) == 9 and all(len(row) == 3 for row in given)
+            if not fine or not all(math.isfinite(v) for row in given for v in row):
+                raise InputError("light.environment: not 9 x 3 finite numbers", "give 9 rows of 3")
+        if self.resolution is not None and not 16 <= self.resolution <= 8192:
+            raise InputError(f"light.resolution: {self.resolution}", "give 16 to 8192")
+
+    @property
+    def shadow(self) -> bool:
+        """Whether any lamp casts shadows."""
+        return any(lamp.shadow for lamp in self.lamps)
+
+    def at(self, time: float) -> Lighting:
+        """The lighting at ``time`` [s]: lamps that spin have turned."""
+        if all(lamp.spin == 0.0 for lamp in self.lamps):
+            return self
+        return replace(self, lamps=tuple(lamp.at(time) for lamp in self.lamps))
+
+    def drawn(self) -> tuple[Lamp, ...]:
+        """All parts of all lamps that shine."""
+        shining = (lamp for lamp in self.lamps if lamp.intensity > 0.0)
+        return tuple(part for lamp in shining for part in lamp.parts())
+
+    def around(self, like: Tensor) -> Tensor:
+        """Environment and ambient together, [9, 3], as :func:`gsfluent.pipeline.shade.shade`."""
+        return _around(self.ambient, self.environment, like.dtype, like.device)
 
 
 @dataclass(frozen=True)
 class Light:
-    """A directional key light and an ambient term.
+    """One directional key light and an ambient term: the short form of :class:`Lighting`.
 
     Attributes:
         direction: From the scene toward the light, scene frame; any length but zero.
@@ -42,167 +202,85 @@ class Light:
         shadow: Whether the key light is occluded by the object.
     """
 
-    direction: tuple[float, float, float] = (1.0, -1.0, 2.0)
-    intensity: float = 0.55
-    ambient: float = 0.6
-    specular: float = 0.08
-    shininess: float = 24.0
+    direction: Vector = (1.0, -1.0, 2.0)
+    intensity: float = INTENSITY
+    ambient: float = AMBIENT
+    specular: float = SPECULAR
+    shininess: float = SHININESS
     shadow: bool = True
 
     def __post_init__(self) -> None:
-        length = sum(x * x for x in self.direction) ** 0.5
-        if not (length > 0.0 and length < float("inf")):
-            raise InputError(
-                f"light.key.direction: {list(self.direction)}", "give three numbers, not all zero"
-            )
-        for name in ("intensity", "ambient", "specular", "shininess"):
-            value = getattr(self, name)
-            if not 0.0 <= value < float("inf"):
-                raise InputError(f"light.{name}: {value}", "give a number of at least 0")
+        """Check ranges."""
+        self.lighting()
 
-    def toward(self, like: Tensor) -> Tensor:
-        """Unit vector toward the light, shape [3], dtype and device of ``like``."""
-        direction = torch.tensor(self.direction, dtype=like.dtype, device=like.device)
-        return direction / direction.norm()
+    def lighting(self) -> Lighting:
+        """The same light in the long form."""
+        return Lighting(
+            lamps=(Lamp(direction=self.direction, intensity=self.intensity, shadow=self.shadow),),
+            ambient=self.ambient,
+            specular=self.specular,
+            shininess=self.shininess,
+        )
 
 
-def to_linear(color: Tensor) -> Tensor:
-    """Display colour [0, 1] to linear radiance (pure power 2.2)."""
-    return color.clamp(min=0.0).pow(_DISPLAY_GAMMA)
+def lighting_of(light: Light | Lighting | None) -> Lighting | None:
+    """The long form of either, None of None."""
+    return light.lighting() if isinstance(light, Light) else light
 
 
-def to_display(radiance: Tensor) -> Tensor:
-    """Linear radiance to display colour, inverse of :func:`to_linear`."""
-    return radiance.clamp(min=0.0).pow(1.0 / _DISPLAY_GAMMA)
-
-
-def blinn_phong(light: Light, normal: Tensor, view: Tensor, transmittance: Tensor) -> Tensor:
-    """Irradiance factor of each point: ``I_a + T I_L (D + S)`` (equations.md section 16).
+def pack_lamps(lamps: tuple[Lamp, ...], faces: tuple[int, ...], like: Tensor) -> Tensor:
+    """Table of lamps for :mod:`gsfluent.pipeline.shade`, [L, LAMP]; cached per device.
 
     Args:
-        light: The light.
-        normal: Unit normals, shape [..., 3].
-        view: Unit vectors from the points toward the camera, shape [..., 3].
-        transmittance: Share of the key light that arrives, shape [...].
-
-    Returns:
-        Factor on the linear colour, shape [...].
+        lamps: What :meth:`Lighting.drawn` gives.
+        faces: Shadow maps of each lamp: 0, 1, or 6.
+        like: Gives dtype and device.
     """
-    toward = light.toward(normal)
-    diffuse = (normal @ toward).clamp(min=0.0)
-    half = torch.nn.functional.normalize(toward + view, dim=-1)
-    # light below the surface's horizon gives no highlight either
-    highlight = (normal * half).sum(-1).clamp(min=0.0).pow(light.shininess) * (diffuse > 0)
-    return light.ambient + transmittance * light.intensity * (diffuse + light.specular * highlight)
+    return _packed(lamps, faces, like.dtype, like.device)
 
 
-@dataclass(frozen=True)
-class ShadowMap:
-    """What the light sees: depth and opacity per texel.
-
-    Attributes:
-        viewmat: Scene to light camera, shape [4, 4].
-        focal: Focal length in texels (square map, principal point in the centre).
-        depth: Expected depth of the splats [m], shape [S, S]; 0 where nothing is.
-        alpha: Opacity, shape [S, S].
-        texel: Width of one texel at the object [m].
-    """
-
-    viewmat: Tensor
-    focal: float
-    depth: Tensor
-    alpha: Tensor
-    texel: float
-
-    @classmethod
-    def of(cls, gaussians: Gaussians, light: Light, *, resolution: int = 384) -> ShadowMap:
-        """Render the map of ``gaussians`` from ``light`` with ``resolution`` squared texels."""
-        means = gaussians.means
-        center = (means.amin(0) + means.amax(0)) / 2
-        # three mean scales of margin keep the rim of the outermost splats inside
-        margin = 3.0 * float(gaussians.scales.amax(-1).mean())
-        radius = float((means - center).norm(dim=-1).amax()) + margin + 1e-9
-        distance = _LIGHT_DISTANCE * radius
-        eye = center + light.toward(means) * distance
-        viewmat = geometry.look_at(eye, center, means.new_tensor([0.0, 0.0, 1.0])).to(means)
-        focal = 0.5 * resolution * _LIGHT_DISTANCE / _BORDER
-        intrinsics = torch.tensor(
-            [[focal, 0.0, resolution / 2], [0.0, focal, resolution / 2], [0.0, 0.0, 1.0]],
-            dtype=means.dtype,
-            device=means.device,
-        )
-        seen = ops.rasterize(
-            means,
-            gaussians.opacities,
-            viewmat,
-            intrinsics,
-            resolution,
-            resolution,
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            colors=torch.zeros_like(means[:, :1]),
-            near=0.1 * radius,
-        )
-        return cls(viewmat, focal, seen.depth, seen.alpha, 2.0 * _BORDER * radius / resolution)
-
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Texel coordinates [P, 2] (texel centres at +0.5) and depth [P] of scene points [P, 3]."""
-        local = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        depth = local[:, 2]
-        return local[:, :2] / depth[:, None] * self.focal + self.alpha.shape[0] / 2, depth
-
-    def transmittance(self, points: Tensor, *, bias: float) -> Tensor:
-        """Share of the light that reaches points on the object (3 x 3 percentage-closer filter).
-
-        Args:
-            points: Scene points [m], shape [P, 3].
-            bias: Depth [m] by which an occluder must be nearer to the light; about the thickness of
-                a splat.
-
-        Returns:
-            Values in [0, 1], shape [P]; 1 outside the map.
-        """
-        texel, depth = self.project(points)
-        size = self.alpha.shape[0]
-        inside = ((texel >= 1.0) & (texel < size - 1.0)).all(dim=-1)
-        base = texel.long().clamp(1, size - 2)
-        first = base[:, 1] * size + base[:, 0]
-        flat_depth, flat_alpha = self.depth.flatten(), self.alpha.flatten()
-        limit = depth - bias
-        blocked = torch.zeros_like(depth)
-        for step in (-1 - size, -size, 1 - size, -1, 0, 1, size - 1, size, size + 1):
-            index = first + step
-            blocked += torch.where(flat_depth[index] < limit, flat_alpha[index], 0.0)
-        return torch.where(inside, 1.0 - blocked / 9.0, 1.0)
-
-    def cast(self, points: Tensor, *, softness: float) -> Tensor:
-        """Share of the light that reaches a receiver behind everything, such as the floor.
-
-        No depth test is needed there, so the opacity itself is blurred: a smooth penumbra without
-        acne.
-
-        Args:
-            points: Scene points on the receiver [m], shape [P, 3].
-            softness: Standard deviation of the penumbra [m].
-        """
-        alpha = gaussian_blur(self.alpha, softness / self.texel)
-        texel, _ = self.project(points)
-        grid = (texel / self.alpha.shape[0] * 2.0 - 1.0)[None, None]
-        sampled = torch.nn.functional.grid_sample(
-            alpha[None, None], grid, mode="bilinear", padding_mode="zeros", align_corners=False
-        )
-        return 1.0 - sampled.flatten().clamp(0.0, 1.0)
+@functools.lru_cache(maxsize=64)
+def _packed(
+    lamps: tuple[Lamp, ...], faces: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    rows, first = [], 0
+    for lamp, count in zip(lamps, faces, strict=True):
+        kind, place = (DIRECTIONAL, lamp.toward)
+        if lamp.position is not None:
+            kind, place = POINT, lamp.position
+        radiance = [part * lamp.intensity for part in lamp.color]
+        maps = [float(first) if count else -1.0, float(count)]
+        reach = [lamp.distance, lamp.falloff, lamp.softness]
+        rows.append([kind, *place, *radiance, *reach, *maps])
+        first += count
+    return torch.tensor(rows, dtype=torch.float64).reshape(-1, LAMP).to(device, dtype)
 
 
-def gaussian_blur(image: Tensor, sigma: float) -> Tensor:
-    """Blur an image [H, W] with a Gaussian of ``sigma`` pixels (zero outside the image)."""
-    if sigma <= 0.0:
-        return image
-    reach = max(1, min(int(3.0 * sigma + 0.5), max(image.shape)))
-    x = torch.arange(-reach, reach + 1, dtype=image.dtype, device=image.device)
-    kernel = torch.exp(-0.5 * (x / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    conv2d = torch.nn.functional.conv2d
-    blurred = conv2d(image[None, None], kernel[None, None, None, :], padding=(0, reach))
-    blurred = conv2d(blurred, kernel[None, None, :, None], padding=(reach, 0))
-    return blurred[0, 0]
+@functools.lru_cache(maxsize=64)
+def _around(
+    ambient: float,
+    environment: tuple[Vector, ...] | None,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    values = torch.zeros(9, 3, dtype=torch.float64)
+    if environment is not None:
+        values += torch.tensor(environment, dtype=torch.float64)
+    values[0] += ambient * _BAND0
+    return values.to(device, dtype)
+
+
+def _axes(forward: Vector) -> tuple[Vector, Vector]:
+    """Two unit vectors across ``forward`` and each other."""
+    x, y, z = forward
+    other = (1.0, 0.0, 0.0) if abs(x) < 0.6 else (0.0, 1.0, 0.0)
+    a = (y * other[2] - z * other[1], z * other[0] - x * other[2], x * other[1] - y * other[0])
+    length = math.hypot(*a)
+    a = (a[0] / length, a[1] / length, a[2] / length)
+    return a, (y * a[2] - z * a[1], z * a[0] - x * a[2], x * a[1] - y * a[0])
+
+
+def _turned(vector: Vector, angle: float) -> Vector:
+    """A vector turned about +z by ``angle`` [rad]."""
+    c, s = math.cos(angle), math.sin(angle)
+    return (c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2])

@@ -19,6 +19,8 @@ PER_CELL = 3.0
 FULL = 0.8
 LEVELS = 5
 """Levels of the pyramid: each has cells twice as wide as the one before."""
+COARSEST = 2 ** (LEVELS - 1)
+"""Cells of the coarsest level, in finest cells."""
 # Levels of the pyramid that ambient occlusion looks at, how far out along the normal in cells of
 # that level, what a flat surface shows there, and how much of the sky each hides when full.
 REACH = 1.0
@@ -50,19 +52,20 @@ class Occupancy(NamedTuple):
 
 def box_frame(means: Tensor, cell: float, nodes: int) -> Tensor:
     """Corner and cell [4] of a grid of ``nodes``^3 around the bulk of ``means`` [N, 3]."""
-    step = cell * 2 ** (LEVELS - 1)
+    step = cell * COARSEST
     corner = means.mean(0) - 0.5 * nodes * cell
     corner = (corner / step).round() * step
     return torch.cat([corner, corner.new_full((1,), cell)])
 
 
-def occupancy(means: Tensor, cell: float, nodes: int) -> Occupancy:
+def occupancy(means: Tensor, cell: float, nodes: int, *, per_cell: float = PER_CELL) -> Occupancy:
     """Scatter centres [N, 3] (trilinear), cut off at full, and pool; see :class:`Occupancy`.
 
     Args:
         means: Centres [m]; those off the grid are left out.
         cell: Finest cell [m].
         nodes: Cells along each side, a multiple of 16.
+        per_cell: Splats in a full cell.
     """
     frame = box_frame(means, cell, nodes)
     place = (means - frame[:3]) / cell - 0.5
@@ -79,7 +82,7 @@ def occupancy(means: Tensor, cell: float, nodes: int) -> Occupancy:
         weight = (part if x else other)[:, 0] * (part if y else other)[:, 1]
         weight = weight * (part if z else other)[:, 2] * inside
         count.index_add_(0, first + ((z * nodes + y) * nodes + x), weight)
-    full = (count / (FULL * PER_CELL)).clamp(max=1.0).view(1, 1, nodes, nodes, nodes)
+    full = (count / (FULL * per_cell)).clamp(max=1.0).view(1, 1, nodes, nodes, nodes)
     levels = [full]
     for _ in range(LEVELS - 1):
         levels.append(torch.nn.functional.avg_pool3d(levels[-1], 2))

@@ -1,31 +1,52 @@
-"""The Render stage: Gaussians, a camera and a light in; a picture with shadows and a floor out.
+"""The Render stage: Gaussians, a camera and light in; a picture with shadows and a floor out.
 
 Shading is deferred: one pass of the rasterizer gives colour, opacity, depth and blended normals per
-pixel, a second one from the light gives its shadow map, and Blinn-Phong then runs once per pixel
-instead of once per splat. Siblings that repair created are composited nearest-only through
-``groups`` (equations.md section 14).
+pixel, a second one from the lamps their shadow maps, and :mod:`gsfluent.pipeline.shade` then lights
+each pixel once. Siblings that repair created are composited nearest-only through ``groups``
+(equations.md section 14).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import Light, ShadowMap, blinn_phong, to_display, to_linear
+from gsfluent.ops.raster import Rendered
+from gsfluent.pipeline.light import (
+    SHININESS,
+    SPECULAR,
+    Light,
+    Lighting,
+    lighting_of,
+    pack_lamps,
+)
+from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.occlusion import Occupancy
 from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.render_normals import estimate_normals
+from gsfluent.pipeline.render_normals import Grid, grid_for, splat_normals
+from gsfluent.pipeline.shade import (
+    ALPHA_FLOOR,
+    shade_image,
+    shade_studio,
+    surface_points,
+    to_display,
+)
+from gsfluent.pipeline.shade_shadow import ShadowMaps
 from gsfluent.pipeline.stage import Stage
 
-# Shadows start this many mean splat sizes behind the occluder, or a lit surface would shadow
-# itself.
-_BIAS_IN_SPLATS = 4.0
-_ALPHA_FLOOR = 1e-4
+# Pictures whose longest side is above this get shadow maps of the second size.
+_LARGE = 800
+_RESOLUTIONS = (512, 1024)
+# How many pictures share one look at how large the matter is (each look waits for the device).
+_LOOK_EVERY = 16
 
 
 @dataclass(frozen=True)
@@ -45,6 +66,25 @@ class Layers:
     normal: Tensor
 
 
+@dataclass(frozen=True)
+class Lit:
+    """What one state of the matter does to the light; shared by all cameras that look at it.
+
+    Attributes:
+        lamps: Packed lamps, [L, LAMP].
+        environment: Irradiance over pi, [9, 3].
+        maps: Shadow maps, or None.
+        grid: Occupancy, or None when nothing needs it.
+        occlusion: Strength of ambient occlusion.
+    """
+
+    lamps: Tensor
+    environment: Tensor
+    maps: ShadowMaps | None
+    grid: Occupancy
+    occlusion: float
+
+
 class Render(Stage):
     """Gaussians to a picture.
 
@@ -55,9 +95,9 @@ class Render(Stage):
         backdrop: Captured surroundings before the studio; None for none.
         background: Display colour behind the splats when there is no studio.
         antialiased: Antialiased splatting (opacity compensation for the pixel filter).
-        normal_cell: Grid spacing [m] of the normal estimate; found anew for each picture when None
-            (a video fixes it with :func:`gsfluent.pipeline.render_normals.occupancy_cell` of its
-            first frame).
+        normal_cell: Spacing [m] of the grid behind normals and occlusion; found anew every few
+            pictures when None (a video fixes it with
+            :func:`gsfluent.pipeline.render_normals.occupancy_cell` of its first frame).
         seed: Unused; rendering has no randomness.
     """
 
@@ -66,7 +106,7 @@ class Render(Stage):
     def __init__(
         self,
         camera: Camera | None = None,
-        light: Light | None = None,
+        light: Light | Lighting | None = None,
         *,
         studio: Studio | None = None,
         backdrop: Backdrop | None = None,
@@ -83,9 +123,16 @@ class Render(Stage):
         self.background = background
         self.antialiased = antialiased
         self.normal_cell = normal_cell
+        self._size: _Size | None = None
 
     def forward(
-        self, gaussians: Gaussians, camera: Camera | None = None, *, groups: Tensor | None = None
+        self,
+        gaussians: Gaussians,
+        camera: Camera | None = None,
+        *,
+        groups: Tensor | None = None,
+        gloss: Tensor | None = None,
+        time: float = 0.0,
     ) -> Tensor:
         """Render one picture.
 
@@ -93,6 +140,9 @@ class Render(Stage):
             gaussians: Scene frame.
             camera: Overrides the stage's camera.
             groups: int32 [N], siblings of which only the nearest shades a pixel; -1 for none.
+            gloss: k_s and n_s of Blinn-Phong per splat, [N, 2]; the default plastic when None. Not
+                read when the light says what everything is like.
+            time: Moment [s], for lamps that move.
 
         Returns:
             Display values in [0, 1], shape [H, W, 3].
@@ -100,17 +150,29 @@ class Render(Stage):
         Raises:
             InputError: No camera, or a camera with lens distortion.
         """
-        return self.layers(gaussians, camera, groups=groups).image
+        return self.layers(gaussians, camera, groups=groups, gloss=gloss, time=time).image
 
     @torch.no_grad()
     def layers(
-        self, gaussians: Gaussians, camera: Camera | None = None, *, groups: Tensor | None = None
+        self,
+        gaussians: Gaussians,
+        camera: Camera | None = None,
+        *,
+        groups: Tensor | None = None,
+        gloss: Tensor | None = None,
+        time: float = 0.0,
     ) -> Layers:
         """As :meth:`forward`, with opacity, depth and normals."""
         camera = self._camera(camera)
         means = gaussians.means
-        viewmat = camera.viewmat.to(means)
-        intrinsics = camera.K.to(means)
+        viewmat, intrinsics = _moved(camera.viewmat, means), _moved(camera.K, means)
+        lighting = lighting_of(self.light)
+        lit, extras = None, None
+        if lighting is not None:
+            lit = self._light(gaussians, camera, lighting.at(time), groups)
+            extras = splat_normals(gaussians, lit.grid)
+            if gloss is not None and (lighting.specular is None or lighting.shininess is None):
+                extras = torch.cat([extras, gloss.to(extras)], 1)
         seen = ops.rasterize(
             means,
             gaussians.opacities,
@@ -122,40 +184,68 @@ class Render(Stage):
             scales=gaussians.scales,
             sh=gaussians.sh,
             antialiased=self.antialiased,
-            normals=self._normals(gaussians),
+            normals=extras,
             groups=groups,
         )
-        alpha = seen.alpha[..., None]
-        albedo = to_linear(seen.image / alpha.clamp(min=_ALPHA_FLOOR))
-        eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        rays = pixel_rays(viewmat, intrinsics, camera.width, camera.height)
-        light = self.light
-        shadow = ShadowMap.of(gaussians, light) if light is not None and light.shadow else None
-        if light is None:
-            normal = torch.zeros_like(seen.image)
-            radiance = albedo
-        else:
-            normal = torch.nn.functional.normalize(seen.normal, dim=-1)
-            radiance = self._lit(
-                albedo, normal, seen.alpha, seen.depth, eye, rays, viewmat, shadow, gaussians
+        assert seen.depth is not None  # asked for
+        front, normal = seen.image, torch.zeros_like(seen.image)
+        studio = None if self.studio is None else self.studio.packed(means)
+        behind = _constant(self.background, means.dtype, means.device)
+        whole = self.backdrop is None  # the fused picture: object, floor and backdrop at once
+        if lit is not None and lighting is not None and seen.normal is not None:
+            normal = seen.normal[..., :3]
+            front = shade_image(
+                seen.image,
+                seen.alpha,
+                seen.depth,
+                normal,
+                _gloss(lighting, seen),
+                viewmat,
+                intrinsics,
+                lit.lamps,
+                lit.environment,
+                behind if whole else torch.zeros_like(behind),
+                maps=lit.maps,
+                grid=lit.grid if lit.occlusion > 0.0 else None,
+                occlusion=lit.occlusion,
+                studio=studio if whole else None,
             )
+            normal = normalize(normal, dim=-1)
+            if whole:
+                return Layers(front, seen.alpha, seen.depth, normal)
+        image = self._over_backdrop(front, behind, seen, camera, lit)
+        return Layers(image.clamp(0.0, 1.0), seen.alpha, seen.depth, normal)
+
+    def _over_backdrop(
+        self, front: Tensor, behind: Tensor, seen: Rendered, camera: Camera, lit: Lit | None
+    ) -> Tensor:
+        """The matter, times its opacity, over the studio and the captured surroundings."""
+        assert seen.depth is not None  # asked for
+        viewmat, intrinsics = _moved(camera.viewmat, front), _moved(camera.K, front)
+        alpha = seen.alpha[..., None]
+        _, rays = surface_points(seen.depth, viewmat, intrinsics)
         if self.studio is not None:
-            lit = self.studio.shade(eye, rays, light or Light(shadow=False), shadow, gaussians)
-            background = to_display(lit)
-        else:
-            background = means.new_tensor(self.background).expand_as(radiance)
-        # splats were fitted by blending display values, so blending stays in display values
-        image = to_display(radiance) * alpha + background * (1.0 - alpha)
-        if self.backdrop is not None:
-            behind = self.backdrop.draw(camera, rays, light, shadow)
-            cover = behind.alpha[..., None]
-            background = behind.image + background * (1.0 - cover)
-            image = to_display(radiance) * alpha + background * (1.0 - alpha)
-            # what is nearer than the matter hides it
-            before = (cover > 0.5) & (behind.depth < seen.depth)[..., None] & (alpha > 0.0)
-            image = torch.where(before, behind.image + image * (1.0 - cover), image)
-        image = image.clamp(0.0, 1.0)
-        return Layers(image, seen.alpha, seen.depth, normal)
+            lamps, around = _plain_light(front) if lit is None else (lit.lamps, lit.environment)
+            radiance = shade_studio(
+                -(viewmat[:3, 3] @ viewmat[:3, :3]),
+                rays,
+                self.studio.packed(front),
+                lamps,
+                around,
+                maps=None if lit is None else lit.maps,
+                grid=None if lit is None or lit.occlusion == 0.0 else lit.grid,
+                occlusion=0.0 if lit is None else lit.occlusion,
+            )
+            behind = to_display(radiance)
+        if self.backdrop is None:
+            return front + behind * (1.0 - alpha)
+        captured = self.backdrop.draw(camera, lit)
+        cover = captured.alpha[..., None]
+        behind = captured.image + behind * (1.0 - cover)
+        image = front + behind * (1.0 - alpha)
+        # what is nearer than the matter hides it
+        before = (cover > 0.5) & (captured.depth < seen.depth)[..., None] & (alpha > 0.0)
+        return torch.where(before, captured.image + image * (1.0 - cover), image)
 
     def _camera(self, camera: Camera | None) -> Camera:
         camera = camera or self.camera
@@ -168,56 +258,79 @@ class Render(Stage):
             )
         return camera
 
-    def _normals(self, gaussians: Gaussians) -> Tensor | None:
-        if self.light is None:
-            return None
-        return estimate_normals(gaussians, cell=self.normal_cell)
-
-    def _lit(
-        self,
-        albedo: Tensor,
-        normal: Tensor,
-        alpha: Tensor,
-        depth: Tensor,
-        eye: Tensor,
-        rays: Tensor,
-        viewmat: Tensor,
-        shadow: ShadowMap | None,
-        gaussians: Gaussians,
-    ) -> Tensor:
-        """Linear radiance of the splats after lighting, shape [H, W, 3]."""
-        light = self.light or Light()
-        covered = alpha > _ALPHA_FLOOR
-        radiance = albedo.clone()
-        if not bool(covered.any()):
-            return radiance
-        toward_eye = -rays[covered]
-        surface = normal[covered]
-        # expected depth is along the optical axis; rays are unit length
-        along = depth[covered] / (rays[covered] @ viewmat[2, :3])
-        points = eye + along[:, None] * rays[covered]
-        arrives = torch.ones_like(along)
-        if shadow is not None:
-            bias = _BIAS_IN_SPLATS * float(gaussians.scales.mean()) + shadow.texel
-            arrives = shadow.transmittance(points + 0.5 * bias * surface, bias=0.5 * bias)
-        radiance[covered] = (
-            albedo[covered] * blinn_phong(light, surface, toward_eye, arrives)[:, None]
+    def _light(
+        self, gaussians: Gaussians, camera: Camera, lighting: Lighting, groups: Tensor | None
+    ) -> Lit:
+        """Shadow maps and occupancy of this state of the matter."""
+        size = self._size
+        if size is None or size.left == 0 or size.count != gaussians.count:
+            size = _Size.of(gaussians, self.normal_cell)
+        self._size = replace(size, left=size.left - 1)
+        lamps = lighting.drawn()
+        faces = faces_of(lamps, size.center, size.radius)
+        large = max(camera.width, camera.height) > _LARGE
+        texels = lighting.resolution or _RESOLUTIONS[large]
+        return Lit(
+            pack_lamps(lamps, faces, gaussians.means),
+            lighting.around(gaussians.means),
+            shadow_maps(gaussians, lamps, faces, texels, groups=groups),
+            size.grid.of(gaussians.means),
+            lighting.occlusion,
         )
-        return radiance
 
 
-def pixel_rays(viewmat: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
-    """Unit rays in the scene through the pixel centres, shape [H, W, 3]."""
-    x = torch.arange(width, dtype=viewmat.dtype, device=viewmat.device) + 0.5
-    y = torch.arange(height, dtype=viewmat.dtype, device=viewmat.device) + 0.5
-    u = (x - intrinsics[0, 2]) / intrinsics[0, 0]
-    v = (y - intrinsics[1, 2]) / intrinsics[1, 1]
-    local = torch.stack(
-        [
-            u.expand(height, width),
-            v[:, None].expand(height, width),
-            torch.ones(height, width).to(u),
-        ],
-        -1,
-    )
-    return torch.nn.functional.normalize(local @ viewmat[:3, :3], dim=-1)
+@dataclass(frozen=True)
+class _Size:
+    """How large the matter is, as the host knows it.
+
+    Attributes:
+        grid: Size of the occupancy grid.
+        center: Middle of the matter [m].
+        radius: Radius of its bulk [m].
+        count: Splats at that time.
+        left: Pictures until the next look.
+    """
+
+    grid: Grid
+    center: tuple[float, float, float]
+    radius: float
+    count: int
+    left: int
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, cell: float | None) -> _Size:
+        middle, reach = bulk(gaussians)
+        x, y, z, radius = torch.cat([middle, reach[None]]).tolist()
+        grid = grid_for(gaussians, cell=cell, radius=1.25 * radius)
+        return cls(grid, (x, y, z), radius, gaussians.count, _LOOK_EVERY)
+
+
+def _gloss(lighting: Lighting, seen: Rendered) -> Tensor:
+    """k_s and n_s of each pixel, [H, W, 2], or of all, [2]."""
+    given = seen.normal
+    if given is None or given.shape[-1] < 5:
+        specular = SPECULAR if lighting.specular is None else lighting.specular
+        shininess = SHININESS if lighting.shininess is None else lighting.shininess
+        return _constant((specular, shininess), seen.alpha.dtype, seen.alpha.device)
+    gloss = given[..., 3:5] / seen.alpha[..., None].clamp(min=ALPHA_FLOOR)
+    if lighting.specular is not None:
+        gloss = torch.stack([torch.full_like(seen.alpha, lighting.specular), gloss[..., 1]], -1)
+    if lighting.shininess is not None:
+        gloss = torch.stack([gloss[..., 0], torch.full_like(seen.alpha, lighting.shininess)], -1)
+    return gloss
+
+
+def _moved(values: Tensor, like: Tensor) -> Tensor:
+    """Host values on the device of ``like``, without waiting for it."""
+    return values.to(like.dtype).to(like.device, non_blocking=True)
+
+
+@functools.lru_cache(maxsize=64)
+def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(values, dtype=dtype).to(device)
+
+
+def _plain_light(like: Tensor) -> tuple[Tensor, Tensor]:
+    """Packed lamps and environment of a floor under captured colours: evenly lit."""
+    plain = Lighting(lamps=())
+    return pack_lamps((), (), like), plain.around(like)

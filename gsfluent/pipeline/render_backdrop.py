@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,7 +18,10 @@ from torch import Tensor
 from gsfluent.data import BACKGROUND, Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.light import Light, ShadowMap, to_display, to_linear
+from gsfluent.pipeline.shade import arriving, surface_points, to_display, to_linear
+
+if TYPE_CHECKING:
+    from gsfluent.pipeline.render import Lit
 
 __all__ = ["Backdrop", "Behind", "covered_floor"]
 
@@ -55,47 +59,32 @@ class Backdrop:
     radius: float
 
     @torch.no_grad()
-    def draw(
-        self, camera: Camera, rays: Tensor, light: Light | None, shadow: ShadowMap | None
-    ) -> Behind:
+    def draw(self, camera: Camera, lit: Lit | None) -> Behind:
         """Draw the backdrop.
 
         Args:
             camera: Pinhole camera.
-            rays: Unit rays of its pixels in the scene, [H, W, 3].
-            light: The light, for the strength of shadows; None draws none.
-            shadow: What the matter leaves of the light.
+            lit: The light that the matter leaves; None draws no shadows.
         """
         splats = self.gaussians
-        viewmat = camera.viewmat.to(splats.means)
+        viewmat, intrinsics = camera.viewmat.to(splats.means), camera.K.to(splats.means)
         # Median depth: haze before a surface pulls the mean depth off it.
         near = 1e-3 * max(self.radius, 1e-6)
         seen = draw(splats, camera, median_depth=True, near=near)
         image, alpha, surface = seen.image, seen.alpha, seen.median_depth
         assert surface is not None  # asked for
-        if light is None or shadow is None:
+        if lit is None or lit.maps is None:
             return Behind(image, alpha, surface)
-        hit = alpha > 0.5
-        eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        along = surface[hit] / (rays[hit] @ viewmat[2, :3])
-        points = eye + along[:, None] * rays[hit]
-        arrives = shadow.cast(points, softness=0.035 * self.radius)
-        # only what lies behind the matter, as the light sees it, is in its shadow
-        texel, depth = shadow.project(points)
-        size = shadow.alpha.shape[0]
-        index = texel.long().clamp(0, size - 1)
-        before = depth > shadow.depth[index[:, 1], index[:, 0]] + 0.02 * self.radius
-        arrives = torch.where(before, arrives, 1.0)
+        points, _ = surface_points(surface, viewmat, intrinsics)
+        up = torch.zeros_like(points)
+        up[..., 2] = 1.0
         # the captured colour is that of an open place in this light
-        up = float(light.toward(points)[2].clamp(min=0.0))
-        share = (light.ambient + light.intensity * arrives * up) / max(
-            light.ambient + light.intensity * up, _ALPHA_FLOOR
-        )
-        cover = alpha[hit][:, None]
-        linear = to_linear(image[hit] / cover) * share[:, None]
-        image = image.clone()
-        image[hit] = to_display(linear) * cover
-        return Behind(image, alpha, surface)
+        open_light = arriving(points, up, lit.lamps, lit.environment, None, None)
+        left = arriving(points, up, lit.lamps, lit.environment, None, lit.maps)
+        share = left / open_light.clamp(min=_ALPHA_FLOOR)
+        cover = alpha[..., None]
+        shaded = to_display(to_linear(image / cover.clamp(min=_ALPHA_FLOOR)) * share) * cover
+        return Behind(torch.where(cover > 0.5, shaded, image), alpha, surface)
 
 
 def no_background() -> InputError:

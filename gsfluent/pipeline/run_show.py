@@ -14,11 +14,12 @@ import numpy as np
 import torch
 
 from gsfluent.config import Shot
-from gsfluent.data import Camera, Gaussians, Solid
+from gsfluent.data import Camera, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
-from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.light import Light, Lighting
+from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
 from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_backdrop import (
     Backdrop,
@@ -27,8 +28,8 @@ from gsfluent.pipeline.render_backdrop import (
     object_radius,
 )
 from gsfluent.pipeline.render_camera import Action, cameras_for
+from gsfluent.pipeline.render_figures import FilmFigures, cameras_around
 from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.render_holes import hole_fraction
 from gsfluent.pipeline.render_normals import occupancy_cell
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame
@@ -43,18 +44,6 @@ _POSTER_DELAY = 0.08
 _RESIDUE = 4.0  # voxels around a solid in which no background is believed
 
 
-def light_of(shot: Shot) -> Light:
-    """The shot's light; what it leaves out keeps the default."""
-    given = {
-        "direction": shot.light.key.direction,
-        "shadow": shot.light.key.shadow,
-        "intensity": shot.light.key.intensity,
-        "ambient": shot.light.ambient,
-        "specular": shot.light.specular,
-    }
-    return Light(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
-
-
 class Film:
     """Cameras, light and studio of one video over the frames of a simulation.
 
@@ -62,16 +51,25 @@ class Film:
         folder: ``OUT/stages/simulate``.
         cameras: One per frame; made by :meth:`of`.
         render: The render stage.
+        shot: What the objects are made of.
         device: Where to render.
+        around: Cameras that stand around the matter, for figures.
     """
 
     def __init__(
-        self, folder: Path, cameras: list[Camera], render: Render, device: torch.device
+        self,
+        folder: Path,
+        cameras: list[Camera],
+        render: Render,
+        shot: Shot,
+        device: torch.device,
+        around: list[Camera] | None = None,
     ) -> None:
         self.folder, self.cameras, self.render, self.device = folder, cameras, render, device
+        self.shot, self.around = shot, around or []
 
     @classmethod
-    def of(cls, out: Path, shot: Shot, light: Light, device: torch.device) -> Film:
+    def of(cls, out: Path, shot: Shot, light: Light | Lighting, device: torch.device) -> Film:
         """Set up the film of a finished simulation.
 
         Raises:
@@ -111,7 +109,7 @@ class Film:
             backdrop=backdrop,
             normal_cell=occupancy_cell(first.gaussians),
         )
-        return cls(folder, cameras, render, device)
+        return cls(folder, cameras, render, shot, device, cameras_around(positions))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -124,7 +122,10 @@ class Film:
     def picture(self, frame: SavedFrame) -> torch.Tensor:
         """The picture [H, W, 3] of a frame."""
         camera = self.cameras[frame.index]
-        return self.render(frame.gaussians, camera, groups=frame.groups)
+        gloss = gloss_of(self.shot, frame)
+        return self.render(
+            frame.gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time
+        )
 
 
 def captured_backdrop(stages: Path, objects: list[str], device: torch.device) -> Backdrop:
@@ -158,12 +159,8 @@ def render_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         film = Film.of(context.out, shot, light, context.device)
-        report: dict[str, Any] = {
-            "frames": len(film),
-            "hole_fraction_before": [],
-            "hole_fraction": [],
-            "transition_gaussians": [],
-        }
+        report: dict[str, Any] = {"frames": len(film)}
+        figures = FilmFigures(film.frame(0), film.around)
         counts: list[int] = []
         drawing = 0.0
         progress = context.reporter.task("render")
@@ -175,7 +172,7 @@ def render_stage(context: RunContext) -> None:
                 start = time.perf_counter()
                 picture = to_bytes(film.picture(frame))
                 drawing += time.perf_counter() - start
-                _count_holes(report, frame, film.cameras[index])
+                figures.add(frame, film.cameras[index])
                 counts.append(int(frame.facts.get("fragments", 1)))
                 report_progress(progress, index + 1, len(film), "")
                 yield picture
@@ -183,6 +180,7 @@ def render_stage(context: RunContext) -> None:
         write_video(
             folder / "video.mp4", pictures(), fps=shot.output.video_fps, size=shot.output.size
         )
+        report |= figures.report()
         report["seconds_per_frame"] = drawing / len(film)
         report["poster_frame"] = poster_frame(counts, shot.output.fps)
         best = film.frame(report["poster_frame"])
@@ -194,23 +192,6 @@ def render_stage(context: RunContext) -> None:
         publish(result.folder / name, context.out / name)
         context.record.values["outputs"][name.split(".")[0]] = name
     context.record.values["render"] = dict(result.report)
-
-
-def _count_holes(report: dict[str, Any], frame: SavedFrame, camera: Camera) -> None:
-    """Append the frame's hole fractions and number of transition splats."""
-    gaussians, matter = frame.gaussians, (frame.positions, frame.volumes)
-    added = gaussians.count - frame.carried
-    whole = hole_fraction(gaussians, *matter, camera, groups=frame.groups)
-    before = whole
-    if added:
-        before = hole_fraction(_first(gaussians, frame.carried), *matter, camera)
-    report["hole_fraction_before"].append(round(before, 6))
-    report["hole_fraction"].append(round(whole, 6))
-    report["transition_gaussians"].append(added)
-
-
-def _first(gaussians: Gaussians, count: int) -> Gaussians:
-    return gaussians.map(lambda value: value[:count])
 
 
 def poster_frame(fragments: list[int], fps: float) -> int:
@@ -245,11 +226,9 @@ def render_again(
     to: Path | None = None,
     camera: str | None = None,
     size: tuple[int, int] | None = None,
-    direction: tuple[float, float, float] | None = None,
-    ambient: float | None = None,
-    specular: float | None = None,
     frame: int | None = None,
     progress: Progress | None = None,
+    **light: Any,
 ) -> dict[str, Any]:
     """Render a finished simulation with another camera, light or size.
 
@@ -259,11 +238,9 @@ def render_again(
         to: Video (.mp4) or picture (.png); ``render.mp4`` or ``render.png`` in ``out`` by default.
         camera: ``orbit``, a photograph's index, or a JSON file; the shot's own by default.
         size: (width, height) [px].
-        direction: Toward the light.
-        ambient: Ambient light.
-        specular: Strength of highlights.
         frame: Only this frame.
         progress: Called per frame.
+        light: Changes to the light, as :func:`gsfluent.pipeline.light_shot.changed` takes them.
 
     Returns:
         ``output``, ``frames`` and ``seconds_per_frame``.
@@ -279,10 +256,7 @@ def render_again(
     if size is not None:
         output = replace(output, size=size)
     shot = replace(shot, output=output)
-    light = light_of(shot)
-    changes = {"direction": direction, "ambient": ambient, "specular": specular}
-    light = replace(light, **{k: v for k, v in changes.items() if v is not None})  # type: ignore[arg-type]
-    film = Film.of(out, shot, light, device)
+    film = Film.of(out, shot, changed(light_of(shot), **light), device)
     target = to or out / ("render.mp4" if frame is None else "render.png")
     start = time.perf_counter()
     if frame is not None:

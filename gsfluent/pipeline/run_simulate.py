@@ -78,12 +78,17 @@ def _material(settings: ObjectSettings) -> Material:
     return materials.get(settings.material).override(**dict(settings.overrides))
 
 
+def _moving(settings: ObjectSettings) -> dict[str, Any]:
+    """The settings of an object that a simulation hangs on: all but its highlights."""
+    return {k: v for k, v in settings.to_dict().items() if k not in materials.LOOKS}
+
+
 def simulate_stage(context: RunContext) -> None:
     """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
     shot = context.shot
     objects = {
         # the numbers of a preset, not its name: a retuned preset is another simulation
-        name: [settings.to_dict(), repr(_material(settings))]
+        name: [_moving(settings), repr(_material(settings))]
         for name, settings in shot.objects.items()
     }
     settings = [
@@ -207,7 +212,11 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         velocity=particles.velocity,
         body=particles.body,
         material=particles.material,
-        facts=dict(frame.stats) | {"energy": dict(frame.energy)},
+        facts=dict(frame.stats)
+        | {
+            "energy": dict(frame.energy),
+            "bodies": [[body.name, body.material.name] for body in scene.bodies],
+        },
     )
 
 

@@ -278,9 +278,9 @@ def shade_studio(
     ao = None
     if grid is not None:
         ao = 1.0 - occlusion * (1.0 - ambient_occlusion(points, up, grid))
-    arrives = _floor_light(points, up, lamps, environment, ao, maps)
+    arrives = arriving(points, up, lamps, environment, ao, maps)
     center = torch.cat([studio[1:3], studio[:1]])
-    bare = _floor_light(center, up.new_tensor((0.0, 0.0, 1.0)), lamps, environment, None, None)
+    bare = arriving(center, up.new_tensor((0.0, 0.0, 1.0)), lamps, environment, None, None)
     floor = paint * arrives / bare.mean().clamp(min=1e-3)
     away = (points[..., :2] - studio[1:3]).norm(dim=-1) / studio[3]
     keep = torch.exp(-away.square())
@@ -288,7 +288,7 @@ def shade_studio(
     return keep * floor + (1.0 - keep) * wall
 
 
-def _floor_light(
+def arriving(
     points: Tensor,
     up: Tensor,
     lamps: Tensor,
@@ -296,13 +296,16 @@ def _floor_light(
     ao: Tensor | None,
     maps: ShadowMaps | None,
 ) -> Tensor:
-    """Light that arrives at points of the floor, over pi, [..., 3]."""
+    """Light over pi [..., 3] that arrives at points [..., 3] of a matt surface, normals ``up``.
+
+    The surface itself is not in the shadow maps: no bias.
+    """
     arrives = irradiance(environment, up)
     if ao is not None:
         arrives = arrives * ao[..., None]
     for lamp in lamps:
         toward, strength = lamp_light(points, lamp)
-        strength = strength * toward[..., 2].clamp(min=0.0)
+        strength = strength * (toward * up).sum(-1).clamp(min=0.0)
         if maps is not None:
             strength = strength * transmittance(points, up, lamp, maps, biased=0.0)
         arrives = arrives + lamp[4:7] * strength[..., None]

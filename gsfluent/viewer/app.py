@@ -56,6 +56,7 @@ class App:
         playback: The clock.
         index: Frame shown.
         follow: Whether each new frame is shown as it comes.
+        pictures: How many have been drawn.
         lock: Held while the frame shown changes.
         shift: Scene position = position in the browser + shift [m]; changes while the view follows
             the object.
@@ -94,6 +95,7 @@ class App:
         self.shift = (0.0, 0.0, 0.0)
         self._anchor = self._center(self.index)
         self._problem = ""
+        self.pictures = 0
         self.lock = threading.RLock()
         self._done = threading.Event()
         self.browser = BrowserSplats(self.timeline) if splats else None
@@ -109,6 +111,8 @@ class App:
         self.look = self._look_panel.look()
         self._plots = PlotPanel(self.server, self.timeline)
         self._set_first_camera()
+        if self.browser is not None:
+            self.browser.prepare(self.server)
         for add_panel in panels:
             add_panel(self.server, self)
         self._artist = Artist(self._paint)
@@ -134,13 +138,14 @@ class App:
                 self.shift = (x, y, z)
             facts = self.timeline.facts()
             self._time_panel.update()
+            busy = self.playback.playing or (self.follow and self.source.running)
             if self.index < len(facts) and "time" in facts[self.index]:
-                self._plots.mark(facts[self.index]["time"], at_once=not self.playback.playing)
+                self._plots.mark(facts[self.index]["time"], at_once=not busy)
             self.redraw()
 
     def redraw(self) -> None:
         """The picture is out of date, for example because a source's newest frame has changed."""
-        self._say()
+        self.say()
         self._artist.request()
 
     def set_look(self, look: Look) -> None:
@@ -236,21 +241,22 @@ class App:
             self.pace.measured(camera.width * camera.height, time.perf_counter() - start)
         except GsfluentError as error:
             self._problem = str(error).split("\n")[0]
-            self._say()
+            self.say()
             return True
         self._problem = ""
         self._legend(legend)
         sharp = camera.width >= full.width
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=92 if sharp else 80)
         client.flush()
+        self.pictures += 1
         return sharp
 
     def _legend(self, legend: Any) -> None:
         if self._look_panel is not None:
             self._look_panel.show_legend("" if legend is None else legend.html())
-        self._say()
+        self.say()
 
-    def _say(self) -> None:
+    def say(self) -> None:
         """The line at the head of the page."""
         text = self.source.state()
         if self._problem:
@@ -266,15 +272,22 @@ class App:
         """The clock: plays, and looks for new frames."""
         looked = time.monotonic()
         while not self._done.wait(_TICK):
-            if self.playback.playing:
-                index = self.playback.index(self.timeline.count, self.timeline.fps())
-                if index != self.index:
-                    self.show(index)
-                elif not self.playback.playing:
-                    self._time_panel.update()
-            if time.monotonic() - looked > _LOOK_FOR_FRAMES:
-                self.refresh()
-                looked = time.monotonic()
+            try:
+                if self.playback.playing:
+                    self._play()
+                if time.monotonic() - looked > _LOOK_FOR_FRAMES:
+                    looked = time.monotonic()
+                    self.refresh()
+            except Exception:
+                _log.exception("viewer: the clock stumbled")  # and goes on
+
+    def _play(self) -> None:
+        """One tick of playing."""
+        index = self.playback.index(self.timeline.count, self.timeline.fps())
+        if index != self.index:
+            self.show(index)
+        elif not self.playback.playing:
+            self._time_panel.update()
 
     def refresh(self) -> None:
         """Look for new frames now."""
@@ -283,7 +296,7 @@ class App:
                 return
         except GsfluentError as error:
             self._problem = str(error).split("\n")[0]
-            self._say()
+            self.say()
             return
         facts = self.timeline.facts()
         last = self.timeline.count - 1
@@ -293,11 +306,11 @@ class App:
 
     def _first_index(self) -> int:
         """The most telling frame of a finished run, the newest of a running one."""
-        last = self.timeline.count - 1
-        if self.source.running:
-            return last
-        counts = [int(row.get("fragments") or 1) for row in self.timeline.facts()]
-        return poster_frame(counts, self.timeline.fps()) if len(counts) > 1 else 0
+        index = self.timeline.count - 1
+        if not self.source.running and index > 0:
+            counts = [int(row.get("fragments") or 1) for row in self.timeline.facts()]
+            index = poster_frame(counts, self.timeline.fps())
+        return self.timeline.readable(index)
 
     def _center(self, index: int) -> tuple[float, float, float]:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.light import Lighting
 
 APPEARANCE, DAMAGE, FRAGMENT, MATERIAL = "Appearance", "Damage", "Fragment", "Material"
 BODY, SPEED, ENERGY, DEPTH = "Body", "Speed", "Kinetic energy", "Depth inside"
@@ -39,13 +39,13 @@ class Look:
 
     Attributes:
         color_by: One of :data:`COLOR_BY`.
-        light: The lamp; None shows captured colours as they are.
+        light: The lamps; None shows captured colours as they are.
         cut: The cut plane, or None.
         floor: Whether floor and backdrop are drawn.
     """
 
     color_by: str = APPEARANCE
-    light: Light | None = field(default_factory=Light)
+    light: Lighting | None = field(default_factory=Lighting)
     cut: Cut | None = None
     floor: bool = True
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.light import SPECULAR, Lamp, Lighting
 from gsfluent.viewer import look
 from gsfluent.viewer.look import Cut, Look
 
@@ -30,7 +31,7 @@ class LookPanel:
     """
 
     def __init__(
-        self, server: viser.ViserServer, app: App, first: Light, *, lit: bool = True
+        self, server: viser.ViserServer, app: App, first: Lighting, *, lit: bool = True
     ) -> None:
         self._app, self._first, self._lit = app, first, lit
         gui = server.gui
@@ -65,24 +66,27 @@ class LookPanel:
                 name = f"{re.sub(r'[^A-Za-z0-9_-]', '_', app.source.title)}_{app.index:04d}.png"
                 event.client.send_file_download(name, app.png(event.client))
 
-    def _build_light(self, gui: viser.GuiApi, first: Light) -> None:
-        azimuth, elevation = look.angles(first.direction)
+    def _build_light(self, gui: viser.GuiApi, first: Lighting) -> None:
+        key = first.lamps[0] if first.lamps else Lamp(intensity=0.0)
+        shine = SPECULAR if first.specular is None else first.specular
+        self._shine = round(float(shine) / 0.02) * 0.02
+        azimuth, elevation = look.angles(key.position or key.direction)
         with gui.add_folder("Light"):
             self._on = gui.add_checkbox(
                 "Lit", True, hint="Off shows the colours as they were photographed"
             )
             self._azimuth = gui.add_slider("Around", -180, 180, 1, round(azimuth), hint="[°]")
             self._elevation = gui.add_slider("Height", 0, 90, 1, round(max(0.0, elevation)))
-            self._intensity = gui.add_slider("Strength", 0.0, 2.0, 0.05, float(first.intensity))
+            self._intensity = gui.add_slider("Strength", 0.0, 2.0, 0.05, float(key.intensity))
             self._ambient = gui.add_slider("Ambient", 0.0, 1.5, 0.05, float(first.ambient))
-            self._specular = gui.add_slider("Highlights", 0.0, 1.0, 0.02, float(first.specular))
-            self._shadow = gui.add_checkbox("Shadow", bool(first.shadow))
+            self._specular = gui.add_slider("Highlights", 0.0, 1.0, 0.02, self._shine)
+            self._shadow = gui.add_checkbox("Shadow", bool(key.shadow))
 
     def _build_cut(self, gui: viser.GuiApi) -> None:
         reach = 1.3 * self._app.timeline.radius
         self._unit, self._factor = ("cm", 100.0) if reach < 1.0 else ("m", 1.0)
-        span = round(reach * self._factor, 2)
-        step = round(max(0.01, 2.0 * span / _STEPS), 2)
+        step = float(f"{2.0 * reach * self._factor / _STEPS:.1g}")
+        span = round(step * math.ceil(reach * self._factor / step), 6)
         with gui.add_folder("Cut plane", expand_by_default=False):
             self._cut = gui.add_checkbox("Cut open", False)
             self._axis = gui.add_dropdown("Across", (*look.AXES, _FREE), initial_value="y")
@@ -122,16 +126,25 @@ class LookPanel:
         """What the controls say."""
         return Look(self._color.value, self._light(), self._cut_plane(), self._floor.value)
 
-    def _light(self) -> Light | None:
+    def _light(self) -> Lighting | None:
         if not self._lit or not self._on.value:
             return None
-        return replace(
-            self._first,
+        first = self._first
+        key = replace(
+            first.lamps[0] if first.lamps else Lamp(),
             direction=look.direction(self._azimuth.value, self._elevation.value),
+            position=None,
             intensity=self._intensity.value,
-            ambient=self._ambient.value,
-            specular=self._specular.value,
             shadow=self._shadow.value,
+        )
+        # untouched, the slider leaves every material its own highlights
+        shine = self._specular.value
+        own = first.specular is None and shine == self._shine
+        return replace(
+            first,
+            lamps=(key, *first.lamps[1:]),
+            ambient=self._ambient.value,
+            specular=None if own else shine,
         )
 
     def _cut_plane(self) -> Cut | None:

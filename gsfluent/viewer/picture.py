@@ -12,7 +12,7 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.light import Lighting
 from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_camera import Action, orbit
@@ -42,9 +42,9 @@ class PictureMaker:
         self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
         self._backdrop = self._captured()
 
-    def first_light(self) -> Light:
+    def first_light(self) -> Lighting:
         """The shot's light, or the usual one."""
-        return light_of(self.shot) if self.shot is not None else Light()
+        return light_of(self.shot) if self.shot is not None else Lighting()
 
     def camera(self, index: int, width: int, height: int) -> Camera:
         """The film's first camera, turned to frame ``index``.

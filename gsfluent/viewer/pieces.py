@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.pipeline.neighbours import nearest
 from gsfluent.pipeline.run_frames import SavedFrame
 
-_REACH = 6.0  # point spacings within which broken matter belongs to the piece beside it
+_REACH = 1.6  # point spacings over which broken matter hangs together
 _KEPT = 64  # frames whose assignment is remembered
 
 
@@ -28,7 +28,7 @@ class Pieces:
 
         Labels of fragments are rows of material points; here they become 0, 1, 2 and so on in the
         order in which they are met, the largest first. Broken points have no label of their own and
-        get that of the nearest whole one, if it is near.
+        get that of the piece they hang on.
 
         Returns:
             Piece of each point, -1 for debris on its own, int64 [P]; and whether the point itself
@@ -58,15 +58,35 @@ class Pieces:
 
 
 def _joined(slots: Tensor, broken: Tensor, frame: SavedFrame) -> Tensor:
-    """Give broken points the piece of the nearest whole point within reach, [P]."""
+    """Give broken points the piece they hang on, through other broken points if need be, [P].
+
+    Shortest paths over links between close points: rubble that lies on a piece is reached, a spray
+    in the air is not.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import dijkstra
+    from scipy.spatial import cKDTree
+
     if not bool(broken.any()) or bool(broken.all()):
         return slots
-    spacing = max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)
-    whole = frame.positions[~broken]
-    queries = frame.positions[broken].double().cpu().numpy()
-    distance, row = nearest(whole, queries, 1, _REACH * spacing)
-    joined = slots[~broken][torch.from_numpy(row[:, 0]).to(slots.device)]
-    near = torch.from_numpy(distance[:, 0] <= _REACH * spacing).to(slots.device)
-    result = slots.clone()
-    result[broken] = torch.where(near, joined, -1)
-    return result
+    reach = _REACH * max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)
+    place = frame.positions.double().cpu().numpy()
+    loose = broken.cpu().numpy()
+    piece = slots.cpu().numpy()
+    rubble = place[loose]
+    gap, beside = cKDTree(place[~loose]).query(rubble, distance_upper_bound=reach)
+    seeds = np.flatnonzero(np.isfinite(gap))
+    if len(seeds) == 0:
+        return slots
+    links = cKDTree(rubble).query_pairs(reach, output_type="ndarray")
+    length = np.linalg.norm(rubble[links[:, 0]] - rubble[links[:, 1]], axis=1) + 1e-12
+    graph = coo_matrix((length, links.T), shape=(len(rubble), len(rubble))).tocsr()
+    _, _, source = dijkstra(
+        graph, directed=False, indices=seeds, return_predecessors=True, min_only=True
+    )
+    found = np.full(len(rubble), -1, dtype=piece.dtype)
+    reached = source >= 0
+    found[reached] = piece[~loose][beside[source[reached]]]
+    piece = piece.copy()
+    piece[loose] = found
+    return torch.from_numpy(piece).to(slots.device)

@@ -80,4 +80,5 @@ def _chart(server: viser.ViserServer, plot: Plot, now: float) -> Any:
         axes=axes,  # type: ignore[arg-type]
         legend={"live": False},
         height=_HEIGHT,
+        padding=(8, 20, 0, 0),
     )

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MOST = 200_000
 _NODE = "/splats"
+_GROUND = 196  # grey value
 _ORDER = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # packed xx, yy, zz, xy, xz, yz to a full matrix
 
 
@@ -42,6 +43,10 @@ class BrowserSplats:
                 f"--splats: {count} splats; browsers draw about {MOST}",
                 "leave --splats out: the pictures are then drawn here",
             )
+
+    def prepare(self, server: viser.ViserServer) -> None:
+        """Grey ground behind the splats."""
+        server.scene.set_background_image(np.full((2, 2, 3), _GROUND, np.uint8), format="png")
 
     def show(
         self,

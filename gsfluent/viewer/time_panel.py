@@ -84,7 +84,8 @@ class TimePanel:
         last = app.timeline.count - 1
         # a slider needs two places
         self._slider.max = max(1, last)
-        self._slider.disabled = self._play.disabled = self._step.disabled = last < 1
+        self._slider.disabled = self._play.disabled = last < 1
+        self._step.visible = last >= 1
         # not under a person's finger, where it may have gone farther meanwhile
         if time.monotonic() - self._held > _HELD:
             self._slider.value = app.index

@@ -180,6 +180,16 @@ class Timeline:
         known[:shared] = self._depth[:shared].to(known)
         return known
 
+    def readable(self, index: int) -> int:
+        """The readable frame nearest to ``index``."""
+        for other in sorted(range(self.count), key=lambda i: abs(i - index)):
+            try:
+                self.frame(other)
+            except GsfluentError:
+                continue
+            return other
+        return self.first.index
+
     def _first_readable(self) -> SavedFrame:
         problem: GsfluentError | None = None
         for index in range(self.count):

@@ -22,7 +22,7 @@ CASES = [
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name in ("melon.ply", "cut.jpg", "labels.npy", "bowl.obj", "side.png"):
+    for name in ("melon.ply", "cut.jpg", "labels.npy", "bowl.obj", "side.png", "room.hdr"):
         (tmp_path / name).write_bytes(b"")
     for name in ("captures/apple", "parts/stem", "segmentation"):
         (tmp_path / name).mkdir(parents=True)

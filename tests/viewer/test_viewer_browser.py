@@ -21,6 +21,7 @@ from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
+from gsfluent.pipeline.run_frames import frame_path  # noqa: E402
 from gsfluent.viewer.app import App  # noqa: E402
 from gsfluent.viewer.source import RunSource  # noqa: E402
 
@@ -45,6 +46,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[App, Any]]:
     if browser is None or driver is None:
         pytest.skip("no chromium and chromedriver on this machine")
     out = write_run(tmp_path_factory.mktemp("run") / "ball")
+    # after the last frame a damaged one
+    frame_path(out / "stages" / "simulate", FRAMES).write_bytes(b"cut short")
     app = App(RunSource(out), torch.device("cpu"), port=0)
     options = webdriver.ChromeOptions()
     options.binary_location = browser
@@ -126,3 +129,10 @@ def test_a_person_sees_the_object_and_what_each_control_does(page: tuple[App, An
     assert int((b > r + 40).sum()) > 1000  # the first piece is blue, the second orange
     assert int((r > b + 60).sum()) > 1000
     assert "Fragments: 2" in chrome.page_source
+
+    slider.send_keys(Keys.ARROW_RIGHT)
+    kept = until(chrome, lambda p: "cannot be shown" in chrome.page_source)
+    assert f"frame_000{FRAMES + 1}.npz" in chrome.page_source
+    assert np.abs(kept.astype(int) - pieces).mean() < 1.0  # the last good picture stays
+    slider.send_keys(Keys.HOME)
+    until(chrome, lambda p: "cannot be shown" not in chrome.page_source)

@@ -1,0 +1,144 @@
+// Occupancy of space by splats on one dense grid with a pyramid of coarser levels, and outward
+// normals from its gradient. The model, with every formula: gsfluent/ops/reference/density.py.
+// Cells are numbered z, y, x; values stand at cell centres and are zero outside the grid.
+#pragma once
+
+#include "core/splat.h"
+
+namespace gsf {
+
+constexpr int kDensityLevels = 5;  // each with cells twice as wide as the one before
+constexpr int kDensityWide = 2;    // level whose gradient settles which side is out
+constexpr int kDensityPasses = 4;  // of [1, 2, 1] / 4 over the finest level, one over the wide one
+constexpr double kDensityClear = 0.1;  // how sure the wide gradient must be
+constexpr double kFlatSplat = 0.5;     // shortest over middle axis
+constexpr double kDensityTiny = 1e-12;
+
+template <typename T>
+struct DensityArgs {
+  int64_t count;   // N
+  const T* means;  // [N, 3]
+  const T* frame;  // [4] corner and finest cell
+  int nodes;       // cells along the finest level's side
+  T full;          // splats in a cell that counts as full
+  T* values;       // all levels, the finest first
+};
+
+template <typename T>
+struct DensityNormalArgs {
+  int64_t count;
+  const T *means, *quats, *scales;  // [N, 3], [N, 4], [N, 3]
+  const T* values;                  // of DensityArgs
+  const T* frame;
+  int nodes;
+  T *fine, *wide;  // smoothed levels 0 and kDensityWide
+  T* spare;        // as large as `fine`
+  T* normals;      // [N, 3]
+};
+
+GSF_HOST_DEVICE int64_t density_level(int nodes, int level) {
+  int64_t start = 0;
+  for (int l = 0; l < level; ++l) {
+    const int64_t side = nodes >> l;
+    start += side * side * side;
+  }
+  return start;
+}
+
+// The eight cells around a point, and its place among them; false when one is off the grid.
+template <typename T>
+struct DensityPlace {
+  int64_t first;
+  int x, y, z;
+  T fx, fy, fz;
+
+  GSF_HOST_DEVICE bool of(const T* frame, int nodes, const T* p) {
+    using std::floor;
+    const T px = (p[0] - frame[0]) / frame[3] - T(0.5);
+    const T py = (p[1] - frame[1]) / frame[3] - T(0.5);
+    const T pz = (p[2] - frame[2]) / frame[3] - T(0.5);
+    const T x0 = floor(px), y0 = floor(py), z0 = floor(pz), most = T(nodes - 1);
+    // Written so that NaN fails.
+    if (!(x0 >= T(0) && x0 < most && y0 >= T(0) && y0 < most && z0 >= T(0) && z0 < most))
+      return false;
+    x = static_cast<int>(x0);
+    y = static_cast<int>(y0);
+    z = static_cast<int>(z0);
+    fx = px - x0;
+    fy = py - y0;
+    fz = pz - z0;
+    first = (int64_t(z) * nodes + y) * nodes + x;
+    return true;
+  }
+  GSF_HOST_DEVICE T weight(int corner) const {
+    return (corner & 1 ? fx : T(1) - fx) * (corner >> 1 & 1 ? fy : T(1) - fy) *
+           (corner >> 2 ? fz : T(1) - fz);
+  }
+  GSF_HOST_DEVICE int64_t cell(int corner, int nodes) const {
+    return first + (int64_t(corner >> 2) * nodes + (corner >> 1 & 1)) * nodes + (corner & 1);
+  }
+};
+
+// Weight of the cell `offset` away in `passes` passes of [1, 2, 1] / 4: binomial over 4^passes.
+template <typename T>
+GSF_HOST_DEVICE T binomial_weight(int passes, int offset) {
+  T w = T(1);
+  for (int k = 0; k < passes + offset; ++k) w = w * T(2 * passes - k) / T(k + 1);
+  for (int k = 0; k < passes; ++k) w *= T(0.25);
+  return w;
+}
+
+// Trilinear gradient per cell, times -1, of one level at a point; 0 off the grid.
+template <typename T>
+GSF_HOST_DEVICE Vec3<T> density_gradient(const T* v, int side, T cell, const T* frame, const T* p) {
+  using std::floor;
+  const Vec3<T> place{(p[0] - frame[0]) / cell - T(0.5), (p[1] - frame[1]) / cell - T(0.5),
+                      (p[2] - frame[2]) / cell - T(0.5)};
+  const T x0 = floor(place.x), y0 = floor(place.y), z0 = floor(place.z), high = T(side);
+  Vec3<T> sum{T(0), T(0), T(0)};
+  if (!(x0 >= T(-1) && x0 < high && y0 >= T(-1) && y0 < high && z0 >= T(-1) && z0 < high))
+    return sum;
+  const int i = static_cast<int>(x0), j = static_cast<int>(y0), k = static_cast<int>(z0);
+  const T fx = place.x - x0, fy = place.y - y0, fz = place.z - z0;
+  const auto at = [&](int x, int y, int z) {
+    const bool inside = x >= 0 && x < side && y >= 0 && y < side && z >= 0 && z < side;
+    return inside ? v[(int64_t(z) * side + y) * side + x] : T(0);
+  };
+  for (int corner = 0; corner < 8; ++corner) {
+    const int dx = corner & 1, dy = corner >> 1 & 1, dz = corner >> 2;
+    const int x = i + dx, y = j + dy, z = k + dz;
+    if (x < 0 || x >= side || y < 0 || y >= side || z < 0 || z >= side) continue;
+    const T w = T(0.5) * (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * (dz ? fz : T(1) - fz);
+    sum.x += w * (at(x - 1, y, z) - at(x + 1, y, z));
+    sum.y += w * (at(x, y - 1, z) - at(x, y + 1, z));
+    sum.z += w * (at(x, y, z - 1) - at(x, y, z + 1));
+  }
+  return sum;
+}
+
+// Outward vector of splat `i`; its length, up to one, says how sure it is.
+template <typename T>
+GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
+  using std::fabs;
+  const T* p = a.means + 3 * i;
+  const T cell = a.frame[3];
+  Vec3<T> out = density_gradient(a.fine, a.nodes, cell, a.frame, p);
+  const Vec3<T> wide =
+      density_gradient(a.wide, a.nodes >> kDensityWide, cell * T(1 << kDensityWide), a.frame, p);
+  // A skin with a gap below it is a sheet to the fine grid, and a sheet has no inside.
+  if (dot(out, wide) < T(0) && norm(wide) > T(kDensityClear)) out = T(-1) * out;
+  const T *s = a.scales + 3 * i, shortest = min(s[0], min(s[1], s[2]));
+  const T middle = s[0] + s[1] + s[2] - shortest - max(s[0], max(s[1], s[2]));
+  Mat3<T> axes;
+  if (shortest < T(kFlatSplat) * middle && rotation_from_quat(a.quats + 4 * i, &axes)) {
+    // Which column, without an index that changes: that would put the matrix into local memory.
+    const bool first = s[0] == shortest, second = !first && s[1] == shortest;
+    const Vec3<T> axis = matvec(axes, Vec3<T>{T(first), T(second), T(!first && !second)});
+    const T agreement = dot(axis, out) / max(norm(out), T(kDensityTiny));
+    // An axis across the gradient is a splat standing on edge (hair, seams): trust the density.
+    if (fabs(agreement) > T(0.5)) out = T(agreement > T(0) ? 1 : -1) * axis;
+  }
+  for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
+}
+
+}  // namespace gsf

@@ -1,0 +1,139 @@
+"""Occupancy and density normals: the kernels against plain PyTorch, laws, bad input."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsfluent.ops import density_normals, occupancy
+from gsfluent.ops.reference import density as reference
+
+NODES = 32
+CUDA = pytest.param("cuda", marks=pytest.mark.cuda)
+DEVICES = [
+    ("cpu", torch.float32, 2e-5),
+    ("cpu", torch.float64, 1e-12),
+    pytest.param("cuda", torch.float32, 2e-5, marks=pytest.mark.cuda),
+    pytest.param("cuda", torch.float64, 1e-12, marks=pytest.mark.cuda),
+]
+
+
+def splats(count: int = 6000) -> tuple[Tensor, Tensor, Tensor]:
+    """A ball of radius 1 with some far strays; every third splat is flat. float64."""
+    g = torch.Generator().manual_seed(3)
+    means = torch.randn(count, 3, generator=g, dtype=torch.float64)
+    radius = torch.rand(count, 1, generator=g, dtype=torch.float64) ** (1 / 3)
+    means = radius * means / means.norm(dim=1, keepdim=True)
+    means[::97] *= 4.0
+    quats = torch.randn(count, 4, generator=g, dtype=torch.float64)
+    scales = 0.02 + 0.02 * torch.rand(count, 3, generator=g, dtype=torch.float64)
+    scales[::3, 1] = 0.004
+    return means, quats, scales
+
+
+def frame(cell: float = 0.09) -> Tensor:
+    low = -0.5 * NODES * cell
+    return torch.tensor([low + 0.01, low, low - 0.02, cell], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("device", "dtype", "bar"), DEVICES)
+def test_kernels_equal_reference(device: str, dtype: torch.dtype, bar: float) -> None:
+    means, quats, scales = splats()
+    want = reference.occupancy(means, frame(), NODES, full=0.8)
+    moved = [t.to(device, dtype) for t in (means, quats, scales)]
+    place = frame().to(device, dtype)
+    got = occupancy(moved[0], place, NODES, full=0.8)
+    assert (got.cpu().double() - want).abs().max() < bar
+    want_normals = reference.density_normals(means, quats, scales, want, frame(), NODES)
+    normals = density_normals(*moved, want.to(device, dtype), place, NODES).cpu().double()
+    error = (normals - want_normals).abs().amax(1)
+    # in float32 a splat at a threshold may fall on its other side
+    assert error.quantile(0.99) < 10 * bar
+    if dtype == torch.float64:
+        assert error.max() < bar
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_cpu_sums_do_not_depend_on_threads(threads: int) -> None:
+    means = splats()[0].float()
+    want = occupancy(means, frame().float(), NODES, full=0.8)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        assert torch.equal(occupancy(means, frame().float(), NODES, full=0.8), want)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_every_level_holds_the_same_matter() -> None:
+    means, _, _ = splats()
+    means = means[(means.abs() < 1.3).all(dim=1)]  # the outermost cell centres stand at 1.39
+    values = occupancy(means, frame(), NODES, full=1e4)  # never cut off
+    for level in range(5):
+        mass = float(reference.level_of(values, NODES, level).sum()) * 8**level * 1e4
+        assert abs(mass - means.shape[0]) < 1e-6 * mass
+
+
+def test_normals_of_a_ball_point_outward() -> None:
+    means, quats, scales = splats(60000)
+    values = occupancy(means, frame(), NODES, full=0.8 * 60000 / (4.19 / 0.09**3))
+    normals = density_normals(means, quats, scales, values, frame(), NODES)
+    skin = (means.norm(dim=1) > 0.93) & (means.norm(dim=1) < 1.01) & (scales[:, 1] > 0.01)
+    outward = means[skin] / means[skin].norm(dim=1, keepdim=True)
+    cosine = (torch.nn.functional.normalize(normals[skin], dim=1) * outward).sum(1)
+    assert torch.rad2deg(cosine.clamp(-1, 1).acos()).mean() < 3.0
+    flat = (scales[:, 1] < 0.01) & (normals.norm(dim=1) > 0.999)
+    assert flat.any()
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 3e38])
+def test_bad_numbers_stay_in_their_memory(device: str, bad: float) -> None:
+    means, quats, scales = (t.float().to(device) for t in splats(500))
+    place = frame().float().to(device)
+    values = occupancy(means, place, NODES, full=0.8)
+    for spoilt in (means, quats, scales):
+        kept = spoilt.clone()
+        spoilt.view(-1)[::5] = bad
+        assert torch.isfinite(occupancy(means, place, NODES, full=0.8)).all()
+        assert density_normals(means, quats, scales, values, place, NODES).shape == (500, 3)
+        spoilt.copy_(kept)
+    for k in range(4):
+        broken = place.clone()
+        broken[k] = bad
+        occupancy(means, broken, NODES, full=0.8)
+        density_normals(means, quats, scales, values, broken, NODES)
+    values[::3] = bad
+    density_normals(means, quats, scales, values, place, NODES)
+
+
+def test_nothing_and_errors() -> None:
+    nothing = torch.zeros(0, 3)
+    place = frame().float()
+    values = occupancy(nothing, place, NODES, full=1.0)
+    assert float(values.abs().sum()) == 0.0
+    none = density_normals(nothing, torch.zeros(0, 4), nothing, values, place, NODES)
+    assert none.shape == (0, 3)
+    with pytest.raises(ValueError, match="nodes must be a multiple of 16"):
+        occupancy(nothing, place, 33, full=1.0)
+    with pytest.raises(ValueError, match="full must be positive"):
+        occupancy(nothing, place, NODES, full=0.0)
+    with pytest.raises(ValueError, match="values must have shape"):
+        density_normals(nothing, torch.zeros(0, 4), nothing, values[:-1], place, NODES)
+    with pytest.raises(TypeError, match="frame"):
+        occupancy(nothing, place.double(), NODES, full=1.0)
+
+
+def test_registration() -> None:
+    means, quats, scales = splats(50)
+    values = occupancy(means, frame(), NODES, full=0.8)
+    tests = ("test_schema", "test_faketensor")
+    torch.library.opcheck(
+        torch.ops.gsfluent.occupancy.default, (means, frame(), NODES, 0.8), test_utils=tests
+    )
+    torch.library.opcheck(
+        torch.ops.gsfluent.density_normals.default,
+        (means, quats, scales, values, frame(), NODES),
+        test_utils=tests,
+    )
