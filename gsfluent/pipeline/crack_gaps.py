@@ -88,11 +88,15 @@ class Gaps:
         """Go on to the next frame.
 
         Args:
-            points: Where the material points are now.
+            points: Where the material points are now; points that joined the run later, to which no
+                splat is bound, come last.
 
         Returns:
             The splats on the faces that are open; None when there is none.
         """
+        count = self.loose.shape[0]
+        if points.broken.shape[0] > count:
+            points = Points(*(value[:count] for value in points))
         self._watch(points)
         if self._elements is None or self._elements.count == 0:
             return None
@@ -148,11 +152,13 @@ class Gaps:
         return {"loose": self.loose.nonzero()[:, 0].cpu(), "shown": self._keys().cpu()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state` of another run of the same scene."""
-        self.loose = torch.zeros_like(self.loose)
-        self.loose[state["loose"].to(self.loose.device)] = True
-        self._shown = state["shown"].to(self.loose.device)
+        """Go on from :meth:`state` of another run of the same scene; from nothing when empty."""
+        self.loose, self._broken = torch.zeros_like(self.loose), torch.zeros_like(self.loose)
         self._elements = None
+        self._shown = torch.zeros(0, dtype=torch.int64, device=self.loose.device)
+        if state:
+            self.loose[state["loose"].to(self.loose.device)] = True
+            self._shown = state["shown"].to(self.loose.device)
 
 
 def _turned(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -109,9 +109,9 @@ class Repair(Stage):
             return None
         if self._gaps is None or self._gaps.carry is not carry:
             self._gaps = Gaps(carry)
-            if self._resumed is not None:
-                self._gaps.restore(self._resumed)
-                self._resumed = None
+        if self._resumed is not None:
+            self._gaps.restore(self._resumed)
+            self._resumed = None
         return self._gaps.step(points)
 
     def forward(
@@ -161,9 +161,8 @@ class Repair(Stage):
         return {} if self._gaps is None else self._gaps.state()
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state` of an earlier run at the next :meth:`step`."""
-        self._gaps = None
-        self._resumed = state or None
+        """Go on from :meth:`state` at the next :meth:`step`; from nothing for an empty one."""
+        self._resumed = state
 
 
 def _with_births(moved: Gaussians, motion: Motion, births: Births | None) -> Repaired:
