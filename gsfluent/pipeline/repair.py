@@ -201,7 +201,7 @@ class _CrackGraph:
             rest = self.carry.gaussians
             shapes = rest.covariances()
             center, shape, overlap = ops.mvee_lens(
-                rest.means[i], shapes[i], rest.means[j], shapes[j], radius=self.radius
+                rest.means[i], shapes[i], rest.means[j], shapes[j], radius=self.radius, flat=0.15
             )
             if shape.ndim == 3:
                 shape = geometry.pack_symmetric(shape)
