@@ -64,7 +64,8 @@ class Run:
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""
-        self.links = rest_links(matter.rest, matter.ranges, matter.spacing)
+        device = matter.particles.device
+        self.links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
         self._pieces: tuple[State, Fragments] | None = None
 
     def _set(self, scene: Scene, matter: Matter) -> None:
@@ -177,7 +178,7 @@ class Run:
 
     def _holding(self, state: State) -> Tensor:
         """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
-        links = self.links.to(state.position.device)
+        links = self.links
         a, b = links.unbind(dim=1)
         rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
         near = now <= STRETCH_LIMIT * rest
