@@ -20,6 +20,8 @@ class Export(Verb):
       gsfluent export out --to ply-seq                       # out/frames/frame_0001.ply ...
       gsfluent export out --to ply-seq --compressed --up=-y  # for SuperSplat: drop the folder on it
       gsfluent export out --to spz,glb --frames 40           # one moment, for a web page
+      gsfluent export out --to delta                         # one small file: out/splats.gsd
+      gsfluent export splats.gsd --to ply-seq                # and back, for any viewer
       gsfluent export out --to usd -o cut_07                 # Houdini, usdview: one scene.usdc
       gsfluent export out --to vtk,vti                       # ParaView: open particles.vtk.series
       gsfluent export out --to mp4 --camera freeze           # time stands still, once around
@@ -27,6 +29,7 @@ class Export(Verb):
 
     Formats (docs/export.md says who reads what, and how large it gets):
       ply-seq  3DGS .ply per frame     spz, splat, glb  the same as smaller or newer files
+      delta    all frames in one small file, read by gsfluent.io.DeltaReader
       usd      all frames in one file: splats, particles with velocity and damage
       vtk, points, vti                 the material points: .vtk, .ply, density volume
       mp4, gif, webp, png              pictures, along any camera path (docs/render.md)
@@ -35,7 +38,7 @@ class Export(Verb):
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder that `gsfluent run` wrote."""
+    """Folder that `gsfluent run` wrote, or a .gsd file."""
     to: str
     """Formats, comma-separated."""
     folder: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -52,6 +55,8 @@ class Export(Verb):
     """The same splats in the same order in every frame; absent ones have opacity 0."""
     attributes: bool = False
     """ply-seq: properties fragment and material."""
+    key_every: int = 30
+    """delta: frames from one that stands alone to the next; fewer: faster jumps, larger file."""
     spz_version: Literal[2, 3] = 3
     """spz: 2 for old readers, with coarser rotations."""
     usd_ending: Literal["usdc", "usda", "usdz"] = "usdc"
@@ -71,7 +76,7 @@ class Export(Verb):
         """Export."""
         from gsfluent.pipeline.export import ExportOptions, export
 
-        existing(self.out, "OUT", folder=True)
+        existing(self.out, "OUT")
         if self.fps is not None and not 0.1 <= self.fps <= 1000.0:
             raise InputError(f"--fps {self.fps:g}", "give a number from 0.1 to 1000")
         options = ExportOptions(
@@ -81,6 +86,7 @@ class Export(Verb):
             compressed=self.compressed,
             constant=self.constant,
             attributes=self.attributes,
+            key_every=self.key_every,
             spz_version=self.spz_version,
             usd_ending=self.usd_ending,
             camera=self.camera,

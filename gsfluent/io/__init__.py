@@ -2,6 +2,7 @@
 
 from gsfluent.io.atomic import atomic_path, write_json
 from gsfluent.io.capture import load_capture
+from gsfluent.io.delta import DeltaReader
 from gsfluent.io.images import load_image, save_image
 from gsfluent.io.ply import read_ply, write_ply
 from gsfluent.io.splats import load_splats, save_splats
@@ -9,6 +10,7 @@ from gsfluent.io.splats import load_splats, save_splats
 load = load_splats
 
 __all__ = [
+    "DeltaReader",
     "atomic_path",
     "load",
     "load_capture",

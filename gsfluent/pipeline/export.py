@@ -13,7 +13,7 @@ from gsfluent.config.read import nearest
 from gsfluent.errors import InputError
 from gsfluent.pipeline.export_frames import Reel
 from gsfluent.pipeline.export_job import ExportOptions, Job
-from gsfluent.pipeline.run_frames import frame_rate
+from gsfluent.pipeline.export_unpack import DeltaReel
 from gsfluent.pipeline.stage import Progress
 
 
@@ -26,6 +26,7 @@ class Format:
         module: Module of the writer, below ``gsfluent.pipeline``.
         function: The writer: takes a :class:`Job`, returns what was written.
         pictures: Rendered; needs the shot's camera and light.
+        splats_only: Needs splats and nothing else, so it can be made of a ``.gsd`` file.
         key: Name in the report.
     """
 
@@ -33,6 +34,7 @@ class Format:
     module: str
     function: str
     pictures: bool = False
+    splats_only: bool = False
     key: str = ""
 
 
@@ -42,11 +44,32 @@ FORMATS: dict[str, Format] = {
     "webp": Format("animated WebP, also with alpha", "export_pictures", "webp", pictures=True),
     "png": Format("PNG sequence, also with alpha", "export_pictures", "png", pictures=True),
     "ply-seq": Format(
-        "3DGS .ply per frame: SuperSplat, Blender, Houdini, Unity", "export_splats", "ply_sequence"
+        "3DGS .ply per frame: SuperSplat, Blender, Houdini, Unity",
+        "export_splats",
+        "ply_sequence",
+        splats_only=True,
     ),
-    "spz": Format(".spz per frame: phones, web viewers", "export_splats", "spz_sequence"),
-    "splat": Format(".splat per frame: the first web viewers", "export_splats", "splat_sequence"),
-    "glb": Format("glTF with KHR_gaussian_splatting per frame", "export_splats", "glb_sequence"),
+    "spz": Format(
+        ".spz per frame: phones, web viewers", "export_splats", "spz_sequence", splats_only=True
+    ),
+    "splat": Format(
+        ".splat per frame: the first web viewers",
+        "export_splats",
+        "splat_sequence",
+        splats_only=True,
+    ),
+    "glb": Format(
+        "glTF with KHR_gaussian_splatting per frame",
+        "export_splats",
+        "glb_sequence",
+        splats_only=True,
+    ),
+    "delta": Format(
+        "one small .gsd file: gsfluent.io.DeltaReader, gsfluent export",
+        "export_delta",
+        "delta",
+        splats_only=True,
+    ),
     "usd": Format("one USD file with time samples: Houdini, usdview", "export_splats", "usd"),
     "vtk": Format("material points per frame: ParaView, VisIt", "export_points", "vtk"),
     "points": Format("material points as .ply: Houdini, Blender", "export_points", "points"),
@@ -66,10 +89,10 @@ def export(
     """Write a finished simulation in some formats.
 
     Args:
-        out: Folder of the run.
+        out: Folder of the run, or a ``.gsd`` file of one.
         kinds: Some of :data:`FORMATS`.
         device: Where pictures are rendered and light is baked.
-        to: Folder to write to; ``out`` by default.
+        to: Folder to write to; by default ``out``, or one named like the file.
         options: How.
         progress: Called per frame.
 
@@ -87,15 +110,16 @@ def export(
             raise InputError(f"--to {kind}: gsfluent cannot write that", nearest(kind, FORMATS))
     if not kinds:
         raise InputError("--to names no format", f"choose from {', '.join(FORMATS)}")
-    reel = Reel(
-        out,
-        frames=options.frames,
-        sh=options.sh,
-        up=options.up,
-    )
-    job = Job(
-        out, to or out, reel, options, options.fps or frame_rate(reel.folder), device, progress
-    )
+    reel: Reel
+    if out.is_file():
+        reel = DeltaReel(out, frames=options.frames, sh=options.sh, up=options.up)
+        for kind in kinds:
+            if not FORMATS[kind].splats_only:
+                raise InputError(f"--to {kind}: {out} holds splats only", "export from the run")
+        to = to or out.with_suffix("")
+    else:
+        reel = Reel(out, frames=options.frames, sh=options.sh, up=options.up)
+    job = Job(out, to or out, reel, options, options.fps or reel.rate(), device, progress)
     return _write(job, kinds)
 
 
@@ -104,7 +128,7 @@ def write_exports(
 ) -> dict[str, Any]:
     """Write the formats that need no rendering, with the usual options; see :func:`export`."""
     reel = Reel(out)
-    rate, cpu = frame_rate(reel.folder), torch.device("cpu")
+    rate, cpu = reel.rate(), torch.device("cpu")
     return _write(Job(out, out, reel, ExportOptions(), rate, cpu, progress), kinds)
 
 

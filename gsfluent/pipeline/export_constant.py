@@ -12,7 +12,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gsfluent import geometry
 from gsfluent.data import Gaussians
+from gsfluent.io.axes import nearest_axes
 from gsfluent.pipeline.export_frames import NOBODY, Moment, Reel
 from gsfluent.pipeline.stage import Progress, report_progress
 
@@ -20,8 +22,8 @@ from gsfluent.pipeline.stage import Progress, report_progress
 class Constant:
     """The frames of a reel with a constant number and order of splats.
 
-    Iterating gives :class:`Moment`; rows are sorted by id. Quaternions keep their sign from frame
-    to frame, so that a player may interpolate.
+    Iterating gives :class:`Moment`; rows are sorted by id. Axes keep their names and quaternions
+    their sign from frame to frame, so that a player may interpolate.
 
     Args:
         reel: The chosen frames; read twice.
@@ -53,14 +55,11 @@ class Constant:
         for moment in self.reel:
             saved = moment.saved
             rows = torch.searchsorted(self.ids, saved.ids.cpu())
-            here = _plain(moment.gaussians.to("cpu"))
-            fields = {}
-            for name in ("means", "quats", "scales", "sh"):
-                value = getattr(here, name)
-                if name == "quats":
-                    kept = now.quats[rows]
-                    value = value * torch.where((value * kept).sum(1, keepdim=True) < 0, -1.0, 1.0)
-                fields[name] = getattr(now, name).index_copy(0, rows, value)
+            here = _least_turned(_plain(moment.gaussians.to("cpu")), now.quats[rows])
+            fields = {
+                name: getattr(now, name).index_copy(0, rows, getattr(here, name))
+                for name in ("means", "quats", "scales", "sh")
+            }
             opacities = torch.zeros(count).index_copy(0, rows, here.opacities)
             now = Gaussians(opacities=opacities, **fields)
             yield Moment(
@@ -79,6 +78,16 @@ class Constant:
 def _plain(gaussians: Gaussians) -> Gaussians:
     """Without labels and normals, which need not be there in every frame."""
     return gaussians.replace(labels=None, normals=None)
+
+
+def _least_turned(gaussians: Gaussians, wanted: Tensor) -> Gaussians:
+    """The same splats with their axes named as they were in the frame before."""
+    quats, scales = nearest_axes(
+        geometry.normalize_quaternions(gaussians.quats).double().numpy(),
+        gaussians.scales.numpy(),
+        geometry.normalize_quaternions(wanted).double().numpy(),
+    )
+    return gaussians.replace(quats=torch.from_numpy(quats).float(), scales=torch.from_numpy(scales))
 
 
 def _spread(values: Tensor, rows: Tensor, count: int) -> Tensor:

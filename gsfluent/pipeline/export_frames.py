@@ -11,7 +11,13 @@ from torch import Tensor
 
 from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame
+from gsfluent.pipeline.run_frames import (
+    SavedFrame,
+    count_frames,
+    frame_rate,
+    frame_time,
+    load_frame,
+)
 
 Relight = Callable[[SavedFrame], Gaussians]
 """Gives the splats of a frame colours that carry the light."""
@@ -94,15 +100,35 @@ class Reel:
         device: torch.device | None = None,
     ) -> None:
         self.out = out
+        self.total = self._open(out)
+        if not 0 <= sh <= 3:
+            raise InputError(f"--sh {sh}", "give a degree from 0 to 3")
+        self.indices = _chosen(frames, self.total)
+        self.sh, self.relight, self.turn = sh, relight, upright(up)
+        self.up, self.device = up, device or torch.device("cpu")
+
+    def _open(self, out: Path) -> int:
+        """Find the frames and return their number."""
         self.folder = out / "stages" / "simulate"
         count = count_frames(self.folder)
         if count == 0:
             raise InputError(f"{out}: no simulated frames", "run the shot first: gsfluent run")
-        if not 0 <= sh <= 3:
-            raise InputError(f"--sh {sh}", "give a degree from 0 to 3")
-        self.indices = _chosen(frames, count)
-        self.sh, self.relight, self.turn = sh, relight, upright(up)
-        self.up, self.device = up, device or torch.device("cpu")
+        return count
+
+    def _load(self, index: int) -> SavedFrame:
+        return load_frame(self.folder, index)
+
+    def times(self) -> list[float]:
+        """Simulated times of the chosen frames [s]."""
+        return [frame_time(self.folder, index) for index in self.indices]
+
+    def rate(self) -> float:
+        """Frames per second of simulated time, counting those that were not chosen."""
+        return frame_rate(self.folder)
+
+    def source(self) -> Path:
+        """File that changes when the frames do."""
+        return self.folder / "stage.json"
 
     def __len__(self) -> int:
         """Number of chosen frames."""
@@ -121,7 +147,7 @@ class Reel:
 
     def moment(self, place: int) -> Moment:
         """Frame number ``place`` of the chosen ones."""
-        saved = load_frame(self.folder, self.indices[place]).to(self.device)
+        saved = self._load(self.indices[place]).to(self.device)
         gaussians = saved.gaussians if self.relight is None else self.relight(saved)
         gaussians = gaussians.with_sh_degree(min(self.sh, gaussians.sh_degree))
         saved = replace(

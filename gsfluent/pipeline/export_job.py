@@ -11,7 +11,6 @@ import torch
 
 from gsfluent.io import write_json
 from gsfluent.pipeline.export_frames import Moment, Reel
-from gsfluent.pipeline.run_frames import count_frames
 from gsfluent.pipeline.run_store import content_digest, fingerprint
 from gsfluent.pipeline.stage import Progress, report_progress
 
@@ -30,6 +29,7 @@ class ExportOptions:
         spz_version: 2 or 3.
         usd_ending: ``usdc``, ``usda`` or ``usdz``.
         usd_parts: Some of ``splats``, ``particles``.
+        key_every: Frames from one key frame to the next of a delta file.
         camera: Camera or camera path of pictures; the shot's own by default.
         size: (width, height) of pictures [px]; the shot's own by default.
         fps: Pictures or time codes per second; the shot's own by default.
@@ -45,6 +45,7 @@ class ExportOptions:
     spz_version: int = 3
     usd_ending: str = "usdc"
     usd_parts: tuple[str, ...] = ("splats", "particles")
+    key_every: int = 30
     camera: str | None = None
     size: tuple[int, int] | None = None
     fps: float | None = None
@@ -113,7 +114,7 @@ class Job:
 
     def _finished(self, target: Path, kind: str) -> bool:
         """Whether files in the folder are of this very export; notes down that they will be."""
-        stage = self.reel.folder / "stage.json"
+        stage = self.reel.source()
         source = content_digest(stage) if stage.is_file() else None
         wanted = replace(self.options, frames=None)
         key = fingerprint("export", kind, repr(wanted), source)
@@ -128,7 +129,7 @@ class Job:
 
     def _forget_stale(self, target: Path, name: str) -> None:
         """Remove files beyond the run's last frame: an older, longer run's, which would play on."""
-        number = count_frames(self.reel.folder) + 1
+        number = self.reel.total + 1
         while (stale := target / name.format(number)).is_file():
             stale.unlink()
             number += 1

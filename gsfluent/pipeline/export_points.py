@@ -12,7 +12,6 @@ from gsfluent.io.ply import write_ply
 from gsfluent.io.vtk import save_series, save_vti, save_vtk_points
 from gsfluent.pipeline.export_frames import Moment
 from gsfluent.pipeline.export_job import Job, span
-from gsfluent.pipeline.run_frames import frame_time
 
 _LARGEST_GRID = 400**3
 
@@ -25,10 +24,6 @@ def point_fields(moment: Moment) -> dict[str, NDArray[np.generic]]:
     return {name: value.cpu().numpy() for name, value in names.items()}
 
 
-def _times(job: Job) -> list[float]:
-    return [frame_time(job.reel.folder, index) for index in job.reel.indices]
-
-
 def vtk(job: Job) -> str:
     """``particles/particles_0001.vtk`` and a ``.vtk.series`` that ParaView plays."""
 
@@ -38,7 +33,7 @@ def vtk(job: Job) -> str:
         save_vtk_points(path, saved.positions.cpu().numpy(), point_fields(moment), title)
 
     names = job.write_each("vtk", "particles", "particles_{:04d}.vtk", write)
-    save_series(job.folder / "particles" / "particles.vtk.series", names, _times(job))
+    save_series(job.folder / "particles" / "particles.vtk.series", names, job.reel.times())
     return span("particles", names)
 
 
@@ -81,7 +76,7 @@ def vti(job: Job) -> str:
         save_vti(path, fields, origin=origin.tolist(), spacing=step)
 
     names = job.write_each("vti", "density", "density_{:04d}.vti", write)
-    save_series(job.folder / "density" / "density.pvd", names, _times(job))
+    save_series(job.folder / "density" / "density.pvd", names, job.reel.times())
     return span("density", names)
 
 

@@ -1,0 +1,62 @@
+"""A simulation as one compact file of key frames and differences (``.gsd``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from gsfluent import geometry
+from gsfluent.io.delta import DeltaFrame
+from gsfluent.io.delta_write import Roster, steps, write_delta
+from gsfluent.pipeline.export_frames import Moment
+from gsfluent.pipeline.export_job import Job
+
+_SHARE = 0.05
+"""Largest error of a centre, as a share of the median splat's smallest standard deviation."""
+
+
+def delta(job: Job) -> str:
+    """``splats.gsd``: every splat once, then only what changes; SH degree 0."""
+    reel, roster = job.reel, Roster()
+    error = 0.0
+    for place, moment in enumerate(reel):
+        frame = delta_frame(moment, place)
+        roster.meet(frame)
+        if place == 0:
+            error = _SHARE * float(np.median(frame.scales.min(axis=1)))
+        job.report(place + 1, len(reel), "delta: which splats there are")
+    write_delta(
+        job.folder / "splats.gsd",
+        _told(job),
+        roster,
+        times=reel.times(),
+        fps=job.fps,
+        step=steps(error),
+        key_every=job.options.key_every,
+        up=reel.up,
+    )
+    return "splats.gsd"
+
+
+def _told(job: Job) -> Iterator[DeltaFrame]:
+    for place, moment in enumerate(job.reel):
+        yield delta_frame(moment, place)
+        job.report(place + 1, len(job.reel), "delta")
+
+
+def delta_frame(moment: Moment, place: int) -> DeltaFrame:
+    """A frame as numpy arrays, quaternions normalised."""
+    host = moment.gaussians.to("cpu", torch.float32)
+    return DeltaFrame(
+        place,
+        moment.saved.time,
+        moment.saved.ids.cpu().numpy().astype(np.int64),
+        moment.fragment.cpu().numpy().astype(np.int32),
+        host.means.numpy(),
+        geometry.normalize_quaternions(host.quats).numpy(),
+        host.scales.numpy(),
+        host.opacities.numpy(),
+        host.sh[:, 0].numpy(),
+    )
