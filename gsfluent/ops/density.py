@@ -52,7 +52,8 @@ def density_normals(
     """Outward vectors of splats: minus the gradient of the smoothed occupancy per cell.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
-    splats whose shortest axis agrees with the gradient (they take that axis), zero off the grid.
+    splats unless their shortest axis lies across a clear gradient (they take that axis), zero off
+    the grid.
     A look four times as wide turns what points inward.
 
     Args:
