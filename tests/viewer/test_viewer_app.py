@@ -16,11 +16,11 @@ from viewer_scene import FRAMES, frame, write_run
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import Lamp, Lighting  # noqa: E402
+from gsfluent.pipeline.light import Lamp, Lighting
 from gsfluent.pipeline.run_frames import SavedFrame, save_frame
 from gsfluent.viewer import splats
 from gsfluent.viewer.app import App
-from gsfluent.viewer.light_panel import Handles  # noqa: E402
+from gsfluent.viewer.light_panel import Handles
 from gsfluent.viewer.source import RunSource
 
 CPU = torch.device("cpu")
