@@ -31,6 +31,7 @@ struct DensityNormalArgs {
   const T *means, *quats, *scales;  // [N, 3], [N, 4], [N, 3]
   const T* values;                  // of DensityArgs
   const T* frame;
+  const T* eye;  // [3], what flat splats face, or null
   int nodes;
   T *fine, *wide;  // smoothed levels 0 and kDensityWide
   T* spare;        // as large as `fine`
@@ -137,8 +138,11 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
     const Vec3<T> axis = matvec(axes, Vec3<T>{T(first), T(second), T(!first && !second)});
     const T agreement = dot(axis, out);
     // An axis across a clear gradient is a splat standing on edge (hair, seams): trust the density.
-    if (fabs(agreement) > T(0.5) * norm(out) - T(kDensityUnclear))
-      out = T(agreement < T(0) ? -1 : 1) * axis;
+    if (fabs(agreement) > T(0.5) * norm(out) - T(kDensityUnclear)) {
+      const T side =
+          a.eye ? dot(axis, Vec3<T>{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]}) : agreement;
+      out = T(side < T(0) ? -1 : 1) * axis;
+    }
   }
   for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
 }

@@ -20,8 +20,6 @@ from gsfluent.pipeline.occlusion import COARSEST, PER_CELL, Occupancy, occupancy
 
 __all__ = ["Grid", "estimate_normals", "grid_for", "occupancy_cell", "splat_normals"]
 
-# Vectors of this length come from a flat splat's own axis; the density's are shorter.
-_FLAT = 0.9
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
 _MOST_NODES = 256
@@ -116,12 +114,12 @@ def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = No
             shell is a sheet without a side to the density, from outside and from inside. When
             None, flat splats take the side of the density.
     """
-    means = gaussians.means
-    outward = ops.density_normals(
-        means, gaussians.quats, gaussians.scales, grid.values, grid.frame, grid.nodes
+    return ops.density_normals(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        grid.values,
+        grid.frame,
+        grid.nodes,
+        eye=eye,
     )
-    if eye is None:
-        return outward
-    away = (outward * (eye - means)).sum(-1, keepdim=True) < 0.0
-    flat = outward.square().sum(-1, keepdim=True) > _FLAT * _FLAT
-    return torch.where(away & flat, -outward, outward)
