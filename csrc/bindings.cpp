@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "core/mvee.h"
 #include "core/mvee_lens.h"
 #include "core/return_mapping.h"
 
@@ -123,16 +124,16 @@ void bind(py::module_ m) {
       arg("f"), "(U, sigma, V) of F = U diag(sigma) V^T with rotations U, V (core/svd3.h).");
   m.def(
       "mvee",
-      [](const Array<T>& points, T tolerance, int max_iterations) {
+      [](const Array<T>& points, double tolerance, int max_iterations) {
         const T* p = expect(points, "points", {-1, 3});
         const py::ssize_t n = points.shape(0);
         if (n < 1) throw std::invalid_argument("points must hold at least one point");
-        std::vector<T> weight(n);
-        const Ellipsoid<T> e = mvee_fit(SerialTeam{}, p, static_cast<int>(n), weight.data(),
+        std::vector<FitPoint<T>> scratch(n);
+        const Ellipsoid<T> e = mvee_fit(SerialTeam{}, p, static_cast<int>(n), scratch.data(),
                                         tolerance, max_iterations);
         return py::make_tuple(to_array(e.center), to_array(to_mat3(e.shape)));
       },
-      arg("points"), arg("tolerance") = T(1e-3), arg("max_iterations") = 1000,
+      arg("points"), arg("tolerance") = 5e-4, arg("max_iterations") = 100,
       "(centre, shape) of the ellipsoid around one point set (core/mvee.h).");
   m.def(
       "ball_lens",
@@ -141,18 +142,19 @@ void bind(py::module_ m) {
         return py::make_tuple(b.center, b.axial, b.radial, b.overlap);
       },
       arg("r1"), arg("r2"), arg("distance"),
-      "(centre on the axis, axial, radial semi-axis, overlap) of two balls (core/mvee_lens.h).");
+      "(centre on the axis, axial, radial semi-axis, overlap) of two balls (core/mvee_pair.h).");
   m.def(
       "mvee_lens",
       [](const Array<T>& mean_a, const Array<T>& cov_a, const Array<T>& mean_b,
-         const Array<T>& cov_b, T radius) {
-        T points[3 * kLensRays], weight[kLensRays];
+         const Array<T>& cov_b, double radius, double flat) {
+        FitPoint<T> points[kLensPoints];
         const LensResult<T> r = mvee_lens(
-            SerialTeam{}, vec3(mean_a, "mean_a"), load_sym3(expect(cov_a, "cov_a", {6})),
-            vec3(mean_b, "mean_b"), load_sym3(expect(cov_b, "cov_b", {6})), radius, points, weight);
+            vec3(mean_a, "mean_a"), load_sym3(expect(cov_a, "cov_a", {6})), vec3(mean_b, "mean_b"),
+            load_sym3(expect(cov_b, "cov_b", {6})), radius, flat, points);
         return py::make_tuple(to_array(r.mean), to_array(r.covariance), r.overlap);
       },
-      arg("mean_a"), arg("cov_a"), arg("mean_b"), arg("cov_b"), arg("radius") = T(2),
+      arg("mean_a"), arg("cov_a"), arg("mean_b"), arg("cov_b"), arg("radius") = 2.0,
+      arg("flat") = 0.0,
       "(mean, covariance, overlap) around one pair of Gaussians (core/mvee_lens.h).");
 }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsfluent import demo, geometry, materials, ops
 from gsfluent.data import SURFACE, Gaussians, Solid
-from gsfluent.demo.fruit import OBJECTS
+from gsfluent.demo.catalogue import OBJECTS
 from gsfluent.lab.fracture_pictures import PARTED, TrueCloud
 from gsfluent.lab.interiors import known_interior
 from gsfluent.pipeline.carry import Carry
@@ -54,8 +54,8 @@ class Case:
 CASES = {
     "melon": Case("watermelon", "fruit.watermelon", 1.0, 0.8),
     "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.0, 0.8, isotropic=True),
-    "marble": Case("marble", "plaster", 3.0, 1.1),
-    "bread": Case("bread", "chocolate", 2.0, 1.0),
+    "marble": Case("marble", "fruit.pumpkin", 1.5, 0.8),
+    "bread": Case("bread", "fruit.watermelon", 1.2, 0.8),
 }
 
 

@@ -38,8 +38,7 @@ template <typename T>
 struct MveeArgs {
   int64_t batch, count;  // fits, points per fit
   const T* points;       // [batch, count, 3]
-  T* weight;             // scratch [batch, count]
-  T tolerance;
+  double tolerance;
   int max_iterations;
   T* center;  // [batch, 3]
   T* shape;   // [batch, 9]
@@ -52,7 +51,8 @@ struct MveeLensArgs {
   const T* covariance_a;  // [batch, 6]
   const T* mean_b;
   const T* covariance_b;
-  T radius;       // k_sigma
+  double radius;  // k_sigma
+  double flat;    // least ratio of the semi-axes of an overlap
   T* mean;        // [batch, 3]
   T* covariance;  // [batch, 6]
   bool* overlap;  // [batch]

@@ -1,6 +1,9 @@
 // CPU kernels of the enclosing-ellipsoid ops: fits in parallel, one thread each.
 #include "host/mvee.h"
 
+#include <vector>
+
+#include "core/mvee.h"
 #include "core/mvee_lens.h"
 
 namespace gsf {
@@ -21,10 +24,11 @@ struct MveeCpu {
   template <typename T>
   static void mvee(const MveeArgs<T>& a, const Tensor&) {
     parallel_for(a.batch, 1, [&](int64_t begin, int64_t end) {
+      std::vector<FitPoint<T>> scratch(a.count);
       for (int64_t i = begin; i < end; ++i) {
         const Ellipsoid<T> fit =
             mvee_fit(SerialTeam{}, a.points + 3 * a.count * i, static_cast<int>(a.count),
-                     a.weight + a.count * i, a.tolerance, a.max_iterations);
+                     scratch.data(), a.tolerance, a.max_iterations);
         store_vec3(a.center + 3 * i, fit.center);
         store_mat3(a.shape + 9 * i, to_mat3(fit.shape));
       }
@@ -34,12 +38,12 @@ struct MveeCpu {
   template <typename T>
   static void mvee_lens(const MveeLensArgs<T>& a, const Tensor&) {
     parallel_for(a.batch, 16, [&](int64_t begin, int64_t end) {
-      T points[3 * kLensRays], weight[kLensRays];
+      FitPoint<T> points[kLensPoints];
       for (int64_t i = begin; i < end; ++i) {
         const LensResult<T> r =
-            gsf::mvee_lens(SerialTeam{}, load_vec3(a.mean_a + 3 * i),
-                           load_sym3(a.covariance_a + 6 * i), load_vec3(a.mean_b + 3 * i),
-                           load_sym3(a.covariance_b + 6 * i), a.radius, points, weight);
+            gsf::mvee_lens(load_vec3(a.mean_a + 3 * i), load_sym3(a.covariance_a + 6 * i),
+                           load_vec3(a.mean_b + 3 * i), load_sym3(a.covariance_b + 6 * i), a.radius,
+                           a.flat, points);
         store_vec3(a.mean + 3 * i, r.mean);
         store_sym3(a.covariance + 6 * i, r.covariance);
         a.overlap[i] = r.overlap;

@@ -13,10 +13,19 @@ cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream);
 template <typename T>
 cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream);
 
+// Values of type T that mvee needs as scratch; none for small sets.
 template <typename T>
-cudaError_t mvee(const MveeArgs<T>& args, cudaStream_t stream);
+int64_t mvee_scratch(const MveeArgs<T>& args);
 
 template <typename T>
-cudaError_t mvee_lens(const MveeLensArgs<T>& args, cudaStream_t stream);
+cudaError_t mvee(const MveeArgs<T>& args, T* scratch, int64_t size, cudaStream_t stream);
+
+// Scratch of mvee_lens: the pairs that need a fit, at most `kLensChunk` at a time.
+inline constexpr int64_t kLensChunk = 1 << 18;
+inline constexpr int64_t kLensFields = 33;  // doubles of a pair's LensSetup
+
+template <typename T>
+cudaError_t mvee_lens(const MveeLensArgs<T>& args, double* setups, int32_t* rows, int32_t* count,
+                      cudaStream_t stream);
 
 }  // namespace gsf::cuda

@@ -10,12 +10,18 @@ struct MveeCuda {
   template <typename T>
   static void mvee(const MveeArgs<T>& args, const Tensor& like) {
     const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::mvee(args, scope.stream()));
+    const int64_t size = cuda::mvee_scratch(args);
+    const Tensor scratch = gsf::new_empty(like, {size}, scalar_type_of<T>());
+    STD_CUDA_CHECK(cuda::mvee(args, size > 0 ? mptr<T>(scratch) : nullptr, size, scope.stream()));
   }
   template <typename T>
   static void mvee_lens(const MveeLensArgs<T>& args, const Tensor& like) {
     const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::mvee_lens(args, scope.stream()));
+    const int64_t chunk = args.batch < cuda::kLensChunk ? args.batch : cuda::kLensChunk;
+    const Tensor setups = gsf::new_empty(like, {cuda::kLensFields * chunk}, ScalarType::Double);
+    const Tensor rows = gsf::new_empty(like, {chunk + 1}, ScalarType::Int);
+    STD_CUDA_CHECK(cuda::mvee_lens(args, mptr<double>(setups), mptr<int32_t>(rows),
+                                   mptr<int32_t>(rows) + chunk, scope.stream()));
   }
 };
 

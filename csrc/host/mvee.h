@@ -20,14 +20,12 @@ struct MveeOps {
     const ScalarType dtype = x.scalar_type();
     Tensor center = gsf::new_empty(x, {batch, 3}, dtype);
     Tensor shape = gsf::new_empty(x, {batch, 3, 3}, dtype);
-    Tensor weight = gsf::new_empty(x, {batch, count}, dtype);
     dispatch_floating(op, x, [&]<typename T>() {
       if (batch == 0) return;
       const MveeArgs<T> args{.batch = batch,
                              .count = count,
                              .points = cptr<T>(x),
-                             .weight = mptr<T>(weight),
-                             .tolerance = T(tolerance),
+                             .tolerance = tolerance,
                              .max_iterations = static_cast<int>(max_iterations),
                              .center = mptr<T>(center),
                              .shape = mptr<T>(shape)};
@@ -39,7 +37,8 @@ struct MveeOps {
   static std::tuple<Tensor, Tensor, Tensor> mvee_lens(const Tensor& mean_a,
                                                       const Tensor& covariance_a,
                                                       const Tensor& mean_b,
-                                                      const Tensor& covariance_b, double radius) {
+                                                      const Tensor& covariance_b, double radius,
+                                                      double flat) {
     const char* op = "mvee_lens";
     check_shape(op, "mean_a", mean_a, {-1, 3});
     const int64_t batch = mean_a.size(0);
@@ -65,7 +64,8 @@ struct MveeOps {
                                  .covariance_a = cptr<T>(ca),
                                  .mean_b = cptr<T>(mb),
                                  .covariance_b = cptr<T>(cb),
-                                 .radius = T(radius),
+                                 .radius = radius,
+                                 .flat = flat,
                                  .mean = mptr<T>(mean),
                                  .covariance = mptr<T>(covariance),
                                  .overlap = mptr<bool>(overlap)};

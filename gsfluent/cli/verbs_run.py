@@ -75,6 +75,7 @@ class Demo(Verb):
       gsfluent demo                            # into demo_out/, a few minutes on two cores
       gsfluent demo watermelon -o out          # the same by name
       gsfluent demo --size preview             # small and quick, for a check
+      gsfluent demo cake --photographs examples/data/cake   # only its photographs and a cut
 
     Nothing is downloaded: gsfluent draws the photographs itself from an object whose inside it
     knows, so run.json can say how far the reconstructed inside is from the truth.
@@ -86,13 +87,20 @@ class Demo(Verb):
     """Folder for the results."""
     size: Literal["full", "preview"] = "full"
     """full, or a small quick one."""
+    photographs: Path | None = None
+    """Only photograph the object into this folder: photographs/, cut.png, truth.npz."""
     force: bool = False
     """Redo every stage."""
 
     def execute(self) -> dict[str, Any]:
         """Run the demo."""
-        from gsfluent.pipeline.run_demo import run_demo
+        from gsfluent.pipeline.run_demo import SIZES, photograph_demo, run_demo
         from gsfluent.progress import reporter
+
+        if self.photographs is not None:
+            scale, seed = SIZES[self.size], self.seed
+            with self.progress("photograph") as progress:
+                return photograph_demo(self.name, self.photographs, scale, seed, progress)
 
         device = self.torch_device()
         with reporter(quiet=self.json) as report:

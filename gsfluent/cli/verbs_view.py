@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from gsfluent.cli.common import Verb, existing
+from gsfluent.errors import InputError
 
 
 @dataclass(kw_only=True)
@@ -21,12 +22,15 @@ class View(Verb):
       gsfluent view out --host 0.0.0.0         # for other machines, too
       gsfluent view out --splats               # the browser draws the splats (up to 200 000)
       gsfluent view out --check                # draws one picture, out/view.png, and exits
+      gsfluent view out --live                 # throw, shoot and cut its objects: docs/live.md
+      gsfluent view melon.ply --live --material fruit.watermelon   # a filled solid
+      gsfluent view shot.yaml --live --run out # a shot, whose objects are prepared in out
 
     OUT may be a run that is still at work: frames appear as they are written.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Folder that `gsfluent run` wrote, or is writing."""
+    """Folder that `gsfluent run` wrote, or is writing; with --live also a shot or a solid."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 lets other machines in."""
     port: int = 8080
@@ -39,11 +43,26 @@ class View(Verb):
     """Where the picture of --check goes; OUT/view.png by default."""
     open: bool = True
     """Open the page in the browser."""
+    live: bool = False
+    """Simulate now, and poke."""
+    material: str | None = None
+    """With --live, of a solid: its material."""
+    run: Path | None = None
+    """With --live, of a shot: the folder in which its objects are prepared."""
+    quality: Literal["live", "preview", "shot", "hero"] = "live"
+    """With --live: cells; live is what the device can do while one looks."""
+    slow: float = 4.0
+    """With --live: slow motion at first."""
 
     def execute(self) -> dict[str, Any]:
         """Serve."""
         from gsfluent.viewer.serve import view_run
 
+        if self.live:
+            return self._live()
+        for name in ("material", "run"):
+            if getattr(self, name) is not None:
+                raise InputError(f"--{name} belongs to --live", "add --live, or leave it out")
         existing(self.out, "OUT", folder=True)
         return view_run(
             self.out,
@@ -53,5 +72,25 @@ class View(Verb):
             splats=self.splats,
             check=self.check,
             to=self.to,
+            browser=self.open,
+        )
+
+    def _live(self) -> dict[str, Any]:
+        """Serve a session one can poke."""
+        from gsfluent.viewer.serve_live import view_live
+
+        for name, given in (("check", self.check), ("splats", self.splats), ("to", self.to)):
+            if given:
+                raise InputError(f"--{name} does nothing with --live", "leave one of them out")
+        return view_live(
+            existing(self.out, "OUT"),
+            device=self.torch_device(),
+            material=self.material,
+            run=self.run,
+            quality=self.quality,
+            slow=self.slow,
+            seed=self.seed,
+            host=self.host,
+            port=self.port,
             browser=self.open,
         )

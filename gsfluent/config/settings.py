@@ -375,6 +375,12 @@ class OutputSettings:
         doc="What stands behind: the studio, or the surroundings that the capture shows.",
         example="captured",
     )  # fmt: skip
+    cracks: str = key(
+        choice("gap", "mvee", "none"), default="gap",
+        doc="How crack faces are drawn: splats born on the faces that open, transition splats from "
+        "overlapping ellipsoids (for comparison), or nothing added.",
+        example="none",
+    )  # fmt: skip
     what: tuple[str, ...] = key(
         several(choice("mp4", *EXPORTS)),
         default=("mp4",),

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.demo.fruit import OBJECTS
+from gsfluent.demo.catalogue import OBJECTS
 from gsfluent.demo.noise import SolidNoise, mix, smoothstep
 from gsfluent.demo.objects import DemoObject
 from gsfluent.demo.truth import save_truth
@@ -54,7 +54,7 @@ class DemoPaths:
 
 
 def make_object(name: str = "watermelon", seed: int = 0) -> DemoObject:
-    """The demo object ``name`` ("watermelon" or "orange"), drawn from ``seed``.
+    """The demo object ``name`` (a key of ``catalogue.OBJECTS``), drawn from ``seed``.
 
     Raises:
         InputError: There is no such object.
@@ -246,7 +246,7 @@ def make_capture(
     With the default 42 views every eighth is held out by the reconstruction, which leaves 37.
 
     Args:
-        name: "watermelon" or "orange".
+        name: "watermelon", "orange", "bread", "cake" or "melons" (two, side by side).
         out_dir: Folder to write; made when missing.
         views: Photographs, at least 3.
         size: Width and height [px], 32 to 4096.
@@ -291,8 +291,8 @@ def make_capture(
                 report_progress(progress, done, len(cameras), "photographs")
         # The exemplar is another fruit of the same kind: nobody can cut the photographed one and
         # keep it whole.
-        sibling = OBJECTS[name](seed + 1000)
-        _write_png(root / "cut.png", *cut_photograph(sibling, axis=2 if name == "orange" else 0))
+        sibling = OBJECTS[name](seed + 1000).one()
+        _write_png(root / "cut.png", *cut_photograph(sibling, axis=sibling.cut_axis))
         save_truth(obj, root / "truth.npz")
     for number, view in enumerate(cameras):
         images.append(root / "images" / f"{number:03d}.png")

@@ -159,6 +159,7 @@ class Orange(DemoObject):
     rind_depth = 0.0015
     pith_depth = 0.0045
     segments = 10
+    cut_axis = 2
 
     def _place_seeds(self, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
         self._turn = rng.uniform(0.0, 2.0 * math.pi)
@@ -218,6 +219,3 @@ class Orange(DemoObject):
         _, to_seed = self.seed_distance(points)
         seed = smoothstep(1.08, 0.96, to_seed.to(torch.float32)) * (depth > self.pith_depth).float()
         return mix(color, _rgb(0.90, 0.84, 0.62), seed).clamp(0.0, 1.0)
-
-
-OBJECTS: dict[str, type[DemoObject]] = {cls.name: cls for cls in (Watermelon, Orange)}

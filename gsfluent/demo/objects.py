@@ -27,6 +27,7 @@ class DemoObject:
         axes: Semi-axes [m].
         center: Centre [m]; its height rests the object on z = 0.
         rind_depth, pith_depth: Depths [m] at which the rind and the pith end.
+        cut_axis: Axis across which the photograph of its inside is cut.
     """
 
     name = ""
@@ -34,6 +35,7 @@ class DemoObject:
     bump_amplitude = 0.01
     rind_depth = 0.004
     pith_depth = 0.012
+    cut_axis = 0
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed
@@ -46,6 +48,10 @@ class DemoObject:
         self.seed_center, self.seed_frame, self.seed_axes = self._place_seeds(rng)
         self.center = torch.zeros(3, dtype=torch.float64)
         self.center[2] = -self._lowest_point()
+
+    def one(self) -> DemoObject:
+        """The object itself, or the first of several: what is cut for the exemplar."""
+        return self
 
     def _axes(self, like: Tensor) -> Tensor:
         return torch.tensor(self.axes, dtype=like.dtype)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.demo.fruit import OBJECTS
+from gsfluent.demo.catalogue import OBJECTS
 from gsfluent.demo.objects import DemoObject
 from gsfluent.errors import InputError
 

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Camera
+from gsfluent.zbuffer import nearest_points
 
 __all__ = ["ExposedVoxels", "TrueCloud", "TruePicture"]
 
@@ -34,6 +35,8 @@ _STRETCH = (0.6, 1.5)
 """Stretches beyond are no deformation of matter in one piece."""
 _LAYERS = 2
 """Layers of voxels drawn behind each exposed face, so that points do not let one see past them."""
+_COVER = 0.9
+"""Radius of a voxel in voxels: half the diagonal of a face that is stretched to ``PARTED``."""
 _CHUNK = 100_000
 PARTED = 1.5
 """Neighbours at this many times their distance at rest leave a gap one can see."""
@@ -223,7 +226,7 @@ class TrueCloud:
     ) -> TruePicture:
         """Draw voxels as opaque points, ``samples`` x ``samples`` per pixel."""
         fine = camera.resized(samples * camera.width, samples * camera.height)
-        first = nearest_points(voxels.position, fine, self.voxel)
+        first = nearest_points(voxels.position, _COVER * self.voxel, fine)
         hit = first >= 0
         z = voxels.position @ fine.viewmat[2, :3].float() + float(fine.viewmat[2, 3])
         seen, back = first[hit].unique(return_inverse=True)
@@ -238,34 +241,6 @@ class TrueCloud:
             alpha,
             torch.where(alpha > 0, _mean(depth, samples) / alpha.clamp(min=1e-6), 0.0),
         )
-
-
-def nearest_points(points: Tensor, camera: Camera, edge: float) -> Tensor:
-    """Row of the nearest point per pixel, int64 [H, W], -1 where there is none.
-
-    Args:
-        points: Points [m], [N, 3]; each covers a square of pixels as large as a cube of ``edge``.
-        camera: Pinhole camera.
-        edge: Edge of the cubes [m].
-    """
-    pixel, z = camera.project(points)
-    width, height = camera.width, camera.height
-    usable = z > 1e-6
-    near = float(z[usable].min()) if bool(usable.any()) else 1.0
-    # the nearest cube sets the size for all: its face's diagonal, or a turned face would show holes
-    side = max(2, math.ceil(math.sqrt(2.0) * edge * float(camera.K[0, 0]) / near))
-    corner = (pixel - 0.5 * (side - 1)).floor().long()
-    rows = torch.arange(len(points))
-    # positive floats are ordered like the integers of the same bits
-    key = (z.float().view(torch.int32).long() << 32) | rows
-    best = torch.full((height * width,), torch.iinfo(torch.int64).max)
-    for dy in range(side):
-        for dx in range(side):
-            x, y = corner[:, 0] + dx, corner[:, 1] + dy
-            on = usable & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            best.scatter_reduce_(0, (y * width + x)[on], key[on], "amin")
-    found = torch.where(best == torch.iinfo(torch.int64).max, -1, best & 0xFFFFFFFF)
-    return found.view(height, width)
 
 
 def _pair(axis: int, side: int) -> tuple[slice, ...]:

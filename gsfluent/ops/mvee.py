@@ -19,7 +19,7 @@ def _check_finite(op: str, name: str, value: Tensor) -> None:
 
 
 def mvee(
-    points: Tensor, *, tolerance: float = 1e-3, max_iterations: int = 1000
+    points: Tensor, *, tolerance: float = 5e-4, max_iterations: int = 100
 ) -> tuple[Tensor, Tensor]:
     """Smallest ellipsoid around each set of points.
 
@@ -27,10 +27,10 @@ def mvee(
 
     Args:
         points: Point sets [any length unit], shape [B, N, 3], N >= 1, float32 or float64.
-        tolerance: Relative optimality gap at which the iteration stops, > 0. The volume exceeds
-            the smallest one by at most about twice this fraction.
-        max_iterations: Bound on the iterations per fit; the result contains its points even when
-            it stops early.
+        tolerance: Fraction by which the volume may exceed the smallest one, > 0: the multipliers
+            of the fit prove it. float32 resolves about 1e-4.
+        max_iterations: Bound on the Newton steps per fit, of which 8 to 15 are usual; the result
+            contains its points even when it stops early.
 
     Returns:
         ``(center, shape)``, [B, 3] and [B, 3, 3]. A set that is flat, a line or a single point
@@ -42,7 +42,8 @@ def mvee(
         ValueError: Wrong shape, no points, a non-finite coordinate, or a bad tolerance.
 
     Gradient: none.
-    Source: Khachiyan's algorithm with away steps, Todd and Yildirim 2007; used by Fracture-GS.
+    Source: primal-dual interior-point method on the lifted problem (Sun and Freund 2004 compare
+    such methods), ten unknowns per step; derivation in docs/mvee.md. Fracture-GS uses Khachiyan's.
     """
     check_tensor("mvee", "points", points, shape=("B", "N", 3))
     if points.shape[0] and not points.shape[1]:
@@ -100,16 +101,15 @@ def mvee_lens(
     cov_b: Tensor,
     *,
     radius: float = 2.0,
+    flat: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gaussian around the overlap of two Gaussians' ellipsoids.
 
     Each Gaussian stands for ``(x - mean)^T cov^-1 (x - mean) <= radius^2``. Balls, and ellipsoids
-    of equal shape, give the exact smallest ellipsoid around the overlap (closed form, three cases
-    by cap height, its axial semi-axis raised to 0.15 of the radial one so that a vanishing
-    overlap does not become a disc). Other pairs are fitted to 128 boundary points and widened to
-    contain 512: over 266 random pairs (axis ratios to about 40) the true overlap reached out by 0.8
-    percent in the median and 17 percent at worst, and the volume was 1.07 (0.99 to 1.8) times that
-    of a dense fit.
+    of equal shape, have a closed form; so has one inside the other. Other pairs are fitted: the
+    result contains the overlap to 1e-5 of its size, and its volume is within 1e-3 of the smallest
+    (measured in docs/mvee.md). float32 covariances hold axis ratios up to about 100 to that
+    accuracy; more extreme ones are widened until they contain the overlap.
 
     Args:
         mean_a: Centres [m], [B, 3], float32 or float64.
@@ -117,6 +117,9 @@ def mvee_lens(
         mean_b: Centres [m], [B, 3].
         cov_b: Covariances [m^2], in the layout of ``cov_a``.
         radius: Size of the ellipsoids in standard deviations, > 0.
+        flat: Least ratio of the semi-axes, from 0 to 1, measured where the smallest ellipsoid
+            ``t q_a + (1 - t) q_b <= 1`` is a ball: keeps the ellipsoid of a vanishing overlap from
+            becoming a disc. 0 gives the smallest ellipsoid.
 
     Returns:
         ``(mean, cov, overlap)``: [B, 3], covariances in the layout of ``cov_a``, and bool [B].
@@ -125,11 +128,11 @@ def mvee_lens(
     Raises:
         TypeError: A tensor has a wrong dtype.
         ValueError: A shape or device is wrong, a value is not finite, a covariance is not
-            positive definite, or ``radius`` is not positive.
+            positive definite, ``radius`` is not positive, or ``flat`` is not in [0, 1].
 
     Gradient: none.
-    Source: Fracture-GS (transition Gaussians); closed form derived from John's conditions, see
-    csrc/core/mvee_lens.h.
+    Source: Fracture-GS (transition Gaussians); closed form from John's conditions, and the fit of
+    unlike ellipsoids, derived in docs/mvee.md.
     """
     op = "mvee_lens"
     check_tensor(op, "mean_a", mean_a, shape=("B", 3))
@@ -137,12 +140,14 @@ def mvee_lens(
     check_tensor(op, "mean_b", mean_b, shape=(batch, 3), like=mean_a)
     if not (radius > 0.0 and math.isfinite(radius)):
         raise ValueError(f"{op}: radius must be positive, got {radius}")
+    if not 0.0 <= flat <= 1.0:
+        raise ValueError(f"{op}: flat must lie in [0, 1], got {flat}")
     packed_a = _check_covariance(op, "cov_a", cov_a, mean_a, batch)
     packed_b = _check_covariance(op, "cov_b", cov_b, mean_a, batch)
     _check_finite(op, "mean_a", mean_a)
     _check_finite(op, "mean_b", mean_b)
     mean, cov, overlap = torch.ops.gsfluent.mvee_lens.default(
-        mean_a, packed_a, mean_b, packed_b, float(radius)
+        mean_a, packed_a, mean_b, packed_b, float(radius), float(flat)
     )
     if cov_a.dim() == 3:
         cov = cov[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(batch, 3, 3)
@@ -151,7 +156,12 @@ def mvee_lens(
 
 @torch.library.register_fake("gsfluent::mvee_lens")
 def _mvee_lens_fake(
-    mean_a: Tensor, covariance_a: Tensor, mean_b: Tensor, covariance_b: Tensor, radius: float
+    mean_a: Tensor,
+    covariance_a: Tensor,
+    mean_b: Tensor,
+    covariance_b: Tensor,
+    radius: float,
+    flat: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     batch = mean_a.shape[0]
     return (

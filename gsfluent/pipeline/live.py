@@ -25,6 +25,7 @@ from gsfluent.pipeline.run_simulate import saved
 from gsfluent.pipeline.simulate import QUALITY, Simulate, frame_of
 from gsfluent.pipeline.simulate_grow import copy_of, grow, shrink
 from gsfluent.pipeline.simulate_run import Run
+from gsfluent.pipeline.simulate_state import State
 from gsfluent.pipeline.simulate_strays import reach_of
 from gsfluent.scene import Scene
 from gsfluent.scene_parts import number, unit, vector
@@ -91,7 +92,10 @@ class LiveSession:
             known = ", ".join(("live", *QUALITY))
             raise InputError(f"live: unknown quality {quality!r}", mend=f"known: {known}")
         self.device, self.seed, self.quality = torch.device(device), seed, quality
-        self.dx = dx or grid_spacing(scene, cells)
+        self.cells, self.dx = cells, grid_spacing(scene, cells)
+        if dx is not None:
+            self.cells = max(1, round(cells * self.dx / number("live: dx", dx, low=1e-9)))
+            self.dx = dx
         self.fps = fps
         self._simulate = Simulate(
             dx=self.dx, seed=seed, device=device, **({"standing": True} | options)
@@ -111,8 +115,10 @@ class LiveSession:
     def _restart(self, index: int, run: Run, base: tuple[int, float]) -> None:
         self.index, self._base, self.failure = index, base, ""
         self.run = run.twin()
+        self._repair.restore({})
         self.pokes: list[dict[str, Any]] = []
         self._frame: SavedFrame | None = None
+        self._rest: tuple[State, bool] | None = None
 
     # --- time ---
 
@@ -145,7 +151,13 @@ class LiveSession:
     @property
     def at_rest(self) -> bool:
         """Whether nothing can happen without a poke: all matter sleeps, nothing moves."""
-        state, run = self.run.state, self.run
+        state = self.run.state
+        if self._rest is None or self._rest[0] is not state:
+            self._rest = state, self._rests(state)
+        return self._rest[1]
+
+    def _rests(self, state: State) -> bool:
+        run = self.run
         if not all(state.landed) or run.kicks.next_change(state) < math.inf:
             return False
         stepper = run.stepper
@@ -290,7 +302,7 @@ class LiveSession:
             self._muzzle_is_free(vector("bullet from", now["from"]), float(now.get("radius", 8e-3)))
         with torch.no_grad():
             grow(self.run, scene, seed=self.seed)
-        self._frame = None
+        self._frame = self._rest = None
         self.pokes.append(now)
         return now
 

@@ -170,7 +170,8 @@ class Render(Stage):
         lit, extras = None, None
         if lighting is not None:
             lit = self._light(gaussians, camera, lighting.at(time), groups)
-            extras = splat_normals(gaussians, lit.grid)
+            eye = -(viewmat[:3, 3] @ viewmat[:3, :3])
+            extras = splat_normals(gaussians, lit.grid, eye)
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
         seen = ops.rasterize(

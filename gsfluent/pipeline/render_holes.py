@@ -1,26 +1,100 @@
-"""How much background shows through the object: the fraction of holes in its silhouette.
+"""How much shows through the object that should not: holes in its silhouette, and in its front.
 
-When a body breaks, the Gaussians that rode on it part and the far side shines through. The
-silhouette against which this is counted comes from the matter itself, the material points drawn as
-solid balls that touch their neighbours, so a true gap between fragments is not a hole but a
-see-through fragment is.
+When a body breaks, the Gaussians that rode on it part and what is behind shines through. What ought
+to be opaque comes from the matter itself: its material points as discs that just touch where two
+points are half as far again from each other as at rest. A true gap between fragments is therefore
+no hole, a see-through fragment is, and so is an opening too narrow for the points to know of.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
+from gsfluent.ops.raster import Rendered
 from gsfluent.pipeline.draw import draw
+from gsfluent.zbuffer import nearest_points
 
-# Balls of this many standard deviations per particle spacing overlap enough to close the silhouette
-# of a packing.
-_SIGMA_IN_SPACINGS = 0.45
-_SOLID = 0.9
-_HOLE = 0.5
-_LONGEST_SIDE = 240
+REACH = 0.75
+"""Radius of a point's disc in point spacings."""
+SPECK = 0.6
+"""Openings between the discs that fill less than half of a square of this many spacings are closed:
+stretched matter has some."""
+RIM = 0.5
+"""The silhouette is drawn in by this many spacings, and one pixel: a soft rim is not a hole."""
+BEHIND = 1.5
+"""What is seen this many spacings behind the matter's front is seen through it."""
+LONGEST_SIDE = 320
+"""Pictures that are measured are no larger [px]."""
+
+
+@dataclass(frozen=True)
+class MatterView:
+    """The matter in one camera.
+
+    Attributes:
+        point: Material point that is seen, int64 [H, W], -1 for none.
+        depth: Camera z of its centre [m], 0 where none, [H, W].
+        silhouette: Pixels that ought to be opaque, bool [H, W].
+        back: Depth beyond which something is behind the matter's front, whatever of its
+            neighbourhood is in front, [H, W].
+    """
+
+    point: Tensor
+    depth: Tensor
+    silhouette: Tensor
+    back: Tensor
+
+    @classmethod
+    def of(cls, positions: Tensor, volume: Tensor, camera: Camera) -> MatterView:
+        """Draw material points [P, 3] of volumes [P] [m^3]."""
+        spacing = volume.clamp(min=0.0).pow(1.0 / 3.0)
+        point = nearest_points(positions, REACH * spacing, camera)
+        seen = point >= 0
+        viewmat = camera.viewmat.to(positions)
+        z = positions @ viewmat[2, :3] + viewmat[2, 3]
+        depth = torch.where(seen, z[point.clamp(min=0)], 0.0)
+        if not bool(seen.any()):
+            return cls(point, depth, seen, depth)
+        own = spacing[point[seen]]
+        pixels = float((camera.K[0, 0].to(own) * own / depth[seen]).median())
+        seen = _mostly(seen, round(0.5 * SPECK * pixels))
+        rim = round(RIM * pixels) + 1
+        back = _dilated(depth, round(pixels)) + BEHIND * float(own.median())
+        return cls(point, depth, erode(seen, rim), back)
+
+
+@dataclass(frozen=True)
+class Holes:
+    """Shares of the silhouette, 0 to 1.
+
+    Attributes:
+        fraction: Mean transmittance: how much of the background shows through.
+        through: Share of the pixels in which one looks through the front at something far behind:
+            half of the light or more comes from behind ``MatterView.back``.
+    """
+
+    fraction: float
+    through: float
+
+    @classmethod
+    def of(cls, drawn: Rendered, matter: MatterView) -> Holes:
+        """Measure a picture that was rasterized with ``median_depth``."""
+        area = int(matter.silhouette.sum())
+        if area == 0:
+            return cls(0.0, 0.0)
+        assert drawn.median_depth is not None  # asked for; narrows the type
+        left = (1.0 - drawn.alpha)[matter.silhouette].clamp(0.0, 1.0)
+        behind = matter.silhouette & (drawn.median_depth > matter.back)
+        return cls(float(left.sum()) / area, float(behind.sum()) / area)
+
+
+def small(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
+    """The camera at the size in which figures are measured."""
+    return camera.scaled(min(1.0, longest / max(camera.width, camera.height)))
 
 
 def hole_fraction(
@@ -31,42 +105,37 @@ def hole_fraction(
     *,
     groups: Tensor | None = None,
 ) -> float:
-    """Share of the silhouette's pixels whose opacity is below one half.
+    """Share of the background that shows through the object's silhouette.
 
     Args:
         gaussians: What is rendered, scene frame.
         positions: Material points [m], shape [P, 3].
         volume: Their volumes [m^3], shape [P].
-        camera: The view; evaluated at no more than 240 px on the longer side.
+        camera: The view; evaluated at no more than :data:`LONGEST_SIDE` on the longer side.
         groups: As in :class:`gsfluent.pipeline.Render`.
 
     Returns:
-        A number in [0, 1]; 0 when the matter is out of view.
+        Mean transmittance in the silhouette, in [0, 1]; 0 when the matter is out of view.
     """
-    camera = camera.scaled(min(1.0, _LONGEST_SIDE / max(camera.width, camera.height)))
-    viewmat, intrinsics = camera.viewmat.to(positions), camera.K.to(positions)
-    spacing = volume.clamp(min=0.0).pow(1.0 / 3.0)
-    quats = positions.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(positions.shape[0], 4)
-    matter = ops.rasterize(
-        positions,
-        torch.full_like(spacing, 0.99),
-        viewmat,
-        intrinsics,
-        camera.width,
-        camera.height,
-        quats=quats.contiguous(),
-        scales=(_SIGMA_IN_SPACINGS * spacing)[:, None].expand(-1, 3).contiguous(),
-        colors=torch.zeros_like(positions[:, :1]),
-        depth=False,
-    ).alpha
+    camera = small(camera)
     flat = torch.zeros_like(gaussians.means[:, :1])
-    drawn = draw(gaussians, camera, colors=flat, groups=groups, near=0.01).alpha
-    silhouette = erode(matter > _SOLID)
-    area = int(silhouette.sum())
-    return float((silhouette & (drawn < _HOLE)).sum()) / area if area else 0.0
+    drawn = draw(gaussians, camera, colors=flat, groups=groups, near=0.01, median_depth=True)
+    return Holes.of(drawn, MatterView.of(positions, volume, camera)).fraction
 
 
-def erode(mask: Tensor) -> Tensor:
-    """Drop the outermost pixel of a mask [H, W]: a soft rim is not a hole."""
+def erode(mask: Tensor, pixels: int = 1) -> Tensor:
+    """Drop the outermost ``pixels`` of a mask [H, W]; the edge of the picture is no edge of it."""
     outside = (~mask).to(torch.float32)[None, None]
-    return torch.nn.functional.max_pool2d(outside, 3, stride=1, padding=1)[0, 0] < 0.5
+    return torch.nn.functional.max_pool2d(outside, 2 * pixels + 1, 1, pixels)[0, 0] < 0.5
+
+
+def _mostly(mask: Tensor, pixels: int) -> Tensor:
+    """Pixels that are in the mask or in whose neighbourhood most are."""
+    share = torch.nn.functional.avg_pool2d(
+        mask.to(torch.float32)[None, None], 2 * pixels + 1, 1, pixels, count_include_pad=False
+    )[0, 0]
+    return mask | (share > 0.5)
+
+
+def _dilated(image: Tensor, pixels: int) -> Tensor:
+    return torch.nn.functional.max_pool2d(image[None, None], 2 * pixels + 1, 1, pixels)[0, 0]

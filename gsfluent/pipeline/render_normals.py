@@ -28,6 +28,8 @@ _PASSES = 4
 # Level of the pyramid whose gradient settles which side is out, and how clear it must be.
 _WIDE = 2
 _CLEAR = 0.1
+# Half the gradient up to which a sheet without sides does not say which way its splats lie.
+_UNCLEAR = 0.05
 # A Gaussian is called flat when its shortest axis is below this share of the middle one.
 _FLAT = 0.5
 # Nodes along a side of the grid: room around the matter, and the most.
@@ -110,12 +112,19 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
     return splat_normals(gaussians, grid_for(gaussians, cell=cell).of(gaussians.means))
 
 
-def splat_normals(gaussians: Gaussians, grid: Occupancy) -> Tensor:
+def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = None) -> Tensor:
     """As :func:`estimate_normals`, from the occupancy of the same splats.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
     splats that agree with the density, zero for the few splats off the grid. Blending them as they
     are lets the sure ones decide.
+
+    Args:
+        gaussians: In the scene frame, any state.
+        grid: Their occupancy.
+        eye: Where the picture is taken from, [3]: what one sees of a flat splat faces that way. A
+            shell is a sheet without a side to the density, from outside and from inside. When
+            None, flat splats take the side of the density.
     """
     means = gaussians.means
     fine = -sample(gradient(grid.level(0), _PASSES), grid.frame, grid.nodes, means)
@@ -124,11 +133,12 @@ def splat_normals(gaussians: Gaussians, grid: Occupancy) -> Tensor:
     against = ((fine * wide).sum(-1) < 0) & (wide.norm(dim=-1) > _CLEAR)
     outward = torch.where(against[:, None], -fine, fine)
     axis, flat = _shortest_axis(gaussians)
-    agreement = (axis * normalize(outward, dim=-1)).sum(-1)
-    # an axis across the density gradient is a splat standing on edge (hair, seams): trust the
+    agreement = (axis * outward).sum(-1)
+    # an axis across a clear density gradient is a splat standing on edge (hair, seams): trust the
     # density
-    trusted = flat & (agreement.abs() > 0.5)
-    return torch.where(trusted[:, None], axis * agreement.sign()[:, None], outward)
+    trusted = flat & (agreement.abs() > 0.5 * outward.norm(dim=-1) - _UNCLEAR)
+    side = agreement if eye is None else (axis * (eye - means)).sum(-1)
+    return torch.where(trusted[:, None], axis * side.sign()[:, None], outward)
 
 
 def gradient(volume: Tensor, passes: int) -> Tensor:

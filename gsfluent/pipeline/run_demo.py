@@ -16,6 +16,7 @@ from gsfluent.io import atomic_path
 from gsfluent.pipeline.run import run_shot
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_store import StageStore, fingerprint
+from gsfluent.pipeline.stage import Progress
 from gsfluent.progress import LineReporter, Reporter
 
 
@@ -66,6 +67,35 @@ def demo_shot(name: str, size: DemoSize, capture: Path, exemplar: Path) -> dict[
     }
 
 
+def photograph_demo(
+    name: str, folder: Path, size: DemoSize, seed: int = 0, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Photograph a built-in object: ``photographs/``, ``cut.png`` and ``truth.npz`` in a folder.
+
+    What is known of the inside does not lie among the photographs that are reconstructed.
+
+    Args:
+        name: An object of the generator.
+        folder: Where they go; made when missing.
+        size: How many photographs, how large.
+        seed: Draws the object.
+        progress: Progress callback.
+
+    Returns:
+        ``folder`` and ``images``, their number.
+
+    Raises:
+        InputError: No such object.
+    """
+    paths = make_capture(
+        name, folder / "photographs", views=size.views, size=size.image_size, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    paths.truth.replace(folder / "truth.npz")
+    paths.cut.replace(folder / "cut.png")
+    return {"folder": str(folder), "images": len(paths.images)}
+
+
 def run_demo(
     name: str = "watermelon",
     out: Path = Path("demo_out"),
@@ -108,18 +138,8 @@ def run_demo(
     store = StageStore(out / "stages", force=force)
 
     def photograph(folder: Path) -> dict[str, Any]:
-        paths = make_capture(
-            name,
-            folder / "photographs",
-            views=scale.views,
-            size=scale.image_size,
-            seed=seed,
-            progress=reporter.task("photograph"),
-        )
-        # what is known of the inside must not lie among the photographs that are reconstructed
-        paths.truth.rename(folder / "truth.npz")
-        paths.cut.rename(folder / "cut.png")
-        return {"photographs": len(paths.images)}
+        made = photograph_demo(name, folder, scale, seed, reporter.task("photograph"))
+        return {"photographs": made["images"]}
 
     key = fingerprint("photograph", name, scale.views, scale.image_size, seed)
     made = store.run("photograph", key, photograph)

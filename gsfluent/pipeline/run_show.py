@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsfluent.config import Shot
-from gsfluent.data import Camera, Gaussians, Solid
+from gsfluent.data import Camera, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
@@ -28,8 +28,8 @@ from gsfluent.pipeline.render_backdrop import (
     object_radius,
 )
 from gsfluent.pipeline.render_camera import Action, cameras_for
+from gsfluent.pipeline.render_figures import FilmFigures, cameras_around
 from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.render_holes import hole_fraction
 from gsfluent.pipeline.render_normals import occupancy_cell
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame
@@ -53,13 +53,20 @@ class Film:
         render: The render stage.
         shot: What the objects are made of.
         device: Where to render.
+        around: Cameras that stand around the matter, for figures.
     """
 
     def __init__(
-        self, folder: Path, cameras: list[Camera], render: Render, shot: Shot, device: torch.device
+        self,
+        folder: Path,
+        cameras: list[Camera],
+        render: Render,
+        shot: Shot,
+        device: torch.device,
+        around: list[Camera] | None = None,
     ) -> None:
         self.folder, self.cameras, self.render, self.device = folder, cameras, render, device
-        self.shot = shot
+        self.shot, self.around = shot, around or []
 
     @classmethod
     def of(cls, out: Path, shot: Shot, light: Light | Lighting, device: torch.device) -> Film:
@@ -102,7 +109,7 @@ class Film:
             backdrop=backdrop,
             normal_cell=occupancy_cell(first.gaussians),
         )
-        return cls(folder, cameras, render, shot, device)
+        return cls(folder, cameras, render, shot, device, cameras_around(positions))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -152,12 +159,8 @@ def render_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         film = Film.of(context.out, shot, light, context.device)
-        report: dict[str, Any] = {
-            "frames": len(film),
-            "hole_fraction_before": [],
-            "hole_fraction": [],
-            "transition_gaussians": [],
-        }
+        report: dict[str, Any] = {"frames": len(film)}
+        figures = FilmFigures(film.frame(0), film.around)
         counts: list[int] = []
         drawing = 0.0
         progress = context.reporter.task("render")
@@ -169,7 +172,7 @@ def render_stage(context: RunContext) -> None:
                 start = time.perf_counter()
                 picture = to_bytes(film.picture(frame))
                 drawing += time.perf_counter() - start
-                _count_holes(report, frame, film.cameras[index])
+                figures.add(frame, film.cameras[index])
                 counts.append(int(frame.facts.get("fragments", 1)))
                 report_progress(progress, index + 1, len(film), "")
                 yield picture
@@ -177,6 +180,7 @@ def render_stage(context: RunContext) -> None:
         write_video(
             folder / "video.mp4", pictures(), fps=shot.output.video_fps, size=shot.output.size
         )
+        report |= figures.report()
         report["seconds_per_frame"] = drawing / len(film)
         report["poster_frame"] = poster_frame(counts, shot.output.fps)
         best = film.frame(report["poster_frame"])
@@ -188,23 +192,6 @@ def render_stage(context: RunContext) -> None:
         publish(result.folder / name, context.out / name)
         context.record.values["outputs"][name.split(".")[0]] = name
     context.record.values["render"] = dict(result.report)
-
-
-def _count_holes(report: dict[str, Any], frame: SavedFrame, camera: Camera) -> None:
-    """Append the frame's hole fractions and number of transition splats."""
-    gaussians, matter = frame.gaussians, (frame.positions, frame.volumes)
-    added = gaussians.count - frame.carried
-    whole = hole_fraction(gaussians, *matter, camera, groups=frame.groups)
-    before = whole
-    if added:
-        before = hole_fraction(_first(gaussians, frame.carried), *matter, camera)
-    report["hole_fraction_before"].append(round(before, 6))
-    report["hole_fraction"].append(round(whole, 6))
-    report["transition_gaussians"].append(added)
-
-
-def _first(gaussians: Gaussians, count: int) -> Gaussians:
-    return gaussians.map(lambda value: value[:count])
 
 
 def poster_frame(fragments: list[int], fps: float) -> int:

@@ -56,6 +56,7 @@ class App:
         playback: The clock.
         index: Frame shown.
         follow: Whether each new frame is shown as it comes.
+        pictures: How many have been drawn.
         lock: Held while the frame shown changes.
         shift: Scene position = position in the browser + shift [m]; changes while the view follows
             the object.
@@ -94,6 +95,7 @@ class App:
         self.shift = (0.0, 0.0, 0.0)
         self._anchor = self._center(self.index)
         self._problem = ""
+        self.pictures = 0
         self.lock = threading.RLock()
         self._done = threading.Event()
         self.browser = BrowserSplats(self.timeline) if splats else None
@@ -136,13 +138,14 @@ class App:
                 self.shift = (x, y, z)
             facts = self.timeline.facts()
             self._time_panel.update()
+            busy = self.playback.playing or (self.follow and self.source.running)
             if self.index < len(facts) and "time" in facts[self.index]:
-                self._plots.mark(facts[self.index]["time"], at_once=not self.playback.playing)
+                self._plots.mark(facts[self.index]["time"], at_once=not busy)
             self.redraw()
 
     def redraw(self) -> None:
         """The picture is out of date, for example because a source's newest frame has changed."""
-        self._say()
+        self.say()
         self._artist.request()
 
     def set_look(self, look: Look) -> None:
@@ -238,21 +241,22 @@ class App:
             self.pace.measured(camera.width * camera.height, time.perf_counter() - start)
         except GsfluentError as error:
             self._problem = str(error).split("\n")[0]
-            self._say()
+            self.say()
             return True
         self._problem = ""
         self._legend(legend)
         sharp = camera.width >= full.width
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=92 if sharp else 80)
         client.flush()
+        self.pictures += 1
         return sharp
 
     def _legend(self, legend: Any) -> None:
         if self._look_panel is not None:
             self._look_panel.show_legend("" if legend is None else legend.html())
-        self._say()
+        self.say()
 
-    def _say(self) -> None:
+    def say(self) -> None:
         """The line at the head of the page."""
         text = self.source.state()
         if self._problem:
@@ -292,7 +296,7 @@ class App:
                 return
         except GsfluentError as error:
             self._problem = str(error).split("\n")[0]
-            self._say()
+            self.say()
             return
         facts = self.timeline.facts()
         last = self.timeline.count - 1

@@ -60,7 +60,7 @@ def view_run(
             save_image(torch.from_numpy(picture).float() / 255.0, target)
             return result | {"output": str(target), "frame": app.index}
         _log.info("viewer: %s (Ctrl-C ends)", app.url)
-        if browser and _has_desktop():
+        if browser and has_desktop():
             webbrowser.open(app.url)
         app.wait()
     except KeyboardInterrupt:
@@ -70,7 +70,7 @@ def view_run(
     return result
 
 
-def _has_desktop() -> bool:
+def has_desktop() -> bool:
     """Whether a browser could show a window: never over a bare ssh line."""
     if sys.platform in ("win32", "darwin"):
         return True

@@ -66,8 +66,9 @@ def test_a_run_leaves_what_it_promises(finished: Path) -> None:
     assert record["fill"]["volume_m3"] == pytest.approx(4 / 3 * np.pi * 0.45**2, rel=0.3)
     render = record["render"]
     assert render["frames"] == FRAMES
-    for name in ("hole_fraction_before", "hole_fraction", "transition_gaussians"):
-        assert len(render[name]) == FRAMES
+    for name in ("hole_fraction", "see_through", "hole_fraction_around", "flicker"):
+        assert len(render[name]) == len(render[f"{name}_before"]) == FRAMES
+    assert len(render["transition_gaussians"]) == FRAMES
     for stage in record["stages"]:
         assert stage["seconds"] > 0
         assert stage["peak_memory_bytes"] > 50e6

@@ -27,14 +27,14 @@ def clouds(batch: int = 12, count: int = 40) -> Tensor:
     return torch.randn(batch, count, 3, dtype=torch.float64) @ mix + 5.0
 
 
-def test_thousands_of_float32_steps_keep_the_sum_of_the_weights() -> None:
+def test_a_tolerance_float32_cannot_reach_ends_at_its_best() -> None:
     generator = torch.Generator().manual_seed(14)
     points = torch.rand(100, 32, 3, generator=generator)
-    options = {"tolerance": 1e-7, "max_iterations": 20000}
-    _, shape = mvee(points, **options)
-    _, want = mvee(points.double(), **options)
-    # 1.6e-5 of it is the margin that keeps float32 points inside; drift made it 1.3e-4.
-    assert (shape.double() - want).abs().max() < 4e-5 * want.abs().max()
+    _, shape = mvee(points, tolerance=1e-9, max_iterations=20000)
+    _, want = mvee(points.double(), tolerance=1e-10, max_iterations=20000)
+    ratio = volume(shape) / volume(want)
+    assert ratio.min() > 1.0
+    assert ratio.max() < 1.0 + 2e-4
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -166,7 +166,7 @@ def test_nested_and_disjoint_balls() -> None:
 
 
 def test_vanishing_lens_is_not_a_disc() -> None:
-    _, cov, overlap = mvee_lens(*balls(1.0, 1.0, 1.9999, torch.float64))
+    _, cov, overlap = mvee_lens(*balls(1.0, 1.0, 1.9999, torch.float64), flat=0.15)
     semi = torch.linalg.eigvalsh(cov[0]).sqrt()
     assert bool(overlap)
     assert float(semi[0] / semi[2]) == pytest.approx(0.15, rel=1e-6)
@@ -235,7 +235,7 @@ def test_registration() -> None:
     mean_a, cov_a, mean_b, cov_b = (a.float() for a in pairs(4, False))
     packed = [c.reshape(-1, 9)[:, [0, 4, 8, 1, 2, 5]] for c in (cov_a, cov_b)]
     torch.library.opcheck(
-        torch.ops.gsfluent.mvee_lens.default, (mean_a, packed[0], mean_b, packed[1], 2.0)
+        torch.ops.gsfluent.mvee_lens.default, (mean_a, packed[0], mean_b, packed[1], 2.0, 0.0)
     )
     compiled = torch.compile(mvee, fullgraph=True, backend="aot_eager")
     points = torch.randn(3, 9, 3)

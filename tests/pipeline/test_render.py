@@ -175,7 +175,8 @@ def test_flat_splats_use_their_own_plane() -> None:
 def test_hole_fraction_counts_what_shows_through() -> None:
     grey = ball()
     volume = torch.full((grey.count,), 0.008**3)
-    assert hole_fraction(grey, grey.means, volume, front()) == 0.0
+    # the rasterizer leaves 1e-4 of the light, and a little more at the rim
+    assert hole_fraction(grey, grey.means, volume, front()) < 5e-4
     # drill a square tunnel along the view: the particles stay, the splats go
     tunnel = (grey.means[:, 0].abs() < 0.05) & ((grey.means[:, 2] - 0.1).abs() < 0.05)
     holed = hole_fraction(grey.select(~tunnel), grey.means, volume, front())

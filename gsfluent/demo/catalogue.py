@@ -1,0 +1,11 @@
+"""The demo objects by name."""
+
+from __future__ import annotations
+
+from gsfluent.demo.baked import Bread, Cake, Melons
+from gsfluent.demo.fruit import Orange, Watermelon
+from gsfluent.demo.objects import DemoObject
+
+OBJECTS: dict[str, type[DemoObject]] = {
+    cls.name: cls for cls in (Watermelon, Orange, Bread, Cake, Melons)
+}

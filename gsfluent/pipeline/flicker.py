@@ -1,0 +1,127 @@
+"""Flicker: how much of a picture changes from frame to frame without anything having moved there.
+
+The material point that a pixel shows (:class:`gsfluent.pipeline.render_holes.MatterView`) says
+where the pixel is in the next frame; there the picture should have the same colour. The camera may
+move as well. Matter that the next frame hides, or shows as something else, is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import Camera
+from gsfluent.pipeline.render_holes import MatterView
+
+HIDDEN = 1.5
+"""Matter found this many point spacings nearer or farther than expected is other matter."""
+_BLUR = (0.25, 0.5, 0.25)
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Where the pixels of a frame are in the next.
+
+    Attributes:
+        target: Pixel coordinates in the next frame, [H, W, 2] (the first pixel's centre is 0.5).
+        valid: Pixels whose matter is seen in both, bool [H, W].
+    """
+
+    target: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        before: MatterView,
+        after: MatterView,
+        positions: tuple[Tensor, Tensor],
+        cameras: tuple[Camera, Camera],
+        spacing: float,
+    ) -> Flow:
+        """Follow the matter from one frame to the next.
+
+        Args:
+            before: Matter of this frame.
+            after: Matter of the next frame.
+            positions: Material points in both [m], [P, 3], the same rows.
+            cameras: Of both frames, at the size of the views.
+            spacing: Distance between material points [m].
+        """
+        first, second = cameras
+        device = before.depth.device
+        height, width = before.depth.shape
+        y, x = torch.meshgrid(
+            torch.arange(height, device=device) + 0.5,
+            torch.arange(width, device=device) + 0.5,
+            indexing="ij",
+        )
+        # a place moves as its point does, on the plane of that point
+        world = _unproject(first, x, y, before.depth)
+        point = before.point.clamp(min=0)
+        world = world + (positions[1] - positions[0])[point]
+        target, z = _project(second, world)
+        column, row = target[..., 0].floor().long(), target[..., 1].floor().long()
+        valid = before.silhouette & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
+        found = after.depth[row, column]
+        valid &= after.silhouette[row, column] & ((found - z).abs() <= HIDDEN * spacing)
+        return cls(target, valid)
+
+
+def flicker(before: Tensor, after: Tensor, flow: Flow) -> float | None:
+    """Mean absolute change of colour along the motion.
+
+    Both pictures are blurred a little (1, 2, 1), or the resampling of a fine texture would count.
+
+    Args:
+        before: Picture of a frame, display values, [H, W, 3].
+        after: Picture of the next frame.
+        flow: From one to the other.
+
+    Returns:
+        Mean over the followed pixels and the channels, 0 to 1; None where nothing can be followed.
+    """
+    if not bool(flow.valid.any()):
+        return None
+    change = (_sampled(_blurred(after), flow.target) - _blurred(before)).abs().mean(-1)
+    return float(change[flow.valid].mean())
+
+
+def _unproject(camera: Camera, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
+    viewmat, k = camera.viewmat.to(depth), camera.K.to(depth)
+    local = torch.stack([(x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1], torch.ones_like(x)], -1)
+    return (local * depth[..., None] - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def _project(camera: Camera, world: Tensor) -> tuple[Tensor, Tensor]:
+    viewmat, k = camera.viewmat.to(world), camera.K.to(world)
+    local = world @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = local[..., 2]
+    safe = z.clamp(min=1e-9)
+    u = k[0, 0] * local[..., 0] / safe + k[0, 2]
+    v = k[1, 1] * local[..., 1] / safe + k[1, 2]
+    # far off the picture a whole number would not fit
+    return torch.stack([u, v], -1).clamp(-1e6, 1e6), z
+
+
+def _blurred(image: Tensor) -> Tensor:
+    weight = image.new_tensor(_BLUR)
+    kernel = (weight[:, None] * weight)[None, None]
+    planes = image.permute(2, 0, 1)[:, None]
+    padded = torch.nn.functional.pad(planes, (1, 1, 1, 1), mode="replicate")
+    return torch.nn.functional.conv2d(padded, kernel)[:, 0].permute(1, 2, 0)
+
+
+def _sampled(image: Tensor, target: Tensor) -> Tensor:
+    """Bilinear samples [H, W, 3] at pixel coordinates."""
+    height, width = image.shape[:2]
+    size = target.new_tensor([width, height])
+    grid = (2.0 * target / size - 1.0)[None].to(image.dtype)
+    planes = image.permute(2, 0, 1)[None]
+    found = torch.nn.functional.grid_sample(
+        planes, grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return found[0].permute(1, 2, 0)

@@ -1,0 +1,82 @@
+"""``gsfluent view --live``: serve a prepared object that one can poke, until Ctrl-C."""
+
+from __future__ import annotations
+
+import logging
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.pipeline.live import LiveSession
+from gsfluent.pipeline.live_player import LivePlayer
+from gsfluent.pipeline.live_scene import open_stage
+from gsfluent.viewer.app import App
+from gsfluent.viewer.live_source import LiveSource
+from gsfluent.viewer.poke import PokePanel
+from gsfluent.viewer.serve import has_desktop
+
+_log = logging.getLogger(__name__)
+
+
+def view_live(
+    source: Path,
+    *,
+    device: torch.device,
+    material: str | None = None,
+    run: Path | None = None,
+    quality: str = "live",
+    slow: float = 4.0,
+    seed: int = 0,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    browser: bool = True,
+) -> dict[str, Any]:
+    """Serve a live session.
+
+    Args:
+        source: Run folder, shot or filled solid.
+        device: Where to simulate and draw.
+        material: Preset for a solid.
+        run: Folder in which a shot's objects are prepared.
+        quality: ``live`` or one of the simulation's.
+        slow: Slow motion at first.
+        seed: Seed of everything random.
+        host: Address to listen on.
+        port: First port to try, 0 for any.
+        browser: Open the page where there is a desktop.
+
+    Returns:
+        ``url``, the session's figures, and ``takes``, the folders that were recorded.
+
+    Raises:
+        InputError: Nothing to poke, no viser, no port, or a number out of range.
+    """
+    stage = open_stage(source, material=material, out=run, device=device, seed=seed)
+    session = LiveSession(stage.scene, quality=quality, device=device, slow=slow, seed=seed)
+    _log.info("live: %d points, cells of %.4g m", session.run.matter.particles.count, session.dx)
+    if not session.at_rest and not session.settle():
+        _log.warning("live: the scene does not come to rest; it goes on while nobody pokes it")
+    player = LivePlayer(session, stage.shot)
+    home = run or (source if source.is_dir() else source.parent)
+    before = set(home.glob("take_*"))
+    panel = PokePanel(player, home)
+    app = App(
+        LiveSource(player, stage.title, stage.shot), device, host=host, port=port, panels=[panel]
+    )
+    player.start()
+    panel.start()
+    try:
+        _log.info("viewer: %s (Ctrl-C ends)", app.url)
+        if browser and has_desktop():
+            webbrowser.open(app.url)
+        app.wait()
+    except KeyboardInterrupt:
+        _log.info("viewer: ended")
+    finally:
+        panel.close()
+        player.close()
+        app.close()
+    takes = sorted(str(path) for path in set(home.glob("take_*")) - before)
+    return {"url": app.url, "takes": takes} | session.report()

@@ -1,0 +1,132 @@
+"""The demo objects that are no fruit: loaf, cake, two melons. Rays, distances and layers agree."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsfluent import demo
+from gsfluent.cli import main
+from gsfluent.demo.baked import CREAM, ICING, JAM, SPONGE, Cake
+from gsfluent.demo.capture import ring_cameras
+from gsfluent.demo.shapes import walk
+
+NAMES = ("bread", "cake", "melons")
+
+
+def rays(obj: demo.DemoObject, side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
+    """Eye and directions of a coarse photograph."""
+    view = ring_cameras(obj, 6, on_table=False)[1]
+    rotation, eye = view[:3, :3], -(view[:3, :3].T @ view[:3, 3])
+    axis = torch.linspace(-0.3, 0.3, side)
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    ray = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3)
+    return eye, ray @ rotation.to(torch.float32)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rays_end_on_the_surface_and_normals_face_them(name: str) -> None:
+    obj = demo.make_object(name, 0)
+    eye, direction = rays(obj)
+    index, hit = obj.intersect(eye, direction)
+    assert 50 < len(index) < len(direction)
+    assert float(obj.depth(hit.double()).abs().max()) < 2e-4
+    normal = obj.normal(hit.double())
+    assert torch.allclose(normal.norm(dim=1), torch.ones(len(hit)).double(), atol=1e-6)
+    assert float(((normal * direction[index].double()).sum(1) < 1e-3).double().mean()) > 0.99
+    # nothing lies between the eye and the hit: what is passed is outside
+    start = eye.float()
+    for share in (0.5, 0.9, 0.99):
+        assert not bool(obj.inside((start + share * (hit - start)).double()).any())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_objects_rest_on_the_floor_and_lie_in_their_bounds(name: str) -> None:
+    obj = demo.make_object(name, 0)
+    low, high = obj.bounds()
+    generator = torch.Generator().manual_seed(0)
+    points = low - 0.02 + (high - low + 0.04) * torch.rand(40000, 3, generator=generator).double()
+    inside = obj.inside(points)
+    assert bool(((points[inside] >= low) & (points[inside] <= high)).all())
+    assert 0.0 <= float(points[inside][:, 2].min()) < 0.004
+
+
+def test_the_distance_of_the_cake_is_that_of_a_round_tin() -> None:
+    cake = Cake(0)
+    points = cake.center + torch.tensor([[0.0, 0, 0], [0.2, 0, 0], [0, 0, 0.1], [0.085, 0, 0.0]])
+    expected = [-0.040, 0.110, 0.060, -0.005]
+    assert cake.level(points.double()).numpy() == pytest.approx(expected, abs=1e-7)
+
+
+def test_walking_by_distance_finds_a_sphere() -> None:
+    """Against the closed form, for rays that pass it on all sides."""
+
+    class Ball(demo.DemoObject):
+        axes = (0.1, 0.1, 0.1)
+        bump_amplitude = 0.0
+
+        def _place_seeds(self, rng):  # type: ignore[no-untyped-def]
+            return torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.ones(3)
+
+        def level(self, points: torch.Tensor) -> torch.Tensor:
+            return (points - self.center.to(points.dtype)).norm(dim=1) - 0.1
+
+    ball = Ball()
+    eye = ball.center + torch.tensor([0.5, 0.0, 0.0]).double()
+    slope = torch.linspace(-0.3, 0.3, 41, dtype=torch.float64)
+    way = torch.stack([-torch.ones_like(slope), slope, torch.zeros_like(slope)], dim=1)
+    index, hit = walk(ball, eye, way)
+    sine = slope.abs() / (1 + slope**2).sqrt()
+    assert index.tolist() == torch.nonzero(sine < 0.1 / 0.5)[:, 0].tolist()
+    along = 0.5 * (1 - sine[index] ** 2).sqrt() - (0.01 - (0.5 * sine[index]) ** 2).sqrt()
+    assert (hit - eye).norm(dim=1).numpy() == pytest.approx(along.numpy(), abs=2e-4)
+
+
+def test_the_cake_has_its_layers_in_order() -> None:
+    cake = Cake(0)
+    heights = torch.tensor([0.001, 0.012, 0.0235, 0.0375, 0.051, 0.065, 0.079])
+    column = torch.stack([torch.zeros(7), torch.zeros(7), heights], dim=1).double()
+    assert cake.labels(column).tolist() == [ICING, SPONGE, JAM, SPONGE, CREAM, SPONGE, ICING]
+    color = cake.interior(column)
+    assert color[2, 0] > 2.5 * color[2, 1]  # jam is red
+    assert float(color[4].min()) > 0.8  # cream is white
+    assert color[3, 2] < 0.75 * color[3, 0]  # sponge is yellow
+
+
+def test_the_crumb_of_the_bread_is_paler_than_its_crust() -> None:
+    bread = demo.make_object("bread", 0)
+    index, hit = bread.intersect(*rays(bread))
+    assert len(index)
+    inner = bread.center + 0.5 * (hit.double() - bread.center)
+    crust, crumb = bread.surface_color(hit), bread.interior(inner)
+    assert float(crumb.mean()) > float(crust.mean()) + 0.3
+    assert float(crumb.std(dim=0).mean()) > 0.03  # it has cells
+
+
+def test_two_melons_are_two_and_their_exemplar_is_one() -> None:
+    both = demo.make_object("melons", 0)
+    assert not bool(both.inside(both.center[None]).any())
+    middle = both.center.clone()
+    middle[0] = both.bounds()[0][0] + 0.13
+    assert set(both.labels(middle[None]).tolist()) <= {3, 4}
+    cut, mask = demo.cut_photograph(both.one(), 48, supersample=1)
+    assert 0.5 < float(mask.mean()) < 0.9
+    assert float(cut[mask > 0.5].mean(dim=0)[0]) > 0.5
+    left, right = (demo.make_object("watermelon", seed) for seed in (0, 77))
+    assert math.prod(both.axes) > math.prod(left.axes) + math.prod(right.axes)
+
+
+def test_photographs_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsfluent.pipeline import run_demo
+
+    small = run_demo.DemoSize(3, 32, 1, 1, 1, "preview", (32, 32), 1.0, 1.0)
+    monkeypatch.setitem(run_demo.SIZES, "preview", small)
+    words = ["demo", "cake", "--size", "preview", "--photographs", str(tmp_path / "cake")]
+    assert main(words) == 0
+    assert len(list((tmp_path / "cake" / "photographs" / "images").glob("*.png"))) == 3
+    assert (tmp_path / "cake" / "cut.png").is_file()
+    assert demo.load_truth(tmp_path / "cake" / "truth.npz").name == "cake"
+    assert main(["demo", "pie", "--photographs", str(tmp_path / "pie")]) == 2

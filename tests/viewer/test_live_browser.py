@@ -1,0 +1,81 @@
+"""Poking in a real browser: press a button, see the object break. Skipped where there is none."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from live_ball import ball
+
+pytest.importorskip("viser", reason="the viewer's extra is not installed")
+pytest.importorskip("selenium", reason="no selenium to drive a browser with")
+
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from test_viewer_browser import FLAGS, greens, reds, until
+
+from gsfluent.pipeline.live import LiveSession
+from gsfluent.pipeline.live_player import AT_REST, RUNNING, LivePlayer
+from gsfluent.pipeline.live_scene import open_stage
+from gsfluent.viewer.app import App
+from gsfluent.viewer.live_source import LiveSource
+from gsfluent.viewer.poke import PokePanel
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LivePlayer, App, Any]]:
+    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if browser is None or driver is None:
+        pytest.skip("no chromium and chromedriver on this machine")
+    home = tmp_path_factory.mktemp("live")
+    ball().save(home / "ball.ply")
+    stage = open_stage(home / "ball.ply", material="fruit.watermelon")
+    session = LiveSession(stage.scene, dx=0.025, slow=4.0)
+    player = LivePlayer(session, stage.shot)
+    panel = PokePanel(player, home)
+    app = App(LiveSource(player, "ball", stage.shot), torch.device("cpu"), port=0, panels=[panel])
+    options = webdriver.ChromeOptions()
+    options.binary_location = browser
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    chrome = webdriver.Chrome(options=options, service=Service(driver))
+    player.start()
+    panel.start()
+    try:
+        chrome.get(app.url)
+        yield player, app, chrome
+    finally:
+        chrome.quit()
+        panel.close()
+        player.close()
+        app.close()
+
+
+def press(chrome: Any, label: str) -> None:
+    path = f"//button[normalize-space(.)='{label}']"
+    deadline = time.monotonic() + 15.0
+    while not (found := chrome.find_elements(By.XPATH, path)):
+        assert time.monotonic() < deadline, f"no button {label!r}"
+        time.sleep(0.1)
+    found[0].click()
+
+
+def test_shoot_breaks_the_object_in_the_picture_and_reset_mends_it(page) -> None:
+    player, app, chrome = page
+    whole = until(chrome, lambda p: greens(p) > 5000, seconds=60.0)
+    assert player.status.state == AT_REST and "at rest" in chrome.page_source
+    assert reds(whole) < 0.02 * greens(whole)
+    press(chrome, "Shoot")
+    until(chrome, lambda p: reds(p) > 0.05 * greens(whole), seconds=60.0)
+    assert player.status.state == RUNNING
+    assert "× real time" in chrome.page_source
+    assert player.session.pokes[0]["type"] == "bullet"
+    assert app.index > 0
+    press(chrome, "Reset")
+    mended = until(chrome, lambda p: reds(p) < 0.02 * greens(whole) < greens(p), seconds=60.0)
+    assert abs(greens(mended) - greens(whole)) < 0.05 * greens(whole)
