@@ -14,6 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent import ops
+
 # Splats per cell of the matter's inside, and the share of it from which a place is full; below one,
 # because counts scatter.
 PER_CELL = 3.0
@@ -65,7 +67,7 @@ def box_frame(means: Tensor, cell: float, nodes: int) -> Tensor:
 
 
 def occupancy(means: Tensor, cell: float, nodes: int, *, per_cell: float = PER_CELL) -> Occupancy:
-    """Scatter centres [N, 3] (trilinear), cut off at full, and pool; see :class:`Occupancy`.
+    """Occupancy of the bulk of ``means`` [N, 3], by :func:`gsfluent.ops.occupancy`.
 
     Args:
         means: Centres [m]; those off the grid are left out.
@@ -74,25 +76,7 @@ def occupancy(means: Tensor, cell: float, nodes: int, *, per_cell: float = PER_C
         per_cell: Splats in a full cell.
     """
     frame = box_frame(means, cell, nodes)
-    place = (means - frame[:3]) / cell - 0.5
-    base = place.floor()
-    part = place - base
-    base = base.long()
-    inside = ((base >= 0) & (base < nodes - 1)).all(-1)
-    first = (base[:, 2] * nodes + base[:, 1]) * nodes + base[:, 0]
-    first = torch.where(inside, first, 0)
-    count = torch.zeros(nodes**3, dtype=means.dtype, device=means.device)
-    other = 1.0 - part
-    for corner in range(8):
-        x, y, z = corner & 1, corner >> 1 & 1, corner >> 2
-        weight = (part if x else other)[:, 0] * (part if y else other)[:, 1]
-        weight = weight * (part if z else other)[:, 2] * inside
-        count.index_add_(0, first + ((z * nodes + y) * nodes + x), weight)
-    full = (count / (FULL * per_cell)).clamp(max=1.0).view(1, 1, nodes, nodes, nodes)
-    levels = [full]
-    for _ in range(LEVELS - 1):
-        levels.append(torch.nn.functional.avg_pool3d(levels[-1], 2))
-    return Occupancy(torch.cat([level.flatten() for level in levels]), frame, nodes)
+    return Occupancy(ops.occupancy(means, frame, nodes, full=FULL * per_cell), frame, nodes)
 
 
 def sample(volume: Tensor, frame: Tensor, nodes: int, points: Tensor) -> Tensor:
