@@ -120,6 +120,8 @@ def find_fragments(
     gone = broken[a] | broken[b] | stretched
     if cut is not None:
         gone = gone | cut_apart(cut[a], cut[b])
+    if rest.is_cuda:
+        return _on_device(a[~gone], b[~gone], broken, mass, smallest)
     kept = links[(~gone).cpu()].cpu().numpy()
     graph = coo_matrix(
         (np.ones(len(kept), dtype=bool), (kept[:, 0], kept[:, 1])), shape=(count, count)
@@ -141,3 +143,47 @@ def find_fragments(
         torch.from_numpy(fractions),
         float(1.0 - fractions.sum()),
     )
+
+
+def components(a: Tensor, b: Tensor, count: int) -> Tensor:
+    """Connected components of a graph, on its device.
+
+    Roots are hooked onto smaller ones and paths halved until all points know their root (after
+    Shiloach and Vishkin 1982): a few rounds, each a few kernels.
+
+    Args:
+        a: One end of each link, int64 [L].
+        b: The other end.
+        count: Number of points.
+
+    Returns:
+        The smallest row of each point's component, int64 [count].
+    """
+    root = torch.arange(count, device=a.device)
+    while a.numel():
+        root.scatter_reduce_(0, torch.maximum(a, b), torch.minimum(a, b), "amin")
+        while not torch.equal(further := root[root], root):
+            root = further
+        a, b = root[a], root[b]
+        open_ = a != b
+        a, b = a[open_], b[open_]
+    return root
+
+
+_SHARES = 2.0**40
+
+
+def _on_device(a: Tensor, b: Tensor, broken: Tensor, mass: Tensor, smallest: int) -> Fragments:
+    """The pieces, without a copy of the points on the host; sums in whole numbers have no order."""
+    count = mass.shape[0]
+    root = components(a, b, count)
+    sizes = torch.bincount(root, minlength=count)
+    whole = (sizes >= smallest) & ~broken.to(root.device)
+    share = mass.double() / mass.double().sum()
+    weight = torch.zeros_like(root).index_add_(0, root, (share * _SHARES).round().long())
+    labels = torch.where(whole[root], root, torch.full_like(root, DEBRIS))
+    ids = whole.nonzero()[:, 0].cpu()
+    fractions = weight.cpu()[ids].double() / _SHARES
+    order = torch.argsort(fractions, descending=True, stable=True)
+    fractions = fractions[order]
+    return Fragments(labels.to(torch.int32), ids[order], fractions, float(1.0 - fractions.sum()))

@@ -239,19 +239,28 @@ class RigidSet:
             volume[i] = box * (1.0 + turns) * (math.pi / 6.0 if kind == 1 else 1.0)
         return volume
 
-    def gap(self, rows: Tensor, low: Tensor, high: Tensor) -> float:
-        """Lower bound of the distance between the colliders and a box [m]."""
-        if self.count == 0:
-            return math.inf
-        corners = torch.stack([low, high]).to(rows)
+    def gaps(self, rows: Tensor, low: Tensor, high: Tensor) -> list[float]:
+        """Lower bounds of the distance between the colliders and boxes [m].
+
+        Args:
+            rows: Rows of the colliders, [M, 32].
+            low: Low corners [m], [K, 3].
+            high: High corners.
+        """
+        if rows.shape[0] == 0 or low.shape[0] == 0:
+            return [math.inf] * low.shape[0]
+        low, high = low.to(rows), high.to(rows)
+        edges = high - low
         lattice = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=rows.dtype)] * 3)
-        at = corners[0] + lattice.to(rows.device) * (corners[1] - corners[0])
-        distance, _ = ops.collider_distance(at, rows, self.sdf)
+        at = low[:, None] + lattice.to(rows.device) * edges[:, None]
+        distance, _ = ops.collider_distance(at.reshape(-1, 3), rows, self.sdf)
+        distance = distance.reshape(*at.shape[:2], -1).amin(dim=1)
         # No place of the box is further from the lattice than half a lattice cell's diagonal. From
         # an endless plane the corners are nearest.
         endless = (rows[:, columns.TYPE] == 0) & (rows[:, columns.RADIUS] == 0)
-        slack = torch.where(endless, 0.0, 0.125 * (corners[1] - corners[0]).norm())
-        return float((distance - slack).min())
+        slack = torch.where(endless, 0.0, 0.125 * edges.norm(dim=1, keepdim=True))
+        result: list[float] = (distance - slack).amin(dim=1).tolist()
+        return result
 
     def surfaces(self, rows: Tensor, points: int = 2000) -> tuple[Tensor, Tensor, float]:
         """Points spread over the surfaces of all colliders but endless planes, to draw them.

@@ -129,17 +129,12 @@ class Leaving:
             0, label, state.calm[rows].long(), "amin"
         )
         calm = (calm >= CALM_FRAMES).cpu()
-        gaps = [self.rigid.gap(state.colliders, low[i], high[i]) for i in range(ids.shape[0])]
+        gaps = self.rigid.gaps(state.colliders, low, high)
         dx = self.matter.dx
         if self.sleep and bool(calm.any()):
             pairs = near_pairs(position, label, LANDING * dx).cpu()
             moving = self.rigid.moving(state.colliders)
-            driven = torch.tensor(
-                [
-                    moving.shape[0] > 0 and self.rigid.gap(moving, low[i], high[i]) <= TAKE_OFF * dx
-                    for i in range(ids.shape[0])
-                ]
-            )
+            driven = torch.tensor(self.rigid.gaps(moving, low, high)) <= TAKE_OFF * dx
             state = self._nap(state, rows, label, pairs, calm, gaps, driven)
         if self.fly:
             high_up = [i for i, gap in enumerate(gaps) if gap > TAKE_OFF * dx and ids[i] >= 0]

@@ -71,7 +71,7 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
             tuple((a - start, b - start) for a, b in matter.ranges[len(old.bodies) :]),
             matter.spacing[len(old.bodies) :],
         )
-        run.links = torch.cat([run.links, links + start])
+        run.links = torch.cat([run.links, (links + start).to(run.links)])
         rows = torch.arange(start, matter.particles.count, device=matter.particles.device)
         _account(run, rows, [body.start if body.held else 0.0 for body in fresh], sign=1.0)
 
@@ -136,8 +136,7 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
     scene = copy_of(run.scene)
     scene.bodies = [run.scene.bodies[n] for n in stay]
     scene.kicks = [dataclasses.replace(kick, body=int(number[kick.body])) for kick in scene.kicks]
-    ends = run.links.to(device)
-    run.links = place[ends[~out[ends].any(dim=1)]].to(run.links.device)
+    run.links = place[run.links[~out[run.links].any(dim=1)]]
     run.stepper.flights = [run.stepper.flights[n] for n in stay]
     _refit(run, scene, matter, state)
 

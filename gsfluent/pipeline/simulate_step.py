@@ -334,6 +334,7 @@ class Stepper:
         to_grid = box_gaps(low, high, grid.low, grid.high) if grid is not None else None
         driven = float(self.rigid.speed(colliders))
         moving = self.rigid.moving(colliders)
+        to_any, to_moving = (self.rigid.gaps(rows, low, high) for rows in (colliders, moving))
         for i, group in enumerate(groups):
             if group.held(time):
                 clear = min(clear, group.flight.held if group.flight is not None else clear)
@@ -341,9 +342,7 @@ class Stepper:
             sleeps = group.flight is None
             # Gap to what is near, and how fast that is.
             near: list[tuple[float, float]] = [(self.blades.gap(low[i], high[i], time), 0.0)]
-            rows = moving if sleeps else colliders
-            if rows.shape[0]:
-                near.append((self.rigid.gap(rows, low[i], high[i]), driven))
+            near.append((to_moving[i] if sleeps else to_any[i], driven))
             for j, other in enumerate(groups):
                 if j == i or (sleeps and other.flight is None):
                     continue

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsfluent.pipeline.fragments import find_fragments, rest_links
+from gsfluent.pipeline import fragments
+from gsfluent.pipeline.fragments import components, find_fragments, rest_links
 
 
 def rope(count: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -87,3 +88,37 @@ def test_bad_links_are_refused():
         find_fragments(torch.tensor([[0, 3]]), rest, rest, broken, torch.ones(3))
     with pytest.raises(ValueError, match="mass must have 3 rows"):
         find_fragments(torch.tensor([[0, 1]]), rest, rest, broken, torch.ones(2))
+
+
+def test_components_on_the_device_are_those_of_scipy() -> None:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    generator = torch.Generator().manual_seed(3)
+    for count, links in ((1, 0), (50, 20), (400, 380), (3000, 6000)):
+        a = torch.randint(0, count, (links,), generator=generator)
+        b = torch.randint(0, count, (links,), generator=generator)
+        graph = coo_matrix((torch.ones(links).numpy(), (a.numpy(), b.numpy())), (count, count))
+        _, label = connected_components(graph, directed=False)
+        first = torch.full((count,), count).scatter_reduce_(
+            0, torch.from_numpy(label).long(), torch.arange(count), "amin"
+        )
+        assert torch.equal(components(a, b, count), first[torch.from_numpy(label).long()])
+    # a long chain in the worst order
+    chain = torch.randperm(2000, generator=generator)
+    assert not components(chain[1:], chain[:-1], 2000).any()
+
+
+def test_pieces_found_on_the_device_are_the_same_pieces() -> None:
+    generator = torch.Generator().manual_seed(1)
+    rest = torch.rand(2000, 3, generator=generator, dtype=torch.float64)
+    links = rest_links(rest, ((0, 2000),), (0.08,))
+    broken = (rest[:, 0] - 0.5).abs() < 0.08
+    mass = torch.rand(2000, generator=generator) + 0.5
+    host = find_fragments(links, rest, rest, broken, mass)
+    a, b = links[~(broken[links].any(dim=1))].T
+    there = fragments._on_device(a, b, broken, mass, fragments.SMALLEST)
+    assert host.count >= 2 and torch.equal(host.labels, there.labels)
+    assert torch.equal(host.ids, there.ids)
+    assert torch.allclose(host.mass_fractions, there.mass_fractions, atol=1e-9)
+    assert abs(host.debris_fraction - there.debris_fraction) < 1e-8
