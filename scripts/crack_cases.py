@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import inspect
 from collections.abc import Callable
@@ -54,8 +55,8 @@ class Case:
 CASES = {
     "melon": Case("watermelon", "fruit.watermelon", 1.0, 0.8),
     "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.0, 0.8, isotropic=True),
-    "marble": Case("marble", "plaster", 3.0, 1.1),
-    "bread": Case("bread", "chocolate", 2.0, 1.0),
+    "marble": Case("marble", "fruit.pumpkin", 1.5, 0.8),
+    "bread": Case("bread", "fruit.watermelon", 1.2, 0.8),
 }
 
 
@@ -189,6 +190,7 @@ class Broken:
             values = {k: torch.from_numpy(data[k]) for k in data.files}
         return Moment(**values | {"pieces": int(values["pieces"])})
 
+    @functools.cache  # noqa: B019
     def broken_frames(self) -> list[int]:
         """Frames in which a hundredth of the matter or more is broken."""
         parts = [float(self.moment(k).broken.float().mean()) for k in range(self.count)]

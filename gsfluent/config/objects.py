@@ -307,7 +307,11 @@ def _one_source(chosen: Where, place: Place) -> None:
 def _refuse_parameters(settings: Mapping[str, Any], extra: tuple[str, ...], place: Place) -> None:
     from gsfluent import materials
 
-    refuse_unknown(settings, [*extra, "law", *materials.PARAMETERS, *materials.LOOKS], place)
+    refuse_unknown(
+        settings,
+        [*extra, "law", *materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS],
+        place,
+    )
 
 
 def _parameters(

@@ -66,7 +66,9 @@ def parameters() -> str:
     laws = ", ".join(f"`{law}`" for law in materials.LAWS)
     return (
         f"`law` ({laws}), "
-        + ", ".join(f"`{name}`" for name in (*materials.PARAMETERS, *materials.LOOKS))
+        + ", ".join(
+            f"`{name}`" for name in (*materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS)
+        )
         + ".\n"
     )
 

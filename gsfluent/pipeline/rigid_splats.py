@@ -6,12 +6,17 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import SURFACE, Gaussians, Particles
+from gsfluent.geometry import matrix_to_quaternion
 from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.scene import Scene
 
 # Splats of this many standard deviations per spacing close a packing of particles.
 _SIGMA_IN_SPACINGS = 0.6
 _STEEL = (0.25, 0.25, 0.25)
+_BLADE = (0.55, 0.57, 0.60)
+_PLATE_POINTS = 100
+_PLATE_HEIGHT = 0.16
+"""Of the plate that stands for a blade, in widths."""
 _PAINT = {
     "water": (0.45, 0.60, 0.68),
     "milk": (0.93, 0.91, 0.85),
@@ -61,6 +66,52 @@ def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
     sizes = torch.full_like(points[:, 0], _SIGMA_IN_SPACINGS * spacing)
     made = _splats(points.float(), sizes.float(), _STEEL)
     return made.replace(normals=normals.float())
+
+
+def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") -> Gaussians | None:
+    """Splats of the blades: a plate behind each edge, or None without blades.
+
+    An edge waits where its path begins, moves along it, and is drawn back the way it came.
+
+    Args:
+        scene: The scene.
+        time: Time [s].
+        device: Where they are made.
+    """
+    made = []
+    for blade in scene.blades:
+        path = torch.tensor(blade.path, dtype=torch.float64)
+        legs = path[1:] - path[:-1]
+        lengths = legs.norm(dim=1)
+        whole = float(lengths.sum())
+        along = min(max(blade.speed * (time - blade.start), 0.0), 2.0 * whole)
+        along = along if along <= whole else 2.0 * whole - along
+        leg = 0
+        while leg + 1 < len(lengths) and along > float(lengths[leg]):
+            along -= float(lengths[leg])
+            leg += 1
+        way = legs[leg] / lengths[leg]
+        edge = torch.tensor(blade.edge, dtype=torch.float64)
+        step = blade.width / _PLATE_POINTS
+        across = torch.arange(_PLATE_POINTS + 1, dtype=torch.float64) * step - 0.5 * blade.width
+        back = torch.arange(round(_PLATE_HEIGHT * _PLATE_POINTS) + 1, dtype=torch.float64) * step
+        a, b = (part.reshape(-1, 1) for part in torch.meshgrid(across, back, indexing="ij"))
+        points = (path[leg] + along * way + a * edge - b * way).float().to(device)
+        normal = torch.linalg.cross(edge, way)
+        normal = (normal / normal.norm()).float()
+        # as thin as a blade: seen along its plane it must not be a row of balls
+        sizes = torch.full((points.shape[0], 3), _SIGMA_IN_SPACINGS * step, device=device)
+        sizes[:, 2] = 0.1 * sizes[:, 0]
+        turn = torch.stack([edge.float(), torch.linalg.cross(normal, edge.float()), normal], dim=1)
+        quat = matrix_to_quaternion(turn.double()).float().to(device)
+        splats = _splats(points, sizes, _BLADE)
+        made.append(
+            splats.replace(
+                quats=quat.expand(points.shape[0], 4).contiguous(),
+                normals=normal.to(device).expand_as(points).contiguous(),
+            )
+        )
+    return Gaussians.cat(made) if made else None
 
 
 def _splats(position: Tensor, sizes: Tensor, paint: tuple[float, float, float]) -> Gaussians:

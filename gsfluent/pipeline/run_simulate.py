@@ -14,7 +14,7 @@ from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dic
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.particles import grid_spacing
-from gsfluent.pipeline.rigid_splats import bare_points, bare_splats, rigid_splats
+from gsfluent.pipeline.rigid_splats import bare_points, bare_splats, blade_splats, rigid_splats
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_frames import SavedFrame, count_frames, save_frame
 from gsfluent.pipeline.run_regions import load_solids
@@ -99,6 +99,7 @@ def simulate_stage(context: RunContext) -> None:
         [shot.solve.quality, shot.solve.cells, shot.solve.standing, shot.solve.loose_crumbs],
         shot.output.fps,
         shot.output.seconds,
+        shot.output.cracks,
     ]
     key = fingerprint("simulate", context.key(context.source_key, settings))
 
@@ -113,6 +114,7 @@ def simulate_stage(context: RunContext) -> None:
             standing=shot.solve.standing,
             loose_crumbs=shot.solve.loose_crumbs,
             deterministic=shot.solve.deterministic,
+            repair=shot.output.cracks,
         )
         state = folder / _STATE
         resume = state if state.is_file() and count_frames(folder) > 0 else None
@@ -176,7 +178,10 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
     anchor, carried = repaired.anchor, frame.carried.count
     points = bare_points(frame.particles, scene)
     bare = bare_splats(frame.particles, scene)
-    steel = rigid_splats(frame.rigid, frame.colliders)
+    things = [rigid_splats(frame.rigid, frame.colliders)]
+    things.append(blade_splats(scene, frame.time, ids.device))
+    seen = [thing for thing in things if thing is not None]
+    steel = Gaussians.cat(seen) if seen else None
     for extra, follows in ((bare, points), (steel, None)):
         if extra is None:
             continue

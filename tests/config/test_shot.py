@@ -329,3 +329,10 @@ def test_any_value_reads_or_is_an_input_error(key: str, value: Any) -> None:
         assert error.what
     else:
         assert Shot.from_dict(shot.resolved()).resolved() == shot.resolved()
+
+
+def test_scatter_of_strength_may_be_set(folder: Path) -> None:
+    shot = read(folder, objects={"melon": {"variation": 0.2, "grain": 0.01}})
+    assert shot.objects["melon"].overrides == {"variation": 0.2, "grain": 0.01}
+    with pytest.raises(InputError, match="variation"):
+        read(folder, objects={"melon": {"material": "jelly", "variation": 0.2}})

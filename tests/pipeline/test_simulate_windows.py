@@ -106,3 +106,24 @@ def test_slow_motion_plays_slower_and_paths_take_environment_variables(
     monkeypatch.delenv("GSFLUENT_TEST_FOLDER")
     with pytest.raises(InputError, match="environment variable that is not set"):
         Shot.from_dict({"splats": "$GSFLUENT_TEST_FOLDER/ball.ply"}, tmp_path)
+
+
+def test_a_blade_is_drawn_behind_its_edge_and_goes_back_the_way_it_came() -> None:
+    from gsfluent.pipeline.rigid_splats import blade_splats
+
+    scene = Scene()
+    assert blade_splats(scene, 0.0) is None
+    scene.add(ellipsoid(), SOFT)
+    scene.blade([(0, 0, 0.5), (0, 0, 0.1), (0.3, 0, 0.1)], width=0.2, speed=1.0, at=1.0)
+    for time, low in ((0.0, 0.5), (1.1, 0.4), (1.3, 0.2), (2.1, 0.2), (9.0, 0.5)):
+        plate = blade_splats(scene, time)
+        assert plate is not None
+        assert float(plate.means[:, 2].min()) == pytest.approx(low, abs=1e-6)
+        assert float(plate.means[:, 1].abs().max()) == pytest.approx(0.1, abs=1e-6)
+        assert plate.normals is not None and float(plate.normals[:, 0].abs().min()) > 0.999
+        # thin across the plate
+        assert float(plate.covariances()[:, 0].max()) < 0.02 * float(
+            plate.covariances()[:, 2].min()
+        )
+    along = blade_splats(scene, 1.6)  # on the second leg, 0.2 m along it
+    assert along is not None and float(along.means[:, 0].max()) == pytest.approx(0.2, abs=1e-6)
