@@ -11,8 +11,9 @@ constexpr int kDensityLevels = 5;  // each with cells twice as wide as the one b
 constexpr int kDensityWide = 2;    // level whose gradient settles which side is out
 constexpr int kDensityPasses = 4;  // of [1, 2, 1] / 4 over the finest level, one over the wide one
 constexpr double kDensityClear = 0.1;  // how sure the wide gradient must be
-constexpr double kFlatSplat = 0.5;     // shortest over middle axis
-constexpr double kDensityTiny = 1e-12;
+// Half the gradient up to which a sheet does not say which way its splats lie.
+constexpr double kDensityUnclear = 0.05;
+constexpr double kFlatSplat = 0.5;  // shortest over middle axis
 
 template <typename T>
 struct DensityArgs {
@@ -30,6 +31,7 @@ struct DensityNormalArgs {
   const T *means, *quats, *scales;  // [N, 3], [N, 4], [N, 3]
   const T* values;                  // of DensityArgs
   const T* frame;
+  const T* eye;  // [3], what flat splats face, or null
   int nodes;
   T *fine, *wide;  // smoothed levels 0 and kDensityWide
   T* spare;        // as large as `fine`
@@ -134,9 +136,13 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
     // Which column, without an index that changes: that would put the matrix into local memory.
     const bool first = s[0] == shortest, second = !first && s[1] == shortest;
     const Vec3<T> axis = matvec(axes, Vec3<T>{T(first), T(second), T(!first && !second)});
-    const T agreement = dot(axis, out) / max(norm(out), T(kDensityTiny));
-    // An axis across the gradient is a splat standing on edge (hair, seams): trust the density.
-    if (fabs(agreement) > T(0.5)) out = T(agreement > T(0) ? 1 : -1) * axis;
+    const T agreement = dot(axis, out);
+    // An axis across a clear gradient is a splat standing on edge (hair, seams): trust the density.
+    if (fabs(agreement) > T(0.5) * norm(out) - T(kDensityUnclear)) {
+      const T side =
+          a.eye ? dot(axis, Vec3<T>{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]}) : agreement;
+      out = T(side < T(0) ? -1 : 1) * axis;
+    }
   }
   for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
 }

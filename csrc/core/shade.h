@@ -10,12 +10,14 @@ constexpr double kAlphaFloor = 1e-4;
 constexpr double kOpaque = 0.999;  // what is behind such a pixel is not worked out
 constexpr double kFaded = 1e-6;    // share below which the floor is left out
 constexpr double kDisplayGamma = 2.2;
-constexpr double kOcclusionReach = 1.0;
-constexpr double kOcclusionFlat = 0.08;
-// How much of the sky a level of the pyramid hides when full.
-GSF_HOST_DEVICE constexpr double occlusion_share(int level) {
-  return level == 0 ? 0.0 : (level < 3 ? 0.28 : (level == 3 ? 0.24 : 0.2));
-}
+// Occlusion cones: levels, looks in cells of a level, own blur, filling, weight of the middle cone,
+// tilt of the other four. Fitted, see gsfluent/pipeline/occlusion.py.
+constexpr int kConeFirst = 1, kConeLast = 4;
+constexpr double kConeReach = 2.16;
+constexpr double kConeFlat = 0.02;
+constexpr double kConeGain = 1.23;
+constexpr double kConeCenter = 0.43;
+constexpr double kConeCos = 0.445, kConeSin = 0.8955;
 
 template <typename T>
 GSF_HOST_DEVICE Vec3<T> to_linear(const Vec3<T>& c) {
@@ -77,27 +79,43 @@ GSF_HOST_DEVICE T sample_level(const T* values, int side, const Vec3<T>& place) 
   return sum;
 }
 
-// Share of the sky that reaches a point: a wide cone along the normal through the pyramid.
+// What one cone of weight 1 lets through from a point on.
 template <typename T>
-GSF_HOST_DEVICE T open_sky(const ShadeArgs<T>& a, const Vec3<T>& point, const Vec3<T>& normal) {
-  if (!a.occupancy) return T(1);
-  const T cell = a.grid_frame[3];
-  const Vec3<T> corner{a.grid_frame[0], a.grid_frame[1], a.grid_frame[2]};
-  T open = T(1);
+GSF_HOST_DEVICE T open_cone(const ShadeArgs<T>& a, const Vec3<T>& from, const Vec3<T>& way) {
   const T* values = a.occupancy;
-  for (int level = 0; level < kOcclusionLevels; ++level) {
+  T left = T(1);
+  for (int level = 0; level <= kConeLast; ++level) {
     const int side = a.nodes >> level;
-    if (occlusion_share(level) > 0.0) {
-      const T wide = cell * T(1 << level);
-      const Vec3<T> out = point + (T(kOcclusionReach) * wide) * normal - corner;
+    if (level >= kConeFirst) {
+      const T wide = a.grid_frame[3] * T(1 << level);
+      const Vec3<T> out = from + (T(kConeReach) * wide) * way;
       const Vec3<T> place{out.x / wide - T(0.5), out.y / wide - T(0.5), out.z / wide - T(0.5)};
-      const T seen =
-          (sample_level(values, side, place) - T(kOcclusionFlat)) / T(1.0 - kOcclusionFlat);
-      open -= T(occlusion_share(level)) * max(seen, T(0));
+      const T seen = sample_level(values, side, place) - T(kConeFlat);
+      left *= max(T(1) - T(kConeGain / (1.0 - kConeFlat)) * max(seen, T(0)), T(0));
     }
     values += int64_t(side) * side * side;
   }
-  return T(1) - a.occlusion * (T(1) - max(open, T(0)));
+  return left;
+}
+
+// Share of the sky that reaches a point, by five cones; all of it without a normal.
+template <typename T>
+GSF_HOST_DEVICE T open_sky(const ShadeArgs<T>& a, const Vec3<T>& point, const Vec3<T>& normal) {
+  using std::fabs;
+  if (!a.occupancy || !(dot(normal, normal) > T(0.5))) return T(1);
+  const Vec3<T> from = point - Vec3<T>{a.grid_frame[0], a.grid_frame[1], a.grid_frame[2]};
+  const T steep = T(fabs(normal.x) > T(0.6)), gentle = T(1) - steep;
+  const Vec3<T> across =
+      unit(Vec3<T>{-normal.z * steep, normal.z * gentle, normal.x * steep - normal.y * gentle});
+  const Vec3<T> other = cross(normal, across);
+  T open = T(kConeCenter) * open_cone(a, from, normal);
+  const T diagonal = T(kConeSin * 0.70710678118654752);
+  for (int k = 0; k < 4; ++k) {
+    const T p = k == 0 || k == 3 ? diagonal : -diagonal, q = k < 2 ? diagonal : -diagonal;
+    const Vec3<T> way = T(kConeCos) * normal + p * across + q * other;
+    open += T(0.25 * (1.0 - kConeCenter)) * open_cone(a, from, way);
+  }
+  return T(1) - a.occlusion * (T(1) - open);
 }
 
 // Unit vector from a point toward the lamp, and the lamp's falloff there.

@@ -24,6 +24,7 @@ class Export(Verb):
       gsfluent export splats.gsd --to ply-seq                # and back, for any viewer
       gsfluent export out --to usd -o cut_07                 # Houdini, usdview: one scene.usdc
       gsfluent export out --to vtk,vti                       # ParaView: open particles.vtk.series
+      gsfluent export out --to meshes --mesh-ending obj      # Blender, Houdini: closed fragments
       gsfluent export out --to mp4 --camera freeze           # time stands still, once around
       gsfluent export out --to webp --alpha --size 480x270   # to lay over a web page
 
@@ -32,6 +33,7 @@ class Export(Verb):
       delta    all frames in one small file, read by gsfluent.io.DeltaReader
       usd      all frames in one file: splats, particles with velocity and damage
       vtk, points, vti                 the material points: .vtk, .ply, density volume
+      meshes                           a closed, coloured surface per fragment
       mp4, gif, webp, png              pictures, along any camera path (docs/render.md)
 
     An interrupted sequence goes on where it stopped when the command is given again.
@@ -62,7 +64,11 @@ class Export(Verb):
     usd_ending: Literal["usdc", "usda", "usdz"] = "usdc"
     """usd: binary, text or zipped."""
     usd_parts: str = "splats,particles"
-    """usd: what goes in."""
+    """usd: what goes in, of splats, particles, meshes."""
+    mesh_ending: Literal["ply", "obj", "glb"] = "ply"
+    """meshes: one mesh with a property fragment (ply), or an object per fragment (obj, glb)."""
+    mesh_blur: float = 1.0
+    """meshes: smoothing in point spacings; less shows the points, more rounds the edges."""
     camera: str | None = None
     """Pictures: orbit, turntable, dolly, freeze[:FRAME], a photograph's index, or a path's file."""
     size: str | None = None
@@ -89,6 +95,8 @@ class Export(Verb):
             key_every=self.key_every,
             spz_version=self.spz_version,
             usd_ending=self.usd_ending,
+            mesh_ending=self.mesh_ending,
+            mesh_blur=self.mesh_blur,
             camera=self.camera,
             size=parse_size(self.size) if self.size else None,
             fps=self.fps,

@@ -42,7 +42,7 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
 
 
 EXPORTS = (
-    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti",
+    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti", "meshes",
 )  # fmt: skip
 """What a run can write beside the video; ``gsfluent export`` writes these and more."""
 
@@ -374,6 +374,12 @@ class OutputSettings:
         choice("studio", "captured"), default="studio",
         doc="What stands behind: the studio, or the surroundings that the capture shows.",
         example="captured",
+    )  # fmt: skip
+    cracks: str = key(
+        choice("gap", "mvee", "none"), default="gap",
+        doc="How crack faces are drawn: splats born on the faces that open, transition splats from "
+        "overlapping ellipsoids (for comparison), or nothing added.",
+        example="none",
     )  # fmt: skip
     what: tuple[str, ...] = key(
         several(choice("mp4", *EXPORTS)),

@@ -47,12 +47,20 @@ def occupancy(means: Tensor, frame: Tensor, nodes: int, *, full: float) -> Tenso
 
 
 def density_normals(
-    means: Tensor, quats: Tensor, scales: Tensor, values: Tensor, frame: Tensor, nodes: int
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    values: Tensor,
+    frame: Tensor,
+    nodes: int,
+    *,
+    eye: Tensor | None = None,
 ) -> Tensor:
     """Outward vectors of splats: minus the gradient of the smoothed occupancy per cell.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
-    splats whose shortest axis agrees with the gradient (they take that axis), zero off the grid.
+    splats unless their shortest axis lies across a clear gradient (they take that axis), zero off
+    the grid.
     A look four times as wide turns what points inward.
 
     Args:
@@ -62,6 +70,8 @@ def density_normals(
         values: What :func:`occupancy` gave.
         frame: As there.
         nodes: As there.
+        eye: Where the picture is taken from [m], shape [3]: flat splats face it. Without, they take
+            the side of the density; a shell has none there, from outside and from inside.
 
     Returns:
         Shape [N, 3].
@@ -82,9 +92,14 @@ def density_normals(
         ("scales", scales, (n, 3)),
         ("values", values, (cells,)),
         ("frame", frame, (4,)),
+        ("eye", eye, (3,)),
     ):
+        if value is None:
+            continue
         check_tensor(op, name, value, shape=shape, like=means)
-    return torch.ops.gsfluent.density_normals.default(means, quats, scales, values, frame, nodes)
+    return torch.ops.gsfluent.density_normals.default(
+        means, quats, scales, values, frame, nodes, eye
+    )
 
 
 def _check_nodes(op: str, nodes: int) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import SURFACE, Gaussians
+from gsfluent.pipeline.neighbours import nearest_rows
 from gsfluent.pipeline.particles import Matter, body_frame
 from gsfluent.scene import Body, Scene
 
@@ -28,8 +29,34 @@ RIGID = 1e-3
 """Splats that are stretched by less than this keep their shape exactly."""
 CHUNK = 100_000
 """Splats that are moved at once; bounds the memory of a frame."""
-REACH = 2.5
+REACH = 1.6
 """A splat on a broken point looks for an unbroken one within this many point spacings."""
+
+
+class Points(NamedTuple):
+    """Where the material points are, and what each does to the splats that ride on it.
+
+    Attributes:
+        position: Positions [m], [N, 3].
+        map: Total deformation, stretches clamped; of broken points the rotation alone, since they
+            deform without limit, [N, 3, 3].
+        rotation: Rotation of the deformation, [N, 3, 3].
+        fragments: Piece of each point, int32 [N], -1 for none.
+        broken: Broken points, bool [N].
+    """
+
+    position: Tensor
+    map: Tensor
+    rotation: Tensor
+    fragments: Tensor
+    broken: Tensor
+
+    @staticmethod
+    def of(position: Tensor, deformation: Tensor, fragments: Tensor, broken: Tensor) -> Points:
+        """Split total deformation gradients [N, 3, 3] into rotation and clamped stretch."""
+        rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
+        shown = torch.where(broken[:, None, None], rotation, clamped)
+        return Points(position, shown, rotation, fragments, broken)
 
 
 class Motion(NamedTuple):
@@ -42,6 +69,7 @@ class Motion(NamedTuple):
         anchor: Material point each splat follows, int64 [M].
         broken: Whether the splat's own (nearest) point is broken, bool [M].
         riding: Whether the splat follows an unbroken point, bool [M].
+        points: The material points.
     """
 
     means: Tensor
@@ -50,6 +78,7 @@ class Motion(NamedTuple):
     anchor: Tensor
     broken: Tensor
     riding: Tensor
+    points: Points
 
 
 class Carry:
@@ -65,30 +94,12 @@ class Carry:
     """
 
     def __init__(self, gaussians: Gaussians, body: Tensor, matter: Matter) -> None:
-        from scipy.spatial import cKDTree
-
         self.gaussians, self.body, self.matter = gaussians, body, matter
-        count = gaussians.count
-        k = NEIGHBOURS
-        index = torch.zeros(count, k, dtype=torch.int64)
-        distance = torch.zeros(count, k, dtype=torch.float64)
-        rest, means = matter.rest.cpu().numpy(), gaussians.means.cpu().numpy()
-        for number, (a, b) in enumerate(matter.ranges):
-            rows = (body == number).nonzero()[:, 0].cpu()
-            if rows.numel() == 0:
-                continue
-            near = min(k, b - a)
-            found, which = cKDTree(rest[a:b]).query(means[rows.numpy()], k=near)
-            found, which = found.reshape(-1, near), which.reshape(-1, near)
-            index[rows, :near] = torch.from_numpy(which).to(torch.int64) + a
-            distance[rows, :near] = torch.from_numpy(found)
-            index[rows, near:] = index[rows, :1]
-            distance[rows, near:] = math.inf
-        spacing = torch.tensor(matter.spacing, dtype=torch.float64)[body.cpu()]
-        device = gaussians.device
-        self.index = index.to(device)
-        self.distance = distance.to(device)
-        self.spacing = spacing.to(device)
+        self.scene: Scene | None = None
+        distance, self.index = near_points(gaussians.means, body, matter)
+        self.distance = distance
+        spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=distance.device)[body]
+        self.spacing = spacing
         self.weight = torch.exp(-0.5 * (distance / spacing[:, None]) ** 2).to(gaussians.means)
         # Far from all points (a stray splat) the nearest one still carries it.
         self.weight[:, 0] = self.weight[:, 0].clamp(min=1e-6)
@@ -103,7 +114,9 @@ class Carry:
             placed = splats.to(device, torch.float32).transformed(body_frame(body, scene))
             parts.append(placed)
             bodies.append(torch.full((placed.count,), number, dtype=torch.int64, device=device))
-        return Carry(Gaussians.cat(parts), torch.cat(bodies), matter)
+        carry = Carry(Gaussians.cat(parts), torch.cat(bodies), matter)
+        carry.scene = scene
+        return carry
 
     def motion(
         self, position: Tensor, deformation: Tensor, fragments: Tensor, broken: Tensor
@@ -119,19 +132,20 @@ class Carry:
         Returns:
             The motion of each splat since time 0.
         """
-        rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
-        # Broken points deform without limit; only their rotation means anything.
-        stretch = torch.where(broken[:, None, None], rotation, clamped)
-        parts = [
-            self._follow(rows, position, stretch, fragments, broken)
-            for rows in torch.arange(self.gaussians.count, device=position.device).split(CHUNK)
-        ]
-        return Motion(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+        return self.follow(Points.of(position, deformation, fragments, broken))
 
-    def _follow(
-        self, rows: Tensor, position: Tensor, stretch: Tensor, fragments: Tensor, broken: Tensor
-    ) -> Motion:
-        """Motion of some splats; ``stretch`` [N, 3, 3] is what each point does to its splats."""
+    def follow(self, points: Points) -> Motion:
+        """As :meth:`motion`, of points that are split already."""
+        everything = torch.arange(self.gaussians.count, device=points.position.device)
+        parts = [self._follow(rows, points) for rows in everything.split(CHUNK)]
+        means, blend, turn, anchor, broken, riding = (
+            torch.cat(columns) for columns in zip(*parts, strict=True)
+        )
+        return Motion(means, blend, turn, anchor, broken, riding, points)
+
+    def _follow(self, rows: Tensor, points: Points) -> tuple[Tensor, ...]:
+        """Columns of the motion of some splats."""
+        position, stretch, _, fragments, broken = points
         index, distance = self.index[rows], self.distance[rows]
         whole = ~broken[index] & (distance <= REACH * self.spacing[rows, None])
         riding = whole.any(dim=1)
@@ -149,7 +163,7 @@ class Carry:
         means = (weight[..., None] * moved).sum(dim=1)
         blend = (weight[..., None, None] * local).sum(dim=1)
         turn, blend = ops.polar_clamped(blend.contiguous(), *STRETCH)
-        return Motion(means, blend, turn, anchor, broken[index[:, 0]], riding)
+        return means, blend, turn, anchor, broken[index[:, 0]], riding
 
     def apply(self, motion: Motion) -> Gaussians:
         """Return the splats at their new places, with their new shapes and turned colours."""
@@ -181,6 +195,34 @@ class Carry:
     def sample(self, values: Tensor) -> Tensor:
         """Return per-point values [N] at each splat's nearest point, [M]."""
         return values[self.index[:, 0]]
+
+
+def near_points(places: Tensor, body: Tensor, matter: Matter) -> tuple[Tensor, Tensor]:
+    """Nearest points of the own body of places at rest.
+
+    Args:
+        places: [M, 3], scene metres.
+        body: Body of each place, int64 [M].
+        matter: The material points.
+
+    Returns:
+        Distances [m], float64 [M, 12], ascending, and rows int64 [M, 12]. A body of fewer points
+        repeats the nearest one at an infinite distance.
+    """
+    count, device = places.shape[0], places.device
+    index = torch.zeros(count, NEIGHBOURS, dtype=torch.int64, device=device)
+    distance = torch.zeros(count, NEIGHBOURS, dtype=torch.float64, device=device)
+    for number, (a, b) in enumerate(matter.ranges):
+        rows = (body == number).nonzero()[:, 0]
+        if rows.numel() == 0:
+            continue
+        near = min(NEIGHBOURS, b - a)
+        found, which = nearest_rows(
+            matter.rest[a:b], places[rows], near, 1.5 * matter.spacing[number]
+        )
+        index[rows, :near], distance[rows, :near] = which + a, found
+        index[rows, near:], distance[rows, near:] = which[:, :1] + a, math.inf
+    return distance, index
 
 
 def _ball_splats(body: Body) -> Gaussians:

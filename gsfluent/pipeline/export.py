@@ -73,6 +73,9 @@ FORMATS: dict[str, Format] = {
     "usd": Format("one USD file with time samples: Houdini, usdview", "export_splats", "usd"),
     "vtk": Format("material points per frame: ParaView, VisIt", "export_points", "vtk"),
     "points": Format("material points as .ply: Houdini, Blender", "export_points", "points"),
+    "meshes": Format(
+        "a closed surface per fragment: Houdini, Blender, games", "export_meshes", "meshes"
+    ),
     "vti": Format("density and damage volume per frame: ParaView", "export_points", "vti"),
 }
 

@@ -1,6 +1,6 @@
 """The lamps' views: depth and opacity of the splats as each lamp sees them, in one call.
 
-A directional lamp looks through a perspective camera 40 scene radii away (its rays differ by 1.4
+A directional lamp looks through a perspective camera 500 scene radii away (its rays differ by 0.1
 degrees from parallel). A point lamp outside the matter has one wide map toward it; one close to or
 inside it has the six faces of a cube. Maps move in whole texels and change size in steps, so that
 the edges of shadows do not swim when the object moves. Nothing here waits for the device.
@@ -24,7 +24,7 @@ from gsfluent.pipeline.shade_shadow import ShadowMaps
 __all__ = ["bulk", "faces_of", "shadow_maps"]
 
 # Distance of a directional lamp's camera in scene radii.
-_FAR = 40.0
+_FAR = 500.0
 # Free border of a map, as a share of the scene's radius.
 _BORDER = 1.15
 # Steps per doubling in which the size of a directional map changes.
@@ -34,7 +34,7 @@ _OUTSIDE = 1.6
 # Half width of a face of the cube over its distance: past 1, so that the filter has room.
 _CUBE = 1.15
 # Bias: what is nearer than this many mean splat sizes, plus texels, is the surface itself.
-_BIAS_SPLATS = 2.0
+_BIAS_SPLATS = 1.0
 _BIAS_TEXELS = 1.0
 # The bulk of the matter: at most this many root-mean-square distances from its mean.
 _BULK = 3.0

@@ -115,6 +115,7 @@ class LiveSession:
     def _restart(self, index: int, run: Run, base: tuple[int, float]) -> None:
         self.index, self._base, self.failure = index, base, ""
         self.run = run.twin()
+        self._repair.restore({})
         self.pokes: list[dict[str, Any]] = []
         self._frame: SavedFrame | None = None
         self._rest: tuple[State, bool] | None = None

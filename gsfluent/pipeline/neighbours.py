@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["nearest"]
+__all__ = ["nearest", "nearest_rows"]
 
 _CHUNK = 1 << 25  # candidate pairs at a time
 _SIDE = 1 << 20  # cells along an axis that a key can tell apart
@@ -47,6 +47,36 @@ def nearest(
         points.detach().double(), torch.from_numpy(queries).to(points.device), count, cell
     )
     return found[0].cpu().numpy(), found[1].cpu().numpy()
+
+
+def nearest_rows(points: Tensor, queries: Tensor, count: int, cell: float) -> tuple[Tensor, Tensor]:
+    """As :func:`nearest` with tensors, all on the device of ``points``.
+
+    The CPU and a GPU find the same neighbours; of those at exactly the same distance the one with
+    the lower row comes first.
+
+    Args:
+        points: Where to look, [N, 3], world units.
+        queries: [M, 3], world units.
+        count: Neighbours per query, at most N.
+        cell: As for :func:`nearest`.
+
+    Returns:
+        Distances float64 [M, count], ascending, and rows int64 [M, count].
+
+    Raises:
+        ValueError: As :func:`nearest`.
+    """
+    if points.device.type == "cpu":
+        found = nearest(points, queries.detach().double().numpy(), count, cell)
+        distance, index = (torch.from_numpy(part) for part in found)
+    else:
+        distance, index = grid_search(
+            points.detach().double(), queries.detach().double(), count, cell
+        )
+    index, order = index.to(torch.int64).sort(dim=1)
+    distance, order = distance.gather(1, order).sort(dim=1, stable=True)
+    return distance, index.gather(1, order)
 
 
 def grid_search(points: Tensor, queries: Tensor, count: int, cell: float) -> tuple[Tensor, Tensor]:

@@ -32,13 +32,6 @@ from gsfluent.pipeline.occlusion import Occupancy
 from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_normals import Grid, grid_for, splat_normals
-from gsfluent.pipeline.shade import (
-    ALPHA_FLOOR,
-    shade_image,
-    shade_studio,
-    surface_points,
-    to_display,
-)
 from gsfluent.pipeline.shade_shadow import ShadowMaps
 from gsfluent.pipeline.stage import Stage
 
@@ -170,7 +163,8 @@ class Render(Stage):
         lit, extras = None, None
         if lighting is not None:
             lit = self._light(gaussians, camera, lighting.at(time), groups)
-            extras = splat_normals(gaussians, lit.grid)
+            eye = -(viewmat[:3, 3] @ viewmat[:3, :3])
+            extras = splat_normals(gaussians, lit.grid, eye)
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
         seen = ops.rasterize(
@@ -189,54 +183,83 @@ class Render(Stage):
         )
         assert seen.depth is not None  # asked for
         front, normal = seen.image, torch.zeros_like(seen.image)
-        studio = None if self.studio is None else self.studio.packed(means)
         behind = _constant(self.background, means.dtype, means.device)
-        whole = self.backdrop is None  # the fused picture: object, floor and backdrop at once
         if lit is not None and lighting is not None and seen.normal is not None:
-            normal = seen.normal[..., :3]
-            front = shade_image(
+            normal = normalize(seen.normal[..., :3], dim=-1)
+            vectors, gloss = _gloss(lighting, seen.normal, seen.alpha)
+            whole = self.backdrop is None  # object, floor and backdrop at once
+            front = self._shaded(
                 seen.image,
                 seen.alpha,
                 seen.depth,
-                normal,
-                _gloss(lighting, seen),
-                viewmat,
-                intrinsics,
-                lit.lamps,
-                lit.environment,
+                vectors,
+                gloss,
+                (viewmat, intrinsics),
+                lit,
                 behind if whole else torch.zeros_like(behind),
-                maps=lit.maps,
-                grid=lit.grid if lit.occlusion > 0.0 else None,
-                occlusion=lit.occlusion,
-                studio=studio if whole else None,
+                whole,
             )
-            normal = normalize(normal, dim=-1)
             if whole:
                 return Layers(front, seen.alpha, seen.depth, normal)
-        image = self._over_backdrop(front, behind, seen, camera, lit)
+        image = self._over_backdrop(front, behind, seen, (viewmat, intrinsics), camera, lit)
         return Layers(image.clamp(0.0, 1.0), seen.alpha, seen.depth, normal)
 
+    def _shaded(
+        self,
+        image: Tensor,
+        alpha: Tensor,
+        depth: Tensor,
+        vectors: Tensor,
+        gloss: Tensor | None,
+        view: tuple[Tensor, Tensor],
+        lit: Lit,
+        background: Tensor,
+        studio: bool,
+    ) -> Tensor:
+        """The lit picture, over the studio if that is wanted."""
+        floor = self.studio if studio else None
+        maps, grid = lit.maps, lit.grid
+        return ops.shade(
+            image,
+            alpha,
+            depth,
+            vectors,
+            *view,
+            lit.lamps,
+            lit.environment,
+            background,
+            gloss=gloss,
+            maps=None if maps is None else tuple(maps),
+            grid=tuple(grid) if lit.occlusion > 0.0 else None,
+            occlusion=lit.occlusion,
+            studio=None if floor is None else floor.packed(image),
+        )
+
     def _over_backdrop(
-        self, front: Tensor, behind: Tensor, seen: Rendered, camera: Camera, lit: Lit | None
+        self,
+        front: Tensor,
+        behind: Tensor,
+        seen: Rendered,
+        view: tuple[Tensor, Tensor],
+        camera: Camera,
+        lit: Lit | None,
     ) -> Tensor:
         """The matter, times its opacity, over the studio and the captured surroundings."""
         assert seen.depth is not None  # asked for
-        viewmat, intrinsics = _moved(camera.viewmat, front), _moved(camera.K, front)
         alpha = seen.alpha[..., None]
-        _, rays = surface_points(seen.depth, viewmat, intrinsics)
         if self.studio is not None:
-            lamps, around = _plain_light(front) if lit is None else (lit.lamps, lit.environment)
-            radiance = shade_studio(
-                -(viewmat[:3, 3] @ viewmat[:3, :3]),
-                rays,
-                self.studio.packed(front),
-                lamps,
-                around,
-                maps=None if lit is None else lit.maps,
-                grid=None if lit is None or lit.occlusion == 0.0 else lit.grid,
-                occlusion=0.0 if lit is None else lit.occlusion,
+            nothing = torch.zeros_like(front)
+            behind = self._shaded(
+                nothing,
+                torch.zeros_like(seen.alpha),
+                torch.zeros_like(seen.alpha),
+                nothing,
+                _constant((0.0, 1.0), front.dtype, front.device),
+                view,
+                _plain_light(front) if lit is None else lit,
+                behind,
+                True,
             )
-            behind = to_display(radiance)
         if self.backdrop is None:
             return front + behind * (1.0 - alpha)
         captured = self.backdrop.draw(camera, lit)
@@ -305,19 +328,17 @@ class _Size:
         return cls(grid, (x, y, z), radius, gaussians.count, _LOOK_EVERY)
 
 
-def _gloss(lighting: Lighting, seen: Rendered) -> Tensor:
-    """k_s and n_s of each pixel, [H, W, 2], or of all, [2]."""
-    given = seen.normal
-    if given is None or given.shape[-1] < 5:
-        specular = SPECULAR if lighting.specular is None else lighting.specular
-        shininess = SHININESS if lighting.shininess is None else lighting.shininess
-        return _constant((specular, shininess), seen.alpha.dtype, seen.alpha.device)
-    gloss = given[..., 3:5] / seen.alpha[..., None].clamp(min=ALPHA_FLOOR)
-    if lighting.specular is not None:
-        gloss = torch.stack([torch.full_like(seen.alpha, lighting.specular), gloss[..., 1]], -1)
-    if lighting.shininess is not None:
-        gloss = torch.stack([gloss[..., 0], torch.full_like(seen.alpha, lighting.shininess)], -1)
-    return gloss
+def _gloss(lighting: Lighting, given: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Vectors and ``gloss`` for :func:`gsfluent.ops.shade`: k_s, n_s per pixel, or of all."""
+    specular, shininess = lighting.specular, lighting.shininess
+    if given.shape[-1] < 5 or (specular is not None and shininess is not None):
+        specular = SPECULAR if specular is None else specular
+        shininess = SHININESS if shininess is None else shininess
+        return given, _constant((specular, shininess), given.dtype, given.device)
+    for column, value in ((3, specular), (4, shininess)):
+        if value is not None:
+            given[..., column] = value * alpha
+    return given, None
 
 
 def _moved(values: Tensor, like: Tensor) -> Tensor:
@@ -330,7 +351,8 @@ def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
     return torch.tensor(values, dtype=dtype).to(device)
 
 
-def _plain_light(like: Tensor) -> tuple[Tensor, Tensor]:
-    """Packed lamps and environment of a floor under captured colours: evenly lit."""
+def _plain_light(like: Tensor) -> Lit:
+    """The light of a floor under captured colours: even."""
     plain = Lighting(lamps=())
-    return pack_lamps((), (), like), plain.around(like)
+    grid = Occupancy(like.new_zeros(0), like.new_zeros(4), 0)
+    return Lit(pack_lamps((), (), like), plain.around(like), None, grid, 0.0)

@@ -1,30 +1,33 @@
-"""Repair of cracks: transition splats that give both sides of a crack an edge.
+"""Repair of cracks: splats that give both sides of a crack a face.
 
-After Fracture-GS (ICLR 2026): a splat whose point is broken gets, for the nearest unbroken splat on
-either side of it, a copy shaped as the smallest ellipsoid around the overlap of the two
-(:func:`gsfluent.ops.mvee_lens`). Unlike there, the overlap is taken at rest, where it exists by
-construction, and the copy then rides rigidly with the unbroken side, so that it stays when the
-pieces part. The parent stays as well; parent and copies form one sibling group, of which a
-rasterizer shows only the nearest per pixel.
+Two ways, see docs/cracks.md:
+
+* ``gap`` (the default) puts fine, flat splats with the colour of the matter on the faces that open
+  (:mod:`gsfluent.pipeline.crack_faces`);
+* ``mvee`` adds transition splats shaped as the overlap of broken splats and their unbroken
+  neighbours, as the Fracture-GS notes describe it (:mod:`gsfluent.pipeline.repair_mvee`).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gsfluent import geometry, ops
-from gsfluent.data import INTERIOR, TRANSITION, Gaussians
-from gsfluent.pipeline.carry import Carry, Motion
+from gsfluent.data import Gaussians
+from gsfluent.errors import InputError
+from gsfluent.pipeline.carry import Carry, Motion, Points
+from gsfluent.pipeline.crack_gaps import Births, Gaps
+from gsfluent.pipeline.repair_mvee import (
+    CROSS_RADIUS,
+    NEIGHBOUR_RADIUS,
+    CrackGraph,
+    transitions,
+)
 from gsfluent.pipeline.stage import Stage
 
-CROSS_RADIUS = 2.0
-"""Ellipsoids are taken at this many standard deviations (k_sigma)."""
-NEIGHBOUR_RADIUS = 2.5
-"""Splats further than this many mean splat spacings are no neighbours (d_c)."""
-CANDIDATES = 12
+METHODS = ("gap", "mvee", "none")
 
 
 class Repaired(NamedTuple):
@@ -53,166 +56,123 @@ class Repaired(NamedTuple):
 
 
 class Repair(Stage):
-    """Adds transition splats along cracks.
+    """Adds splats along cracks.
 
     Args:
-        radius: Size of the ellipsoids that are intersected, in standard deviations.
-        neighbour_radius: Largest distance of neighbours, in mean splat spacings.
+        method: ``gap``, ``mvee`` or ``none``.
+        radius: Size of the ellipsoids that are intersected, in standard deviations (``mvee``).
+        neighbour_radius: Largest distance of neighbours, in mean splat spacings (``mvee``).
         seed: Not used; repair is deterministic.
+
+    Raises:
+        InputError: An unknown method.
     """
 
     name = "repair"
 
     def __init__(
         self,
+        method: str = "gap",
         *,
         radius: float = CROSS_RADIUS,
         neighbour_radius: float = NEIGHBOUR_RADIUS,
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
+        if method not in METHODS:
+            raise InputError(
+                f"repair: unknown method {method!r}", mend=f"known: {', '.join(METHODS)}"
+            )
+        self.method = method
         self.radius = radius
         self.neighbour_radius = neighbour_radius
-        self._graph: _CrackGraph | None = None
+        self._graph: CrackGraph | None = None
+        self._gaps: Gaps | None = None
+        self._resumed: dict[str, Any] | None = None
 
-    def forward(self, carry: Carry, motion: Motion, carried: Gaussians | None = None) -> Repaired:
+    def step(self, carry: Carry, points: Points) -> Births | None:
+        """Go on to the next frame (method ``gap``): call once per frame, in their order.
+
+        What was open before decides with what is open now, so that nothing flickers.
+
+        Args:
+            carry: The binding of the splats; another one than last time starts a new run.
+            points: Where the material points are.
+
+        Returns:
+            Splats on open crack faces; None where there is none, and with the other methods.
+
+        Raises:
+            InputError: The binding knows no scene.
+        """
+        if self.method != "gap":
+            return None
+        if self._gaps is None or self._gaps.carry is not carry:
+            self._gaps = Gaps(carry)
+        if self._resumed is not None:
+            self._gaps.restore(self._resumed)
+            self._resumed = None
+        return self._gaps.step(points)
+
+    def forward(
+        self,
+        carry: Carry,
+        motion: Motion,
+        carried: Gaussians | None = None,
+        *,
+        births: Births | None = None,
+    ) -> Repaired:
         """Repair the splats of one moment.
 
         Args:
             carry: The binding of the splats.
             motion: Their motion.
             carried: ``carry.apply(motion)``, when it is at hand.
+            births: What :meth:`step` returned for this moment; without it the step is made here.
 
         Returns:
             All splats, sibling groups, and how many were added.
+
+        Raises:
+            InputError: As :meth:`step`.
         """
         moved = carry.apply(motion) if carried is None else carried
-        none = torch.full((moved.count,), -1, dtype=torch.int32, device=moved.device)
-        graph = self._graph
-        if graph is None or graph.carry is not carry:
-            graph = self._graph = _CrackGraph(carry, self.radius, self.neighbour_radius)
-        parent, side = graph.pairs(motion)
-        if parent.numel() == 0:
+        if self.method == "gap":
+            return _with_births(moved, motion, births or self.step(carry, motion.points))
+        if self.method == "none":
             return Repaired.none(moved, motion.anchor)
-        center, shape = graph.lenses(parent, side)
-        rest = carry.gaussians
-        # Rigid with the unbroken side: its rotation about its own centre.
-        turn = motion.rotation[side]
-        means = motion.means[side] + (turn @ (center - rest.means[side])[..., None])[..., 0]
-        quats, scales = geometry.covariance_to_quats_scales(shape)
-        quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), quats)
-        labels = torch.full((parent.numel(),), TRANSITION, dtype=torch.int32, device=moved.device)
-        added = Gaussians(
-            means=means,
-            quats=quats,
-            scales=scales,
-            opacities=rest.opacities[parent],
-            sh=geometry.rotate_sh(rest.sh[parent], turn),
-            labels=labels,
-            normals=None if moved.normals is None else moved.normals[side],
-        )
-        groups = torch.cat([none, parent.to(torch.int32)])
+        if self._graph is None or self._graph.carry is not carry:
+            self._graph = CrackGraph(carry, self.radius, self.neighbour_radius)
+        made = transitions(self._graph, motion, moved)
+        if made is None:
+            return Repaired.none(moved, motion.anchor)
+        added, parent, side = made
+        groups = torch.full((moved.count,), -1, dtype=torch.int32, device=moved.device)
         groups[parent] = parent.to(torch.int32)
+        groups = torch.cat([groups, parent.to(torch.int32)])
         # a pair of splats names its transition splat for good, in whatever order they are born
         ids = torch.arange(moved.count, device=moved.device)
         ids = torch.cat([ids, moved.count * (parent + 1) + side])
         anchor = torch.cat([motion.anchor, motion.anchor[side]])
         return Repaired(Gaussians.cat([moved, added]), groups, parent.numel(), ids, anchor)
 
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs besides the points: plain tensors."""
+        return {} if self._gaps is None else self._gaps.state()
 
-class _CrackGraph:
-    """Neighbours of every splat at rest, nearest first, and the lenses computed so far.
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state` at the next :meth:`step`; from nothing for an empty one."""
+        self._resumed = state
 
-    Args:
-        carry: The binding, which holds the splats at rest.
-        radius: Size of the ellipsoids, in standard deviations.
-        neighbour_radius: Largest distance of neighbours, in mean splat spacings.
-    """
 
-    def __init__(self, carry: Carry, radius: float, neighbour_radius: float) -> None:
-        from scipy.spatial import cKDTree
-
-        means = carry.gaussians.means.cpu().numpy()
-        count = means.shape[0]
-        near = torch.zeros(count, CANDIDATES, dtype=torch.int64)
-        usable = torch.zeros(count, CANDIDATES, dtype=torch.bool)
-        body = carry.body.cpu()
-        for number in body.unique().tolist():
-            rows = (body == number).nonzero()[:, 0]
-            k = min(CANDIDATES + 1, rows.numel())
-            if k < 2:
-                continue
-            distance, which = cKDTree(means[rows.numpy()]).query(means[rows.numpy()], k=k)
-            spacing = float(torch.from_numpy(distance[:, 1]).median())
-            # Dense fillings count their spacing over the nearest eight, as on a lattice.
-            spacing = max(spacing, float(torch.from_numpy(distance[:, min(8, k - 1)]).median()) / 2)
-            near[rows, : k - 1] = rows[torch.from_numpy(which[:, 1:]).to(torch.int64)]
-            usable[rows, : k - 1] = torch.from_numpy(distance[:, 1:]) <= neighbour_radius * spacing
-        device = carry.gaussians.device
-        self._near, self._usable = near.to(device), usable.to(device)
-        self.carry, self.radius = carry, radius
-        self._keys = torch.zeros(0, dtype=torch.int64, device=device)
-        self._centers = carry.gaussians.means.new_zeros(0, 3)
-        self._shapes = carry.gaussians.means.new_zeros(0, 6)
-        self._overlaps = torch.zeros(0, dtype=torch.bool, device=device)
-
-    def pairs(self, motion: Motion) -> tuple[Tensor, Tensor]:
-        """Pick, for each broken inner splat, an unbroken neighbour on each side.
-
-        Returns:
-            Rows of the parents and of the neighbours, int64 [T] each.
-        """
-        carry = self.carry
-        inner = carry.gaussians.labels == INTERIOR
-        parent = (motion.broken & inner).nonzero()[:, 0]
-        if parent.numel() == 0:
-            return parent, parent
-        near = self._near[parent]
-        usable = self._usable[parent] & ~motion.broken[near]
-        first = usable.to(torch.int8).argmax(dim=1)
-        has_first = usable.any(dim=1)
-        rest = carry.gaussians.means
-        offset = rest[near] - rest[parent][:, None]
-        one = offset.gather(1, first[:, None, None].expand(-1, 1, 3))
-        # The other side of the crack: neighbours in the half space away from the first.
-        other = usable & ((offset * one).sum(dim=2) < 0)
-        second = other.to(torch.int8).argmax(dim=1)
-        has_second = other.any(dim=1)
-        parents = torch.cat([parent[has_first], parent[has_second]])
-        sides = torch.cat(
-            [
-                near.gather(1, first[:, None])[has_first, 0],
-                near.gather(1, second[:, None])[has_second, 0],
-            ]
-        )
-        overlap = self._known(parents, sides)
-        return parents[overlap], sides[overlap]
-
-    def _known(self, parent: Tensor, side: Tensor) -> Tensor:
-        """Make sure the lens of each pair is known; return whether the pair overlaps, bool [T].
-
-        A lens depends on the splats at rest only, so each pair is computed once per simulation.
-        """
-        count = self.carry.gaussians.count
-        keys = parent * count + side
-        new = keys[~torch.isin(keys, self._keys)].unique()
-        if new.numel():
-            i, j = new // count, new % count
-            rest = self.carry.gaussians
-            shapes = rest.covariances()
-            center, shape, overlap = ops.mvee_lens(
-                rest.means[i], shapes[i], rest.means[j], shapes[j], radius=self.radius, flat=0.15
-            )
-            if shape.ndim == 3:
-                shape = geometry.pack_symmetric(shape)
-            order = torch.argsort(torch.cat([self._keys, new]))
-            self._keys = torch.cat([self._keys, new])[order]
-            self._centers = torch.cat([self._centers, center])[order]
-            self._shapes = torch.cat([self._shapes, shape])[order]
-            self._overlaps = torch.cat([self._overlaps, overlap])[order]
-        return self._overlaps[torch.searchsorted(self._keys, keys)]
-
-    def lenses(self, parent: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-        """Return centres [T, 3] and covariances [T, 6] of known pairs, at rest."""
-        slots = torch.searchsorted(self._keys, parent * self.carry.gaussians.count + side)
-        return self._centers[slots], self._shapes[slots]
+def _with_births(moved: Gaussians, motion: Motion, births: Births | None) -> Repaired:
+    if births is None:
+        return Repaired.none(moved, motion.anchor)
+    rows = torch.arange(moved.count + births.ids.numel(), device=moved.device)
+    return Repaired(
+        Gaussians.cat([moved, births.gaussians]),
+        torch.full_like(rows, -1, dtype=torch.int32),
+        births.ids.numel(),
+        torch.cat([rows[: moved.count], births.ids]),
+        torch.cat([motion.anchor, births.anchor]),
+    )

@@ -99,6 +99,7 @@ def simulate_stage(context: RunContext) -> None:
         [shot.solve.quality, shot.solve.cells, shot.solve.standing],
         shot.output.fps,
         shot.output.seconds,
+        shot.output.cracks,
     ]
     key = fingerprint("simulate", context.key(context.source_key, settings))
 
@@ -112,6 +113,7 @@ def simulate_stage(context: RunContext) -> None:
             dx=None if cells is None else grid_spacing(scene, cells),
             standing=shot.solve.standing,
             deterministic=shot.solve.deterministic,
+            repair=shot.output.cracks,
         )
         state = folder / _STATE
         resume = state if state.is_file() and count_frames(folder) > 0 else None

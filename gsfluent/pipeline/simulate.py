@@ -21,10 +21,11 @@ from torch import Tensor
 
 from gsfluent.data import Gaussians, Particles
 from gsfluent.errors import InputError
-from gsfluent.pipeline.carry import Carry, Motion
+from gsfluent.pipeline.carry import Carry, Motion, Points
+from gsfluent.pipeline.crack_gaps import Births
 from gsfluent.pipeline.fragments import Fragments
 from gsfluent.pipeline.particles import ALPHA_JITTER, Matter, build_matter, grid_spacing
-from gsfluent.pipeline.repair import Repair, Repaired
+from gsfluent.pipeline.repair import METHODS, Repair, Repaired
 from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_run import Run
 from gsfluent.pipeline.simulate_solver import CFL
@@ -69,6 +70,8 @@ class SimulationFrame:
     colliders: Tensor
     _carry: Carry | None = None
     _repair: Repair | None = None
+    _points: Points | None = None
+    _births: Births | None = None
 
     def _binding(self) -> Carry:
         if self._carry is None:
@@ -82,9 +85,9 @@ class SimulationFrame:
         Splats of all bodies follow each other in the order of the scene; transition splats come
         last.
         """
-        if self._repair is None:
+        if self._repair is None or (self._repair.method == "gap" and self._births is None):
             return Repaired.none(self.carried, self.motion.anchor)
-        return self._repair(self._binding(), self.motion, self.carried)
+        return self._repair(self._binding(), self.motion, self.carried, births=self._births)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -104,10 +107,10 @@ class SimulationFrame:
     @functools.cached_property
     def motion(self) -> Motion:
         """Where each splat has gone."""
-        carry, deformation = self._binding(), self.particles.deformation
-        if deformation is None:
+        carry = self._binding()
+        if self._points is None:
             raise InputError("frame: no deformation was tracked", mend="Simulate(splats=True)")
-        return carry.motion(self.particles.position, deformation, self.fragments, self.broken)
+        return carry.follow(self._points)
 
     @functools.cached_property
     def splat_damage(self) -> Tensor:
@@ -141,7 +144,8 @@ class Simulate(Stage):
             device: the composed operators on a GPU, whose sums have no order.
         standing: Let what stands still on the floor at time 0 sleep, without a strain, until
             something comes near; else its weight begins to act then.
-        repair: Add transition splats along cracks to ``frame.gaussians``.
+        repair: How ``frame.gaussians`` get splats along cracks: a method of
+            :class:`gsfluent.pipeline.Repair`; True for its default, False for ``none``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
         return_map: Options of :func:`gsfluent.ops.return_mapping`.
         max_rollbacks: Roll-backs in a row before the run is given up.
@@ -173,7 +177,7 @@ class Simulate(Stage):
         law_kernels: bool = True,
         contact_near: bool = True,
         deterministic: bool = False,
-        repair: bool = True,
+        repair: bool | str = True,
         splats: bool = True,
         standing: bool = False,
         return_map: dict[str, float | bool] | None = None,
@@ -193,7 +197,10 @@ class Simulate(Stage):
         self.quality, self.dx, self.device = quality, dx, torch.device(device)
         self.jitter, self.max_particles = jitter, max_particles
         self.max_rollbacks, self.step_hook = max_rollbacks, step_hook
-        self.splats, self.with_repair = splats, repair
+        self.splats = splats
+        self._repair = Repair(
+            repair if isinstance(repair, str) else METHODS[0] if repair else "none"
+        )
         self._options = {
             "cfl": cfl,
             "free_flight": free_flight,
@@ -256,14 +263,10 @@ class Simulate(Stage):
             )
         count = max(1, round(fps * seconds))
         run = self.run_of(scene, fps)
-        if resume is not None:
-            run.resume(resume)
+        self._repair.restore(run.resume(resume) if resume is not None else {})
         self._run = run
-        carry = repair = None
-        if self.splats:
-            carry = Carry.bind(scene, run.matter)
-            repair = Repair() if self.with_repair else None
-        return self._frames(run, count, carry, repair, progress)
+        carry = Carry.bind(scene, run.matter) if self.splats else None
+        return self._frames(run, count, carry, self._repair, progress)
 
     def run_of(self, scene: Scene, fps: float) -> Run:
         """A run of a scene at time 0, to be advanced by hand."""
@@ -274,7 +277,7 @@ class Simulate(Stage):
         run: Run,
         count: int,
         carry: Carry | None,
-        repair: Repair | None,
+        repair: Repair,
         progress: Progress | None,
     ) -> Iterator[SimulationFrame]:
         for index in range(run.next_frame, count):
@@ -293,7 +296,7 @@ class Simulate(Stage):
         """
         if self._run is None or self._run.next_frame == 0:
             raise InputError("simulate: there is no frame to save", mend="take a frame first")
-        self._run.save(path)
+        self._run.save(path, self._repair.state())
 
     def report(self) -> dict[str, Any]:
         """Return the section ``simulation`` of run.json, plus ``verdict`` and ``reason``.
@@ -315,10 +318,14 @@ def frame_of(
     peak, start = run.state.peak, run.matter.particles.alpha
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
     damage = torch.where(run.matter.brittle, damage, 0.0)
+    particles, broken, points, births = run.state.particles, peak >= 0, None, None
+    if carry is not None and particles.deformation is not None:
+        points = Points.of(particles.position, particles.deformation, pieces.labels, broken)
+        births = None if repair is None else repair.step(carry, points)
     return SimulationFrame(
         index=index,
         time=time,
-        particles=run.state.particles,
+        particles=particles,
         damage=damage.clamp(0.0, 1.0),
         fragments=pieces.labels,
         energy={
@@ -329,9 +336,11 @@ def frame_of(
         },
         stats=stats,
         pieces=pieces,
-        broken=peak >= 0,
+        broken=broken,
         rigid=run.stepper.rigid,
         colliders=run.state.colliders,
         _carry=carry,
         _repair=repair,
+        _points=points,
+        _births=births,
     )

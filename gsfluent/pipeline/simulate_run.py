@@ -213,8 +213,8 @@ class Run:
         self.per_frame.append(stats)
         return now, pieces, stats
 
-    def save(self, path: str | Path) -> None:
-        """Write the state of the last frame."""
+    def save(self, path: str | Path, repair: dict[str, Any]) -> None:
+        """Write the state of the last frame, and that of the repair of cracks."""
         counters = dataclasses.asdict(self.stepper.counters)
         extra = {
             "counters": counters,
@@ -225,11 +225,12 @@ class Run:
             "per_frame": self.per_frame,
             "seconds": self.seconds,
             "fps": self.fps,
+            "repair": repair,
         }
         save_state(path, self.state, self.matter, extra)
 
-    def resume(self, path: str | Path) -> None:
-        """Take up a saved run.
+    def resume(self, path: str | Path) -> dict[str, Any]:
+        """Take up a saved run; returns the state of the repair of cracks.
 
         Raises:
             InputError: The file is missing, damaged, or belongs to other settings.
@@ -251,6 +252,7 @@ class Run:
         self.ledger.scale = float(extra["ledger"]["scale"])
         self.per_frame = list(extra["per_frame"])
         self.seconds = float(extra["seconds"])
+        return dict(extra.get("repair", {}))
 
     def report(self) -> dict[str, Any]:
         """Return the figures of run.json's section ``simulation``, with verdict and reason."""

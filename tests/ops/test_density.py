@@ -47,6 +47,12 @@ def test_kernels_equal_reference(device: str, dtype: torch.dtype, bar: float) ->
     assert (got.cpu().double() - want).abs().max() < bar
     want_normals = reference.density_normals(means, quats, scales, want, frame(), NODES)
     normals = density_normals(*moved, want.to(device, dtype), place, NODES).cpu().double()
+    eye = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
+    seen = density_normals(*moved, want.to(device, dtype), place, NODES, eye=eye.to(device, dtype))
+    want_seen = reference.density_normals(means, quats, scales, want, frame(), NODES, eye=eye)
+    assert not torch.equal(want_seen, want_normals)
+    normals = torch.cat([normals, seen.cpu().double()])
+    want_normals = torch.cat([want_normals, want_seen])
     error = (normals - want_normals).abs().amax(1)
     # in float32 a splat at a threshold may fall on its other side
     assert error.quantile(0.99) < 10 * bar
@@ -134,6 +140,6 @@ def test_registration() -> None:
     )
     torch.library.opcheck(
         torch.ops.gsfluent.density_normals.default,
-        (means, quats, scales, values, frame(), NODES),
+        (means, quats, scales, values, frame(), NODES, None),
         test_utils=tests,
     )

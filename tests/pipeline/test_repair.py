@@ -104,7 +104,7 @@ def test_no_splat_is_strung_across_a_gap(bound):
 def test_repair_adds_splats_only_at_cracks(bound):
     state = split(bound, 0.1)
     motion = bound.motion(**state)
-    result = Repair()(bound, motion)
+    result = Repair("mvee")(bound, motion)
     count = bound.gaussians.count
     assert result.added > 0 and result.gaussians.count == count + result.added
     labels = result.gaussians.labels
@@ -115,13 +115,13 @@ def test_repair_adds_splats_only_at_cracks(bound):
     assert bool((bound.gaussians.labels[parents] == INTERIOR).all())
     assert bool((bound.gaussians.means[parents, 0].abs() < 0.03).all())
     assert torch.equal(result.gaussians.opacities[count:], bound.gaussians.opacities[parents])
-    none = Repair()(bound, bound.motion(**still(bound)))
+    none = Repair("mvee")(bound, bound.motion(**still(bound)))
     assert none.added == 0 and none.gaussians.count == count
     assert bool((none.groups == -1).all())
 
 
 def test_transition_splats_stay_on_the_edges_of_the_pieces(bound):
-    repair = Repair()
+    repair = Repair("mvee")
     near = repair(bound, bound.motion(**split(bound, 0.05)))
     far = repair(bound, bound.motion(**split(bound, 0.30)))
     assert near.added == far.added
@@ -134,7 +134,7 @@ def test_transition_splats_stay_on_the_edges_of_the_pieces(bound):
 
 
 def test_transition_splats_lie_inside_both_parents_overlap(bound):
-    result = Repair()(bound, bound.motion(**split(bound, 0.0)))
+    result = Repair("mvee")(bound, bound.motion(**split(bound, 0.0)))
     count = bound.gaussians.count
     parents = result.groups[count:].long()
     largest = bound.gaussians.scales[parents].amax(dim=1)

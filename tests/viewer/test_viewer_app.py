@@ -16,9 +16,11 @@ from viewer_scene import FRAMES, frame, write_run
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
 from gsfluent.errors import InputError
+from gsfluent.pipeline.light import Lamp, Lighting
 from gsfluent.pipeline.run_frames import SavedFrame, save_frame
 from gsfluent.viewer import splats
 from gsfluent.viewer.app import App
+from gsfluent.viewer.light_panel import Handles
 from gsfluent.viewer.source import RunSource
 
 CPU = torch.device("cpu")
@@ -153,3 +155,22 @@ def test_a_run_that_is_begun_anew_stays_in_range(serve: Any, tmp_path: Path) -> 
     save_frame(folder, frame(0))
     (folder / "stage.json").write_text('{"fingerprint": "new", "complete": false}')
     until(lambda: app.timeline.count == 1 and app.index == 0)
+
+
+def test_lamps_are_turned_about_the_object_and_come_back() -> None:
+    pivot = (0.1, -0.2, 0.3)
+    far = Lamp(direction=(1.0, -1.0, 2.0), intensity=0.7, color=(1.0, 0.5, 0.2))
+    where = Handles.of(far, pivot)
+    assert where.distance is None
+    again = where.moved(far, pivot)
+    assert again.toward == pytest.approx(far.toward) and again.intensity == 0.7
+    near = Handles(90.0, 0.0, 0.5).moved(far, pivot)
+    assert near.position == pytest.approx((0.1, 0.3, 0.3)) and near.color == far.color
+    assert near.distance == 0.5  # its strength is that at the object
+    back = Handles.of(near, pivot)
+    assert (back.azimuth, back.elevation, back.distance) == pytest.approx((90.0, 0.0, 0.5))
+
+
+def test_the_page_starts_with_the_light_of_the_shot(serve: Any) -> None:
+    app = serve(Falling())
+    assert app.look.light == Lighting()  # no shot: the usual one, untouched by the controls
