@@ -36,6 +36,10 @@ class ExportOptions:
         size: (width, height) of pictures [px]; the shot's own by default.
         fps: Pictures or time codes per second; the shot's own by default.
         alpha: Pictures with a transparent background instead of the studio.
+        relit: Bake the light into the colours of splats and meshes.
+        light: Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
+        lamps: More lamps.
+        environment: An equirectangular picture, ``sky`` or ``none``.
     """
 
     frames: str | None = None
@@ -54,6 +58,10 @@ class ExportOptions:
     size: tuple[int, int] | None = None
     fps: float | None = None
     alpha: bool = False
+    relit: bool = False
+    light: str | None = None
+    lamps: tuple[str, ...] = ()
+    environment: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
