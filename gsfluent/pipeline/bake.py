@@ -59,9 +59,9 @@ def bake_light(
     grid = size.of(means)
     normal = normalize(splat_normals(gaussians, grid), dim=-1)
     lamps = lighting.drawn()
-    center, radius = bulk(gaussians)
-    x, y, z = center.tolist()
-    faces = faces_of(lamps, (x, y, z), float(radius))
+    where = bulk(gaussians)
+    x, y, z = where.middle.tolist()
+    faces = faces_of(lamps, (x, y, z), float(where.radius))
     maps = shadow_maps(gaussians, lamps, faces, lighting.resolution or _RESOLUTION, groups=groups)
     skin = means + (_LIFT * size.cell) * normal
     ao = None

@@ -8,6 +8,7 @@ a host synchronisation: one scatter, pooling, and one lookup per quantity.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -58,15 +59,26 @@ class Occupancy(NamedTuple):
         return self.values[start : start + side**3].view(side, side, side)
 
 
-def box_frame(means: Tensor, cell: float, nodes: int) -> Tensor:
-    """Corner and cell [4] of a grid of ``nodes``^3 around the bulk of ``means`` [N, 3]."""
+def box_frame(middle: Tensor, cell: float, nodes: int) -> Tensor:
+    """Corner and cell [4] of a grid of ``nodes``^3 around ``middle`` [3], in coarse steps."""
     step = cell * COARSEST
-    corner = means.mean(0) - 0.5 * nodes * cell
-    corner = (corner / step).round() * step
-    return torch.cat([corner, corner.new_full((1,), cell)])
+    corner = ((middle - 0.5 * nodes * cell) / step).round() * step
+    return torch.cat([corner, _constant(cell, middle.dtype, middle.device)])
 
 
-def occupancy(means: Tensor, cell: float, nodes: int, *, per_cell: float = PER_CELL) -> Occupancy:
+@functools.lru_cache(maxsize=64)
+def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor([value], dtype=torch.float64).to(device, dtype)
+
+
+def occupancy(
+    means: Tensor,
+    cell: float,
+    nodes: int,
+    *,
+    per_cell: float = PER_CELL,
+    middle: Tensor | None = None,
+) -> Occupancy:
     """Occupancy of the bulk of ``means`` [N, 3], by :func:`gsfluent.ops.occupancy`.
 
     Args:
@@ -74,8 +86,9 @@ def occupancy(means: Tensor, cell: float, nodes: int, *, per_cell: float = PER_C
         cell: Finest cell [m].
         nodes: Cells along each side, a multiple of 16.
         per_cell: Splats in a full cell.
+        middle: Middle of the matter [m], [3]; the mean of the centres when None.
     """
-    frame = box_frame(means, cell, nodes)
+    frame = box_frame(means.mean(0) if middle is None else middle, cell, nodes)
     return Occupancy(ops.occupancy(means, frame, nodes, full=FULL * per_cell), frame, nodes)
 
 

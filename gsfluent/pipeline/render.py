@@ -293,11 +293,12 @@ class Render(Stage):
         faces = faces_of(lamps, size.center, size.radius)
         large = max(camera.width, camera.height) > _LARGE
         texels = lighting.resolution or _RESOLUTIONS[large]
+        where = bulk(gaussians)
         return Lit(
             pack_lamps(lamps, faces, gaussians.means),
             lighting.around(gaussians.means),
-            shadow_maps(gaussians, lamps, faces, texels, groups=groups),
-            size.grid.of(gaussians.means),
+            shadow_maps(gaussians, lamps, faces, texels, groups=groups, where=where),
+            size.grid.of(gaussians.means, where.middle),
             lighting.occlusion,
         )
 
@@ -322,8 +323,8 @@ class _Size:
 
     @classmethod
     def of(cls, gaussians: Gaussians, cell: float | None) -> _Size:
-        middle, reach = bulk(gaussians)
-        x, y, z, radius = torch.cat([middle, reach[None]]).tolist()
+        where = bulk(gaussians)
+        x, y, z, radius = torch.cat([where.middle, where.radius[None]]).tolist()
         grid = grid_for(gaussians, cell=cell, radius=1.25 * radius)
         return cls(grid, (x, y, z), radius, gaussians.count, _LOOK_EVERY)
 

@@ -66,9 +66,9 @@ class Grid(NamedTuple):
     nodes: int
     per_cell: float
 
-    def of(self, means: Tensor) -> Occupancy:
-        """Occupancy of centres [N, 3]."""
-        return occupancy(means, self.cell, self.nodes, per_cell=self.per_cell)
+    def of(self, means: Tensor, middle: Tensor | None = None) -> Occupancy:
+        """Occupancy of centres [N, 3], on a grid around ``middle`` [3] or else their mean."""
+        return occupancy(means, self.cell, self.nodes, per_cell=self.per_cell, middle=middle)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:
@@ -84,7 +84,7 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
     from gsfluent.pipeline.light_maps import bulk
 
     cell = occupancy_cell(gaussians) if cell is None else cell
-    radius = radius or float(bulk(gaussians)[1])
+    radius = radius or float(bulk(gaussians).radius)
     most = _MOST_NODES if gaussians.device.type == "cuda" else _MOST_NODES_CPU
     coarser = max(1.0, 2.0 * radius / (cell * (most - 2 * _ROOM)))
     nodes = int(2.0 * radius / (coarser * cell)) + 2 * _ROOM
