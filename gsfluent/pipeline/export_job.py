@@ -28,12 +28,18 @@ class ExportOptions:
         attributes: Properties ``fragment`` and ``material`` in PLY.
         spz_version: 2 or 3.
         usd_ending: ``usdc``, ``usda`` or ``usdz``.
-        usd_parts: Some of ``splats``, ``particles``.
+        usd_parts: Some of ``splats``, ``particles``, ``meshes``.
+        mesh_ending: ``ply``, ``obj`` or ``glb``.
+        mesh_blur: Point spacings over which fragments' surfaces are smoothed.
         key_every: Frames from one key frame to the next of a delta file.
         camera: Camera or camera path of pictures; the shot's own by default.
         size: (width, height) of pictures [px]; the shot's own by default.
         fps: Pictures or time codes per second; the shot's own by default.
         alpha: Pictures with a transparent background instead of the studio.
+        relit: Bake the light into the colours of splats and meshes.
+        light: Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
+        lamps: More lamps.
+        environment: An equirectangular picture, ``sky`` or ``none``.
     """
 
     frames: str | None = None
@@ -45,11 +51,17 @@ class ExportOptions:
     spz_version: int = 3
     usd_ending: str = "usdc"
     usd_parts: tuple[str, ...] = ("splats", "particles")
+    mesh_ending: str = "ply"
+    mesh_blur: float = 1.0
     key_every: int = 30
     camera: str | None = None
     size: tuple[int, int] | None = None
     fps: float | None = None
     alpha: bool = False
+    relit: bool = False
+    light: str | None = None
+    lamps: tuple[str, ...] = ()
+    environment: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

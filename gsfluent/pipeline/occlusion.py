@@ -8,8 +8,8 @@ a host synchronisation: one scatter, pooling, and one lookup per quantity.
 
 from __future__ import annotations
 
-import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -59,36 +59,30 @@ class Occupancy(NamedTuple):
         return self.values[start : start + side**3].view(side, side, side)
 
 
-def box_frame(middle: Tensor, cell: float, nodes: int) -> Tensor:
-    """Corner and cell [4] of a grid of ``nodes``^3 around ``middle`` [3], in coarse steps."""
+def box_frame(center: Sequence[float], cell: float, nodes: int) -> list[float]:
+    """Corner x, y, z and cell of a grid of ``nodes``^3 around ``center`` [m], in whole steps."""
     step = cell * COARSEST
-    corner = ((middle - 0.5 * nodes * cell) / step).round() * step
-    return torch.cat([corner, _constant(cell, middle.dtype, middle.device)])
-
-
-@functools.lru_cache(maxsize=64)
-def _constant(value: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.tensor([value], dtype=torch.float64).to(device, dtype)
+    return [*(round((x - 0.5 * nodes * cell) / step) * step for x in center), cell]
 
 
 def occupancy(
     means: Tensor,
+    center: Sequence[float],
     cell: float,
     nodes: int,
     *,
     per_cell: float = PER_CELL,
-    middle: Tensor | None = None,
 ) -> Occupancy:
     """Occupancy of the bulk of ``means`` [N, 3], by :func:`gsfluent.ops.occupancy`.
 
     Args:
         means: Centres [m]; those off the grid are left out.
+        center: Middle of the grid [m], about.
         cell: Finest cell [m].
         nodes: Cells along each side, a multiple of 16.
         per_cell: Splats in a full cell.
-        middle: Middle of the matter [m], [3]; the mean of the centres when None.
     """
-    frame = box_frame(means.mean(0) if middle is None else middle, cell, nodes)
+    frame = means.new_tensor(box_frame(center, cell, nodes))
     return Occupancy(ops.occupancy(means, frame, nodes, full=FULL * per_cell), frame, nodes)
 
 

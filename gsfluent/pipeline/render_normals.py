@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from gsfluent import ops
@@ -20,8 +19,6 @@ from gsfluent.pipeline.occlusion import COARSEST, PER_CELL, Occupancy, occupancy
 
 __all__ = ["Grid", "estimate_normals", "grid_for", "occupancy_cell", "splat_normals"]
 
-# Vectors of this length come from a flat splat's own axis; the density's are shorter.
-_FLAT = 0.9
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
 _MOST_NODES = 256
@@ -66,9 +63,9 @@ class Grid(NamedTuple):
     nodes: int
     per_cell: float
 
-    def of(self, means: Tensor, middle: Tensor | None = None) -> Occupancy:
-        """Occupancy of centres [N, 3], on a grid around ``middle`` [3] or else their mean."""
-        return occupancy(means, self.cell, self.nodes, per_cell=self.per_cell, middle=middle)
+    def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
+        """Occupancy of centres [N, 3] around ``center`` [m]."""
+        return occupancy(means, center, self.cell, self.nodes, per_cell=self.per_cell)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:
@@ -84,7 +81,7 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
     from gsfluent.pipeline.light_maps import bulk
 
     cell = occupancy_cell(gaussians) if cell is None else cell
-    radius = radius or float(bulk(gaussians).radius)
+    radius = radius or bulk(gaussians).radius
     most = _MOST_NODES if gaussians.device.type == "cuda" else _MOST_NODES_CPU
     coarser = max(1.0, 2.0 * radius / (cell * (most - 2 * _ROOM)))
     nodes = int(2.0 * radius / (coarser * cell)) + 2 * _ROOM
@@ -99,7 +96,11 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
         gaussians: In the scene frame, any state.
         cell: Grid spacing; found from the positions when not given.
     """
-    return splat_normals(gaussians, grid_for(gaussians, cell=cell).of(gaussians.means))
+    from gsfluent.pipeline.light_maps import bulk
+
+    matter = bulk(gaussians)
+    grid = grid_for(gaussians, cell=cell, radius=matter.radius)
+    return splat_normals(gaussians, grid.of(gaussians.means, matter.center))
 
 
 def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = None) -> Tensor:
@@ -116,12 +117,12 @@ def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = No
             shell is a sheet without a side to the density, from outside and from inside. When
             None, flat splats take the side of the density.
     """
-    means = gaussians.means
-    outward = ops.density_normals(
-        means, gaussians.quats, gaussians.scales, grid.values, grid.frame, grid.nodes
+    return ops.density_normals(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        grid.values,
+        grid.frame,
+        grid.nodes,
+        eye=eye,
     )
-    if eye is None:
-        return outward
-    away = (outward * (eye - means)).sum(-1, keepdim=True) < 0.0
-    flat = outward.square().sum(-1, keepdim=True) > _FLAT * _FLAT
-    return torch.where(away & flat, -outward, outward)

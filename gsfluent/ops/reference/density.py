@@ -78,7 +78,14 @@ def sample(volume: Tensor, frame: Tensor, nodes: int, points: Tensor) -> Tensor:
 
 
 def density_normals(
-    means: Tensor, quats: Tensor, scales: Tensor, values: Tensor, frame: Tensor, nodes: int
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    values: Tensor,
+    frame: Tensor,
+    nodes: int,
+    *,
+    eye: Tensor | None = None,
 ) -> Tensor:
     """See ``gsfluent.ops``."""
     fine = -sample(gradient(level_of(values, nodes, 0), PASSES), frame, nodes, means)
@@ -95,5 +102,6 @@ def density_normals(
     agreement = (axis * outward).sum(-1)
     trusted = agreement.abs() > 0.5 * outward.norm(dim=-1) - UNCLEAR
     trusted &= shortest < FLAT * middle
-    side = torch.where(agreement < 0, -1.0, 1.0).to(axis)
+    side = agreement if eye is None else (axis * (eye - means)).sum(-1)
+    side = torch.where(side < 0, -1.0, 1.0).to(axis)
     return torch.where(trusted[:, None], axis * side[:, None], outward)
