@@ -53,8 +53,8 @@ def room() -> Tensor:
 
 def evening() -> Tensor:
     """A made-up evening: blue above, orange low on the left, dark ground; linear radiance."""
-    polar = (torch.arange(64, dtype=torch.float64) + 0.5)[:, None] * math.pi / 64
-    turn = (torch.arange(128, dtype=torch.float64) + 0.5) / 64.0 * math.pi - math.pi
+    polar = (torch.arange(32, dtype=torch.float64) + 0.5)[:, None] * math.pi / 32
+    turn = (torch.arange(64, dtype=torch.float64) + 0.5) / 32.0 * math.pi - math.pi
     up, left = polar.cos(), (-(polar.sin() * turn.sin())).clamp(min=0.0)
     sky = torch.tensor([0.25, 0.40, 0.75], dtype=torch.float64) * (0.6 + 0.4 * up)[..., None]
     glow = torch.tensor([1.6, 0.8, 0.3], dtype=torch.float64) * (left**2)[..., None]
