@@ -53,8 +53,8 @@ def room() -> Tensor:
 
 def evening() -> Tensor:
     """A made-up evening: blue above, orange low on the left, dark ground; linear radiance."""
-    polar = (torch.arange(64, dtype=torch.float64) + 0.5)[:, None] * math.pi / 64
-    turn = (torch.arange(128, dtype=torch.float64) + 0.5) / 64.0 * math.pi - math.pi
+    polar = (torch.arange(32, dtype=torch.float64) + 0.5)[:, None] * math.pi / 32
+    turn = (torch.arange(64, dtype=torch.float64) + 0.5) / 32.0 * math.pi - math.pi
     up, left = polar.cos(), (-(polar.sin() * turn.sin())).clamp(min=0.0)
     sky = torch.tensor([0.25, 0.40, 0.75], dtype=torch.float64) * (0.6 + 0.4 * up)[..., None]
     glow = torch.tensor([1.6, 0.8, 0.3], dtype=torch.float64) * (left**2)[..., None]
@@ -164,10 +164,9 @@ def shadow(name: str, *, samples: int = 1) -> dict[str, float]:
     middle = splats.means.mean(0).double()
     expected = truth.unblocked(line, true, [thing], middle, 4000)
     lamps = Lighting(lamps=(replace_samples(lamp, samples),)).drawn()
-    center, radius = bulk(splats)
-    x, y, z = center.tolist()
-    faces = faces_of(lamps, (x, y, z), float(radius))
-    maps = shadow_maps(splats, lamps, faces, MAP)
+    matter = bulk(splats)
+    faces = faces_of(lamps, matter)
+    maps = shadow_maps(splats, lamps, faces, MAP, matter)
     assert maps is not None
     up = torch.tensor([0.0, 0.0, 1.0]).expand(line.shape[0], 3)
     table = pack_lamps(lamps, faces, splats.means)
@@ -235,7 +234,7 @@ def occlusion(name: str) -> tuple[float, Tensor, Tensor]:
     """RMS error of the sky's share, found and true values along the points."""
     things, splats, points, normals = occlusion_cases()[name]
     expected = truth.sky_share(points, normals, things, 4000)
-    grid = grid_for(splats).of(splats.means)
+    grid = grid_for(splats).of(splats.means, bulk(splats).center)
     found = ambient_occlusion(points.float(), normals.float(), grid).double()
     return float((found - expected).square().mean().sqrt()), found, expected
 

@@ -38,6 +38,53 @@ struct DensityNormalArgs {
   T* normals;      // [N, 3]
 };
 
+template <typename T>
+struct BulkArgs {
+  int64_t count;
+  const T *means, *scales;  // [N, 3] each
+  double* out;              // [kBulkSize]
+};
+
+// Sums of a cloud of splats over those with finite numbers: how many, centre, squared distance from
+// the origin of the coordinates, the three scales. What comes out: centre x, y, z, root mean square
+// and largest distance from it, mean scale.
+constexpr int kBulkSums = 6;
+constexpr int kBulkSize = 6;
+template <typename T>
+GSF_HOST_DEVICE bool bulk_terms(const BulkArgs<T>& a, int64_t i, double* sum) {
+  const double x = a.means[3 * i], y = a.means[3 * i + 1], z = a.means[3 * i + 2];
+  const double size = double(a.scales[3 * i]) + a.scales[3 * i + 1] + a.scales[3 * i + 2];
+  if (!finite(x + y + z + size)) return false;
+  sum[0] += 1.0;
+  sum[1] += x;
+  sum[2] += y;
+  sum[3] += z;
+  sum[4] += x * x + y * y + z * z;
+  sum[5] += size;
+  return true;
+}
+// `sum` may be `out`; the largest distance is left at zero.
+GSF_HOST_DEVICE void bulk_finish(const double* sum, double* out) {
+  const double n = max(sum[0], 1.0), x = sum[1] / n, y = sum[2] / n, z = sum[3] / n;
+  const double spread = max(sum[4] / n - (x * x + y * y + z * z), 0.0), size = sum[5] / (3.0 * n);
+  out[0] = x;
+  out[1] = y;
+  out[2] = z;
+  out[3] = std::sqrt(spread);
+  out[4] = 0.0;
+  out[5] = size;
+}
+// Squared distance of splat `i` from the centre, 0 when it was left out.
+template <typename T>
+GSF_HOST_DEVICE double bulk_away(const BulkArgs<T>& a, int64_t i) {
+  double unused[kBulkSums];
+  for (double& v : unused) v = 0.0;
+  if (!bulk_terms(a, i, unused)) return 0.0;
+  const double x = a.means[3 * i] - a.out[0], y = a.means[3 * i + 1] - a.out[1],
+               z = a.means[3 * i + 2] - a.out[2];
+  return x * x + y * y + z * z;
+}
+
 GSF_HOST_DEVICE int64_t density_level(int nodes, int level) {
   int64_t start = 0;
   for (int l = 0; l < level; ++l) {

@@ -63,9 +63,9 @@ class Grid(NamedTuple):
     nodes: int
     per_cell: float
 
-    def of(self, means: Tensor) -> Occupancy:
-        """Occupancy of centres [N, 3]."""
-        return occupancy(means, self.cell, self.nodes, per_cell=self.per_cell)
+    def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
+        """Occupancy of centres [N, 3] around ``center`` [m]."""
+        return occupancy(means, center, self.cell, self.nodes, per_cell=self.per_cell)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:
@@ -81,7 +81,7 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
     from gsfluent.pipeline.light_maps import bulk
 
     cell = occupancy_cell(gaussians) if cell is None else cell
-    radius = radius or float(bulk(gaussians)[1])
+    radius = radius or bulk(gaussians).radius
     most = _MOST_NODES if gaussians.device.type == "cuda" else _MOST_NODES_CPU
     coarser = max(1.0, 2.0 * radius / (cell * (most - 2 * _ROOM)))
     nodes = int(2.0 * radius / (coarser * cell)) + 2 * _ROOM
@@ -96,7 +96,11 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
         gaussians: In the scene frame, any state.
         cell: Grid spacing; found from the positions when not given.
     """
-    return splat_normals(gaussians, grid_for(gaussians, cell=cell).of(gaussians.means))
+    from gsfluent.pipeline.light_maps import bulk
+
+    matter = bulk(gaussians)
+    grid = grid_for(gaussians, cell=cell, radius=matter.radius)
+    return splat_normals(gaussians, grid.of(gaussians.means, matter.center))
 
 
 def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = None) -> Tensor:
