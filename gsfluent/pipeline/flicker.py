@@ -74,7 +74,7 @@ class Flow:
         valid &= after.silhouette[row, column] & ((found - z).abs() <= HIDDEN * spacing)
         # rims are soft: what lies beside other matter, or moves unlike its neighbours, is mixed
         far = HIDDEN * spacing
-        valid &= (_range(before.depth[..., None]) <= far)
+        valid &= _range(before.depth[..., None]) <= far
         valid &= (_range(after.depth[..., None]) <= far)[row, column]
         shift = target - torch.stack([x, y], -1)
         valid &= _range(shift) <= COHERENT
