@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from crack_cases import CASES, METHODS, Broken, Drawn, ideal
+from crack_cases import CASES, METHODS, Broken, Drawn, Moment, ideal
 from page import enter
 from torch import Tensor
 
@@ -31,9 +31,12 @@ from gsfluent.data import Camera
 from gsfluent.io import save_image
 from gsfluent.lab.fracture_pictures import PARTED, TrueCloud, TruePicture
 from gsfluent.metrics import psnr, ssim
+from gsfluent.ops.raster import Rendered
 from gsfluent.pipeline.compare_weights import Lpips
 from gsfluent.pipeline.draw import draw
+from gsfluent.pipeline.flicker import Flow, flicker
 from gsfluent.pipeline.render_camera import Action, look_at
+from gsfluent.pipeline.render_holes import Holes, MatterView
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "crack_accuracy.md"
 VIEWS = ((-60.0, 20.0), (60.0, 20.0), (180.0, 20.0), (0.0, 55.0))
@@ -72,20 +75,23 @@ def true_pictures(
     return [TruePicture(*(part[c] for part in parts)) for c in range(len(views))]
 
 
-def picture(drawn: Drawn, camera: Camera) -> Tensor:
+def picture(drawn: Drawn, camera: Camera) -> Rendered:
     gaussians, groups = drawn
-    back = torch.tensor(WHITE)
-    image = draw(gaussians, camera, groups=groups, background=back, near=0.01).image
-    return image.clamp(0.0, 1.0)
+    options: dict[str, Any] = {"near": 0.01, "median_depth": True, "groups": groups}
+    return draw(gaussians, camera, background=torch.tensor(WHITE), **options)
 
 
 class Score:
-    """Figures of one method, a list over frames and cameras each."""
+    """Figures of one method, one row for each frame and camera."""
 
     def __init__(self, lpips: Lpips | None) -> None:
-        self.lpips, self.rows = lpips, []  # type: ignore[var-annotated]
+        self.lpips = lpips
+        self.rows: list[dict[str, float]] = []
+        self._last: dict[int, Tensor] = {}
 
-    def add(self, image: Tensor, truth: TruePicture) -> None:
+    def add(
+        self, image: Tensor, truth: TruePicture, holes: Holes | None, view: int, flow: Flow | None
+    ) -> None:
         row = {
             "psnr": psnr(image, truth.image),
             "psnr_inside": psnr(image, truth.image, (truth.alpha > 0.5).float()),
@@ -94,10 +100,21 @@ class Score:
         if self.lpips is not None:
             pair = [(x.numpy() * 255).round().astype(np.uint8) for x in (image, truth.image)]
             row["lpips"] = self.lpips(*pair)
+        if holes is not None:
+            row |= {"holes": 100 * holes.fraction, "through": 100 * holes.through}
+        if flow is not None:
+            change = flicker(self._last[view], image, flow)
+            if change is not None:
+                row["flicker"] = 100 * change
+        self._last[view] = image
         self.rows.append(row)
 
     def means(self) -> dict[str, float]:
-        return {k: float(np.mean([row[k] for row in self.rows])) for k in self.rows[0]}
+        names = dict.fromkeys(k for row in self.rows for k in row)
+        found = {k: float(np.mean([row[k] for row in self.rows if k in row])) for k in names}
+        if "holes" in names:
+            found["most holes"] = max(row["holes"] for row in self.rows)
+        return found
 
 
 def methods(broken: Broken, cloud: TrueCloud, only: list[str] | None) -> dict[str, Any]:
@@ -106,29 +123,46 @@ def methods(broken: Broken, cloud: TrueCloud, only: list[str] | None) -> dict[st
 
 
 def judge(broken: Broken, given: argparse.Namespace) -> dict[str, Any]:
-    """All methods over the broken frames of one case, and the whole object for comparison."""
+    """All methods over broken frames of one case, and the whole object for comparison."""
     size = (given.size, round(0.75 * given.size))
     views = cameras(broken, size)
     cloud = broken.cloud(given.voxels, given.parted)
-    frames = given.frames or broken.broken_frames()
+    every = broken.broken_frames()
+    # two frames each shortly after the break and late, so that flicker can be measured
+    frames = given.frames or sorted({*every[1:3], *every[-2:]})
     lpips = Lpips(given.lpips, torch.device("cpu")) if given.lpips else None
     chosen = methods(broken, cloud, given.only)
-    scores = {name: Score(lpips) for name in chosen}
+    scores = {name: Score(lpips) for name in ("truth", *chosen)}
     whole = Score(lpips)
-    before = broken.broken_frames()[0] - 1
+    before = every[0] - 1
     first = broken.carry.apply(broken.moment(before).motion(broken.carry)), None
     truths = true_pictures(broken, cloud, before, views, given.voxels)
-    for camera, truth in zip(views, truths, strict=True):
-        whole.add(picture(first, camera), truth)
+    for number, (camera, truth) in enumerate(zip(views, truths, strict=True)):
+        whole.add(picture(first, camera).image.clamp(0, 1), truth, None, number, None)
+    volume, spacing = broken.matter.particles.volume, broken.matter.spacing[0]
+    last: tuple[int, Moment, list[MatterView]] | None = None
     for index in frames:
         truths = true_pictures(broken, cloud, index, views, given.voxels)
         moment = broken.moment(index)
+        matter = [MatterView.of(moment.position, volume, camera) for camera in views]
+        flows: list[Flow | None] = [None] * len(views)
+        if last is not None and last[0] == index - 1:
+            moved = last[1].position, moment.position
+            flows = [
+                Flow.of(old, new, moved, (camera, camera), spacing)
+                for old, new, camera in zip(last[2], matter, views, strict=True)
+            ]
+        last = index, moment, matter
         rows: list[list[Tensor]] = [[truth.image] for truth in truths]
+        for number, truth in enumerate(truths):
+            scores["truth"].add(truth.image, truth, None, number, flows[number])
         for name, method in chosen.items():
             drawn = method(broken, moment)
-            for row, camera, truth in zip(rows, views, truths, strict=True):
-                row.append(picture(drawn, camera))
-                scores[name].add(row[-1], truth)
+            for number, (row, camera, truth) in enumerate(zip(rows, views, truths, strict=True)):
+                seen = picture(drawn, camera)
+                row.append(seen.image.clamp(0.0, 1.0))
+                holes = Holes.of(seen, matter[number])
+                scores[name].add(row[-1], truth, holes, number, flows[number])
         if given.sheets:
             titles = ["truth", *chosen]
             sheet(rows[given.view], titles, given.sheets / f"{broken.name}_{index:03d}.png")
@@ -161,24 +195,37 @@ def sheet(pictures: list[Tensor], titles: list[str], path: Path) -> None:
     save_image(torch.from_numpy(np.concatenate(tiles, 1)).float() / 255, path)
 
 
+COLUMNS = {
+    "psnr": ("PSNR image", ".2f"),
+    "psnr_inside": ("silhouette", ".2f"),
+    "ssim": ("SSIM", ".3f"),
+    "lpips": ("LPIPS", ".3f"),
+    "holes": ("holes %", ".2f"),
+    "most holes": ("most", ".2f"),
+    "through": ("see-through %", ".2f"),
+    "flicker": ("flicker %", ".2f"),
+}
+
+
 def table(name: str, found: dict[str, Any]) -> Iterator[str]:
-    names = {"psnr": "image", "psnr_inside": "silhouette", "ssim": "SSIM", "lpips": "LPIPS"}
-    columns = [k for k in names if k in found["whole"]]
+    everything = found["methods"] | {"(before it breaks)": found["whole"]}
+    columns = [k for k in COLUMNS if any(k in row for row in everything.values())]
     yield (
         f"**{name}**: {found['splats']} splats on {found['points']} points, "
-        f"{len(found['frames'])} broken frames, {found['cameras']} cameras"
+        f"frames {', '.join(map(str, found['frames']))}, {found['cameras']} cameras"
     )
     yield ""
-    yield "| method | PSNR " + " | ".join(names[k] for k in columns) + " | over raw |"
+    yield "| method | " + " | ".join(COLUMNS[k][0] for k in columns) + " | over raw |"
     yield "| --- " * (len(columns) + 2) + "|"
     base = found["methods"].get("raw", {}).get("psnr")
-    for method, row in found["methods"].items():
-        over = "" if base is None else f"{row['psnr'] - base:+.2f}"
-        cells = [f"{row[k]:.3f}" if k in ("ssim", "lpips") else f"{row[k]:.2f}" for k in columns]
+    for method, row in everything.items():
+        judged = method not in ("truth", "(before it breaks)")
+        over = f"{row['psnr'] - base:+.2f}" if base is not None and judged else ""
+        cells = [
+            format(row[k], COLUMNS[k][1]) if k in row and (judged or math.isfinite(row[k])) else ""
+            for k in columns
+        ]
         yield "| " + " | ".join([method, *cells, over]) + " |"
-    row = found["whole"]
-    cells = [f"{row[k]:.3f}" if k in ("ssim", "lpips") else f"{row[k]:.2f}" for k in columns]
-    yield "| " + " | ".join(["(before it breaks)", *cells, ""]) + " |"
 
 
 def main() -> int:
@@ -189,7 +236,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--object", nargs="*", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--frames", type=numbers, help="default: all in which it is broken")
+    parser.add_argument("--frames", type=numbers, help="default: two early, two late")
     parser.add_argument("--only", type=lambda s: s.split(","), help="methods, comma-separated")
     parser.add_argument("--size", type=int, default=400, help="width of the pictures [px]")
     parser.add_argument("--cells", type=int, default=20, help="grid cells along the object")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import inspect
 from collections.abc import Callable
@@ -189,6 +190,7 @@ class Broken:
             values = {k: torch.from_numpy(data[k]) for k in data.files}
         return Moment(**values | {"pieces": int(values["pieces"])})
 
+    @functools.cache  # noqa: B019
     def broken_frames(self) -> list[int]:
         """Frames in which a hundredth of the matter or more is broken."""
         parts = [float(self.moment(k).broken.float().mean()) for k in range(self.count)]

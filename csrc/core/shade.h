@@ -10,12 +10,14 @@ constexpr double kAlphaFloor = 1e-4;
 constexpr double kOpaque = 0.999;  // what is behind such a pixel is not worked out
 constexpr double kFaded = 1e-6;    // share below which the floor is left out
 constexpr double kDisplayGamma = 2.2;
-constexpr double kOcclusionReach = 1.0;
-constexpr double kOcclusionFlat = 0.08;
-// How much of the sky a level of the pyramid hides when full.
-GSF_HOST_DEVICE constexpr double occlusion_share(int level) {
-  return level == 0 ? 0.0 : (level < 3 ? 0.28 : (level == 3 ? 0.24 : 0.2));
-}
+// Occlusion cones: levels, looks in cells of a level, own blur, filling, weight of the middle cone,
+// tilt of the other four. Fitted, see gsfluent/pipeline/occlusion.py.
+constexpr int kConeFirst = 1, kConeLast = 4;
+constexpr double kConeReach = 2.16;
+constexpr double kConeFlat = 0.02;
+constexpr double kConeGain = 1.23;
+constexpr double kConeCenter = 0.43;
+constexpr double kConeCos = 0.445, kConeSin = 0.8955;
 
 template <typename T>
 GSF_HOST_DEVICE Vec3<T> to_linear(const Vec3<T>& c) {
@@ -58,46 +60,80 @@ GSF_HOST_DEVICE Vec3<T> irradiance(const T* e, const Vec3<T>& n) {
 // Trilinear value of one level of the pyramid, cell centres as nodes; 0 outside.
 template <typename T>
 GSF_HOST_DEVICE T sample_level(const T* values, int side, const Vec3<T>& place) {
-  using std::floor;
-  const T x0 = floor(place.x), y0 = floor(place.y), z0 = floor(place.z);
-  // Comparisons that NaN fails.
+  // Comparisons that NaN fails; most of a picture's looks end here.
   const T high = T(side);
-  if (!(x0 >= T(-1) && x0 < high && y0 >= T(-1) && y0 < high && z0 >= T(-1) && z0 < high))
+  if (!(place.x > T(-1) && place.x < high && place.y > T(-1) && place.y < high && place.z > T(-1) &&
+        place.z < high))
     return T(0);
-  const int i = static_cast<int>(x0), j = static_cast<int>(y0), k = static_cast<int>(z0);
-  const T fx = place.x - x0, fy = place.y - y0, fz = place.z - z0;
+  // Casts cut toward zero: shifted by one they round down.
+  const int i = static_cast<int>(place.x + T(1)) - 1, j = static_cast<int>(place.y + T(1)) - 1,
+            k = static_cast<int>(place.z + T(1)) - 1;
+  const T fx = place.x - T(i), fy = place.y - T(j), fz = place.z - T(k);
+  const int last = side - 1, layer = side * side;
+  if (i >= 0 && j >= 0 && k >= 0 && i < last && j < last && k < last) {
+    const T* v = values + (int64_t(k) * layer + j * side + i);
+    const auto row = [&](const T* w) { return w[0] + fx * (w[1] - w[0]); };
+    const T near0 = row(v), near1 = row(v + side), far0 = row(v + layer),
+            far1 = row(v + layer + side);
+    const T low = near0 + fy * (near1 - near0);
+    return low + fz * (far0 + fy * (far1 - far0) - low);
+  }
   T sum = T(0);
   for (int corner = 0; corner < 8; ++corner) {
     const int dx = corner & 1, dy = corner >> 1 & 1, dz = corner >> 2;
     const int x = i + dx, y = j + dy, z = k + dz;
     if (x < 0 || x >= side || y < 0 || y >= side || z < 0 || z >= side) continue;
     sum += (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * (dz ? fz : T(1) - fz) *
-           values[(int64_t(z) * side + y) * side + x];
+           values[int64_t(z) * layer + y * side + x];
   }
   return sum;
 }
 
-// Share of the sky that reaches a point: a wide cone along the normal through the pyramid.
+// What one cone of weight 1 lets through from a point on.
 template <typename T>
-GSF_HOST_DEVICE T open_sky(const ShadeArgs<T>& a, const Vec3<T>& point, const Vec3<T>& normal) {
-  if (!a.occupancy) return T(1);
-  const T cell = a.grid_frame[3];
-  const Vec3<T> corner{a.grid_frame[0], a.grid_frame[1], a.grid_frame[2]};
-  T open = T(1);
+GSF_HOST_DEVICE T open_cone(const ShadeArgs<T>& a, const Vec3<T>& from, const Vec3<T>& way) {
   const T* values = a.occupancy;
-  for (int level = 0; level < kOcclusionLevels; ++level) {
+  T left = T(1);
+  for (int level = 0; level <= kConeLast; ++level) {
     const int side = a.nodes >> level;
-    if (occlusion_share(level) > 0.0) {
-      const T wide = cell * T(1 << level);
-      const Vec3<T> out = point + (T(kOcclusionReach) * wide) * normal - corner;
-      const Vec3<T> place{out.x / wide - T(0.5), out.y / wide - T(0.5), out.z / wide - T(0.5)};
-      const T seen =
-          (sample_level(values, side, place) - T(kOcclusionFlat)) / T(1.0 - kOcclusionFlat);
-      open -= T(occlusion_share(level)) * max(seen, T(0));
+    if (level >= kConeFirst) {
+      const T scale = T(1) / T(1 << level), reach = T(kConeReach);
+      const Vec3<T> place{scale * from.x + reach * way.x - T(0.5),
+                          scale * from.y + reach * way.y - T(0.5),
+                          scale * from.z + reach * way.z - T(0.5)};
+      const T seen = sample_level(values, side, place) - T(kConeFlat);
+      left *= max(T(1) - T(kConeGain / (1.0 - kConeFlat)) * max(seen, T(0)), T(0));
     }
     values += int64_t(side) * side * side;
   }
-  return T(1) - a.occlusion * (T(1) - max(open, T(0)));
+  return left;
+}
+
+// Share of the sky that reaches a point, by five cones; all of it without a normal.
+template <typename T>
+GSF_HOST_DEVICE T open_sky(const ShadeArgs<T>& a, const Vec3<T>& point, const Vec3<T>& normal) {
+  using std::fabs;
+  if (!a.occupancy || !(dot(normal, normal) > T(0.5))) return T(1);
+  // In finest cells.
+  const Vec3<T> from = (T(1) / a.grid_frame[3]) *
+                       (point - Vec3<T>{a.grid_frame[0], a.grid_frame[1], a.grid_frame[2]});
+  // Farther off than the longest look (and its interpolation) nothing can be seen.
+  const T away = T((kConeReach + 1.0) * (1 << kConeLast)), end = T(a.nodes) + away;
+  if (!(from.x > -away && from.x < end && from.y > -away && from.y < end && from.z > -away &&
+        from.z < end))
+    return T(1);
+  const T steep = T(fabs(normal.x) > T(0.6)), gentle = T(1) - steep;
+  const Vec3<T> across =
+      unit(Vec3<T>{-normal.z * steep, normal.z * gentle, normal.x * steep - normal.y * gentle});
+  const Vec3<T> other = cross(normal, across);
+  T open = T(kConeCenter) * open_cone(a, from, normal);
+  const T diagonal = T(kConeSin * 0.70710678118654752);
+  for (int k = 0; k < 4; ++k) {
+    const T p = k == 0 || k == 3 ? diagonal : -diagonal, q = k < 2 ? diagonal : -diagonal;
+    const Vec3<T> way = T(kConeCos) * normal + p * across + q * other;
+    open += T(0.25 * (1.0 - kConeCenter)) * open_cone(a, from, way);
+  }
+  return T(1) - a.occlusion * (T(1) - open);
 }
 
 // Unit vector from a point toward the lamp, and the lamp's falloff there.

@@ -9,11 +9,13 @@
 namespace gsf {
 
 constexpr int kSearchTaps = 16;
-constexpr int kFilterTaps = 24;
+constexpr int kFilterTaps = 32;
 constexpr double kLeastSearch = 2.0;  // texels
 constexpr double kLeastFilter = 1.2;
-constexpr double kMostSpread = 0.125;  // of the map's side
+constexpr double kMostSpread = 0.25;  // of the map's side
+constexpr double kSure = 0.3;         // opacity from which a blocker counts for the deepest one
 constexpr double kSteepest = 4.0;
+constexpr double kNormalOffset = 1.0;  // biases that a point is lifted off bumpy splats
 constexpr double kTinyLength = 1e-12;
 
 // Points of Vogel's spiral over the unit disc, one after the other: turns by the golden angle.
@@ -79,7 +81,7 @@ GSF_HOST_DEVICE int shadow_face(const ShadeArgs<T>& a, const T* lamp, const Vec3
   return best;
 }
 
-// Share of the lamp's light that reaches a point with unit normal; 1 outside the map.
+// Share of the lamp's light that reaches a point with unit normal; 1 behind the lamp.
 template <typename T>
 GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, const Vec3<T>& point,
                                        const Vec3<T>& normal, T biased) {
@@ -92,7 +94,9 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   view.depth_map = a.map_depth + int64_t(face) * a.texels * a.texels;
   view.alpha_map = a.map_alpha + int64_t(face) * a.texels * a.texels;
   const Vec3<T> r0{row[0], row[1], row[2]}, r1{row[4], row[5], row[6]}, r2{row[8], row[9], row[10]};
-  const Vec3<T> local{dot(r0, point) + row[3], dot(r1, point) + row[7], dot(r2, point) + row[11]};
+  const Vec3<T> raised = point + (T(kNormalOffset) * biased * row[14]) * normal;
+  const Vec3<T> local{dot(r0, raised) + row[3], dot(r1, raised) + row[7],
+                      dot(r2, raised) + row[11]};
   view.plane = {dot(r0, normal), dot(r1, normal), dot(r2, normal)};
   view.depth = local.z;
   view.focal = row[12];
@@ -104,8 +108,7 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   view.x = view.u * view.focal + half;
   view.y = view.v * view.focal + half;
   const T side = T(a.texels);
-  if (!(local.z > T(0) && view.x > T(0) && view.x < side && view.y > T(0) && view.y < side))
-    return T(1);
+  if (!(local.z > T(0))) return T(1);
   view.level = dot(view.plane, local);
   view.per_depth = view.focal / safe;
   const bool is_point = lamp[0] > T(0.5);
@@ -116,7 +119,7 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   T search = lamp[9] * (view.depth - closest) * view.per_depth;
   if (is_point) search = search / max(closest, T(kTinyLength));
   search = clamp(search, T(kLeastSearch), most);
-  T weight = T(0), total = T(0);
+  T weight = T(0), total = T(0), deepest = T(0);
   Spiral<T> spiral;
   for (int i = 0; i < kSearchTaps; ++i) {
     T du, dv;
@@ -130,10 +133,13 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
     if (found < view.own_depth(du, dv) - view.bias) {
       weight += share;
       total += share * found;
+      if (share > T(kSure)) deepest = max(deepest, found);
     }
   }
   if (!(weight > T(0))) return T(1);
-  const T blocker = total / max(weight, T(kTinyLength));
+  // Of what a lamp sees of a body the rim, which limits the light, is deepest.
+  const T mean = total / max(weight, T(kTinyLength));
+  const T blocker = T(0.5) * (mean + max(mean, deepest));
   T spread = lamp[9] * max(view.depth - blocker, T(0)) * view.per_depth;
   if (is_point) spread = spread / max(blocker, T(kTinyLength));
   spread = clamp(spread, T(kLeastFilter), most);

@@ -34,8 +34,24 @@ struct DensityOps {
     return values;
   }
 
+  static Tensor bulk(Tensor means, Tensor scales) {
+    const char* op = "splat_bulk";
+    check_shape(op, "means", means, {-1, 3});
+    check_shape(op, "scales", scales, {means.size(0), 3});
+    check_dtype(op, "scales", scales, means.scalar_type());
+    check_same_device(op, "scales", scales, means);
+    means = gsf::contiguous(means);
+    scales = gsf::contiguous(scales);
+    Tensor out = gsf::new_zeros(means, {kBulkSize}, ScalarType::Double);
+    dispatch_floating(op, means, [&]<typename T>() {
+      const BulkArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(scales), mptr<double>(out)};
+      Backend::bulk(args, means);
+    });
+    return out;
+  }
+
   static Tensor normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame,
-                        int64_t nodes) {
+                        int64_t nodes, OptTensor eye) {
     const char* op = "density_normals";
     check_shape(op, "means", means, {-1, 3});
     const int64_t n = means.size(0);
@@ -50,6 +66,12 @@ struct DensityOps {
       check_same_device(op, "every tensor", *t, means);
       *t = gsf::contiguous(*t);
     }
+    if (eye) {
+      check_shape(op, "eye", *eye, {3});
+      check_dtype(op, "eye", *eye, means.scalar_type());
+      check_same_device(op, "eye", *eye, means);
+      eye = gsf::contiguous(*eye);
+    }
     const auto real = means.scalar_type();
     const int64_t cells = int64_t(side) * side * side, coarse = int64_t(wide) * wide * wide;
     Tensor out = gsf::new_empty(means, {n, 3}, real);
@@ -57,9 +79,18 @@ struct DensityOps {
     dispatch_floating(op, means, [&]<typename T>() {
       if (n == 0) return;
       T* room = mptr<T>(smooth);
-      const DensityNormalArgs<T> args{
-          n,    cptr<T>(means), cptr<T>(quats),   cptr<T>(scales), cptr<T>(values), cptr<T>(frame),
-          side, room,           room + 2 * cells, room + cells,    mptr<T>(out)};
+      const DensityNormalArgs<T> args{n,
+                                      cptr<T>(means),
+                                      cptr<T>(quats),
+                                      cptr<T>(scales),
+                                      cptr<T>(values),
+                                      cptr<T>(frame),
+                                      eye ? cptr<T>(*eye) : nullptr,
+                                      side,
+                                      room,
+                                      room + 2 * cells,
+                                      room + cells,
+                                      mptr<T>(out)};
       Backend::normals(args, means);
     });
     return out;

@@ -20,10 +20,12 @@ class Export(Verb):
       gsfluent export out --to ply-seq                       # out/frames/frame_0001.ply ...
       gsfluent export out --to ply-seq --compressed --up=-y  # for SuperSplat: drop the folder on it
       gsfluent export out --to spz,glb --frames 40           # one moment, for a web page
+      gsfluent export out --to ply-seq --relit --light=1,-1,2   # with light and shadow baked in
       gsfluent export out --to delta                         # one small file: out/splats.gsd
       gsfluent export splats.gsd --to ply-seq                # and back, for any viewer
       gsfluent export out --to usd -o cut_07                 # Houdini, usdview: one scene.usdc
       gsfluent export out --to vtk,vti                       # ParaView: open particles.vtk.series
+      gsfluent export out --to meshes --mesh-ending obj      # Blender, Houdini: closed fragments
       gsfluent export out --to mp4 --camera freeze           # time stands still, once around
       gsfluent export out --to webp --alpha --size 480x270   # to lay over a web page
 
@@ -32,6 +34,7 @@ class Export(Verb):
       delta    all frames in one small file, read by gsfluent.io.DeltaReader
       usd      all frames in one file: splats, particles with velocity and damage
       vtk, points, vti                 the material points: .vtk, .ply, density volume
+      meshes                           a closed, coloured surface per fragment
       mp4, gif, webp, png              pictures, along any camera path (docs/render.md)
 
     An interrupted sequence goes on where it stopped when the command is given again.
@@ -62,7 +65,11 @@ class Export(Verb):
     usd_ending: Literal["usdc", "usda", "usdz"] = "usdc"
     """usd: binary, text or zipped."""
     usd_parts: str = "splats,particles"
-    """usd: what goes in."""
+    """usd: what goes in, of splats, particles, meshes."""
+    mesh_ending: Literal["ply", "obj", "glb"] = "ply"
+    """meshes: one mesh with a property fragment (ply), or an object per fragment (obj, glb)."""
+    mesh_blur: float = 1.0
+    """meshes: smoothing in point spacings; less shows the points, more rounds the edges."""
     camera: str | None = None
     """Pictures: orbit, turntable, dolly, freeze[:FRAME], a photograph's index, or a path's file."""
     size: str | None = None
@@ -71,6 +78,14 @@ class Export(Verb):
     """Pictures and usd: frames shown per second; the simulation's own by default."""
     alpha: bool = False
     """png, webp: nothing behind the object."""
+    relit: bool = False
+    """Bake the light into the colours of splats and meshes, for viewers that have none."""
+    light: str | None = None
+    """Toward the key light, such as 1,-1,2, or a YAML file with a light: section."""
+    lamp: Annotated[tuple[str, ...], tyro.conf.arg(metavar="LAMP")] = ()
+    """More lamps, such as 'point=0.3,0,0.5;intensity=2'."""
+    environment: str | None = None
+    """Light from everywhere: an equirectangular picture, sky, or none."""
 
     def execute(self) -> dict[str, Any]:
         """Export."""
@@ -89,10 +104,16 @@ class Export(Verb):
             key_every=self.key_every,
             spz_version=self.spz_version,
             usd_ending=self.usd_ending,
+            mesh_ending=self.mesh_ending,
+            mesh_blur=self.mesh_blur,
             camera=self.camera,
             size=parse_size(self.size) if self.size else None,
             fps=self.fps,
             alpha=self.alpha,
+            relit=self.relit,
+            light=self.light,
+            lamps=self.lamp,
+            environment=self.environment,
             usd_parts=tuple(part.strip() for part in self.usd_parts.split(",")),
         )
         with self.progress("export") as progress:

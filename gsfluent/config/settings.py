@@ -42,7 +42,7 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
 
 
 EXPORTS = (
-    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti",
+    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti", "meshes",
 )  # fmt: skip
 """What a run can write beside the video; ``gsfluent export`` writes these and more."""
 

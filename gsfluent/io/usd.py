@@ -20,6 +20,7 @@ from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
+from gsfluent.io.gltf import to_linear
 
 _THREE_SIGMA = 3.0
 
@@ -203,7 +204,7 @@ class UsdWriter:
         corners = np.ascontiguousarray(faces.reshape(-1), np.int32)
         prim.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(corners), time)
         # display colours of a stage are linear light
-        prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(_linear(colors)), time)
+        prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(to_linear(colors)), time)
         prim.CreateExtentAttr().Set(_box(where, 0.0), time)
         self._seen[name].add(time)
 
@@ -232,13 +233,6 @@ class UsdWriter:
 def _floats(values: Any) -> NDArray[np.float32]:
     array = values.numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
     return np.ascontiguousarray(array, dtype=np.float32)
-
-
-def _linear(display: NDArray[Any]) -> NDArray[np.float32]:
-    """From sRGB display values to linear light (IEC 61966-2-1)."""
-    low = display / 12.92
-    high = ((np.maximum(display, 0.04045) + 0.055) / 1.055) ** 2.4
-    return _floats(np.where(display <= 0.04045, low, high))
 
 
 def _box(points: NDArray[Any], margin: float) -> Any:

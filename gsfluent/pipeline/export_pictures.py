@@ -11,10 +11,12 @@ from torch import Tensor
 
 from gsfluent.errors import InputError
 from gsfluent.pipeline.export_job import Job, span
+from gsfluent.pipeline.export_relit import lighting_for
+from gsfluent.pipeline.light_shot import gloss_of
 from gsfluent.pipeline.render_camera import Action
 from gsfluent.pipeline.render_path import FREEZE_SECONDS, Cut, freeze
 from gsfluent.pipeline.run_frames import count_frames, load_frame
-from gsfluent.pipeline.run_show import Film, light_of, poster_frame, shot_of
+from gsfluent.pipeline.run_show import Film, poster_frame, shot_of
 from gsfluent.pipeline.video import to_bytes, write_animation, write_video
 
 _ALPHA_FLOOR = 1e-4  # below, a pixel has no colour of its own
@@ -86,7 +88,7 @@ class _Takes:
             output = replace(output, size=options.size)
         self.size = output.size
         shot = replace(shot, output=output)
-        self.film = Film.of(job.out, shot, light_of(shot), job.device)
+        self.film = Film.of(job.out, shot, lighting_for(shot, options), job.device)
         if options.alpha:
             self.film.render.studio = self.film.render.backdrop = None
             self.film.render.background = (0.0, 0.0, 0.0)
@@ -114,7 +116,13 @@ class _Takes:
         for done, cut in enumerate(self.cuts, start=1):
             if loaded is None or loaded.index != cut.frame:
                 loaded = self.film.frame(cut.frame)
-            layers = self.film.render.layers(loaded.gaussians, cut.camera, groups=loaded.groups)
+            layers = self.film.render.layers(
+                loaded.gaussians,
+                cut.camera,
+                groups=loaded.groups,
+                gloss=gloss_of(self.film.shot, loaded),
+                time=loaded.time,
+            )
             image = straight(layers.image, layers.alpha) if self.job.options.alpha else layers.image
             yield to_bytes(image)
             self.job.report(done, len(self.cuts), kind)

@@ -17,7 +17,7 @@ from gsfluent.pipeline.export_constant import Constant
 from gsfluent.pipeline.export_frames import Moment
 from gsfluent.pipeline.export_job import Job, span
 
-_USD_PARTS = ("splats", "particles")
+_USD_PARTS = ("splats", "particles", "meshes")
 
 
 def _sequence(
@@ -123,5 +123,10 @@ def usd(job: Job) -> str:
                     saved.velocity.cpu().numpy(),
                     properties,
                 )
+            if "meshes" in parts:
+                from gsfluent.pipeline.export_meshes import fragment_meshes
+
+                for piece in fragment_meshes(moment, job.options.mesh_blur):
+                    stage.mesh(code, piece.name, piece.vertices, piece.faces, piece.colors)
             job.report(place + 1, len(job.reel), "usd")
     return name

@@ -2,7 +2,8 @@
 
 The material point that a pixel shows (:class:`gsfluent.pipeline.render_holes.MatterView`) says
 where the pixel is in the next frame; there the picture should have the same colour. The camera may
-move as well. Matter that the next frame hides, or shows as something else, is left out.
+move as well. Matter that the next frame hides, or shows as something else, is left out, and so are
+the rims of pieces and crumbs that turn: there a picture changes although nothing is wrong with it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from gsfluent.pipeline.render_holes import MatterView
 
 HIDDEN = 1.5
 """Matter found this many point spacings nearer or farther than expected is other matter."""
+COHERENT = 1.0
+"""Neighbouring pixels whose shifts differ by more [px] show matter that is coming apart."""
+_RIM = 2
 _BLUR = (0.25, 0.5, 0.25)
 
 
@@ -68,6 +72,12 @@ class Flow:
         column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
         found = after.depth[row, column]
         valid &= after.silhouette[row, column] & ((found - z).abs() <= HIDDEN * spacing)
+        # rims are soft: what lies beside other matter, or moves unlike its neighbours, is mixed
+        far = HIDDEN * spacing
+        valid &= _range(before.depth[..., None]) <= far
+        valid &= (_range(after.depth[..., None]) <= far)[row, column]
+        shift = target - torch.stack([x, y], -1)
+        valid &= _range(shift) <= COHERENT
         return cls(target, valid)
 
 
@@ -88,6 +98,15 @@ def flicker(before: Tensor, after: Tensor, flow: Flow) -> float | None:
         return None
     change = (_sampled(_blurred(after), flow.target) - _blurred(before)).abs().mean(-1)
     return float(change[flow.valid].mean())
+
+
+def _range(image: Tensor) -> Tensor:
+    """Largest spread of a channel in the neighbourhood of each pixel of [H, W, C], [H, W]."""
+    planes = image.permute(2, 0, 1)[None]
+    size = 2 * _RIM + 1
+    high = torch.nn.functional.max_pool2d(planes, size, 1, _RIM)
+    low = -torch.nn.functional.max_pool2d(-planes, size, 1, _RIM)
+    return (high - low)[0].amax(0)
 
 
 def _unproject(camera: Camera, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:

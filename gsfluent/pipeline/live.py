@@ -98,7 +98,10 @@ class LiveSession:
             self.dx = dx
         self.fps = fps
         self._simulate = Simulate(
-            dx=self.dx, seed=seed, device=device, **({"standing": True} | options)
+            dx=self.dx,
+            seed=seed,
+            device=device,
+            **({"standing": True, "loose_crumbs": True} | options),
         )
         start = copy_of(scene)
         self._first = self._simulate.run_of(start, fps)

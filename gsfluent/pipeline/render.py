@@ -9,7 +9,7 @@ each pixel once. Siblings that repair created are composited nearest-only throug
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -27,26 +27,19 @@ from gsfluent.pipeline.light import (
     lighting_of,
     pack_lamps,
 )
-from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.light_maps import Bulk, bulk, faces_of, shadow_maps
 from gsfluent.pipeline.occlusion import Occupancy
 from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_normals import Grid, grid_for, splat_normals
-from gsfluent.pipeline.shade import (
-    ALPHA_FLOOR,
-    shade_image,
-    shade_studio,
-    surface_points,
-    to_display,
-)
 from gsfluent.pipeline.shade_shadow import ShadowMaps
 from gsfluent.pipeline.stage import Stage
 
 # Pictures whose longest side is above this get shadow maps of the second size.
 _LARGE = 800
 _RESOLUTIONS = (512, 1024)
-# How many pictures share one look at how large the matter is (each look waits for the device).
-_LOOK_EVERY = 16
+# Room of the occupancy grid for matter that flies apart; beyond, a new one is laid out.
+_ROOM = 1.25
 
 
 @dataclass(frozen=True)
@@ -170,7 +163,8 @@ class Render(Stage):
         lit, extras = None, None
         if lighting is not None:
             lit = self._light(gaussians, camera, lighting.at(time), groups)
-            extras = splat_normals(gaussians, lit.grid)
+            eye = -(viewmat[:3, 3] @ viewmat[:3, :3])
+            extras = splat_normals(gaussians, lit.grid, eye)
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
         seen = ops.rasterize(
@@ -189,54 +183,83 @@ class Render(Stage):
         )
         assert seen.depth is not None  # asked for
         front, normal = seen.image, torch.zeros_like(seen.image)
-        studio = None if self.studio is None else self.studio.packed(means)
         behind = _constant(self.background, means.dtype, means.device)
-        whole = self.backdrop is None  # the fused picture: object, floor and backdrop at once
         if lit is not None and lighting is not None and seen.normal is not None:
-            normal = seen.normal[..., :3]
-            front = shade_image(
+            normal = normalize(seen.normal[..., :3], dim=-1)
+            vectors, gloss = _gloss(lighting, seen.normal, seen.alpha)
+            whole = self.backdrop is None  # object, floor and backdrop at once
+            front = self._shaded(
                 seen.image,
                 seen.alpha,
                 seen.depth,
-                normal,
-                _gloss(lighting, seen),
-                viewmat,
-                intrinsics,
-                lit.lamps,
-                lit.environment,
+                vectors,
+                gloss,
+                (viewmat, intrinsics),
+                lit,
                 behind if whole else torch.zeros_like(behind),
-                maps=lit.maps,
-                grid=lit.grid if lit.occlusion > 0.0 else None,
-                occlusion=lit.occlusion,
-                studio=studio if whole else None,
+                whole,
             )
-            normal = normalize(normal, dim=-1)
             if whole:
                 return Layers(front, seen.alpha, seen.depth, normal)
-        image = self._over_backdrop(front, behind, seen, camera, lit)
+        image = self._over_backdrop(front, behind, seen, (viewmat, intrinsics), camera, lit)
         return Layers(image.clamp(0.0, 1.0), seen.alpha, seen.depth, normal)
 
+    def _shaded(
+        self,
+        image: Tensor,
+        alpha: Tensor,
+        depth: Tensor,
+        vectors: Tensor,
+        gloss: Tensor | None,
+        view: tuple[Tensor, Tensor],
+        lit: Lit,
+        background: Tensor,
+        studio: bool,
+    ) -> Tensor:
+        """The lit picture, over the studio if that is wanted."""
+        floor = self.studio if studio else None
+        maps, grid = lit.maps, lit.grid
+        return ops.shade(
+            image,
+            alpha,
+            depth,
+            vectors,
+            *view,
+            lit.lamps,
+            lit.environment,
+            background,
+            gloss=gloss,
+            maps=None if maps is None else tuple(maps),
+            grid=tuple(grid) if lit.occlusion > 0.0 else None,
+            occlusion=lit.occlusion,
+            studio=None if floor is None else floor.packed(image),
+        )
+
     def _over_backdrop(
-        self, front: Tensor, behind: Tensor, seen: Rendered, camera: Camera, lit: Lit | None
+        self,
+        front: Tensor,
+        behind: Tensor,
+        seen: Rendered,
+        view: tuple[Tensor, Tensor],
+        camera: Camera,
+        lit: Lit | None,
     ) -> Tensor:
         """The matter, times its opacity, over the studio and the captured surroundings."""
         assert seen.depth is not None  # asked for
-        viewmat, intrinsics = _moved(camera.viewmat, front), _moved(camera.K, front)
         alpha = seen.alpha[..., None]
-        _, rays = surface_points(seen.depth, viewmat, intrinsics)
         if self.studio is not None:
-            lamps, around = _plain_light(front) if lit is None else (lit.lamps, lit.environment)
-            radiance = shade_studio(
-                -(viewmat[:3, 3] @ viewmat[:3, :3]),
-                rays,
-                self.studio.packed(front),
-                lamps,
-                around,
-                maps=None if lit is None else lit.maps,
-                grid=None if lit is None or lit.occlusion == 0.0 else lit.grid,
-                occlusion=0.0 if lit is None else lit.occlusion,
+            nothing = torch.zeros_like(front)
+            behind = self._shaded(
+                nothing,
+                torch.zeros_like(seen.alpha),
+                torch.zeros_like(seen.alpha),
+                nothing,
+                _constant((0.0, 1.0), front.dtype, front.device),
+                view,
+                _plain_light(front) if lit is None else lit,
+                behind,
+                True,
             )
-            behind = to_display(radiance)
         if self.backdrop is None:
             return front + behind * (1.0 - alpha)
         captured = self.backdrop.draw(camera, lit)
@@ -262,62 +285,59 @@ class Render(Stage):
         self, gaussians: Gaussians, camera: Camera, lighting: Lighting, groups: Tensor | None
     ) -> Lit:
         """Shadow maps and occupancy of this state of the matter."""
+        matter = bulk(gaussians)
         size = self._size
-        if size is None or size.left == 0 or size.count != gaussians.count:
-            size = _Size.of(gaussians, self.normal_cell)
-        self._size = replace(size, left=size.left - 1)
+        if size is None or not size.fits(gaussians.count, matter):
+            size = self._size = _Size.of(gaussians, matter, self.normal_cell)
         lamps = lighting.drawn()
-        faces = faces_of(lamps, size.center, size.radius)
+        faces = faces_of(lamps, matter)
         large = max(camera.width, camera.height) > _LARGE
         texels = lighting.resolution or _RESOLUTIONS[large]
         return Lit(
             pack_lamps(lamps, faces, gaussians.means),
             lighting.around(gaussians.means),
-            shadow_maps(gaussians, lamps, faces, texels, groups=groups),
-            size.grid.of(gaussians.means),
+            shadow_maps(gaussians, lamps, faces, texels, matter, groups=groups),
+            size.grid.of(gaussians.means, matter.center),
             lighting.occlusion,
         )
 
 
 @dataclass(frozen=True)
 class _Size:
-    """How large the matter is, as the host knows it.
+    """The occupancy grid, and the matter it was made for.
 
     Attributes:
-        grid: Size of the occupancy grid.
-        center: Middle of the matter [m].
-        radius: Radius of its bulk [m].
+        grid: Its size.
+        radius: Largest radius of the matter [m] it has room for.
         count: Splats at that time.
-        left: Pictures until the next look.
     """
 
     grid: Grid
-    center: tuple[float, float, float]
     radius: float
     count: int
-    left: int
 
     @classmethod
-    def of(cls, gaussians: Gaussians, cell: float | None) -> _Size:
-        middle, reach = bulk(gaussians)
-        x, y, z, radius = torch.cat([middle, reach[None]]).tolist()
-        grid = grid_for(gaussians, cell=cell, radius=1.25 * radius)
-        return cls(grid, (x, y, z), radius, gaussians.count, _LOOK_EVERY)
+    def of(cls, gaussians: Gaussians, matter: Bulk, cell: float | None) -> _Size:
+        radius = _ROOM * matter.radius
+        return cls(grid_for(gaussians, cell=cell, radius=radius), radius, gaussians.count)
+
+    def fits(self, count: int, matter: Bulk) -> bool:
+        """Whether it will do for this matter too."""
+        alike = self.count < _ROOM * count and count < _ROOM * self.count
+        return alike and 0.5 * self.radius < matter.radius <= self.radius
 
 
-def _gloss(lighting: Lighting, seen: Rendered) -> Tensor:
-    """k_s and n_s of each pixel, [H, W, 2], or of all, [2]."""
-    given = seen.normal
-    if given is None or given.shape[-1] < 5:
-        specular = SPECULAR if lighting.specular is None else lighting.specular
-        shininess = SHININESS if lighting.shininess is None else lighting.shininess
-        return _constant((specular, shininess), seen.alpha.dtype, seen.alpha.device)
-    gloss = given[..., 3:5] / seen.alpha[..., None].clamp(min=ALPHA_FLOOR)
-    if lighting.specular is not None:
-        gloss = torch.stack([torch.full_like(seen.alpha, lighting.specular), gloss[..., 1]], -1)
-    if lighting.shininess is not None:
-        gloss = torch.stack([gloss[..., 0], torch.full_like(seen.alpha, lighting.shininess)], -1)
-    return gloss
+def _gloss(lighting: Lighting, given: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Vectors and ``gloss`` for :func:`gsfluent.ops.shade`: k_s, n_s per pixel, or of all."""
+    specular, shininess = lighting.specular, lighting.shininess
+    if given.shape[-1] < 5 or (specular is not None and shininess is not None):
+        specular = SPECULAR if specular is None else specular
+        shininess = SHININESS if shininess is None else shininess
+        return given, _constant((specular, shininess), given.dtype, given.device)
+    for column, value in ((3, specular), (4, shininess)):
+        if value is not None:
+            given[..., column] = value * alpha
+    return given, None
 
 
 def _moved(values: Tensor, like: Tensor) -> Tensor:
@@ -330,7 +350,8 @@ def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
     return torch.tensor(values, dtype=dtype).to(device)
 
 
-def _plain_light(like: Tensor) -> tuple[Tensor, Tensor]:
-    """Packed lamps and environment of a floor under captured colours: evenly lit."""
+def _plain_light(like: Tensor) -> Lit:
+    """The light of a floor under captured colours: even."""
     plain = Lighting(lamps=())
-    return pack_lamps((), (), like), plain.around(like)
+    grid = Occupancy(like.new_zeros(0), like.new_zeros(4), 0)
+    return Lit(pack_lamps((), (), like), plain.around(like), None, grid, 0.0)

@@ -9,27 +9,16 @@ they use their shortest axis, turned outward. Nothing but :func:`occupancy_cell`
 
 from __future__ import annotations
 
-import functools
-import math
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
-from torch.nn.functional import conv3d, normalize
 
+from gsfluent import ops
 from gsfluent.data import INTERIOR, Gaussians
-from gsfluent.pipeline.occlusion import COARSEST, PER_CELL, Occupancy, occupancy, sample
+from gsfluent.pipeline.occlusion import COARSEST, PER_CELL, Occupancy, occupancy
 
 __all__ = ["Grid", "estimate_normals", "grid_for", "occupancy_cell", "splat_normals"]
 
-# Binomial smoothing before the gradient, in passes of [1, 2, 1] / 4: counts scatter, and without
-# it a ball's normals are 5 to 18 degrees off; with four passes 1.6.
-_PASSES = 4
-# Level of the pyramid whose gradient settles which side is out, and how clear it must be.
-_WIDE = 2
-_CLEAR = 0.1
-# A Gaussian is called flat when its shortest axis is below this share of the middle one.
-_FLAT = 0.5
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
 _MOST_NODES = 256
@@ -74,9 +63,9 @@ class Grid(NamedTuple):
     nodes: int
     per_cell: float
 
-    def of(self, means: Tensor) -> Occupancy:
-        """Occupancy of centres [N, 3]."""
-        return occupancy(means, self.cell, self.nodes, per_cell=self.per_cell)
+    def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
+        """Occupancy of centres [N, 3] around ``center`` [m]."""
+        return occupancy(means, center, self.cell, self.nodes, per_cell=self.per_cell)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:
@@ -92,7 +81,7 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
     from gsfluent.pipeline.light_maps import bulk
 
     cell = occupancy_cell(gaussians) if cell is None else cell
-    radius = radius or float(bulk(gaussians)[1])
+    radius = radius or bulk(gaussians).radius
     most = _MOST_NODES if gaussians.device.type == "cuda" else _MOST_NODES_CPU
     coarser = max(1.0, 2.0 * radius / (cell * (most - 2 * _ROOM)))
     nodes = int(2.0 * radius / (coarser * cell)) + 2 * _ROOM
@@ -107,62 +96,33 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
         gaussians: In the scene frame, any state.
         cell: Grid spacing; found from the positions when not given.
     """
-    return splat_normals(gaussians, grid_for(gaussians, cell=cell).of(gaussians.means))
+    from gsfluent.pipeline.light_maps import bulk
+
+    matter = bulk(gaussians)
+    grid = grid_for(gaussians, cell=cell, radius=matter.radius)
+    return splat_normals(gaussians, grid.of(gaussians.means, matter.center))
 
 
-def splat_normals(gaussians: Gaussians, grid: Occupancy) -> Tensor:
+def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = None) -> Tensor:
     """As :func:`estimate_normals`, from the occupancy of the same splats.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
     splats that agree with the density, zero for the few splats off the grid. Blending them as they
     are lets the sure ones decide.
-    """
-    means = gaussians.means
-    fine = -sample(gradient(grid.level(0), _PASSES), grid.frame, grid.nodes, means)
-    wide = -sample(gradient(grid.level(_WIDE), 1), grid.frame, grid.nodes, means)
-    # a skin with a gap below it is a sheet to the fine grid, and a sheet has no inside
-    against = ((fine * wide).sum(-1) < 0) & (wide.norm(dim=-1) > _CLEAR)
-    outward = torch.where(against[:, None], -fine, fine)
-    axis, flat = _shortest_axis(gaussians)
-    agreement = (axis * normalize(outward, dim=-1)).sum(-1)
-    # an axis across the density gradient is a splat standing on edge (hair, seams): trust the
-    # density
-    trusted = flat & (agreement.abs() > 0.5)
-    return torch.where(trusted[:, None], axis * agreement.sign()[:, None], outward)
-
-
-def gradient(volume: Tensor, passes: int) -> Tensor:
-    """Gradient per cell [3, D, D, D] in x, y, z of a volume [D, D, D] (z, y, x), smoothed before.
 
     Args:
-        volume: Values at cell centres; zero outside.
-        passes: Passes of [1, 2, 1] / 4 along each axis.
+        gaussians: In the scene frame, any state.
+        grid: Their occupancy.
+        eye: Where the picture is taken from, [3]: what one sees of a flat splat faces that way. A
+            shell is a sheet without a side to the density, from outside and from inside. When
+            None, flat splats take the side of the density.
     """
-    smooth, slope = _kernels(passes, volume.dtype, volume.device)
-    for axis in range(3):
-        shape, pad = [1, 1, 1, 1, 1], [0, 0, 0]
-        shape[2 + axis], pad[axis] = 2 * passes + 1, passes
-        volume = conv3d(volume.view(1, 1, *volume.shape[-3:]), smooth.view(shape), padding=pad)
-    return conv3d(volume, slope, padding=1)[0]
-
-
-@functools.lru_cache(maxsize=16)
-def _kernels(passes: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Binomial kernel [2 passes + 1] and central differences [3, 1, 3, 3, 3]."""
-    row = [math.comb(2 * passes, k) / 4.0**passes for k in range(2 * passes + 1)]
-    slope = torch.zeros(3, 1, 3, 3, 3, dtype=torch.float64)
-    slope[0, 0, 1, 1, 0] = slope[1, 0, 1, 0, 1] = slope[2, 0, 0, 1, 1] = -0.5
-    slope[0, 0, 1, 1, 2] = slope[1, 0, 1, 2, 1] = slope[2, 0, 2, 1, 1] = 0.5
-    smooth = torch.tensor(row, dtype=torch.float64)
-    return smooth.to(device, dtype), slope.to(device, dtype)
-
-
-def _shortest_axis(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Unit shortest axis [N, 3] of each splat, and whether it is flat, bool [N]."""
-    scales, quats = gaussians.scales, normalize(gaussians.quats, dim=-1)
-    shortest, index = scales.min(dim=-1)
-    middle = scales.sum(-1) - shortest - scales.amax(-1)
-    along = torch.nn.functional.one_hot(index, 3).to(scales)
-    w, vector = quats[:, :1], quats[:, 1:]
-    once = torch.linalg.cross(vector, along)
-    return along + 2.0 * (w * once + torch.linalg.cross(vector, once)), shortest < _FLAT * middle
+    return ops.density_normals(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        grid.values,
+        grid.frame,
+        grid.nodes,
+        eye=eye,
+    )

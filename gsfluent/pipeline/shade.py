@@ -1,14 +1,15 @@
-"""Light per pixel, as one pure function of tensors: :func:`shade`.
+"""Light at points of surfaces: :func:`shade_points`, and how its tables are packed.
 
 ``L = c E(n) ao + sum_m T_m a_m I_m (c D_m + S_m)`` on linear radiance (equations.md section 16),
 with Blinn-Phong ``D = max(0, n.l)`` and ``S = k_s max(0, n.h)^{n_s}``, ``h = (l + v) / |l + v|``.
 ``E`` is the light from everywhere: irradiance over pi in real spherical harmonics of degree 2
 (Ramamoorthi and Hanrahan 2001). A highlight has the lamp's colour, not the object's, as on anything
-that is no metal. ``T`` are percentage-closer soft shadows (Fernando 2005): the mean depth of what
-blocks a disc of the shadow map sets the width of the penumbra over which blocking is averaged.
+that is no metal. ``T`` are percentage-closer soft shadows (Fernando 2005):
+:mod:`gsfluent.pipeline.shade_shadow`.
 
-No statement here waits for the device, and every pixel is on its own: the function is the model of
-the fused kernel. How its tables are packed:
+Pictures are shaded by :func:`gsfluent.ops.shade`, one kernel for all of a pixel; a test holds it to
+these functions, which bake light into splats and shade captured surroundings. No statement here
+waits for the device.
 
 ``lamps`` [L, LAMP]:
     ===== =======================================================================================
@@ -47,7 +48,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsfluent.pipeline.occlusion import Occupancy, ambient_occlusion
 from gsfluent.pipeline.shade_shadow import ShadowMaps, transmittance
 
 LAMP = 12
@@ -55,8 +55,6 @@ MAP = 15
 STUDIO = 13
 DIRECTIONAL, POINT = 0.0, 1.0
 ALPHA_FLOOR = 1e-4
-OPAQUE = 0.999
-FADED = 1e-6
 DISPLAY_GAMMA = 2.2
 _TINY = 1e-12
 
@@ -69,43 +67,6 @@ def to_linear(color: Tensor) -> Tensor:
 def to_display(radiance: Tensor) -> Tensor:
     """Linear radiance to display colour, inverse of :func:`to_linear`."""
     return radiance.clamp(min=0.0).pow(1.0 / DISPLAY_GAMMA)
-
-
-def shade(
-    albedo: Tensor,
-    alpha: Tensor,
-    depth: Tensor,
-    normal: Tensor,
-    gloss: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    lamps: Tensor,
-    environment: Tensor,
-    *,
-    ao: Tensor | None = None,
-    maps: ShadowMaps | None = None,
-) -> Tensor:
-    """Linear radiance [H, W, 3] of every pixel; where ``alpha`` is below 1e-4, the albedo.
-
-    Args:
-        albedo: Linear colour, [H, W, 3].
-        alpha: Opacity, [H, W].
-        depth: Camera z of the surface [m], [H, W].
-        normal: Outward normals of any length, [H, W, 3]; zero where there is none (then only the
-            mean of the environment lights the pixel).
-        gloss: k_s and n_s of Blinn-Phong, [H, W, 2] or [2].
-        viewmat: Scene to camera, [4, 4].
-        K: Intrinsics [px], [3, 3].
-        lamps: Packed lamps, [L, LAMP], see the module.
-        environment: Irradiance over pi, ambient light included, [9, 3]: :func:`irradiance`.
-        ao: Share of the environment that arrives, [H, W]; all of it when None.
-        maps: Shadow maps; no shadows when None.
-    """
-    points, rays = surface_points(depth, viewmat, K)
-    shaded = shade_points(
-        points, normal, -rays, albedo, gloss, lamps, environment, ao=ao, maps=maps
-    )
-    return torch.where((alpha > ALPHA_FLOOR)[..., None], shaded, albedo)
 
 
 def surface_points(depth: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
@@ -133,9 +94,19 @@ def shade_points(
     ao: Tensor | None = None,
     maps: ShadowMaps | None = None,
 ) -> Tensor:
-    """As :func:`shade`, of points [..., 3] with unit vectors ``view`` [..., 3] toward the eye.
+    """Linear radiance [..., 3] that points of surfaces send to the eye.
 
-    The other arguments have the shape of the points: ``ao`` [...], ``gloss`` [..., 2] or [2].
+    Args:
+        points: Where [m], [..., 3].
+        normal: Outward normals of any length, [..., 3]; zero where there is none (then only the
+            mean of the environment lights the point).
+        view: Unit vectors toward the eye, [..., 3].
+        albedo: Linear colour, [..., 3].
+        gloss: k_s and n_s of Blinn-Phong, [..., 2] or [2].
+        lamps: Packed lamps, [L, LAMP], see the module.
+        environment: Irradiance over pi, ambient light included, [9, 3].
+        ao: Share of the environment that arrives, [...]; all of it when None.
+        maps: Shadow maps; no shadows when None.
     """
     normal = normalize(normal, dim=-1)
     around = irradiance(environment, normal)
@@ -189,103 +160,6 @@ def harmonics(direction: Tensor) -> Tensor:
         ],
         -1,
     )
-
-
-def shade_image(
-    image: Tensor,
-    alpha: Tensor,
-    depth: Tensor,
-    normal: Tensor,
-    gloss: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    lamps: Tensor,
-    environment: Tensor,
-    background: Tensor,
-    *,
-    maps: ShadowMaps | None = None,
-    grid: Occupancy | None = None,
-    occlusion: float = 1.0,
-    studio: Tensor | None = None,
-) -> Tensor:
-    """The finished picture [H, W, 3], display values in [0, 1], from what the rasterizer blended.
-
-    Splats were fitted by blending display values, so blending stays in display values.
-
-    Args:
-        image: Colours times opacity, display values, [H, W, 3].
-        alpha: Opacity, [H, W].
-        depth: Camera z of the surface [m], [H, W].
-        normal: Blended normals, [H, W, 3].
-        gloss: k_s and n_s of Blinn-Phong, [H, W, 2] (not times opacity) or [2].
-        viewmat: Scene to camera, [4, 4].
-        K: Intrinsics [px], [3, 3].
-        lamps: Packed lamps, [L, LAMP].
-        environment: Irradiance over pi, [9, 3].
-        background: Display colour behind everything when there is no studio, [3].
-        maps: Shadow maps; None for no shadows.
-        grid: Occupancy that hides the environment; None for none.
-        occlusion: Strength of that, 0 to 1.
-        studio: Packed floor and backdrop, [STUDIO], or None.
-    """
-    albedo = to_linear(image / alpha[..., None].clamp(min=ALPHA_FLOOR))
-    points, rays = surface_points(depth, viewmat, K)
-    normal = normalize(normal, dim=-1)
-    ao = None
-    if grid is not None:
-        ao = 1.0 - occlusion * (1.0 - ambient_occlusion(points, normal, grid))
-    lit = shade_points(points, normal, -rays, albedo, gloss, lamps, environment, ao=ao, maps=maps)
-    front = to_display(torch.where((alpha > ALPHA_FLOOR)[..., None], lit, albedo))
-    behind = background
-    if studio is not None:
-        eye = -(viewmat[:3, 3] @ viewmat[:3, :3])
-        behind = to_display(
-            shade_studio(
-                eye, rays, studio, lamps, environment, maps=maps, grid=grid, occlusion=occlusion
-            )
-        )
-    # what lies behind nearly opaque pixels need not be worked out
-    cover = torch.where(alpha > OPAQUE, 1.0, alpha)[..., None]
-    return (front * cover + behind * (1.0 - cover)).clamp(0.0, 1.0)
-
-
-def shade_studio(
-    eye: Tensor,
-    rays: Tensor,
-    studio: Tensor,
-    lamps: Tensor,
-    environment: Tensor,
-    *,
-    maps: ShadowMaps | None = None,
-    grid: Occupancy | None = None,
-    occlusion: float = 1.0,
-) -> Tensor:
-    """Linear radiance [..., 3] of floor and backdrop along unit rays [..., 3] from ``eye`` [3].
-
-    Each ray meets ``z = height`` in closed form. The light on the floor is taken relative to that
-    on the open floor at its centre, so that the paint keeps its grey under any light; far away the
-    floor dissolves into the backdrop. From below there is no floor: it would only hide the object.
-    """
-    paint, horizon, zenith = studio[4:7], studio[7:10], studio[10:13]
-    rise = (2.0 * rays[..., 2:3]).clamp(0.0, 1.0)
-    wall = horizon + (zenith - horizon) * rise
-    down = -rays[..., 2]
-    above = eye[2] - studio[0]
-    hits = (down > 1e-4) & (above > 0.0)
-    points = eye + (above / down.clamp(min=1e-4))[..., None] * rays
-    up = torch.zeros_like(points)
-    up[..., 2] = 1.0
-    ao = None
-    if grid is not None:
-        ao = 1.0 - occlusion * (1.0 - ambient_occlusion(points, up, grid))
-    arrives = arriving(points, up, lamps, environment, ao, maps)
-    center = torch.cat([studio[1:3], studio[:1]])
-    bare = arriving(center, up.new_tensor((0.0, 0.0, 1.0)), lamps, environment, None, None)
-    floor = paint * arrives / bare.mean().clamp(min=1e-3)
-    away = (points[..., :2] - studio[1:3]).norm(dim=-1) / studio[3]
-    keep = torch.exp(-away.square())
-    keep = (keep * (hits & (keep > FADED)))[..., None]
-    return keep * floor + (1.0 - keep) * wall
 
 
 def arriving(

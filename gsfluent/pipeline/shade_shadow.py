@@ -16,16 +16,22 @@ import torch
 from torch import Tensor
 
 SEARCH_TAPS = 16
-FILTER_TAPS = 24
+FILTER_TAPS = 32
 # Texels: the smallest disc searched for blockers, and the smallest averaged over (it smooths the
 # staircase of the map's texels).
 LEAST_SEARCH = 2.0
 LEAST_FILTER = 1.2
 # Share of the map's side: the largest disc.
-MOST_SPREAD = 0.125
+MOST_SPREAD = 0.25
+# A blocker this opaque counts for the deepest one: of a body, what limits the light is its rim, and
+# of what the lamp sees of a body the rim is deepest. Half way there from the mean fits best.
+SURE = 0.3
 # A surface steeper than this against the lamp is treated as if it were this steep when the depth it
 # would have at a neighbouring texel is taken from its plane.
 STEEPEST = 4.0
+# Points are lifted off the surface by this many biases before they look at the lamp: splats are
+# bumps, and at a slant one would shadow the next.
+NORMAL_OFFSET = 1.0
 _GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 _TINY = 1e-12
 
@@ -55,7 +61,7 @@ def transmittance(
 ) -> Tensor:
     """Share of one lamp's light that reaches points [..., 3] with unit normals, [...] in [0, 1].
 
-    Points outside the map are lit. The depth that the surface itself would have at each tap comes
+    Points behind the lamp are lit. The depth that the surface itself would have at each tap comes
     from its tangent plane, so that wide discs do not make a slanted surface shadow itself.
 
     Args:
@@ -71,7 +77,8 @@ def transmittance(
     face = first + _face(points, lamp, maps.cameras, first)
     row = maps.cameras[face]
     turn = row[..., :12].reshape(*row.shape[:-1], 3, 4)
-    local = (turn[..., :3] @ points[..., None])[..., 0] + turn[..., 3]
+    raised = points + (NORMAL_OFFSET * biased) * row[..., 14:15] * normal
+    local = (turn[..., :3] @ raised[..., None])[..., 0] + turn[..., 3]
     plane = (turn[..., :3] @ normal[..., None])[..., 0]
     depth, focal, nearest, bias = local[..., 2], row[..., 12], row[..., 13], biased * row[..., 14]
     safe = depth.clamp(min=_TINY)
@@ -92,8 +99,9 @@ def transmittance(
         return torch.where(level < 0.0, along, depth)
 
     def at(column: Tensor, line: Tensor) -> Tensor:
-        """Index of a texel; those off the map are caught by the caller."""
-        return base + line.long().clamp(0, size - 1) * size + column.long().clamp(0, size - 1)
+        """Index of a texel; off the map, of the nearest on its border, where nothing is."""
+        across, down = column.clamp(0, size - 1).long(), line.clamp(0, size - 1).long()
+        return base + down * size + across
 
     x, y = u * focal + 0.5 * size, v * focal + 0.5 * size
     point = lamp[0] > 0.5
@@ -103,13 +111,16 @@ def transmittance(
     search = torch.where(point, search / closest.clamp(min=_TINY), search)
     search = search.clamp(LEAST_SEARCH, most)
     weight, total = torch.zeros_like(depth), torch.zeros_like(depth)
+    deepest = torch.zeros_like(depth)
     for a, b in disc(SEARCH_TAPS):
         du, dv = a * search, b * search
         index = at((x + du).floor(), (y + dv).floor())
         found = flat_depth[index]
         share = flat_alpha[index] * (found < own_depth(du, dv) - bias)
         weight, total = weight + share, total + share * found
-    blocker = total / weight.clamp(min=_TINY)
+        deepest = torch.maximum(deepest, torch.where(share > SURE, found, 0.0))
+    mean = total / weight.clamp(min=_TINY)
+    blocker = 0.5 * (mean + torch.maximum(mean, deepest))
     spread = lamp[9] * (depth - blocker).clamp(min=0.0) * per_depth
     spread = torch.where(point, spread / blocker.clamp(min=_TINY), spread)
     spread = spread.clamp(LEAST_FILTER, most)
@@ -124,8 +135,7 @@ def transmittance(
             for dy, wy in ((0.0, 1.0 - fy), (1.0, fy)):
                 index = at(left + dx, top + dy)
                 blocked += wx * wy * flat_alpha[index] * (flat_depth[index] < limit)
-    inside = (depth > 0.0) & (x > 0.0) & (x < size) & (y > 0.0) & (y < size)
-    hit = inside & (weight > 0.0) & (lamp[10] >= 0.0)
+    hit = (depth > 0.0) & (weight > 0.0) & (lamp[10] >= 0.0)
     return torch.where(hit, 1.0 - (blocked / FILTER_TAPS).clamp(0.0, 1.0), 1.0)
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from gsfluent.pipeline.light import SPECULAR, Lamp, Lighting
+from gsfluent.pipeline.light import Lighting
 from gsfluent.viewer import look
+from gsfluent.viewer.light_panel import LightPanel
 from gsfluent.viewer.look import Cut, Look
 
 if TYPE_CHECKING:
@@ -33,16 +33,19 @@ class LookPanel:
     def __init__(
         self, server: viser.ViserServer, app: App, first: Lighting, *, lit: bool = True
     ) -> None:
-        self._app, self._first, self._lit = app, first, lit
+        self._app = app
         gui = server.gui
         with gui.add_folder("Colour"):
             self._color = gui.add_dropdown("By", look.COLOR_BY, initial_value=look.APPEARANCE)
             self._legend = gui.add_html("", visible=False)
+        self._light: LightPanel | None = None
         if lit:
-            self._build_light(gui, first)
+            x, y = app.timeline.middle()
+            radius = app.timeline.radius
+            self._light = LightPanel(gui, first, (x, y, radius), radius, self._changed)
         self._build_cut(gui)
         with gui.add_folder("View", expand_by_default=False):
-            self._track = gui.add_checkbox(
+            self._track: Any = gui.add_checkbox(
                 "Follow object", app.tracking, hint="The view travels with the matter"
             )
             self._floor = gui.add_checkbox("Floor", True, visible=lit)
@@ -53,7 +56,8 @@ class LookPanel:
 
         @self._track.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
-            app.track(self._track.value)
+            if event.client is not None:
+                app.track(self._track.value)
 
         @home.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
@@ -65,22 +69,6 @@ class LookPanel:
             if event.client is not None:
                 name = f"{re.sub(r'[^A-Za-z0-9_-]', '_', app.source.title)}_{app.index:04d}.png"
                 event.client.send_file_download(name, app.png(event.client))
-
-    def _build_light(self, gui: viser.GuiApi, first: Lighting) -> None:
-        key = first.lamps[0] if first.lamps else Lamp(intensity=0.0)
-        shine = SPECULAR if first.specular is None else first.specular
-        self._shine = round(float(shine) / 0.02) * 0.02
-        azimuth, elevation = look.angles(key.position or key.direction)
-        with gui.add_folder("Light"):
-            self._on = gui.add_checkbox(
-                "Lit", True, hint="Off shows the colours as they were photographed"
-            )
-            self._azimuth = gui.add_slider("Around", -180, 180, 1, round(azimuth), hint="[°]")
-            self._elevation = gui.add_slider("Height", 0, 90, 1, round(max(0.0, elevation)))
-            self._intensity = gui.add_slider("Strength", 0.0, 2.0, 0.05, float(key.intensity))
-            self._ambient = gui.add_slider("Ambient", 0.0, 1.5, 0.05, float(first.ambient))
-            self._specular = gui.add_slider("Highlights", 0.0, 1.0, 0.02, self._shine)
-            self._shadow = gui.add_checkbox("Shadow", bool(key.shadow))
 
     def _build_cut(self, gui: viser.GuiApi) -> None:
         reach = 1.3 * self._app.timeline.radius
@@ -96,17 +84,6 @@ class LookPanel:
             self._flip = gui.add_checkbox("Other side", False)
 
     def _controls(self) -> list[Any]:
-        light = []
-        if self._lit:
-            light = [
-                self._on,
-                self._azimuth,
-                self._elevation,
-                self._intensity,
-                self._ambient,
-                self._specular,
-                self._shadow,
-            ]
         cut = [
             self._cut,
             self._axis,
@@ -115,37 +92,17 @@ class LookPanel:
             self._offset,
             self._flip,
         ]
-        return [self._color, *light, *cut, self._floor]
+        return [self._color, *cut, self._floor]
 
-    def _changed(self, event: Any) -> None:
+    def _changed(self, event: Any = None) -> None:
         free = self._axis.value == _FREE
         self._cut_azimuth.visible = self._cut_elevation.visible = free
         self._app.set_look(self.look())
 
     def look(self) -> Look:
         """What the controls say."""
-        return Look(self._color.value, self._light(), self._cut_plane(), self._floor.value)
-
-    def _light(self) -> Lighting | None:
-        if not self._lit or not self._on.value:
-            return None
-        first = self._first
-        key = replace(
-            first.lamps[0] if first.lamps else Lamp(),
-            direction=look.direction(self._azimuth.value, self._elevation.value),
-            position=None,
-            intensity=self._intensity.value,
-            shadow=self._shadow.value,
-        )
-        # untouched, the slider leaves every material its own highlights
-        shine = self._specular.value
-        own = first.specular is None and shine == self._shine
-        return replace(
-            first,
-            lamps=(key, *first.lamps[1:]),
-            ambient=self._ambient.value,
-            specular=None if own else shine,
-        )
+        light = None if self._light is None else self._light.lighting()
+        return Look(self._color.value, light, self._cut_plane(), self._floor.value)
 
     def _cut_plane(self) -> Cut | None:
         if not self._cut.value:
@@ -157,6 +114,10 @@ class LookPanel:
         sign = -1.0 if self._flip.value else 1.0
         x, y, z = (sign * value for value in normal)
         return Cut((x, y, z), sign * self._offset.value / self._factor)
+
+    def show_tracking(self, on: bool) -> None:
+        """Show whether the view follows the object."""
+        self._track.value = on
 
     def show_legend(self, content: str) -> None:
         """Put the legend under the choice of colours; nothing hides it."""

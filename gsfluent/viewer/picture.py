@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,12 +14,13 @@ from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import GsfluentError
 from gsfluent.pipeline.light import Lighting
+from gsfluent.pipeline.light_shot import gloss_of, light_of
 from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_camera import Action, orbit
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.run_frames import SavedFrame
-from gsfluent.pipeline.run_show import captured_backdrop, light_of
+from gsfluent.pipeline.run_show import captured_backdrop
 from gsfluent.viewer.color import Legend, splat_colors
 from gsfluent.viewer.look import Cut, Look
 from gsfluent.viewer.source import RunSource
@@ -26,6 +28,23 @@ from gsfluent.viewer.timeline import Timeline
 
 _log = logging.getLogger(__name__)
 _BARE = (0.93, 0.93, 0.94)  # ground when there is no floor
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What of a frame is drawn.
+
+    Attributes:
+        gaussians: Splats, coloured and cut.
+        groups: Siblings, int32 [N].
+        gloss: Highlights of each splat, [N, 2], or None.
+        legend: What the colours mean, or None.
+    """
+
+    gaussians: Gaussians
+    groups: Tensor
+    gloss: Tensor | None
+    legend: Legend | None
 
 
 class PictureMaker:
@@ -41,6 +60,7 @@ class PictureMaker:
         self.shot = timeline.source.shot
         self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
         self._backdrop = self._captured()
+        self._render: tuple[object, Render] | None = None
 
     def first_light(self) -> Lighting:
         """The shot's light, or the usual one."""
@@ -81,31 +101,42 @@ class PictureMaker:
             RunError: The frame is missing or damaged.
         """
         frame = self.timeline.frame(index)
-        gaussians, groups, legend = self.splats(frame, look)
-        render = Render(
-            light=look.light,
-            studio=self._studio() if look.floor else None,
-            backdrop=self._backdrop if look.floor else None,
-            background=_BARE,
-            normal_cell=self.timeline.normal_cell,
-        )
+        drawn = self.splats(frame, look)
+        gaussians, groups, gloss = drawn.gaussians, drawn.groups, drawn.gloss
+        render = self._renderer(index, look)
         if gaussians.count == 0:  # everything is cut away
             image = self._empty(frame, camera, render)
         else:
-            image = render(gaussians, camera, groups=groups)
+            image = render(gaussians, camera, groups=groups, gloss=gloss, time=frame.time)
         values = (image * 255.0).round().clamp(0, 255).to(torch.uint8)
-        return values.cpu().numpy(), legend
+        return values.cpu().numpy(), drawn.legend
 
-    def splats(self, frame: SavedFrame, look: Look) -> tuple[Gaussians, Tensor, Legend | None]:
-        """The splats that are drawn, coloured and cut, with their groups [N] and the legend."""
+    def _renderer(self, index: int, look: Look) -> Render:
+        """The render stage of a state of matter and light; it remembers how large matter is."""
+        key = (self.timeline.revision, index, look)
+        if self._render is None or self._render[0] != key:
+            render = Render(
+                light=look.light,
+                studio=self._studio() if look.floor else None,
+                backdrop=self._backdrop if look.floor else None,
+                background=_BARE,
+                normal_cell=self.timeline.normal_cell,
+            )
+            self._render = (key, render)
+        return self._render[1]
+
+    def splats(self, frame: SavedFrame, look: Look) -> Drawn:
+        """The splats of a frame as a look shows them."""
         gaussians, groups = frame.gaussians, frame.groups
+        gloss = None if self.shot is None else gloss_of(self.shot, frame)
         colors, legend = splat_colors(frame, self.timeline, look.color_by)
         if colors is not None:
             gaussians = gaussians.with_sh_degree(0).with_colors(colors)
         if look.cut is not None:
             kept = ~hidden(gaussians.means, look.cut, self.timeline.survey(frame.index).center)
             gaussians, groups = gaussians.select(kept), groups[kept]
-        return gaussians, groups, legend
+            gloss = None if gloss is None else gloss[kept]
+        return Drawn(gaussians, groups, gloss, legend)
 
     def _empty(self, frame: SavedFrame, camera: Camera, render: Render) -> Tensor:
         """Floor and backdrop alone: one splat that nobody sees keeps to the renderer's path."""

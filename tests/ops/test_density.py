@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent.ops import density_normals, occupancy
+from gsfluent.ops import density_normals, occupancy, splat_bulk
 from gsfluent.ops.reference import density as reference
 
 NODES = 32
@@ -47,6 +47,12 @@ def test_kernels_equal_reference(device: str, dtype: torch.dtype, bar: float) ->
     assert (got.cpu().double() - want).abs().max() < bar
     want_normals = reference.density_normals(means, quats, scales, want, frame(), NODES)
     normals = density_normals(*moved, want.to(device, dtype), place, NODES).cpu().double()
+    eye = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
+    seen = density_normals(*moved, want.to(device, dtype), place, NODES, eye=eye.to(device, dtype))
+    want_seen = reference.density_normals(means, quats, scales, want, frame(), NODES, eye=eye)
+    assert not torch.equal(want_seen, want_normals)
+    normals = torch.cat([normals, seen.cpu().double()])
+    want_normals = torch.cat([want_normals, want_seen])
     error = (normals - want_normals).abs().amax(1)
     # in float32 a splat at a threshold may fall on its other side
     assert error.quantile(0.99) < 10 * bar
@@ -73,6 +79,23 @@ def test_every_level_holds_the_same_matter() -> None:
     for level in range(5):
         mass = float(reference.level_of(values, NODES, level).sum()) * 8**level * 1e4
         assert abs(mass - means.shape[0]) < 1e-6 * mass
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bulk_is_that_of_the_finite_splats(device: str, dtype: torch.dtype) -> None:
+    means, _, scales = (t.to(dtype) for t in splats(150_000))
+    means[7, 1], scales[11, 0], means[13, 2] = float("nan"), float("inf"), float("-inf")
+    good = torch.isfinite(means).all(1) & torch.isfinite(scales).all(1)
+    want = means[good].double()
+    bulk = splat_bulk(means.to(device), scales.to(device))
+    away = (want - want.mean(0)).norm(dim=1)
+    assert torch.tensor(bulk.center).sub(want.mean(0)).abs().max() < 1e-6
+    assert bulk.spread == pytest.approx(float(away.square().mean().sqrt()), rel=1e-6)
+    assert bulk.reach == pytest.approx(float(away.max()), rel=1e-6)
+    assert bulk.size == pytest.approx(float(scales[good].double().mean()), rel=1e-6)
+    nothing = splat_bulk(means[:0].to(device), scales[:0].to(device))
+    assert nothing == ((0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
 
 def test_normals_of_a_ball_point_outward() -> None:
@@ -132,8 +155,9 @@ def test_registration() -> None:
     torch.library.opcheck(
         torch.ops.gsfluent.occupancy.default, (means, frame(), NODES, 0.8), test_utils=tests
     )
+    torch.library.opcheck(torch.ops.gsfluent.splat_bulk.default, (means, scales), test_utils=tests)
     torch.library.opcheck(
         torch.ops.gsfluent.density_normals.default,
-        (means, quats, scales, values, frame(), NODES),
+        (means, quats, scales, values, frame(), NODES, None),
         test_utils=tests,
     )

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+from shade_model import shade_image
 from torch import Tensor
 
 from gsfluent import geometry
 from gsfluent.ops import shade
 from gsfluent.pipeline.occlusion import Occupancy
-from gsfluent.pipeline.shade import shade_image
 from gsfluent.pipeline.shade_shadow import ShadowMaps
 
 HEIGHT, WIDTH, TEXELS, NODES = 37, 53, 48, 32

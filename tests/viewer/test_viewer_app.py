@@ -16,9 +16,11 @@ from viewer_scene import FRAMES, frame, write_run
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
 from gsfluent.errors import InputError
+from gsfluent.pipeline.light import Lamp, Lighting
 from gsfluent.pipeline.run_frames import SavedFrame, save_frame
 from gsfluent.viewer import splats
 from gsfluent.viewer.app import App
+from gsfluent.viewer.light_panel import Handles
 from gsfluent.viewer.source import RunSource
 
 CPU = torch.device("cpu")
@@ -97,6 +99,41 @@ def test_the_view_travels_with_the_object_without_a_jump(serve: Any) -> None:
     np.testing.assert_allclose(np.array(app.shift) - kept, [0, 0, -0.2], atol=1e-6)
 
 
+def test_a_view_that_stands_begins_to_follow_what_falls_away(serve: Any) -> None:
+    source = Falling()
+    source.frames = 1
+    app = serve(source)
+    assert not app.tracking
+    source.frames = 4
+    until(lambda: app.index == 3 and app.tracking)
+    kept = app.shift  # no jump where it begins
+    source.frames = 5
+    until(lambda: app.index == 4)
+    np.testing.assert_allclose(np.array(app.shift) - kept, [0, 0, -0.2], atol=1e-6)
+    app.track(False)  # and a person's word is the last
+    source.frames = 6
+    until(lambda: app.index == 5)
+    assert not app.tracking
+
+
+def test_the_view_goes_with_an_object_that_is_placed_anew(serve: Any) -> None:
+    source = Falling()
+    source.frames = 1
+    app = serve(source)
+    app.track(False)
+    lifted = source.frame
+
+    def frame_higher(index: int) -> SavedFrame:
+        moment = lifted(index)
+        up = torch.tensor([0.0, 0.0, 0.7])
+        gaussians = moment.gaussians.replace(means=moment.gaussians.means + up)
+        return dataclasses.replace(moment, gaussians=gaussians, positions=moment.positions + up)
+
+    source.frame, source.revision = frame_higher, "2"
+    until(lambda: app.timeline.revision == "2" and app.shift != (0.0, 0.0, 0.0))
+    assert app.shift == pytest.approx((0.0, 0.0, 0.7), abs=1e-6)
+
+
 def test_playing_goes_on_to_the_end_and_begins_anew(serve: Any, tmp_path: Path) -> None:
     app = serve(RunSource(write_run(tmp_path / "ball")))
     app.playback.loop, app.playback.speed = False, 2.0
@@ -153,3 +190,22 @@ def test_a_run_that_is_begun_anew_stays_in_range(serve: Any, tmp_path: Path) -> 
     save_frame(folder, frame(0))
     (folder / "stage.json").write_text('{"fingerprint": "new", "complete": false}')
     until(lambda: app.timeline.count == 1 and app.index == 0)
+
+
+def test_lamps_are_turned_about_the_object_and_come_back() -> None:
+    pivot = (0.1, -0.2, 0.3)
+    far = Lamp(direction=(1.0, -1.0, 2.0), intensity=0.7, color=(1.0, 0.5, 0.2))
+    where = Handles.of(far, pivot)
+    assert where.distance is None
+    again = where.moved(far, pivot)
+    assert again.toward == pytest.approx(far.toward) and again.intensity == 0.7
+    near = Handles(90.0, 0.0, 0.5).moved(far, pivot)
+    assert near.position == pytest.approx((0.1, 0.3, 0.3)) and near.color == far.color
+    assert near.distance == 0.5  # its strength is that at the object
+    back = Handles.of(near, pivot)
+    assert (back.azimuth, back.elevation, back.distance) == pytest.approx((90.0, 0.0, 0.5))
+
+
+def test_the_page_starts_with_the_light_of_the_shot(serve: Any) -> None:
+    app = serve(Falling())
+    assert app.look.light == Lighting()  # no shot: the usual one, untouched by the controls

@@ -119,7 +119,7 @@ def test_a_person_sees_the_object_and_what_each_control_does(page: tuple[App, An
     before = until(chrome, lambda p: app.wait_idle(0.1))
     control(chrome, "Around").send_keys(Keys.HOME)
     until(chrome, lambda p: np.abs(p.astype(int) - before).mean() > 1.0)
-    assert abs(app.look.light.direction[1]) < 1e-6  # -180 degrees: along x
+    assert abs(app.look.light.lamps[0].direction[1]) < 1e-6  # -180 degrees: along x
 
     chrome.find_element(By.CSS_SELECTOR, 'input[value="Appearance"]').click()
     option = "//*[@role='option'][normalize-space(.)='Fragment']"

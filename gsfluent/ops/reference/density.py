@@ -15,6 +15,8 @@ PASSES = 4
 WIDE_PASSES = 1
 WIDE = 2
 CLEAR = 0.1
+# Half the gradient up to which a sheet does not say which way its splats lie.
+UNCLEAR = 0.05
 # A splat is called flat when its shortest axis is below this share of the middle one.
 FLAT = 0.5
 
@@ -76,7 +78,14 @@ def sample(volume: Tensor, frame: Tensor, nodes: int, points: Tensor) -> Tensor:
 
 
 def density_normals(
-    means: Tensor, quats: Tensor, scales: Tensor, values: Tensor, frame: Tensor, nodes: int
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    values: Tensor,
+    frame: Tensor,
+    nodes: int,
+    *,
+    eye: Tensor | None = None,
 ) -> Tensor:
     """See ``gsfluent.ops``."""
     fine = -sample(gradient(level_of(values, nodes, 0), PASSES), frame, nodes, means)
@@ -90,6 +99,9 @@ def density_normals(
     w, vector = unit[:, :1], unit[:, 1:]
     once = torch.linalg.cross(vector, along)
     axis = along + 2.0 * (w * once + torch.linalg.cross(vector, once))
-    agreement = (axis * normalize(outward, dim=-1)).sum(-1)
-    trusted = (shortest < FLAT * middle) & (agreement.abs() > 0.5)
-    return torch.where(trusted[:, None], axis * agreement.sign()[:, None], outward)
+    agreement = (axis * outward).sum(-1)
+    trusted = agreement.abs() > 0.5 * outward.norm(dim=-1) - UNCLEAR
+    trusted &= shortest < FLAT * middle
+    side = agreement if eye is None else (axis * (eye - means)).sum(-1)
+    side = torch.where(side < 0, -1.0, 1.0).to(axis)
+    return torch.where(trusted[:, None], axis * side[:, None], outward)
