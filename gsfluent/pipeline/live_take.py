@@ -92,7 +92,7 @@ class Take:
         }
         fps = session.fps * self._slow
         values["output"] = dict(values["output"]) | {
-            "fps": fps, "seconds": count / fps, "slow": self._slow,
+            "fps": fps, "seconds": count / fps, "slow": self._slow, "cracks": session.cracks,
         }  # fmt: skip
         if not isinstance(values["output"].get("camera"), str):
             values["output"]["camera"] = "orbit"
