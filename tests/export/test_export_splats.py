@@ -364,7 +364,9 @@ def test_frames_that_are_no_more_do_not_play_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "said"),
     [
-        ("alembic", {}, "ply-seq"),
+        ("spzz", {}, "did you mean 'spz'"),
+        ("alembic", {}, "use usd"),
+        ("vdb", {}, "vti"),
         ("spz", {"frames": "9:3"}, "--frames"),
         ("spz", {"frames": "77"}, f"0 to {LAST}"),
         ("spz", {"frames": "a:b"}, "10:40"),
