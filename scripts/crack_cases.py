@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -282,7 +281,6 @@ METHODS: dict[str, Callable[[Broken, Moment], Drawn]] = {
     "raw": raw,
     "raw-total": lambda b, m: raw(b, m, total=True),
     "carried": carried,
+    "mvee": lambda b, m: repaired(b, m, method="mvee"),
     "default": repaired,
 }
-if "method" in inspect.signature(Repair).parameters:
-    METHODS["mvee"] = lambda b, m: repaired(b, m, method="mvee")

@@ -20,7 +20,7 @@ from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.export import write_exports
 from gsfluent.pipeline.light import Light, Lighting
 from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.render import Render
+from gsfluent.pipeline.render import Layers, Render
 from gsfluent.pipeline.render_backdrop import (
     Backdrop,
     covered_floor,
@@ -121,9 +121,13 @@ class Film:
 
     def picture(self, frame: SavedFrame) -> torch.Tensor:
         """The picture [H, W, 3] of a frame."""
+        return self.layers(frame).image
+
+    def layers(self, frame: SavedFrame) -> Layers:
+        """The picture of a frame with its opacity and depth."""
         camera = self.cameras[frame.index]
         gloss = gloss_of(self.shot, frame)
-        return self.render(
+        return self.render.layers(
             frame.gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time
         )
 
@@ -170,9 +174,10 @@ def render_stage(context: RunContext) -> None:
             for index in range(len(film)):
                 frame = film.frame(index)
                 start = time.perf_counter()
-                picture = to_bytes(film.picture(frame))
+                layers = film.layers(frame)
+                picture = to_bytes(layers.image)
                 drawing += time.perf_counter() - start
-                figures.add(frame, film.cameras[index])
+                figures.add(frame, film.cameras[index], layers.alpha, layers.depth)
                 counts.append(int(frame.facts.get("fragments", 1)))
                 report_progress(progress, index + 1, len(film), "")
                 yield picture
