@@ -92,6 +92,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor, Tensor, Tensor, Tensor, Tensor)");
 
   // --- density: occupancy of space by splats, and normals from its gradient ---
+  m.def("splat_bulk(Tensor means, Tensor scales) -> Tensor");
   m.def("occupancy(Tensor means, Tensor frame, int nodes, float full) -> Tensor");
   m.def(
       "density_normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame, "

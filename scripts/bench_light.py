@@ -23,7 +23,7 @@ import torch
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
 from gsfluent.pipeline.light import Lamp, Lighting, pack_lamps
-from gsfluent.pipeline.light_maps import faces_of, shadow_maps
+from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_normals import grid_for, splat_normals
@@ -82,9 +82,10 @@ def measure(
     plain = Render(camera, studio=None)
     grid = grid_for(matter)
     drawn = lighting.drawn()
-    faces = faces_of(drawn, (0.0, 0.0, 0.11), 0.13)
+    whole = bulk(matter)
+    faces = faces_of(drawn, whole)
     texels = 1024 if max(size) > 800 else 512
-    occupied = grid.of(matter.means)
+    occupied = grid.of(matter.means, whole.center)
     normals = splat_normals(matter, occupied)
     viewmat, intrinsics = camera.viewmat.to(matter.means), camera.K.to(matter.means)
 
@@ -104,8 +105,9 @@ def measure(
 
     parts: dict[str, Callable[[], Any]] = {
         "main pass": main,
-        "shadow maps": lambda: shadow_maps(matter, drawn, faces, texels),
-        "occupancy": lambda: grid.of(matter.means),
+        "bulk": lambda: bulk(matter),
+        "shadow maps": lambda: shadow_maps(matter, drawn, faces, texels, whole),
+        "occupancy": lambda: grid.of(matter.means, whole.center),
         "normals": lambda: splat_normals(matter, occupied),
         "unlit picture": lambda: plain(matter),
         "lit picture": lambda: render(matter),
@@ -113,7 +115,7 @@ def measure(
     with torch.no_grad():
         times = {name: clock(work, device, repeats) for name, work in parts.items()}
     whole = times["lit picture"]
-    known = sum(times[n] for n in ("main pass", "shadow maps", "occupancy", "normals"))
+    known = sum(times[n] for n in ("main pass", "bulk", "shadow maps", "occupancy", "normals"))
     times["shading and floor (the rest)"] = whole - known
     rows = {name: round(value, 3) for name, value in times.items()}
     lamp_rows = pack_lamps(drawn, faces, matter.means).shape[0]

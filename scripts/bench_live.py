@@ -11,7 +11,9 @@ the CPU, where the machine may be shared.
 from __future__ import annotations
 
 import argparse
+import cProfile
 import json
+import pstats
 import statistics
 import sys
 import time
@@ -20,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from page import enter
 
 from gsfluent.data import INTERIOR, SURFACE, Camera, Gaussians, Solid
 from gsfluent.pipeline.live import LiveSession
@@ -115,7 +118,7 @@ def measured(points: int, frames: int, slow: float, device: torch.device) -> dic
                 watch.spent[part].clear()
             begun, start = watch.now(), session.time
         if not watch.timed("simulate", session._advance):
-            raise SystemExit(f"the simulation failed: {session.failure}")
+            break
         whole = watch.timed(
             "pieces and figures",
             lambda: frame_of(
@@ -131,6 +134,8 @@ def measured(points: int, frames: int, slow: float, device: torch.device) -> dic
         )
         pieces = frame.facts["fragments"]
     wall = watch.now() - begun
+    done = len(watch.spent["draw"])
+    watch.spent = {part: times[:done] for part, times in watch.spent.items()}
     ms = {part: 1e3 * statistics.mean(watch.spent[part]) for part in PARTS}
     total = [sum(row) for row in zip(*watch.spent.values(), strict=True)]
     return {
@@ -143,26 +148,41 @@ def measured(points: int, frames: int, slow: float, device: torch.device) -> dic
         "steps_per_frame": session.report()["substeps"] / (frames + 2),
         "parts_ms": ms,
         "worst_frame_ms": 1e3 * max(total),
-        "pictures_per_second": frames / wall,
+        "pictures_per_second": done / wall,
         "real_time_factor": (session.time - start) / wall,
         "fragments": pieces,
         "verdict": session.report()["verdict"],
+        "reason": session.report()["reason"],
     }
 
 
-def table(rows: list[dict[str, Any]], device: str) -> str:
-    """The rows as a page's table."""
-    head = ["points", "cells", "splats", "slow motion", "pictures/s", "x real time", "frame [ms]"]
-    head += ["worst", *PARTS, "pieces"]
-    lines = [f"On {device}:", "", "| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-    for row in rows:
+def table(measure: dict[str, Any]) -> str:
+    """A measurement as a table of a page; frame times are means [ms]."""
+    head = ["points", "cells", "splats", "slow motion", "pictures/s", "x real time", "frame"]
+    head += ["worst", *PARTS, "pieces", "verdict"]
+    lines = [f"{measure['device']}:", "", "| " + " | ".join(head) + " |"]
+    lines.append("|" + " --- |" * len(head))
+    for row in measure["rows"]:
         parts = row["parts_ms"]
         cells = [f"{row['points']}", f"{row['cells']}", f"{row['splats']}", f"{row['slow']:g}"]
         cells += [f"{row['pictures_per_second']:.1f}", f"{row['real_time_factor']:.3f}"]
-        cells += [f"{sum(parts.values()):.1f}", f"{row['worst_frame_ms']:.1f}"]
-        cells += [f"{parts[part]:.1f}" for part in PARTS] + [f"{row['fragments']}"]
+        cells += [f"{sum(parts.values()):.0f}", f"{row['worst_frame_ms']:.0f}"]
+        cells += [f"{parts[part]:.1f}" for part in PARTS]
+        cells += [f"{row['fragments']}", row["verdict"]]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def entered(page: Path, files: list[Path]) -> None:
+    """Enter measurements into a page; a later one of the same device takes the place of another."""
+    found: dict[str, dict[str, Any]] = {}
+    for file in files:
+        for line in file.read_text(encoding="utf-8").splitlines():
+            if line.startswith("{") and '"rows"' in line:
+                measure = json.loads(line)
+                found[measure["device"]] = measure
+    text = "\n\n".join(table(found[name]) for name in sorted(found, reverse=True))
+    page.write_text(enter(page.read_text(encoding="utf-8"), "live", text), encoding="utf-8")
 
 
 def main() -> None:
@@ -174,16 +194,29 @@ def main() -> None:
     parser.add_argument("--slow", type=float, nargs="+", default=[4.0, 10.0], help="slow motions")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--out", type=Path, help="JSON file")
+    parser.add_argument("--profile", type=int, help="profile a scene of so many points, too")
+    parser.add_argument("--page", type=Path, help="enter what --read holds into this page, and end")
+    parser.add_argument("--read", type=Path, nargs="+", help="files with what was printed")
     args = parser.parse_args()
+    if args.page is not None:
+        entered(args.page, args.read or [])
+        return
     device = torch.device(args.device)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "one CPU core"
     rows = [
         measured(points, args.frames, slow, device) for points in args.points for slow in args.slow
     ]
-    print(table(rows, name))
-    print(json.dumps({"device": name, "rows": rows}))
+    if args.profile:
+        profile = cProfile.Profile()
+        profile.enable()
+        measured(args.profile, args.frames, args.slow[0], device)
+        profile.disable()
+        pstats.Stats(profile).sort_stats("tottime").print_stats(30)
+    measure = {"device": name, "rows": rows}
+    print(table(measure))
+    print(json.dumps(measure))
     if args.out is not None:
-        args.out.write_text(json.dumps({"device": name, "rows": rows}, indent=1), encoding="utf-8")
+        args.out.write_text(json.dumps(measure, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

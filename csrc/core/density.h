@@ -13,6 +13,10 @@ constexpr int kDensityPasses = 4;  // of [1, 2, 1] / 4 over the finest level, on
 constexpr double kDensityClear = 0.1;  // how sure the wide gradient must be
 // Half the gradient up to which a sheet does not say which way its splats lie.
 constexpr double kDensityUnclear = 0.05;
+// Gradient from which the density leads, and the share of a flat splat's own axis then.
+constexpr double kDensitySure = 0.12;
+constexpr double kDensityOwn = 0.5;
+constexpr double kDensityAway = -0.25;
 constexpr double kFlatSplat = 0.5;  // shortest over middle axis
 
 template <typename T>
@@ -37,6 +41,53 @@ struct DensityNormalArgs {
   T* spare;        // as large as `fine`
   T* normals;      // [N, 3]
 };
+
+template <typename T>
+struct BulkArgs {
+  int64_t count;
+  const T *means, *scales;  // [N, 3] each
+  double* out;              // [kBulkSize]
+};
+
+// Sums of a cloud of splats over those with finite numbers: how many, centre, squared distance from
+// the origin of the coordinates, the three scales. What comes out: centre x, y, z, root mean square
+// and largest distance from it, mean scale.
+constexpr int kBulkSums = 6;
+constexpr int kBulkSize = 6;
+template <typename T>
+GSF_HOST_DEVICE bool bulk_terms(const BulkArgs<T>& a, int64_t i, double* sum) {
+  const double x = a.means[3 * i], y = a.means[3 * i + 1], z = a.means[3 * i + 2];
+  const double size = double(a.scales[3 * i]) + a.scales[3 * i + 1] + a.scales[3 * i + 2];
+  if (!finite(x + y + z + size)) return false;
+  sum[0] += 1.0;
+  sum[1] += x;
+  sum[2] += y;
+  sum[3] += z;
+  sum[4] += x * x + y * y + z * z;
+  sum[5] += size;
+  return true;
+}
+// `sum` may be `out`; the largest distance is left at zero.
+GSF_HOST_DEVICE void bulk_finish(const double* sum, double* out) {
+  const double n = max(sum[0], 1.0), x = sum[1] / n, y = sum[2] / n, z = sum[3] / n;
+  const double spread = max(sum[4] / n - (x * x + y * y + z * z), 0.0), size = sum[5] / (3.0 * n);
+  out[0] = x;
+  out[1] = y;
+  out[2] = z;
+  out[3] = std::sqrt(spread);
+  out[4] = 0.0;
+  out[5] = size;
+}
+// Squared distance of splat `i` from the centre, 0 when it was left out.
+template <typename T>
+GSF_HOST_DEVICE double bulk_away(const BulkArgs<T>& a, int64_t i) {
+  double unused[kBulkSums];
+  for (double& v : unused) v = 0.0;
+  if (!bulk_terms(a, i, unused)) return 0.0;
+  const double x = a.means[3 * i] - a.out[0], y = a.means[3 * i + 1] - a.out[1],
+               z = a.means[3 * i + 2] - a.out[2];
+  return x * x + y * y + z * z;
+}
 
 GSF_HOST_DEVICE int64_t density_level(int nodes, int level) {
   int64_t start = 0;
@@ -131,18 +182,26 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
   if (dot(out, wide) < T(0) && norm(wide) > T(kDensityClear)) out = T(-1) * out;
   const T *s = a.scales + 3 * i, shortest = min(s[0], min(s[1], s[2]));
   const T middle = s[0] + s[1] + s[2] - shortest - max(s[0], max(s[1], s[2]));
+  T least = T(kDensityAway);  // cosine to the eye below which it is seen from its other side
   Mat3<T> axes;
   if (shortest < T(kFlatSplat) * middle && rotation_from_quat(a.quats + 4 * i, &axes)) {
     // Which column, without an index that changes: that would put the matrix into local memory.
     const bool first = s[0] == shortest, second = !first && s[1] == shortest;
     const Vec3<T> axis = matvec(axes, Vec3<T>{T(first), T(second), T(!first && !second)});
-    const T agreement = dot(axis, out);
-    // An axis across a clear gradient is a splat standing on edge (hair, seams): trust the density.
-    if (fabs(agreement) > T(0.5) * norm(out) - T(kDensityUnclear)) {
-      const T side =
-          a.eye ? dot(axis, Vec3<T>{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]}) : agreement;
-      out = T(side < T(0) ? -1 : 1) * axis;
+    const T agreement = dot(axis, out), clear = norm(out), side = T(agreement < T(0) ? -1 : 1);
+    if (clear > T(kDensitySure)) {
+      // A solid's density knows better than one splat; their sum keeps what both say.
+      const Vec3<T> sum = (T(1) / clear) * out + (T(kDensityOwn) * side) * axis;
+      out = (T(1) / norm(sum)) * sum;
+    } else if (fabs(agreement) > T(0.5) * clear - T(kDensityUnclear)) {
+      // Across a clear gradient it would be a splat standing on edge (hair, seams).
+      out = side * axis;
+      least = T(0);
     }
+  }
+  if (a.eye) {
+    const Vec3<T> view{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]};
+    if (dot(out, view) < least * norm(out) * norm(view)) out = T(-1) * out;
   }
   for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
 }

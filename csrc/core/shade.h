@@ -60,21 +60,31 @@ GSF_HOST_DEVICE Vec3<T> irradiance(const T* e, const Vec3<T>& n) {
 // Trilinear value of one level of the pyramid, cell centres as nodes; 0 outside.
 template <typename T>
 GSF_HOST_DEVICE T sample_level(const T* values, int side, const Vec3<T>& place) {
-  using std::floor;
-  const T x0 = floor(place.x), y0 = floor(place.y), z0 = floor(place.z);
-  // Comparisons that NaN fails.
+  // Comparisons that NaN fails; most of a picture's looks end here.
   const T high = T(side);
-  if (!(x0 >= T(-1) && x0 < high && y0 >= T(-1) && y0 < high && z0 >= T(-1) && z0 < high))
+  if (!(place.x > T(-1) && place.x < high && place.y > T(-1) && place.y < high && place.z > T(-1) &&
+        place.z < high))
     return T(0);
-  const int i = static_cast<int>(x0), j = static_cast<int>(y0), k = static_cast<int>(z0);
-  const T fx = place.x - x0, fy = place.y - y0, fz = place.z - z0;
+  // Casts cut toward zero: shifted by one they round down.
+  const int i = static_cast<int>(place.x + T(1)) - 1, j = static_cast<int>(place.y + T(1)) - 1,
+            k = static_cast<int>(place.z + T(1)) - 1;
+  const T fx = place.x - T(i), fy = place.y - T(j), fz = place.z - T(k);
+  const int last = side - 1, layer = side * side;
+  if (i >= 0 && j >= 0 && k >= 0 && i < last && j < last && k < last) {
+    const T* v = values + (int64_t(k) * layer + j * side + i);
+    const auto row = [&](const T* w) { return w[0] + fx * (w[1] - w[0]); };
+    const T near0 = row(v), near1 = row(v + side), far0 = row(v + layer),
+            far1 = row(v + layer + side);
+    const T low = near0 + fy * (near1 - near0);
+    return low + fz * (far0 + fy * (far1 - far0) - low);
+  }
   T sum = T(0);
   for (int corner = 0; corner < 8; ++corner) {
     const int dx = corner & 1, dy = corner >> 1 & 1, dz = corner >> 2;
     const int x = i + dx, y = j + dy, z = k + dz;
     if (x < 0 || x >= side || y < 0 || y >= side || z < 0 || z >= side) continue;
     sum += (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * (dz ? fz : T(1) - fz) *
-           values[(int64_t(z) * side + y) * side + x];
+           values[int64_t(z) * layer + y * side + x];
   }
   return sum;
 }
@@ -87,9 +97,10 @@ GSF_HOST_DEVICE T open_cone(const ShadeArgs<T>& a, const Vec3<T>& from, const Ve
   for (int level = 0; level <= kConeLast; ++level) {
     const int side = a.nodes >> level;
     if (level >= kConeFirst) {
-      const T wide = a.grid_frame[3] * T(1 << level);
-      const Vec3<T> out = from + (T(kConeReach) * wide) * way;
-      const Vec3<T> place{out.x / wide - T(0.5), out.y / wide - T(0.5), out.z / wide - T(0.5)};
+      const T scale = T(1) / T(1 << level), reach = T(kConeReach);
+      const Vec3<T> place{scale * from.x + reach * way.x - T(0.5),
+                          scale * from.y + reach * way.y - T(0.5),
+                          scale * from.z + reach * way.z - T(0.5)};
       const T seen = sample_level(values, side, place) - T(kConeFlat);
       left *= max(T(1) - T(kConeGain / (1.0 - kConeFlat)) * max(seen, T(0)), T(0));
     }
@@ -103,7 +114,14 @@ template <typename T>
 GSF_HOST_DEVICE T open_sky(const ShadeArgs<T>& a, const Vec3<T>& point, const Vec3<T>& normal) {
   using std::fabs;
   if (!a.occupancy || !(dot(normal, normal) > T(0.5))) return T(1);
-  const Vec3<T> from = point - Vec3<T>{a.grid_frame[0], a.grid_frame[1], a.grid_frame[2]};
+  // In finest cells.
+  const Vec3<T> from = (T(1) / a.grid_frame[3]) *
+                       (point - Vec3<T>{a.grid_frame[0], a.grid_frame[1], a.grid_frame[2]});
+  // Farther off than the longest look (and its interpolation) nothing can be seen.
+  const T away = T((kConeReach + 1.0) * (1 << kConeLast)), end = T(a.nodes) + away;
+  if (!(from.x > -away && from.x < end && from.y > -away && from.y < end && from.z > -away &&
+        from.z < end))
+    return T(1);
   const T steep = T(fabs(normal.x) > T(0.6)), gentle = T(1) - steep;
   const Vec3<T> across =
       unit(Vec3<T>{-normal.z * steep, normal.z * gentle, normal.x * steep - normal.y * gentle});

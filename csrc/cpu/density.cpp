@@ -3,6 +3,7 @@
 #include "host/density.h"
 
 #include <algorithm>
+#include <vector>
 
 namespace gsf {
 namespace {
@@ -41,6 +42,29 @@ struct DensityCpu {
             }
       });
     }
+  }
+
+  template <typename T>
+  static void bulk(const BulkArgs<T>& a, const Tensor&) {
+    // Pieces of fixed size, added up in order: the same for any number of threads.
+    constexpr int64_t kPiece = 65536;
+    const int64_t pieces = (a.count + kPiece - 1) / kPiece;
+    std::vector<double> sums(pieces * kBulkSums, 0.0);
+    const auto each = [&](const auto& work) {
+      parallel_for(pieces, 1, [&](int64_t begin, int64_t end) {
+        for (int64_t p = begin; p < end; ++p)
+          for (int64_t i = p * kPiece; i < std::min(a.count, (p + 1) * kPiece); ++i)
+            work(i, &sums[p * kBulkSums]);
+      });
+    };
+    each([&](int64_t i, double* sum) { bulk_terms(a, i, sum); });
+    double total[kBulkSums] = {};
+    for (size_t k = 0; k < sums.size(); ++k) total[k % kBulkSums] += sums[k];
+    bulk_finish(total, a.out);
+    std::fill(sums.begin(), sums.end(), 0.0);
+    each([&](int64_t i, double* most) { *most = max(*most, bulk_away(a, i)); });
+    for (int64_t p = 0; p < pieces; ++p) a.out[4] = max(a.out[4], sums[p * kBulkSums]);
+    a.out[4] = std::sqrt(a.out[4]);
   }
 
   // Binomial smoothing of a cube along x, y and z; the last step ends in `out`.
@@ -89,5 +113,6 @@ struct DensityCpu {
 
 STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
   m.impl("occupancy", TORCH_BOX(&gsf::DensityOps<gsf::DensityCpu>::occupancy));
+  m.impl("splat_bulk", TORCH_BOX(&gsf::DensityOps<gsf::DensityCpu>::bulk));
   m.impl("density_normals", TORCH_BOX(&gsf::DensityOps<gsf::DensityCpu>::normals));
 }

@@ -61,6 +61,51 @@ void smooth(const T* in, T* out, T* spare, int side, cudaStream_t stream) {
   smooth_kernel<T, kPasses, 2><<<blocks, kThreads, 0, stream>>>(spare, out, side);
 }
 
+__device__ inline double warp_total(double v) {
+  for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(0xffffffffu, v, offset);
+  return v;
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kThreads) bulk_sums_kernel(BulkArgs<T> a) {
+  double sum[kBulkSums] = {};
+  const int64_t step = int64_t(gridDim.x) * kThreads;
+  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < a.count; i += step)
+    bulk_terms(a, i, sum);
+  // One atomic per block and sum: all go to the same few addresses.
+  __shared__ double block[kBulkSums];
+  if (threadIdx.x < kBulkSums) block[threadIdx.x] = 0.0;
+  __syncthreads();
+  for (int k = 0; k < kBulkSums; ++k) {
+    const double total = warp_total(sum[k]);
+    if (threadIdx.x % 32 == 0) atomicAdd(block + k, total);
+  }
+  __syncthreads();
+  if (threadIdx.x < kBulkSums) atomicAdd(a.out + threadIdx.x, block[threadIdx.x]);
+}
+
+template <typename T>
+__global__ void bulk_finish_kernel(BulkArgs<T> a, bool root) {
+  if (root)
+    a.out[4] = sqrt(a.out[4]);
+  else
+    bulk_finish(a.out, a.out);
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kThreads) bulk_reach_kernel(BulkArgs<T> a) {
+  double most = 0.0;
+  const int64_t step = int64_t(gridDim.x) * kThreads;
+  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < a.count; i += step)
+    most = max(most, bulk_away(a, i));
+  for (int offset = 16; offset > 0; offset /= 2)
+    most = max(most, __shfl_xor_sync(0xffffffffu, most, offset));
+  // Of numbers that are not negative, the bits are in the same order.
+  if (threadIdx.x % 32 == 0)
+    atomicMax(reinterpret_cast<unsigned long long*>(a.out + 4),
+              static_cast<unsigned long long>(__double_as_longlong(most)));
+}
+
 template <typename T>
 __global__ void normal_kernel(DensityNormalArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -82,6 +127,17 @@ cudaError_t occupancy(const DensityArgs<T>& a, cudaStream_t stream) {
 }
 
 template <typename T>
+cudaError_t splat_bulk(const BulkArgs<T>& a, cudaStream_t stream) {
+  constexpr unsigned kMostBlocks = 512;
+  const unsigned needed = blocks_for(a.count), blocks = needed < kMostBlocks ? needed : kMostBlocks;
+  if (a.count > 0) bulk_sums_kernel<T><<<blocks, kThreads, 0, stream>>>(a);
+  bulk_finish_kernel<T><<<1, 1, 0, stream>>>(a, false);
+  if (a.count > 0) bulk_reach_kernel<T><<<blocks, kThreads, 0, stream>>>(a);
+  bulk_finish_kernel<T><<<1, 1, 0, stream>>>(a, true);
+  return cudaGetLastError();
+}
+
+template <typename T>
 cudaError_t density_normals(const DensityNormalArgs<T>& a, cudaStream_t stream) {
   smooth<T, kDensityPasses>(a.values, a.fine, a.spare, a.nodes, stream);
   smooth<T, 1>(a.values + density_level(a.nodes, kDensityWide), a.wide, a.spare,
@@ -92,6 +148,8 @@ cudaError_t density_normals(const DensityNormalArgs<T>& a, cudaStream_t stream) 
 
 template cudaError_t occupancy(const DensityArgs<float>&, cudaStream_t);
 template cudaError_t occupancy(const DensityArgs<double>&, cudaStream_t);
+template cudaError_t splat_bulk(const BulkArgs<float>&, cudaStream_t);
+template cudaError_t splat_bulk(const BulkArgs<double>&, cudaStream_t);
 template cudaError_t density_normals(const DensityNormalArgs<float>&, cudaStream_t);
 template cudaError_t density_normals(const DensityNormalArgs<double>&, cudaStream_t);
 

@@ -10,6 +10,9 @@ namespace gsf::cuda {
 // `values` come in as zeros.
 template <typename T>
 cudaError_t occupancy(const DensityArgs<T>& a, cudaStream_t stream);
+// `out` comes in as zeros.
+template <typename T>
+cudaError_t splat_bulk(const BulkArgs<T>& a, cudaStream_t stream);
 template <typename T>
 cudaError_t density_normals(const DensityNormalArgs<T>& a, cudaStream_t stream);
 

@@ -34,6 +34,22 @@ struct DensityOps {
     return values;
   }
 
+  static Tensor bulk(Tensor means, Tensor scales) {
+    const char* op = "splat_bulk";
+    check_shape(op, "means", means, {-1, 3});
+    check_shape(op, "scales", scales, {means.size(0), 3});
+    check_dtype(op, "scales", scales, means.scalar_type());
+    check_same_device(op, "scales", scales, means);
+    means = gsf::contiguous(means);
+    scales = gsf::contiguous(scales);
+    Tensor out = gsf::new_zeros(means, {kBulkSize}, ScalarType::Double);
+    dispatch_floating(op, means, [&]<typename T>() {
+      const BulkArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(scales), mptr<double>(out)};
+      Backend::bulk(args, means);
+    });
+    return out;
+  }
+
   static Tensor normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame,
                         int64_t nodes, OptTensor eye) {
     const char* op = "density_normals";

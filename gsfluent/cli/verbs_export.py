@@ -20,6 +20,7 @@ class Export(Verb):
       gsfluent export out --to ply-seq                       # out/frames/frame_0001.ply ...
       gsfluent export out --to ply-seq --compressed --up=-y  # for SuperSplat: drop the folder on it
       gsfluent export out --to spz,glb --frames 40           # one moment, for a web page
+      gsfluent export out --to ply-seq --relit --light=1,-1,2   # with light and shadow baked in
       gsfluent export out --to delta                         # one small file: out/splats.gsd
       gsfluent export splats.gsd --to ply-seq                # and back, for any viewer
       gsfluent export out --to usd -o cut_07                 # Houdini, usdview: one scene.usdc
@@ -77,6 +78,14 @@ class Export(Verb):
     """Pictures and usd: frames shown per second; the simulation's own by default."""
     alpha: bool = False
     """png, webp: nothing behind the object."""
+    relit: bool = False
+    """Bake the light into the colours of splats and meshes, for viewers that have none."""
+    light: str | None = None
+    """Toward the key light, such as 1,-1,2, or a YAML file with a light: section."""
+    lamp: Annotated[tuple[str, ...], tyro.conf.arg(metavar="LAMP")] = ()
+    """More lamps, such as 'point=0.3,0,0.5;intensity=2'."""
+    environment: str | None = None
+    """Light from everywhere: an equirectangular picture, sky, or none."""
 
     def execute(self) -> dict[str, Any]:
         """Export."""
@@ -101,6 +110,10 @@ class Export(Verb):
             size=parse_size(self.size) if self.size else None,
             fps=self.fps,
             alpha=self.alpha,
+            relit=self.relit,
+            light=self.light,
+            lamps=self.lamp,
+            environment=self.environment,
             usd_parts=tuple(part.strip() for part in self.usd_parts.split(",")),
         )
         with self.progress("export") as progress:

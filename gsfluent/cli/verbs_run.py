@@ -136,7 +136,7 @@ class Render(Verb):
     to: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Where the video (.mp4) or picture (.png) goes."""
     camera: str | None = None
-    """orbit, the index of a photograph, or a JSON file."""
+    """orbit, turntable, dolly, the index of a photograph, or a path (docs/export.md)."""
     size: str | None = None
     """Such as 1280x720."""
     light: str | None = None

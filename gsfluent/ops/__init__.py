@@ -37,6 +37,8 @@ _PUBLIC: dict[str, str] = {
     "mvee_lens": "gsfluent.ops.mvee",
     "Rendered": "gsfluent.ops.raster",
     "rasterize": "gsfluent.ops.raster",
+    "Bulk": "gsfluent.ops.density",
+    "splat_bulk": "gsfluent.ops.density",
     "occupancy": "gsfluent.ops.density",
     "density_normals": "gsfluent.ops.density",
     "shade": "gsfluent.ops.shade",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +13,38 @@ from gsfluent._check import check_tensor
 
 LEVELS = 5
 _MOST_NODES = 1024
+
+
+class Bulk(NamedTuple):
+    """Where a cloud of splats is, known to the host."""
+
+    center: tuple[float, float, float]
+    """Mean of the centres [m]."""
+    spread: float
+    """Root mean square distance from it [m]."""
+    reach: float
+    """Largest distance from it [m]."""
+    size: float
+    """Mean standard deviation of the splats [m]."""
+
+
+def splat_bulk(means: Tensor, scales: Tensor) -> Bulk:
+    """Find where a cloud of splats is; those with NaN or infinity are left out. Waits once.
+
+    Args:
+        means: Centres [m], shape [N, 3], float32 or float64.
+        scales: Standard deviations [m], shape [N, 3].
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong.
+
+    Gradient: none.
+    """
+    check_tensor("splat_bulk", "means", means, shape=("N", 3))
+    check_tensor("splat_bulk", "scales", scales, shape=(means.shape[0], 3), like=means)
+    x, y, z, spread, reach, size = torch.ops.gsfluent.splat_bulk.default(means, scales).tolist()
+    return Bulk((x, y, z), spread, reach, size)
 
 
 def occupancy(means: Tensor, frame: Tensor, nodes: int, *, full: float) -> Tensor:
@@ -59,9 +92,9 @@ def density_normals(
     """Outward vectors of splats: minus the gradient of the smoothed occupancy per cell.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
-    splats unless their shortest axis lies across a clear gradient (they take that axis), zero off
-    the grid.
-    A look four times as wide turns what points inward.
+    splats (where the gradient is clear it leads and their shortest axis adds to it; on a sheet they
+    take that axis, unless it lies across the gradient), zero off the grid. A look four times as
+    wide turns what points inward.
 
     Args:
         means: Centres [m], shape [N, 3], float32 or float64.
@@ -70,8 +103,8 @@ def density_normals(
         values: What :func:`occupancy` gave.
         frame: As there.
         nodes: As there.
-        eye: Where the picture is taken from [m], shape [3]: flat splats face it. Without, they take
-            the side of the density; a shell has none there, from outside and from inside.
+        eye: Where the picture is taken from [m], shape [3]: what looks away from it is turned. A
+            shell has no side to the density, and is seen from outside or from inside.
 
     Returns:
         Shape [N, 3].
@@ -107,6 +140,11 @@ def _check_nodes(op: str, nodes: int) -> None:
         raise ValueError(f"{op}: nodes must be a multiple of 16 up to {_MOST_NODES}, got {nodes}")
 
 
+@torch.library.register_fake("gsfluent::splat_bulk")
+def _bulk_fake(means: Tensor, scales: Tensor) -> Tensor:
+    return means.new_empty(6, dtype=torch.float64)
+
+
 @torch.library.register_fake("gsfluent::occupancy")
 def _occupancy_fake(means: Tensor, frame: Tensor, nodes: int, full: float) -> Tensor:
     return means.new_empty(sum((nodes >> level) ** 3 for level in range(LEVELS)))
@@ -121,5 +159,6 @@ def _no_gradient(ctx: object, *grads: Tensor) -> None:
     raise NotImplementedError("density: no gradient")
 
 
+torch.library.register_autograd("gsfluent::splat_bulk", _no_gradient)
 torch.library.register_autograd("gsfluent::occupancy", _no_gradient)
 torch.library.register_autograd("gsfluent::density_normals", _no_gradient)

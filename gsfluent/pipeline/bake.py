@@ -55,14 +55,14 @@ def bake_light(
     assert lighting is not None  # not None was given
     lighting = lighting.at(time)
     means = gaussians.means
-    size = grid_for(gaussians, cell=normal_cell)
-    grid = size.of(means)
+    matter = bulk(gaussians)
+    size = grid_for(gaussians, cell=normal_cell, radius=matter.radius)
+    grid = size.of(means, matter.center)
     normal = normalize(splat_normals(gaussians, grid), dim=-1)
     lamps = lighting.drawn()
-    center, radius = bulk(gaussians)
-    x, y, z = center.tolist()
-    faces = faces_of(lamps, (x, y, z), float(radius))
-    maps = shadow_maps(gaussians, lamps, faces, lighting.resolution or _RESOLUTION, groups=groups)
+    faces = faces_of(lamps, matter)
+    texels = lighting.resolution or _RESOLUTION
+    maps = shadow_maps(gaussians, lamps, faces, texels, matter, groups=groups)
     skin = means + (_LIFT * size.cell) * normal
     ao = None
     if lighting.occlusion > 0.0:

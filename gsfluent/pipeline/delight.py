@@ -15,7 +15,7 @@ limits of one capture. The mean brightness cannot be known; it is kept.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,16 +26,20 @@ from gsfluent.data import INTERIOR, Gaussians
 from gsfluent.pipeline.render_normals import estimate_normals
 from gsfluent.pipeline.shade import harmonics, to_display, to_linear
 
-__all__ = ["Delighting", "delight", "estimate_shading"]
+if TYPE_CHECKING:
+    from gsfluent.pipeline.run_frames import SavedFrame
 
-_SAMPLES = 6000  # splats that the light is estimated from
-_PARTNERS = 24  # pairs per splat
-_CANDIDATES = 160  # of which the most alike in chromaticity are taken
-_CHROMA = 0.03  # spread of chromaticities that are one paint
+__all__ = ["Delighting", "Delit", "delight", "estimate_shading"]
+
+_SAMPLES = 3000  # splats that the light is estimated from
+_PARTNERS = 40  # pairs per splat
+# Spread of chromaticities that are one paint: coloured light tints paint, so not too narrow.
+_CHROMA = 0.04
 _STEPS = 12
 _RIDGE = 1e-3  # pull toward even light
 _LEAST = 0.15  # of the mean: the light is nowhere believed darker
 _DARK = 0.01  # linear: too dark to say anything
+_FEWEST = 100  # splats that light can be estimated from
 _SEED = 0
 
 
@@ -43,7 +47,8 @@ class Delighting(NamedTuple):
     """The light of a capture.
 
     Attributes:
-        coefficients: E over its mean on the surface, spherical harmonics of degree 2, [9].
+        coefficients: E over its mean on the surface, spherical harmonics of degree 2, one column
+            per colour, [9, 3].
         strength: Standard deviation of E over its mean on the surface.
         spread: Median of ``|log c_i - log c_j|`` over the pairs, before and after.
     """
@@ -71,26 +76,27 @@ def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> 
     index = skin.nonzero()[:, 0]
     even = torch.zeros(9, dtype=torch.float64, device=grey.device)
     even[0] = 1.0 / 0.28209479177387814
-    if index.numel() < 100:
-        return Delighting(even, 0.0, (0.0, 0.0))
+    if index.numel() < _FEWEST:
+        return Delighting(even[:, None].expand(9, 3), 0.0, (0.0, 0.0))
     generator = torch.Generator().manual_seed(_SEED)
     picked = torch.randperm(index.numel(), generator=generator)[:_SAMPLES].to(index.device)
     index = index[picked]
     basis = harmonics(normalize(normals[index].double(), dim=-1))
-    level = grey[index].log()
+    level = linear[index].clamp(min=1e-4).log()
     chroma = linear[index] / linear[index].sum(-1, keepdim=True)
-    first, second = _pairs(chroma, generator)
+    count = index.numel()
+    first = torch.arange(count, device=index.device).repeat_interleave(_PARTNERS)
+    second = torch.randint(count, (count * _PARTNERS,), generator=generator).to(index.device)
     alike = torch.exp(-0.5 * ((chroma[first] - chroma[second]).norm(dim=-1) / _CHROMA) ** 2)
     target = level[first] - level[second]
-    found = _solve(basis, first, second, target, alike, even)
+    columns = [_solve(basis, first, second, target[:, c], alike, even) for c in range(3)]
+    found = torch.stack(columns, 1)
+    found = found / (basis @ found).clamp(min=_LEAST).mean(0)
     light = (basis @ found).clamp(min=_LEAST)
-    found = found / light.mean()
-    light = light.log()
-    rest = (target - light[first] + light[second]).abs()
-    relative = (basis @ found).clamp(min=_LEAST)
-    return Delighting(
-        found, float(relative.std()), (float(target.abs().median()), float(rest.median()))
-    )
+    rest = target - light.log()[first] + light.log()[second]
+    sure = alike > 0.5
+    before, after = (values[sure].abs().median() for values in (target, rest))
+    return Delighting(found, float(light.mean(-1).std()), (float(before), float(after)))
 
 
 def delight(
@@ -114,26 +120,15 @@ def delight(
     light = harmonics(normalize(normals.double(), dim=-1)) @ shading.coefficients
     light = light.clamp(min=_LEAST).pow(strength).to(gaussians.means)
     # deep below the skin the normal says nothing
-    light = torch.where(normals.norm(dim=-1) > 0.05, light, 1.0)
+    light = torch.where(normals.norm(dim=-1, keepdim=True) > 0.05, light, 1.0)
     if gaussians.labels is not None:
-        light = torch.where(gaussians.labels == INTERIOR, 1.0, light)
+        light = torch.where((gaussians.labels == INTERIOR)[:, None], 1.0, light)
     before = gaussians.colors()
-    after = to_display(to_linear(before) / light[:, None])
+    after = to_display(to_linear(before) / light)
     ratio = after / before.clamp(min=1.0 / 255.0)
     sh = gaussians.sh * ratio[:, None]
     sh[:, 0] = geometry.rgb_to_sh0(after)
     return gaussians.replace(sh=sh)
-
-
-def _pairs(chroma: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Rows of splats and of partners of alike chromaticity, each [M]."""
-    count = chroma.shape[0]
-    candidates = torch.randint(count, (count, _CANDIDATES), generator=generator).to(chroma.device)
-    apart = (chroma[:, None] - chroma[candidates]).norm(dim=-1)
-    near = apart.topk(_PARTNERS, largest=False).indices
-    second = torch.gather(candidates, 1, near).reshape(-1)
-    first = torch.arange(count, device=chroma.device).repeat_interleave(_PARTNERS)
-    return first, second
 
 
 def _solve(
@@ -156,3 +151,58 @@ def _solve(
         move[0] = 0.0  # the mean is not known
         found = found + move.clamp(-0.5, 0.5)
     return found
+
+
+class Delit:
+    """The captured light of a film's objects, found in its first frame, while they are whole.
+
+    Each body has a light of its own, because events turn bodies before they move. Splats that the
+    repair adds take the factor of the material point that they follow.
+
+    Args:
+        first: The first frame of the film.
+        strength: Share of the captured light that is divided out, 0 to 1.
+    """
+
+    def __init__(self, first: SavedFrame, strength: float) -> None:
+        gaussians = first.gaussians
+        count = gaussians.count
+        factor = torch.ones(count, 3, dtype=gaussians.dtype, device=gaussians.device)
+        normals = estimate_normals(gaussians)
+        anchor = first.anchor.long().clamp(min=0)
+        body = torch.where(first.anchor >= 0, first.body[anchor].long(), -1)
+        body = torch.where(first.ids >= 0, body, -1)
+        before = gaussians.colors()
+        for number in body.unique().tolist():
+            if number < 0:
+                continue
+            mine = (body == number).nonzero()[:, 0]
+            part = gaussians.select(mine)
+            after = delight(part, strength=strength, normals=normals[mine]).colors()
+            factor[mine] = after / before[mine].clamp(min=1.0 / 255.0)
+        # by number of the splat, and by point for splats that come later
+        known = (first.ids >= 0) & (body >= 0)
+        self._by_id = torch.ones(int(first.ids.clamp(min=0).amax()) + 1, 3).to(factor)
+        self._by_id[first.ids[known]] = factor[known]
+        points = first.positions.shape[0]
+        total = torch.zeros(points, 3).to(factor).index_add_(0, anchor[known], factor[known])
+        number_of = (
+            torch.zeros(points)
+            .to(factor)
+            .index_add_(0, anchor[known], torch.ones_like(factor[known, 0]))
+        )
+        mean = total / number_of.clamp(min=1.0)[:, None]
+        self._by_point = torch.where(number_of[:, None] > 0, mean, 1.0)
+
+    def apply(self, frame: SavedFrame) -> Gaussians:
+        """The splats of a frame without the captured light."""
+        ids, anchor = frame.ids, frame.anchor.long()
+        old = (ids >= 0) & (ids < self._by_id.shape[0])
+        factor = self._by_id[torch.where(old, ids, 0)]
+        point = self._by_point[anchor.clamp(0, self._by_point.shape[0] - 1)]
+        follows = (ids >= 0) & (anchor >= 0)
+        factor = torch.where(old[:, None], factor, torch.where(follows[:, None], point, 1.0))
+        gaussians = frame.gaussians
+        sh = gaussians.sh * factor[:, None]
+        sh[:, 0] = geometry.rgb_to_sh0(gaussians.colors() * factor)
+        return gaussians.replace(sh=sh)

@@ -13,6 +13,7 @@ from gsfluent.config.read import nearest
 from gsfluent.errors import InputError
 from gsfluent.pipeline.export_frames import Reel
 from gsfluent.pipeline.export_job import ExportOptions, Job
+from gsfluent.pipeline.export_relit import relight_of
 from gsfluent.pipeline.export_unpack import DeltaReel
 from gsfluent.pipeline.stage import Progress
 
@@ -117,11 +118,19 @@ def export(
     if out.is_file():
         reel = DeltaReel(out, frames=options.frames, sh=options.sh, up=options.up)
         for kind in kinds:
-            if not FORMATS[kind].splats_only:
-                raise InputError(f"--to {kind}: {out} holds splats only", "export from the run")
+            if options.relit or not FORMATS[kind].splats_only:
+                what = "--relit" if options.relit else f"--to {kind}"
+                raise InputError(f"{what}: {out} holds splats only", "export from the run")
         to = to or out.with_suffix("")
     else:
-        reel = Reel(out, frames=options.frames, sh=options.sh, up=options.up)
+        reel = Reel(
+            out,
+            frames=options.frames,
+            sh=options.sh,
+            relight=relight_of(out, options) if options.relit else None,
+            up=options.up,
+            device=device if options.relit else None,
+        )
     job = Job(out, to or out, reel, options, options.fps or reel.rate(), device, progress)
     return _write(job, kinds)
 

@@ -36,6 +36,10 @@ class ExportOptions:
         size: (width, height) of pictures [px]; the shot's own by default.
         fps: Pictures or time codes per second; the shot's own by default.
         alpha: Pictures with a transparent background instead of the studio.
+        relit: Bake the light into the colours of splats and meshes.
+        light: Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
+        lamps: More lamps.
+        environment: An equirectangular picture, ``sky`` or ``none``.
     """
 
     frames: str | None = None
@@ -54,6 +58,10 @@ class ExportOptions:
     size: tuple[int, int] | None = None
     fps: float | None = None
     alpha: bool = False
+    relit: bool = False
+    light: str | None = None
+    lamps: tuple[str, ...] = ()
+    environment: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,18 +126,28 @@ class Job:
 
     def _finished(self, target: Path, kind: str) -> bool:
         """Whether files in the folder are of this very export; notes down that they will be."""
-        stage = self.reel.source()
-        source = content_digest(stage) if stage.is_file() else None
-        wanted = replace(self.options, frames=None)
-        key = fingerprint("export", kind, repr(wanted), source)
-        note = target / ".export.json"
+        source = self.reel.source()
+        known = content_digest(source) if source.is_file() else None
+        wanted = repr(replace(self.options, frames=None))
+        key = fingerprint("export", kind, wanted, known, self._light())
+        # beside the folder: a player that is given the folder must find frames only
+        note = self.folder / ".gsfluent-export.json"
         try:
-            same = json.loads(note.read_text(encoding="utf-8")).get(kind) == key
-        except (OSError, ValueError, AttributeError):
-            same = False
+            notes = dict(json.loads(note.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            notes = {}
+        same = known is not None and notes.get(target.name) == key
         if not same:
-            write_json(note, {kind: key})
-        return same and source is not None
+            write_json(note, notes | {target.name: key})
+        return same
+
+    def _light(self) -> list[str]:
+        """Digests of the files that say what light is baked in."""
+        if not self.options.relit:
+            return []
+        given = (self.out / "run.json", self.options.light, self.options.environment)
+        files = [Path(name) for name in given if name is not None]
+        return [content_digest(file) for file in files if file.is_file()]
 
     def _forget_stale(self, target: Path, name: str) -> None:
         """Remove files beyond the run's last frame: an older, longer run's, which would play on."""

@@ -23,6 +23,7 @@ from gsfluent.pipeline.export_frames import Moment, upright
 from gsfluent.pipeline.export_job import Job, span
 from gsfluent.pipeline.export_points import deposit
 from gsfluent.pipeline.fill_colors import surface_colors
+from gsfluent.pipeline.rubble import REACH, clinging
 
 if TYPE_CHECKING:
     import trimesh
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 FORMATS = ("ply", "obj", "glb")
 DEBRIS = -1
 
-_REACH = 1.6  # point spacings over which broken matter hangs on a piece
 _CELL = 0.5  # point spacings: edge of the grid's cells
 BLUR = 1.0
 """Point spacings over which the matter of fragments is blurred: below, the points show as bumps;
@@ -40,6 +40,7 @@ _CRUMBS = 0.75  # share of it for debris, whose crumbs are a few points each and
 _APART = 2.0  # point spacings between heaps whose surfaces do not meet
 _REACHES = 3.0  # blurs around the matter that are looked at
 _NEAR = 1e-4  # a grid value this near to the level would make triangles without area
+_FINE_GRID = 2_000_000  # cells above which a volume is counted well enough cell by cell
 _CLOSE = 0.005  # relative error of the volume that needs no better level
 _TRIES = 6
 
@@ -169,7 +170,7 @@ def fragment_meshes(moment: Moment, blur: float = BLUR) -> Iterator[Piece]:
         return
     volumes = saved.volumes.double().cpu().numpy()
     spacing = float(np.cbrt(np.median(volumes)))
-    piece = clinging(where, saved.fragments.cpu().numpy().astype(np.int64), _REACH * spacing)
+    piece = clinging(where, saved.fragments.cpu().numpy().astype(np.int64), REACH * spacing)
     anchor = saved.anchor.cpu().numpy()
     splats = np.where(anchor >= 0, piece[np.maximum(anchor, 0)], DEBRIS - 1)
     for number in np.unique(piece).tolist():
@@ -179,44 +180,6 @@ def fragment_meshes(moment: Moment, blur: float = BLUR) -> Iterator[Piece]:
         rows = np.flatnonzero(splats == number)
         colors = _colors(moment.gaussians, rows, vertices, _CELL * spacing)
         yield Piece(number, vertices, faces, colors, float(volumes[mine].sum()))
-
-
-def clinging(
-    where: NDArray[np.float64], fragment: NDArray[np.int64], reach: float
-) -> NDArray[np.int64]:
-    """Give broken points (-1) the fragment they hang on.
-
-    Args:
-        where: [P, 3] in metres.
-        fragment: [P], -1 for broken points.
-        reach: Largest gap between points that hang together [m].
-
-    Returns:
-        Fragment of each point, still -1 where nothing is near.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import dijkstra
-    from scipy.spatial import cKDTree
-
-    loose = fragment < 0
-    if not loose.any() or loose.all():
-        return fragment
-    rubble, solid = where[loose], fragment[~loose]
-    gap, beside = cKDTree(where[~loose]).query(rubble, distance_upper_bound=reach)
-    seeds = np.flatnonzero(np.isfinite(gap))
-    found = fragment.copy()
-    if len(seeds) == 0:
-        return found
-    links = cKDTree(rubble).query_pairs(reach, output_type="ndarray")
-    # a zero would not count as a link
-    length = np.linalg.norm(rubble[links[:, 0]] - rubble[links[:, 1]], axis=1) + 1e-12
-    graph = coo_matrix((length, links.T), shape=(len(rubble), len(rubble))).tocsr()
-    _, _, source = dijkstra(
-        graph, directed=False, indices=seeds, return_predecessors=True, min_only=True
-    )
-    reached = source >= 0
-    found[np.flatnonzero(loose)[reached]] = solid[beside[source[reached]]]
-    return found
 
 
 def surface(
@@ -284,9 +247,9 @@ def _heap(
     # the blur may not have faded out at the rim, and an open rim is an open mesh
     for axis in range(3):
         np.moveaxis(density, axis, 0)[[0, -1]] = 0.0
-    samples = _samples(density)
+    samples, per_cell = _samples(density)
     wanted, near = float(volumes.sum()), _NEAR * float(density.max())
-    cells = 8.0 * wanted / cell**3
+    cells = per_cell * wanted / cell**3
     best: tuple[float, NDArray[np.float64], NDArray[np.int64]] | None = None
     for _ in range(_TRIES):
         level = float(samples[-int(np.clip(round(cells), 1, len(samples) - 1))])
@@ -307,14 +270,17 @@ def _heap(
     return best[1], best[2]
 
 
-def _samples(density: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sorted values at eight times the grid's points: how much space lies above which level."""
-    for axis in range(3):
-        rows = np.moveaxis(density, axis, 0)
-        finer = np.repeat(rows, 2, axis=0)[:-1]
-        finer[1::2] = 0.5 * (rows[1:] + rows[:-1])
-        density = np.moveaxis(finer, 0, axis)
-    return np.sort(density, axis=None)
+def _samples(density: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+    """Sorted values that tell how much space lies above which level, and how many make a cell."""
+    per_cell = 1
+    if density.size < _FINE_GRID:
+        per_cell = 8
+        for axis in range(3):  # halfway values too
+            rows = np.moveaxis(density, axis, 0)
+            finer = np.repeat(rows, 2, axis=0)[:-1]
+            finer[1::2] = 0.5 * (rows[1:] + rows[:-1])
+            density = np.moveaxis(finer, 0, axis)
+    return np.sort(density[density > 0.0]), per_cell
 
 
 def _volume(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gsfluent.errors import InputError
 from gsfluent.pipeline.export_job import Job, span
-from gsfluent.pipeline.light_shot import gloss_of, light_of
+from gsfluent.pipeline.export_relit import lighting_for
+from gsfluent.pipeline.light_shot import gloss_of
 from gsfluent.pipeline.render_camera import Action
 from gsfluent.pipeline.render_path import FREEZE_SECONDS, Cut, freeze
 from gsfluent.pipeline.run_frames import count_frames, load_frame
@@ -87,7 +88,7 @@ class _Takes:
             output = replace(output, size=options.size)
         self.size = output.size
         shot = replace(shot, output=output)
-        self.film = Film.of(job.out, shot, light_of(shot), job.device)
+        self.film = Film.of(job.out, shot, lighting_for(shot, options), job.device)
         if options.alpha:
             self.film.render.studio = self.film.render.backdrop = None
             self.film.render.background = (0.0, 0.0, 0.0)

@@ -114,7 +114,9 @@ class Lamp:
         share = replace(self, samples=1, intensity=self.intensity / self.samples)
         width = 1.0 / math.sqrt(self.samples)
         found = []
-        for a, b in disc(self.samples):
+        spots = disc(self.samples)
+        middle = [sum(spot[axis] for spot in spots) / len(spots) for axis in (0, 1)]
+        for a, b in ((a - middle[0], b - middle[1]) for a, b in spots):
             offset = [self.softness * (a * p + b * q) for p, q in zip(across, upward, strict=True)]
             if self.position is None:
                 x, y, z = (t + o for t, o in zip(self.toward, offset, strict=True))

@@ -36,6 +36,9 @@ POKES = ("throw", "bullet", "blade", "press", "pour")
 """Events that can come while the simulation runs."""
 SETTLE = 3.0
 """Simulated seconds after which an object that does not come to rest counts as prepared [s]."""
+REPAIR = {"cpu": "mvee", "cuda": "gap"}
+"""How cracks get splats by device: fine faces (``gap``) cost a CPU as much as the simulation does,
+and quadruple what is drawn."""
 MOST_LOOSE = 24
 """Bullets and jets at a time; the oldest leaves for a new one."""
 
@@ -57,6 +60,7 @@ class LiveSession:
         slow: Slow motion: a frame is ``1 / (fps * slow)`` simulated seconds.
         seed: Seed of points and weakness.
         dx: Grid spacing [m]; overrides ``quality``.
+        cracks: Method of :class:`gsfluent.pipeline.Repair`; default by device.
         options: Further arguments of :class:`gsfluent.pipeline.Simulate`.
 
     Raises:
@@ -79,6 +83,7 @@ class LiveSession:
         slow: float = 1.0,
         seed: int = 0,
         dx: float | None = None,
+        cracks: str | None = None,
         **options: Any,
     ) -> None:
         if not any(body.solid is not None for body in scene.bodies):
@@ -98,13 +103,17 @@ class LiveSession:
             self.dx = dx
         self.fps = fps
         self._simulate = Simulate(
-            dx=self.dx, seed=seed, device=device, **({"standing": True} | options)
+            dx=self.dx,
+            seed=seed,
+            device=device,
+            **({"standing": True, "loose_crumbs": True} | options),
         )
         start = copy_of(scene)
         self._first = self._simulate.run_of(start, fps)
         self.solids = len(scene.bodies)
         self._carry = Carry.bind(start, self._first.matter)
-        self._repair = Repair()
+        self.cracks = REPAIR.get(self.device.type, "mvee") if cracks is None else cracks
+        self._repair = Repair(self.cracks)
         self._reach = reach_of(self._first.matter)
         self._prepared = self._first.twin(), 0, (0, 0.0)
         self.dropped = 0

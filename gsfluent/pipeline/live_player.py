@@ -36,7 +36,7 @@ MOST_FRAMES = 5_000
 """Frames after which numbers begin at 0 again, so that a long session needs no more memory."""
 WINDOW = 1.0
 """Wall seconds over which speeds are averaged."""
-AT_REST, RUNNING, FAILED = "at rest", "running", "failed"
+AT_REST, RUNNING, FAILED, PAUSED = "at rest", "running", "failed", "paused"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Status:
     """What a player is doing.
 
     Attributes:
-        state: ``at rest``, ``running`` or ``failed``.
+        state: ``at rest``, ``running``, ``paused`` or ``failed``.
         time: Simulated time [s].
         real_time: Simulated seconds per wall second over the last second of work; None at rest.
         wanted: What slow motion asks for: ``1 / slow``.
@@ -90,7 +90,7 @@ class LivePlayer:
         self._frames: collections.OrderedDict[int, SavedFrame] = collections.OrderedDict()
         self._facts: dict[int, dict[str, Any]] = {}
         self._bytes = 0
-        self._stop = False
+        self._stop = self._paused = False
         self._message = ""
         self._speed: collections.deque[tuple[float, float, float]] = collections.deque()
         self._take: Take | None = None
@@ -173,6 +173,16 @@ class LivePlayer:
 
         return self._enqueue(act)
 
+    def pause(self, paused: bool) -> Future[Any]:
+        """Let the simulation stand, or go on; pokes are taken all the same."""
+
+        def act() -> None:
+            self._paused = paused
+            if not paused:
+                self._speed.clear()
+
+        return self._enqueue(act)
+
     def record(self, out: Path) -> Future[Any]:
         """Reset, and write what happens from then on into a run folder."""
 
@@ -217,7 +227,7 @@ class LivePlayer:
                     self._one_frame()
 
     def _idle(self) -> bool:
-        return bool(self.session.failure) or self.session.at_rest
+        return self._paused or bool(self.session.failure) or self.session.at_rest
 
     def _obey(self) -> None:
         """Do what is in the queue."""
@@ -225,18 +235,23 @@ class LivePlayer:
             act, future = self._queue.popleft()
             if not future.set_running_or_notify_cancel():
                 continue
+            error: Exception | None = None
+            result = None
             try:
                 result = act()
                 self._message = ""
-                future.set_result(result)
-            except GsfluentError as error:
-                self._message = str(error).split("\n")[0]
-                future.set_exception(error)
-            except Exception as error:
+            except GsfluentError as problem:
+                self._message, error = str(problem).split("\n")[0], problem
+            except Exception as problem:
                 _log.exception("live: a command failed")
-                self._message = f"{type(error).__name__}: {error}"
-                future.set_exception(error)
+                self._message = f"{type(problem).__name__}: {problem}"
+                error = problem
+            # who waits for it finds the status as it is then
             self._status = self._look()
+            if error is None:
+                future.set_result(result)
+            else:
+                future.set_exception(error)
             with self._wake:
                 self._wake.notify_all()
 
@@ -282,6 +297,7 @@ class LivePlayer:
         if self._take is not None:
             self._finish_take()
         self.session.reset()
+        self._paused = False
         with self._wake:
             self._begin_anew()
         self._speed.clear()
@@ -317,6 +333,7 @@ class LivePlayer:
         session, speed = self.session, list(self._speed)
         wall, simulated = sum(s[0] for s in speed), sum(s[1] for s in speed)
         state = FAILED if session.failure else AT_REST if session.at_rest else RUNNING
+        state = PAUSED if state == RUNNING and self._paused else state
         return Status(
             state=state,
             time=session.time,

@@ -85,10 +85,14 @@ class Take:
         session = self.session
         events = [poke | {"at": poke["at"] - self._start} for poke in session.pokes]
         values = self.shot.resolved() | {"events": events}
-        values["solve"] = dict(values["solve"]) | {"cells": session.cells, "standing": True}
+        values["solve"] = dict(values["solve"]) | {
+            "cells": session.cells,
+            "standing": True,
+            "loose_crumbs": True,
+        }
         fps = session.fps * self._slow
         values["output"] = dict(values["output"]) | {
-            "fps": fps, "seconds": count / fps, "slow": self._slow,
+            "fps": fps, "seconds": count / fps, "slow": self._slow, "cracks": session.cracks,
         }  # fmt: skip
         if not isinstance(values["output"].get("camera"), str):
             values["output"]["camera"] = "orbit"

@@ -9,6 +9,7 @@ a host synchronisation: one scatter, pooling, and one lookup per quantity.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -58,24 +59,30 @@ class Occupancy(NamedTuple):
         return self.values[start : start + side**3].view(side, side, side)
 
 
-def box_frame(means: Tensor, cell: float, nodes: int) -> Tensor:
-    """Corner and cell [4] of a grid of ``nodes``^3 around the bulk of ``means`` [N, 3]."""
+def box_frame(center: Sequence[float], cell: float, nodes: int) -> list[float]:
+    """Corner x, y, z and cell of a grid of ``nodes``^3 around ``center`` [m], in whole steps."""
     step = cell * COARSEST
-    corner = means.mean(0) - 0.5 * nodes * cell
-    corner = (corner / step).round() * step
-    return torch.cat([corner, corner.new_full((1,), cell)])
+    return [*(round((x - 0.5 * nodes * cell) / step) * step for x in center), cell]
 
 
-def occupancy(means: Tensor, cell: float, nodes: int, *, per_cell: float = PER_CELL) -> Occupancy:
+def occupancy(
+    means: Tensor,
+    center: Sequence[float],
+    cell: float,
+    nodes: int,
+    *,
+    per_cell: float = PER_CELL,
+) -> Occupancy:
     """Occupancy of the bulk of ``means`` [N, 3], by :func:`gsfluent.ops.occupancy`.
 
     Args:
         means: Centres [m]; those off the grid are left out.
+        center: Middle of the grid [m], about.
         cell: Finest cell [m].
         nodes: Cells along each side, a multiple of 16.
         per_cell: Splats in a full cell.
     """
-    frame = box_frame(means, cell, nodes)
+    frame = means.new_tensor(box_frame(center, cell, nodes))
     return Occupancy(ops.occupancy(means, frame, nodes, full=FULL * per_cell), frame, nodes)
 
 

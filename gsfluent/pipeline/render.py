@@ -9,7 +9,7 @@ each pixel once. Siblings that repair created are composited nearest-only throug
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ from gsfluent.pipeline.light import (
     lighting_of,
     pack_lamps,
 )
-from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.light_maps import Bulk, bulk, faces_of, shadow_maps
 from gsfluent.pipeline.occlusion import Occupancy
 from gsfluent.pipeline.render_backdrop import Backdrop
 from gsfluent.pipeline.render_floor import Studio
@@ -38,8 +38,8 @@ from gsfluent.pipeline.stage import Stage
 # Pictures whose longest side is above this get shadow maps of the second size.
 _LARGE = 800
 _RESOLUTIONS = (512, 1024)
-# How many pictures share one look at how large the matter is (each look waits for the device).
-_LOOK_EVERY = 16
+# Room of the occupancy grid for matter that flies apart; beyond, a new one is laid out.
+_ROOM = 1.25
 
 
 @dataclass(frozen=True)
@@ -285,47 +285,46 @@ class Render(Stage):
         self, gaussians: Gaussians, camera: Camera, lighting: Lighting, groups: Tensor | None
     ) -> Lit:
         """Shadow maps and occupancy of this state of the matter."""
+        matter = bulk(gaussians)
         size = self._size
-        if size is None or size.left == 0 or size.count != gaussians.count:
-            size = _Size.of(gaussians, self.normal_cell)
-        self._size = replace(size, left=size.left - 1)
+        if size is None or not size.fits(gaussians.count, matter):
+            size = self._size = _Size.of(gaussians, matter, self.normal_cell)
         lamps = lighting.drawn()
-        faces = faces_of(lamps, size.center, size.radius)
+        faces = faces_of(lamps, matter)
         large = max(camera.width, camera.height) > _LARGE
         texels = lighting.resolution or _RESOLUTIONS[large]
         return Lit(
             pack_lamps(lamps, faces, gaussians.means),
             lighting.around(gaussians.means),
-            shadow_maps(gaussians, lamps, faces, texels, groups=groups),
-            size.grid.of(gaussians.means),
+            shadow_maps(gaussians, lamps, faces, texels, matter, groups=groups),
+            size.grid.of(gaussians.means, matter.center),
             lighting.occlusion,
         )
 
 
 @dataclass(frozen=True)
 class _Size:
-    """How large the matter is, as the host knows it.
+    """The occupancy grid, and the matter it was made for.
 
     Attributes:
-        grid: Size of the occupancy grid.
-        center: Middle of the matter [m].
-        radius: Radius of its bulk [m].
+        grid: Its size.
+        radius: Largest radius of the matter [m] it has room for.
         count: Splats at that time.
-        left: Pictures until the next look.
     """
 
     grid: Grid
-    center: tuple[float, float, float]
     radius: float
     count: int
-    left: int
 
     @classmethod
-    def of(cls, gaussians: Gaussians, cell: float | None) -> _Size:
-        middle, reach = bulk(gaussians)
-        x, y, z, radius = torch.cat([middle, reach[None]]).tolist()
-        grid = grid_for(gaussians, cell=cell, radius=1.25 * radius)
-        return cls(grid, (x, y, z), radius, gaussians.count, _LOOK_EVERY)
+    def of(cls, gaussians: Gaussians, matter: Bulk, cell: float | None) -> _Size:
+        radius = _ROOM * matter.radius
+        return cls(grid_for(gaussians, cell=cell, radius=radius), radius, gaussians.count)
+
+    def fits(self, count: int, matter: Bulk) -> bool:
+        """Whether it will do for this matter too."""
+        alike = self.count < _ROOM * count and count < _ROOM * self.count
+        return alike and 0.5 * self.radius < matter.radius <= self.radius
 
 
 def _gloss(lighting: Lighting, given: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -2,8 +2,8 @@
 
 The outward normal is minus the gradient of the smoothed occupancy of space. It exists on the skin,
 on crack faces and on debris alike, needs no memory of the rest state and, unlike a plane fitted to
-neighbours (PCA), it has a side. Flat Gaussians know their plane better than any neighbourhood does:
-they use their shortest axis, turned outward. Nothing but :func:`occupancy_cell` and
+neighbours (PCA), it has a side. Flat Gaussians add their shortest axis, and on a sheet, where the
+density has no side, take it alone. Nothing but :func:`occupancy_cell` and
 :func:`grid_for` waits for the device; both are called once per film.
 """
 
@@ -63,9 +63,9 @@ class Grid(NamedTuple):
     nodes: int
     per_cell: float
 
-    def of(self, means: Tensor) -> Occupancy:
-        """Occupancy of centres [N, 3]."""
-        return occupancy(means, self.cell, self.nodes, per_cell=self.per_cell)
+    def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
+        """Occupancy of centres [N, 3] around ``center`` [m]."""
+        return occupancy(means, center, self.cell, self.nodes, per_cell=self.per_cell)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:
@@ -81,7 +81,7 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
     from gsfluent.pipeline.light_maps import bulk
 
     cell = occupancy_cell(gaussians) if cell is None else cell
-    radius = radius or float(bulk(gaussians)[1])
+    radius = radius or bulk(gaussians).radius
     most = _MOST_NODES if gaussians.device.type == "cuda" else _MOST_NODES_CPU
     coarser = max(1.0, 2.0 * radius / (cell * (most - 2 * _ROOM)))
     nodes = int(2.0 * radius / (coarser * cell)) + 2 * _ROOM
@@ -96,22 +96,26 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
         gaussians: In the scene frame, any state.
         cell: Grid spacing; found from the positions when not given.
     """
-    return splat_normals(gaussians, grid_for(gaussians, cell=cell).of(gaussians.means))
+    from gsfluent.pipeline.light_maps import bulk
+
+    matter = bulk(gaussians)
+    grid = grid_for(gaussians, cell=cell, radius=matter.radius)
+    return splat_normals(gaussians, grid.of(gaussians.means, matter.center))
 
 
 def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = None) -> Tensor:
     """As :func:`estimate_normals`, from the occupancy of the same splats.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
-    splats that agree with the density, zero for the few splats off the grid. Blending them as they
-    are lets the sure ones decide.
+    splats, zero for the few splats off the grid. Blending them as they are lets the sure ones
+    decide.
 
     Args:
         gaussians: In the scene frame, any state.
         grid: Their occupancy.
-        eye: Where the picture is taken from, [3]: what one sees of a flat splat faces that way. A
-            shell is a sheet without a side to the density, from outside and from inside. When
-            None, flat splats take the side of the density.
+        eye: Where the picture is taken from, [3]: what one sees faces that way. A shell is a sheet
+            without a side to the density, from outside and from inside. When None, vectors take
+            the side of the density.
     """
     return ops.density_normals(
         gaussians.means,

@@ -71,7 +71,7 @@ def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
 def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") -> Gaussians | None:
     """Splats of the blades: a plate behind each edge, or None without blades.
 
-    An edge waits where its path begins, moves along it, and is drawn back the way it came.
+    An edge waits where its path begins, moves along it, is drawn back the way it came, and is gone.
 
     Args:
         scene: The scene.
@@ -84,7 +84,9 @@ def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") 
         legs = path[1:] - path[:-1]
         lengths = legs.norm(dim=1)
         whole = float(lengths.sum())
-        along = min(max(blade.speed * (time - blade.start), 0.0), 2.0 * whole)
+        along = max(blade.speed * (time - blade.start), 0.0)
+        if along > 2.0 * whole:
+            continue
         along = along if along <= whole else 2.0 * whole - along
         leg = 0
         while leg + 1 < len(lengths) and along > float(lengths[leg]):

@@ -17,8 +17,9 @@ from gsfluent.config import Shot
 from gsfluent.data import Camera, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load, load_capture, save_image
+from gsfluent.pipeline.delight import Delit
 from gsfluent.pipeline.export import write_exports
-from gsfluent.pipeline.light import Light, Lighting
+from gsfluent.pipeline.light import Light, Lighting, lighting_of
 from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
 from gsfluent.pipeline.render import Layers, Render
 from gsfluent.pipeline.render_backdrop import (
@@ -67,6 +68,9 @@ class Film:
     ) -> None:
         self.folder, self.cameras, self.render, self.device = folder, cameras, render, device
         self.shot, self.around = shot, around or []
+        lighting = lighting_of(render.light)
+        share = 0.0 if lighting is None else lighting.delight
+        self._delit = Delit(self.frame(0), share) if share > 0.0 else None
 
     @classmethod
     def of(cls, out: Path, shot: Shot, light: Light | Lighting, device: torch.device) -> Film:
@@ -127,8 +131,9 @@ class Film:
         """The picture of a frame with its opacity and depth."""
         camera = self.cameras[frame.index]
         gloss = gloss_of(self.shot, frame)
+        gaussians = frame.gaussians if self._delit is None else self._delit.apply(frame)
         return self.render.layers(
-            frame.gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time
+            gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time
         )
 
 

@@ -96,7 +96,7 @@ def simulate_stage(context: RunContext) -> None:
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.quality, shot.solve.cells, shot.solve.standing],
+        [shot.solve.quality, shot.solve.cells, shot.solve.standing, shot.solve.loose_crumbs],
         shot.output.fps,
         shot.output.seconds,
         shot.output.cracks,
@@ -112,6 +112,7 @@ def simulate_stage(context: RunContext) -> None:
             device=context.device,
             dx=None if cells is None else grid_spacing(scene, cells),
             standing=shot.solve.standing,
+            loose_crumbs=shot.solve.loose_crumbs,
             deterministic=shot.solve.deterministic,
             repair=shot.output.cracks,
         )

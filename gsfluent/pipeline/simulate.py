@@ -144,6 +144,8 @@ class Simulate(Stage):
             device: the composed operators on a GPU, whose sums have no order.
         standing: Let what stands still on the floor at time 0 sleep, without a strain, until
             something comes near; else its weight begins to act then.
+        loose_crumbs: Take broken points with next to nothing around them off the grid for good:
+            they fall freely and stay where they meet the floor.
         repair: How ``frame.gaussians`` get splats along cracks: a method of
             :class:`gsfluent.pipeline.Repair`; True for its default, False for ``none``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
@@ -180,6 +182,7 @@ class Simulate(Stage):
         repair: bool | str = True,
         splats: bool = True,
         standing: bool = False,
+        loose_crumbs: bool = False,
         return_map: dict[str, float | bool] | None = None,
         max_rollbacks: int = 6,
         max_particles: int = 8_000_000,
@@ -213,6 +216,7 @@ class Simulate(Stage):
             "contact_near": contact_near,
             "deterministic": deterministic,
             "standing": standing,
+            "loose_crumbs": loose_crumbs,
             "return_map": return_map,
         }
         self._run: Run | None = None

@@ -21,6 +21,7 @@ from gsfluent.pipeline.simulate_kick import Kicks
 from gsfluent.pipeline.simulate_solver import Counters, Unhealthy
 from gsfluent.pipeline.simulate_state import State, load_state, save_state
 from gsfluent.pipeline.simulate_step import Stepper
+from gsfluent.pipeline.simulate_stretch import bounded
 from gsfluent.scene import Scene
 
 MOMENTUM_BAR = 1e-4
@@ -118,7 +119,7 @@ class Run:
         # A frame is a clean start: what follows does not depend on what was cached before it, so a
         # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
         stepper.reset()
-        state = self._regroup(state)
+        state = bounded(self._regroup(state))
         watch.keep(state, only=True)
         checked = grouped = state.step
         broken = self._broken(state)
@@ -131,6 +132,7 @@ class Run:
                 now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
+                    state = bounded(state)
                     trouble = watch.check(state, stepper)
                     checked = state.step
             except Unhealthy as error:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.errors import InputError
+from gsfluent.pipeline import simulate_strays as crumbs
 from gsfluent.pipeline.blades import BladeSet
 from gsfluent.pipeline.particles import Matter
 from gsfluent.pipeline.rigid import RigidSet
@@ -41,7 +42,6 @@ from gsfluent.pipeline.simulate_solver import (
     resident_can,
 )
 from gsfluent.pipeline.simulate_state import State, at_rows
-from gsfluent.pipeline.simulate_strays import drift, find_strays, reach_of
 from gsfluent.scene import Scene
 
 __all__ = ["CFL", "Counters", "State", "Stepper", "Unhealthy"]
@@ -72,6 +72,7 @@ class Stepper:
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
         standing: Whether what stands still at time 0 sleeps from then on.
+        loose_crumbs: Whether broken points that are alone leave the grid for good.
         flights: The first flights of the first bodies, when they are known.
     """
 
@@ -92,6 +93,7 @@ class Stepper:
         deterministic: bool = False,
         return_map: dict[str, Any] | None = None,
         standing: bool = False,
+        loose_crumbs: bool = False,
         flights: Sequence[Flight] = (),
     ) -> None:
         self.scene, self.matter = scene, matter
@@ -102,8 +104,8 @@ class Stepper:
         self.counters = Counters()
         self.dt_scale = 1.0
         self.field_limit = LIMIT
-        self._standing = standing
-        self._reach = reach_of(matter)
+        self._standing, self._loose = standing, loose_crumbs
+        self._reach = crumbs.reach_of(matter)
         device = matter.particles.device
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         self._pull = float(self._gravity.norm())
@@ -161,6 +163,11 @@ class Stepper:
         state = self._renumber(state, on_grid)
         if not at_frame:
             return state
+        if self._loose:
+            state = self._let_go(
+                state, crumbs.find_lonely(state.position, state.peak, on_grid, self.matter.dx)
+            )
+            on_grid = grid_mask(state, self.matter)
         state = count_calm(state, on_grid, self._gravity, self.matter.dx)
         state = self.leaving(state, unit, frame)
         self.counters.naps, self.counters.piece_flights = self.leaving.naps, self.leaving.flights
@@ -402,7 +409,7 @@ class Stepper:
         self.counters.point_seconds += span * p.count
         strays = state.stray.nonzero()[:, 0]
         if strays.numel():
-            push = drift(
+            push = crumbs.drift(
                 position, values["velocity"], p.mass, strays, span, self.scene.gravity,
                 self.scene.floor,
             )  # fmt: skip
@@ -416,15 +423,14 @@ class Stepper:
     def _retire(self, state: State) -> State:
         """Take broken points that are far away off the grid."""
         candidate = grid_mask(state, self.matter)
-        far = find_strays(state.position, state.peak, candidate, self._reach)
-        if not bool(far.any()):
-            return state
-        particles = state.particles
-        state = state._replace(
-            particles=particles.replace(strain=particles.strain.masked_fill(far[:, None], 0.0)),
-            stray=state.stray | far,
+        return self._let_go(
+            state, crumbs.find_strays(state.position, state.peak, candidate, self._reach)
         )
-        self._take(state)
+
+    def _let_go(self, state: State, gone: Tensor) -> State:
+        if bool(gone.any()):
+            state = crumbs.let_go(state, gone)
+            self._take(state)
         return state
 
 

@@ -11,7 +11,10 @@ import torch
 from torch import Tensor
 
 from gsfluent.pipeline.particles import Matter
+from gsfluent.pipeline.simulate_state import State
 
+LONELY = 48
+"""Points in 216 cells, of 1728 in whole matter, below which broken ones are alone."""
 DISTANCE = 8.0
 """Distance from the middle of the unbroken matter, in extents of the largest body."""
 
@@ -39,6 +42,48 @@ def find_strays(position: Tensor, peak: Tensor, candidate: Tensor, reach: float)
     middle = (weight * position).sum(dim=0) / weight.sum().clamp(min=1.0)
     far = ((position - middle) ** 2).sum(dim=1) > reach * reach
     return candidate & far & (peak >= 0)
+
+
+def let_go(state: State, crumbs: Tensor) -> State:
+    """The state in which these points [N] are strays, without a strain."""
+    p = state.particles
+    return state._replace(
+        particles=p.replace(strain=p.strain.masked_fill(crumbs[:, None], 0.0)),
+        stray=state.stray | crumbs,
+    )
+
+
+def find_lonely(position: Tensor, peak: Tensor, candidate: Tensor, dx: float) -> Tensor:
+    """Tell which candidates are broken and have next to nothing around them, bool [N].
+
+    Less than :data:`LONELY` points, none of them unbroken, in the 3^3 cubes of two cells around
+    them: a density at which nothing of a solid's mechanics is left.
+
+    Args:
+        position: Positions [m], [N, 3].
+        peak: Largest alpha so far, [N].
+        candidate: Points on the grid, bool [N].
+        dx: Grid spacing [m].
+    """
+    rows = candidate.nonzero()[:, 0]
+    lonely = torch.zeros_like(candidate)
+    if rows.numel() == 0:
+        return lonely
+    cube = torch.floor(position[rows] / (2.0 * dx)).to(torch.int64)
+    cube = cube - cube.amin(dim=0) + 1
+    wide = cube.amax(dim=0) + 2
+    key = (cube[:, 0] * wide[1] + cube[:, 1]) * wide[2] + cube[:, 2]
+    cubes, home, counts = torch.unique(key, return_inverse=True, return_counts=True)
+    whole = torch.zeros_like(cubes).index_add_(0, home, (peak[rows] < 0).long())
+    counts = counts + LONELY * whole
+    around = torch.zeros_like(counts)
+    step = torch.tensor([-1, 0, 1], device=key.device)
+    star = ((step[:, None, None] * wide[1] + step[:, None]) * wide[2] + step).flatten()
+    for shift in star:
+        at = torch.searchsorted(cubes, cubes + shift).clamp(max=cubes.shape[0] - 1)
+        around += torch.where(cubes[at] == cubes + shift, counts[at], 0)
+    lonely[rows] = (around < LONELY)[home]
+    return lonely
 
 
 def drift(

@@ -92,6 +92,7 @@ class App:
         self.index = self._first_index()
         self.follow = source.running
         self.tracking = self._travels()
+        self._tracked_by_itself = True
         self.shift = (0.0, 0.0, 0.0)
         self._anchor = self._center(self.index)
         self._problem = ""
@@ -131,11 +132,12 @@ class App:
     def show(self, index: int) -> None:
         """Go to frame ``index``."""
         with self.lock:
-            self.index = max(0, min(index, self.timeline.count - 1))
+            index = max(0, min(index, self.timeline.count - 1))
             if self.tracking:
-                center = self._center(self.index)
+                center = self._center(index)
                 x, y, z = (c - a for c, a in zip(center, self._anchor, strict=True))
                 self.shift = (x, y, z)
+            self.index = index
             facts = self.timeline.facts()
             self._time_panel.update()
             busy = self.playback.playing or (self.follow and self.source.running)
@@ -170,6 +172,17 @@ class App:
 
     def track(self, on: bool) -> None:
         """Whether the view travels with the matter; nothing jumps when this changes."""
+        self._tracked_by_itself = False
+        self._set_tracking(on)
+
+    def _track_by_itself(self) -> None:
+        """Follow matter that has left its place, unless a person has decided."""
+        if self._tracked_by_itself and not self.tracking and self._travels():
+            self._set_tracking(True)
+            if self._look_panel is not None:
+                self._look_panel.show_tracking(True)
+
+    def _set_tracking(self, on: bool) -> None:
         with self.lock:
             center = self._center(self.index)
             x, y, z = (c - s for c, s in zip(center, self.shift, strict=True))
@@ -234,10 +247,10 @@ class App:
                 legend = self.browser.show(self.server, self.index, self.look, self.shift)
                 self._legend(legend)
                 return True
-            full = self.camera(client)
-            camera = self.camera(client, budget)
+            with self.lock:  # frame and camera of the same moment
+                index, full, camera = self.index, self.camera(client), self.camera(client, budget)
             start = time.perf_counter()
-            picture, legend = self.maker.picture_and_legend(self.index, camera, self.look)
+            picture, legend = self.maker.picture_and_legend(index, camera, self.look)
             self.pace.measured(camera.width * camera.height, time.perf_counter() - start)
         except GsfluentError as error:
             self._problem = str(error).split("\n")[0]
@@ -291,6 +304,7 @@ class App:
 
     def refresh(self) -> None:
         """Look for new frames now."""
+        revision, before = self.timeline.revision, self._center(self.timeline.first.index)
         try:
             if not self.timeline.refresh():
                 return
@@ -298,6 +312,12 @@ class App:
             self._problem = str(error).split("\n")[0]
             self.say()
             return
+        if self.timeline.revision != revision and not self.tracking:
+            # the solid lies where it was photographed, the first frame where it is dropped from
+            after = self._center(self.timeline.first.index)
+            x, y, z = (s + a - b for s, a, b in zip(self.shift, after, before, strict=True))
+            self.shift = (x, y, z)
+        self._track_by_itself()
         facts = self.timeline.facts()
         last = self.timeline.count - 1
         now = last if self.follow else min(self.index, last)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from gsfluent.config import Shot
-from gsfluent.pipeline.live_player import AT_REST, FAILED, LivePlayer
+from gsfluent.pipeline.live_player import AT_REST, FAILED, PAUSED, LivePlayer
 from gsfluent.pipeline.run_frames import SavedFrame
 
 
@@ -45,7 +45,8 @@ class LiveSource:
         status = self.player.status
         if status.state == FAILED:
             return f"**The simulation has failed:** {status.message} Press *Reset*."
-        head = "**At rest.** Poke it." if status.state == AT_REST else "**Live**"
+        heads = {AT_REST: "**At rest.** Poke it.", PAUSED: "**Paused.**"}
+        head = heads.get(status.state, "**Live**")
         if status.real_time is not None:
             head += f" · {factor(status.real_time)} × real time"
         if status.recording is not None:

@@ -45,7 +45,7 @@ class LookPanel:
             self._light = LightPanel(gui, first, (x, y, radius), radius, self._changed)
         self._build_cut(gui)
         with gui.add_folder("View", expand_by_default=False):
-            self._track = gui.add_checkbox(
+            self._track: Any = gui.add_checkbox(
                 "Follow object", app.tracking, hint="The view travels with the matter"
             )
             self._floor = gui.add_checkbox("Floor", True, visible=lit)
@@ -56,7 +56,8 @@ class LookPanel:
 
         @self._track.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
-            app.track(self._track.value)
+            if event.client is not None:
+                app.track(self._track.value)
 
         @home.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
@@ -113,6 +114,10 @@ class LookPanel:
         sign = -1.0 if self._flip.value else 1.0
         x, y, z = (sign * value for value in normal)
         return Cut((x, y, z), sign * self._offset.value / self._factor)
+
+    def show_tracking(self, on: bool) -> None:
+        """Show whether the view follows the object."""
+        self._track.value = on
 
     def show_legend(self, content: str) -> None:
         """Put the legend under the choice of colours; nothing hides it."""

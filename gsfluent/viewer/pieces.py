@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsfluent.pipeline.rubble import REACH, clinging
 from gsfluent.pipeline.run_frames import SavedFrame
 
-_REACH = 1.6  # point spacings over which broken matter hangs together
 _KEPT = 64  # frames whose assignment is remembered
 
 
@@ -63,30 +63,7 @@ def _joined(slots: Tensor, broken: Tensor, frame: SavedFrame) -> Tensor:
     Shortest paths over links between close points: rubble that lies on a piece is reached, a spray
     in the air is not.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import dijkstra
-    from scipy.spatial import cKDTree
-
-    if not bool(broken.any()) or bool(broken.all()):
-        return slots
-    reach = _REACH * max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)
+    reach = REACH * max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)
     place = frame.positions.double().cpu().numpy()
-    loose = broken.cpu().numpy()
-    piece = slots.cpu().numpy()
-    rubble = place[loose]
-    gap, beside = cKDTree(place[~loose]).query(rubble, distance_upper_bound=reach)
-    seeds = np.flatnonzero(np.isfinite(gap))
-    if len(seeds) == 0:
-        return slots
-    links = cKDTree(rubble).query_pairs(reach, output_type="ndarray")
-    length = np.linalg.norm(rubble[links[:, 0]] - rubble[links[:, 1]], axis=1) + 1e-12
-    graph = coo_matrix((length, links.T), shape=(len(rubble), len(rubble))).tocsr()
-    _, _, source = dijkstra(
-        graph, directed=False, indices=seeds, return_predecessors=True, min_only=True
-    )
-    found = np.full(len(rubble), -1, dtype=piece.dtype)
-    reached = source >= 0
-    found[reached] = piece[~loose][beside[source[reached]]]
-    piece = piece.copy()
-    piece[loose] = found
-    return torch.from_numpy(piece).to(slots.device)
+    piece = np.where(broken.cpu().numpy(), -1, slots.cpu().numpy())
+    return torch.from_numpy(clinging(place, piece, reach)).to(slots.device)

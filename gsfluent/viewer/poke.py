@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import logging
 import threading
 import time
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.live_player import AT_REST, FAILED, LivePlayer, Status
+from gsfluent.pipeline.live_player import FAILED, PAUSED, RUNNING, LivePlayer, Status
 from gsfluent.viewer.live_source import factor
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _SAY_EVERY = 0.25  # seconds between two updates of the figures
 _PLOT_EVERY = 0.5
+_DRAWN_OVER = 2.0  # seconds over which pictures are counted
 _PATIENCE = 120.0  # seconds a poke may have to wait for the frame in hand
 SLOW = {"1 (real time)": 1.0, "2": 2.0, "4": 4.0, "10": 10.0, "30": 30.0, "100": 100.0}
 
@@ -39,7 +41,7 @@ class PokePanel:
         self.player, self.takes = player, takes
         self._app: App | None = None
         self._stop = threading.Event()
-        self._pictures = 0
+        self._drawn: collections.deque[tuple[float, int]] = collections.deque()
         self._looked = time.monotonic()
         self._thread = threading.Thread(target=self._watch, name="gsfluent-poke", daemon=True)
 
@@ -55,7 +57,7 @@ class PokePanel:
             self._click: Any = gui.add_checkbox(
                 "Shoot where I click", False, hint="A click on the picture fires there"
             )
-            self._speed = gui.add_slider("Bullet [m/s]", 5, 300, 5, 120)
+            self._speed = gui.add_slider("Bullet [m/s]", 5, 300, 5, 80)
             self._radius = gui.add_slider("Radius [mm]", 2, 40, 1, 15)
             self._throw = gui.add_button("Throw", hint="Away from the camera and up")
             self._toss = gui.add_slider("Throw [m/s]", 0.5, 15, 0.5, 5)
@@ -64,6 +66,7 @@ class PokePanel:
             self._slow = gui.add_dropdown(
                 "Slow motion", tuple(dict.fromkeys((*SLOW, chosen))), initial_value=chosen
             )
+            self._pause: Any = gui.add_button("Pause", hint="The simulation stands or goes on")
             self._reset = gui.add_button("Reset")
             self._record: Any = gui.add_button("Record", hint="Resets, then writes a run folder")
         self._shoot.on_click(lambda event: self._with_client(event, self._fire))
@@ -71,6 +74,9 @@ class PokePanel:
         self._cut.on_click(lambda event: self._with_client(event, self._slice))
         self._reset.on_click(lambda event: self._ask(self.player.reset))
         self._record.on_click(lambda event: self._take())
+        self._pause.on_click(
+            lambda event: self._ask(lambda: self.player.pause(self._pause.label == "Pause"))
+        )
 
         @self._slow.on_update
         def _(event: Any) -> None:
@@ -196,11 +202,14 @@ class PokePanel:
     def _say(self, status: Status) -> None:
         app = self._app
         assert app is not None
-        now = time.monotonic()
-        span = now - self._looked
-        drawn = (app.pictures - self._pictures) / span if span > 0.0 else 0.0
-        self._looked, self._pictures = now, app.pictures
+        self._looked = now = time.monotonic()
+        self._drawn.append((now, app.pictures))
+        (then, before), (now, after) = self._drawn[0], self._drawn[-1]
+        drawn = (after - before) / (now - then) if now > then else 0.0
+        while now - self._drawn[0][0] > _DRAWN_OVER:
+            self._drawn.popleft()
         self._figures.content = figures(status, drawn)
+        self._pause.label = "Go on" if status.state == PAUSED else "Pause"
         recording = status.recording is not None
         self._record.label = "End recording" if recording else "Record"
         app.say()
@@ -212,10 +221,12 @@ def figures(status: Status, drawn: float) -> str:
     if status.state == FAILED:
         rows.append("<b>failed</b>: reset")
     elif status.real_time is None:
-        rows.append("at rest" if status.state == AT_REST else "starting")
+        rows.append("starting" if status.state == RUNNING else status.state)
     else:
         wanted = "" if status.wanted == 1.0 else f" (slow motion asks {factor(status.wanted)})"
         rows.append(f"<b>{factor(status.real_time)} × real time</b>{wanted}")
+        if status.state == PAUSED:
+            rows[-1] += " until the pause"
         rows.append(f"{status.frames_per_second:.1f} frames/s, {drawn:.1f} pictures/s")
     count = f"t = {status.time:.3f} s, {status.particles} points"
     rows.append(count + (f", {status.dropped} dropped" if status.dropped else ""))

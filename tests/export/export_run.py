@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
 import torch
 
 from gsfluent import geometry
+from gsfluent.config import Shot
 from gsfluent.data import TRANSITION, Camera, Gaussians
 from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.run_frames import SavedFrame, save_frame
 
 FRAMES, CARRIED, POINTS = 4, 400, 600
 FPS = 25.0
+SIZE = (96, 64)
 # births and deaths of transition splats: frame -> ids that live in it
 LIVING = ((), (1000, 1001, 7000), (1001, 7000), (1001, 9000))
 
@@ -85,6 +88,15 @@ def make_run(out: Path, *, degree: int = 1, still: bool = False) -> Path:
             facts={"fragments": 1 if index < 2 else 2},
         )
         save_frame(folder, frame)
+    return out
+
+
+def add_record(out: Path) -> Path:
+    """Write the run's record, which tells camera and light."""
+    (out / "splats.ply").write_bytes(b"")
+    values = {"splats": str(out / "splats.ply"), "output": {"fps": FPS, "size": list(SIZE)}}
+    shot = Shot.from_dict(values, out)
+    (out / "run.json").write_text(json.dumps({"shot": shot.resolved()}))
     return out
 
 

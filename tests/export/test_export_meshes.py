@@ -15,7 +15,8 @@ from export_run import FRAMES, make_run, points_of_a_cube
 from gsfluent.errors import InputError
 from gsfluent.pipeline.export import ExportOptions, export
 from gsfluent.pipeline.export_frames import Reel
-from gsfluent.pipeline.export_meshes import Piece, clinging, fragment_meshes, surface
+from gsfluent.pipeline.export_meshes import Piece, fragment_meshes, surface
+from gsfluent.pipeline.rubble import clinging
 
 pytest.importorskip("skimage")
 CPU = torch.device("cpu")

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from export_run import FPS, FRAMES, make_run
+from export_run import FPS, FRAMES, SIZE, add_record, make_run
 from PIL import Image
 
-from gsfluent.config import Shot
 from gsfluent.data import Camera
 from gsfluent.errors import InputError
 from gsfluent.pipeline.export import ExportOptions, export
@@ -22,17 +21,11 @@ from gsfluent.pipeline.render_path import freeze
 from gsfluent.pipeline.video import write_animation
 
 CPU = torch.device("cpu")
-SIZE = (96, 64)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = make_run(tmp_path_factory.mktemp("pictures"), degree=0)
-    splats = out / "splats.ply"
-    splats.write_bytes(b"")
-    shot = Shot.from_dict({"splats": str(splats), "output": {"fps": FPS, "size": list(SIZE)}})
-    (out / "run.json").write_text(json.dumps({"shot": shot.resolved()}))
-    return out
+    return add_record(make_run(tmp_path_factory.mktemp("pictures"), degree=0))
 
 
 def write(run: Path, to: Path, kinds: str, **options: object) -> Path:
@@ -160,6 +153,13 @@ def test_the_poses_of_a_capture_are_a_path(tmp_path: Path) -> None:
     assert float(cameras[0].K[0, 0]) == pytest.approx(2 * focal)
     assert torch.allclose(cameras[1].center(), torch.tensor([0.5, 0.5, 0.5]).double(), atol=1e-9)
     assert all(sees(camera, torch.zeros(3).double()) for camera in cameras)
+
+
+def test_another_light_shows(run: Path, tmp_path: Path) -> None:
+    write(run, tmp_path / "a", "png", frames="0")
+    write(run, tmp_path / "b", "png", frames="0", light="-1,1,0.5", environment="none")
+    a, b = (np.array(Image.open(tmp_path / n / "pictures" / "picture_0001.png")) for n in "ab")
+    assert np.abs(a.astype(int) - b).mean() > 5.0
 
 
 @pytest.mark.parametrize(

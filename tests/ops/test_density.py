@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent.ops import density_normals, occupancy
+from gsfluent.ops import density_normals, occupancy, splat_bulk
 from gsfluent.ops.reference import density as reference
 
 NODES = 32
@@ -81,6 +81,23 @@ def test_every_level_holds_the_same_matter() -> None:
         assert abs(mass - means.shape[0]) < 1e-6 * mass
 
 
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bulk_is_that_of_the_finite_splats(device: str, dtype: torch.dtype) -> None:
+    means, _, scales = (t.to(dtype) for t in splats(150_000))
+    means[7, 1], scales[11, 0], means[13, 2] = float("nan"), float("inf"), float("-inf")
+    good = torch.isfinite(means).all(1) & torch.isfinite(scales).all(1)
+    want = means[good].double()
+    bulk = splat_bulk(means.to(device), scales.to(device))
+    away = (want - want.mean(0)).norm(dim=1)
+    assert torch.tensor(bulk.center).sub(want.mean(0)).abs().max() < 1e-6
+    assert bulk.spread == pytest.approx(float(away.square().mean().sqrt()), rel=1e-6)
+    assert bulk.reach == pytest.approx(float(away.max()), rel=1e-6)
+    assert bulk.size == pytest.approx(float(scales[good].double().mean()), rel=1e-6)
+    nothing = splat_bulk(means[:0].to(device), scales[:0].to(device))
+    assert nothing == ((0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+
+
 def test_normals_of_a_ball_point_outward() -> None:
     means, quats, scales = splats(60000)
     values = occupancy(means, frame(), NODES, full=0.8 * 60000 / (4.19 / 0.09**3))
@@ -138,6 +155,7 @@ def test_registration() -> None:
     torch.library.opcheck(
         torch.ops.gsfluent.occupancy.default, (means, frame(), NODES, 0.8), test_utils=tests
     )
+    torch.library.opcheck(torch.ops.gsfluent.splat_bulk.default, (means, scales), test_utils=tests)
     torch.library.opcheck(
         torch.ops.gsfluent.density_normals.default,
         (means, quats, scales, values, frame(), NODES, None),

@@ -15,6 +15,7 @@ from gsfluent.pipeline.run_simulate import saved
 from gsfluent.pipeline.simulate import Simulate
 from gsfluent.pipeline.simulate_grow import copy_of, grow, shrink
 from gsfluent.pipeline.simulate_health import figures_of
+from gsfluent.pipeline.simulate_strays import find_lonely
 from gsfluent.scene import Scene
 
 DX = 0.0125
@@ -45,7 +46,7 @@ def test_a_poke_is_the_event_of_a_shot(event) -> None:
     frames = live.advance((count - 3 - 1) / 100.0)
     scene = standing()
     scene.add_event(event | {"at": at})
-    simulate = Simulate(dx=DX, standing=True)
+    simulate = Simulate(dx=DX, standing=True, loose_crumbs=True)
     *_, last = simulate(scene, fps=100.0, seconds=count / 100.0)
     assert last.index == live.index and last.time == live.time
     # to the bit: the same matter in the same state goes through the same code
@@ -228,7 +229,7 @@ def test_a_late_bullet_hits_as_an_early_one_does(rigid) -> None:
     for at in (0.0, 0.5):
         scene = standing()
         scene.add_event(BULLET | {"at": at, "rigid": rigid, "radius": 0.012})
-        simulate = Simulate(dx=DX, standing=True)
+        simulate = Simulate(dx=DX, standing=True, loose_crumbs=True)
         frames = list(simulate(scene, fps=50.0, seconds=at + 0.06))
         ends.append(frames[-1])
         seen = saved(frames[0], scene).gaussians
@@ -241,3 +242,30 @@ def test_a_late_bullet_hits_as_an_early_one_does(rigid) -> None:
     assert ends[0].stats["damaged_fraction"] == pytest.approx(
         ends[1].stats["damaged_fraction"], rel=0.02
     )
+
+
+def test_crumbs_that_are_alone_leave_the_grid_with_their_momentum() -> None:
+    generator = torch.Generator().manual_seed(0)
+    cloud = torch.rand(40, 3, generator=generator, dtype=torch.float64) * 0.1
+    clump = torch.rand(400, 3, generator=generator, dtype=torch.float64) * 0.04 + 0.5
+    single = torch.tensor([[0.6, 0.0, 0.0]], dtype=torch.float64)
+    position = torch.cat([cloud, clump, single, single + 0.02])
+    peak = torch.ones(len(position))
+    peak[-1] = -0.1  # an unbroken point near the single one keeps it
+    everyone = torch.ones(len(position), dtype=torch.bool)
+    lonely = find_lonely(position, peak, everyone, 0.02)
+    assert lonely[:40].all() and not lonely[40:].any()
+    everyone[:20] = False
+    assert find_lonely(position, peak, everyone, 0.02)[:40].tolist() == [False] * 20 + [True] * 20
+
+    scene = Scene(floor=None, gravity=(0, 0, 0))
+    scene.add(ellipsoid((0.05,) * 3, splats=200), name="ball")
+    live = LiveSession(scene, dx=DX, fps=100.0)
+    live.shoot((0.2, 0, 0), (-1, 0, 0), 80.0, 0.01)
+    live.advance(0.03)
+    run, state = live.run, live.run.state
+    assert len(run.scene.bodies) == 2 and 50 < int(state.stray.sum()) < state.stray.numel()
+    now = figures_of(run.matter, state, run.scene.gravity)
+    bullet = 4 / 3 * math.pi * 0.01**3 * 7800 * 80.0
+    assert now.momentum == pytest.approx((-bullet, 0, 0), abs=1e-5 * bullet)
+    assert not state.particles.strain[state.stray].any()

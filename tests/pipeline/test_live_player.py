@@ -169,7 +169,8 @@ def test_a_take_is_a_run_and_its_shot_gives_the_same(solid, tmp_path) -> None:
     solids = {body.name: body.solid for body in stage.scene.bodies}
     scene = build_scene(shot, solids, stage.scene.bodies[0].frame)
     assert scene.bodies[0].offset == pytest.approx(stage.scene.bodies[0].offset)
-    simulate = Simulate(dx=DX, standing=shot.solve.standing)
+    solve = shot.solve
+    simulate = Simulate(dx=DX, standing=solve.standing, loose_crumbs=solve.loose_crumbs)
     *_, end = simulate(scene, fps=shot.output.fps, seconds=shot.output.seconds)
     assert end.index == 6
     count = last.positions.shape[0]

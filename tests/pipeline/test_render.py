@@ -13,7 +13,7 @@ from torch import Tensor
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light import Lamp, Light, Lighting, pack_lamps, to_display, to_linear
-from gsfluent.pipeline.light_maps import shadow_maps
+from gsfluent.pipeline.light_maps import bulk, shadow_maps
 from gsfluent.pipeline.occlusion import ambient_occlusion
 from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_camera import Action, cameras_for, orbit
@@ -99,7 +99,7 @@ def test_linear_and_display_values_are_inverse() -> None:
 
 def test_shadow_map_darkens_what_lies_behind() -> None:
     lamps = (Lamp(direction=(0.0, 0.0, 1.0)),)
-    maps = shadow_maps(ball(), lamps, (1,), 256)
+    maps = shadow_maps(ball(), lamps, (1,), 256, bulk(ball()))
     assert maps is not None
     points = torch.tensor([[0.0, 0.0, -0.2], [0.25, 0.0, -0.2], [0.0, 0.0, 0.4]])
     up = torch.tensor([0.0, 0.0, 1.0]).expand(3, 3)
@@ -134,7 +134,11 @@ def test_contact_shadow_fades_with_height() -> None:
 
     def sky(height: float) -> float:
         grey = ball(center=(0.0, 0.0, height))
-        return float(ambient_occlusion(spot, up, grid_for(grey, cell=0.012).of(grey.means)))
+        return float(
+            ambient_occlusion(
+                spot, up, grid_for(grey, cell=0.012).of(grey.means, bulk(grey).center)
+            )
+        )
 
     assert sky(0.1) < 0.6
     assert sky(0.2) > sky(0.1) + 0.1

@@ -99,6 +99,41 @@ def test_the_view_travels_with_the_object_without_a_jump(serve: Any) -> None:
     np.testing.assert_allclose(np.array(app.shift) - kept, [0, 0, -0.2], atol=1e-6)
 
 
+def test_a_view_that_stands_begins_to_follow_what_falls_away(serve: Any) -> None:
+    source = Falling()
+    source.frames = 1
+    app = serve(source)
+    assert not app.tracking
+    source.frames = 4
+    until(lambda: app.index == 3 and app.tracking)
+    kept = app.shift  # no jump where it begins
+    source.frames = 5
+    until(lambda: app.index == 4)
+    np.testing.assert_allclose(np.array(app.shift) - kept, [0, 0, -0.2], atol=1e-6)
+    app.track(False)  # and a person's word is the last
+    source.frames = 6
+    until(lambda: app.index == 5)
+    assert not app.tracking
+
+
+def test_the_view_goes_with_an_object_that_is_placed_anew(serve: Any) -> None:
+    source = Falling()
+    source.frames = 1
+    app = serve(source)
+    app.track(False)
+    lifted = source.frame
+
+    def frame_higher(index: int) -> SavedFrame:
+        moment = lifted(index)
+        up = torch.tensor([0.0, 0.0, 0.7])
+        gaussians = moment.gaussians.replace(means=moment.gaussians.means + up)
+        return dataclasses.replace(moment, gaussians=gaussians, positions=moment.positions + up)
+
+    source.frame, source.revision = frame_higher, "2"
+    until(lambda: app.timeline.revision == "2" and app.shift != (0.0, 0.0, 0.0))
+    assert app.shift == pytest.approx((0.0, 0.0, 0.7), abs=1e-6)
+
+
 def test_playing_goes_on_to_the_end_and_begins_anew(serve: Any, tmp_path: Path) -> None:
     app = serve(RunSource(write_run(tmp_path / "ball")))
     app.playback.loop, app.playback.speed = False, 2.0
