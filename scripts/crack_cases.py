@@ -239,7 +239,7 @@ def raw(broken: Broken, moment: Moment, *, total: bool = False) -> Drawn:
         values, vectors = torch.linalg.eigh(b.double())
         root = vectors * values.clamp(min=1e-6).sqrt()[:, None] @ vectors.mT
         local = root.float() @ rotation
-    own = carry.index[:, 0]
+    own = carry.owner
     local, turn = local[own], rotation[own]
     arm = rest.means - carry.matter.rest[own]
     means = moment.position[own] + (local @ arm[..., None])[..., 0]
@@ -252,7 +252,7 @@ def raw(broken: Broken, moment: Moment, *, total: bool = False) -> Drawn:
 def ideal(broken: Broken, moment: Moment, cloud: TrueCloud) -> Drawn:
     """The splats moved exactly as the true matter: what a perfect binding would reach."""
     rest = broken.carry.gaussians
-    owner = broken.carry.index[:, 0]
+    owner = broken.carry.owner
     means, local = cloud.follow(
         rest.means, owner, moment.position, moment.deformation, moment.fragments
     )

@@ -20,7 +20,7 @@ from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.delight import Delit
 from gsfluent.pipeline.export import write_exports
 from gsfluent.pipeline.light import Light, Lighting, lighting_of
-from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
+from gsfluent.pipeline.light_shot import changed, gloss_of, light_of, looks_of
 from gsfluent.pipeline.render import Layers, Render
 from gsfluent.pipeline.render_backdrop import (
     Backdrop,
@@ -164,7 +164,8 @@ def render_stage(context: RunContext) -> None:
     output += [shot.output.slow, shot.output.backdrop]
     path = shot.output.camera
     camera_key = content_digest(path) if isinstance(path, Path) else None
-    key = fingerprint("render", context.key(context.source_key, repr(light), output, camera_key))
+    looks = [repr(light), repr(looks_of(shot))]
+    key = fingerprint("render", context.key(context.source_key, looks, output, camera_key))
 
     def work(folder: Path) -> dict[str, Any]:
         film = Film.of(context.out, shot, light, context.device)
