@@ -10,11 +10,12 @@ On the CPU it is the process's time, so that other work on the machine does not 
 from __future__ import annotations
 
 import argparse
-import json
 import time
+from pathlib import Path
 from typing import Any
 
 import torch
+from page import enter
 
 from gsfluent.data import INTERIOR, SURFACE, Gaussians
 from gsfluent.pipeline.render_camera import look_at
@@ -26,6 +27,7 @@ from gsfluent.viewer.picture import PictureMaker
 from gsfluent.viewer.timeline import Timeline
 
 RADIUS, HEIGHT = 0.1, 0.13
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "viewer.md"
 
 
 class Ball:
@@ -121,31 +123,38 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--splats", type=int, nargs="+", default=[50_000, 200_000, 1_000_000])
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--enter", metavar="NAME", help="enter into docs/viewer.md under this name")
+    parser.add_argument("--read", type=Path, help="a table printed before, instead of measuring")
     arguments = parser.parse_args()
-    rows = []
-    for count in arguments.splats:
-        maker = PictureMaker(Timeline(Ball(count), torch.device(arguments.device)))
+    if arguments.read is not None:
+        table = arguments.read.read_text(encoding="utf-8")
+    else:
+        table = run(arguments.device, arguments.splats, arguments.repeats)
+        print(table)
+    if arguments.enter:
+        lines = [line for line in table.splitlines() if "| fragment |" not in line]
+        page = PAGE.read_text(encoding="utf-8")
+        name = f"pictures on {arguments.enter}"
+        PAGE.write_text(
+            enter(page, name, "\n".join(lines), arguments.enter + ":"), encoding="utf-8"
+        )
+
+
+def run(device: str, splats: list[int], repeats: int) -> str:
+    """The table for a device."""
+    head = "| splats | picture | coloured by | picture [ms] | JPEG [ms] | size [kB] |"
+    lines, notes = [head, "| --- | --- | --- | --- | --- | --- |"], []
+    for count in splats:
+        maker = PictureMaker(Timeline(Ball(count), torch.device(device)))
         pace = Pace()
         for size in ((640, 360), (1280, 720), (1920, 1080)):
             for name, look in (("appearance", Look()), ("fragment", Look(FRAGMENT))):
-                found = measure(maker, size, look, pace, arguments.repeats)
-                rows.append({"splats": count, "size": f"{size[0]}x{size[1]}", "by": name, **found})
-        scale = pace.scale(1280, 720, BUDGETS[0])
-        rows.append({"splats": count, "moving_share_of_1280x720": round(scale, 2)})
-    if arguments.json:
-        print(json.dumps(rows, indent=1))
-        return
-    print("| splats | picture | coloured by | picture [ms] | JPEG [ms] | size [kB] |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for row in rows:
-        if "size" in row:
-            times = f"{row['picture_ms']:.1f} | {row['jpeg_ms']:.1f} | {row['kB']:.0f}"
-            print(f"| {row['splats']} | {row['size']} | {row['by']} | {times} |")
-    for row in rows:
-        if "moving_share_of_1280x720" in row:
-            share = row["moving_share_of_1280x720"]
-            print(f"{row['splats']} splats: while moving, {share} of the sides of 1280x720")
+                found = measure(maker, size, look, pace, repeats)
+                times = f"{found['picture_ms']:.1f} | {found['jpeg_ms']:.1f} | {found['kB']:.0f}"
+                lines.append(f"| {count} | {size[0]}x{size[1]} | {name} | {times} |")
+        share = pace.scale(1280, 720, BUDGETS[0])
+        notes.append(f"{count} splats: {share:.2f} of the sides of 1280x720 while moving")
+    return "\n".join([*lines, "", "; ".join(notes) + "."])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Light against ray-traced truth: lit balls, shadow edges and penumbrae, occlusion.
+"""Light against ray-traced truth: lit balls, shadows, occlusion, captured light divided out.
 
     python scripts/light_accuracy.py [--page docs/light.md] [--json FILE] [--pictures FOLDER]
 
@@ -24,6 +24,8 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.io import save_image
 from gsfluent.lab import light_truth as truth
 from gsfluent.pipeline import environment
+from gsfluent.pipeline.bake import bake_light
+from gsfluent.pipeline.delight import delight
 from gsfluent.pipeline.light import Lamp, Lighting, pack_lamps, to_display, to_linear
 from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.occlusion import ambient_occlusion
@@ -239,12 +241,72 @@ def occlusion(name: str) -> tuple[float, Tensor, Tensor]:
     return float((found - expected).square().mean().sqrt()), found, expected
 
 
+def paints(splats: Gaussians) -> dict[str, Gaussians]:
+    """The ball in one grey, in two greens that wind around it, and in blotches of many colours."""
+    place = splats.means / RADIUS
+    turn = torch.atan2(place[:, 1], place[:, 0])
+    dark = (torch.sin(9 * turn + 2 * torch.sin(4 * place[:, 2])) > 0.1).float()[:, None]
+    stripes = dark * torch.tensor([0.35, 0.55, 0.2]) + (1 - dark) * torch.tensor([0.12, 0.25, 0.1])
+    generator = torch.Generator().manual_seed(1)
+    waves = 6.0 * torch.randn(12, 3, generator=generator)
+    phases = 2.0 * math.pi * torch.rand(12, generator=generator)
+    blotch = torch.sin(place @ waves.T + phases).mean(1, keepdim=True)
+    blotches = (0.5 + blotch * torch.tensor([0.5, 0.4, 0.2])).clamp(0.05, 0.95)
+    return {
+        "one grey": splats,
+        "green stripes": splats.with_colors(stripes),
+        "blotches": splats.with_colors(blotches),
+    }
+
+
+def delighting(splats: Gaussians) -> dict[str, dict[str, float]]:
+    """RMS error of the linear colours against the true paint, and of the ball relit, both ways.
+
+    Relative to the RMS of the truth; of the paint after the best common factor, because the mean
+    brightness of a capture's light cannot be known.
+    """
+    sun = Lamp(direction=(1.0, -1.0, 1.5), intensity=0.7, shadow=False)
+    sky = environment.sky_and_ground((1.1, 1.1, 1.2), (0.35, 0.33, 0.3))
+    days = {
+        "sun": Lighting((sun,), 0.35, occlusion=0.0),
+        "sky over dark ground": Lighting((), 0.0, sky, occlusion=0.0),
+        "even": Lighting((), 1.0, occlusion=0.0),
+    }
+    lamp = Lamp(direction=(-1.0, 0.5, 0.3), shadow=False)
+    other = Lighting((lamp,), 0.3, occlusion=0.0)
+
+    def off(found: Gaussians, wanted: Gaussians) -> float:
+        a, b = to_linear(found.colors()), to_linear(wanted.colors())
+        a = a * (a * b).sum() / (a * a).sum()
+        return float((a - b).square().mean().sqrt() / b.square().mean().sqrt())
+
+    found = {}
+    for day, lighting in days.items():
+        for paint, true in paints(splats).items():
+            captured = bake_light(true, lighting)
+            bare = delight(captured)
+            wanted = bake_light(true, other)
+            found[f"{paint}, {day}"] = {
+                "paint_before": off(captured, true),
+                "paint_after": off(bare, true),
+                "relit_before": off(bake_light(captured, other), wanted),
+                "relit_after": off(bake_light(bare, other), wanted),
+            }
+    return found
+
+
 def figures(pictures: Path | None = None) -> dict[str, Any]:
     """All numbers."""
     ball = truth.Ball((0.0, 0.0, 0.0), RADIUS)
     kinds = {
         "flat splats on the surface": truth.surface_splats(ball, SURFACE_SPLATS, GREY),
         "round splats throughout": truth.solid_splats(ball, SPACING, GREY),
+        "flat skin, filled": Gaussians.cat(
+            [
+                truth.surface_splats(ball, SURFACE_SPLATS // 2, GREY),
+                truth.solid_splats(truth.Ball(ball.center, 0.97 * RADIUS), 0.005, GREY),
+            ]
+        ),
     }
     balls: dict[str, dict[str, float]] = {}
     rows = []
@@ -253,21 +315,26 @@ def figures(pictures: Path | None = None) -> dict[str, Any]:
         row = []
         for kind, splats in kinds.items():
             balls[name][kind], picture = sphere(splats, name)
-            row.append(picture)
+            if kind != "flat skin, filled":
+                row.append(picture)
         rows.append(torch.cat(row, 1))
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-        save_image(torch.cat(rows), pictures / "light_spheres.png")
+        save_image(torch.cat(rows), pictures / "light_spheres.jpg")
     return {
         "sphere": balls,
         "shadow": {name: shadow(name) for name in shadow_cases()},
         "occlusion": {name: occlusion(name)[0] for name in occlusion_cases()},
+        "delight": delighting(kinds["flat splats on the surface"]),
     }
 
 
 def tables(found: dict[str, Any]) -> str:
     """Markdown."""
-    lines = ["| lit ball, error of radiance | flat splats | round splats |", "| --- | --- | --- |"]
+    lines = [
+        "| lit ball, error of radiance | flat splats | round splats | flat skin, filled |",
+        "| --- | --- | --- | --- |",
+    ]
     for name, row in found["sphere"].items():
         lines.append(f"| {name} | " + " | ".join(f"{100 * v:.2f} %" for v in row.values()) + " |")
     lines += [
@@ -281,6 +348,13 @@ def tables(found: dict[str, Any]) -> str:
     lines += ["", "| occlusion | RMS error of the sky's share |", "| --- | --- |"]
     for name, value in found["occlusion"].items():
         lines.append(f"| {name} | {value:.3f} |")
+    lines += [
+        "",
+        "| captured light divided out | paint before | after | relit before | after |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name, row in found["delight"].items():
+        lines.append(f"| {name} | " + " | ".join(f"{100 * v:.1f} %" for v in row.values()) + " |")
     return "\n".join(lines)
 
 

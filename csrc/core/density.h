@@ -13,6 +13,10 @@ constexpr int kDensityPasses = 4;  // of [1, 2, 1] / 4 over the finest level, on
 constexpr double kDensityClear = 0.1;  // how sure the wide gradient must be
 // Half the gradient up to which a sheet does not say which way its splats lie.
 constexpr double kDensityUnclear = 0.05;
+// Gradient from which the density leads, and the share of a flat splat's own axis then.
+constexpr double kDensitySure = 0.12;
+constexpr double kDensityOwn = 0.5;
+constexpr double kDensityAway = -0.25;
 constexpr double kFlatSplat = 0.5;  // shortest over middle axis
 
 template <typename T>
@@ -178,18 +182,26 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
   if (dot(out, wide) < T(0) && norm(wide) > T(kDensityClear)) out = T(-1) * out;
   const T *s = a.scales + 3 * i, shortest = min(s[0], min(s[1], s[2]));
   const T middle = s[0] + s[1] + s[2] - shortest - max(s[0], max(s[1], s[2]));
+  T least = T(kDensityAway);  // cosine to the eye below which it is seen from its other side
   Mat3<T> axes;
   if (shortest < T(kFlatSplat) * middle && rotation_from_quat(a.quats + 4 * i, &axes)) {
     // Which column, without an index that changes: that would put the matrix into local memory.
     const bool first = s[0] == shortest, second = !first && s[1] == shortest;
     const Vec3<T> axis = matvec(axes, Vec3<T>{T(first), T(second), T(!first && !second)});
-    const T agreement = dot(axis, out);
-    // An axis across a clear gradient is a splat standing on edge (hair, seams): trust the density.
-    if (fabs(agreement) > T(0.5) * norm(out) - T(kDensityUnclear)) {
-      const T side =
-          a.eye ? dot(axis, Vec3<T>{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]}) : agreement;
-      out = T(side < T(0) ? -1 : 1) * axis;
+    const T agreement = dot(axis, out), clear = norm(out), side = T(agreement < T(0) ? -1 : 1);
+    if (clear > T(kDensitySure)) {
+      // A solid's density knows better than one splat; their sum keeps what both say.
+      const Vec3<T> sum = (T(1) / clear) * out + (T(kDensityOwn) * side) * axis;
+      out = (T(1) / norm(sum)) * sum;
+    } else if (fabs(agreement) > T(0.5) * clear - T(kDensityUnclear)) {
+      // Across a clear gradient it would be a splat standing on edge (hair, seams).
+      out = side * axis;
+      least = T(0);
     }
+  }
+  if (a.eye) {
+    const Vec3<T> view{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]};
+    if (dot(out, view) < least * norm(out) * norm(view)) out = T(-1) * out;
   }
   for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
 }

@@ -5,148 +5,156 @@
 
 namespace gsf {
 
-// Points of the fit come in eight groups (a lane each on the GPU): points g, g + 8, ... belong to
-// group g. First the fixed ones of the rim, then those of the caps, then the slots for furthest
+// Points of the overlap that stay where they are: the starts of every search for its furthest
 // points.
-inline constexpr int kLensGroups = 8;
-inline constexpr int kLensRim = 3, kLensCaps = 3, kLensSlots = 4;  // per group
-inline constexpr int kLensFixed = kLensGroups * (kLensRim + kLensCaps);
-inline constexpr int kLensPoints = kLensFixed + kLensGroups * kLensSlots;
-inline constexpr int kLensSteps = 40;  // most steps of the fit
+inline constexpr int kLensRim = 24, kLensCaps = 24;
+inline constexpr int kLensPoints = 24;  // points of the fit; nine determine an ellipsoid
+inline constexpr int kLensRounds = 16;  // searches at most
+inline constexpr int kLensSteps = 6;    // steps of the fit between two searches, at most
 
-// Fits the overlap; the result is { |k (y, 1)|^2 total <= 1 + 3 reach } in the setup's frame:
-// center and inverse factor. `points` is scratch of kLensPoints.
+// Fit in the setup's frame: { center + root z, |z| <= 1 }.
 template <typename T>
 struct LensFit {
   Vec3<T> center;
-  Mat3<T> root;  // { center + root z, |z| <= 1 }
+  Mat3<T> root;
   int steps;
-  T reach;  // how far the points reach out of the ellipsoid of their weights, squared
+  T reach;  // how far the overlap reaches out of the ellipsoid of the multipliers, squared
 };
 
-template <typename T, class Team>
-GSF_HOST_DEVICE LensFit<T> lens_fit(const Team& team, const detail::Overlap<T>& overlap,
-                                    FitPoint<T>* points) {
-  using detail::Objective;
-  using std::abs;
-  using std::sqrt;
-  for (int i = team.rank(); i < kLensPoints; i += team.size()) {
-    FitPoint<T>& p = points[i];
-    const int home = i < kLensFixed ? i : i - kLensFixed;
-    p.y = home < kLensRim * kLensGroups
-              ? overlap.rim(detail::fibonacci_direction<T>(home, kLensRim * kLensGroups))
-              : overlap.on_surface(detail::fibonacci_direction<T>(home - kLensRim * kLensGroups,
-                                                                  kLensCaps * kLensGroups));
-    p.u = T(1.0 / kLensPoints);
-    p.s = T(1);
+namespace detail {
+
+template <typename T>
+GSF_HOST_DEVICE T largest_distance(const FitPoint<T>* points, const LiftedFactor<T>& factor) {
+  T highest = T(0);
+  for (int i = 0; i < kLensPoints; ++i) highest = max(highest, factor.distance(points[i].y));
+  return highest;
+}
+
+// Puts a point into the slot close by, or else into the least important one.
+template <typename T>
+GSF_HOST_DEVICE void add_point(FitPoint<T>* points, const LiftedFactor<T>& factor, T m,
+                               const Vec3<T>& y) {
+  int slot = 0;
+  T least = T(1e30);
+  bool known = false;
+  for (int j = 0; j < kLensPoints; ++j) {
+    const Vec3<T> off = points[j].y - y;
+    const bool near = dot(off, off) < T(9e-4);
+    const T rank = near ? T(-1) : points[j].u;
+    known = known || (near && !(m > factor.distance(points[j].y)));
+    if (rank < least) {
+      least = rank;
+      slot = j;
+    }
   }
-  team.sync();
-  LiftedFactor<T> factor, best{};
-  LensFit<T> out;
-  T best_excess = T(1e30), highest = T(0), complementarity = T(0);
-  int step = 0;
-  const auto on_rim = [&](const Vec3<T>& y) {
-    return abs(detail::gauge(overlap.a, y) - detail::gauge(overlap.b, y)) < T(1e-3);
-  };
-  T gap = T(0.05);
-  for (; step < kLensSteps; ++step) {
-    factor = lifted_factor(team, points, kLensPoints, 3);
-    highest = T(0);
-    const Objective<T> objective(factor);
-    for (int i = team.rank(); i < kLensPoints; i += team.size())
-      highest = max(highest, factor.distance(points[i].y));
-    highest = team.largest(highest);
-    const bool climb = step > 0 && (highest * factor.total < T(3) + gap ||
-                                    complementarity < T(2e-4) || step == kLensSteps - 1);
-    const T worth = T(3) * (T(1) + T(1e-4)) / factor.total;
-    T sum = T(0);
-    for (int g = team.rank(); climb && g < kLensGroups; g += team.size()) {
-      T furthest = T(0);
-      Vec3<T> found{T(0), T(0), T(0)};
-      T best_cap = T(0);
-      int start = 0;
-      for (int i = g + kLensGroups * kLensRim; i < kLensFixed; i += kLensGroups) {
-        const T m = factor.distance(points[i].y);
-        if (m > best_cap) {
-          best_cap = m;
-          start = i;
-        }
-      }
-      for (int i = g; i < kLensPoints; i += kLensGroups) {
-        const bool rim_home = i < kLensGroups * kLensRim;
-        if (!rim_home && i < kLensFixed && i != start) continue;
-        Vec3<T> y = points[i].y;
-        const bool rim = rim_home || (i >= kLensFixed && on_rim(y));
-        const T m = detail::climb(overlap, objective, factor, rim, 4, y);
-        highest = max(highest, m);
-        if (m > furthest) {
-          furthest = m;
-          found = y;
-        }
-      }
-      if (furthest > worth) {
-        int slot = kLensFixed + g;
-        T least = T(1e30);
-        for (int i = kLensFixed + g; i < kLensPoints; i += kLensGroups) {
-          // A slot close by is refined; otherwise the least important one is taken.
-          const T rank = norm(points[i].y - found) < T(0.01) ? T(-1) : points[i].u;
-          if (rank < least) {
-            least = rank;
-            slot = i;
-          }
-        }
-        points[slot].y = found;
-        points[slot].u = max(points[slot].u, T(0.005));
+  if (known) return;
+  points[slot].y = y;
+  points[slot].u = max(points[slot].u, T(0.02));
+}
+
+// Climbs from the furthest of every `groups`-th home in [from, to), and adds what reaches further
+// than `worth` to the points. Returns the largest squared distance met.
+template <typename T>
+GSF_HOST_DEVICE T search(const Overlap<T>& overlap, const Objective<T>& objective,
+                         const LiftedFactor<T>& factor, const Vec3<T>* homes, int from, int to,
+                         int groups, bool rim, int steps, T worth, FitPoint<T>* points) {
+  T highest = T(0);
+  for (int g = 0; g < groups; ++g) {
+    Vec3<T> y = homes[from + g];
+    T most = factor.distance(y);
+    for (int i = from + g + groups; i < to; i += groups) {
+      const Vec3<T> z = homes[i];
+      const T m = factor.distance(z);
+      if (m > most) {
+        most = m;
+        y = z;
       }
     }
-    for (int i = team.rank(); i < kLensPoints; i += team.size()) {
-      FitPoint<T>& p = points[i];
-      highest = max(highest, factor.distance(p.y));
-      sum += p.u * p.s;
+    const T m = climb(overlap, objective, factor, rim, steps, y);
+    highest = max(highest, m);
+    if (m > worth) add_point(points, factor, m, y);
+  }
+  return highest;
+}
+
+}  // namespace detail
+
+// Smallest ellipsoid around the overlap: fits to a few of its points, in turn with searches for its
+// furthest points, which replace the least important ones. `points` is scratch of kLensPoints.
+template <typename T>
+GSF_HOST_DEVICE LensFit<T> lens_fit(const detail::Overlap<T>& overlap, FitPoint<T>* points) {
+  using std::sqrt;
+  const SerialTeam team;
+  constexpr int kHomes = kLensRim + kLensCaps;
+  Vec3<T> homes[kHomes];
+  for (int i = 0; i < kLensRim; ++i)
+    homes[i] = overlap.rim(detail::fibonacci_direction<T>(i, kLensRim));
+  for (int i = 0; i < kLensCaps; ++i)
+    homes[kLensRim + i] = overlap.on_surface(detail::fibonacci_direction<T>(i, kLensCaps));
+  for (int i = 0; i < kLensPoints; ++i) {
+    // Two thirds from the rim, the rest from the caps, spread evenly.
+    const int rim = (2 * kLensPoints) / 3;
+    points[i].y = i < rim ? homes[(i * kLensRim) / rim]
+                          : homes[kLensRim + ((i - rim) * kLensCaps) / (kLensPoints - rim)];
+    points[i].u = T(1.0 / kLensPoints);
+  }
+  // The middles of the two caps, which follow the furthest points there.
+  Vec3<T> poles[2] = {overlap.on_surface({T(1), T(0), T(0)}),
+                      overlap.on_surface({T(-1), T(0), T(0)})};
+  LiftedFactor<T> factor = lifted_factor(team, points, kLensPoints, 3), best{};
+  T best_excess = T(1e30), gap = T(0.1), room = T(0.1);
+  int steps = 0;
+  for (int round = 0; round < kLensRounds; ++round) {
+    T highest = detail::largest_distance(points, factor);
+    T complementarity = barrier_start(team, points, kLensPoints, factor, highest, room);
+    for (int step = 0; step < kLensSteps; ++step, ++steps) {
+      const T target = max(T(0.1) * complementarity, T(1e-4)) / T(kLensPoints);
+      barrier_step(team, points, kLensPoints, factor, target);
+      factor = lifted_factor(team, points, kLensPoints, 3);
+      highest = T(0);
+      complementarity = T(0);
+      for (int i = 0; i < kLensPoints; ++i) {
+        highest = max(highest, factor.distance(points[i].y));
+        complementarity += points[i].u * points[i].s;
+      }
+      if (highest * factor.total < T(3) + gap || complementarity < T(2e-4)) break;
     }
-    team.sync();
-    highest = team.largest(highest);
-    complementarity = team.sum(sum);
-    const T excess = highest * factor.total - T(3);
-    if (climb && !(excess >= best_excess)) {
+    const detail::Objective<T> objective(factor);
+    const T worth = T(3) * (T(1) + T(2e-4)) / factor.total;
+    highest = max(highest, detail::search(overlap, objective, factor, homes, 0, kLensRim, 8, true,
+                                          3, worth, points));
+    highest = max(highest, detail::search(overlap, objective, factor, homes, kLensRim, kHomes, 2,
+                                          false, 3, worth, points));
+    for (int k = 0; k < 2; ++k) {
+      const T m = detail::climb(overlap, objective, factor, false, 3, poles[k]);
+      highest = max(highest, m);
+      if (m > worth) detail::add_point(points, factor, m, poles[k]);
+    }
+    T excess = highest * factor.total - T(3);
+    if (excess <= T(3) * T(6e-4)) {  // once more, from more starts
+      highest = max(highest, detail::search(overlap, objective, factor, homes, 0, kLensRim,
+                                            kLensRim, true, 3, worth, points));
+      highest = max(highest, detail::search(overlap, objective, factor, homes, kLensRim, kHomes, 8,
+                                            false, 6, worth, points));
+      excess = highest * factor.total - T(3);
+    }
+    if (!(excess >= best_excess)) {
       best_excess = excess;
       best = factor;
     }
-    if (climb && excess < T(3) * T(5e-4)) break;
-#ifdef TRACE
-    if (TRACE)
-      printf("  %d: highest %.6f total %.5f gap %.2e climb %d reach %.6f\n", step, (double)highest,
-             (double)factor.total, (double)complementarity, climb,
-             double(highest * factor.total) / 3);
-#endif
-    if (climb) gap = max(T(0.1) * excess, T(7.5e-4));
-    if (climb || step == 0) {
-      // Back to a well-centred start: no multiplier near zero, every slack positive and exact.
-      if (step > 0) {
-        for (int i = team.rank(); i < kLensPoints; i += team.size())
-          points[i].u = max(points[i].u, T(0.002));
-        team.sync();
-        factor = lifted_factor(team, points, kLensPoints, 3);
-        highest = T(0);
-        for (int i = team.rank(); i < kLensPoints; i += team.size())
-          highest = max(highest, factor.distance(points[i].y));
-        highest = team.largest(highest);
-      }
-      complementarity =
-          barrier_start(team, points, kLensPoints, factor, highest, step == 0 ? T(0.1) : T(0.01));
-    }
-    const T target = max(T(0.1) * complementarity, T(1e-4)) / T(kLensPoints);
-    barrier_step(team, points, kLensPoints, factor, target);
-    sum = T(0);
-    for (int i = team.rank(); i < kLensPoints; i += team.size()) sum += points[i].u * points[i].s;
-    complementarity = team.sum(sum);
+    if (excess <= T(3) * T(6e-4)) break;
+    gap = max(T(0.1) * excess, T(7.5e-4));
+    room = T(0.01);
+    // Back to a well-centred start: no multiplier near zero, every slack positive and exact.
+    for (int i = 0; i < kLensPoints; ++i) points[i].u = max(points[i].u, T(0.01));
+    factor = lifted_factor(team, points, kLensPoints, 3);
   }
-  // The lower Cholesky factor of the shape, as far out as the furthest point.
   const T margin = sizeof(T) == 4 ? T(1) + T(3e-6) : T(1) + T(1e-7);
   const T reach = T(1) + max(best_excess * T(1.0 / 3.0), T(0));
+  LensFit<T> out;
   out.center = best.mean;
   out.root = (margin * sqrt(T(3) * reach / best.total)) * best.root();
-  out.steps = step;
+  out.steps = steps;
   out.reach = reach;
   return out;
 }
@@ -232,7 +240,7 @@ GSF_HOST_DEVICE LensResult<T> mvee_lens(const Vec3<T>& mean_a, const Sym3<T>& co
                                      to_double(cov_b), radius, flat);
   if (setup.kind == LensKind::kNone) return lens_nothing<T>(setup);
   if (setup.kind == LensKind::kKnown) return lens_gaussian<T>(setup.center, setup.frame, radius);
-  const LensFit<T> fit = lens_fit(SerialTeam{}, detail::overlap_of<T>(setup), points);
+  const LensFit<T> fit = lens_fit(detail::overlap_of<T>(setup), points);
   return lens_result(setup.center, setup.frame, setup.half, fit, radius, flat);
 }
 

@@ -1,4 +1,5 @@
-// CUDA kernels of the enclosing-ellipsoid ops: eight lanes of a warp per fit.
+// CUDA kernels of the enclosing-ellipsoid ops: eight lanes of a warp per point set, one thread per
+// overlap.
 #include <algorithm>
 
 #include "core/mvee.h"
@@ -100,21 +101,19 @@ __global__ void __launch_bounds__(128)
   }
 }
 
-// Pairs per block and words of shared memory per pair, padded so that four pairs of a warp read
-// from different banks.
+// Pairs per block, one thread each, and words of shared memory per pair: an odd number, so that the
+// threads of a warp read from different banks.
 template <typename T>
-inline constexpr int kLensPairs = sizeof(T) == 4 ? 16 : 8;
+inline constexpr int kLensPairs = sizeof(T) == 4 ? 64 : 32;
 template <typename T>
-inline constexpr int kLensWords = kLensPoints * (sizeof(FitPoint<T>) / sizeof(T)) + 8;
+inline constexpr int kLensWords = kLensPoints * int(sizeof(FitPoint<T>) / sizeof(T)) + 1;
 
-// Eight lanes per queued pair.
 template <typename T>
-__global__ void __launch_bounds__(8 * kLensPairs<T>)
+__global__ void __launch_bounds__(kLensPairs<T>)
     lens_fit_kernel(const MveeLensArgs<T> a, int64_t begin, const double* setups, int64_t stride,
                     const int32_t* rows, const int32_t* count) {
   __shared__ T scratch[kLensPairs<T> * kLensWords<T>];
-  const int pair = threadIdx.x / 8;
-  const int slot = blockIdx.x * kLensPairs<T> + pair;
+  const int slot = blockIdx.x * kLensPairs<T> + threadIdx.x;
   if (slot >= *count) return;
   const double* in = setups + slot;
   const auto field = [&](int f) { return in[f * stride]; };
@@ -123,10 +122,9 @@ __global__ void __launch_bounds__(8 * kLensPairs<T>)
                        T(field(f + 4)), T(field(f + 5))},
                       {T(field(f + 6)), T(field(f + 7)), T(field(f + 8))}};
   };
-  const OctetTeam team;
-  const LensFit<T> fit = lens_fit(team, detail::Overlap<T>{quadric(15), quadric(24)},
-                                  reinterpret_cast<FitPoint<T>*>(scratch + pair * kLensWords<T>));
-  if (team.rank() != 0) return;
+  const LensFit<T> fit =
+      lens_fit(detail::Overlap<T>{quadric(15), quadric(24)},
+               reinterpret_cast<FitPoint<T>*>(scratch + threadIdx.x * kLensWords<T>));
   Mat3<double> frame;
   for (int c = 0; c < 9; ++c) frame.m[c] = field(3 + c);
   store(a, begin + rows[slot],
@@ -174,7 +172,7 @@ cudaError_t mvee_lens(const MveeLensArgs<T>& args, double* setups, int32_t* rows
         args, begin, begin + n, setups, stride, rows, count);
     // The host does not know how many pairs were queued; blocks beyond them leave at once.
     lens_fit_kernel<T><<<static_cast<unsigned>((n + kLensPairs<T> - 1) / kLensPairs<T>),
-                         8 * kLensPairs<T>, 0, stream>>>(args, begin, setups, stride, rows, count);
+                         kLensPairs<T>, 0, stream>>>(args, begin, setups, stride, rows, count);
   }
   return cudaGetLastError();
 }

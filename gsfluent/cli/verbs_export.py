@@ -35,7 +35,7 @@ class Export(Verb):
       usd      all frames in one file: splats, particles with velocity and damage
       vtk, points, vti                 the material points: .vtk, .ply, density volume
       meshes                           a closed, coloured surface per fragment
-      mp4, gif, webp, png              pictures, along any camera path (docs/render.md)
+      mp4, gif, webp, png              pictures, along any camera path
 
     An interrupted sequence goes on where it stopped when the command is given again.
     """

@@ -80,7 +80,15 @@ class Roster:
         self._known = np.zeros(0, np.int64)
 
     def meet(self, frame: DeltaFrame) -> None:
-        """Note down the splats of a frame that are new."""
+        """Note down the splats of a frame that are new.
+
+        Raises:
+            InputError: Two splats have the same id.
+        """
+        if len(np.unique(frame.ids)) != len(frame.ids):
+            raise InputError(
+                f"delta: frame {frame.index} has two splats of one id", "run the shot again"
+            )
         new = ~np.isin(frame.ids, self._known)
         if new.any():
             self._known = np.union1d(self._known, frame.ids[new])

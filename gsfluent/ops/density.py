@@ -92,9 +92,9 @@ def density_normals(
     """Outward vectors of splats: minus the gradient of the smoothed occupancy per cell.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
-    splats unless their shortest axis lies across a clear gradient (they take that axis), zero off
-    the grid.
-    A look four times as wide turns what points inward.
+    splats (where the gradient is clear it leads and their shortest axis adds to it; on a sheet they
+    take that axis, unless it lies across the gradient), zero off the grid. A look four times as
+    wide turns what points inward.
 
     Args:
         means: Centres [m], shape [N, 3], float32 or float64.
@@ -103,8 +103,8 @@ def density_normals(
         values: What :func:`occupancy` gave.
         frame: As there.
         nodes: As there.
-        eye: Where the picture is taken from [m], shape [3]: flat splats face it. Without, they take
-            the side of the density; a shell has none there, from outside and from inside.
+        eye: Where the picture is taken from [m], shape [3]: what looks away from it is turned. A
+            shell has no side to the density, and is seen from outside or from inside.
 
     Returns:
         Shape [N, 3].

@@ -81,6 +81,18 @@ FORMATS: dict[str, Format] = {
 }
 
 
+_OTHERS: dict[tuple[str, ...], str] = {
+    ("vdb", "nvdb", "openvdb"): "there is no library for it on PyPI; vti is the same volume",
+    ("abc", "alembic", "fbx"): "use usd, or meshes and points",
+    ("obj", "stl"): "use meshes, with --mesh-ending obj",
+    ("ksplat", "sog", "sogs"): "write ply-seq and convert it with splat-transform (npm)",
+    ("gltf",): "use glb",
+    ("ply",): "use ply-seq for splats, points for material points, meshes for fragments",
+    ("avi", "mov", "mkv", "video"): "use mp4",
+    ("jpg", "jpeg", "pictures", "frames"): "use png",
+}
+
+
 def export(
     out: Path,
     kinds: list[str],
@@ -111,7 +123,7 @@ def export(
     kinds = [kind.strip() for kind in kinds if kind.strip()]
     for kind in kinds:
         if kind not in FORMATS:
-            raise InputError(f"--to {kind}: gsfluent cannot write that", nearest(kind, FORMATS))
+            raise InputError(f"--to {kind}: gsfluent cannot write that", _instead(kind))
     if not kinds:
         raise InputError("--to names no format", f"choose from {', '.join(FORMATS)}")
     reel: Reel
@@ -142,6 +154,14 @@ def write_exports(
     reel = Reel(out)
     rate, cpu = reel.rate(), torch.device("cpu")
     return _write(Job(out, out, reel, ExportOptions(), rate, cpu, progress), kinds)
+
+
+def _instead(kind: str) -> str:
+    """What to ask for in place of a format there is not."""
+    for names, mend in _OTHERS.items():
+        if kind.lower() in names:
+            return mend
+    return nearest(kind, FORMATS)
 
 
 def _write(job: Job, kinds: list[str]) -> dict[str, Any]:

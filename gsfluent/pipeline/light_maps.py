@@ -45,7 +45,7 @@ _CUBE_TOWARD: tuple[Vector, ...] = (
     (0.0, 0.0, 1.0),
 )
 # Bias: what is nearer than this many mean splat sizes, plus texels, is the surface itself.
-_BIAS_SPLATS = 1.0
+_BIAS_SPLATS = 3.0
 _BIAS_TEXELS = 1.0
 # The bulk of the matter: at most this many root-mean-square distances from its mean.
 _BULK = 3.0

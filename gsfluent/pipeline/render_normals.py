@@ -2,8 +2,8 @@
 
 The outward normal is minus the gradient of the smoothed occupancy of space. It exists on the skin,
 on crack faces and on debris alike, needs no memory of the rest state and, unlike a plane fitted to
-neighbours (PCA), it has a side. Flat Gaussians know their plane better than any neighbourhood does:
-they use their shortest axis, turned outward. Nothing but :func:`occupancy_cell` and
+neighbours (PCA), it has a side. Flat Gaussians add their shortest axis, and on a sheet, where the
+density has no side, take it alone. Nothing but :func:`occupancy_cell` and
 :func:`grid_for` waits for the device; both are called once per film.
 """
 
@@ -107,15 +107,15 @@ def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = No
     """As :func:`estimate_normals`, from the occupancy of the same splats.
 
     Their length says how sure they are: about 0.3 on a skin, near zero deep inside, one for flat
-    splats that agree with the density, zero for the few splats off the grid. Blending them as they
-    are lets the sure ones decide.
+    splats, zero for the few splats off the grid. Blending them as they are lets the sure ones
+    decide.
 
     Args:
         gaussians: In the scene frame, any state.
         grid: Their occupancy.
-        eye: Where the picture is taken from, [3]: what one sees of a flat splat faces that way. A
-            shell is a sheet without a side to the density, from outside and from inside. When
-            None, flat splats take the side of the density.
+        eye: Where the picture is taken from, [3]: what one sees faces that way. A shell is a sheet
+            without a side to the density, from outside and from inside. When None, vectors take
+            the side of the density.
     """
     return ops.density_normals(
         gaussians.means,

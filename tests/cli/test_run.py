@@ -240,6 +240,26 @@ def test_export_vtk_holds_the_particles(finished: Path) -> None:
     assert 0.0 < points[:, 2].mean() < 1.5
 
 
+def test_export_hands_a_real_run_on(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["export", str(finished), "--to", "delta,spz,png,ply-seq", "--frames", "::4"]
+    words += ["--size", "64x48", "--camera", "turntable", "-o", str(tmp_path), "--json"]
+    assert main(words) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert written["spz"] == "spz/frame_0001.spz to frame_0009.spz"
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 3
+    assert main(["export", str(tmp_path / "splats.gsd"), "--to", "ply-seq"]) == 0
+    for number in (1, 2, 3):
+        unpacked = load(tmp_path / "splats" / "frames" / f"frame_{number:04d}.ply")
+        straight = load(tmp_path / "frames" / f"frame_{4 * number - 3:04d}.ply")
+        assert unpacked.count == straight.count
+        gap = unpacked.means[::50, None].double() - straight.means
+        off = gap.norm(dim=2).amin(dim=1)
+        finest = straight.scales.median(dim=1).values.quantile(0.1)
+        assert float(off.max()) < 3**0.5 * 0.031 * float(finest)
+
+
 def test_plan_agrees_with_the_run(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(finished.parent / "shot.yaml"), "--json"]) == 0
     plan = json.loads(capsys.readouterr().out)

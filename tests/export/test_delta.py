@@ -274,4 +274,7 @@ def test_too_little_to_write(tmp_path: Path) -> None:
         write(tmp_path / "a.gsd", frames, key_every=0)
     with pytest.raises(InputError, match="no splat"):
         write(tmp_path / "a.gsd", [])
+    twice = dataclasses.replace(frames[0], ids=np.zeros_like(frames[0].ids))
+    with pytest.raises(InputError, match="one id"):
+        write(tmp_path / "a.gsd", [twice])
     assert list(tmp_path.iterdir()) == []

@@ -330,6 +330,12 @@ def test_usd(run: Path, tmp_path: Path, ending: str) -> None:
     assert volume.sum() == pytest.approx(0.2**3, rel=1e-4)
     fragment = UsdGeom.PrimvarsAPI(points).GetPrimvar("fragment").Get(time)
     assert (np.array(fragment) == saved.fragments.numpy()).all()
+    # what USD's own validators have to say
+    validation = pytest.importorskip("pxr.UsdValidation")
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 5
+    problems = validation.ValidationContext(validators).Validate(stage)
+    assert [problem.GetErrorAsString() for problem in problems] == []
 
 
 def test_an_interrupted_sequence_goes_on(run: Path, tmp_path: Path) -> None:
@@ -358,7 +364,9 @@ def test_frames_that_are_no_more_do_not_play_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "said"),
     [
-        ("alembic", {}, "ply-seq"),
+        ("spzz", {}, "did you mean 'spz'"),
+        ("alembic", {}, "use usd"),
+        ("vdb", {}, "vti"),
         ("spz", {"frames": "9:3"}, "--frames"),
         ("spz", {"frames": "77"}, f"0 to {LAST}"),
         ("spz", {"frames": "a:b"}, "10:40"),

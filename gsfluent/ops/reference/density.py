@@ -17,6 +17,11 @@ WIDE = 2
 CLEAR = 0.1
 # Half the gradient up to which a sheet does not say which way its splats lie.
 UNCLEAR = 0.05
+# Gradient from which the density leads, and the share of a flat splat's own axis then.
+SURE = 0.12
+OWN = 0.5
+# Cosine to the eye below which a vector is seen from its other side.
+AWAY = -0.25
 # A splat is called flat when its shortest axis is below this share of the middle one.
 FLAT = 0.5
 
@@ -100,8 +105,16 @@ def density_normals(
     once = torch.linalg.cross(vector, along)
     axis = along + 2.0 * (w * once + torch.linalg.cross(vector, once))
     agreement = (axis * outward).sum(-1)
-    trusted = agreement.abs() > 0.5 * outward.norm(dim=-1) - UNCLEAR
-    trusted &= shortest < FLAT * middle
-    side = agreement if eye is None else (axis * (eye - means)).sum(-1)
-    side = torch.where(side < 0, -1.0, 1.0).to(axis)
-    return torch.where(trusted[:, None], axis * side[:, None], outward)
+    clear = outward.norm(dim=-1)
+    flat = shortest < FLAT * middle
+    own = axis * torch.where(agreement < 0, -1.0, 1.0).to(axis)[:, None]
+    led = normalize(normalize(outward, dim=-1) + OWN * own, dim=-1)
+    sure = clear > SURE
+    alone = flat & ~sure & (agreement.abs() > 0.5 * clear - UNCLEAR)
+    outward = torch.where((flat & sure)[:, None], led, outward)
+    outward = torch.where(alone[:, None], own, outward)
+    if eye is None:
+        return outward
+    view = eye - means
+    least = torch.where(alone, 0.0, AWAY).to(axis) * outward.norm(dim=-1) * view.norm(dim=-1)
+    return torch.where(((outward * view).sum(-1) < least)[:, None], -outward, outward)
