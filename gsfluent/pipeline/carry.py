@@ -1,11 +1,12 @@
 """Gaussians ride on material points.
 
-Each splat is bound at rest to the nearest points of its body. At a later time it moves with those
-of them that are in one piece: ``m = sum_k w_k (x_k + A_k (m0 - X_k))`` with ``A_k`` the point's
-total deformation, its stretches clamped so that no splat becomes a needle or a balloon; the
+Each splat belongs to the point of its body that is nearest at rest. At a later time it moves with
+that point and those of its neighbours that it still hangs together with
+(:mod:`gsfluent.pipeline.crack_links`): ``m = sum_k w_k (x_k + A_k (m0 - X_k))`` with ``A_k`` the
+point's total deformation, its stretches clamped so that no splat becomes a needle or a balloon; the
 covariance becomes ``A S A^T`` (PhysGaussian, section 3.3, with total instead of elastic
-deformation) and the colour turns with the rotation of A. A splat on a broken point follows the
-nearest unbroken neighbour, so that it lies on the edge of a piece and is never strung across a gap.
+deformation) and the colour turns with the rotation of A. What has parted is never strung across the
+gap: crumbs fly on their own, with the rotation alone.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import SURFACE, Gaussians
+from gsfluent.pipeline.crack_links import Hanging, Links
 from gsfluent.pipeline.neighbours import nearest_rows
 from gsfluent.pipeline.particles import Matter, body_frame
 from gsfluent.scene import Body, Scene
 
-NEIGHBOURS = 12
 STRETCH = (0.6, 1.5)
 """Bounds of the stretch that splats show."""
 RIGID = 1e-3
 """Splats that are stretched by less than this keep their shape exactly."""
 CHUNK = 100_000
 """Splats that are moved at once; bounds the memory of a frame."""
-REACH = 1.6
-"""A splat on a broken point looks for an unbroken one within this many point spacings."""
+BLEND = 0.6
+"""Width of the blend of neighbouring points, in point spacings."""
 
 
 class Points(NamedTuple):
@@ -38,11 +39,12 @@ class Points(NamedTuple):
 
     Attributes:
         position: Positions [m], [N, 3].
-        map: Total deformation, stretches clamped; of broken points the rotation alone, since they
-            deform without limit, [N, 3, 3].
+        map: Total deformation, stretches clamped; outside of pieces the rotation alone, since
+            crumbs have no shape to keep, [N, 3, 3].
         rotation: Rotation of the deformation, [N, 3, 3].
         fragments: Piece of each point, int32 [N], -1 for none.
         broken: Broken points, bool [N].
+        hanging: How they hang together; None to see it afresh.
     """
 
     position: Tensor
@@ -50,12 +52,13 @@ class Points(NamedTuple):
     rotation: Tensor
     fragments: Tensor
     broken: Tensor
+    hanging: Hanging | None = None
 
     @staticmethod
     def of(position: Tensor, deformation: Tensor, fragments: Tensor, broken: Tensor) -> Points:
         """Split total deformation gradients [N, 3, 3] into rotation and clamped stretch."""
         rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
-        shown = torch.where(broken[:, None, None], rotation, clamped)
+        shown = torch.where((fragments < 0)[:, None, None], rotation, clamped)
         return Points(position, shown, rotation, fragments, broken)
 
 
@@ -66,9 +69,9 @@ class Motion(NamedTuple):
         means: Centres [m], [M, 3].
         map: Local deformation A, stretches clamped, [M, 3, 3].
         rotation: Rotation of A, [M, 3, 3].
-        anchor: Material point each splat follows, int64 [M].
-        broken: Whether the splat's own (nearest) point is broken, bool [M].
-        riding: Whether the splat follows an unbroken point, bool [M].
+        anchor: Material point of each splat, int64 [M].
+        broken: Whether that point is broken, bool [M].
+        riding: Whether that point belongs to a piece, bool [M].
         points: The material points.
     """
 
@@ -96,13 +99,8 @@ class Carry:
     def __init__(self, gaussians: Gaussians, body: Tensor, matter: Matter) -> None:
         self.gaussians, self.body, self.matter = gaussians, body, matter
         self.scene: Scene | None = None
-        distance, self.index = near_points(gaussians.means, body, matter)
-        self.distance = distance
-        spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=distance.device)[body]
-        self.spacing = spacing
-        self.weight = torch.exp(-0.5 * (distance / spacing[:, None]) ** 2).to(gaussians.means)
-        # Far from all points (a stray splat) the nearest one still carries it.
-        self.weight[:, 0] = self.weight[:, 0].clamp(min=1e-6)
+        self.links = Links(matter)
+        self.owner = nearest_points(gaussians.means, body, matter)
 
     @staticmethod
     def bind(scene: Scene, matter: Matter) -> Carry:
@@ -134,40 +132,61 @@ class Carry:
         """
         return self.follow(Points.of(position, deformation, fragments, broken))
 
-    def follow(self, points: Points) -> Motion:
-        """As :meth:`motion`, of points that are split already."""
-        everything = torch.arange(self.gaussians.count, device=points.position.device)
-        parts = [self._follow(rows, points) for rows in everything.split(CHUNK)]
-        means, blend, turn, anchor, broken, riding = (
-            torch.cat(columns) for columns in zip(*parts, strict=True)
-        )
-        return Motion(means, blend, turn, anchor, broken, riding, points)
+    def follow(self, points: Points, rest: Gaussians | None = None) -> Motion:
+        """As :meth:`motion`, of points that are split already.
 
-    def _follow(self, rows: Tensor, points: Points) -> tuple[Tensor, ...]:
-        """Columns of the motion of some splats."""
-        position, stretch, _, fragments, broken = points
-        index, distance = self.index[rows], self.distance[rows]
-        whole = ~broken[index] & (distance <= REACH * self.spacing[rows, None])
-        riding = whole.any(dim=1)
-        # First unbroken neighbour, or the nearest point when all are broken.
-        slot = torch.where(riding, whole.to(torch.int8).argmax(dim=1), 0)
-        anchor = index.gather(1, slot[:, None])[:, 0]
-        piece = fragments[anchor]
-        together = whole & (fragments[index] == piece[:, None]) & (piece >= 0)[:, None]
-        together.scatter_(1, slot[:, None], True)
-        weight = self.weight[rows].clamp(min=1e-12) * together
+        Args:
+            points: The material points.
+            rest: Splats at rest, if not those that were bound but cut ones.
+        """
+        if points.hanging is None:
+            points = points._replace(hanging=self.links.look(points.position, points.fragments))
+        means, blend = self.place((rest or self.gaussians).means, self.owner, points)
+        turn, blend = ops.polar_clamped(blend, *STRETCH)
+        riding = points.fragments[self.owner] >= 0
+        return Motion(means, blend, turn, self.owner, points.broken[self.owner], riding, points)
+
+    def place(self, places: Tensor, owner: Tensor, points: Points) -> tuple[Tensor, Tensor]:
+        """Where places at rest have gone.
+
+        Args:
+            places: [P, 3], scene metres.
+            owner: Point of each, int64 [P].
+            points: The material points, with ``hanging``.
+
+        Returns:
+            Places now [P, 3] and the map of small vectors there [P, 3, 3].
+        """
+        if places.shape[0] == 0:
+            return places, places.new_zeros(0, 3, 3)
+        parts = [
+            self._place(places[rows], owner[rows], points)
+            for rows in torch.arange(places.shape[0], device=places.device).split(CHUNK)
+        ]
+        return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
+
+    def _place(self, places: Tensor, owner: Tensor, points: Points) -> tuple[Tensor, Tensor]:
+        assert points.hanging is not None  # follow sees to it
+        index = self.links.near[owner]
+        arm = places[:, None] - self.matter.rest[index]
+        width = BLEND * self.links.spacing[owner, None]
+        weight = torch.exp(-0.5 * arm.square().sum(dim=2) / width.square())
+        # far from all points (a stray splat) the nearest one still carries it
+        weight = weight.clamp(min=1e-12) * ~points.hanging.parted[owner]
         weight = weight / weight.sum(dim=1, keepdim=True)
-        local = stretch[index]
-        arm = self.gaussians.means[rows][:, None] - self.matter.rest[index]
-        moved = position[index] + (local @ arm[..., None])[..., 0]
+        local = points.map[index]
+        moved = points.position[index] + (local @ arm[..., None])[..., 0]
         means = (weight[..., None] * moved).sum(dim=1)
-        blend = (weight[..., None, None] * local).sum(dim=1)
-        turn, blend = ops.polar_clamped(blend.contiguous(), *STRETCH)
-        return means, blend, turn, anchor, broken[index[:, 0]], riding
+        return means, (weight[..., None, None] * local).sum(dim=1)
 
-    def apply(self, motion: Motion) -> Gaussians:
-        """Return the splats at their new places, with their new shapes and turned colours."""
-        rest = self.gaussians
+    def apply(self, motion: Motion, rest: Gaussians | None = None) -> Gaussians:
+        """Return the splats at their new places, with their new shapes and turned colours.
+
+        Args:
+            motion: From :meth:`follow`.
+            rest: Splats at rest, if not those that were bound but cut ones.
+        """
+        rest = rest or self.gaussians
         turn = geometry.matrix_to_quaternion(motion.rotation)
         quats = geometry.quaternion_multiply(turn, geometry.normalize_quaternions(rest.quats))
         scales = rest.scales
@@ -194,10 +213,10 @@ class Carry:
 
     def sample(self, values: Tensor) -> Tensor:
         """Return per-point values [N] at each splat's nearest point, [M]."""
-        return values[self.index[:, 0]]
+        return values[self.owner]
 
 
-def near_points(places: Tensor, body: Tensor, matter: Matter) -> tuple[Tensor, Tensor]:
+def nearest_points(places: Tensor, body: Tensor, matter: Matter) -> Tensor:
     """Nearest points of the own body of places at rest.
 
     Args:
@@ -206,23 +225,15 @@ def near_points(places: Tensor, body: Tensor, matter: Matter) -> tuple[Tensor, T
         matter: The material points.
 
     Returns:
-        Distances [m], float64 [M, 12], ascending, and rows int64 [M, 12]. A body of fewer points
-        repeats the nearest one at an infinite distance.
+        Rows int64 [M].
     """
-    count, device = places.shape[0], places.device
-    index = torch.zeros(count, NEIGHBOURS, dtype=torch.int64, device=device)
-    distance = torch.zeros(count, NEIGHBOURS, dtype=torch.float64, device=device)
+    owner = torch.zeros(places.shape[0], dtype=torch.int64, device=places.device)
     for number, (a, b) in enumerate(matter.ranges):
         rows = (body == number).nonzero()[:, 0]
-        if rows.numel() == 0:
-            continue
-        near = min(NEIGHBOURS, b - a)
-        found, which = nearest_rows(
-            matter.rest[a:b], places[rows], near, 1.5 * matter.spacing[number]
-        )
-        index[rows, :near], distance[rows, :near] = which + a, found
-        index[rows, near:], distance[rows, near:] = which[:, :1] + a, math.inf
-    return distance, index
+        if rows.numel():
+            found = nearest_rows(matter.rest[a:b], places[rows], 1, matter.spacing[number])[1]
+            owner[rows] = found[:, 0] + a
+    return owner
 
 
 def _ball_splats(body: Body) -> Gaussians:

@@ -1,37 +1,34 @@
-"""The gaps of a running simulation: which face elements show, frame by frame.
+"""The cracks of a running simulation: what has parted, which splats it cuts, which faces it opens.
 
-Two things are remembered, both per run: the points that have ever come loose from a neighbour, and
-the elements that show. An element starts to show when its gap opens beyond one width and stops when
-it has closed below a smaller one, so that nothing toggles; in between its opacity follows the
-width, so that nothing pops. Both are part of a saved run (:meth:`Gaps.state`).
+What is remembered from frame to frame is which neighbouring points have parted
+(:mod:`gsfluent.pipeline.crack_links`); everything else follows from it and is kept only because
+little of it changes from one frame to the next. It is part of a saved run (:meth:`Gaps.state`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from gsfluent import geometry
+from gsfluent import geometry, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.carry import Carry, Points
-from gsfluent.pipeline.crack_faces import Elements, find_elements
+from gsfluent.pipeline.carry import STRETCH, Carry, Points
+from gsfluent.pipeline.crack_cuts import cut_splats
+from gsfluent.pipeline.crack_faces import CRUMB, PIECE, Elements, Fit, find_elements
+from gsfluent.pipeline.crack_links import BACK, FULL, OPEN, Hanging
 from gsfluent.pipeline.crack_sites import Sites
-from gsfluent.pipeline.neighbours import nearest_rows
 
-OPEN, CLOSED = 0.10, 0.05
-"""Openings at which an element starts and stops showing, in spacings of the material points."""
-FULL = 0.30
-"""Opening from which it is as opaque as it gets, in spacings."""
 OPACITY = 0.98
-LOOSE = 0.08
-"""Change of the distance of two neighbours that makes both loose, in spacings."""
-NEAR = 8
-"""Neighbours of a point that are watched."""
+"""Opacity of a face element where the gap is wide."""
+SLACK = 0.4
+"""Standard deviations by which the cuts of splats stay outside of a crack: what is left must still
+cover."""
 CHUNK = 100_000
-"""Sites whose elements are found at once; bounds memory."""
+"""Sites and splats that are looked at at once; bounds memory."""
 
 
 class Births(NamedTuple):
@@ -48,8 +45,22 @@ class Births(NamedTuple):
     anchor: Tensor
 
 
+class Cracks(NamedTuple):
+    """The cracks of one moment.
+
+    Attributes:
+        points: The material points, with how they hang together.
+        rest: The splats at rest, those that lie across a crack cut.
+        births: Splats on open faces; None where there is none.
+    """
+
+    points: Points
+    rest: Gaussians
+    births: Births | None
+
+
 class Gaps:
-    """Watches the gaps of one run.
+    """Follows the cracks of one run.
 
     Args:
         carry: The binding of the splats; it must know its scene (:meth:`Carry.bind`).
@@ -65,129 +76,106 @@ class Gaps:
                 mend="bind with Carry.bind(scene, matter), or use Repair(method='mvee')",
             )
         self.carry = carry
-        matter = carry.matter
-        count, device = matter.particles.count, matter.particles.device
-        self.loose = torch.zeros(count, dtype=torch.bool, device=device)
-        self._broken = self.loose.clone()
-        self._shown = torch.zeros(0, dtype=torch.int64, device=device)
         self._sites: Sites | None = None
-        self._elements: Elements | None = None
-        self._alive = torch.zeros(0, dtype=torch.bool, device=device)
-        self._spacing = torch.zeros(count, device=device)
-        self._near = torch.zeros(count, NEAR, dtype=torch.int64, device=device)
-        for (a, b), spacing in zip(matter.ranges, matter.spacing, strict=True):
-            self._spacing[a:b] = spacing
-            k = min(NEAR + 1, b - a)
-            found = nearest_rows(matter.rest[a:b], matter.rest[a:b], k, 1.5 * spacing)[1] + a
-            self._near[a:b] = found[:, -1:]
-            self._near[a:b, : k - 1] = found[:, 1:]
-        rest = matter.rest
-        self._apart = (rest[self._near] - rest[:, None]).norm(dim=2)
+        self.restore({})
 
-    def step(self, points: Points) -> Births | None:
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state` of another run of the same scene; from nothing when empty."""
+        self._before: Hanging | None = self.carry.links.restored(state) if state else None
+        self._opened = torch.zeros_like(self.carry.links.near, dtype=torch.bool)
+        self._crumb = torch.zeros_like(self._opened[:, 0])
+        self._elements: Elements | None = None
+        self._rest = self.carry.gaussians
+
+    def state(self) -> dict[str, Any]:
+        """What a later run needs to go on from here."""
+        return {} if self._before is None else self._before.state()
+
+    def step(self, points: Points) -> Cracks:
         """Go on to the next frame.
 
         Args:
             points: Where the material points are now; points that joined the run later, to which no
                 splat is bound, come last.
-
-        Returns:
-            The splats on the faces that are open; None when there is none.
         """
-        count = self.loose.shape[0]
-        if points.broken.shape[0] > count:
-            points = Points(*(value[:count] for value in points))
-        self._watch(points)
+        hanging = self.carry.links.look(points.position, points.fragments, self._before)
+        self._before = hanging
+        points = points._replace(hanging=hanging)
+        crumb = points.fragments[: hanging.opened.shape[0]] < 0
+        changed = (hanging.opened != self._opened).any(dim=1)
+        changed |= (crumb != self._crumb) & hanging.opened.any(dim=1)
+        if bool(changed.any()):
+            self._opened, self._crumb = hanging.opened, crumb
+            self._cut(changed)
+            self._open(changed)
         if self._elements is None or self._elements.count == 0:
-            return None
-        elements = self._elements
-        gap = _opening(elements, self.carry.matter.rest, points)
-        spacing = self._spacing[elements.anchor]
-        alive = gap > torch.where(self._alive, CLOSED, OPEN) * spacing
-        self._alive = alive
-        rows = alive.nonzero()[:, 0]
-        if rows.numel() == 0:
-            return None
-        shown = elements.select(rows)
-        share = gap[rows] / spacing[rows]
-        opacity = OPACITY * ((share - CLOSED) / (FULL - CLOSED)).clamp(0.0, 1.0)
-        return _births(shown, opacity, self.carry, points)
+            return Cracks(points, self._rest, None)
+        return Cracks(points, self._rest, _births(self._elements, self.carry, points))
 
-    def _watch(self, points: Points) -> None:
-        """Find the points that came loose or broke, and the elements around them."""
-        now = (points.position[self._near] - points.position[:, None]).norm(dim=2)
-        moved = (now - self._apart).abs().amax(dim=1)
-        loose = self.loose | points.broken | (moved > LOOSE * self._spacing)
-        changed = (loose != self.loose) | (points.broken != self._broken)
-        if self._elements is None:
-            changed |= loose  # after a resume
-        if not bool(changed.any()):
-            return
-        self.loose, self._broken = loose, points.broken
+    def _cut(self, changed: Tensor) -> None:
+        """Cut the splats of points [N] anew."""
+        carry, links = self.carry, self.carry.links
+        whole, rest = carry.gaussians, self._rest
+        stale = changed[carry.owner].nonzero()[:, 0]
+        means, quats, scales = rest.means.clone(), rest.quats.clone(), rest.scales.clone()
+        for rows in stale.split(CHUNK):
+            shape = whole.means[rows], whole.quats[rows], whole.scales[rows]
+            cut, *now = cut_splats(
+                *shape, owner=carry.owner[rows], near=links.near, opened=self._opened,
+                rest=links.rest, slack=SLACK,
+            )  # fmt: skip
+            for value, before, after in zip((means, quats, scales), shape, now, strict=True):
+                value[rows] = before.index_copy(0, cut, after)
+        self._rest = rest.replace(means=means, quats=quats, scales=scales)
+
+    def _open(self, changed: Tensor) -> None:
+        """Find the face elements of the sites of points [N] anew."""
+        carry = self.carry
         if self._sites is None:
-            assert self.carry.scene is not None  # __init__ checks it
-            self._sites = Sites.of(self.carry.scene, self.carry.matter)
-        stale = changed[self._sites.index].any(dim=1)
-        parts = (
-            [] if self._elements is None else [self._elements.select(~stale[self._elements.site])]
+            assert carry.scene is not None  # __init__ checks it
+            self._sites = Sites.of(carry.scene, carry.matter)
+        stale = changed[self._sites.owner]
+        old = self._elements
+        parts = [] if old is None else [old.select(~stale[old.site])]
+        crumb = self._crumb[self._sites.owner]
+        for fit, which in ((PIECE, ~crumb), (CRUMB, crumb)):
+            for rows in (stale & which).nonzero()[:, 0].split(CHUNK):
+                parts.append(self._found(rows, fit))
+        self._elements = Elements.sorted(parts) if parts else None
+
+    def _found(self, rows: Tensor, fit: Fit) -> Elements:
+        """Face elements of some sites, cut where other faces begin."""
+        links = self.carry.links
+        assert self._sites is not None  # _open sees to it
+        found = find_elements(self._sites, rows, links.rest, links.near, self._opened, fit)
+        cut, means, quats, scales = cut_splats(
+            found.means, found.quats, found.scales, owner=found.owner, near=links.near,
+            opened=self._opened, rest=links.rest, slack=fit.slack,
+        )  # fmt: skip
+        return dataclasses.replace(
+            found,
+            means=found.means.index_copy(0, cut, means),
+            quats=found.quats.index_copy(0, cut, quats),
+            scales=found.scales.index_copy(0, cut, scales),
         )
-        shown = self._keys()
-        rest = self.carry.matter.rest
-        for rows in stale.nonzero()[:, 0].split(CHUNK):
-            parts.append(find_elements(self._sites, rows, rest, points.broken, loose))
-        if not parts:
-            return
-        self._elements = Elements.sorted(parts)
-        self._alive = torch.isin(self._elements.key, shown)
-        self._shown = shown[:0]
-
-    def _keys(self) -> Tensor:
-        """Keys of the elements that show, int64, ascending."""
-        if self._elements is None:
-            return self._shown
-        return self._elements.key[self._alive]
-
-    def state(self) -> dict[str, Any]:
-        """What a later run needs to go on from here: two tensors."""
-        return {"loose": self.loose.nonzero()[:, 0].cpu(), "shown": self._keys().cpu()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state` of another run of the same scene; from nothing when empty."""
-        self.loose, self._broken = torch.zeros_like(self.loose), torch.zeros_like(self.loose)
-        self._elements = None
-        self._shown = torch.zeros(0, dtype=torch.int64, device=self.loose.device)
-        if state:
-            self.loose[state["loose"].to(self.loose.device)] = True
-            self._shown = state["shown"].to(self.loose.device)
 
 
-def _turned(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """Products of matrices [E, 3, 3] and vectors [E, 3]; faster than a batch of tiny gemms."""
-    return (matrices * vectors[:, None]).sum(dim=2)
-
-
-def _opening(elements: Elements, rest: Tensor, points: Points) -> Tensor:
-    """Distance [m] between where anchor and rival take each element, [E]."""
-    a, r, m = elements.anchor, elements.rival, elements.means
-    mine = points.position[a] + _turned(points.map[a], m - rest[a])
-    theirs = points.position[r] + _turned(points.map[r], m - rest[r])
-    return (mine - theirs).norm(dim=1)
-
-
-def _births(shown: Elements, opacity: Tensor, carry: Carry, points: Points) -> Births:
-    """Elements as splats, where their anchors are now."""
-    a = shown.anchor
-    rest = carry.matter.rest
-    means = points.position[a] + _turned(points.map[a], shown.means - rest[a])
-    turn = points.rotation[a]
-    quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), shown.quats)
+def _births(elements: Elements, carry: Carry, points: Points) -> Births:
+    """Elements as splats, where their points are now."""
+    assert points.hanging is not None  # step puts it there
+    ratio = points.hanging.ratio.view(-1)[elements.pair]
+    least = BACK * OPEN
+    opacity = OPACITY * ((ratio - least) / (FULL - least)).clamp(0.0, 1.0)
+    means, local = carry.place(elements.means, elements.owner, points)
+    turn, _ = ops.polar_clamped(local, *STRETCH)
+    quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), elements.quats)
     gaussians = Gaussians(
         means=means,
         quats=quats,
-        scales=shown.scales,
+        scales=elements.scales,
         opacities=opacity,
-        sh=geometry.rgb_to_sh0(shown.color)[:, None],
-        labels=torch.full_like(a, TRANSITION, dtype=torch.int32),
-        normals=_turned(turn, shown.normals),
+        sh=geometry.rgb_to_sh0(elements.color)[:, None],
+        labels=torch.full_like(elements.owner, TRANSITION, dtype=torch.int32),
+        normals=(turn * elements.normals[:, None]).sum(dim=2),
     )
-    return Births(gaussians, carry.gaussians.count + shown.key, a)
+    return Births(gaussians, carry.gaussians.count + elements.key, elements.owner)

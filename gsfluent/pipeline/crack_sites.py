@@ -14,15 +14,16 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Gaussians, Solid
-from gsfluent.pipeline.carry import near_points
+from gsfluent.pipeline.carry import nearest_points
 from gsfluent.pipeline.fill_colors import surface_colors
 from gsfluent.pipeline.fill_pieces import sample, signed_depth
 from gsfluent.pipeline.neighbours import nearest_rows
 from gsfluent.pipeline.particles import Matter, body_frame
 from gsfluent.scene import Scene
 
-PER_POINT = 2.0
-"""Sites per spacing of the material points and axis, at least: a crumb of one point has a shape."""
+PER_POINT = (2.0, 3.0)
+"""Sites per spacing of the material points and axis, at least, so that a crumb of one point has a
+shape, and at most; between them the voxels of the colours decide."""
 MOST = 1_000_000
 """Largest number of sites of a scene; more would make a coarser lattice."""
 SKIN = 1.75
@@ -41,9 +42,7 @@ class Sites:
         outward: Unit vector to the nearest skin, [S, 3].
         depth: Distance to the skin [m], [S].
         skin: Colour of the skin where it is near, else that of the matter, [S, 3].
-        index: Nearest material points, int64 [S, 12].
-        distance: Their distances [m], [S, 12].
-        spacing: Spacing of the material points [m], [S].
+        owner: Nearest material point, int64 [S].
     """
 
     means: Tensor
@@ -53,9 +52,7 @@ class Sites:
     outward: Tensor
     depth: Tensor
     skin: Tensor
-    index: Tensor
-    distance: Tensor
-    spacing: Tensor
+    owner: Tensor
 
     @property
     def count(self) -> int:
@@ -77,8 +74,8 @@ class Sites:
         for number, body in enumerate(scene.bodies):
             if body.solid is None:
                 continue
-            pitch = min(body.frame.scale * body.solid.voxel, matter.spacing[number] / PER_POINT)
-            pitch = max(pitch, finest)
+            coarse, fine = (matter.spacing[number] / n for n in PER_POINT)
+            pitch = max(min(max(body.frame.scale * body.solid.voxel, fine), coarse), finest)
             frame = body_frame(body, scene)
             made = _of_solid(body.solid.to(device), pitch / frame.scale)
             means, color, outward, depth, skin = made
@@ -95,28 +92,15 @@ class Sites:
         if not columns[0]:
             return _none(device)
         means, pitches, voxels, color, outward, depth, skin, owner = (torch.cat(c) for c in columns)
-        distance, index = near_points(means, owner, matter)
-        spacing = torch.tensor(matter.spacing, dtype=torch.float32, device=device)[owner]
-        firm = ~matter.of_law("fluid", "drucker_prager")[index[:, 0]]
-        every = (
-            means,
-            pitches,
-            voxels,
-            color,
-            outward,
-            depth,
-            skin,
-            index,
-            distance.float(),
-            spacing,
-        )
+        points = nearest_points(means, owner, matter)
+        firm = ~matter.of_law("fluid", "drucker_prager")[points]
+        every = (means, pitches, voxels, color, outward, depth, skin, points)
         return Sites(*(value[firm] for value in every))
 
 
 def _none(device: torch.device) -> Sites:
     flat, tall = torch.zeros(0, device=device), torch.zeros(0, 3, device=device)
-    index = torch.zeros(0, 1, dtype=torch.int64, device=device)
-    return Sites(tall, flat, flat, tall, tall, flat, tall, index, index.float(), flat)
+    return Sites(tall, flat, flat, tall, tall, flat, tall, flat.to(torch.int64))
 
 
 def _of_solid(solid: Solid, pitch: float) -> tuple[Tensor, ...]:

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
-from gsfluent.ops.raster import Rendered
 from gsfluent.pipeline.draw import draw
 from gsfluent.zbuffer import nearest_points
 
@@ -63,7 +62,7 @@ class MatterView:
         pixels = float((camera.K[0, 0].to(own) * own / depth[seen]).median())
         seen = _mostly(seen, round(0.5 * SPECK * pixels))
         rim = round(RIM * pixels) + 1
-        back = _dilated(depth, round(pixels)) + BEHIND * float(own.median())
+        back = dilated(depth, round(pixels)) + BEHIND * float(own.median())
         return cls(point, depth, erode(seen, rim), back)
 
 
@@ -74,21 +73,31 @@ class Holes:
     Attributes:
         fraction: Mean transmittance: how much of the background shows through.
         through: Share of the pixels in which one looks through the front at something far behind:
-            half of the light or more comes from behind ``MatterView.back``.
+            the light comes, on average, from behind ``MatterView.back``.
     """
 
     fraction: float
     through: float
 
     @classmethod
-    def of(cls, drawn: Rendered, matter: MatterView) -> Holes:
-        """Measure a picture that was rasterized with ``median_depth``."""
+    def of(cls, alpha: Tensor, depth: Tensor, matter: MatterView) -> Holes:
+        """Measure a picture.
+
+        Args:
+            alpha: Opacity of the splats, [H, W], at the size of ``matter`` or larger.
+            depth: Their expected depth [m], of the same size.
+            matter: What ought to be opaque.
+        """
         area = int(matter.silhouette.sum())
         if area == 0:
             return cls(0.0, 0.0)
-        assert drawn.median_depth is not None  # asked for; narrows the type
-        left = (1.0 - drawn.alpha)[matter.silhouette].clamp(0.0, 1.0)
-        behind = matter.silhouette & (drawn.median_depth > matter.back)
+        size = matter.silhouette.shape
+        if alpha.shape != size:
+            planes = alpha[None, None], depth[None, None]
+            alpha = torch.nn.functional.interpolate(planes[0], size, mode="area")[0, 0]
+            depth = torch.nn.functional.interpolate(planes[1], size, mode="nearest")[0, 0]
+        left = (1.0 - alpha)[matter.silhouette].clamp(0.0, 1.0)
+        behind = matter.silhouette & (depth > matter.back)
         return cls(float(left.sum()) / area, float(behind.sum()) / area)
 
 
@@ -119,14 +128,15 @@ def hole_fraction(
     """
     camera = small(camera)
     flat = torch.zeros_like(gaussians.means[:, :1])
-    drawn = draw(gaussians, camera, colors=flat, groups=groups, near=0.01, median_depth=True)
-    return Holes.of(drawn, MatterView.of(positions, volume, camera)).fraction
+    drawn = draw(gaussians, camera, colors=flat, groups=groups, near=0.01, depth=True)
+    assert drawn.depth is not None  # asked for; narrows the type
+    matter = MatterView.of(positions, volume, camera)
+    return Holes.of(drawn.alpha, drawn.depth, matter).fraction
 
 
 def erode(mask: Tensor, pixels: int = 1) -> Tensor:
     """Drop the outermost ``pixels`` of a mask [H, W]; the edge of the picture is no edge of it."""
-    outside = (~mask).to(torch.float32)[None, None]
-    return torch.nn.functional.max_pool2d(outside, 2 * pixels + 1, 1, pixels)[0, 0] < 0.5
+    return dilated((~mask).to(torch.float32), pixels) < 0.5
 
 
 def _mostly(mask: Tensor, pixels: int) -> Tensor:
@@ -137,5 +147,10 @@ def _mostly(mask: Tensor, pixels: int) -> Tensor:
     return mask | (share > 0.5)
 
 
-def _dilated(image: Tensor, pixels: int) -> Tensor:
-    return torch.nn.functional.max_pool2d(image[None, None], 2 * pixels + 1, 1, pixels)[0, 0]
+def dilated(image: Tensor, pixels: int) -> Tensor:
+    """Largest value in the square of ``2 pixels + 1`` around each pixel of [..., H, W]."""
+    planes = image.reshape(1, -1, *image.shape[-2:])
+    size = 2 * pixels + 1
+    # rows, then columns: a square window in one go takes a hundred times as long
+    rows = torch.nn.functional.max_pool2d(planes, (1, size), 1, (0, pixels))
+    return torch.nn.functional.max_pool2d(rows, (size, 1), 1, (pixels, 0)).view_as(image)

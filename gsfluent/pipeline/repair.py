@@ -18,7 +18,7 @@ from torch import Tensor
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.carry import Carry, Motion, Points
-from gsfluent.pipeline.crack_gaps import Births, Gaps
+from gsfluent.pipeline.crack_gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.repair_mvee import (
     CROSS_RADIUS,
     NEIGHBOUR_RADIUS,
@@ -90,7 +90,7 @@ class Repair(Stage):
         self._gaps: Gaps | None = None
         self._resumed: dict[str, Any] | None = None
 
-    def step(self, carry: Carry, points: Points) -> Births | None:
+    def step(self, carry: Carry, points: Points) -> Cracks | None:
         """Go on to the next frame (method ``gap``): call once per frame, in their order.
 
         What was open before decides with what is open now, so that nothing flickers.
@@ -100,7 +100,7 @@ class Repair(Stage):
             points: Where the material points are.
 
         Returns:
-            Splats on open crack faces; None where there is none, and with the other methods.
+            The cracks; None with the other methods.
 
         Raises:
             InputError: The binding knows no scene.
@@ -120,15 +120,15 @@ class Repair(Stage):
         motion: Motion,
         carried: Gaussians | None = None,
         *,
-        births: Births | None = None,
+        cracks: Cracks | None = None,
     ) -> Repaired:
         """Repair the splats of one moment.
 
         Args:
             carry: The binding of the splats.
             motion: Their motion.
-            carried: ``carry.apply(motion)``, when it is at hand.
-            births: What :meth:`step` returned for this moment; without it the step is made here.
+            carried: The carried splats, when they are at hand (method ``gap``: the cut ones).
+            cracks: What :meth:`step` returned for this moment; without it the step is made here.
 
         Returns:
             All splats, sibling groups, and how many were added.
@@ -136,9 +136,14 @@ class Repair(Stage):
         Raises:
             InputError: As :meth:`step`.
         """
+        if cracks is None and self.method == "gap":
+            cracks, carried = self.step(carry, motion.points), None
+            assert cracks is not None  # method gap
+            motion = carry.follow(cracks.points, cracks.rest)
+        if cracks is not None:
+            moved = carry.apply(motion, cracks.rest) if carried is None else carried
+            return _with_births(moved, motion, cracks.births)
         moved = carry.apply(motion) if carried is None else carried
-        if self.method == "gap":
-            return _with_births(moved, motion, births or self.step(carry, motion.points))
         if self.method == "none":
             return Repaired.none(moved, motion.anchor)
         if self._graph is None or self._graph.carry is not carry:

@@ -22,7 +22,7 @@ from torch import Tensor
 from gsfluent.data import Gaussians, Particles
 from gsfluent.errors import InputError
 from gsfluent.pipeline.carry import Carry, Motion, Points
-from gsfluent.pipeline.crack_gaps import Births
+from gsfluent.pipeline.crack_gaps import Cracks
 from gsfluent.pipeline.fragments import Fragments
 from gsfluent.pipeline.particles import ALPHA_JITTER, Matter, build_matter, grid_spacing
 from gsfluent.pipeline.repair import METHODS, Repair, Repaired
@@ -71,12 +71,17 @@ class SimulationFrame:
     _carry: Carry | None = None
     _repair: Repair | None = None
     _points: Points | None = None
-    _births: Births | None = None
+    _cracks: Cracks | None = None
 
     def _binding(self) -> Carry:
         if self._carry is None:
             raise InputError("frame: this run carries no splats", mend="Simulate(splats=True)")
         return self._carry
+
+    @property
+    def _rest(self) -> Gaussians | None:
+        """The splats at rest, cut at cracks."""
+        return None if self._cracks is None else self._cracks.rest
 
     @functools.cached_property
     def repaired(self) -> Repaired:
@@ -85,9 +90,9 @@ class SimulationFrame:
         Splats of all bodies follow each other in the order of the scene; transition splats come
         last.
         """
-        if self._repair is None or (self._repair.method == "gap" and self._births is None):
+        if self._repair is None:
             return Repaired.none(self.carried, self.motion.anchor)
-        return self._repair(self._binding(), self.motion, self.carried, births=self._births)
+        return self._repair(self._binding(), self.motion, self.carried, cracks=self._cracks)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -102,7 +107,7 @@ class SimulationFrame:
     @functools.cached_property
     def carried(self) -> Gaussians:
         """The splats without repair: one for one those of the solids."""
-        return self._binding().apply(self.motion)
+        return self._binding().apply(self.motion, self._rest)
 
     @functools.cached_property
     def motion(self) -> Motion:
@@ -110,7 +115,7 @@ class SimulationFrame:
         carry = self._binding()
         if self._points is None:
             raise InputError("frame: no deformation was tracked", mend="Simulate(splats=True)")
-        return carry.follow(self._points)
+        return carry.follow(self._points, self._rest)
 
     @functools.cached_property
     def splat_damage(self) -> Tensor:
@@ -322,10 +327,11 @@ def frame_of(
     peak, start = run.state.peak, run.matter.particles.alpha
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
     damage = torch.where(run.matter.brittle, damage, 0.0)
-    particles, broken, points, births = run.state.particles, peak >= 0, None, None
+    particles, broken, points, cracks = run.state.particles, peak >= 0, None, None
     if carry is not None and particles.deformation is not None:
         points = Points.of(particles.position, particles.deformation, pieces.labels, broken)
-        births = None if repair is None else repair.step(carry, points)
+        cracks = None if repair is None else repair.step(carry, points)
+        points = points if cracks is None else cracks.points
     return SimulationFrame(
         index=index,
         time=time,
@@ -346,5 +352,5 @@ def frame_of(
         _carry=carry,
         _repair=repair,
         _points=points,
-        _births=births,
+        _cracks=cracks,
     )
