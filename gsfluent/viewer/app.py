@@ -193,13 +193,15 @@ class App:
         """Turn a browser's camera to the whole of what is in the present frame."""
         try:
             survey = self.timeline.survey(self.index)
-            camera = self.maker.camera(self.index, 4, 3)
+            size = (max(16, client.camera.image_width), max(16, client.camera.image_height))
+            camera = self.maker.camera(self.index, *size)
         except GsfluentError:
             return
         shift = np.array(self.shift)
         with client.atomic():
             client.camera.position = camera.center().numpy() - shift
             client.camera.look_at = np.array(survey.center) - shift
+            client.camera.fov = 2.0 * np.arctan(0.5 * camera.height / float(camera.K[1, 1]))
 
     def camera(self, client: viser.ClientHandle, budget: float = float("inf")) -> Camera:
         """The camera of a browser in the scene, at the size that is drawn within ``budget`` [s]."""
