@@ -16,6 +16,7 @@ from pathlib import Path
 import gsfluent as gf
 from gsfluent.demo import make_capture
 from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.render_floor import Studio
 
 
 def main() -> int:
@@ -43,16 +44,17 @@ def main() -> int:
     texture = gf.pipeline.Texture(method="exemplar", exemplar=paths.cut, device=options.device)
     solid = texture(solid, capture)
 
-    # what happens: it falls from 1.2 m; the material is a preset with one number changed
+    # what happens: it falls from 0.7 m; the material is a preset with one number changed
     scene = gf.Scene(floor=0.0)
     scene.add(solid, material=gf.materials.fruit.orange.override(cohesion=0.08), name="orange")
-    scene.drop(1.2)
+    scene.drop(0.7)
 
-    camera = gf.Camera.look_at((0.28, -0.34, 0.22), (0.0, 0.0, 0.03), width=320, height=240)
-    render = gf.pipeline.Render(camera, Light(direction=(1.0, -1.0, 2.0)))
+    camera = gf.Camera.look_at((0.42, -0.5, 0.34), (0.0, 0.0, 0.05), width=320, height=240)
+    studio = Studio(height=0.0, center=(0.0, 0.0), radius=0.05, extent=0.3)
+    render = gf.pipeline.Render(camera, Light(direction=(1.0, -1.0, 2.0)), studio=studio)
     simulate = gf.pipeline.Simulate(quality="preview", device=options.device)
     fps = 30.0
-    fall = round(fps * 0.49)  # it lands after 0.49 s; pictures are made from then on
+    fall = round(fps * 0.37)  # it lands after 0.38 s; pictures are made from then on
     for frame in simulate(scene, fps=fps, seconds=(fall + options.frames) / fps):
         if frame.index < fall:
             continue

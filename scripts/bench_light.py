@@ -2,6 +2,7 @@
 
     python scripts/bench_light.py                    # 1080p, 1 M Gaussians, GPU if there is one
     python scripts/bench_light.py --device cpu --gaussians 100000 --size 640x360
+    python scripts/bench_light.py --read h100.out cpu.out --page docs/light.md
 
 A solid ball of matter breaks in four above a floor, under one soft key light. On the GPU times are
 medians of CUDA events around calls that run back to back; on the CPU they are the process's time.
@@ -16,9 +17,11 @@ import math
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
+from page import enter
 
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
@@ -130,6 +133,20 @@ def measure(
     }
 
 
+def table(lines: list[dict[str, Any]]) -> str:
+    """Markdown of what was measured, one column per line of JSON."""
+    heads = [
+        f"{line['device']}, {line['gaussians']:,} splats, {line['size'][0]} x {line['size'][1]}, "
+        f"{line['lamps']} lamp{'s' if line['lamps'] > 1 else ''}"
+        for line in lines
+    ]
+    rows = [f"| ms | {' | '.join(heads)} |", f"| --- |{' --- |' * len(lines)}"]
+    for name in lines[0]["milliseconds"]:
+        cells = [f"{line['milliseconds'][name]:.2f}" for line in lines]
+        rows.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--gaussians", type=int, default=1_000_000)
@@ -137,7 +154,19 @@ def main() -> None:
     parser.add_argument("--lamps", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--read", type=Path, nargs="+", help="outputs of earlier runs, for --page")
+    parser.add_argument("--page", type=Path, help="enter the table of --read into this page")
     options = parser.parse_args()
+    if options.read:
+        texts = [path.read_text(encoding="utf-8") for path in options.read]
+        lines = [
+            json.loads(line) for text in texts for line in text.splitlines() if line[:1] == "{"
+        ]
+        print(table(lines))
+        if options.page:
+            page = options.page.read_text(encoding="utf-8")
+            options.page.write_text(enter(page, "light speed", table(lines)), encoding="utf-8")
+        return
     width, height = (int(side) for side in options.size.split("x"))
     for lamps in options.lamps:
         found = measure(

@@ -107,12 +107,12 @@ def measured(points: int, frames: int, slow: float, device: torch.device) -> dic
     render = Render(studio=studio, normal_cell=occupancy_cell(first.gaussians))
     watch = Watch(device)
     begun = time.perf_counter()
-    session.shoot((1.0, 0.0, 0.12), (-1.0, 0.0, 0.0), 120.0, 0.015)
+    session.shoot((1.0, 0.0, 0.12), (-1.0, 0.0, 0.0), 80.0, 0.015)
     poke = time.perf_counter() - begun
     pieces = 1
     for index in range(frames + 2):
         if index == frames // 2:
-            session.shoot((0.0, 1.0, 0.12), (0.0, -1.0, 0.0), 120.0, 0.015)
+            session.shoot((0.0, 1.0, 0.12), (0.0, -1.0, 0.0), 80.0, 0.015)
         if index == 2:  # what is made once has been made
             for part in PARTS:
                 watch.spent[part].clear()

@@ -91,7 +91,7 @@ def row(name: str, record: dict[str, Any]) -> str:
         str(record["fill"]["interior_gaussians"]),
         str(simulation["particles"]),
         str(max(simulation["per_frame"]["fragments"])),
-        f"{max(holes['hole_fraction_before']):.4f}",
+        f"{max(x for x in holes['hole_fraction_before'] if x is not None):.4f}",
         f"{max(holes['hole_fraction']):.4f}",
         f"{seconds:.0f}",
         record["verdict"],

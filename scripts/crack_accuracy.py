@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -77,7 +77,7 @@ def true_pictures(
 
 def picture(drawn: Drawn, camera: Camera) -> Rendered:
     gaussians, groups = drawn
-    options: dict[str, Any] = {"near": 0.01, "median_depth": True, "groups": groups}
+    options: dict[str, Any] = {"near": 0.01, "depth": True, "groups": groups}
     return draw(gaussians, camera, background=torch.tensor(WHITE), **options)
 
 
@@ -128,8 +128,8 @@ def judge(broken: Broken, given: argparse.Namespace) -> dict[str, Any]:
     views = cameras(broken, size)
     cloud = broken.cloud(given.voxels, given.parted)
     every = broken.broken_frames()
-    # two frames each shortly after the break and late, so that flicker can be measured
-    frames = given.frames or sorted({*every[1:3], *every[-2:]})
+    # two frames shortly after the break, for flicker, and the last
+    frames = given.frames or sorted({*every[1:3], every[-1]})
     lpips = Lpips(given.lpips, torch.device("cpu")) if given.lpips else None
     chosen = methods(broken, cloud, given.only)
     scores = {name: Score(lpips) for name in ("truth", *chosen)}
@@ -155,13 +155,14 @@ def judge(broken: Broken, given: argparse.Namespace) -> dict[str, Any]:
         last = index, moment, matter
         rows: list[list[Tensor]] = [[truth.image] for truth in truths]
         for number, truth in enumerate(truths):
-            scores["truth"].add(truth.image, truth, None, number, flows[number])
+            own = Holes.of(truth.alpha, truth.depth, matter[number])
+            scores["truth"].add(truth.image, truth, own, number, flows[number])
         for name, method in chosen.items():
             drawn = method(broken, moment)
             for number, (row, camera, truth) in enumerate(zip(rows, views, truths, strict=True)):
                 seen = picture(drawn, camera)
                 row.append(seen.image.clamp(0.0, 1.0))
-                holes = Holes.of(seen, matter[number])
+                holes = Holes.of(seen.alpha, cast(Tensor, seen.depth), matter[number])
                 scores[name].add(row[-1], truth, holes, number, flows[number])
         if given.sheets:
             titles = ["truth", *chosen]
@@ -236,7 +237,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--object", nargs="*", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--frames", type=numbers, help="default: two early, two late")
+    parser.add_argument("--frames", type=numbers, help="default: two early, one late")
     parser.add_argument("--only", type=lambda s: s.split(","), help="methods, comma-separated")
     parser.add_argument("--size", type=int, default=400, help="width of the pictures [px]")
     parser.add_argument("--cells", type=int, default=20, help="grid cells along the object")

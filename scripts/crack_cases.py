@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +54,7 @@ class Case:
 CASES = {
     "melon": Case("watermelon", "fruit.watermelon", 1.0, 0.8),
     "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.0, 0.8, isotropic=True),
-    "marble": Case("marble", "fruit.pumpkin", 1.5, 0.8),
+    "marble": Case("marble", "fruit.watermelon", 1.5, 0.8),
     "bread": Case("bread", "fruit.watermelon", 1.2, 0.8),
 }
 
@@ -282,7 +281,6 @@ METHODS: dict[str, Callable[[Broken, Moment], Drawn]] = {
     "raw": raw,
     "raw-total": lambda b, m: raw(b, m, total=True),
     "carried": carried,
+    "mvee": lambda b, m: repaired(b, m, method="mvee"),
     "default": repaired,
 }
-if "method" in inspect.signature(Repair).parameters:
-    METHODS["mvee"] = lambda b, m: repaired(b, m, method="mvee")

@@ -315,11 +315,12 @@ def figures(pictures: Path | None = None) -> dict[str, Any]:
         row = []
         for kind, splats in kinds.items():
             balls[name][kind], picture = sphere(splats, name)
-            row.append(picture)
+            if kind != "flat skin, filled":
+                row.append(picture)
         rows.append(torch.cat(row, 1))
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-        save_image(torch.cat(rows), pictures / "light_spheres.png")
+        save_image(torch.cat(rows), pictures / "light_spheres.jpg")
     return {
         "sphere": balls,
         "shadow": {name: shadow(name) for name in shadow_cases()},

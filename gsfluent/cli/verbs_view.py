@@ -53,6 +53,8 @@ class View(Verb):
     """With --live: cells; live is what the device can do while one looks."""
     slow: float = 4.0
     """With --live: slow motion at first."""
+    cracks: Literal["mvee", "gap", "none"] = "mvee"
+    """With --live: splats along cracks; gap has finer faces and is slower."""
 
     def execute(self) -> dict[str, Any]:
         """Serve."""
@@ -89,6 +91,7 @@ class View(Verb):
             run=self.run,
             quality=self.quality,
             slow=self.slow,
+            cracks=self.cracks,
             seed=self.seed,
             host=self.host,
             port=self.port,

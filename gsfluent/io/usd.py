@@ -150,12 +150,13 @@ class UsdWriter:
         self._at(time)
         if self._points is None:
             self._points = UsdGeom.Points.Define(self.stage, "/scene/particles")
-            self._points.CreateIdsAttr(Vt.Int64Array.FromNumpy(np.arange(len(positions))))
             # splats are the picture; the points are there to be picked up
             self._points.CreatePurposeAttr().Set(UsdGeom.Tokens.guide)
         prim, where = self._points, _floats(positions)
         widths = 2.0 * np.cbrt(3.0 * np.asarray(volumes, np.float64) / (4.0 * np.pi))
         prim.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(where), time)
+        # in every frame, as a jet pours more of them; the same array is stored once
+        prim.CreateIdsAttr().Set(Vt.Int64Array.FromNumpy(np.arange(len(where))), time)
         prim.CreateWidthsAttr().Set(Vt.FloatArray.FromNumpy(_floats(widths)), time)
         prim.CreateVelocitiesAttr().Set(Vt.Vec3fArray.FromNumpy(_floats(velocity)), time)
         prim.CreateExtentAttr().Set(_box(where, float(widths.max()) / 2.0), time)

@@ -130,6 +130,7 @@ def pad_colliders(colliders: Tensor) -> Tensor:
 
 def check_colliders(op: str, rows: Tensor, sdf_count: int) -> None:
     """Refuse rows that are no collider; the same conditions as ``collider_valid`` of the core."""
+    rows = rows.cpu()  # one copy instead of a launch per condition
     kind, mode, radius, extent = (
         rows[:, TYPE],
         rows[:, MODE],

@@ -14,14 +14,13 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Camera
-from gsfluent.pipeline.render_holes import MatterView
+from gsfluent.pipeline.render_holes import MatterView, dilated
 
 HIDDEN = 1.5
 """Matter found this many point spacings nearer or farther than expected is other matter."""
 COHERENT = 1.0
 """Neighbouring pixels whose shifts differ by more [px] show matter that is coming apart."""
 _RIM = 2
-_BLUR = (0.25, 0.5, 0.25)
 
 
 @dataclass(frozen=True)
@@ -74,10 +73,11 @@ class Flow:
         valid &= after.silhouette[row, column] & ((found - z).abs() <= HIDDEN * spacing)
         # rims are soft: what lies beside other matter, or moves unlike its neighbours, is mixed
         far = HIDDEN * spacing
-        valid &= _range(before.depth[..., None]) <= far
-        valid &= (_range(after.depth[..., None]) <= far)[row, column]
+        seen = before.point >= 0
+        valid &= seen & (_range(before.depth[..., None], seen) <= far)
+        valid &= (_range(after.depth[..., None], after.point >= 0) <= far)[row, column]
         shift = target - torch.stack([x, y], -1)
-        valid &= _range(shift) <= COHERENT
+        valid &= _range(shift, seen) <= COHERENT
         return cls(target, valid)
 
 
@@ -100,13 +100,11 @@ def flicker(before: Tensor, after: Tensor, flow: Flow) -> float | None:
     return float(change[flow.valid].mean())
 
 
-def _range(image: Tensor) -> Tensor:
-    """Largest spread of a channel in the neighbourhood of each pixel of [H, W, C], [H, W]."""
-    planes = image.permute(2, 0, 1)[None]
-    size = 2 * _RIM + 1
-    high = torch.nn.functional.max_pool2d(planes, size, 1, _RIM)
-    low = -torch.nn.functional.max_pool2d(-planes, size, 1, _RIM)
-    return (high - low)[0].amax(0)
+def _range(image: Tensor, seen: Tensor) -> Tensor:
+    """Largest spread of a channel of [H, W, C] over the pixels seen around each, [H, W]."""
+    planes = image.permute(2, 0, 1)
+    high = dilated(torch.where(seen, planes, -torch.inf), _RIM)
+    return (high + dilated(torch.where(seen, -planes, -torch.inf), _RIM)).amax(0)
 
 
 def _unproject(camera: Camera, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
@@ -127,11 +125,13 @@ def _project(camera: Camera, world: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _blurred(image: Tensor) -> Tensor:
-    weight = image.new_tensor(_BLUR)
-    kernel = (weight[:, None] * weight)[None, None]
-    planes = image.permute(2, 0, 1)[:, None]
-    padded = torch.nn.functional.pad(planes, (1, 1, 1, 1), mode="replicate")
-    return torch.nn.functional.conv2d(padded, kernel)[:, 0].permute(1, 2, 0)
+    for axis in (0, 1):
+        count = image.shape[axis]
+        row = torch.arange(count, device=image.device)
+        before = image.index_select(axis, (row - 1).clamp(min=0))
+        after = image.index_select(axis, (row + 1).clamp(max=count - 1))
+        image = 0.25 * before + 0.5 * image + 0.25 * after
+    return image
 
 
 def _sampled(image: Tensor, target: Tensor) -> Tensor:

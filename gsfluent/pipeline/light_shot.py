@@ -18,10 +18,10 @@ from gsfluent.pipeline import environment
 from gsfluent.pipeline.light import SHININESS, SPECULAR, Lamp, Lighting
 
 if TYPE_CHECKING:
-    from gsfluent.config import Shot
+    from gsfluent.config import ObjectSettings, Shot
     from gsfluent.pipeline.run_frames import SavedFrame
 
-__all__ = ["changed", "gloss_of", "light_of", "lighting_from"]
+__all__ = ["changed", "gloss_of", "light_of", "lighting_from", "looks_of"]
 
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
@@ -103,6 +103,16 @@ def changed(
     return replace(lighting, **{k: v for k, v in shared.items() if v is not None})  # type: ignore[arg-type]
 
 
+def looks_of(shot: Shot) -> dict[str, tuple[float, float]]:
+    """k_s and n_s of every object of a shot; a picture hangs on them, its simulation does not."""
+    return {name: _shine(settings) for name, settings in shot.objects.items()}
+
+
+def _shine(settings: ObjectSettings) -> tuple[float, float]:
+    made_of = materials.get(settings.material).override(**dict(settings.overrides))
+    return made_of.specular, made_of.shininess
+
+
 def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     """k_s and n_s of every splat, [N, 2], from the material of the body that it follows.
 
@@ -112,15 +122,13 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     names = frame.facts.get("bodies")
     if not names:
         return None
-    rows = []
+    rows, looks = [], looks_of(shot)
     for name, preset in names:
-        made_of = None
-        if name in shot.objects:
-            settings = shot.objects[name]
-            made_of = materials.get(settings.material).override(**dict(settings.overrides))
-        elif preset in materials.names():
+        row = looks.get(name, (SPECULAR, SHININESS))
+        if name not in looks and preset in materials.names():
             made_of = materials.get(preset)
-        rows.append((made_of.specular, made_of.shininess) if made_of else (SPECULAR, SHININESS))
+            row = (made_of.specular, made_of.shininess)
+        rows.append(row)
     steel = materials.get("steel")
     rows.append((steel.specular, steel.shininess))
     table = torch.tensor(rows).to(frame.gaussians.means)

@@ -36,9 +36,9 @@ POKES = ("throw", "bullet", "blade", "press", "pour")
 """Events that can come while the simulation runs."""
 SETTLE = 3.0
 """Simulated seconds after which an object that does not come to rest counts as prepared [s]."""
-REPAIR = {"cpu": "mvee", "cuda": "gap"}
-"""How cracks get splats by device: fine faces (``gap``) cost a CPU as much as the simulation does,
-and quadruple what is drawn."""
+CRACKS = "mvee"
+"""How cracks get splats: fine faces (``gap``) cost as much as the simulation does, and make many
+times as many splats."""
 MOST_LOOSE = 24
 """Bullets and jets at a time; the oldest leaves for a new one."""
 
@@ -60,7 +60,7 @@ class LiveSession:
         slow: Slow motion: a frame is ``1 / (fps * slow)`` simulated seconds.
         seed: Seed of points and weakness.
         dx: Grid spacing [m]; overrides ``quality``.
-        cracks: Method of :class:`gsfluent.pipeline.Repair`; default by device.
+        cracks: Method of :class:`gsfluent.pipeline.Repair`.
         options: Further arguments of :class:`gsfluent.pipeline.Simulate`.
 
     Raises:
@@ -83,7 +83,7 @@ class LiveSession:
         slow: float = 1.0,
         seed: int = 0,
         dx: float | None = None,
-        cracks: str | None = None,
+        cracks: str = CRACKS,
         **options: Any,
     ) -> None:
         if not any(body.solid is not None for body in scene.bodies):
@@ -112,7 +112,7 @@ class LiveSession:
         self._first = self._simulate.run_of(start, fps)
         self.solids = len(scene.bodies)
         self._carry = Carry.bind(start, self._first.matter)
-        self.cracks = REPAIR.get(self.device.type, "mvee") if cracks is None else cracks
+        self.cracks = cracks
         self._repair = Repair(self.cracks)
         self._reach = reach_of(self._first.matter)
         self._prepared = self._first.twin(), 0, (0, 0.0)

@@ -1,9 +1,10 @@
 """Figures of a film: holes and flicker of what is drawn, beside the splats without any care.
 
 "Before" is what one gets by moving each splat rigidly with the material point that was nearest at
-the start, as the peers do: no binding to pieces, no repair. Measured without light and from the
-direction-independent colours, in the film's own camera, and in three that stand around the matter
-in turn, one a frame. While nothing is broken both are the same and drawn once.
+the start, as the peers do: no binding to pieces, no repair. Holes in the film are counted in its
+own pictures, every frame. What needs pictures of its own (before, flicker, and the view of one of
+three cameras around the matter) is measured in two frames of every twelve in which something is
+broken, or it would cost as much as the film; without light, from the direction-independent colours.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from gsfluent.pipeline.run_frames import SavedFrame
 
 AROUND = ((30.0, 15.0), (150.0, 15.0), (270.0, 15.0))
 """Azimuth and elevation of the cameras around the matter [degrees]."""
+EVERY = 12
 _SIZE = (200, 150)
 _FIELD = 32.0  # degrees, of look_at
 _NEIGHBOURS = 8
@@ -94,6 +96,7 @@ def _plain(gaussians: Gaussians) -> Gaussians:
 class _Last(NamedTuple):
     """What flicker needs of the frame before."""
 
+    number: int
     matter: MatterView
     camera: Camera
     positions: Tensor
@@ -105,66 +108,99 @@ class FilmFigures:
 
     Args:
         first: The first frame.
-        around: Cameras around the matter, of which each frame takes the next.
+        around: Cameras around the matter.
+        every: Of so many broken frames two are measured in full.
     """
 
-    def __init__(self, first: SavedFrame, around: Sequence[Camera] = ()) -> None:
-        self._raw, self._around = RawCarry(first), list(around)
+    def __init__(
+        self, first: SavedFrame, around: Sequence[Camera] = (), *, every: int = EVERY
+    ) -> None:
+        self._raw, self._around, self._every = RawCarry(first), list(around), every
         volume = first.volumes
         self._spacing = float(volume.clamp(min=0.0).pow(1 / 3).median()) if len(volume) else 0.0
         self._last: _Last | None = None
+        self._broken = 0
         self._values: dict[str, list[float | int | None]] = {
             name + end: [] for name in _FIGURES for end in ("_before", "")
         }
         self._values["transition_gaussians"] = []
 
     @torch.no_grad()
-    def add(self, frame: SavedFrame, camera: Camera) -> None:
-        """Measure a frame: in the film's camera, and in the next of those around."""
+    def add(self, frame: SavedFrame, camera: Camera, alpha: Tensor, depth: Tensor) -> None:
+        """Measure a frame.
+
+        Args:
+            frame: The frame.
+            camera: The film's camera.
+            alpha: Opacity of the splats in the film's picture, [H, W].
+            depth: Their expected depth there [m], [H, W].
+        """
         index = len(self._values["flicker"])
-        added = frame.gaussians.count - frame.carried
-        shown = [(_plain(frame.gaussians), frame.groups if added else None)]
-        if added or bool((frame.damage >= 1.0).any()):
-            shown.insert(0, (self._raw.at(frame), None))
         view = small(camera)
         matter = MatterView.of(frame.positions, frame.volumes, view)
+        film = Holes.of(alpha, depth, matter)
+        for values in self._values.values():
+            values.append(None)
+        added = frame.gaussians.count - frame.carried
+        self._set("transition_gaussians", added)
+        if not added and not bool((frame.damage >= 1.0).any()):
+            self._enter("", [film, film])
+            return
+        turn, self._broken = self._broken % self._every, self._broken + 1
+        # the second and third broken frame, and so on: in the first nothing has parted yet
+        if turn not in (1 % self._every, 2 % self._every):
+            self._enter("", [None, film])
+            return
+        shown = [
+            (self._raw.at(frame), None),
+            (_plain(frame.gaussians), frame.groups if added else None),
+        ]
         drawn = [_drawn(splats, view, groups) for splats, groups in shown]
+        self._enter("", [_holes(drawn[0], matter), film])
         images = [picture.image for picture in drawn]
-        self._enter("", [Holes.of(picture, matter) for picture in drawn])
-        self._enter_flicker(_Last(matter, view, frame.positions, images))
+        self._enter_flicker(_Last(index, matter, view, frame.positions, images))
         if self._around:
             view = self._around[index % len(self._around)]
             matter = MatterView.of(frame.positions, frame.volumes, view)
             drawn = [_drawn(splats, view, groups) for splats, groups in shown]
-            self._enter("_around", [Holes.of(picture, matter) for picture in drawn])
-        self._values["transition_gaussians"].append(added)
+            self._enter("_around", [_holes(picture, matter) for picture in drawn])
 
-    def _enter(self, where: str, found: list[Holes]) -> None:
-        for end, holes in (("_before", found[0]), ("", found[-1])):
-            self._values[f"hole_fraction{where}{end}"].append(round(holes.fraction, 6))
-            self._values[f"see_through{where}{end}"].append(round(holes.through, 6))
+    def _set(self, name: str, value: float | int | None) -> None:
+        self._values[name][-1] = round(value, 6) if isinstance(value, float) else value
+
+    def _enter(self, where: str, found: list[Holes | None]) -> None:
+        for end, holes in zip(("_before", ""), found, strict=True):
+            if holes is not None:
+                self._set(f"hole_fraction{where}{end}", holes.fraction)
+                self._set(f"see_through{where}{end}", holes.through)
 
     def _enter_flicker(self, now: _Last) -> None:
         last, self._last = self._last, now
-        changes: list[float | None] = [None, None]
-        if last is not None and last.positions.shape == now.positions.shape:
-            moved, views = (last.positions, now.positions), (last.camera, now.camera)
-            flow = Flow.of(last.matter, now.matter, moved, views, self._spacing)
-            pairs = [(last.images[k], now.images[k]) for k in (0, -1)]
-            if len(last.images) == len(now.images) == 1:
-                pairs = pairs[:1]
-            changes = [flicker(*pair, flow) for pair in pairs]
-        for end, change in (("_before", changes[0]), ("", changes[-1])):
-            self._values["flicker" + end].append(None if change is None else round(change, 6))
+        if last is None or last.number != now.number - 1:
+            return
+        if last.positions.shape != now.positions.shape:
+            return
+        moved, views = (last.positions, now.positions), (last.camera, now.camera)
+        flow = Flow.of(last.matter, now.matter, moved, views, self._spacing)
+        for k, end in enumerate(("_before", "")):
+            self._set(f"flicker{end}", flicker(last.images[k], now.images[k], flow))
 
     def report(self) -> dict[str, list[float | int | None]]:
-        """Lists with one entry a frame; ``_around``: in the cameras around, in turn."""
-        return {name: values for name, values in self._values.items() if values}
+        """Lists with one entry a frame, None where not measured.
+
+        ``_around``: in a camera around the matter, another one each time.
+        """
+        return self._values
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, groups: Tensor | None) -> Rendered:
     white = gaussians.means.new_ones(3)
-    return draw(gaussians, camera, groups=groups, near=0.01, median_depth=True, background=white)
+    return draw(gaussians, camera, groups=groups, near=0.01, depth=True, background=white)
+
+
+def _holes(drawn: Rendered, matter: MatterView) -> Holes:
+    assert drawn.depth is not None  # asked for; narrows the type
+    return Holes.of(drawn.alpha, drawn.depth, matter)
 
 
 def cameras_around(positions: list[Tensor]) -> list[Camera]:

@@ -205,12 +205,14 @@ class RigidSet:
             impulse: Given to the matter between them [N s], float64 [M, 3].
             torque: About each collider's point [N m s], float64 [M, 3].
         """
+        device = rows.device  # a few numbers: on a GPU each operation would cost a launch
+        rows, now, impulse, torque = (v.cpu() for v in (rows, now, impulse, torque))
         given = (impulse * rows[:, 10:13]).sum(dim=1) + (torque * rows[:, 20:23]).sum(dim=1)
-        pull = torch.tensor(self._gravity, dtype=rows.dtype, device=rows.device)
+        pull = torch.tensor(self._gravity, dtype=rows.dtype)
         fallen = rows[:, columns.MASS] * ((now[:, 3:6] - rows[:, 3:6]) @ pull)
         # A free body gives what it loses of its own energy.
         lost = _kinetic(rows) - _kinetic(now) + fallen
-        return torch.where(rows[:, columns.MASS] > 0.0, lost, given).sum().clamp(min=0.0)
+        return torch.where(rows[:, columns.MASS] > 0.0, lost, given).sum().clamp(min=0).to(device)
 
     def touchable(self, rows: Tensor) -> Tensor:
         """Volume of grid nodes that each free body can touch, its lever counted in [m^3], [M].

@@ -20,8 +20,8 @@ from gsfluent.io import load, load_capture, save_image
 from gsfluent.pipeline.delight import Delit
 from gsfluent.pipeline.export import write_exports
 from gsfluent.pipeline.light import Light, Lighting, lighting_of
-from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.render import Render
+from gsfluent.pipeline.light_shot import changed, gloss_of, light_of, looks_of
+from gsfluent.pipeline.render import Layers, Render
 from gsfluent.pipeline.render_backdrop import (
     Backdrop,
     covered_floor,
@@ -125,10 +125,16 @@ class Film:
 
     def picture(self, frame: SavedFrame) -> torch.Tensor:
         """The picture [H, W, 3] of a frame."""
+        return self.layers(frame).image
+
+    def layers(self, frame: SavedFrame) -> Layers:
+        """The picture of a frame with its opacity and depth."""
         camera = self.cameras[frame.index]
         gloss = gloss_of(self.shot, frame)
         gaussians = frame.gaussians if self._delit is None else self._delit.apply(frame)
-        return self.render(gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time)
+        return self.render.layers(
+            gaussians, camera, groups=frame.groups, gloss=gloss, time=frame.time
+        )
 
 
 def captured_backdrop(stages: Path, objects: list[str], device: torch.device) -> Backdrop:
@@ -158,7 +164,8 @@ def render_stage(context: RunContext) -> None:
     output += [shot.output.slow, shot.output.backdrop]
     path = shot.output.camera
     camera_key = content_digest(path) if isinstance(path, Path) else None
-    key = fingerprint("render", context.key(context.source_key, repr(light), output, camera_key))
+    looks = [repr(light), repr(looks_of(shot))]
+    key = fingerprint("render", context.key(context.source_key, looks, output, camera_key))
 
     def work(folder: Path) -> dict[str, Any]:
         film = Film.of(context.out, shot, light, context.device)
@@ -173,9 +180,10 @@ def render_stage(context: RunContext) -> None:
             for index in range(len(film)):
                 frame = film.frame(index)
                 start = time.perf_counter()
-                picture = to_bytes(film.picture(frame))
+                layers = film.layers(frame)
+                picture = to_bytes(layers.image)
                 drawing += time.perf_counter() - start
-                figures.add(frame, film.cameras[index])
+                figures.add(frame, film.cameras[index], layers.alpha, layers.depth)
                 counts.append(int(frame.facts.get("fragments", 1)))
                 report_progress(progress, index + 1, len(film), "")
                 yield picture

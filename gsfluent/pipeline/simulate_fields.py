@@ -58,6 +58,8 @@ def _with_neighbours(label: Tensor, links: Tensor) -> Tensor:
 
     The largest of the labels at hand is taken, so that the result does not depend on any order.
     """
+    # Only links with an open end spread anything, and no end opens again.
+    links = links[(label[links] < 0).any(dim=1)]
     a, b = links.unbind(dim=1)
     for _ in range(_HOPS):
         open_a, open_b = label[a] < 0, label[b] < 0

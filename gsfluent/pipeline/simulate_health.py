@@ -127,6 +127,7 @@ class Watch:
         self.reasons: list[str] = []
         self.kind = ""
         self._ring: collections.deque[State] = collections.deque(maxlen=RING)
+        self._measured: tuple[State, Figures] | None = None
 
     def keep(self, state: State, *, only: bool = False) -> None:
         """Remember a good state; ``only`` forgets the others (a frame has been handed out)."""
@@ -149,8 +150,14 @@ class Watch:
             self.good_in_a_row = 0
         return None
 
+    def figures(self, state: State) -> Figures:
+        """Measure a state, once."""
+        if self._measured is None or self._measured[0] is not state:
+            self._measured = state, figures_of(self.matter, state, self.gravity)
+        return self._measured[1]
+
     def _judge(self, state: State) -> Unhealthy | None:
-        now = figures_of(self.matter, state, self.gravity)
+        now = self.figures(state)
         p = state.particles
         if now.non_finite:
             finite = torch.isfinite(p.velocity).all(dim=1) & torch.isfinite(p.strain).all(dim=1)

@@ -64,23 +64,27 @@ def near_pairs(position: Tensor, label: Tensor, edge: float) -> Tensor:
     labels, name = torch.unique(label.long(), return_inverse=True)
     # Pairs of cube and label as one number each: sorting rows costs ten times as much.
     found = torch.unique(home * labels.shape[0] + name)
-    start, owner = found // labels.shape[0], labels[found % labels.shape[0]]
+    total = labels.shape[0]
+    start, owner = found // total, found % total  # owners by their place in labels
     key = cubes[start]
     counts = torch.bincount(start, minlength=cubes.shape[0])
     first = torch.cumsum(counts, 0) - counts
     most = int(counts.max()) if counts.numel() else 0
+    # All steps at once: on a GPU what counts is how many operations there are.
+    wanted = key + torch.tensor(_half_star(), device=key.device)[:, None]
+    at = torch.searchsorted(cubes, wanted).clamp(max=max(cubes.shape[0] - 1, 0))
+    there = cubes[at] == wanted
+    owners = owner.expand_as(at)
     pairs = []
-    for step in _half_star():
-        at = torch.searchsorted(cubes, key + step).clamp(max=cubes.shape[0] - 1)
-        there = cubes[at] == key + step
-        for i in range(most):
-            both = there & (i < counts[at])
-            other = owner[(first[at] + i).clamp(max=owner.shape[0] - 1)]
-            both &= other != owner
-            pairs.append(torch.stack([owner[both], other[both]], dim=1))
+    for i in range(most):
+        other = owner[(first[at] + i).clamp(max=owner.shape[0] - 1)]
+        both = there & (i < counts[at]) & (other != owners)
+        pair = torch.minimum(owners, other) * total + torch.maximum(owners, other)
+        pairs.append(pair[both])
     if not pairs:
         return torch.zeros(0, 2, dtype=torch.int64, device=position.device)
-    return torch.unique(torch.cat(pairs).sort(dim=1).values, dim=0)
+    found = torch.unique(torch.cat(pairs))
+    return torch.stack([labels[found // total], labels[found % total]], dim=1)
 
 
 def time_to_meet(gap: float, speed: float, pull: float) -> float:

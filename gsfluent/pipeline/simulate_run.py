@@ -192,8 +192,8 @@ class Run:
         self, index: int, time: float | None = None
     ) -> tuple[Figures, Fragments, dict[str, Any]]:
         """Measure the present state and add it to the per-frame records (``time``: of it)."""
-        state, matter = self.state, self.matter
-        now = figures_of(matter, state, self.scene.gravity)
+        state = self.state
+        now = self.watch.figures(state)
         self.figures = now
         pieces = self._fragments(state)
         stats = {

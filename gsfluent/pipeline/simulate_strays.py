@@ -76,12 +76,11 @@ def find_lonely(position: Tensor, peak: Tensor, candidate: Tensor, dx: float) ->
     cubes, home, counts = torch.unique(key, return_inverse=True, return_counts=True)
     whole = torch.zeros_like(cubes).index_add_(0, home, (peak[rows] < 0).long())
     counts = counts + LONELY * whole
-    around = torch.zeros_like(counts)
     step = torch.tensor([-1, 0, 1], device=key.device)
     star = ((step[:, None, None] * wide[1] + step[:, None]) * wide[2] + step).flatten()
-    for shift in star:
-        at = torch.searchsorted(cubes, cubes + shift).clamp(max=cubes.shape[0] - 1)
-        around += torch.where(cubes[at] == cubes + shift, counts[at], 0)
+    wanted = cubes + star[:, None]
+    at = torch.searchsorted(cubes, wanted).clamp(max=cubes.shape[0] - 1)
+    around = torch.where(cubes[at] == wanted, counts[at], 0).sum(dim=0)
     lonely[rows] = (around < LONELY)[home]
     return lonely
 

@@ -152,8 +152,7 @@ def _material(frame: SavedFrame, timeline: Timeline) -> tuple[Tensor, Legend]:
 
 
 def _body(frame: SavedFrame, timeline: Timeline) -> tuple[Tensor, Legend]:
-    shot = timeline.source.shot
-    names = list(shot.objects) if shot is not None else []
+    names = [str(name) for name, *_ in frame.facts.get("bodies") or ()]
     return _counted(frame.body.long(), frame.volumes, "Bodies", "body", names=names)
 
 

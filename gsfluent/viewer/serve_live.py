@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from gsfluent.pipeline.live import LiveSession
+from gsfluent.pipeline.live import CRACKS, LiveSession
 from gsfluent.pipeline.live_player import LivePlayer
 from gsfluent.pipeline.live_scene import open_stage
 from gsfluent.viewer.app import App
@@ -28,6 +28,7 @@ def view_live(
     run: Path | None = None,
     quality: str = "live",
     slow: float = 4.0,
+    cracks: str = CRACKS,
     seed: int = 0,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -42,6 +43,7 @@ def view_live(
         run: Folder in which a shot's objects are prepared.
         quality: ``live`` or one of the simulation's.
         slow: Slow motion at first.
+        cracks: How cracks get splats, see :class:`gsfluent.pipeline.Repair`.
         seed: Seed of everything random.
         host: Address to listen on.
         port: First port to try, 0 for any.
@@ -54,7 +56,9 @@ def view_live(
         InputError: Nothing to poke, no viser, no port, or a number out of range.
     """
     stage = open_stage(source, material=material, out=run, device=device, seed=seed)
-    session = LiveSession(stage.scene, quality=quality, device=device, slow=slow, seed=seed)
+    session = LiveSession(
+        stage.scene, quality=quality, device=device, slow=slow, seed=seed, cracks=cracks
+    )
     _log.info("live: %d points, cells of %.4g m", session.run.matter.particles.count, session.dx)
     if not session.at_rest and not session.settle():
         _log.warning("live: the scene does not come to rest; it goes on while nobody pokes it")

@@ -71,5 +71,5 @@ def still_frame(isolate: Path, solids: list[Path]) -> SavedFrame:
         velocity=torch.zeros_like(positions),
         body=torch.cat(bodies),
         material=torch.cat(materials),
-        facts={},
+        facts={"bodies": [[path.stem, ""] for path in solids]},
     )

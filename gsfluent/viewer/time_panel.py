@@ -10,8 +10,9 @@ if TYPE_CHECKING:
 
     from gsfluent.viewer.app import App
 
-_SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1 (real time)": 1.0, "2": 2.0}
-_FIRST_SPEED = "1/4"
+_SPEEDS = {f"1/{n}": 1.0 / n for n in (256, 128, 64, 32, 16, 8, 4, 2)}
+_SPEEDS |= {"1 (real time)": 1.0, "2": 2.0}
+_WATCHABLE = 20.0  # frames a second
 _HELD = 0.4  # seconds for which a slider counts as held after it was moved
 
 
@@ -27,17 +28,18 @@ class TimePanel:
         gui = server.gui
         self._app = app
         self._held = 0.0
+        first = first_speed(app.timeline.fps())
         with gui.add_folder("Time"):
             self._slider: Any = gui.add_slider("Frame", 0, 1, 1, 0)
             self._facts = gui.add_html("")
             self._play = gui.add_button("Play")
             self._step = gui.add_button_group("Step", ("first", "back", "next", "last"))
-            self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value=_FIRST_SPEED)
+            self._speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value=first)
             self._loop = gui.add_checkbox("Loop", True)
             self._follow: Any = gui.add_checkbox(
                 "Newest frame", False, hint="Go to each frame as it is written", visible=False
             )
-        app.playback.speed = _SPEEDS[_FIRST_SPEED]
+        app.playback.speed = _SPEEDS[first]
 
         @self._slider.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
@@ -94,6 +96,12 @@ class TimePanel:
         self._follow.value = app.follow
         facts = app.timeline.facts()
         self._facts.content = facts_line(facts[app.index] if app.index < len(facts) else {})
+
+
+def first_speed(fps: float) -> str:
+    """The fastest speed, up to real time, at which the eye can follow ``fps`` frames a second."""
+    slow = [name for name, speed in _SPEEDS.items() if speed <= 1.0 and fps * speed <= _WATCHABLE]
+    return slow[-1] if slow else next(iter(_SPEEDS))
 
 
 def facts_line(facts: dict[str, Any]) -> str:

@@ -338,6 +338,28 @@ def test_usd(run: Path, tmp_path: Path, ending: str) -> None:
     assert [problem.GetErrorAsString() for problem in problems] == []
 
 
+def test_usd_takes_matter_that_is_poured(tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    from gsfluent.io.usd import open_usd
+
+    with open_usd(tmp_path / "jet.usda", fps=24.0, up="y") as stage:
+        for frame in (1, 2, 3):
+            where = np.random.default_rng(frame).normal(size=(10 * frame, 3))
+            ones = np.ones(len(where))
+            stage.points(float(frame), where, ones, where, {"damage": ones})
+    stage = usd.Stage.Open(str(tmp_path / "jet.usda"))
+    points = UsdGeom.Points(stage.GetPrimAtPath("/scene/particles"))
+    for frame in (1, 2, 3):
+        assert list(points.GetIdsAttr().Get(float(frame))) == list(range(10 * frame))
+        assert len(points.GetPointsAttr().Get(float(frame))) == 10 * frame
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    with pytest.raises(InputError, match="no frame"), open_usd(tmp_path / "b.usda", fps=24.0):
+        pass
+    assert not (tmp_path / "b.usda").exists()
+
+
 def test_an_interrupted_sequence_goes_on(run: Path, tmp_path: Path) -> None:
     (run / "stages" / "simulate" / "stage.json").write_text('{"fingerprint": "a"}')
     write(run, tmp_path, "spz")

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsfluent.data import Camera
 from gsfluent.lab import light_truth as truth
+from gsfluent.pipeline.light import Lamp, Lighting, to_linear
+from gsfluent.pipeline.render import Render
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
@@ -93,3 +96,19 @@ def test_truth_of_the_sky_above_a_floor_beside_a_wall() -> None:
     up = torch.tensor([[0.0, 0.0, 1.0]]).double()
     share = truth.sky_share(point, up, [wall], 4000)
     assert float(share) == pytest.approx(0.5, abs=0.01)
+
+
+def test_moving_matter_does_not_shimmer() -> None:
+    # the same ball seen the same way, moved by parts of a cell and of a texel between pictures
+    solid = truth.solid_splats(truth.Ball((0.0, 0.0, 0.0), 0.1), 0.005, 0.5)
+    pictures = []
+    for step in range(4):
+        move = step * torch.tensor([0.0031, 0.0017, 0.0023])
+        eye, target = move + torch.tensor([0.15, -0.8, 0.25]), move
+        camera = Camera.look_at(eye, target, width=96, height=96, fov=15.5)
+        light = Lighting((Lamp(),), ambient=0.3)
+        layers = Render(camera, light).layers(solid.replace(means=solid.means + move))
+        pictures.append(to_linear(layers.image)[layers.alpha > 0.999])
+    for picture in pictures[1:]:
+        change = (picture - pictures[0]).square().mean().sqrt() / pictures[0].square().mean().sqrt()
+        assert float(change) < 0.01

@@ -12,7 +12,7 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.flicker import Flow, flicker
 from gsfluent.pipeline.render_figures import FilmFigures, RawCarry, cameras_around
-from gsfluent.pipeline.render_holes import Holes, MatterView, hole_fraction
+from gsfluent.pipeline.render_holes import REACH, RIM, Holes, MatterView, hole_fraction
 from gsfluent.pipeline.run_frames import SavedFrame
 
 STEP = 0.01
@@ -48,8 +48,8 @@ def fine(points: torch.Tensor, opacity: float = 0.95, edge: int = 2) -> Gaussian
 
 def measured(splats: Gaussians, points: torch.Tensor) -> Holes:
     view = camera()
-    drawn = draw(splats, view, near=0.01, median_depth=True)
-    return Holes.of(drawn, MatterView.of(points, volume(points), view))
+    drawn = draw(splats, view, near=0.01, depth=True)
+    return Holes.of(drawn.alpha, drawn.depth, MatterView.of(points, volume(points), view))
 
 
 def silhouette(points: torch.Tensor) -> float:
@@ -59,8 +59,8 @@ def silhouette(points: torch.Tensor) -> float:
 
 
 def test_the_silhouette_is_the_plate_less_its_rim() -> None:
-    # discs reach a quarter of a spacing beyond the plate, half a spacing and a pixel are taken off
-    side = 0.2 + 2 * (0.25 - 0.5) * STEP - 2 * WIDE / 240
+    # discs reach beyond the plate's half spacing; the rim and a pixel are taken off
+    side = 0.2 + 2 * (REACH - 0.5 - RIM) * STEP - 2 * WIDE / 240
     assert silhouette(slab()) == pytest.approx(side**2, rel=0.03)
     assert measured(fine(slab()), slab()).fraction < 5e-4
 
@@ -206,18 +206,33 @@ def test_raw_splats_ride_rigidly_on_their_points() -> None:
 
 def test_the_figures_of_a_film_put_what_is_drawn_beside_what_is_not_repaired() -> None:
     points = slab(layers=1)
-    splats = fine(points)
-    figures = FilmFigures(saved(points, splats, 0, splats.count), cameras_around([points])[:1])
+    splats = fine(points, opacity=0.5)
+    figures = FilmFigures(
+        saved(points, splats, 0, splats.count), cameras_around([points])[:1], every=4
+    )
+
+    def add(points: torch.Tensor, splats: Gaussians, carried: int) -> None:
+        frame = saved(points, splats, 0, carried)
+        if carried < splats.count:
+            frame.damage[0] = 1.0
+        drawn = draw(splats, camera(), near=0.01, depth=True)
+        figures.add(frame, camera(), drawn.alpha, drawn.depth)
+
+    add(points, splats, splats.count)
     apart = points.clone()
-    apart[:, 0] *= 1.45  # less than what parts them
-    figures.add(saved(points, splats, 0, splats.count), camera())
+    apart[:, 0] *= 1.05
     repaired = fine(apart)
     wide = Gaussians.cat([repaired, repaired.replace(scales=1.5 * repaired.scales)])
-    figures.add(saved(apart, wide, 1, splats.count), camera())
+    for _ in range(4):
+        add(apart, wide, splats.count)
     report = figures.report()
-    assert report["transition_gaussians"] == [0, splats.count]
-    assert report["hole_fraction_before"][0] == report["hole_fraction"][0] < 0.01
-    assert report["hole_fraction"][1] < 0.2 * report["hole_fraction_before"][1]
-    assert report["flicker"][0] is None and report["flicker_before"][1] > 0
-    assert {len(values) for values in report.values()} == {2}
-    assert 0 < report["hole_fraction_around"][1] < 0.01
+    assert report["transition_gaussians"] == [0] + 4 * [splats.count]
+    assert all(len(values) == 5 for values in report.values())
+    before, after = report["hole_fraction_before"], report["hole_fraction"]
+    # two of four broken frames are measured in full; unbroken ones need no second picture
+    assert before[0] == after[0] and before[1] is before[4] is None
+    assert all(after[k] < 0.5 * before[k] for k in (2, 3))
+    assert after[1] == after[2] == after[4]
+    assert [value is not None for value in report["flicker"]] == [False, False, False, True, False]
+    assert report["flicker"][3] == report["flicker_before"][3] == 0.0
+    assert 0 < report["hole_fraction_around"][2] < 0.01

@@ -113,8 +113,8 @@ def test_pieces_that_were_pressed_together_come_apart_again(separate: bool) -> N
     rest = run.matter.rest
     right = rest[:, 0] > 0
     # A break without a layer of powder: the halves lie beside each other, the links are cut.
-    a, b = run._links.unbind(dim=1)
-    run._links = run._links[right[a] == right[b]]
+    a, b = run.links.unbind(dim=1)
+    run.links = run.links[right[a] == right[b]]
     speed = torch.where(right, 0.2, -0.2)
     velocity = speed[:, None] * torch.tensor([1.0, 0.0, 0.0])
     state = run.state

@@ -21,6 +21,7 @@ from gsfluent.pipeline.run_frames import SavedFrame, save_frame
 from gsfluent.viewer import splats
 from gsfluent.viewer.app import App
 from gsfluent.viewer.light_panel import Handles
+from gsfluent.viewer.look import BODY, Cut, Look
 from gsfluent.viewer.source import RunSource
 
 CPU = torch.device("cpu")
@@ -110,6 +111,12 @@ def test_a_view_that_stands_begins_to_follow_what_falls_away(serve: Any) -> None
     source.frames = 5
     until(lambda: app.index == 4)
     np.testing.assert_allclose(np.array(app.shift) - kept, [0, 0, -0.2], atol=1e-6)
+    # a live reset: everything is where it was, and so is the view
+    source.frames, source.revision = 1, "2"
+    until(lambda: app.index == 0 and not app.tracking)
+    assert app.shift == (0.0, 0.0, 0.0)
+    source.frames = 4
+    until(lambda: app.tracking)
     app.track(False)  # and a person's word is the last
     source.frames = 6
     until(lambda: app.index == 5)
@@ -171,6 +178,29 @@ def test_too_many_splats_for_a_browser_are_refused(
     monkeypatch.setattr(splats, "MOST", 100)
     with pytest.raises(InputError, match=r"--splats: \d+ splats; browsers draw about 100"):
         serve(RunSource(write_run(tmp_path / "ball", 1)), splats=True)
+
+
+def test_splats_arrive_in_the_browser_where_they_are_in_the_scene(
+    serve: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = serve(Falling(), splats=True)
+    sent: dict[str, Any] = {}
+    monkeypatch.setattr(
+        app.server.scene, "add_gaussian_splats", lambda name, **values: sent.update(values)
+    )
+    shift = (0.1, 0.2, 0.3)
+    cut = Cut((0.0, 0.0, 1.0), 0.02)
+    legend = app.browser.show(app.server, 1, Look(BODY, None, cut), shift)
+    assert legend is not None and legend.title == "Bodies: 1"
+    gaussians = app.timeline.frame(1).gaussians
+    middle = app.timeline.survey(1).center
+    kept = gaussians.means[:, 2] <= middle[2] + 0.02
+    seen = sent["centers"] * sent["scale"] + np.array(sent["position"]) + np.array(shift)
+    np.testing.assert_allclose(seen, gaussians.means[kept], atol=1e-6)
+    assert np.ptp(sent["rgbs"], axis=0).max() < 1e-6  # one body, one colour
+    sent.clear()
+    app.browser.show(app.server, 1, Look(BODY, None, cut), shift)
+    assert sent == {}  # nothing has changed, nothing is sent
 
 
 def test_a_single_frame_needs_no_controls_of_time(serve: Any, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from gsfluent.viewer.artist import BUDGETS, Artist
 from gsfluent.viewer.pace import Pace
 from gsfluent.viewer.playback import Playback
 from gsfluent.viewer.plots import plots_of
+from gsfluent.viewer.time_panel import first_speed
 
 
 class Clock:
@@ -37,6 +38,13 @@ def test_playback_runs_at_its_speed_loops_and_stops() -> None:
     assert play.index(10, 20.0) == 2
     play.loop = False
     assert play.index(10, 20.0) == 9 and not play.playing
+
+
+@pytest.mark.parametrize(
+    ("fps", "speed"), [(15.0, "1 (real time)"), (40.0, "1/2"), (1000.0, "1/64"), (1e6, "1/256")]
+)
+def test_slow_motion_is_played_so_that_the_eye_can_follow(fps: float, speed: str) -> None:
+    assert first_speed(fps) == speed
 
 
 def test_pace_learns_a_machine_and_keeps_to_the_budget() -> None:

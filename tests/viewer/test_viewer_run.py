@@ -18,6 +18,8 @@ from gsfluent.cli import main
 from gsfluent.data import SURFACE
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.run_frames import frame_path, save_frame
+from gsfluent.viewer.color import splat_colors
+from gsfluent.viewer.look import BODY
 from gsfluent.viewer.server import free_port
 from gsfluent.viewer.source import RunSource
 from gsfluent.viewer.timeline import Timeline
@@ -93,6 +95,8 @@ def test_a_filled_solid_is_shown_until_frames_come(tmp_path: Path) -> None:
     seen = timeline.frame(0)
     volume = 4.0 / 3.0 * np.pi * RADIUS**3
     assert float(seen.volumes.sum()) == pytest.approx(volume, rel=0.15)
+    _, legend = splat_colors(seen, timeline, BODY)
+    assert legend is not None and legend.entries[0][1].startswith("ball")
     # every splat follows a point beside it
     apart = (seen.positions[seen.anchor.long()] - seen.gaussians.means).norm(dim=1)
     assert float(apart.max()) < 2.5 * solid.voxel

@@ -58,9 +58,12 @@ def unit_det_shift(d: Tensor) -> Tensor:
 
     with torch.no_grad():
         y = 2.0 * (h / 3.0).sqrt()
-        for _ in range(60):  # monotone from above
-            step = torch.where(slope(y, h) > 0, residual(y, h, c) / slope(y, h), 0.0)
+        for turn in range(60):  # monotone from above
+            rise = slope(y, h)
+            step = torch.where(rise > 0, residual(y, h, c) / rise, 0.0)
             y = y - step
+            if y.is_cuda and turn % 4 != 3:  # asking costs more there than a step too many
+                continue
             if not bool((step.abs() > 1e-15 * (1.0 + y.abs())).any()):
                 break
         safe_slope = torch.where(slope(y, h) > 0, slope(y, h), 1.0)
