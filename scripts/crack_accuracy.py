@@ -155,7 +155,8 @@ def judge(broken: Broken, given: argparse.Namespace) -> dict[str, Any]:
         last = index, moment, matter
         rows: list[list[Tensor]] = [[truth.image] for truth in truths]
         for number, truth in enumerate(truths):
-            scores["truth"].add(truth.image, truth, None, number, flows[number])
+            own = Holes.of(truth.alpha, truth.depth, matter[number])
+            scores["truth"].add(truth.image, truth, own, number, flows[number])
         for name, method in chosen.items():
             drawn = method(broken, moment)
             for number, (row, camera, truth) in enumerate(zip(rows, views, truths, strict=True)):

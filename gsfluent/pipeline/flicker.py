@@ -73,10 +73,11 @@ class Flow:
         valid &= after.silhouette[row, column] & ((found - z).abs() <= HIDDEN * spacing)
         # rims are soft: what lies beside other matter, or moves unlike its neighbours, is mixed
         far = HIDDEN * spacing
-        valid &= _range(before.depth[..., None]) <= far
-        valid &= (_range(after.depth[..., None]) <= far)[row, column]
+        seen = before.point >= 0
+        valid &= seen & (_range(before.depth[..., None], seen) <= far)
+        valid &= (_range(after.depth[..., None], after.point >= 0) <= far)[row, column]
         shift = target - torch.stack([x, y], -1)
-        valid &= _range(shift) <= COHERENT
+        valid &= _range(shift, seen) <= COHERENT
         return cls(target, valid)
 
 
@@ -99,10 +100,11 @@ def flicker(before: Tensor, after: Tensor, flow: Flow) -> float | None:
     return float(change[flow.valid].mean())
 
 
-def _range(image: Tensor) -> Tensor:
-    """Largest spread of a channel in the neighbourhood of each pixel of [H, W, C], [H, W]."""
-    planes = image.permute(2, 0, 1).contiguous()
-    return (dilated(planes, _RIM) + dilated(-planes, _RIM)).amax(0)
+def _range(image: Tensor, seen: Tensor) -> Tensor:
+    """Largest spread of a channel of [H, W, C] over the pixels seen around each, [H, W]."""
+    planes = image.permute(2, 0, 1)
+    high = dilated(torch.where(seen, planes, -torch.inf), _RIM)
+    return (high + dilated(torch.where(seen, -planes, -torch.inf), _RIM)).amax(0)
 
 
 def _unproject(camera: Camera, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
