@@ -47,7 +47,7 @@ def transitions(
     # Rigid with the unbroken side: its rotation about its own centre.
     turn = motion.rotation[side]
     means = motion.means[side] + (turn @ (center - rest.means[side])[..., None])[..., 0]
-    quats, scales = geometry.covariance_to_quats_scales(shape)
+    quats, scales = ops.covariance_axes(shape)
     quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), quats)
     added = Gaussians(
         means=means,
