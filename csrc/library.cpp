@@ -71,7 +71,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("mvee(Tensor points, float tolerance, int max_iterations) -> (Tensor, Tensor)");
   m.def(
       "mvee_lens(Tensor mean_a, Tensor covariance_a, Tensor mean_b, Tensor covariance_b, float "
-      "radius, float flat) -> (Tensor, Tensor, Tensor)");
+      "radius, float flat) -> (Tensor, Tensor, Tensor, Tensor)");
 
   // --- raster: Gaussian splatting ---
   // Returns image, alpha, depth, median depth, normal, contribution, radii, then what the adjoint

@@ -77,6 +77,8 @@ struct MveeLensArgs {
   T* mean;        // [batch, 3]
   T* covariance;  // [batch, 6]
   bool* overlap;  // [batch]
+  // [6], zero at first: for each kind of LensFault, batch minus the first row that has it.
+  int64_t* faults;
 };
 
 }  // namespace gsf
