@@ -216,19 +216,9 @@ class Carry:
             rest: Splats at rest, if not those that were bound but cut ones.
         """
         rest = rest or self.gaussians
-        turn = geometry.matrix_to_quaternion(motion.rotation)
-        quats = geometry.quaternion_multiply(turn, geometry.normalize_quaternions(rest.quats))
-        scales = rest.scales
-        change = (motion.map - motion.rotation).abs().amax(dim=(1, 2))
-        bent = (change > RIGID).nonzero()[:, 0]
-        if bent.numel():
-            root = motion.map[bent] @ geometry.quaternion_to_matrix(rest.quats[bent])
-            root = root * rest.scales[bent, None, :]
-            new_quats, new_scales = geometry.covariance_to_quats_scales(
-                geometry.pack_symmetric(root @ root.mT)
-            )
-            quats = quats.index_copy(0, bent, new_quats)
-            scales = scales.index_copy(0, bent, new_scales)
+        quats, scales = ops.carry_axes(
+            rest.quats, rest.scales, motion.map, motion.rotation, rigid=RIGID
+        )
         normals = rest.normals
         if normals is not None:
             normals = (motion.rotation @ normals[..., None])[..., 0]
