@@ -70,22 +70,23 @@ def run_pictures(out: Path, index: int, size: tuple[int, int]) -> Tensor:
     return torch.cat([torch.cat(pictures[:2], 1), torch.cat(pictures[2:], 1)])
 
 
-def splat_pictures(path: Path, up: tuple[float, float, float], size: tuple[int, int]) -> Tensor:
+def splat_pictures(path: Path, up: Tensor, front: Tensor, size: tuple[int, int]) -> Tensor:
     """As captured, lit from left and right; below, with the captured light divided out."""
     splats = load(path)
     center, radius, _ = bulk(splats)
-    above = torch.tensor(up) / torch.tensor(up).norm()
-    side = torch.linalg.cross(above, torch.tensor([0.3, 0.9, 0.2]))
-    side = side / side.norm()
-    front = torch.linalg.cross(side, above)
-    eye = torch.tensor(center) + radius * (3.2 * front + 1.4 * above)
-    camera = Camera.look_at(eye.tolist(), center, width=size[0], height=size[1], fov=38.0, up=up)
+    above = up / up.norm()
+    front = front - (front @ above) * above
+    front = front / front.norm()
+    side = torch.linalg.cross(above, front)
+    eye = torch.tensor(center) + radius * (2.3 * front + 0.6 * above)
+    camera = Camera.look_at(
+        eye.tolist(), center, width=size[0], height=size[1], fov=40.0, up=above.tolist()
+    )
     bare = delight(splats)
     rows = [[Render(camera)(splats)], [Render(camera)(bare)]]
     for sign in (-1.0, 1.0):
-        way = sign * side + 0.4 * above + 0.3 * front
-        x, y, z = way.tolist()
-        light = Lighting((Lamp(direction=(x, y, z), intensity=1.1),), ambient=0.15)
+        x, y, z = (sign * side + 0.5 * above + 0.6 * front).tolist()
+        light = Lighting((Lamp(direction=(x, y, z), intensity=0.9),), ambient=0.25)
         for row, matter in zip(rows, (splats, bare), strict=True):
             row.append(Render(camera, light)(matter))
     return torch.cat([torch.cat(row, 1) for row in rows])
@@ -115,6 +116,7 @@ def main() -> None:
     parser.add_argument("--frame", type=int, default=0)
     parser.add_argument("--splats", type=Path, help="splat file of an object")
     parser.add_argument("--up", default="0,0,1", help="its up axis")
+    parser.add_argument("--front", default="1,0,0", help="where they are seen from")
     parser.add_argument("--penumbra", action="store_true", help="lamps of growing width")
     parser.add_argument("--size", default="480x360", help="of each picture")
     parser.add_argument("-o", "--out", type=Path, required=True)
@@ -123,8 +125,11 @@ def main() -> None:
     if options.run is not None:
         image = run_pictures(options.run, options.frame, (width, height))
     elif options.splats is not None:
-        x, y, z = (float(part) for part in options.up.split(","))
-        image = splat_pictures(options.splats, (x, y, z), (width, height))
+        up, front = (
+            torch.tensor([float(part) for part in text.split(",")])
+            for text in (options.up, options.front)
+        )
+        image = splat_pictures(options.splats, up, front, (width, height))
     elif options.penumbra:
         image = penumbra_pictures((width, height))
     else:

@@ -19,7 +19,7 @@ from gsfluent.pipeline.render import Render
 from gsfluent.pipeline.render_camera import Action, cameras_for, orbit
 from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.render_holes import hole_fraction
-from gsfluent.pipeline.render_normals import estimate_normals, grid_for
+from gsfluent.pipeline.render_normals import estimate_normals, grid_for, splat_normals
 from gsfluent.pipeline.shade import shade_points, surface_points
 from gsfluent.pipeline.shade_shadow import transmittance
 
@@ -164,16 +164,33 @@ def test_debris_far_apart_does_not_need_a_huge_grid() -> None:
     assert float(normals.norm(dim=1).max()) <= 1.0 + 1e-6
 
 
-def test_flat_splats_use_their_own_plane() -> None:
+def test_flat_splats_on_a_solid_add_their_axis_to_the_density() -> None:
     grey = ball()
     away = torch.nn.functional.normalize(grey.means - torch.tensor([0.0, 0.0, 0.1]), dim=1)
-    top = away[:, 2] > 0.95
+    skin = (grey.means - torch.tensor([0.0, 0.0, 0.1])).norm(dim=1) > 0.09
+    slanted = skin & (away[:, 2] > 0.7) & (away[:, 2] < 0.95)
     scales = grey.scales.clone()
-    scales[top, 2] *= 0.1  # flat in z
-    normals = estimate_normals(grey.replace(scales=scales))
-    skin = top & ((grey.means - torch.tensor([0.0, 0.0, 0.1])).norm(dim=1) > 0.09)
-    expected = torch.tensor([0.0, 0.0, 1.0]).expand(int(skin.sum()), 3)
-    torch.testing.assert_close(normals[skin], expected, atol=1e-6, rtol=0)
+    scales[slanted, 2] *= 0.1  # flat in z, which is 18 to 45 degrees off the surface's normal
+    plain = torch.nn.functional.normalize(estimate_normals(grey)[slanted], dim=1)
+    normals = estimate_normals(grey.replace(scales=scales))[slanted]
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(len(normals)))
+    bent = (normals[:, 2] - plain[:, 2]).mean()
+    assert float(bent) > 0.05  # toward the axis
+    assert float((normals * plain).sum(1).min()) > 0.9  # the density leads
+
+
+def test_sheet_of_flat_splats_faces_the_eye() -> None:
+    axis = torch.arange(-0.1, 0.1, 0.004)
+    spots = torch.cartesian_prod(axis, axis)
+    means = torch.cat([spots, torch.zeros_like(spots[:, :1])], 1)
+    scales = torch.tensor([0.004, 0.004, 0.0002]).expand_as(means).contiguous()
+    sheet = Gaussians.from_colors(means, scales, torch.full_like(means, 0.5))
+    grid = grid_for(sheet).of(means, (0.0, 0.0, 0.0))
+    for height in (1.0, -1.0):
+        normals = splat_normals(sheet, grid, torch.tensor([0.1, 0.2, height]))
+        inner = spots.abs().amax(1) < 0.08
+        expected = torch.tensor([0.0, 0.0, height]).expand(int(inner.sum()), 3)
+        torch.testing.assert_close(normals[inner], expected, atol=1e-5, rtol=0)
 
 
 def test_hole_fraction_counts_what_shows_through() -> None:
