@@ -229,6 +229,23 @@ def table(name: str, found: dict[str, Any]) -> Iterator[str]:
         yield "| " + " | ".join([method, *cells, over]) + " |"
 
 
+def of_run(out: Path) -> Iterator[str]:
+    """Largest and mean figures of a finished run, before and after repair."""
+    render = json.loads((out / "run.json").read_text(encoding="utf-8"))["render"]
+    yield "| figure | before: largest | mean | drawn: largest | mean | frames |"
+    yield "| --- " * 6 + "|"
+    for name in ("hole_fraction", "hole_fraction_around", "see_through", "flicker"):
+        # frames in which both were measured
+        both = zip(render[f"{name}_before"], render[name], strict=True)
+        pairs = [(a, b) for a, b in both if a is not None and b is not None]
+        cells = [
+            f"{100 * f(side):.3f} %" for side in zip(*pairs, strict=True) for f in (max, np.mean)
+        ]
+        yield "| " + " | ".join([name, *cells, str(len(pairs))]) + " |"
+    worst = max(x for x in render["hole_fraction"] if x is not None)
+    yield f"Every frame of the film: hole_fraction at most {100 * worst:.3f} %"
+
+
 def main() -> int:
     def numbers(text: str) -> list[int]:
         return [int(part) for part in text.split(",")]
@@ -237,6 +254,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--object", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--run", type=Path, help="tabulate a finished run's run.json instead")
     parser.add_argument("--frames", type=numbers, help="default: two early, one late")
     parser.add_argument("--only", type=lambda s: s.split(","), help="methods, comma-separated")
     parser.add_argument("--size", type=int, default=400, help="width of the pictures [px]")
@@ -251,6 +269,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write every figure of every picture here")
     parser.add_argument("--write", action="store_true", help=f"enter the tables into {PAGE.name}")
     given = parser.parse_args()
+    if given.run:
+        sys.stdout.write("\n".join(of_run(given.run)) + "\n")
+        return 0
     lines: list[str] = []
     everything = {}
     for name in given.object:
