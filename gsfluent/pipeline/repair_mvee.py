@@ -146,7 +146,7 @@ class CrackGraph:
             order = torch.argsort(torch.cat([self._keys, new]))
             self._keys = torch.cat([self._keys, new])[order]
             self._centers = torch.cat([self._centers, center])[order]
-            quats, scales = geometry.covariance_to_quats_scales(shape)
+            quats, scales = ops.covariance_axes(shape)
             self._quats = torch.cat([self._quats, quats])[order]
             self._scales = torch.cat([self._scales, scales])[order]
             self._overlaps = torch.cat([self._overlaps, overlap])[order]
