@@ -62,12 +62,16 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
 
   // --- deform: polar decomposition, clamped deformation ---
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");
+  m.def("covariance_axes(Tensor covariance) -> (Tensor, Tensor)");
+  m.def(
+      "carry_axes(Tensor quats, Tensor scales, Tensor map, Tensor rotation, float rigid) -> "
+      "(Tensor, Tensor)");
 
   // --- mvee: minimum-volume enclosing ellipsoids ---
   m.def("mvee(Tensor points, float tolerance, int max_iterations) -> (Tensor, Tensor)");
   m.def(
       "mvee_lens(Tensor mean_a, Tensor covariance_a, Tensor mean_b, Tensor covariance_b, float "
-      "radius, float flat) -> (Tensor, Tensor, Tensor)");
+      "radius, float flat) -> (Tensor, Tensor, Tensor, Tensor)");
 
   // --- raster: Gaussian splatting ---
   // Returns image, alpha, depth, median depth, normal, contribution, radii, then what the adjoint

@@ -36,7 +36,9 @@ from gsfluent.pipeline.compare_weights import Lpips
 from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.flicker import Flow, flicker
 from gsfluent.pipeline.render_camera import Action, look_at
-from gsfluent.pipeline.render_holes import Holes, MatterView
+from gsfluent.pipeline.render_figures import RawCarry
+from gsfluent.pipeline.render_holes import Holes, MatterView, small
+from gsfluent.pipeline.run_show import Film, light_of, shot_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "crack_accuracy.md"
 VIEWS = ((-60.0, 20.0), (60.0, 20.0), (180.0, 20.0), (0.0, 55.0))
@@ -229,6 +231,46 @@ def table(name: str, found: dict[str, Any]) -> Iterator[str]:
         yield "| " + " | ".join([method, *cells, over]) + " |"
 
 
+def of_run(out: Path) -> Iterator[str]:
+    """Largest and mean figures of a finished run, before and after repair."""
+    render = json.loads((out / "run.json").read_text(encoding="utf-8"))["render"]
+    yield "| figure | before: largest | mean | drawn: largest | mean | frames |"
+    yield "| --- " * 6 + "|"
+    for name in ("hole_fraction", "hole_fraction_around", "see_through", "flicker"):
+        # frames in which both were measured
+        both = zip(render[f"{name}_before"], render[name], strict=True)
+        pairs = [(a, b) for a, b in both if a is not None and b is not None]
+        cells = [
+            f"{100 * f(side):.3f} %" for side in zip(*pairs, strict=True) for f in (max, np.mean)
+        ]
+        yield "| " + " | ".join([name, *cells, str(len(pairs))]) + " |"
+    yield ""
+    yield from every_camera(out)
+
+
+def every_camera(out: Path) -> Iterator[str]:
+    """Holes in every frame of a finished run, in the film's camera and the three around."""
+    shot = shot_of(out)
+    film = Film.of(out, shot, light_of(shot), torch.device("cpu"))
+    raw = RawCarry(film.frame(0))
+    worst: dict[tuple[int, str], float] = {}
+    for index in range(len(film)):
+        frame = film.frame(index)
+        shown = {"raw": (raw.at(frame), None), "drawn": (frame.gaussians, frame.groups)}
+        for number, camera in enumerate([small(film.cameras[index]), *film.around]):
+            matter = MatterView.of(frame.positions, frame.volumes, camera)
+            for name, drawn in shown.items():
+                seen = picture(drawn, camera)
+                found = Holes.of(seen.alpha, cast(Tensor, seen.depth), matter).fraction
+                worst[number, name] = max(worst.get((number, name), 0.0), found)
+    yield f"| camera, worst of all {len(film)} frames | raw | drawn |"
+    yield "| --- | --- | --- |"
+    for number in range(1 + len(film.around)):
+        title = f"around {number}" if number else "film"
+        cells = [f"{100 * worst[number, name]:.3f} %" for name in ("raw", "drawn")]
+        yield f"| {title} | {' | '.join(cells)} |"
+
+
 def main() -> int:
     def numbers(text: str) -> list[int]:
         return [int(part) for part in text.split(",")]
@@ -237,6 +279,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--object", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--run", type=Path, help="tabulate a finished run's run.json instead")
     parser.add_argument("--frames", type=numbers, help="default: two early, one late")
     parser.add_argument("--only", type=lambda s: s.split(","), help="methods, comma-separated")
     parser.add_argument("--size", type=int, default=400, help="width of the pictures [px]")
@@ -251,6 +294,12 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write every figure of every picture here")
     parser.add_argument("--write", action="store_true", help=f"enter the tables into {PAGE.name}")
     given = parser.parse_args()
+    if given.run:
+        text = "\n".join(of_run(given.run))
+        sys.stdout.write(text + "\n")
+        if given.write:
+            PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), "run", text))
+        return 0
     lines: list[str] = []
     everything = {}
     for name in given.object:

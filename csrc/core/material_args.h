@@ -34,6 +34,27 @@ struct ReturnMappingArgs {
   int32_t* info;  // [4] plastic, guarded, inverted, invalid particles; zeroed by the caller
 };
 
+// Axes of Gaussians from covariances, and of Gaussians carried by a deformation (core/carry.h).
+template <typename T>
+struct CovarianceAxesArgs {
+  int64_t count;
+  const T* covariance;  // [count, 6]
+  T* quats;             // [count, 4]
+  T* scales;            // [count, 3]
+};
+
+template <typename T>
+struct CarryAxesArgs {
+  int64_t count;
+  const T* rest_quats;   // [count, 4]
+  const T* rest_scales;  // [count, 3]
+  const T* map;          // [count, 9]
+  const T* rotation;     // [count, 9]
+  T rigid;               // largest entry of map - rotation that still counts as rigid
+  T* quats;
+  T* scales;
+};
+
 template <typename T>
 struct MveeArgs {
   int64_t batch, count;  // fits, points per fit
@@ -56,6 +77,8 @@ struct MveeLensArgs {
   T* mean;        // [batch, 3]
   T* covariance;  // [batch, 6]
   bool* overlap;  // [batch]
+  // [6], zero at first: for each kind of LensFault, batch minus the first row that has it.
+  int64_t* faults;
 };
 
 }  // namespace gsf

@@ -52,17 +52,20 @@ GSF_HOST_DEVICE void add_point(FitPoint<T>* points, const LiftedFactor<T>& facto
   points[slot].u = max(points[slot].u, T(0.02));
 }
 
-// Climbs from the furthest of every `groups`-th home in [from, to), and adds what reaches further
-// than `worth` to the points. Returns the largest squared distance met.
+// Climbs from the furthest home of each group of the rim and of the caps, and from the poles, and
+// adds what reaches out to the points; `many` makes the groups small. Returns the largest squared
+// distance met. Not inlined on the device: the kernel waits for its instructions otherwise.
 template <typename T>
-GSF_HOST_DEVICE T search(const Overlap<T>& overlap, const Objective<T>& objective,
-                         const LiftedFactor<T>& factor, const Vec3<T>* homes, int from, int to,
-                         int groups, bool rim, int steps, T worth, FitPoint<T>* points) {
+GSF_HOST_DEVICE_COLD T search(const Overlap<T>& overlap, const LiftedFactor<T>& factor,
+                              const Vec3<T>* homes, Vec3<T>* poles, bool many,
+                              FitPoint<T>* points) {
+  const Objective<T> objective(factor);
+  const T worth = T(3) * (T(1) + T(2e-4)) / factor.total;
   T highest = T(0);
-  for (int g = 0; g < groups; ++g) {
-    Vec3<T> y = homes[from + g];
+  const auto furthest = [&](int from, int to, int groups) {
+    Vec3<T> y = homes[from];
     T most = factor.distance(y);
-    for (int i = from + g + groups; i < to; i += groups) {
+    for (int i = from + groups; i < to; i += groups) {
       const Vec3<T> z = homes[i];
       const T m = factor.distance(z);
       if (m > most) {
@@ -70,8 +73,20 @@ GSF_HOST_DEVICE T search(const Overlap<T>& overlap, const Objective<T>& objectiv
         y = z;
       }
     }
-    const T m = climb(overlap, objective, factor, rim, steps, y);
+    return y;
+  };
+  const int rims = many ? kLensRim : 8, caps = many ? kLensCaps : 2;
+  for (int g = 0; g < rims; ++g) {
+    Vec3<T> y = furthest(g, kLensRim, rims);
+    const T m = climb(overlap, objective, factor, true, 3, y);
     highest = max(highest, m);
+    if (m > worth) add_point(points, factor, m, y);
+  }
+  for (int g = 0; g < caps + 2; ++g) {
+    Vec3<T> y = g < caps ? furthest(kLensRim + g, kLensRim + kLensCaps, caps) : poles[g - caps];
+    const T m = climb(overlap, objective, factor, false, many ? 6 : 3, y);
+    highest = max(highest, m);
+    if (g >= caps) poles[g - caps] = y;
     if (m > worth) add_point(points, factor, m, y);
   }
   return highest;
@@ -103,51 +118,55 @@ GSF_HOST_DEVICE LensFit<T> lens_fit(const detail::Overlap<T>& overlap, FitPoint<
                       overlap.on_surface({T(-1), T(0), T(0)})};
   LiftedFactor<T> factor = lifted_factor(team, points, kLensPoints, 3), best{};
   T best_excess = T(1e30), gap = T(0.1), room = T(0.1);
-  int steps = 0;
-  for (int round = 0; round < kLensRounds; ++round) {
-    T highest = detail::largest_distance(points, factor);
-    T complementarity = barrier_start(team, points, kLensPoints, factor, highest, room);
-    for (int step = 0; step < kLensSteps; ++step, ++steps) {
-      const T target = max(T(0.1) * complementarity, T(1e-4)) / T(kLensPoints);
-      barrier_step(team, points, kLensPoints, factor, target);
-      factor = lifted_factor(team, points, kLensPoints, 3);
-      highest = T(0);
-      complementarity = T(0);
-      for (int i = 0; i < kLensPoints; ++i) {
-        highest = max(highest, factor.distance(points[i].y));
-        complementarity += points[i].u * points[i].s;
-      }
-      if (highest * factor.total < T(3) + gap || complementarity < T(2e-4)) break;
-    }
-    const detail::Objective<T> objective(factor);
-    const T worth = T(3) * (T(1) + T(2e-4)) / factor.total;
-    highest = max(highest, detail::search(overlap, objective, factor, homes, 0, kLensRim, 8, true,
-                                          3, worth, points));
-    highest = max(highest, detail::search(overlap, objective, factor, homes, kLensRim, kHomes, 2,
-                                          false, 3, worth, points));
-    for (int k = 0; k < 2; ++k) {
-      const T m = detail::climb(overlap, objective, factor, false, 3, poles[k]);
-      highest = max(highest, m);
-      if (m > worth) detail::add_point(points, factor, m, poles[k]);
-    }
-    T excess = highest * factor.total - T(3);
-    if (excess <= T(3) * T(6e-4)) {  // once more, from more starts
-      highest = max(highest, detail::search(overlap, objective, factor, homes, 0, kLensRim,
-                                            kLensRim, true, 3, worth, points));
-      highest = max(highest, detail::search(overlap, objective, factor, homes, kLensRim, kHomes, 8,
-                                            false, 6, worth, points));
-      excess = highest * factor.total - T(3);
-    }
+  int steps = 0, round = 0;
+  bool accepted = false;
+  const auto keep_best = [&](T excess) {
+    accepted = excess <= T(3) * T(6e-4);
     if (!(excess >= best_excess)) {
       best_excess = excess;
       best = factor;
     }
-    if (excess <= T(3) * T(6e-4)) break;
+  };
+  const auto restart = [&](T excess) {
     gap = max(T(0.1) * excess, T(7.5e-4));
     room = T(0.01);
     // Back to a well-centred start: no multiplier near zero, every slack positive and exact.
     for (int i = 0; i < kLensPoints; ++i) points[i].u = max(points[i].u, T(0.01));
     factor = lifted_factor(team, points, kLensPoints, 3);
+  };
+  // Rounds of the few starts until they find nothing, then once from many: two loops, so that the
+  // threads of a warp search from many at the same time.
+  while (!accepted && round < kLensRounds) {
+    T highest = T(0);
+    for (; round < kLensRounds; ++round) {
+      highest = detail::largest_distance(points, factor);
+      T complementarity = barrier_start(team, points, kLensPoints, factor, highest, room);
+      for (int step = 0; step < kLensSteps; ++step, ++steps) {
+        const T target = max(T(0.1) * complementarity, T(1e-4)) / T(kLensPoints);
+        barrier_step(team, points, kLensPoints, factor, target);
+        factor = lifted_factor(team, points, kLensPoints, 3);
+        highest = T(0);
+        complementarity = T(0);
+        for (int i = 0; i < kLensPoints; ++i) {
+          highest = max(highest, factor.distance(points[i].y));
+          complementarity += points[i].u * points[i].s;
+        }
+        if (highest * factor.total < T(3) + gap || complementarity < T(2e-4)) break;
+      }
+      const T few = detail::search(overlap, factor, homes, poles, false, points);
+      highest = max(highest, few);
+      const T excess = highest * factor.total - T(3);
+      keep_best(excess);
+      if (accepted || round + 1 == kLensRounds) break;
+      restart(excess);
+    }
+    const T many = detail::search(overlap, factor, homes, poles, true, points);
+    highest = max(highest, many);
+    const T excess = highest * factor.total - T(3);
+    if (accepted) best_excess = T(1e30);  // it was not the whole truth
+    keep_best(excess);
+    ++round;
+    if (!accepted) restart(excess);
   }
   const T margin = sizeof(T) == 4 ? T(1) + T(3e-6) : T(1) + T(1e-7);
   const T reach = T(1) + max(best_excess * T(1.0 / 3.0), T(0));
@@ -186,6 +205,29 @@ GSF_HOST_DEVICE Vec3<double> to_double(const Vec3<T>& v) {
 template <typename T>
 GSF_HOST_DEVICE Sym3<double> to_double(const Sym3<T>& s) {
   return {double(s.xx), double(s.yy), double(s.zz), double(s.xy), double(s.xz), double(s.yz)};
+}
+
+// What may be wrong with one Gaussian; those of the second follow those of the first in `faults`.
+enum LensFault : int {
+  kMeanNotFinite,
+  kCovarianceNotFinite,
+  kNotPositive,
+  kLensFaults,
+  kSound = -1
+};
+
+// Positive semi-definite to rounding, relative to the trace so that the size of the scene does not
+// matter; a zero axis is flat.
+template <typename T>
+GSF_HOST_DEVICE int lens_fault(const Vec3<T>& mean, const Sym3<T>& cov) {
+  if (!finite(mean.x) || !finite(mean.y) || !finite(mean.z)) return kMeanNotFinite;
+  if (!finite(cov)) return kCovarianceNotFinite;
+  const Sym3<double> c = to_double(cov);
+  const double sum = trace(c);
+  const double minor =
+      c.xx * c.yy - c.xy * c.xy + c.xx * c.zz - c.xz * c.xz + c.yy * c.zz - c.yz * c.yz;
+  const bool sound = sum > 0.0 && min(min(c.xx, c.yy), c.zz) >= 0.0 && minor >= -1e-6 * sum * sum;
+  return sound ? kSound : kNotPositive;
 }
 
 template <typename T>

@@ -1,7 +1,7 @@
 // CPU kernels of the deformation ops.
 #include "host/deform.h"
 
-#include "core/svd3.h"
+#include "core/carry.h"
 
 namespace gsf {
 namespace {
@@ -18,6 +18,18 @@ struct DeformCpu {
       }
     });
   }
+  template <typename T>
+  static void covariance_axes(const CovarianceAxesArgs<T>& a, const Tensor&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::covariance_axes(a, i);
+    });
+  }
+  template <typename T>
+  static void carry_axes(const CarryAxesArgs<T>& a, const Tensor&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::carry_axes(a, i);
+    });
+  }
 };
 
 }  // namespace
@@ -25,4 +37,6 @@ struct DeformCpu {
 
 STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
   m.impl("polar_clamped", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::polar_clamped));
+  m.impl("covariance_axes", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::covariance_axes));
+  m.impl("carry_axes", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::carry_axes));
 }

@@ -1,6 +1,7 @@
 // CPU kernels of the enclosing-ellipsoid ops: fits in parallel, one thread each.
 #include "host/mvee.h"
 
+#include <atomic>
 #include <vector>
 
 #include "core/mvee.h"
@@ -18,6 +19,14 @@ void store_vec3(T* p, const Vec3<T>& v) {
   p[0] = v.x;
   p[1] = v.y;
   p[2] = v.z;
+}
+
+// The largest value reported so far.
+void report(int64_t* to, int64_t value) {
+  const std::atomic_ref<int64_t> most(*to);
+  int64_t seen = most.load();
+  while (seen < value && !most.compare_exchange_weak(seen, value)) {
+  }
 }
 
 struct MveeCpu {
@@ -40,10 +49,15 @@ struct MveeCpu {
     parallel_for(a.batch, 16, [&](int64_t begin, int64_t end) {
       FitPoint<T> points[kLensPoints];
       for (int64_t i = begin; i < end; ++i) {
+        const Vec3<T> mean_a = load_vec3(a.mean_a + 3 * i), mean_b = load_vec3(a.mean_b + 3 * i);
+        const Sym3<T> cov_a = load_sym3(a.covariance_a + 6 * i);
+        const Sym3<T> cov_b = load_sym3(a.covariance_b + 6 * i);
+        const int fault_a = lens_fault(mean_a, cov_a), fault_b = lens_fault(mean_b, cov_b);
+        if (fault_a != kSound) report(a.faults + fault_a, a.batch - i);
+        if (fault_b != kSound) report(a.faults + kLensFaults + fault_b, a.batch - i);
+        if (fault_a != kSound || fault_b != kSound) continue;
         const LensResult<T> r =
-            gsf::mvee_lens(load_vec3(a.mean_a + 3 * i), load_sym3(a.covariance_a + 6 * i),
-                           load_vec3(a.mean_b + 3 * i), load_sym3(a.covariance_b + 6 * i), a.radius,
-                           a.flat, points);
+            gsf::mvee_lens(mean_a, cov_a, mean_b, cov_b, a.radius, a.flat, points);
         store_vec3(a.mean + 3 * i, r.mean);
         store_sym3(a.covariance + 6 * i, r.covariance);
         a.overlap[i] = r.overlap;

@@ -1,5 +1,5 @@
-// CUDA kernel of polar_clamped: one thread per matrix.
-#include "core/svd3.h"
+// CUDA kernels of the deformation ops: one thread per matrix or Gaussian.
+#include "core/carry.h"
 #include "cuda/launch_material.h"
 
 namespace gsf::cuda {
@@ -15,18 +15,47 @@ __global__ void polar_kernel(PolarArgs<T> a) {
   store_mat3(a.clamped + 9 * i, clamped);
 }
 
+template <typename T>
+__global__ void covariance_axes_kernel(CovarianceAxesArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::covariance_axes(a, i);
+}
+
+template <typename T>
+__global__ void carry_axes_kernel(CarryAxesArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::carry_axes(a, i);
+}
+
+template <typename Args, typename Kernel>
+cudaError_t launch(const Args& args, cudaStream_t stream, Kernel kernel) {
+  if (args.count == 0) return cudaSuccess;
+  constexpr int kThreads = 128;
+  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
+  kernel<<<blocks, kThreads, 0, stream>>>(args);
+  return cudaGetLastError();
+}
+
 }  // namespace
 
 template <typename T>
 cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream) {
-  if (args.count == 0) return cudaSuccess;
-  constexpr int kThreads = 128;
-  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
-  polar_kernel<T><<<blocks, kThreads, 0, stream>>>(args);
-  return cudaGetLastError();
+  return launch(args, stream, polar_kernel<T>);
+}
+template <typename T>
+cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, covariance_axes_kernel<T>);
+}
+template <typename T>
+cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, carry_axes_kernel<T>);
 }
 
 template cudaError_t polar(const PolarArgs<float>&, cudaStream_t);
 template cudaError_t polar(const PolarArgs<double>&, cudaStream_t);
+template cudaError_t covariance_axes(const CovarianceAxesArgs<float>&, cudaStream_t);
+template cudaError_t covariance_axes(const CovarianceAxesArgs<double>&, cudaStream_t);
+template cudaError_t carry_axes(const CarryAxesArgs<float>&, cudaStream_t);
+template cudaError_t carry_axes(const CarryAxesArgs<double>&, cudaStream_t);
 
 }  // namespace gsf::cuda

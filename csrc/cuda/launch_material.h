@@ -11,6 +11,12 @@ template <typename T>
 cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream);
 
 template <typename T>
+cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
 cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream);
 
 // Values of type T that mvee needs as scratch; none for small sets.

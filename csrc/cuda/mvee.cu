@@ -74,11 +74,22 @@ __global__ void __launch_bounds__(128)
                       int64_t stride, int32_t* rows, int32_t* count) {
   const int64_t i = begin + int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i >= end) return;
-  const auto vec = [](const T* p) { return Vec3<double>{p[0], p[1], p[2]}; };
-  const auto sym = [](const T* p) { return to_double(load_sym3(p)); };
-  const LensSetup s =
-      lens_setup(vec(a.mean_a + 3 * i), sym(a.covariance_a + 6 * i), vec(a.mean_b + 3 * i),
-                 sym(a.covariance_b + 6 * i), a.radius, a.flat);
+  const auto vec = [](const T* p) { return Vec3<T>{p[0], p[1], p[2]}; };
+  const Vec3<T> mean_a = vec(a.mean_a + 3 * i), mean_b = vec(a.mean_b + 3 * i);
+  const Sym3<T> cov_a = load_sym3(a.covariance_a + 6 * i);
+  const Sym3<T> cov_b = load_sym3(a.covariance_b + 6 * i);
+  const int fault_a = lens_fault(mean_a, cov_a), fault_b = lens_fault(mean_b, cov_b);
+  if (fault_a != kSound || fault_b != kSound) {
+    const auto report = [&](int fault) {
+      atomicMax(reinterpret_cast<unsigned long long*>(a.faults + fault),
+                static_cast<unsigned long long>(a.batch - i));
+    };
+    if (fault_a != kSound) report(fault_a);
+    if (fault_b != kSound) report(kLensFaults + fault_b);
+    return;
+  }
+  const LensSetup s = lens_setup(to_double(mean_a), to_double(cov_a), to_double(mean_b),
+                                 to_double(cov_b), a.radius, a.flat);
   if (s.kind != LensKind::kGeneral) {
     store(a, i,
           s.kind == LensKind::kNone ? lens_nothing<T>(s)

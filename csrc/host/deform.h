@@ -23,6 +23,47 @@ struct DeformOps {
     });
     return {rotation, clamped};
   }
+
+  static std::tuple<Tensor, Tensor> covariance_axes(Tensor covariance) {
+    const char* op = "covariance_axes";
+    check_shape(op, "covariance", covariance, {-1, 6});
+    covariance = gsf::contiguous(covariance);
+    const int64_t n = covariance.size(0);
+    Tensor quats = gsf::new_empty(covariance, {n, 4}, covariance.scalar_type());
+    Tensor scales = gsf::new_empty(covariance, {n, 3}, covariance.scalar_type());
+    dispatch_floating(op, covariance, [&]<typename T>() {
+      if (n == 0) return;
+      Backend::covariance_axes(
+          CovarianceAxesArgs<T>{n, cptr<T>(covariance), mptr<T>(quats), mptr<T>(scales)},
+          covariance);
+    });
+    return {quats, scales};
+  }
+
+  static std::tuple<Tensor, Tensor> carry_axes(Tensor quats, Tensor scales, Tensor map,
+                                               Tensor rotation, double rigid) {
+    const char* op = "carry_axes";
+    check_shape(op, "quats", quats, {-1, 4});
+    const int64_t n = quats.size(0);
+    check_shape(op, "scales", scales, {n, 3});
+    check_shape(op, "map", map, {n, 3, 3});
+    check_shape(op, "rotation", rotation, {n, 3, 3});
+    for (Tensor* t : {&quats, &scales, &map, &rotation}) {
+      check_dtype(op, "every tensor", *t, quats.scalar_type());
+      check_same_device(op, "every tensor", *t, quats);
+      *t = gsf::contiguous(*t);
+    }
+    Tensor new_quats = gsf::new_empty(quats, {n, 4}, quats.scalar_type());
+    Tensor new_scales = gsf::new_empty(quats, {n, 3}, quats.scalar_type());
+    dispatch_floating(op, quats, [&]<typename T>() {
+      if (n == 0) return;
+      const CarryAxesArgs<T> args{
+          n,        cptr<T>(quats),     cptr<T>(scales),    cptr<T>(map), cptr<T>(rotation),
+          T(rigid), mptr<T>(new_quats), mptr<T>(new_scales)};
+      Backend::carry_axes(args, quats);
+    });
+    return {new_quats, new_scales};
+  }
 };
 
 }  // namespace gsf

@@ -34,11 +34,11 @@ struct MveeOps {
     return {center, shape};
   }
 
-  static std::tuple<Tensor, Tensor, Tensor> mvee_lens(const Tensor& mean_a,
-                                                      const Tensor& covariance_a,
-                                                      const Tensor& mean_b,
-                                                      const Tensor& covariance_b, double radius,
-                                                      double flat) {
+  static std::tuple<Tensor, Tensor, Tensor, Tensor> mvee_lens(const Tensor& mean_a,
+                                                              const Tensor& covariance_a,
+                                                              const Tensor& mean_b,
+                                                              const Tensor& covariance_b,
+                                                              double radius, double flat) {
     const char* op = "mvee_lens";
     check_shape(op, "mean_a", mean_a, {-1, 3});
     const int64_t batch = mean_a.size(0);
@@ -57,6 +57,8 @@ struct MveeOps {
     Tensor mean = gsf::new_empty(ma, {batch, 3}, dtype);
     Tensor covariance = gsf::new_empty(ma, {batch, 6}, dtype);
     Tensor overlap = gsf::new_empty(ma, {batch}, ScalarType::Bool);
+    // Reported and not checked here, so that the caller decides when to wait for the device.
+    Tensor faults = gsf::new_zeros(ma, {6}, ScalarType::Long);
     dispatch_floating(op, ma, [&]<typename T>() {
       if (batch == 0) return;
       const MveeLensArgs<T> args{.batch = batch,
@@ -68,10 +70,11 @@ struct MveeOps {
                                  .flat = flat,
                                  .mean = mptr<T>(mean),
                                  .covariance = mptr<T>(covariance),
-                                 .overlap = mptr<bool>(overlap)};
+                                 .overlap = mptr<bool>(overlap),
+                                 .faults = mptr<int64_t>(faults)};
       Backend::mvee_lens(args, ma);
     });
-    return {mean, covariance, overlap};
+    return {mean, covariance, overlap, faults};
   }
 };
 

@@ -51,8 +51,8 @@ class View(Verb):
     """With --live, of a shot: the folder in which its objects are prepared."""
     quality: Literal["live", "preview", "shot", "hero"] = "live"
     """With --live: cells; live is what the device can do while one looks."""
-    slow: float = 4.0
-    """With --live: slow motion at first."""
+    slow: float | None = None
+    """With --live: slow motion at first; by default as much as this machine needs."""
     cracks: Literal["mvee", "gap", "none"] = "mvee"
     """With --live: splats along cracks; gap has finer faces and is slower."""
 

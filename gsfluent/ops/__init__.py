@@ -33,6 +33,8 @@ _PUBLIC: dict[str, str] = {
     "Solver": "gsfluent.ops.solver",
     "SolverError": "gsfluent.ops.solver",
     "polar_clamped": "gsfluent.ops.deform",
+    "covariance_axes": "gsfluent.ops.deform",
+    "carry_axes": "gsfluent.ops.deform",
     "mvee": "gsfluent.ops.mvee",
     "mvee_lens": "gsfluent.ops.mvee",
     "Rendered": "gsfluent.ops.raster",

@@ -1,4 +1,4 @@
-"""Carrying splats by a deformation gradient: rotation and stretch-limited deformation."""
+"""Carrying splats by a deformation gradient: rotation, stretch-limited deformation, new axes."""
 
 from __future__ import annotations
 
@@ -51,3 +51,88 @@ def _polar_no_gradient(ctx: torch.autograd.function.FunctionCtx, *grads: Tensor)
 
 
 torch.library.register_autograd("gsfluent::polar_clamped", _polar_no_gradient)
+
+
+def covariance_axes(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions and standard deviations of covariances.
+
+    Axes come longest first, each at least 1e-6 of the longest. A covariance that is not finite
+    gives the identity and zeros.
+
+    Args:
+        covariance: Packed xx, yy, zz, xy, xz, yz [m^2], shape [N, 6], float32 or float64.
+
+    Returns:
+        ``(quats, scales)``: wxyz [N, 4] and [m] [N, 3].
+
+    Raises:
+        TypeError: A wrong dtype.
+        ValueError: A wrong shape.
+
+    Gradient: none (:func:`gsfluent.geometry.covariance_to_quats_scales` has one). One-sided
+    Jacobi (Hestenes 1958).
+    """
+    check_tensor("covariance_axes", "covariance", covariance, shape=("N", 6))
+    quats, scales = torch.ops.gsfluent.covariance_axes.default(covariance)
+    return quats, scales
+
+
+def carry_axes(
+    quats: Tensor, scales: Tensor, map: Tensor, rotation: Tensor, *, rigid: float
+) -> tuple[Tensor, Tensor]:
+    """Axes of Gaussians that ride on deforming matter: covariance ``A S A^T``.
+
+    Where no entry of ``map - rotation`` exceeds ``rigid`` a Gaussian is turned and keeps its scales
+    exactly; elsewhere the new axes are the singular vectors and values of ``A R(q) diag(s)``.
+
+    Args:
+        quats: Orientations at rest, wxyz, shape [N, 4], float32 or float64; zero counts as the
+            identity.
+        scales: Standard deviations at rest [m], shape [N, 3].
+        map: Deformations A, shape [N, 3, 3].
+        rotation: Their rotations, shape [N, 3, 3].
+        rigid: See above, >= 0.
+
+    Returns:
+        ``(quats, scales)`` now, unit quaternions [N, 4] and [N, 3]. A map that is not finite leaves
+        the Gaussian as it was.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong, or ``rigid`` is negative.
+
+    Gradient: none. PhysGaussian, section 3.3, with total instead of elastic deformation.
+    """
+    op = "carry_axes"
+    check_tensor(op, "quats", quats, shape=("N", 4))
+    n = quats.shape[0]
+    check_tensor(op, "scales", scales, shape=(n, 3), like=quats)
+    check_tensor(op, "map", map, shape=(n, 3, 3), like=quats)
+    check_tensor(op, "rotation", rotation, shape=(n, 3, 3), like=quats)
+    if not rigid >= 0.0:
+        raise ValueError(f"{op}: rigid must not be negative, got {rigid}")
+    new_quats, new_scales = torch.ops.gsfluent.carry_axes.default(
+        quats, scales, map, rotation, float(rigid)
+    )
+    return new_quats, new_scales
+
+
+@torch.library.register_fake("gsfluent::covariance_axes")
+def _covariance_axes_fake(covariance: Tensor) -> tuple[Tensor, Tensor]:
+    n = covariance.shape[0]
+    return covariance.new_empty((n, 4)), covariance.new_empty((n, 3))
+
+
+@torch.library.register_fake("gsfluent::carry_axes")
+def _carry_axes_fake(
+    quats: Tensor, scales: Tensor, map: Tensor, rotation: Tensor, rigid: float
+) -> tuple[Tensor, Tensor]:
+    return quats.new_empty(quats.shape), scales.new_empty(scales.shape)
+
+
+def _axes_no_gradient(ctx: torch.autograd.function.FunctionCtx, *grads: Tensor) -> None:
+    raise NotImplementedError("axes of Gaussians: no gradient")
+
+
+torch.library.register_autograd("gsfluent::covariance_axes", _axes_no_gradient)
+torch.library.register_autograd("gsfluent::carry_axes", _axes_no_gradient)

@@ -70,28 +70,35 @@ def _mvee_no_gradient(ctx: Any, *grads: Tensor) -> None:
 torch.library.register_autograd("gsfluent::mvee", _mvee_no_gradient)
 
 _ORDER = (0, 4, 8, 1, 2, 5)
+# In the order of LensFault (csrc/core/mvee_lens.h), of the first Gaussian and of the second.
+_NOT_FINITE = "finite, got NaN or infinity in row {}"
+_FAULTS = [
+    (f"{name}_{side}", what)
+    for side in "ab"
+    for name, what in (
+        ("mean", _NOT_FINITE),
+        ("cov", _NOT_FINITE),
+        ("cov", "positive definite, row {} is not"),
+    )
+]
 
 
-def _check_covariance(op: str, name: str, value: Tensor, like: Tensor, batch: int) -> Tensor:
-    """Validated [B, 6] form of a covariance given as [B, 6] or [B, 3, 3]."""
+def _packed(op: str, name: str, value: Tensor, like: Tensor, batch: int) -> Tensor:
+    """[B, 6] form of a covariance given as [B, 6] or [B, 3, 3]."""
     if isinstance(value, Tensor) and value.dim() == 3:
         check_tensor(op, name, value, shape=(batch, 3, 3), like=like)
-        packed = value.reshape(batch, 9)[:, list(_ORDER)]
-    else:
-        check_tensor(op, name, value, shape=(batch, 6), like=like)
-        packed = value
-    _check_finite(op, name, packed)
-    if not torch.compiler.is_compiling() and batch:
-        # Relative to the trace, so that the size of the scene does not matter; a zero axis is flat.
-        xx, yy, zz, xy, xz, yz = packed.double().unbind(1)
-        trace = xx + yy + zz
-        minor = xx * yy - xy * xy + xx * zz - xz * xz + yy * zz - yz * yz
-        wrong = (torch.minimum(torch.minimum(xx, yy), zz) < 0) | (minor < -1e-6 * trace**2)
-        wrong |= trace <= 0
-        if bool(wrong.any()):
-            row = int(wrong.nonzero()[0])
-            raise ValueError(f"{op}: {name} must be positive definite, row {row} is not")
-    return packed
+        return value.reshape(batch, 9)[:, list(_ORDER)]
+    check_tensor(op, name, value, shape=(batch, 6), like=like)
+    return value
+
+
+def _raise_faults(op: str, faults: Tensor, batch: int) -> None:
+    """Raise for the first row the kernel found fault with; one wait for the device."""
+    if torch.compiler.is_compiling() or not batch:
+        return
+    for (name, what), left in zip(_FAULTS, faults.tolist(), strict=True):
+        if left:
+            raise ValueError(f"{op}: {name} must be {what.format(batch - left)}")
 
 
 def mvee_lens(
@@ -142,13 +149,12 @@ def mvee_lens(
         raise ValueError(f"{op}: radius must be positive, got {radius}")
     if not 0.0 <= flat <= 1.0:
         raise ValueError(f"{op}: flat must lie in [0, 1], got {flat}")
-    packed_a = _check_covariance(op, "cov_a", cov_a, mean_a, batch)
-    packed_b = _check_covariance(op, "cov_b", cov_b, mean_a, batch)
-    _check_finite(op, "mean_a", mean_a)
-    _check_finite(op, "mean_b", mean_b)
-    mean, cov, overlap = torch.ops.gsfluent.mvee_lens.default(
+    packed_a = _packed(op, "cov_a", cov_a, mean_a, batch)
+    packed_b = _packed(op, "cov_b", cov_b, mean_a, batch)
+    mean, cov, overlap, faults = torch.ops.gsfluent.mvee_lens.default(
         mean_a, packed_a, mean_b, packed_b, float(radius), float(flat)
     )
+    _raise_faults(op, faults, batch)
     if cov_a.dim() == 3:
         cov = cov[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(batch, 3, 3)
     return mean, cov, overlap
@@ -162,12 +168,13 @@ def _mvee_lens_fake(
     covariance_b: Tensor,
     radius: float,
     flat: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     batch = mean_a.shape[0]
     return (
         mean_a.new_empty((batch, 3)),
         mean_a.new_empty((batch, 6)),
         mean_a.new_empty((batch,), dtype=torch.bool),
+        mean_a.new_empty((6,), dtype=torch.int64),
     )
 
 

@@ -175,9 +175,38 @@ class Carry:
         weight = weight.clamp(min=1e-12) * ~points.hanging.parted[owner]
         weight = weight / weight.sum(dim=1, keepdim=True)
         local = points.map[index]
-        moved = points.position[index] + (local @ arm[..., None])[..., 0]
+        # sums of products: batches of tiny matrix products are slow
+        moved = points.position[index] + (local * arm[:, :, None]).sum(dim=3)
         means = (weight[..., None] * moved).sum(dim=1)
         return means, (weight[..., None, None] * local).sum(dim=1)
+
+    def cells(self, owners: Tensor, points: Points) -> tuple[Tensor, Tensor, Tensor]:
+        """How the matter around some points moves, to first order.
+
+        Args:
+            owners: The points, int64 [P].
+            points: All material points, with ``hanging``.
+
+        Returns:
+            Where the places of the points themselves have gone [P, 3], the gradient of
+            :meth:`place` there [P, 3, 3], and its rotation [P, 3, 3].
+        """
+        assert points.hanging is not None  # follow sees to it
+        index = self.links.near[owners]
+        arm = self.matter.rest[owners][:, None] - self.matter.rest[index]
+        square = (BLEND * self.links.spacing[owners, None]).square()
+        weight = torch.exp(-0.5 * arm.square().sum(dim=2) / square)
+        weight = weight * ~points.hanging.parted[owners]
+        weight = weight / weight.sum(dim=1, keepdim=True)
+        local = points.map[index]
+        moved = points.position[index] + (local * arm[:, :, None]).sum(dim=3)
+        means = (weight[..., None] * moved).sum(dim=1)
+        blend = (weight[..., None, None] * local).sum(dim=1)
+        # d weight / d place: towards what weighs more
+        pull = (weight[..., None] * arm).sum(dim=1, keepdim=True) - arm
+        pull = (weight / square)[..., None] * pull
+        bend = ((moved - means[:, None])[..., None] * pull[:, :, None]).sum(dim=1)
+        return means, blend + bend, ops.polar_clamped(blend, *STRETCH)[0]
 
     def apply(self, motion: Motion, rest: Gaussians | None = None) -> Gaussians:
         """Return the splats at their new places, with their new shapes and turned colours.
@@ -187,19 +216,9 @@ class Carry:
             rest: Splats at rest, if not those that were bound but cut ones.
         """
         rest = rest or self.gaussians
-        turn = geometry.matrix_to_quaternion(motion.rotation)
-        quats = geometry.quaternion_multiply(turn, geometry.normalize_quaternions(rest.quats))
-        scales = rest.scales
-        change = (motion.map - motion.rotation).abs().amax(dim=(1, 2))
-        bent = (change > RIGID).nonzero()[:, 0]
-        if bent.numel():
-            root = motion.map[bent] @ geometry.quaternion_to_matrix(rest.quats[bent])
-            root = root * rest.scales[bent, None, :]
-            new_quats, new_scales = geometry.covariance_to_quats_scales(
-                geometry.pack_symmetric(root @ root.mT)
-            )
-            quats = quats.index_copy(0, bent, new_quats)
-            scales = scales.index_copy(0, bent, new_scales)
+        quats, scales = ops.carry_axes(
+            rest.quats, rest.scales, motion.map, motion.rotation, rigid=RIGID
+        )
         normals = rest.normals
         if normals is not None:
             normals = (motion.rotation @ normals[..., None])[..., 0]

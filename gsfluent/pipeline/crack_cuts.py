@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from gsfluent import geometry
+from gsfluent import geometry, ops
 
 REACH = 2.0
 """Cracks further than this many standard deviations from a centre leave the splat alone."""
@@ -102,5 +102,5 @@ def cut_splats(
         distance = ((anchor - mean) * n).sum(dim=1)
         distance = distance + slack * (n[:, None] @ covariance @ n[..., None])[:, 0, 0].sqrt()
         mean, covariance = cut_at(mean, covariance, n, torch.where(here, distance, torch.inf))
-    new_quats, new_scales = geometry.covariance_to_quats_scales(geometry.pack_symmetric(covariance))
+    new_quats, new_scales = ops.covariance_axes(geometry.pack_symmetric(covariance))
     return rows, mean, new_quats, new_scales

@@ -10,6 +10,7 @@ once, when the gap opens; from frame to frame the elements only ride along.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import torch
@@ -80,6 +81,21 @@ class Elements:
     scales: Tensor
     color: Tensor
     normals: Tensor
+
+    @functools.cached_property
+    def _cells(self) -> tuple[Tensor, Tensor]:
+        cell, slot = torch.unique(self.owner, return_inverse=True)
+        return cell, slot
+
+    @property
+    def cell(self) -> Tensor:
+        """Points that own elements, int64 [C]."""
+        return self._cells[0]
+
+    @property
+    def slot(self) -> Tensor:
+        """Place of each element's owner in :attr:`cell`, int64 [E]."""
+        return self._cells[1]
 
     @property
     def count(self) -> int:

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsfluent import geometry, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.carry import STRETCH, Carry, Points
+from gsfluent.pipeline.carry import Carry, Points
 from gsfluent.pipeline.crack_cuts import cut_splats
 from gsfluent.pipeline.crack_faces import CRUMB, PIECE, Elements, Fit, find_elements
 from gsfluent.pipeline.crack_links import BACK, FULL, OPEN, Hanging
@@ -166,13 +166,16 @@ def _births(elements: Elements, carry: Carry, points: Points) -> Births:
     ratio = points.hanging.ratio.view(-1)[elements.pair]
     least = BACK * OPEN
     opacity = OPACITY * ((ratio - least) / (FULL - least)).clamp(0.0, 1.0)
-    means, local = carry.place(elements.means, elements.owner, points)
-    turn, _ = ops.polar_clamped(local, *STRETCH)
-    quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), elements.quats)
+    cell, slot = elements.cell, elements.slot
+    center, gradient, rotation = carry.cells(cell, points)
+    arm = elements.means - carry.matter.rest[elements.owner]
+    means = center[slot] + (gradient[slot] * arm[:, None]).sum(dim=2)
+    turn = rotation[slot]
+    quats, scales = ops.carry_axes(elements.quats, elements.scales, turn, turn, rigid=0.0)
     gaussians = Gaussians(
         means=means,
         quats=quats,
-        scales=elements.scales,
+        scales=scales,
         opacities=opacity,
         sh=geometry.rgb_to_sh0(elements.color)[:, None],
         labels=torch.full_like(elements.owner, TRANSITION, dtype=torch.int32),

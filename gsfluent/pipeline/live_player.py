@@ -34,6 +34,8 @@ KEPT_BYTES = 1 << 30
 """Memory for frames that can still be looked at."""
 MOST_FRAMES = 5_000
 """Frames after which numbers begin at 0 again, so that a long session needs no more memory."""
+AUTOMATIC = (1.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0)
+"""Slow motions among which the automatic one chooses."""
 WINDOW = 1.0
 """Wall seconds over which speeds are averaged."""
 AT_REST, RUNNING, FAILED, PAUSED = "at rest", "running", "failed", "paused"
@@ -94,6 +96,7 @@ class LivePlayer:
         self._message = ""
         self._speed: collections.deque[tuple[float, float, float]] = collections.deque()
         self._take: Take | None = None
+        self.automatic = False
         self.count = self.revision = 0
         self._keep(session.frame())
         self._status = self._look()
@@ -162,16 +165,42 @@ class LivePlayer:
         """Back to the prepared object; ends a take."""
         return self._enqueue(self._reset)
 
-    def set_slow(self, slow: float) -> Future[Any]:
-        """Slow motion; not while a take is recorded, whose frames are evenly spaced."""
+    def set_slow(self, slow: float | None) -> Future[Any]:
+        """Slow motion; not while a take is recorded, whose frames are evenly spaced.
+
+        Args:
+            slow: How many times slower; None lets it follow what the machine can do.
+        """
 
         def act() -> None:
             if self._take is not None:
                 raise InputError("a take has one speed", mend="end the recording first")
-            self.session.set_slow(slow)
+            self.automatic = slow is None
+            if slow is not None:
+                self.session.set_slow(slow)
             self._speed.clear()
 
         return self._enqueue(act)
+
+    def _adapt(self) -> None:
+        """More slow motion while frames come late, less while they wait, a step at a time.
+
+        A frame of more slow motion has fewer steps; what does not depend on them remains.
+        """
+        if not self.automatic or self._take is not None or len(self._speed) < 4:
+            return
+        busy = sum(ready for _, _, ready in self._speed) / len(self._speed)
+        steps = [value for value in AUTOMATIC if value != self.session.slow]
+        above = [value for value in steps if value > self.session.slow]
+        below = [value for value in steps if value < self.session.slow]
+        if busy > 1.2 / self.session.fps and above:
+            self.session.set_slow(above[0])
+        elif busy < 0.4 / self.session.fps and below:
+            self.session.set_slow(below[-1])
+        else:
+            return
+        self._speed.clear()
+        self._status = self._look()
 
     def pause(self, paused: bool) -> Future[Any]:
         """Let the simulation stand, or go on; pokes are taken all the same."""
@@ -216,6 +245,20 @@ class LivePlayer:
     # --- in the thread ---
 
     def _work(self) -> None:
+        try:
+            self._loop()
+        except Exception as error:  # nobody would hear of it otherwise
+            _log.exception("live: the thread ended")
+            self.session.failure = f"{type(error).__name__}: {error}"
+            self._message = self.session.failure
+            self._status = self._look()
+            with self._wake:
+                self._stop = True
+                while self._queue:
+                    self._queue.popleft()[1].set_exception(error)
+                self._wake.notify_all()
+
+    def _loop(self) -> None:
         with torch.no_grad(), _stream(self.session.device):
             while True:
                 with self._wake:
@@ -292,6 +335,7 @@ class LivePlayer:
         if session.at_rest:
             self._speed.clear()
             self._status = self._look()
+        self._adapt()
 
     def _reset(self) -> None:
         if self._take is not None:
@@ -354,9 +398,10 @@ def _stream(device: torch.device) -> Iterator[None]:
     if device.type != "cuda":
         yield
         return
-    torch.cuda.set_device(device)
-    stream = torch.cuda.Stream(device)
-    stream.wait_stream(torch.cuda.default_stream(device))
+    number = torch.cuda.current_device() if device.index is None else device.index
+    torch.cuda.set_device(number)
+    stream = torch.cuda.Stream(number)
+    stream.wait_stream(torch.cuda.default_stream(number))
     with torch.cuda.stream(stream):
         yield
 

@@ -7,7 +7,7 @@ import torch
 from gsfluent.pipeline.particles import POINTS_PER_CELL
 from gsfluent.scene import Scene
 
-BUDGET = {"cpu": 6_000, "cuda": 100_000}
+BUDGET = {"cpu": 6_000, "cuda": 30_000}
 """Material points of quality ``live`` by device: what docs/live.md measures as interactive."""
 CELLS = (8, 64)
 """Fewest and most cells along the longest side of the largest solid."""

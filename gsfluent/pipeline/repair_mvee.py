@@ -42,13 +42,12 @@ def transitions(
     parent, side = graph.pairs(motion)
     if parent.numel() == 0:
         return None
-    center, shape = graph.lenses(parent, side)
+    center, rest_quats, scales = graph.lenses(parent, side)
     rest = graph.carry.gaussians
     # Rigid with the unbroken side: its rotation about its own centre.
     turn = motion.rotation[side]
     means = motion.means[side] + (turn @ (center - rest.means[side])[..., None])[..., 0]
-    quats, scales = geometry.covariance_to_quats_scales(shape)
-    quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), quats)
+    quats = geometry.quaternion_multiply(geometry.matrix_to_quaternion(turn), rest_quats)
     added = Gaussians(
         means=means,
         quats=quats,
@@ -91,7 +90,8 @@ class CrackGraph:
         self.carry, self.radius = carry, radius
         self._keys = torch.zeros(0, dtype=torch.int64, device=device)
         self._centers = carry.gaussians.means.new_zeros(0, 3)
-        self._shapes = carry.gaussians.means.new_zeros(0, 6)
+        self._quats = carry.gaussians.means.new_zeros(0, 4)
+        self._scales = carry.gaussians.means.new_zeros(0, 3)
         self._overlaps = torch.zeros(0, dtype=torch.bool, device=device)
 
     def pairs(self, motion: Motion) -> tuple[Tensor, Tensor]:
@@ -146,11 +146,13 @@ class CrackGraph:
             order = torch.argsort(torch.cat([self._keys, new]))
             self._keys = torch.cat([self._keys, new])[order]
             self._centers = torch.cat([self._centers, center])[order]
-            self._shapes = torch.cat([self._shapes, shape])[order]
+            quats, scales = ops.covariance_axes(shape)
+            self._quats = torch.cat([self._quats, quats])[order]
+            self._scales = torch.cat([self._scales, scales])[order]
             self._overlaps = torch.cat([self._overlaps, overlap])[order]
         return self._overlaps[torch.searchsorted(self._keys, keys)]
 
-    def lenses(self, parent: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-        """Return centres [T, 3] and covariances [T, 6] of known pairs, at rest."""
+    def lenses(self, parent: Tensor, side: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return centres [T, 3], quaternions [T, 4] and sizes [T, 3] of known pairs, at rest."""
         slots = torch.searchsorted(self._keys, parent * self.carry.gaussians.count + side)
-        return self._centers[slots], self._shapes[slots]
+        return self._centers[slots], self._quats[slots], self._scales[slots]

@@ -93,6 +93,9 @@ class App:
         self.follow = source.running
         self.tracking = self._travels()
         self._tracked_by_itself = True
+        self._revision = self.timeline.revision
+        self._home = self._center(self.timeline.first.index)
+        self._standing: tuple[float, float, float] | None = None
         self.shift = (0.0, 0.0, 0.0)
         self._anchor = self._center(self.index)
         self._problem = ""
@@ -132,6 +135,8 @@ class App:
     def show(self, index: int) -> None:
         """Go to frame ``index``."""
         with self.lock:
+            if self.timeline.revision != self._revision:
+                self._begin_anew()
             index = max(0, min(index, self.timeline.count - 1))
             if self.tracking:
                 center = self._center(index)
@@ -178,9 +183,24 @@ class App:
     def _track_by_itself(self) -> None:
         """Follow matter that has left its place, unless a person has decided."""
         if self._tracked_by_itself and not self.tracking and self._travels():
+            self._standing = self.shift
             self._set_tracking(True)
             if self._look_panel is not None:
                 self._look_panel.show_tracking(True)
+
+    def _begin_anew(self) -> None:
+        """Keep the object in view when the source has begun anew."""
+        home, self._revision = self._home, self.timeline.revision
+        self._home = self._center(self.timeline.first.index)
+        if self._standing is not None and self._tracked_by_itself and not self._travels():
+            # what made the view follow is undone (a live reset): it stands again where it stood
+            self.tracking, self.shift, self._standing = False, self._standing, None
+            if self._look_panel is not None:
+                self._look_panel.show_tracking(False)
+        if not self.tracking:
+            # the solid lies where it was photographed, the first frame where it is dropped from
+            x, y, z = (s + a - b for s, a, b in zip(self.shift, self._home, home, strict=True))
+            self.shift = (x, y, z)
 
     def _set_tracking(self, on: bool) -> None:
         with self.lock:
@@ -306,7 +326,6 @@ class App:
 
     def refresh(self) -> None:
         """Look for new frames now."""
-        revision, before = self.timeline.revision, self._center(self.timeline.first.index)
         try:
             if not self.timeline.refresh():
                 return
@@ -314,11 +333,6 @@ class App:
             self._problem = str(error).split("\n")[0]
             self.say()
             return
-        if self.timeline.revision != revision and not self.tracking:
-            # the solid lies where it was photographed, the first frame where it is dropped from
-            after = self._center(self.timeline.first.index)
-            x, y, z = (s + a - b for s, a, b in zip(self.shift, after, before, strict=True))
-            self.shift = (x, y, z)
         self._track_by_itself()
         facts = self.timeline.facts()
         last = self.timeline.count - 1

@@ -26,6 +26,7 @@ _SAY_EVERY = 0.25  # seconds between two updates of the figures
 _PLOT_EVERY = 0.5
 _DRAWN_OVER = 2.0  # seconds over which pictures are counted
 _PATIENCE = 120.0  # seconds a poke may have to wait for the frame in hand
+AUTO = "automatic"
 SLOW = {"1 (real time)": 1.0, "2": 2.0, "4": 4.0, "10": 10.0, "30": 30.0, "100": 100.0}
 
 
@@ -51,6 +52,7 @@ class PokePanel:
         gui = server.gui
         slow = self.player.session.slow
         chosen = next((name for name, value in SLOW.items() if value == slow), f"{slow:g}")
+        chosen = AUTO if self.player.automatic else chosen
         with gui.add_folder("Poke", order=-1):
             self._figures = gui.add_html("")
             self._shoot = gui.add_button("Shoot", hint="From the camera at the middle of the view")
@@ -64,7 +66,7 @@ class PokePanel:
             self._cut = gui.add_button_group("Cut", ("upright", "level"))
             self._blade = gui.add_slider("Blade [m/s]", 0.5, 10, 0.5, 2)
             self._slow = gui.add_dropdown(
-                "Slow motion", tuple(dict.fromkeys((*SLOW, chosen))), initial_value=chosen
+                "Slow motion", tuple(dict.fromkeys((AUTO, *SLOW, chosen))), initial_value=chosen
             )
             self._pause: Any = gui.add_button("Pause", hint="The simulation stands or goes on")
             self._reset = gui.add_button("Reset")
@@ -80,7 +82,8 @@ class PokePanel:
 
         @self._slow.on_update
         def _(event: Any) -> None:
-            self._ask(lambda: self.player.set_slow(SLOW.get(self._slow.value, slow)))
+            chosen = None if self._slow.value == AUTO else SLOW.get(self._slow.value, slow)
+            self._ask(lambda: self.player.set_slow(chosen))
 
         @self._click.on_update
         def _(event: Any) -> None:

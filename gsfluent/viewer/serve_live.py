@@ -27,7 +27,7 @@ def view_live(
     material: str | None = None,
     run: Path | None = None,
     quality: str = "live",
-    slow: float = 4.0,
+    slow: float | None = None,
     cracks: str = CRACKS,
     seed: int = 0,
     host: str = "127.0.0.1",
@@ -42,7 +42,7 @@ def view_live(
         material: Preset for a solid.
         run: Folder in which a shot's objects are prepared.
         quality: ``live`` or one of the simulation's.
-        slow: Slow motion at first.
+        slow: Slow motion at first; None: as much as this machine needs.
         cracks: How cracks get splats, see :class:`gsfluent.pipeline.Repair`.
         seed: Seed of everything random.
         host: Address to listen on.
@@ -57,12 +57,13 @@ def view_live(
     """
     stage = open_stage(source, material=material, out=run, device=device, seed=seed)
     session = LiveSession(
-        stage.scene, quality=quality, device=device, slow=slow, seed=seed, cracks=cracks
+        stage.scene, quality=quality, device=device, slow=slow or 4.0, seed=seed, cracks=cracks
     )
     _log.info("live: %d points, cells of %.4g m", session.run.matter.particles.count, session.dx)
     if not session.at_rest and not session.settle():
         _log.warning("live: the scene does not come to rest; it goes on while nobody pokes it")
     player = LivePlayer(session, stage.shot)
+    player.automatic = slow is None
     home = run or (source if source.is_dir() else source.parent)
     before = set(home.glob("take_*"))
     panel = PokePanel(player, home)

@@ -342,3 +342,14 @@ def test_set_colliders_moves_what_moves() -> None:
     want = torch.tensor([5.0, -2.0 * 10 * 1e-4, 0.0], dtype=torch.float64)
     torch.testing.assert_close(solver.colliders[0, 3:6], want)
     assert float(solver.colliders[0, 11]) == -2.0
+
+
+def test_unique_rows_are_those_of_torch() -> None:
+    from gsfluent.ops.solver_state import _unique_rows
+
+    generator = torch.Generator().manual_seed(0)
+    columns = [torch.randint(0, n, (900,), generator=generator) for n in (3, 7, 5)]
+    values = 0.37 * torch.stack(columns, dim=1).double()
+    rows, inverse = _unique_rows(values)
+    wanted = torch.unique(values, dim=0, return_inverse=True)
+    assert torch.equal(rows, wanted[0]) and torch.equal(inverse, wanted[1])

@@ -25,6 +25,7 @@ from gsfluent.pipeline.light import Lamp, Light, Lighting, lighting_of, pack_lam
 from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
 from gsfluent.pipeline.render import Render
+from gsfluent.pipeline.render_floor import Studio
 from gsfluent.pipeline.shade import irradiance
 from gsfluent.pipeline.shade_shadow import transmittance
 
@@ -364,3 +365,15 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     assert float(gloss_of(shot(tmp_path), loose)[3, 0]) > 0.5  # type: ignore[index]
     loose.facts = {}
     assert gloss_of(shot(tmp_path), loose) is None
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("position", [None, (0.2, -0.2, 0.1), (0.0, -0.12, 0.02)])
+def test_picture_is_the_same_on_the_gpu(skin: Gaussians, position: Any) -> None:
+    lamps = (Lamp(), Lamp(position=position, size=0.03, distance=0.3)) if position else (Lamp(),)
+    light = Lighting(lamps, environment=environment.sky_and_ground((0.4,) * 3, (0.1,) * 3))
+    camera = Camera.look_at((0.3, -0.6, 0.3), (0, 0, 0), width=160, height=120, fov=30.0)
+    studio = Studio(-0.1, (0.0, 0.0), 0.1, 0.2)
+    host = Render(camera, light, studio=studio)(skin)
+    device = Render(camera, light, studio=studio)(skin.to(torch.device("cuda"))).cpu()
+    assert float((host - device).abs().mean()) < 2e-3

@@ -82,6 +82,33 @@ def test_the_real_time_factor_is_simulated_time_by_wall_time(solid) -> None:
     assert status.latency == pytest.approx(0.02) and min(walls) >= 0.04
 
 
+def test_automatic_slow_motion_follows_the_machine(solid) -> None:
+    player = player_of(solid)
+    player.automatic = True
+    now = [0.0]
+    player._clock = lambda: now[0]
+    player.do(lambda s: s.throw((0, 0, 1.0)))
+    player._obey()
+    step = player.session.step
+
+    def slow_step():
+        now[0] += cost
+        return step()
+
+    player.session.step = slow_step  # type: ignore[method-assign]
+    cost = 0.05  # five times what 100 frames a second allow
+    for _ in range(12):
+        player._one_frame()
+    assert player.session.slow == 7.0 and player.status.wanted == pytest.approx(1 / 7)
+    cost = 0.0101
+    for _ in range(8):
+        player._one_frame()
+    assert player.session.slow == 7.0
+    player.set_slow(2.0)
+    player._obey()
+    assert player.session.slow == 2.0 and not player.automatic
+
+
 def test_a_bad_poke_is_told_and_nothing_stops(solid) -> None:
     player = player_of(solid).start()
     try:

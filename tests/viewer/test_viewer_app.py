@@ -111,6 +111,12 @@ def test_a_view_that_stands_begins_to_follow_what_falls_away(serve: Any) -> None
     source.frames = 5
     until(lambda: app.index == 4)
     np.testing.assert_allclose(np.array(app.shift) - kept, [0, 0, -0.2], atol=1e-6)
+    # a live reset: everything is where it was, and so is the view
+    source.frames, source.revision = 1, "2"
+    until(lambda: app.index == 0 and not app.tracking)
+    assert app.shift == (0.0, 0.0, 0.0)
+    source.frames = 4
+    until(lambda: app.tracking)
     app.track(False)  # and a person's word is the last
     source.frames = 6
     until(lambda: app.index == 5)
