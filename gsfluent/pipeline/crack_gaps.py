@@ -24,7 +24,7 @@ from gsfluent.pipeline.crack_sites import Sites
 
 OPACITY = 0.98
 """Opacity of a face element where the gap is wide."""
-SLACK = 0.4
+SLACK = 0.1
 """Standard deviations by which the cuts of splats stay outside of a crack: what is left must still
 cover."""
 CHUNK = 100_000
