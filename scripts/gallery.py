@@ -63,7 +63,7 @@ SCENES = {
     "apple_shot": Scene("apple shot", "", (0.06, 0.14, 0.35, 0.98)),
     "skull_struck": Scene("skull struck", "", (0.05, 0.2, 0.45, 0.98)),
     "bread_torn": Scene("bread torn", "bread", (0.02, 0.2, 0.5, 0.98)),
-    "cake_cut": Scene("cake cut by a blade", "cake", (0.12, 0.28, 0.5, 0.98)),
+    "cake_cut": Scene("cake cut by a blade", "cake", (0.12, 0.36, 0.56, 0.98)),
     "milk_poured": Scene("milk poured", "orange", (0.12, 0.35, 0.6, 0.98)),
     "melons_collided": Scene("two bodies collided", "melons", (0.02, 0.2, 0.45, 0.98)),
 }

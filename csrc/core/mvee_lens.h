@@ -75,7 +75,7 @@ GSF_HOST_DEVICE_COLD T search(const Overlap<T>& overlap, const LiftedFactor<T>& 
     }
     return y;
   };
-  const int rims = many ? kLensRim : 8, caps = many ? 8 : 2;
+  const int rims = many ? kLensRim : 8, caps = many ? kLensCaps : 2;
   for (int g = 0; g < rims; ++g) {
     Vec3<T> y = furthest(g, kLensRim, rims);
     const T m = climb(overlap, objective, factor, true, 3, y);

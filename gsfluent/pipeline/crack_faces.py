@@ -41,7 +41,7 @@ class Fit(NamedTuple):
 
 PIECE = Fit(layer=0.85, overlap=0.3, width=0.55, inset=0.3, slack=0.0)
 """On pieces, whose faces are broad: what counts is that nothing shows through."""
-CRUMB = Fit(layer=0.6, overlap=0.0, width=0.4, inset=0.45, slack=-0.5)
+CRUMB = Fit(layer=0.5, overlap=0.0, width=0.4, inset=0.45, slack=-0.8)
 """On crumbs, which are a few elements wide: what counts is that they do not swell."""
 THICKNESS = 0.25
 """Standard deviation across the face, in pitches."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import geometry
+from gsfluent import geometry, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.carry import Carry, Points
@@ -24,7 +24,7 @@ from gsfluent.pipeline.crack_sites import Sites
 
 OPACITY = 0.98
 """Opacity of a face element where the gap is wide."""
-SLACK = 0.4
+SLACK = 0.1
 """Standard deviations by which the cuts of splats stay outside of a crack: what is left must still
 cover."""
 CHUNK = 100_000
@@ -170,15 +170,15 @@ def _births(elements: Elements, carry: Carry, points: Points) -> Births:
     center, gradient, rotation = carry.cells(cell, points)
     arm = elements.means - carry.matter.rest[elements.owner]
     means = center[slot] + (gradient[slot] * arm[:, None]).sum(dim=2)
-    turn = geometry.matrix_to_quaternion(rotation)[slot]
-    quats = geometry.quaternion_multiply(turn, elements.quats)
+    turn = rotation[slot]
+    quats, scales = ops.carry_axes(elements.quats, elements.scales, turn, turn, rigid=0.0)
     gaussians = Gaussians(
         means=means,
         quats=quats,
-        scales=elements.scales,
+        scales=scales,
         opacities=opacity,
         sh=geometry.rgb_to_sh0(elements.color)[:, None],
         labels=torch.full_like(elements.owner, TRANSITION, dtype=torch.int32),
-        normals=(rotation[slot] * elements.normals[:, None]).sum(dim=2),
+        normals=(turn * elements.normals[:, None]).sum(dim=2),
     )
     return Births(gaussians, carry.gaussians.count + elements.key, elements.owner)
