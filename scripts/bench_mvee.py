@@ -10,12 +10,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
+from page import enter
 from torch import Tensor
 
 from gsfluent import ops
@@ -92,7 +97,9 @@ def reach(points: Tensor, center: Tensor, shape: Tensor) -> Tensor:
     return (offset @ inverse * offset).sum(2).amax(1).sqrt()
 
 
-def check_pairs(pairs: Pairs, checked: int, device: torch.device, dtype: torch.dtype) -> dict:
+def check_pairs(
+    pairs: Pairs, checked: int, device: torch.device, dtype: torch.dtype
+) -> dict[str, Any]:
     """Largest distance outside and the volumes' ratio, of the first rows, against float64."""
     few = tuple(p[:checked].to(dtype) for p in pairs)
     mean, cov, overlap = (t.cpu() for t in ops.mvee_lens(*(p.to(device) for p in few)))
@@ -113,7 +120,7 @@ def check_pairs(pairs: Pairs, checked: int, device: torch.device, dtype: torch.d
     }
 
 
-def bench(args: argparse.Namespace) -> list[dict]:
+def bench(args: argparse.Namespace) -> list[dict[str, Any]]:
     device, dtype = torch.device(args.device), getattr(torch, args.dtype)
     rows = []
     lens, enclose = torch.ops.gsfluent.mvee_lens.default, torch.ops.gsfluent.mvee.default
@@ -122,10 +129,10 @@ def bench(args: argparse.Namespace) -> list[dict]:
         given = tuple(p.to(device, dtype) for p in pairs)
         packed = [c.reshape(-1, 9)[:, [0, 4, 8, 1, 2, 5]].contiguous() for c in given[1::2]]
         raw = (given[0], packed[0], given[2], packed[1], 2.0, 0.0)
-        row = {"case": f"{args.pairs} pairs, {name}"}
-        row["kernel_ms"] = 1e3 * timed(lambda raw=raw: lens(*raw), device, args.repeats)
+        row: dict[str, Any] = {"case": f"{args.pairs} pairs, {name}"}
+        row["kernel_ms"] = 1e3 * timed(partial(lens, *raw), device, args.repeats)
         row["op_ms"] = 1e3 * timed(
-            lambda g=given, p=packed: ops.mvee_lens(g[0], p[0], g[2], p[1]), device, args.repeats
+            partial(ops.mvee_lens, given[0], packed[0], given[2], packed[1]), device, args.repeats
         )
         row["share"] = float(lens(*raw)[2].float().mean())
         rows.append(row | check_pairs(pairs, args.checked, device, dtype))
@@ -137,7 +144,7 @@ def bench(args: argparse.Namespace) -> list[dict]:
         points = points.to(device)
         row = {"case": f"{sets} sets of {count} points"}
         row["kernel_ms"] = 1e3 * timed(
-            lambda p=points: enclose(p, 5e-4, 100), device, max(1, args.repeats // 2)
+            partial(enclose, points, 5e-4, 100), device, max(1, args.repeats // 2)
         )
         center, shape = (t.cpu() for t in enclose(points[: args.checked], 5e-4, 100))
         _, want = ops.mvee(few, tolerance=1e-7)
@@ -146,6 +153,17 @@ def bench(args: argparse.Namespace) -> list[dict]:
         row["volume_low"], row["volume_high"] = float(ratio.min()), float(ratio.max())
         rows.append(row)
     return rows
+
+
+def saved_table(text: str) -> str:
+    """The Markdown table of a saved run: times only."""
+    lines = ["| case | kernel ms | through ops, ms |", "|---|---|---|"]
+    for line in text.splitlines():
+        found = re.match(r"(\d+ .*?)\s+kernel_ms (\S+)(?:\s+op_ms (\S+))?", line)
+        if found:
+            times = [f"{float(t):.2f}" if t else "" for t in found.groups()[1:]]
+            lines.append(f"| {found.group(1)} | {times[0]} | {times[1]} |")
+    return "\n".join(lines)
 
 
 def main() -> int:
@@ -159,7 +177,13 @@ def main() -> int:
     families = ["balls", "same shape", "contained", "near balls", "ratio 4", "ratio 40", "thin"]
     parser.add_argument("--families", nargs="*", default=families, choices=families)
     parser.add_argument("--json", action="store_true", help="print JSON and no table")
+    parser.add_argument("--saved", type=Path, help="a saved table instead of a run")
+    parser.add_argument("--page", type=Path, help="enter the table into this page")
     args = parser.parse_args()
+    if args.saved is not None and args.page is not None:
+        table = saved_table(args.saved.read_text())
+        args.page.write_text(enter(args.page.read_text(), "mvee speed", table))
+        return 0
     rows = bench(args)
     if args.json:
         sys.stdout.write(json.dumps(rows, indent=1) + "\n")
