@@ -19,6 +19,7 @@ from gsfluent.pipeline.reconstruct_views import TrainView
 
 _log = logging.getLogger(__name__)
 
+_SCRAP = 0.3  # share of the largest body of a hull below which another one is a scrap
 _COARSE = 40  # cells per side of the first hull
 _FLATNESS = 0.35  # thickness of a starting disc over its radius
 
@@ -103,11 +104,11 @@ def visual_hull(views: list[TrainView], resolution: int = 96, forgiven: float = 
     voxel = float((upper - lower).max()) / resolution
     shape = [int(n) + 2 for n in ((upper - lower) / voxel).ceil()]
     fine = _carve(views, lower - voxel, voxel, (shape[0], shape[1], shape[2]), allowed)
-    return _largest_body(fine) if bool(fine.occupancy.any()) else _largest_body(hull)
+    return _bodies(fine) if bool(fine.occupancy.any()) else _bodies(hull)
 
 
-def _largest_body(hull: Hull) -> Hull:
-    """The hull without what hangs apart from its largest body."""
+def _bodies(hull: Hull) -> Hull:
+    """The hull without scraps that hang apart; objects photographed together all stay."""
     from scipy import ndimage
 
     pieces, count = ndimage.label(hull.occupancy.cpu().numpy(), structure=np.ones((3, 3, 3)))
@@ -115,7 +116,8 @@ def _largest_body(hull: Hull) -> Hull:
         return hull
     sizes = np.bincount(pieces.reshape(-1))
     sizes[0] = 0
-    body = torch.from_numpy(pieces == int(sizes.argmax())).to(hull.occupancy.device)
+    kept = np.nonzero(sizes >= _SCRAP * sizes.max())[0]
+    body = torch.from_numpy(np.isin(pieces, kept)).to(hull.occupancy.device)
     return Hull(body, hull.origin, hull.voxel)
 
 

@@ -130,3 +130,16 @@ def test_photographs_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert (tmp_path / "cake" / "cut.png").is_file()
     assert demo.load_truth(tmp_path / "cake" / "truth.npz").name == "cake"
     assert main(["demo", "pie", "--photographs", str(tmp_path / "pie")]) == 2
+
+
+def test_both_of_two_melons_are_rebuilt(tmp_path: Path) -> None:
+    """The hull that the splats start from once kept its largest body only."""
+    from gsfluent.io import load_capture
+    from gsfluent.pipeline import Reconstruct
+
+    paths = demo.make_capture("melons", tmp_path, views=14, size=48)
+    splats, _ = Reconstruct(iterations=5, max_gaussians=2000)(load_capture(paths.root))
+    x = splats.means[:, 0]
+    assert 0.3 < float((x > 0).float().mean()) < 0.7
+    low, high = (float(torch.quantile(x, q)) for q in (0.02, 0.98))
+    assert low < -0.2 and high > 0.2
