@@ -194,7 +194,7 @@ def _mvee(op: Any, p: dict[str, Any]) -> Results:
     """Centre and shape at the last gap float64 resolves; in float32 the volume, which the same
     rounding moves by its square only."""
     if op is mvee:
-        center, shape = op.mvee(p["points"], tolerance=1e-6, max_iterations=2000)
+        center, shape = op.mvee(p["points"], tolerance=1e-7, max_iterations=5000)
     else:
         center, shape = op.mvee(p["points"], tolerance=1e-12)
     return {"center": center, "shape": shape}
