@@ -101,59 +101,6 @@ def covariance(quats: Tensor, scales: Tensor) -> Tensor:
     return pack_symmetric(root @ root.mT)
 
 
-# Sweeps of the cyclic Jacobi method: quadratic convergence leaves nothing after five for 3x3.
-_JACOBI_SWEEPS = 6
-
-
-def symmetric_eigen(packed: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues [..., 3] (unordered) and eigenvectors [..., 3, 3] (columns) of packed [..., 6].
-
-    Cyclic Jacobi rotations on whole tensors: ``torch.linalg.eigh`` is slow for many 3x3 matrices on
-    the CPU, and cuSOLVER's batched solver refuses the batch of a whole scene.
-    """
-    a = {(i, i): packed[..., i] for i in range(3)}
-    a |= {(0, 1): packed[..., 3], (0, 2): packed[..., 4], (1, 2): packed[..., 5]}
-    one, zero = torch.ones_like(packed[..., 0]), torch.zeros_like(packed[..., 0])
-    columns = list(
-        torch.eye(3, dtype=one.dtype, device=one.device).expand(*one.shape, 3, 3).unbind(-1)
-    )
-    tiny = torch.finfo(packed.dtype).tiny
-    # Four leave the same rounding as six in float32, and each costs a GPU a hundred launches.
-    sweeps = 4 if packed.is_cuda and packed.dtype == torch.float32 else _JACOBI_SWEEPS
-    for p, q in ((0, 1), (0, 2), (1, 2)) * sweeps:
-        r = 3 - p - q
-        off = a[p, q]
-        turns = off.abs() > tiny
-        # t = tan of the angle that annuls a_pq, the smaller root (Golub & Van Loan, 8.5.2)
-        theta = (a[q, q] - a[p, p]) / (2.0 * torch.where(turns, off, one))
-        t = torch.where(theta < 0, -one, one) / (theta.abs() + (theta * theta + 1.0).sqrt())
-        t = torch.where(turns, t, zero)
-        cos = (t * t + 1.0).rsqrt()
-        sin = t * cos
-        rp, rq = (min(r, p), max(r, p)), (min(r, q), max(r, q))
-        moved = t * off
-        a[p, p], a[q, q], a[p, q] = a[p, p] - moved, a[q, q] + moved, zero
-        a[rp], a[rq] = cos * a[rp] - sin * a[rq], sin * a[rp] + cos * a[rq]
-        # whole columns at once: on a GPU what counts is how many operations there are
-        c, s, u, v = cos[..., None], sin[..., None], columns[p], columns[q]
-        columns[p], columns[q] = c * u - s * v, s * u + c * v
-    values = torch.stack([a[0, 0], a[1, 1], a[2, 2]], dim=-1)
-    return values, torch.stack(columns, dim=-1)
-
-
-def covariance_to_quats_scales(packed: Tensor) -> tuple[Tensor, Tensor]:
-    """Quaternions [..., 4] and standard deviations [..., 3] of packed covariances [..., 6].
-
-    Eigenvalues are floored at 1e-12 of the largest, so a flattened covariance gives a thin splat
-    and not NaN.
-    """
-    values, vectors = symmetric_eigen(packed)
-    largest = values.amax(-1, keepdim=True).clamp_min(torch.finfo(packed.dtype).tiny)
-    values = torch.maximum(values, 1e-12 * largest)
-    # Jacobi rotations compose to a proper rotation: no flip is needed
-    return matrix_to_quaternion(vectors), values.sqrt()
-
-
 def sh_degree(coefficients: int) -> int:
     """Degree d of ``coefficients`` = (d + 1)^2 spherical-harmonic coefficients.
 

@@ -244,7 +244,7 @@ def raw(broken: Broken, moment: Moment, *, total: bool = False) -> Drawn:
     arm = rest.means - carry.matter.rest[own]
     means = moment.position[own] + (local @ arm[..., None])[..., 0]
     root = local @ geometry.quaternion_to_matrix(rest.quats) * rest.scales[:, None]
-    quats, scales = geometry.covariance_to_quats_scales(geometry.pack_symmetric(root @ root.mT))
+    quats, scales = ops.covariance_axes(geometry.pack_symmetric(root @ root.mT))
     sh = geometry.rotate_sh(rest.sh, turn)
     return rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None), None
 
@@ -258,7 +258,7 @@ def ideal(broken: Broken, moment: Moment, cloud: TrueCloud) -> Drawn:
     )
     turn, local = ops.polar_clamped(local.contiguous(), 0.6, 1.5)
     root = local @ geometry.quaternion_to_matrix(rest.quats) * rest.scales[:, None]
-    quats, scales = geometry.covariance_to_quats_scales(geometry.pack_symmetric(root @ root.mT))
+    quats, scales = ops.covariance_axes(geometry.pack_symmetric(root @ root.mT))
     sh = geometry.rotate_sh(rest.sh, turn)
     return rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None), None
 

@@ -37,13 +37,14 @@ GSF_HOST_DEVICE void quat_from_rotation(const Mat3<T>& m, T* q) {
   q[3] = scale * z;
 }
 
-// Quaternion and axes of the ellipsoid that a map makes of the unit ball: map = U diag(s) V^T.
+// Quaternion and axes of the ellipsoid that a map makes of the unit ball: map = U diag(s) V^T. No
+// axis is less than `share` of the longest.
 template <typename T>
-GSF_HOST_DEVICE void ellipsoid_axes(const Mat3<T>& map, T* quat, T* scales) {
+GSF_HOST_DEVICE void ellipsoid_axes(const Mat3<T>& map, T share, T* quat, T* scales) {
   using std::abs;
   const Svd3<T> d = svd3(map);
   quat_from_rotation(d.u, quat);
-  const T least = T(kLeastAxis) * abs(d.sigma.x);
+  const T least = share * abs(d.sigma.x);
   for (int k = 0; k < 3; ++k) scales[k] = max(abs(d.sigma[k]), least);
 }
 
@@ -65,10 +66,9 @@ GSF_HOST_DEVICE void covariance_axes(const CovarianceAxesArgs<T>& a, int64_t i) 
     for (int k = 0; k < 3; ++k) scales[k] = T(0);
     return;
   }
-  ellipsoid_axes(c, quat, scales);
   // Of a symmetric matrix the singular values are the eigenvalues, squares of the axes.
-  const T least = T(kLeastAxis) * sqrt(scales[0]);
-  for (int k = 0; k < 3; ++k) scales[k] = max(sqrt(scales[k]), least);
+  ellipsoid_axes(c, T(kLeastAxis * kLeastAxis), quat, scales);
+  for (int k = 0; k < 3; ++k) scales[k] = sqrt(scales[k]);
 }
 
 // A Gaussian that rides: turned by the rotation as it is where the map hardly stretches, else
@@ -87,7 +87,7 @@ GSF_HOST_DEVICE void carry_axes(const CarryAxesArgs<T>& a, int64_t i) {
   for (int r = 0; r < 3; ++r)
     for (int c = 0; c < 3; ++c) root(r, c) *= s[c];
   if (change > a.rigid && finite(root)) {
-    ellipsoid_axes(root, quat, scales);
+    ellipsoid_axes(root, T(kLeastAxis), quat, scales);
     return;
   }
   const Mat3<T> turned = matmul(turn, axes);

@@ -69,8 +69,7 @@ def covariance_axes(covariance: Tensor) -> tuple[Tensor, Tensor]:
         TypeError: A wrong dtype.
         ValueError: A wrong shape.
 
-    Gradient: none (:func:`gsfluent.geometry.covariance_to_quats_scales` has one). One-sided
-    Jacobi (Hestenes 1958).
+    Gradient: none. One-sided Jacobi (Hestenes 1958).
     """
     check_tensor("covariance_axes", "covariance", covariance, shape=("N", 6))
     quats, scales = torch.ops.gsfluent.covariance_axes.default(covariance)
