@@ -84,7 +84,7 @@ GSF_HOST_DEVICE_COLD T search(const Overlap<T>& overlap, const LiftedFactor<T>& 
   }
   for (int g = 0; g < caps + 2; ++g) {
     Vec3<T> y = g < caps ? furthest(kLensRim + g, kLensRim + kLensCaps, caps) : poles[g - caps];
-    const T m = climb(overlap, objective, factor, false, many ? 6 : 3, y);
+    const T m = climb(overlap, objective, factor, false, many ? 4 : 3, y);
     highest = max(highest, m);
     if (g >= caps) poles[g - caps] = y;
     if (m > worth) add_point(points, factor, m, y);

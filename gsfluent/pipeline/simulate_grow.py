@@ -124,10 +124,12 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
         if int(first[name]) < 0:
             group = torch.where(group == name, -2 - int((group == name).nonzero()[0, 0]), group)
     named = torch.where(group >= 0, first[group.clamp(min=0).long()].to(group), -2 - group)
+    unit = state.unit[keep]  # pieces are of one body: their first rows stay with them
     state = state._replace(
         particles=kept(state.particles),
         landed=tuple(state.landed[n] for n in stay),
         group=torch.where(group == -1, group, named),
+        unit=torch.where(unit >= 0, place[unit.clamp(min=0)], unit),
         **{
             key: getattr(state, key)[keep]
             for key in ("position", "peak", "stray", "field", "cut", "asleep", "calm")
@@ -190,6 +192,7 @@ def _joined_state(state: State, matter: Matter, bodies: int, *, landed: bool) ->
     rows = torch.arange(first, matter.particles.count, device=state.position.device)
     new = matter.particles.select(rows)
     brittle = matter.brittle[first:]
+    starts = torch.tensor([a for a, _ in matter.ranges], device=rows.device)
 
     def more(name: str, value: bool | int) -> Tensor:
         old = getattr(state, name)
@@ -206,6 +209,7 @@ def _joined_state(state: State, matter: Matter, bodies: int, *, landed: bool) ->
         group=more("group", -1),
         asleep=more("asleep", False),
         calm=more("calm", 0),
+        unit=torch.cat([state.unit, starts[new.body.long()]]),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,8 @@ MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
 REGROUP = 128
 """Grid steps between two looks for new pieces within a frame."""
+LOOKS = 240.0
+"""Looks for new pieces, and for what may leave the grid, in a simulated second at most."""
 Hook = Callable[[State], State]
 
 
@@ -119,7 +122,11 @@ class Run:
         # A frame is a clean start: what follows does not depend on what was cached before it, so a
         # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
         stepper.reset()
-        state = bounded(self._regroup(state))
+        # With many frames a second not each of them is worth a look.
+        ticks = [math.floor(LOOKS * t + 1e-6) for t in (state.time, until)]
+        if ticks[0] != ticks[1] or until <= state.time:
+            state = self._regroup(state)
+        state = bounded(state)
         watch.keep(state, only=True)
         checked = grouped = state.step
         broken = self._broken(state)

@@ -16,9 +16,9 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.particles import Matter
 
-VERSION = 6
+VERSION = 7
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
-_POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm")
+_POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit")
 _WHOLE = ("impulse", "colliders", "work", "dissipated")
 
 
@@ -51,6 +51,8 @@ class State(NamedTuple):
         calm: Frames in a row during which the point hardly moved, int16 [N].
         dissipated: Kinetic energy of vibration and of creep that went when groups left the grid
             [J], float64 [].
+        unit: What each point hung together with when that was last looked at, int64 [N]: the first
+            row of its body or piece, -1 for powder.
         kicked: How many of the scene's kicks have been given.
     """
 
@@ -70,6 +72,7 @@ class State(NamedTuple):
     asleep: Tensor
     calm: Tensor
     dissipated: Tensor
+    unit: Tensor
     kicked: int = 0
 
     @staticmethod
@@ -95,6 +98,7 @@ class State(NamedTuple):
             asleep=none,
             calm=torch.zeros(p.count, dtype=torch.int16, device=p.device),
             dissipated=zero,
+            unit=torch.tensor([a for a, _ in matter.ranges], device=p.device)[p.body.long()],
         )
 
     def adopting(self, before: State) -> State:

@@ -122,7 +122,6 @@ class Stepper:
             self.flights.append(
                 Flight(points, points.position, self._gravity, 0.0, matter.dx, held=held)
             )
-        self._unit = matter.particles.body.long()
         self.reset()
 
     def reset(self) -> None:
@@ -147,7 +146,7 @@ class Stepper:
         state = self._land(state)[0]
         if not self._standing:
             return state
-        return lay_down(state, self.matter, self.rigid, self._gravity, self._unit)
+        return lay_down(state, self.matter, self.rigid, self._gravity, state.unit)
 
     def regroup(self, state: State, unit: Tensor, frame: float, *, at_frame: bool = True) -> State:
         """Give units fields of their own and let what may leave the grid do so.
@@ -158,7 +157,7 @@ class Stepper:
             frame: Length of a frame [s].
             at_frame: Whether a frame begins here; groups leave only then.
         """
-        self._unit = unit
+        state = state._replace(unit=unit)
         on_grid = grid_mask(state, self.matter)
         state = self._renumber(state, on_grid)
         if not at_frame:
@@ -182,7 +181,7 @@ class Stepper:
         if not self.separate_fragments or not bool(on_grid.any()):
             return state
         field = number_fields(
-            self._unit, state.position, self.matter.particles.mass, on_grid, self.matter.dx,
+            state.unit, state.position, self.matter.particles.mass, on_grid, self.matter.dx,
             self.field_limit, MOST if self._resident_now(state) else FIELDS,
         )  # fmt: skip
         return state if torch.equal(field, state.field) else state._replace(field=field)
@@ -237,8 +236,8 @@ class Stepper:
         if self.blades.speed(state.time) > 0.0:
             return False
         # On powder a cut leaves nothing to hold; what shares a field has to lie on one side.
-        whole = self._unit if self.separate_fragments else state.field
-        held = self._unit >= 0
+        whole = state.unit if self.separate_fragments else state.field
+        held = state.unit >= 0
         return self.blades.splits(whole[held], state.cut[held]).numel() == 0
 
     def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:

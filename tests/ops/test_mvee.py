@@ -83,6 +83,22 @@ def test_affine_equivariance() -> None:
     assert (moved_center - (center @ a.mT + shift)).abs().max() < 1e-2
 
 
+@pytest.mark.parametrize(("dtype", "thin"), [(torch.float32, 3e-2), (torch.float64, 1e-5)])
+def test_nearly_flat_sets_keep_their_smallest_volume(dtype: torch.dtype, thin: float) -> None:
+    generator = torch.Generator().manual_seed(4)
+    turn = rotations(generator, 20)
+    round_set = torch.randn(20, 64, 3, generator=generator, dtype=torch.float64)
+    squeeze = torch.tensor([1.0, thin**0.5, thin], dtype=torch.float64)
+    points = (round_set * squeeze @ turn.mT).to(dtype)
+    center, shape = mvee(points)
+    assert reach(points.double(), center, shape).max() < 1.0 + 1e-5
+    # Volumes go along with the squeeze, so that the truth is that of the set before it.
+    before = (points.double() @ turn) / squeeze
+    want = volume(mvee(before, tolerance=1e-8)[1]) * squeeze.prod()
+    assert (volume(shape) / want).max() < 1.0 + 1e-3
+    assert (volume(shape) / want).min() > 1.0 - 1e-6
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_degenerate_sets_get_their_own_dimension(dtype: torch.dtype) -> None:
     square = torch.tensor([[1, 1, 0], [-1, 1, 0], [1, -1, 0], [-1, -1, 0]], dtype=dtype)

@@ -58,6 +58,25 @@ def test_a_poke_is_the_event_of_a_shot(event) -> None:
     assert simulate.report()["substeps"] == live.report()["substeps"] > 0
 
 
+def test_with_many_frames_a_second_it_still_is_that_event() -> None:
+    # at 600 frames a second not every frame is looked at for new pieces
+    live = LiveSession(standing(), dx=DX, fps=60.0, slow=10.0)
+    live.advance(5 / 600)
+    live.poke(BULLET)
+    live.advance(5 / 600)
+    live.poke(THROW)
+    frames = live.advance(15 / 600)
+    scene = standing()
+    scene.add_event(BULLET | {"at": live.pokes[0]["at"]})
+    scene.add_event(THROW | {"at": live.pokes[1]["at"]})
+    simulate = Simulate(dx=DX, standing=True, loose_crumbs=True)
+    *_, last = simulate(scene, fps=600.0, seconds=26 / 600)
+    assert last.index == live.index == 25
+    assert torch.equal(last.particles.position, frames[-1].positions)
+    assert torch.equal(last.fragments, frames[-1].fragments)
+    assert float(last.stats["damaged_fraction"]) > 0.0
+
+
 def test_the_same_pokes_give_the_same_frames() -> None:
     ends = []
     live = session()
