@@ -156,15 +156,17 @@ class Carry:
             Places now [P, 3] and the map of small vectors there [P, 3, 3].
         """
         assert points.hanging is not None  # follow sees to it
+        links = self.links
+        count = links.near.shape[0]  # points that joined the run later carry nothing
         return ops.carry_place(
             places,
             owner,
-            self.links.near,
+            links.near,
             points.hanging.parted,
-            self.matter.rest,
-            points.position,
-            points.map,
-            BLEND * self.links.spacing,
+            links.rest,
+            points.position[:count],
+            points.map[:count],
+            BLEND * links.spacing,
         )
 
     def cells(self, owners: Tensor, points: Points) -> tuple[Tensor, Tensor, Tensor]:
