@@ -64,6 +64,9 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("polar_clamped(Tensor deformation, float lo, float hi) -> (Tensor, Tensor)");
   m.def("covariance_axes(Tensor covariance) -> (Tensor, Tensor)");
   m.def(
+      "carry_place(Tensor places, Tensor owner, Tensor near, Tensor parted, Tensor rest, "
+      "Tensor position, Tensor map, Tensor width) -> (Tensor, Tensor)");
+  m.def(
       "carry_axes(Tensor quats, Tensor scales, Tensor map, Tensor rotation, float rigid) -> "
       "(Tensor, Tensor)");
 

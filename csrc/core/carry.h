@@ -95,4 +95,36 @@ GSF_HOST_DEVICE void carry_axes(const CarryAxesArgs<T>& a, int64_t i) {
   for (int k = 0; k < 3; ++k) scales[k] = s[k];
 }
 
+// Where a place at rest has gone: with the neighbours of its point that have not parted, each by
+// its own map, by a Gaussian of the distance at rest. A number that is no point moves nothing.
+template <typename T>
+GSF_HOST_DEVICE void carry_place(const CarryPlaceArgs<T>& a, int64_t i) {
+  using std::exp;
+  const T* p = a.places + 3 * i;
+  const int64_t own = a.owner[i];
+  Vec3<T> mean{T(0), T(0), T(0)};
+  Mat3<T> blend{};
+  T total = T(0);
+  if (own >= 0 && own < a.points) {
+    const T narrow = T(-0.5) / (a.width[own] * a.width[own]);
+    for (int k = 0; k < a.near_count; ++k) {
+      const int64_t j = a.near[own * a.near_count + k];
+      if (a.parted[own * a.near_count + k] || j < 0 || j >= a.points) continue;
+      const T* r = a.rest + 3 * j;
+      const Vec3<T> arm{p[0] - r[0], p[1] - r[1], p[2] - r[2]};
+      // Far from all points (a stray) the nearest ones still carry it.
+      const T w = max(exp(narrow * dot(arm, arm)), T(1e-12));
+      const Mat3<T> map = load_mat3(a.map + 9 * j);
+      const T* x = a.position + 3 * j;
+      mean = mean + w * (Vec3<T>{x[0], x[1], x[2]} + matvec(map, arm));
+      for (int c = 0; c < 9; ++c) blend.m[c] += w * map.m[c];
+      total += w;
+    }
+  }
+  const bool moved = total > T(0);
+  const T share = moved ? T(1) / total : T(0);
+  for (int c = 0; c < 3; ++c) a.means[3 * i + c] = moved ? share * mean[c] : p[c];
+  for (int c = 0; c < 9; ++c) a.blend[9 * i + c] = moved ? share * blend.m[c] : T(c % 4 == 0);
+}
+
 }  // namespace gsf

@@ -56,6 +56,22 @@ struct CarryAxesArgs {
 };
 
 template <typename T>
+struct CarryPlaceArgs {
+  int64_t count, points;  // places, material points
+  int near_count;         // K
+  const T* places;        // [count, 3] at rest
+  const int64_t* owner;   // [count] point of each
+  const int64_t* near;    // [points, K] neighbours of a point
+  const bool* parted;     // [points, K]
+  const T* rest;          // [points, 3]
+  const T* position;      // [points, 3]
+  const T* map;           // [points, 9]
+  const T* width;         // [points] of the blend [m]
+  T* means;               // [count, 3]
+  T* blend;               // [count, 9]
+};
+
+template <typename T>
 struct MveeArgs {
   int64_t batch, count;  // fits, points per fit
   const T* points;       // [batch, count, 3]

@@ -25,6 +25,12 @@ struct DeformCpu {
     });
   }
   template <typename T>
+  static void carry_place(const CarryPlaceArgs<T>& a, const Tensor&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::carry_place(a, i);
+    });
+  }
+  template <typename T>
   static void carry_axes(const CarryAxesArgs<T>& a, const Tensor&) {
     parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) gsf::carry_axes(a, i);
@@ -38,5 +44,6 @@ struct DeformCpu {
 STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
   m.impl("polar_clamped", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::polar_clamped));
   m.impl("covariance_axes", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::covariance_axes));
+  m.impl("carry_place", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::carry_place));
   m.impl("carry_axes", TORCH_BOX(&gsf::DeformOps<gsf::DeformCpu>::carry_axes));
 }

@@ -22,6 +22,12 @@ __global__ void covariance_axes_kernel(CovarianceAxesArgs<T> a) {
 }
 
 template <typename T>
+__global__ void carry_place_kernel(CarryPlaceArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::carry_place(a, i);
+}
+
+template <typename T>
 __global__ void carry_axes_kernel(CarryAxesArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i < a.count) gsf::carry_axes(a, i);
@@ -47,6 +53,10 @@ cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stre
   return launch(args, stream, covariance_axes_kernel<T>);
 }
 template <typename T>
+cudaError_t carry_place(const CarryPlaceArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, carry_place_kernel<T>);
+}
+template <typename T>
 cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, carry_axes_kernel<T>);
 }
@@ -55,6 +65,8 @@ template cudaError_t polar(const PolarArgs<float>&, cudaStream_t);
 template cudaError_t polar(const PolarArgs<double>&, cudaStream_t);
 template cudaError_t covariance_axes(const CovarianceAxesArgs<float>&, cudaStream_t);
 template cudaError_t covariance_axes(const CovarianceAxesArgs<double>&, cudaStream_t);
+template cudaError_t carry_place(const CarryPlaceArgs<float>&, cudaStream_t);
+template cudaError_t carry_place(const CarryPlaceArgs<double>&, cudaStream_t);
 template cudaError_t carry_axes(const CarryAxesArgs<float>&, cudaStream_t);
 template cudaError_t carry_axes(const CarryAxesArgs<double>&, cudaStream_t);
 

@@ -14,6 +14,9 @@ template <typename T>
 cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stream);
 
 template <typename T>
+cudaError_t carry_place(const CarryPlaceArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
 cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream);
 
 template <typename T>

@@ -40,6 +40,50 @@ struct DeformOps {
     return {quats, scales};
   }
 
+  static std::tuple<Tensor, Tensor> carry_place(Tensor places, Tensor owner, Tensor near,
+                                                Tensor parted, Tensor rest, Tensor position,
+                                                Tensor map, Tensor width) {
+    const char* op = "carry_place";
+    check_shape(op, "places", places, {-1, 3});
+    check_shape(op, "rest", rest, {-1, 3});
+    check_shape(op, "near", near, {rest.size(0), -1});
+    const int64_t count = places.size(0), points = rest.size(0), k = near.size(1);
+    check_shape(op, "owner", owner, {count});
+    check_shape(op, "parted", parted, {points, k});
+    check_shape(op, "position", position, {points, 3});
+    check_shape(op, "map", map, {points, 3, 3});
+    check_shape(op, "width", width, {points});
+    check_dtype(op, "owner", owner, ScalarType::Long);
+    check_dtype(op, "near", near, ScalarType::Long);
+    check_dtype(op, "parted", parted, ScalarType::Bool);
+    for (Tensor* t : {&rest, &position, &map, &width})
+      check_dtype(op, "every float tensor", *t, places.scalar_type());
+    for (Tensor* t : {&places, &owner, &near, &parted, &rest, &position, &map, &width}) {
+      check_same_device(op, "every tensor", *t, places);
+      *t = gsf::contiguous(*t);
+    }
+    Tensor means = gsf::new_empty(places, {count, 3}, places.scalar_type());
+    Tensor blend = gsf::new_empty(places, {count, 3, 3}, places.scalar_type());
+    dispatch_floating(op, places, [&]<typename T>() {
+      if (count == 0) return;
+      const CarryPlaceArgs<T> args{count,
+                                   points,
+                                   static_cast<int>(k),
+                                   cptr<T>(places),
+                                   cptr<int64_t>(owner),
+                                   cptr<int64_t>(near),
+                                   cptr<bool>(parted),
+                                   cptr<T>(rest),
+                                   cptr<T>(position),
+                                   cptr<T>(map),
+                                   cptr<T>(width),
+                                   mptr<T>(means),
+                                   mptr<T>(blend)};
+      Backend::carry_place(args, places);
+    });
+    return {means, blend};
+  }
+
   static std::tuple<Tensor, Tensor> carry_axes(Tensor quats, Tensor scales, Tensor map,
                                                Tensor rotation, double rigid) {
     const char* op = "carry_axes";

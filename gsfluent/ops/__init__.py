@@ -35,6 +35,7 @@ _PUBLIC: dict[str, str] = {
     "polar_clamped": "gsfluent.ops.deform",
     "covariance_axes": "gsfluent.ops.deform",
     "carry_axes": "gsfluent.ops.deform",
+    "carry_place": "gsfluent.ops.deform",
     "mvee": "gsfluent.ops.mvee",
     "mvee_lens": "gsfluent.ops.mvee",
     "Rendered": "gsfluent.ops.raster",

@@ -116,6 +116,62 @@ def carry_axes(
     return new_quats, new_scales
 
 
+def carry_place(
+    places: Tensor,
+    owner: Tensor,
+    near: Tensor,
+    parted: Tensor,
+    rest: Tensor,
+    position: Tensor,
+    map: Tensor,
+    width: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Where places at rest have gone with the material points around them.
+
+    ``m = sum_k w_k (x_k + A_k (m0 - X_k))`` over the neighbours of a place's own point that have
+    not parted from it, ``w_k ~ exp(-|m0 - X_k|^2 / 2 width^2)``, at least 1e-12, sum one; the map
+    there is ``sum_k w_k A_k``.
+
+    Args:
+        places: m0 [m], shape [P, 3], float32 or float64.
+        owner: Own point of each, int64 [P].
+        near: Neighbours of every point, itself among them, int64 [N, K].
+        parted: Which of them have parted from it, bool [N, K].
+        rest: Points X at rest [m], [N, 3].
+        position: Points x now [m], [N, 3].
+        map: What each point does to small vectors, A, [N, 3, 3].
+        width: Width of the blend at each point [m], [N].
+
+    Returns:
+        Places now [P, 3] and maps [P, 3, 3]. A place without any neighbour stays where it was.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong.
+
+    Gradient: none.
+    """
+    op = "carry_place"
+    check_tensor(op, "places", places, shape=("P", 3))
+    check_tensor(op, "rest", rest, shape=("N", 3), like=places)
+    n, count = rest.shape[0], places.shape[0]
+    check_tensor(op, "owner", owner, shape=(count,), dtype=torch.int64, like=places)
+    check_tensor(op, "near", near, shape=(n, "K"), dtype=torch.int64, like=places)
+    check_tensor(op, "parted", parted, shape=(n, near.shape[1]), dtype=torch.bool, like=places)
+    check_tensor(op, "position", position, shape=(n, 3), like=places)
+    check_tensor(op, "map", map, shape=(n, 3, 3), like=places)
+    check_tensor(op, "width", width, shape=(n,), like=places)
+    means, blend = torch.ops.gsfluent.carry_place.default(
+        places, owner, near, parted, rest, position, map, width
+    )
+    return means, blend
+
+
+@torch.library.register_fake("gsfluent::carry_place")
+def _carry_place_fake(places: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+    return places.new_empty(places.shape), places.new_empty((places.shape[0], 3, 3))
+
+
 @torch.library.register_fake("gsfluent::covariance_axes")
 def _covariance_axes_fake(covariance: Tensor) -> tuple[Tensor, Tensor]:
     n = covariance.shape[0]
@@ -133,5 +189,6 @@ def _axes_no_gradient(ctx: torch.autograd.function.FunctionCtx, *grads: Tensor) 
     raise NotImplementedError("axes of Gaussians: no gradient")
 
 
+torch.library.register_autograd("gsfluent::carry_place", _axes_no_gradient)
 torch.library.register_autograd("gsfluent::covariance_axes", _axes_no_gradient)
 torch.library.register_autograd("gsfluent::carry_axes", _axes_no_gradient)

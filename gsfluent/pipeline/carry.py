@@ -28,8 +28,6 @@ STRETCH = (0.6, 1.5)
 """Bounds of the stretch that splats show."""
 RIGID = 1e-3
 """Splats that are stretched by less than this keep their shape exactly."""
-CHUNK = 100_000
-"""Splats that are moved at once; bounds the memory of a frame."""
 BLEND = 0.6
 """Width of the blend of neighbouring points, in point spacings."""
 
@@ -157,28 +155,19 @@ class Carry:
         Returns:
             Places now [P, 3] and the map of small vectors there [P, 3, 3].
         """
-        if places.shape[0] == 0:
-            return places, places.new_zeros(0, 3, 3)
-        parts = [
-            self._place(places[rows], owner[rows], points)
-            for rows in torch.arange(places.shape[0], device=places.device).split(CHUNK)
-        ]
-        return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
-
-    def _place(self, places: Tensor, owner: Tensor, points: Points) -> tuple[Tensor, Tensor]:
         assert points.hanging is not None  # follow sees to it
-        index = self.links.near[owner]
-        arm = places[:, None] - self.matter.rest[index]
-        width = BLEND * self.links.spacing[owner, None]
-        weight = torch.exp(-0.5 * arm.square().sum(dim=2) / width.square())
-        # far from all points (a stray splat) the nearest one still carries it
-        weight = weight.clamp(min=1e-12) * ~points.hanging.parted[owner]
-        weight = weight / weight.sum(dim=1, keepdim=True)
-        local = points.map[index]
-        # sums of products: batches of tiny matrix products are slow
-        moved = points.position[index] + (local * arm[:, :, None]).sum(dim=3)
-        means = (weight[..., None] * moved).sum(dim=1)
-        return means, (weight[..., None, None] * local).sum(dim=1)
+        links = self.links
+        count = links.near.shape[0]  # points that joined the run later carry nothing
+        return ops.carry_place(
+            places,
+            owner,
+            links.near,
+            points.hanging.parted,
+            links.rest,
+            points.position[:count],
+            points.map[:count],
+            BLEND * links.spacing,
+        )
 
     def cells(self, owners: Tensor, points: Points) -> tuple[Tensor, Tensor, Tensor]:
         """How the matter around some points moves, to first order.

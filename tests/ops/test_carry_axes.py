@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import geometry
-from gsfluent.ops import carry_axes, covariance_axes, polar_clamped
+from gsfluent.ops import carry_axes, carry_place, covariance_axes, polar_clamped
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 DTYPES = [(torch.float32, 2e-5), (torch.float64, 1e-12)]
@@ -86,3 +86,72 @@ def test_errors_and_registration() -> None:
     torch.library.opcheck(torch.ops.gsfluent.carry_axes.default, arguments, test_utils=names)
     packed = geometry.covariance(quats, scales)
     torch.library.opcheck(torch.ops.gsfluent.covariance_axes.default, (packed,), test_utils=names)
+
+
+def flock() -> dict[str, Tensor]:
+    """Points with neighbours, some parted, and places beside them; float64."""
+    generator = torch.Generator().manual_seed(4)
+    rest = rand(60, 3, seed=5)
+    distance = torch.cdist(rest, rest)
+    near = distance.argsort(dim=1)[:, :7]
+    parted = torch.rand(60, 7, generator=generator) < 0.3
+    parted[:, 0] = False
+    owner = torch.randint(0, 60, (300,), generator=generator)
+    return {
+        "places": rest[owner] + 0.2 * rand(300, 3, seed=6),
+        "owner": owner,
+        "near": near,
+        "parted": parted,
+        "rest": rest,
+        "position": rest + rand(60, 3, seed=7),
+        "map": torch.eye(3, dtype=torch.float64) + 0.2 * rand(60, 3, 3, seed=8),
+        "width": 0.3 + 0.1 * rand(60, seed=9).abs(),
+    }
+
+
+def send(inputs: dict[str, Tensor], device: str, dtype: torch.dtype) -> dict[str, Tensor]:
+    return {
+        name: value.to(device, dtype) if value.is_floating_point() else value.to(device)
+        for name, value in inputs.items()
+    }
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("dtype", "bar"), DTYPES)
+def test_places_go_with_what_they_hang_together_with(
+    device: str, dtype: torch.dtype, bar: float
+) -> None:
+    a = flock()
+    index = a["near"][a["owner"]]
+    arm = a["places"][:, None] - a["rest"][index]
+    weight = torch.exp(-0.5 * arm.square().sum(2) / a["width"][a["owner"], None].square())
+    weight = weight.clamp(min=1e-12) * ~a["parted"][a["owner"]]
+    weight = weight / weight.sum(1, keepdim=True)
+    moved = a["position"][index] + (a["map"][index] @ arm[..., None])[..., 0]
+    means, blend = carry_place(**send(a, device, dtype))
+    assert (means.cpu().double() - (weight[..., None] * moved).sum(1)).abs().max() < 10 * bar
+    want = (weight[..., None, None] * a["map"][index]).sum(1)
+    assert (blend.cpu().double() - want).abs().max() < 10 * bar
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_places_without_a_point_stay(device: str) -> None:
+    a = send(flock(), device, torch.float32)
+    a["owner"][:3] = torch.tensor([-1, 60, 2**40])
+    a["near"][5] = -7
+    a["parted"][6] = True
+    a["owner"][3:5] = torch.tensor([5, 6])
+    means, blend = carry_place(**a)
+    assert torch.equal(means[:5], a["places"][:5])
+    assert torch.equal(blend[:5].cpu(), torch.eye(3).repeat(5, 1, 1))
+    none = {**a, "places": a["places"][:0], "owner": a["owner"][:0]}
+    assert carry_place(**none)[0].shape == (0, 3)
+    with pytest.raises(ValueError, match="parted must have shape"):
+        carry_place(**{**a, "parted": a["parted"][:, :3]})
+    with pytest.raises(TypeError, match="owner"):
+        carry_place(**{**a, "owner": a["owner"].int()})
+    torch.library.opcheck(
+        torch.ops.gsfluent.carry_place.default,
+        tuple(a.values()),
+        test_utils=("test_schema", "test_faketensor"),
+    )
