@@ -191,7 +191,9 @@ def main() -> None:
     )
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--points", type=int, nargs="+", default=[30_000, 100_000, 300_000])
-    parser.add_argument("--slow", type=float, nargs="+", default=[4.0, 20.0, 50.0], help="slow motions")
+    parser.add_argument(
+        "--slow", type=float, nargs="+", default=[4.0, 20.0, 50.0], help="slow motions"
+    )
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--out", type=Path, help="JSON file")
     parser.add_argument("--profile", type=int, help="profile a scene of so many points, too")
