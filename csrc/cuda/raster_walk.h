@@ -202,9 +202,9 @@ cudaError_t with_variant(int features, bool flag, const F& f) {
     return flag ? f.template operator()<kF, true>() : f.template operator()<kF, false>();
   };
   if constexpr (sizeof(T) == sizeof(float)) {
-    if (features <= 3) return choose.template operator()<3>();  // rgb
-    if (features == 4) return choose.template operator()<4>();  // rgb, depth
-    if (features <= 8) return choose.template operator()<8>();  // rgb, normal, depth
+    if (features <= 3) return choose.template operator()<3>();    // rgb
+    if (features == 4) return choose.template operator()<4>();    // rgb, depth
+    if (features <= 8) return choose.template operator()<8>();    // rgb, normal, depth
     if (features <= 12) return choose.template operator()<12>();  // and what light asks of a splat
   }
   return choose.template operator()<kMaxFeatures>();
