@@ -16,13 +16,12 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.ops.density import LEVELS
 
 # Splats per cell of the matter's inside, and the share of it from which a place is full; below one,
 # because counts scatter.
 PER_CELL = 3.0
 FULL = 0.8
-LEVELS = 5
-"""Levels of the pyramid: each has cells twice as wide as the one before."""
 COARSEST = 2 ** (LEVELS - 1)
 """Cells of the coarsest level, in finest cells."""
 # Ambient occlusion: levels of the pyramid that each cone steps through, how far out in cells of

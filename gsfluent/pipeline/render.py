@@ -50,13 +50,21 @@ class Layers:
         image: Finished picture, display values, shape [H, W, 3].
         alpha: Opacity of the splats, shape [H, W].
         depth: Expected depth of the splats [m], 0 where there is none, shape [H, W].
-        normal: Unit normals of the splats, zero where there is none, shape [H, W, 3].
+        blended: Blended normals of the splats and what stands beside them, [H, W, K]; None when
+            nothing was lit.
     """
 
     image: Tensor
     alpha: Tensor
     depth: Tensor
-    normal: Tensor
+    blended: Tensor | None
+
+    @property
+    def normal(self) -> Tensor:
+        """Unit normals of the splats, zero where there is none, shape [H, W, 3]."""
+        if self.blended is None:
+            return torch.zeros_like(self.image)
+        return normalize(self.blended[..., :3], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -182,10 +190,9 @@ class Render(Stage):
             groups=groups,
         )
         assert seen.depth is not None  # asked for
-        front, normal = seen.image, torch.zeros_like(seen.image)
+        front = seen.image
         behind = _constant(self.background, means.dtype, means.device)
         if lit is not None and lighting is not None and seen.normal is not None:
-            normal = normalize(seen.normal[..., :3], dim=-1)
             vectors, gloss = _gloss(lighting, seen.normal, seen.alpha)
             whole = self.backdrop is None  # object, floor and backdrop at once
             front = self._shaded(
@@ -200,9 +207,9 @@ class Render(Stage):
                 whole,
             )
             if whole:
-                return Layers(front, seen.alpha, seen.depth, normal)
+                return Layers(front, seen.alpha, seen.depth, seen.normal)
         image = self._over_backdrop(front, behind, seen, (viewmat, intrinsics), camera, lit)
-        return Layers(image.clamp(0.0, 1.0), seen.alpha, seen.depth, normal)
+        return Layers(image.clamp(0.0, 1.0), seen.alpha, seen.depth, seen.normal)
 
     def _shaded(
         self,

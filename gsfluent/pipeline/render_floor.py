@@ -1,7 +1,7 @@
 """The studio behind the splats: an analytic floor that takes shadows, and a neutral backdrop.
 
 A ground plane needs no Gaussians: each pixel's ray meets ``z = height`` in closed form
-(:func:`gsfluent.pipeline.shade.shade_studio`), so the floor is sharp at any size, never punches
+(in :func:`gsfluent.ops.shade`), so the floor is sharp at any size, never punches
 through the object, and costs one pass over the pixels. Far away it dissolves into the backdrop,
 whose grey rises with the ray, so that no horizon line cuts the picture.
 """

@@ -59,15 +59,21 @@ def view_run(
             picture = app.maker.picture(app.index, camera, app.look)
             save_image(torch.from_numpy(picture).float() / 255.0, target)
             return result | {"output": str(target), "frame": app.index}
+        stay(app, browser=browser)
+    finally:
+        app.close()
+    return result
+
+
+def stay(app: App, *, browser: bool) -> None:
+    """Say the address, open a browser where one could show, and serve until Ctrl-C."""
+    try:
         _log.info("viewer: %s (Ctrl-C ends)", app.url)
         if browser and has_desktop():
             webbrowser.open(app.url)
         app.wait()
     except KeyboardInterrupt:
         _log.info("viewer: ended")
-    finally:
-        app.close()
-    return result
 
 
 def has_desktop() -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import webbrowser
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from gsfluent.pipeline.live_scene import open_stage
 from gsfluent.viewer.app import App
 from gsfluent.viewer.live_source import LiveSource
 from gsfluent.viewer.poke import PokePanel
-from gsfluent.viewer.serve import has_desktop
+from gsfluent.viewer.serve import stay
 
 _log = logging.getLogger(__name__)
 
@@ -73,12 +72,7 @@ def view_live(
     player.start()
     panel.start()
     try:
-        _log.info("viewer: %s (Ctrl-C ends)", app.url)
-        if browser and has_desktop():
-            webbrowser.open(app.url)
-        app.wait()
-    except KeyboardInterrupt:
-        _log.info("viewer: ended")
+        stay(app, browser=browser)
     finally:
         panel.close()
         player.close()
