@@ -1,0 +1,140 @@
+"""What a simulator hands in: where the points of a scene were at the times that it asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .scene import Floats, Scene, SceneError
+
+__all__ = ["Measure", "Run"]
+
+_OPTIONAL = ("damage", "stress", "impulse")
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """One figure of a run beside its reference.
+
+    Attributes:
+        quantity: What was measured.
+        value: The figure.
+        reference: What it should be.
+        error: Distance of the two in the measure of ``tolerance``.
+        tolerance: Largest accepted error.
+        unit: Of ``value`` and ``reference``.
+        source: Where the reference comes from.
+    """
+
+    quantity: str
+    value: float
+    reference: float
+    error: float
+    tolerance: float
+    unit: str = ""
+    source: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is a number within the tolerance."""
+        return bool(np.isfinite(self.error) and self.error <= self.tolerance)
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A simulator's answer to a :class:`~gsfluent.fracturebench.scene.Scene`.
+
+    Attributes:
+        scene: Name of the case.
+        method: Who computed it, such as ``gsfluent`` or ``physgaussian``.
+        times: Times [s], those of the scene, [T].
+        x: Positions [m], [T, N, 3]; a run that broke off leaves NaN from there on.
+        v: Velocities [m/s], [T, N, 3].
+        wall_seconds: Time the steps took, without set-up, compilation and copying out [s].
+        steps: Steps taken.
+        settings: What was chosen: ``dx``, ``dt`` or ``cfl``, precision, ... plain values.
+        device: On what.
+        failed: Why it broke off, or empty.
+        damage: 0 intact to 1 broken, [T, N], if the method knows.
+        stress: Cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept.
+        impulse: Given by each collider or drive so far [N s], [T, K, 3], if kept.
+    """
+
+    scene: str
+    method: str
+    times: Floats
+    x: Floats
+    v: Floats
+    wall_seconds: float
+    steps: int
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    device: str = ""
+    failed: str = ""
+    damage: Floats | None = None
+    stress: Floats | None = None
+    impulse: Floats | None = None
+
+    @property
+    def finite(self) -> bool:
+        """Whether it went through: no reason to break off, and only numbers."""
+        return not self.failed and bool(np.isfinite(self.x).all() and np.isfinite(self.v).all())
+
+    def matched(self, scene: Scene) -> Run:
+        """Return itself if it answers this scene.
+
+        Raises:
+            SceneError: Another case, other times or another number of points.
+        """
+        if self.scene != scene.name:
+            raise SceneError(f"a run of {self.scene!r} cannot be judged as {scene.name!r}")
+        shape = (scene.times.shape[0], scene.count, 3)
+        for name in ("x", "v"):
+            value = getattr(self, name)
+            if value.shape != shape:
+                raise SceneError(
+                    f"{self.method}, {scene.name}: {name} has shape {value.shape}, the scene asks "
+                    f"for {shape} (times, points, 3)"
+                )
+        if not np.allclose(self.times, scene.times, rtol=1e-6, atol=0.0):
+            raise SceneError(f"{self.method}, {scene.name}: other times than the scene asks for")
+        return self
+
+    def save(self, path: str | Path) -> Path:
+        """Write an ``.npz``, under a temporary name until it is whole."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(path.name + ".tmp")
+        arrays: dict[str, Any] = {"times": self.times, "x": self.x, "v": self.v}
+        arrays |= {k: getattr(self, k) for k in _OPTIONAL if getattr(self, k) is not None}
+        plain = {
+            k: getattr(self, k)
+            for k in ("scene", "method", "wall_seconds", "steps", "settings", "device", "failed")
+        }
+        with temporary.open("wb") as file:
+            np.savez(file, header=np.array(json.dumps(plain)), **arrays)
+        return temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Run:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            SceneError: The file is not such a file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                header = json.loads(str(data["header"]))
+                arrays: dict[str, Any] = {
+                    k: np.asarray(data[k], dtype=np.float64) for k in ("times", "x", "v")
+                }
+                more: dict[str, Any] = {
+                    k: np.asarray(data[k], np.float64) for k in _OPTIONAL if k in data
+                }
+            return cls(**header, **arrays, **more)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise SceneError(f"{path}: not a run of FractureBench ({error})") from error

@@ -1,0 +1,147 @@
+"""What a simulator is given: points, materials, walls, drives and the times to answer for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FORMAT", "Scene", "SceneError"]
+
+FORMAT = 1
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+_ARRAYS = ("x", "v", "volume", "material", "body", "affine", "times")
+
+
+class SceneError(ValueError):
+    """A scene or a run that is not what it should be; the message says what, where and the mend."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """One problem at one resolution, in SI units.
+
+    Attributes:
+        name: Case it belongs to (:mod:`gsfluent.fracturebench.registry`).
+        dx: Node spacing it was made for [m].
+        x: Positions [m], float64 [N, 3].
+        v: Velocities [m/s], float64 [N, 3].
+        volume: Volume of each point at rest [m^3], [N].
+        material: Row of ``materials`` of each point, int32 [N].
+        body: Body of each point, int32 [N]; points of different bodies are not glued together.
+        affine: Velocity gradients at the start [1/s], [N, 3, 3]: APIC's C. A method without them
+            leaves them out.
+        times: When positions and velocities are asked for [s], rising, [T].
+        materials: ``law`` (``elastic`` or ``nacc``), ``young_modulus`` [Pa], ``poisson_ratio``,
+            ``density`` [kg/m^3]; for ``nacc`` also ``friction``, ``cohesion``, ``hardening`` and
+            ``alpha`` (at the start).
+        gravity: [m/s^2].
+        colliders: Planes: ``{"point", "normal", "kind": "sticky" | "slip" | "separate",
+            "friction"}``.
+        drives: Groups of points whose velocity is prescribed, in place of what the method would
+            give them: ``{"points": [indices], "velocity": [vx, vy, vz], "start": s, "end": s}``.
+            Other keys (a load that depends on time or place) are described by the case.
+        friction: Coulomb coefficient between bodies.
+        facts: Numbers that the judge needs and a simulator does not.
+    """
+
+    name: str
+    dx: float
+    x: Floats
+    v: Floats
+    volume: Floats
+    material: Ints
+    body: Ints
+    affine: Floats
+    times: Floats
+    materials: tuple[Mapping[str, Any], ...]
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    colliders: tuple[Mapping[str, Any], ...] = ()
+    drives: tuple[Mapping[str, Any], ...] = ()
+    friction: float = 0.0
+    facts: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, t = self.x.shape[0], self.times.shape[0]
+        shapes = {
+            "x": (n, 3), "v": (n, 3), "volume": (n,), "material": (n,), "body": (n,),
+            "affine": (n, 3, 3), "times": (t,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value.shape != shape:
+                raise SceneError(f"{self.name}: {name} has shape {value.shape}, expected {shape}")
+            if not np.isfinite(value).all():
+                raise SceneError(f"{self.name}: {name} holds numbers that are not finite")
+        if n == 0 or t == 0 or self.times[0] < 0.0 or (np.diff(self.times) <= 0.0).any():
+            raise SceneError(f"{self.name}: needs points and rising times")
+        if self.material.min() < 0 or self.material.max() >= len(self.materials):
+            raise SceneError(f"{self.name}: material must be 0 to {len(self.materials) - 1}")
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return self.x.shape[0]
+
+    @property
+    def mass(self) -> Floats:
+        """Mass of each point [kg], [N]."""
+        density = np.array([float(m["density"]) for m in self.materials])
+        return density[self.material] * self.volume
+
+    @property
+    def wave_speed(self) -> float:
+        """Fastest pressure wave [m/s]."""
+
+        def speed(row: Mapping[str, Any]) -> float:
+            young, nu = float(row["young_modulus"]), float(row["poisson_ratio"])
+            modulus = young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+            return float(np.sqrt(modulus / float(row["density"])))
+
+        return max(speed(row) for row in self.materials)
+
+    @property
+    def seconds(self) -> float:
+        """Simulated time [s]."""
+        return float(self.times[-1])
+
+    def header(self) -> dict[str, Any]:
+        """Everything but the arrays, as plain values: what the YAML file beside them says."""
+        arrays = set(_ARRAYS)
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {"format": FORMAT} | {k: v for k, v in plain.items() if k not in arrays}
+
+    def save(self, path: str | Path) -> Path:
+        """Write an ``.npz`` that holds all of it, under a temporary name until it is whole."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(path.name + ".tmp")
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        with temporary.open("wb") as file:
+            np.savez(file, header=np.array(json.dumps(self.header())), **arrays)
+        return temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            SceneError: The file is not such a file, or of another format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                header = json.loads(str(data["header"]))
+                arrays = {name: data[name] for name in _ARRAYS}
+        except (OSError, ValueError, KeyError) as error:
+            raise SceneError(f"{path}: not a scene of FractureBench ({error})") from error
+        if header.pop("format", None) != FORMAT:
+            raise SceneError(f"{path}: not of format {FORMAT}; make the scenes again")
+        for key in ("materials", "colliders", "drives", "gravity"):
+            header[key] = tuple(header[key])
+        return cls(**header, **arrays)
