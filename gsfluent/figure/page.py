@@ -164,4 +164,5 @@ def _class(kind: str) -> str:
 
 def _cell(value: object) -> str:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return f"<td{' class="number"' if number else ''}>{html.escape(shown(value))}</td>"
+    kind = ' class="number"' if number else ""
+    return f"<td{kind}>{html.escape(shown(value))}</td>"

@@ -23,7 +23,7 @@ FAILED = "#b00020"
 INK = "#222222"
 GRID = "#dddddd"
 
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {  # Any: matplotlib types its keys one by one
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
     "font.size": 9.0,
     "axes.edgecolor": INK,
