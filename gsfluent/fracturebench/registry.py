@@ -14,6 +14,7 @@ __all__ = ["Case", "case", "cases", "find", "judge"]
 MODULES = (
     "contact",
     "elastic",
+    "flow",
 )
 """Modules of this package that register cases."""
 
