@@ -7,11 +7,16 @@ from collections.abc import Callable, Iterable, Sequence
 
 from gsfluent.charts.record import Record
 
-__all__ = ["NO_ANSWER", "Verdict", "Versus", "cases", "compare", "front", "methods", "verdict"]
+__all__ = [
+    "NO_ANSWER", "ROUND_OFF", "Verdict", "Versus", "cases", "compare", "counted", "front",
+    "methods", "verdict",
+]  # fmt: skip
 
 NO_ANSWER = 1.0
 """Errors of the cases are relative: at 1 a run knows as much as one that says nothing, and such a
 level is not reached."""
+ROUND_OFF = 1e-6
+"""Errors below this are what rounding leaves of an exact answer, and count as equal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +94,11 @@ def methods(records: Iterable[Record], ours: str = "gsfluent") -> list[str]:
     return [m for m in (ours,) if m in found] + [m for m in found if m != ours]
 
 
+def counted(record: Record) -> float:
+    """A run's error as it counts: at least :data:`ROUND_OFF`."""
+    return max(record.error, ROUND_OFF)
+
+
 def front(
     records: Iterable[Record], cost: Callable[[Record], float] = lambda r: r.wall_per_simulated
 ) -> list[Record]:
@@ -98,15 +108,15 @@ def front(
     """
     good = [r for r in records if r.ok and r.error < NO_ANSWER]
     kept: list[Record] = []
-    for record in sorted(good, key=lambda r: (cost(r), r.error)):
-        if not kept or record.error < kept[-1].error:
+    for record in sorted(good, key=lambda r: (cost(r), counted(r))):
+        if not kept or counted(record) < counted(kept[-1]):
             kept.append(record)
     return kept
 
 
 def cheapest(records: Iterable[Record], error: float) -> Record | None:
     """The cheapest run of at most this error, or None."""
-    good = [r for r in records if r.ok and r.error <= error]
+    good = [r for r in records if r.ok and counted(r) <= max(error, ROUND_OFF)]
     return min(good, key=lambda r: r.wall_per_simulated, default=None)
 
 

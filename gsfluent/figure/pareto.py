@@ -143,10 +143,12 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_title(panel.title)
-    low = min((d.error for d in seen), default=1e-3) / 2.0
-    high = max((d.error for d in seen), default=1e-1) * 2.5
+    low = min((d.error for d in seen), default=1e-3) / 2.5
+    high = max((d.error for d in seen), default=1e-1) * 2.0
+    middle = math.sqrt(low * high)  # at least a decade and a half, so that ticks have names
+    low, high = min(low, middle / 5.6), max(high, middle * 5.6)
     costs = [d.cost for d in panel.dots if _finite(d.cost)] or [1.0]
-    left, right = min(costs) / 2.2, max(costs) * 2.2
+    left, right = min(costs) / 3.0, max(costs) * 2.0
     top = high * (high / low) ** 0.09
     ax.set_xlim(left, right)
     ax.set_ylim(low, top)
@@ -181,9 +183,7 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
 
 def _iso(ax: Axes, left: float, right: float, low: float, high: float) -> None:
     """Lines on which time times error is the same."""
-    for power in range(
-        math.floor(math.log10(left * low)), math.ceil(math.log10(right * high)) + 1
-    ):
+    for power in range(math.floor(math.log10(left * low)), math.ceil(math.log10(right * high)) + 1):
         product = 10.0**power
         ax.plot([left, right], [product / left, product / right], "--", lw=0.5, color="#c9c9c9",
                 zorder=1)  # fmt: skip

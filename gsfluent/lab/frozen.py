@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -64,6 +65,7 @@ def play(
     engine: Literal["solver", "ops"] | None = None,
     fields: bool = True,
     method: str = "gsfluent",
+    watch: Callable[[World, int], None] | None = None,
     **options: Any,
 ) -> Run:
     """Run a scene by gsfluent's solver.
@@ -77,6 +79,7 @@ def play(
         engine: As in :class:`gsfluent.lab.driver.World`.
         fields: A velocity field per body; False puts all into one.
         method: Name in the record.
+        watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
         **options: Further arguments of World (``k``, ``epsilon``, ``implicit``, ...).
 
     Returns:
@@ -111,6 +114,8 @@ def play(
             torch.cuda.synchronize()
         wall += time.perf_counter() - start
         x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
+        if watch is not None:
+            watch(world, i)
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         "engine": world.engine, "fields": several, **options,
