@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -65,6 +66,7 @@ def play(
     engine: Literal["solver", "ops"] | None = None,
     fields: bool = True,
     method: str = "gsfluent",
+    watch: Callable[[World, int], None] | None = None,
     **options: Any,
 ) -> Run:
     """Run a scene by gsfluent's solver.
@@ -78,6 +80,7 @@ def play(
         engine: As in :class:`gsfluent.lab.driver.World`.
         fields: A velocity field per body; False puts all into one.
         method: Name in the record.
+        watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
         **options: Further arguments of World (``k``, ``epsilon``, ``implicit``, ...).
 
     Returns:
@@ -95,7 +98,8 @@ def play(
         body=torch.from_numpy(scene.body) if several else None,
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
-        deformation="deformation" in scene.asks, **options,
+        deformation=bool(options.pop("deformation", False)) or "deformation" in scene.asks,
+        **options,
     )  # fmt: skip
     shape = (scene.times.shape[0], scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
@@ -115,6 +119,8 @@ def play(
         x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
         if turned is not None and world.deformation is not None:
             turned[i] = world.deformation.double().cpu().numpy()
+        if watch is not None:
+            watch(world, i)
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         "engine": world.engine, "fields": several, **options,
