@@ -12,6 +12,7 @@ import torch
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.driver import World
+from gsfluent.lab.frozen_fracture import damage, drive
 from gsfluent.lab.shapes import parameters
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
@@ -94,10 +95,15 @@ def play(
         body=torch.from_numpy(scene.body) if several else None,
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
-        **options,
+        force=drive(scene, dtype, device), **options,
     )  # fmt: skip
     shape = (scene.times.shape[0], scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
+    more: dict[str, np.ndarray] = {}
+    if bool((alpha < 0.0).any()):  # something can break
+        more = {"damage": np.full(shape[:2], math.nan), "stress": np.full((*shape[:2], 6), math.nan)}
+    if scene.colliders:
+        more["impulse"] = np.full((shape[0], len(scene.colliders), 3), math.nan)
     wall, failed = 0.0, ""
     cuda = torch.device(device).type == "cuda"
     for i, end in enumerate(scene.times):
@@ -111,10 +117,14 @@ def play(
             torch.cuda.synchronize()
         wall += time.perf_counter() - start
         x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
+        for name, value in more.items():
+            given = damage(world, alpha) if name == "damage" else getattr(world, name)
+            value[i] = given.double().cpu().numpy()
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         "engine": world.engine, "fields": several, **options,
     }  # fmt: skip
     return Run(
-        scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed
-    )
+        scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed,
+        **more,
+    )  # fmt: skip
