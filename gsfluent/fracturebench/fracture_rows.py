@@ -2,7 +2,8 @@
 
 A row of law ``nacc`` is that of non-associative Cam-Clay (Wolper et al. 2019, CD-MPM) with an
 elliptic yield surface in pressure p (positive in compression) and shear stress q:
-``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0`` with ``p0 = kappa sinh(xi max(-alpha, 0))``.
+``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0`` with ``p0 = kappa sinh(xi max(-alpha, 0))``, at
+most 0.495 kappa.
 
 ================== =================================================================================
 ``friction``       M, slope of the critical state line
@@ -33,11 +34,25 @@ import numpy as np
 
 from .run import Run
 from .scene import Floats, Ints, Scene, SceneError
+from .shapes import elastic
 
-__all__ = ["brittle", "damage_of", "elastic", "levels", "moduli", "scattered", "shape_noise", "wave"]
+__all__ = [
+    "BAND_CELLS",
+    "BROKEN",
+    "brittle",
+    "damage_of",
+    "levels",
+    "moduli",
+    "scattered",
+    "shape_noise",
+]
 
 BAND_CELLS = 2.0
 """Width of the narrowest crack that a grid of quadratic splines can show [dx]."""
+BROKEN = 0.999
+"""Damage from which a point counts as broken."""
+P0_CAP = 0.495
+"""Largest p0 over kappa: beyond half of it no volume would give the pressure."""
 
 
 def moduli(row: dict[str, Any]) -> tuple[float, float]:
@@ -46,22 +61,11 @@ def moduli(row: dict[str, Any]) -> tuple[float, float]:
     return young / (2.0 * (1.0 + nu)), young / (3.0 * (1.0 - 2.0 * nu))
 
 
-def wave(row: dict[str, Any]) -> float:
-    """Speed of the pressure wave [m/s]."""
-    mu, kappa = moduli(row)
-    return math.sqrt((kappa + 4.0 / 3.0 * mu) / float(row["density"]))
-
-
-def elastic(young: float, poisson: float, density: float) -> dict[str, Any]:
-    """Row of a material that never breaks."""
-    return {"law": "elastic", "young_modulus": young, "poisson_ratio": poisson, "density": density}
-
-
 def _facts(row: dict[str, Any], density: float) -> dict[str, Any]:
     """The row with what it means for other damage models; ``density`` is the energy's [J/m^3]."""
     mu, kappa = moduli(row)
     slope, beta = float(row["friction"]), float(row["cohesion"])
-    p0 = kappa * (1e-5 + math.sinh(-float(row["hardening"]) * float(row["alpha"])))
+    p0 = kappa * min(1e-5 + math.sinh(-float(row["hardening"]) * float(row["alpha"])), P0_CAP)
     # with p = -kappa e and q = 2 mu e the yield condition is quadratic in the strain e
     a = 4.0 * mu * mu * (1.0 + 2.0 * beta) + (slope * kappa) ** 2
     b = slope * slope * kappa * p0 * (1.0 - beta)
@@ -168,8 +172,8 @@ def damage_of(scene: Scene, run: Run) -> Floats:
     """
     if run.damage is None:
         raise SceneError(
-            f"{run.method}, {scene.name}: this case is judged by damage; hand in `damage`, 0 intact "
-            "to 1 broken, for every time and point"
+            f"{run.method}, {scene.name}: this case is judged by damage; hand in `damage`, 0 "
+            "intact to 1 broken, for every time and point"
         )
     if run.damage.shape != (scene.times.shape[0], scene.count):
         raise SceneError(

@@ -14,6 +14,8 @@ __all__ = ["Case", "case", "cases", "find", "judge"]
 MODULES = (
     "contact",
     "elastic",
+    "fracture_bars",
+    "fracture_shatter",
 )
 """Modules of this package that register cases."""
 

@@ -12,7 +12,7 @@ import torch
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.driver import World
-from gsfluent.lab.frozen_fracture import damage, drive
+from gsfluent.lab.frozen_fracture import Drives, damage
 from gsfluent.lab.shapes import parameters
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
@@ -55,6 +55,16 @@ def _colliders(scene: Scene) -> torch.Tensor | None:
     return torch.stack(made) if made else None
 
 
+def _handed(name: str, world: World, alpha: torch.Tensor, drives: Drives | None) -> torch.Tensor:
+    """What a run hands in beside positions and velocities."""
+    if name == "damage":
+        return damage(world, alpha)
+    if name == "impulse" and drives is not None:
+        return torch.cat([world.impulse, drives.impulse])
+    value: torch.Tensor = getattr(world, name)
+    return value
+
+
 def play(
     scene: Scene,
     *,
@@ -88,6 +98,7 @@ def play(
     """
     law, params, alpha = rows(scene)
     several = fields and int(scene.body.max()) > 0
+    drives = Drives(scene, dtype, device) if scene.drives else None
     world = World(
         torch.from_numpy(scene.x), torch.from_numpy(scene.v), mass=torch.from_numpy(scene.mass),
         volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
@@ -95,15 +106,19 @@ def play(
         body=torch.from_numpy(scene.body) if several else None,
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
-        force=drive(scene, dtype, device), **options,
+        force=drives, **options,
     )  # fmt: skip
     shape = (scene.times.shape[0], scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
     more: dict[str, np.ndarray] = {}
     if bool((alpha < 0.0).any()):  # something can break
-        more = {"damage": np.full(shape[:2], math.nan), "stress": np.full((*shape[:2], 6), math.nan)}
-    if scene.colliders:
-        more["impulse"] = np.full((shape[0], len(scene.colliders), 3), math.nan)
+        more = {
+            "damage": np.full(shape[:2], math.nan),
+            "stress": np.full((*shape[:2], 6), math.nan),
+        }
+    acting = len(scene.colliders) + len(scene.drives)
+    if acting:
+        more["impulse"] = np.full((shape[0], acting, 3), math.nan)
     wall, failed = 0.0, ""
     cuda = torch.device(device).type == "cuda"
     for i, end in enumerate(scene.times):
@@ -118,8 +133,7 @@ def play(
         wall += time.perf_counter() - start
         x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
         for name, value in more.items():
-            given = damage(world, alpha) if name == "damage" else getattr(world, name)
-            value[i] = given.double().cpu().numpy()
+            value[i] = _handed(name, world, alpha, drives).double().cpu().numpy()
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         "engine": world.engine, "fields": several, **options,

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.driver import Force, World
+from gsfluent.lab.driver import World
 
-__all__ = ["damage", "drive"]
+__all__ = ["Drives", "damage"]
 
 
 class _Drive:
@@ -39,9 +39,14 @@ class _Drive:
             force = torch.tensor(item["force"], dtype=torch.float64)
             self.push = (force / mass[:, None]).to(device, dtype)
 
+        self.mass = torch.from_numpy(scene.mass).to(device)[self.rows, None]
+        self.impulse = torch.zeros(3, dtype=torch.float64, device=device)
+
     def __call__(self, v: Tensor, time: float, dt: float) -> None:
+        """Change the velocities of a step in place."""
         if not self.start <= time < self.end:
             return
+        before = v[self.rows].double()
         share = min(1.0, (time - self.start) / self.ramp) if self.ramp > 0.0 else 1.0
         if self.damping:
             v[self.rows] *= 1.0 - dt * self.damping
@@ -49,21 +54,32 @@ class _Drive:
             v[self.rows] += (share * dt) * self.push
         for column, axis in enumerate(self.axes):
             v[self.rows, axis] = share * self.velocity[column]
+        self.impulse += (self.mass * (v[self.rows].double() - before)).sum(dim=0)
 
 
-def drive(scene: Scene, dtype: torch.dtype, device: str | torch.device) -> Force | None:
-    """What the drives of a scene do before every step; None if it has none."""
-    if not scene.drives:
-        return None
-    items = [_Drive(scene, item, dtype, torch.device(device)) for item in scene.drives]
+class Drives:
+    """What the drives of a scene do before every step: a force of :class:`World`.
 
-    def apply(world: World, dt: float) -> None:
+    Args:
+        scene: The scene.
+        dtype: Precision of the velocities.
+        device: Where they are.
+    """
+
+    def __init__(self, scene: Scene, dtype: torch.dtype, device: str | torch.device):
+        self._items = [_Drive(scene, item, dtype, torch.device(device)) for item in scene.drives]
+
+    def __call__(self, world: World, dt: float) -> None:
+        """Change the velocities of the world."""
         v = world.velocity.clone()
-        for item in items:
+        for item in self._items:
             item(v, world.time, dt)
         world.velocity = v
 
-    return apply
+    @property
+    def impulse(self) -> Tensor:
+        """Given by each drive so far [N s], float64 [D, 3]."""
+        return torch.stack([item.impulse for item in self._items])
 
 
 def damage(world: World, start: Tensor) -> Tensor:
