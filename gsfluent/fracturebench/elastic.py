@@ -41,7 +41,7 @@ def _mode_measures(
 
 
 def _times(omega: float, periods: int, each: int = 8) -> Floats:
-    return np.arange(1, periods * each + 1) * (2.0 * math.pi / omega / each)
+    return 2.0 * math.pi / (omega * each) * np.arange(1.0, periods * each + 1)
 
 
 _BAR = elastic(1e5, 0.0, 1000.0)
@@ -93,7 +93,7 @@ def _halves(x: Floats) -> tuple[Floats, Floats]:
 def _judge_halves(scene: Scene, run: Run) -> Iterator[Measure]:
     start = scene.x[:, 0]
     shape = np.zeros_like(scene.x)
-    shape[:, 0], exact = _halves(start)
+    shape[:, 0], _ = _halves(start)
     source = "cos(k1 x), k1 = 2 k2, tan(k2 L / 2) = sqrt 2, w = k2 c2:"
     yield from _mode_measures(scene, run, shape, "the first mode", source)
     # strains of both halves near the joint, each as a multiple of the mode's own slope there
@@ -230,7 +230,7 @@ def spin(dx: float, per_cell: int) -> Scene:
     points, volume = ball(_RADIUS, dx, per_cell)
     turn = np.array([[0.0, -_OMEGA, 0.0], [_OMEGA, 0.0, 0.0], [0.0, 0.0, 0.0]])
     slowest = 2.6462 / _RADIUS * math.sqrt(_JELLY["young_modulus"] / 2.6 / _JELLY["density"])
-    breathing = _times(slowest, _BREATHS)
+    breathing = _times(slowest, _BREATHS, 4)
     times = np.append(breathing, 2.0 * math.pi / _OMEGA)
     return free(
         "spin", points, points @ turn.T, dx, per_cell, times, _JELLY, volume=volume,

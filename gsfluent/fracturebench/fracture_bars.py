@@ -59,6 +59,7 @@ def spall(dx: float, per_cell: int) -> Scene:
     times = np.linspace(0.0, (1.0 + 3.0 * _FLYER) / c, 111)[1:]
     return free(
         "spall", points, velocity, dx, per_cell, times, row, colliders=walls(dx, (1, 2)),
+        asks=("damage",),
         facts={"length": length, "spall_strength": strength, "impedance": impedance},
     )  # fmt: skip
 
@@ -124,5 +125,6 @@ def stretched_bar(dx: float, per_cell: int) -> Scene:
     size = expected_size(rate, float(row["fracture_energy"]), strength, 1000.0, c)
     return free(
         "stretched_bar", points, velocity, dx, per_cell, np.linspace(0.0, end, 9)[1:], rows,
-        affine=affine, material=index, colliders=walls(dx, (1, 2)), facts={"expected": size},
+        affine=affine, material=index, colliders=walls(dx, (1, 2)), asks=("damage",),
+        facts={"expected": size},
     )  # fmt: skip

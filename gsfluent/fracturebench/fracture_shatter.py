@@ -88,6 +88,7 @@ def shatter(dx: float, per_cell: int) -> Scene:
     times = np.linspace(0.0, _END * RADIUS / c, _SAMPLES + 1)[1:]
     return free(
         "shatter", points, [0.0, 0.0, -_SPEED * c], dx, per_cell, times, rows, material=index,
+        asks=("damage", "stress"),
         colliders=(
             {
                 "point": [0.0, 0.0, -RADIUS], "normal": [0.0, 0.0, 1.0], "kind": "separate",

@@ -14,6 +14,7 @@ __all__ = ["Case", "case", "cases", "find", "judge"]
 MODULES = (
     "contact",
     "elastic",
+    "flow",
     "fracture_bars",
     "fracture_shatter",
 )
