@@ -18,6 +18,8 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
+from gsfluent.pipeline.choose_shot import choose_stage
+from gsfluent.pipeline.report import REPORT, write_report
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_prepare import (
     fill_stage,
@@ -85,6 +87,7 @@ def run_shot(
         fill_stage(context)
         texture_stage(context)
         regions_stage(context)
+        choose_stage(context)
         simulate_stage(context)
         render_stage(context)
         export_stage(context)
@@ -102,7 +105,9 @@ def run_shot(
             _kept(out, store),
             "run the same command again to go on; GSFLUENT_DEBUG=1 shows the traceback",
         ) from error
+    record.values["outputs"]["report"] = REPORT
     values = record.finish(store.results)
+    write_report(out, values)
     _log.info(
         "%s in %.1f s: %s (%s)",
         out,
