@@ -39,6 +39,13 @@ KNOBS = {
     "transfer": "textbook: APIC, PIC or FLIP",
 }
 """What may be named in ``--only``."""
+OFF_GRID = {"flight": "flight on the grid", "rest": "no sleep"}
+"""Cases of :mod:`gsfluent.charts.off_grid`, and what their measure is called when it is off."""
+_OFF: dict[str, dict[str, Any]] = {
+    "flight": {"free_flight": False, "piece_flight": False},
+    "rest": {"sleep": False},
+}
+_OFF_RUNGS = (0.025, 0.0167)
 _FINER = (1.5, 2.0, 3.0, 4.0)
 _MOST_NUMBERS = 3e7
 """Times x points that are kept of one run on a GPU: 1.5 GB of positions and velocities."""
@@ -123,14 +130,15 @@ def ladder(
         InputError: An unknown case or knob.
     """
     known = {c.name: c for c in cases()}
-    if missing := [n for n in names if n not in known]:
-        raise InputError(f"--cases: no case {missing[0]!r}", f"there are {', '.join(known)}")
+    if missing := [n for n in names if n not in known and n not in OFF_GRID]:
+        there = ", ".join([*known, *OFF_GRID])
+        raise InputError(f"--cases: no case {missing[0]!r}", f"there are {there}")
     wanted = set(only) or set(KNOBS)
     if wrong := sorted(wanted - set(KNOBS)):
         raise InputError(f"--only: no knob {wrong[0]!r}", f"there are {', '.join(KNOBS)}")
-    chosen = [known[n] for n in dict.fromkeys(names)] or list(known.values())
-    if quick and not names:
-        chosen = [known[n] for n in ("bar", "pull_apart")]
+    given = names or (("bar", "pull_apart") if quick else (*known, *OFF_GRID))
+    chosen = [known[n] for n in dict.fromkeys(given) if n in known]
+    off_grid = [n for n in dict.fromkeys(given) if n in OFF_GRID]
     found: list[Setting] = []
     steps = {case.name: rungs(case, device, quick) for case in chosen}
     for case in chosen:
@@ -138,6 +146,11 @@ def ladder(
     for case in chosen:
         for dx in _two(steps[case.name]):
             found += _knobs(case, dx, device, quick)
+    for name in off_grid:
+        for dx in _OFF_RUNGS[:1] if quick else _OFF_RUNGS:
+            words, off = OFF_GRID[name], _OFF[name]
+            found.append(Setting(name, dx, knob="adaptive"))
+            found.append(Setting(name, dx, knob="adaptive", variant=words, options=off))
     if textbook:
         for case in chosen:
             found += _textbook(case, steps[case.name], quick)
