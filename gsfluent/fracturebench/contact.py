@@ -126,7 +126,7 @@ def _judge_collide(scene: Scene, run: Run) -> Iterator[Measure]:
 
 
 @case(
-    kind="contact", dx=0.0125, judge=_judge_collide,
+    kind="contact", dx=0.05 / 6, judge=_judge_collide,
     ladder=(0.05 / 3, 0.0125, 0.01, 0.05 / 6, 0.05 / 7),
 )  # fmt: skip
 def collide(dx: float, per_cell: int) -> Scene:
@@ -200,7 +200,7 @@ def _judge_oblique(scene: Scene, run: Run) -> Iterator[Measure]:
 
 
 @case(
-    kind="contact", dx=0.0125, judge=_judge_oblique,
+    kind="contact", dx=0.05 / 6, judge=_judge_oblique,
     ladder=(0.05 / 3, 0.0125, 0.01, 0.05 / 6, 0.05 / 7),
 )  # fmt: skip
 def oblique(dx: float, per_cell: int) -> Scene:
@@ -228,7 +228,7 @@ def _judge_drop(scene: Scene, run: Run) -> Iterator[Measure]:
 
 
 @case(
-    kind="contact", dx=0.0125, judge=_judge_drop,
+    kind="contact", dx=0.01, judge=_judge_drop,
     ladder=(0.025, 0.1 / 6, 0.0125, 0.01, 0.1 / 12),
 )  # fmt: skip
 def drop(dx: float, per_cell: int) -> Scene:
