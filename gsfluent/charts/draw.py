@@ -171,7 +171,10 @@ class Chart:
                      band=_band(mine))  # fmt: skip
 
     def _rates(self) -> Rates | None:
-        runs = [r for r in self.records if r.ok and r.kind != "machine"]
+        runs = [
+            r for r in self.records
+            if r.ok and r.kind != "machine" and math.isfinite(r.ns_per_point_step)
+        ]  # fmt: skip
         if not runs:
             return None
         names = methods(runs, OURS)
