@@ -215,7 +215,7 @@ def _judge_spin(scene: Scene, run: Run) -> Iterator[Measure]:
         (share * (scene.seconds - np.sin(rate * scene.seconds) / rate)).sum()
     )
     seen_turn = math.atan2(sine, cosine)
-    seen_turn += 2.0 * math.pi * round((exact_turn - seen_turn) / (2.0 * math.pi))
+    seen_turn += 2.0 * math.pi * float(np.round((exact_turn - seen_turn) / (2.0 * math.pi)))
     yield Measure(
         "angle turned", seen_turn, exact_turn, abs(seen_turn / exact_turn - 1.0), 1e-3, "rad",
         "angular momentum over moment of inertia",
