@@ -1,4 +1,4 @@
-"""Verbs of the lab: chart."""
+"""Verbs of the lab: chart, stability."""
 
 from __future__ import annotations
 
@@ -146,3 +146,68 @@ class Chart(Verb):
                 f"{s.case} {s.method} dx {s.dx:.3g} {s.variant}".rstrip() for s in done.left_out
             ]
         return done.records
+
+
+@dataclass(kw_only=True)
+class Stability(Verb):
+    """Draw where each variant of the method first fails: maps over pairs of settings.
+
+    Examples:
+      gsfluent stability -o stability                    # all maps, about five minutes on two cores
+      gsfluent stability --quick                         # three by three points of each
+      gsfluent stability --maps fragments poisson        # some maps
+      gsfluent stability --device cuda                   # those that are worth a GPU
+      gsfluent stability --draw stability/stability.jsonl  # only draw what was recorded
+
+    Writes stability.jsonl (a line per point), a PNG per map and stability.html. docs/stability.md
+    says what they show.
+    """
+
+    out: Out = Path("stability")
+    """Folder of the results; points whose lines are there are not run again."""
+    maps: Words = ()
+    """Maps; all by default, on a GPU those worth it."""
+    quick: bool = False
+    """Three by three points of each map, for a look or for CI."""
+    jobs: int = 1
+    """Processes that share the work."""
+    draw: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.jsonl ...")] = ()
+    """Draw these lines and run nothing."""
+
+    def execute(self) -> dict[str, Any]:
+        """Run what is missing and draw all of it."""
+        from gsfluent.charts import stability
+        from gsfluent.charts.stability_peers import marks
+        from gsfluent.charts.stability_report import verdict, write_all
+
+        maps = [m for name in self.maps for m in name.split(",") if m]
+        if self.draw:
+            wanted = stability.chosen(maps)
+            files = [existing(path, "--draw", folder=False) for path in self.draw]
+            points = [p for path in files for p in stability.read(path)]
+            known = {m.name for m in wanted}
+            points = [p for p in points if p.map in known]
+            if not points:
+                raise InputError(
+                    "--draw: no point of these maps in the files", "run `gsfluent stability` first"
+                )
+        else:
+            device = self.torch_device()
+            wanted = stability.chosen(maps, gpu=device.type == "cuda")
+            if device.type == "cuda" and self.jobs > 1:
+                raise InputError("--jobs with a GPU", "leave it out: one process feeds it")
+            with self.progress("stability") as progress:
+                points = stability.run_maps(
+                    wanted, self.out / "stability.jsonl", device=device.type, quick=self.quick,
+                    jobs=self.jobs, progress=progress,
+                )  # fmt: skip
+        page = write_all(wanted, points, self.out, marks(wanted))
+        drawn = [m for m in wanted if any(p.map == m.name for p in points)]
+        return {
+            "page": page,
+            "maps": len(drawn),
+            "points": len(points),
+            "held": sum(p.holds for p in points),
+            "seconds": round(sum(p.seconds for p in points), 1),
+            "not inside with margin": verdict(drawn, points),
+        }

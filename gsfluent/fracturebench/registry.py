@@ -15,6 +15,8 @@ MODULES = (
     "contact",
     "elastic",
     "flow",
+    "fracture_bars",
+    "fracture_shatter",
 )
 """Modules of this package that register cases."""
 

@@ -62,7 +62,7 @@ class Run:
         failed: Why it broke off, or empty.
         damage: 0 intact to 1 broken, [T, N], if the method knows.
         stress: Cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept.
-        impulse: Given by each collider or drive so far [N s], [T, K, 3], if kept.
+        impulse: Given by each collider, and then by each drive, so far [N s], [T, K, 3], if kept.
         deformation: Deformation gradient of each point since the start, [T, N, 3, 3], if kept.
     """
 

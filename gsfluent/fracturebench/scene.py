@@ -65,9 +65,12 @@ class Scene:
         gravity: [m/s^2].
         colliders: Planes: ``{"point", "normal", "kind": "sticky" | "slip" | "separate",
             "friction"}``.
-        drives: Groups of points whose velocity is prescribed, in place of what the method would
-            give them: ``{"points": [indices], "velocity": [vx, vy, vz], "start": s, "end": s}``.
-            Other keys (a load that depends on time or place) are described by the case.
+        drives: What acts on groups of points. ``points`` is a list of indices or ``"all"``, and
+            one of: ``velocity`` [vx, vy, vz], prescribed in place of what the method would give
+            them (null: this component is free); ``force``, [[fx, fy, fz], ...] in N on each of the
+            points, added; ``damping`` in 1/s, the force ``-damping m v``. ``start`` and ``end`` [s]
+            bound it (default always); over ``ramp`` seconds from the start velocity and force
+            grow linearly from 0 (default at once).
         friction: Coulomb coefficient between bodies.
         facts: Numbers that the judge needs and a simulator does not.
         asks: Further fields of :class:`~gsfluent.fracturebench.run.Run` that the case is judged

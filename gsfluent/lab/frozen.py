@@ -14,6 +14,7 @@ import torch
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.driver import World
+from gsfluent.lab.frozen_fracture import Drives, damage
 from gsfluent.lab.shapes import parameters
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
@@ -56,6 +57,24 @@ def _colliders(scene: Scene) -> torch.Tensor | None:
     return torch.stack(made) if made else None
 
 
+def _handed(name: str, world: World, alpha: torch.Tensor, drives: Drives | None) -> torch.Tensor:
+    """What a scene asks for beside positions and velocities."""
+    if name == "damage":
+        return damage(world, alpha)
+    if name == "impulse" and drives is not None:
+        return torch.cat([world.impulse, drives.impulse])
+    value: torch.Tensor = getattr(world, name)
+    return value
+
+
+def _padded(values: list[np.ndarray], count: int) -> np.ndarray | None:
+    """The samples with NaN for those that a run which broke off does not have, [count, ...]."""
+    if not values:
+        return None
+    missing = [np.full_like(values[0], math.nan)] * (count - len(values))
+    return np.stack(values + missing)
+
+
 def play(
     scene: Scene,
     *,
@@ -91,6 +110,7 @@ def play(
     """
     law, params, alpha = rows(scene)
     several = fields and int(scene.body.max()) > 0
+    drives = Drives(scene, dtype, device) if scene.drives else None
     world = World(
         torch.from_numpy(scene.x), torch.from_numpy(scene.v), mass=torch.from_numpy(scene.mass),
         volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
@@ -98,12 +118,14 @@ def play(
         body=torch.from_numpy(scene.body) if several else None,
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
+        force=drives,
         deformation=bool(options.pop("deformation", False)) or "deformation" in scene.asks,
         **options,
     )  # fmt: skip
-    shape = (scene.times.shape[0], scene.count, 3)
+    count = scene.times.shape[0]
+    shape = (count, scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
-    turned = np.full((*shape, 3), math.nan) if "deformation" in scene.asks else None
+    asked: dict[str, list[np.ndarray]] = {name: [] for name in scene.asks}
     wall, failed = 0.0, ""
     cuda = torch.device(device).type == "cuda"
     for i, end in enumerate(scene.times):
@@ -117,8 +139,8 @@ def play(
             torch.cuda.synchronize()
         wall += time.perf_counter() - start
         x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
-        if turned is not None and world.deformation is not None:
-            turned[i] = world.deformation.double().cpu().numpy()
+        for name, values in asked.items():
+            values.append(_handed(name, world, alpha, drives).double().cpu().numpy())
         if watch is not None:
             watch(world, i)
     settings = {
@@ -127,7 +149,7 @@ def play(
     }  # fmt: skip
     return Run(
         scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed,
-        deformation=turned,
+        **{name: _padded(values, count) for name, values in asked.items()},
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Compute the references of FractureBench that have no closed form, and store them.
 
-    python scripts/fracturebench/references.py [-o FILE]
+    python scripts/fracturebench/references.py [NAME ...] [-o FILE]
 
 Lagrangian finite elements in NumPy, nothing of gsfluent's solver: elements that follow the matter
 have no grid to cross, and contact with a plane is a condition on their nodes. ``collide`` is one
@@ -180,48 +180,94 @@ def cube_on_floor(
     return np.asarray(np.interp(times, t, height))
 
 
-def refine(solve: Any, sizes: tuple[int, ...], scale: float) -> tuple[np.ndarray, float, float]:
-    """Run three meshes; return the finest, the order and the error left by Richardson (rms)."""
+def refine(solve: Any, sizes: tuple[int, ...]) -> tuple[np.ndarray, float, float]:
+    """Run three meshes; return the finest, the order, and the error left by Richardson.
+
+    The error is a root mean square over that of the answer.
+    """
     found = []
     for n in sizes:
         found.append(solve(n))
         print(f"  {n} elements", file=sys.stderr, flush=True)
     coarse, fine = found[1] - found[0], found[2] - found[1]
-    rms = [float(np.sqrt(np.mean(d * d))) / scale for d in (coarse, fine)]
+    size = float(np.sqrt(np.mean(found[2] ** 2)))
+    rms = [float(np.sqrt(np.mean(d * d))) / size for d in (coarse, fine)]
     order = math.log2(rms[0] / rms[1])
     return found[2], order, rms[1] / (2.0**order - 1.0)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--out", type=Path, default=OUT)
-    args = parser.parse_args()
-    said: dict[str, Any] = {}
+def stiffening(times: np.ndarray, momentum: np.ndarray, speed: float, poisson: float) -> float:
+    """How much stiffer than Hertz's the contact of two balls is: s in F (1 + s sqrt(depth / R)).
 
+    The s for which a ball of this force has the given momentum (units as in ball_on_mirror).
+    """
+    young = (1.0 + poisson) * (1.0 - 2.0 * poisson) / (1.0 - poisson)
+    mass = 4.0 / 3.0 * math.pi
+    hertz = 4.0 / 3.0 * 0.5 * young / (1.0 - poisson**2) * math.sqrt(0.5) / mass
+
+    def miss(s: float) -> float:
+        dt, half, v, found = 0.002, 0.0, speed, [1.0]  # half the depth
+        for _ in range(round(times[-1] / dt)):
+            depth = max(2.0 * half, 0.0)
+            v -= dt * hertz * depth**1.5 * (1.0 + s * math.sqrt(depth))
+            half += dt * v
+            found.append(v / speed)
+        seen = np.interp(times, np.arange(len(found)) * dt, found)
+        return float(np.mean((seen - momentum) ** 2))
+
+    low, high = 0.0, 3.0
+    golden = 0.5 * (math.sqrt(5.0) - 1.0)
+    while high - low > 1e-3:
+        a, b = high - golden * (high - low), low + golden * (high - low)
+        low, high = (low, b) if miss(a) < miss(b) else (a, high)
+    return 0.5 * (low + high)
+
+
+def collide() -> dict[str, Any]:
+    """Two balls that meet head on at 0.04 of the wave speed."""
     speed, poisson, times = 0.02, 0.3, np.linspace(0.0, 16.0, 161)
-    print("collide", file=sys.stderr)
-    p, order, left = refine(lambda n: ball_on_mirror(n, speed, poisson, times), (16, 32, 64), 1.0)
-    said["collide"] = {
+    p, order, left = refine(lambda n: ball_on_mirror(n, speed, poisson, times), (16, 32, 64))
+    return {
         "speed": speed, "poisson_ratio": poisson, "times": times.round(6).tolist(),
         "momentum": p.round(7).tolist(), "order": round(order, 2), "error": float(f"{left:.2g}"),
+        "stiffening": round(stiffening(times, p, speed, poisson), 3),
     }  # fmt: skip
 
-    speed, gravity, times = 0.03, 0.00728, np.linspace(0.0, 8.0, 81)
-    print("drop", file=sys.stderr)
+
+def drop() -> dict[str, Any]:
+    """A cube on a sticky floor at 0.03 of the wave speed."""
+    speed, gravity, poisson, times = 0.03, 0.00728, 0.3, np.linspace(0.0, 8.0, 81)
     height, order, left = refine(
-        lambda n: cube_on_floor(n, speed, gravity, poisson, times), (6, 12, 24), 1.0
+        lambda n: cube_on_floor(n, speed, gravity, poisson, times), (6, 12, 24)
     )
-    left /= float(np.sqrt(np.mean(height**2)))
-    said["drop"] = {
+    return {
         "speed": speed, "gravity": gravity, "poisson_ratio": poisson,
         "times": times.round(6).tolist(), "height": height.round(8).tolist(),
         "order": round(order, 2), "error": float(f"{left:.2g}"),
     }  # fmt: skip
+
+
+CASES = {"collide": collide, "drop": drop}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="cases; default all")
+    parser.add_argument("-o", "--out", type=Path, default=OUT, metavar="FILE")
+    args = parser.parse_args()
+    if unknown := sorted(set(args.names) - set(CASES)):
+        parser.error(f"no reference {', '.join(unknown)}; there are {', '.join(CASES)}")
+    said = json.loads(args.out.read_text(encoding="utf-8")) if args.out.is_file() else {}
+    for name in args.names or CASES:
+        print(name, file=sys.stderr)
+        said[name] = CASES[name]()
+        print(f"{name}: order {said[name]['order']}, error {said[name]['error']}")
     temporary = args.out.with_suffix(".tmp")
-    temporary.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+    rows = {name: said[name] for name in sorted(said)}
+    temporary.write_text(json.dumps(rows) + "\n", encoding="utf-8")
     temporary.replace(args.out)
-    for name, row in said.items():
-        print(f"{name}: order {row['order']}, error {row['error']}")
 
 
 if __name__ == "__main__":
