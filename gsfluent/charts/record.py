@@ -172,6 +172,8 @@ def of_run(
     runs: Run | Iterable[Run],
     *,
     variant: str = "",
+    wall: Sequence[float] | None = None,
+    steps: int | None = None,
     machine: str | None = None,
     commit: str | None = None,
     **settings: Any,
@@ -183,9 +185,12 @@ def of_run(
         scene: What was run.
         runs: One run, or its repeats by one method at one setting.
         variant: What differs from the method's defaults.
+        wall: Seconds of separate runs that went to the last time without a stop; default: those of
+            the runs given, which also stopped at every time asked for.
+        steps: Steps of one of these; default: of the run that is judged.
         machine: Where; default: this one.
         commit: Of what; default: of gsfluent.
-        **settings: Added to those of the run.
+        **settings: Added to those of the run; ``points`` counts where it is not the scene's.
 
     Returns:
         The median of the times, and the error and measures of the repeat of median error; if any
@@ -205,9 +210,10 @@ def of_run(
     chosen = broken[0] if broken else order[(len(order) - 1) // 2]
     measures: list[Measure] = judged[chosen]
     failed = (repeats[chosen].failed or "a number is not finite") if broken else ""
-    wall = [float(run.wall_seconds) for run in repeats]
+    wall = [float(run.wall_seconds) for run in repeats] if not wall else [float(w) for w in wall]
     middle = statistics.median(wall)
-    work = scene.count * max(1, repeats[chosen].steps)
+    steps = repeats[chosen].steps if steps is None else steps
+    points = int(settings.get("points", scene.count))
     per_cell = round(scene.dx**3 / sorted(scene.volume)[scene.count // 2], 3)
     known = {"dx": scene.dx, "ppc": per_cell, **first.settings, **settings}
     if len(repeats) > 1 and (judged[order[-1]][0].error > judged[order[0]][0].error):
@@ -215,9 +221,9 @@ def of_run(
     return Record(
         case=case.name, kind=case.kind, method=first.method, variant=variant, settings=known,
         device=first.device, machine=_machine(first.device) if machine is None else machine,
-        points=scene.count, steps=repeats[chosen].steps, simulated_seconds=scene.seconds,
+        points=points, steps=steps, simulated_seconds=scene.seconds,
         wall_seconds=wall, wall_per_simulated=middle / scene.seconds,
-        ns_per_point_step=1e9 * middle / work,
+        ns_per_point_step=1e9 * middle / (points * max(1, steps)),
         error=math.inf if broken else float(measures[0].error),
         measures=[dataclasses.asdict(m) for m in measures], failed=failed,
         commit=_commit() if commit is None else commit,

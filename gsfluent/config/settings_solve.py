@@ -3,9 +3,42 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
-from gsfluent.config.read import choice, flag, key, whole
+from gsfluent.config.read import Place, Reader, choice, flag, key, mapping, number, section, whole
+from gsfluent.errors import InputError
+
+
+def share(low: float, high: float) -> Reader:
+    """Reader of a share, ``3%`` or ``0.03``, in ``low..high``."""
+
+    def read(value: Any, place: Place) -> float:
+        if isinstance(value, str) and value.strip().endswith("%"):
+            value, unit = value.strip()[:-1].strip(), 0.01
+        else:
+            unit = 1.0
+        try:
+            found = unit * float(number()(value, place))
+        except InputError:
+            raise place.error("be a share such as 3% or 0.03", value) from None
+        if not low <= found <= high:
+            raise place.error(f"lie in {low:.2%}..{high:.0%}", f"{found:.4g}")
+        return round(found, 12)  # 3 * 0.01 is not 0.03
+
+    return read
+
+
+def read_error(text: str, argument: str) -> float:
+    """Read a bound on the error from words, for the command line.
+
+    Raises:
+        InputError: Not a share such as ``3%`` or ``0.03``, or out of range.
+    """
+    return float(_ERROR(text, Place(argument, Path())))
+
+
+_ERROR = share(1e-4, 0.5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,7 +46,6 @@ class SolveSettings:
     """``solve:`` - how accurately."""
 
     LATER: ClassVar[dict[str, str]] = {
-        "error": "choosing the setting by an error bound",
         "seconds_per_frame": "choosing the setting by a time budget",
     }
     quality: str = key(
@@ -27,6 +59,19 @@ class SolveSettings:
         default=None,
         doc="Cells along the longest side of the largest solid, instead of those of `quality`.",
         example="32",
+    )
+    cfl: float = key(
+        number(0.05, 0.9),
+        default=0.5,
+        doc="Courant number of the automatic time step.",
+        example="0.7",
+    )
+    error: float | None = key(
+        _ERROR,
+        default=None,
+        doc="Largest error, instead of `quality` and `cells`: the cheapest cells and cfl that "
+        "short probes of the shot promise to meet it with.",
+        example="3%",
     )
     standing: bool = key(
         flag,
@@ -49,3 +94,18 @@ class SolveSettings:
         "anyway; a blade at work on a GPU does not, and is refused then.",
         example="true",
     )
+
+
+def read_solve(value: Any, place: Place) -> SolveSettings:
+    """Read ``solve:``; what chooses the cells may be said only once."""
+    solve: SolveSettings = section(SolveSettings, value, place)
+    given = mapping(value, place)
+    # of a resolved shot every default is written out: those say nothing
+    defaults = {"quality": "shot", "cfl": 0.5}
+    for name in ("quality", "cells", "cfl"):
+        if solve.error is not None and given.get(name, defaults.get(name)) != defaults.get(name):
+            raise InputError(
+                f"{place.path}.error chooses the cells and the time step, and {name} is given too",
+                f"remove error or {name}",
+            )
+    return solve

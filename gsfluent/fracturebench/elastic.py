@@ -41,7 +41,7 @@ def _mode_measures(
 
 
 def _times(omega: float, periods: int, each: int = 8) -> Floats:
-    return np.arange(1, periods * each + 1) * (2.0 * math.pi / omega / each)
+    return 2.0 * math.pi / (omega * each) * np.arange(1.0, periods * each + 1)
 
 
 _BAR = elastic(1e5, 0.0, 1000.0)
@@ -93,7 +93,7 @@ def _halves(x: Floats) -> tuple[Floats, Floats]:
 def _judge_halves(scene: Scene, run: Run) -> Iterator[Measure]:
     start = scene.x[:, 0]
     shape = np.zeros_like(scene.x)
-    shape[:, 0], exact = _halves(start)
+    shape[:, 0], _ = _halves(start)
     source = "cos(k1 x), k1 = 2 k2, tan(k2 L / 2) = sqrt 2, w = k2 c2:"
     yield from _mode_measures(scene, run, shape, "the first mode", source)
     # strains of both halves near the joint, each as a multiple of the mode's own slope there
@@ -110,7 +110,7 @@ def _judge_halves(scene: Scene, run: Run) -> Iterator[Measure]:
     )  # fmt: skip
 
 
-@case(kind="elastic", dx=0.01, ladder=(0.02, 0.0125, 0.01, 0.00625, 0.005), judge=_judge_halves)
+@case(kind="elastic", dx=0.005, ladder=(0.02, 0.0125, 0.01, 0.00625, 0.005), judge=_judge_halves)
 def two_material_bar(dx: float, per_cell: int) -> Scene:
     """Free bar of a soft and a stiff half (1 to 4) in its first mode: the joint carries it."""
     thick = 0.04
@@ -148,7 +148,7 @@ def _judge_beam(scene: Scene, run: Run) -> Iterator[Measure]:
     yield from _mode_measures(scene, run, shape, "the first bending mode", source)
 
 
-@case(kind="elastic", dx=0.0125, ladder=(0.025, 0.05 / 3, 0.0125, 0.05 / 6), judge=_judge_beam)
+@case(kind="elastic", dx=0.05 / 6, ladder=(0.025, 0.05 / 3, 0.0125, 0.05 / 6), judge=_judge_beam)
 def beam(dx: float, per_cell: int) -> Scene:
     """Free beam 8 times as long as thick in its first bending mode (body of GaussianBench A2)."""
     points = box([0.0, 0.0, 0.0], _SIZE, dx, per_cell)
@@ -215,7 +215,7 @@ def _judge_spin(scene: Scene, run: Run) -> Iterator[Measure]:
         (share * (scene.seconds - np.sin(rate * scene.seconds) / rate)).sum()
     )
     seen_turn = math.atan2(sine, cosine)
-    seen_turn += 2.0 * math.pi * round((exact_turn - seen_turn) / (2.0 * math.pi))
+    seen_turn += 2.0 * math.pi * float(np.round((exact_turn - seen_turn) / (2.0 * math.pi)))
     yield Measure(
         "angle turned", seen_turn, exact_turn, abs(seen_turn / exact_turn - 1.0), 1e-3, "rad",
         "angular momentum over moment of inertia",
@@ -223,14 +223,14 @@ def _judge_spin(scene: Scene, run: Run) -> Iterator[Measure]:
 
 
 @case(
-    kind="elastic", dx=0.0125, ladder=(0.025, 0.05 / 3, 0.0125, 0.01, 0.05 / 7), judge=_judge_spin
+    kind="elastic", dx=0.05 / 7, ladder=(0.025, 0.05 / 3, 0.0125, 0.01, 0.05 / 7), judge=_judge_spin
 )
 def spin(dx: float, per_cell: int) -> Scene:
     """Elastic ball turning in empty space: how it widens, what it keeps (GaussianBench A1)."""
     points, volume = ball(_RADIUS, dx, per_cell)
     turn = np.array([[0.0, -_OMEGA, 0.0], [_OMEGA, 0.0, 0.0], [0.0, 0.0, 0.0]])
     slowest = 2.6462 / _RADIUS * math.sqrt(_JELLY["young_modulus"] / 2.6 / _JELLY["density"])
-    breathing = _times(slowest, _BREATHS)
+    breathing = _times(slowest, _BREATHS, 4)
     times = np.append(breathing, 2.0 * math.pi / _OMEGA)
     return free(
         "spin", points, points @ turn.T, dx, per_cell, times, _JELLY, volume=volume,

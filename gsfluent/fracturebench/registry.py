@@ -14,6 +14,9 @@ __all__ = ["Case", "case", "cases", "find", "judge"]
 MODULES = (
     "contact",
     "elastic",
+    "flow",
+    "fracture_bars",
+    "fracture_shatter",
 )
 """Modules of this package that register cases."""
 

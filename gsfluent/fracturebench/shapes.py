@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .scene import Floats, Scene
 
@@ -88,8 +89,8 @@ def free(
     materials: Mapping[str, Any] | Sequence[Mapping[str, Any]],
     *,
     affine: Floats | None = None,
-    material: Floats | None = None,
-    body: Floats | None = None,
+    material: NDArray[Any] | None = None,
+    body: NDArray[Any] | None = None,
     volume: Floats | None = None,
     facts: Mapping[str, Any] | None = None,
     **more: Any,
@@ -114,7 +115,7 @@ def free(
     n = points.shape[0]
     rows = (materials,) if isinstance(materials, Mapping) else tuple(materials)
 
-    def index(value: Floats | None) -> Any:
+    def index(value: NDArray[Any] | None) -> Any:
         return np.zeros(n, np.int32) if value is None else np.asarray(value).astype(np.int32)
 
     return Scene(

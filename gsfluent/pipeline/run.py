@@ -18,6 +18,7 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
+from gsfluent.pipeline.choose_shot import choose_stage
 from gsfluent.pipeline.report import REPORT, write_report
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_prepare import (
@@ -86,6 +87,7 @@ def run_shot(
         fill_stage(context)
         texture_stage(context)
         regions_stage(context)
+        choose_stage(context)
         simulate_stage(context)
         render_stage(context)
         export_stage(context)

@@ -155,7 +155,6 @@ def test_unknown_keys_name_their_path_and_the_nearest(
 @pytest.mark.parametrize(
     "keys",
     [
-        {"solve": {"error": 0.03}},
         {"solve": {"seconds_per_frame": 0.5}},
     ],
 )
