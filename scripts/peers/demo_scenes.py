@@ -189,4 +189,3 @@ def error(given: Scene, run: Run, mode: Mode) -> float:
 def domain(setting: Setting) -> peerlib.Placement:
     """Their domain: n_grid cells, 2 m, nothing moved."""
     return peerlib.Placement(setting.n_grid, setting.dx, np.zeros(3, np.int64))
-

@@ -146,7 +146,9 @@ def peer(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
                     setting, peerlib.method(solver, variant), matter, scene,
                     device=options.device, machine=machine, steps=steps or count, walls=walls,
                     per_simulated=per_step / setting.dt, error=error, failed=failed,
-                    commit=version, timed_steps=count, ms_per_step=1e3 * per_step,
+                    courant=scene.wave_speed * setting.dt / scene.dx,
+                    commit=version, timed_steps=count,
+                    ms_per_step=1e3 * per_step,
                     gaussians=options.gaussians,
                 ))  # fmt: skip
                 sys.stderr.write(
@@ -159,8 +161,9 @@ def peer(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
 def riding(setting: Setting, x: Any, width: float, options: argparse.Namespace) -> float:
     """Seconds to move all Gaussians with the points once: gsfluent's own op, median of five."""
     import torch
-    from gsfluent import ops
     from scipy.spatial import cKDTree
+
+    from gsfluent import ops
 
     places, _ = demo_scenes.pipeline(setting, options.gaussians)
     places = places[: options.gaussians]  # fill points carry no splat
@@ -199,6 +202,7 @@ def target(found: Sequence[Mapping[str, Any]], setting: Setting, matter: str) ->
 def ours(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
     """Find gsfluent's cheapest setting whose error is at most PhysGaussian's."""
     import torch
+
     from gsfluent.charts.record import commit, machine
     from gsfluent.lab.frozen import clock, play
 
@@ -212,7 +216,9 @@ def ours(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
             if (f"demo_{setting.name}", "gsfluent", label, options.device) in map(key, found):
                 continue
             if not wanted:
-                sys.stdout.write(f"{setting.name}: no error of PhysGaussian's ({matter}) to reach\n")
+                sys.stdout.write(
+                    f"{setting.name}: no error of PhysGaussian's ({matter}) to reach\n"
+                )
                 continue
             best: dict[str, Any] | None = None
             nearest = math.inf
@@ -241,8 +247,8 @@ def ours(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
                     break  # finer ones of this CFL and count are dearer
             if best is None:
                 sys.stdout.write(
-                    f"{setting.name} ({matter}): no setting tried reaches {wanted:.4f}; the nearest "
-                    f"was {nearest:.4f}\n"
+                    f"{setting.name} ({matter}): no setting tried reaches {wanted:.4f}; the "
+                    f"nearest was {nearest:.4f}\n"
                 )
                 continue
             add(options.out, best)
@@ -258,9 +264,9 @@ def ours(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
 def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
     """Markdown of one device."""
     out = [
-        "| config | matter | its points | its error | its c dt/dx | as shipped, ms/ms | graph, ms/ms "
-        "| gsfluent: points, dx over its dx, c dt/dx | error | ms/ms | cheaper than shipped | "
-        "than graph |",
+        "| config | matter | its points | its error | its c dt/dx | as shipped, ms/ms "
+        "| graph, ms/ms | gsfluent: points, dx over its dx, c dt/dx | error | ms/ms "
+        "| cheaper than shipped | than graph |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     by = {key(line): line for line in found}
@@ -286,7 +292,8 @@ def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
                 cells += [f"{mine['points']:,}, {own['dx'] / steps['dx']:.2f}, {own['cfl']}",
                           f"{mine['error']:.4f}", f"{wall:.4g}",
                           f"{shipped['wall_per_simulated'] / wall:,.0f}",
-                          f"{graph['wall_per_simulated'] / wall:,.0f}" if graph else ""]  # fmt: skip
+                          f"{graph['wall_per_simulated'] / wall:,.0f}" if graph else "",
+                ]  # fmt: skip
             out.append(f"| {' | '.join(cells)} |")
     return "\n".join(out)
 

@@ -22,7 +22,7 @@ import numpy as np
 import peerlib
 from peerlib import Cannot, Floats, Scene
 
-COURANT = (1.0, 0.37, 3.0, 10.0)
+COURANT = (0.37, 0.1, 1.0, 3.0)
 UNREACHED = 1e15  # yield pressure and stress [Pa], its own default for "never"
 OPTIONS: dict[str, dict[str, Any]] = {
     "default": {},

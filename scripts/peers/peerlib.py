@@ -12,7 +12,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -304,13 +304,15 @@ def main(peer: Peer, description: str, arguments: Sequence[str] | None = None) -
     else:
         variant = options.variant or peer.variants[options.device][0]
         jobs = [{"scene": str(options.scene), "out": str(options.out), "variant": variant,
-                 "courant": options.courant, "dt": options.dt, "repeat": options.repeat}]  # fmt: skip
-    begin = time.perf_counter()
+                 "courant": options.courant, "dt": options.dt, "repeat": options.repeat},
+        ]  # fmt: skip
+    begin, path, scene = time.perf_counter(), "", None
     for i, job in enumerate(jobs, 1):
         out = Path(job["out"])
         if out.is_file():
             continue
-        scene = Scene.load(job["scene"])
+        if scene is None or path != job["scene"]:
+            path, scene = job["scene"], Scene.load(job["scene"])
         dt = job.get("dt") or job["courant"] * scene.dx / scene.wave_speed
         run = play(
             peer, scene, variant=job["variant"], device=options.device, dt=dt,

@@ -24,7 +24,7 @@ import peerlib
 from peerlib import Cannot, Floats, Placement, Scene
 
 # c dt/dx of its six configs: 0.366, 0.110, 0.367, 0.028, 0.070, 0.013
-COURANT = (0.1, 0.37, 0.03, 0.7, 0.9)
+COURANT = (0.37, 0.7, 0.1, 0.9, 0.03)
 WALL_NODES = 3  # nodes at each side that its bounding box stops
 
 
@@ -48,7 +48,9 @@ def walls(scene: Scene, placed: Placement) -> tuple[Placement, list[Floats], boo
         # its surface collider stops a node wholly, whatever kind it is given; only its bounding
         # box lets matter slide and leave
         if plane["kind"] != "separate" or float(plane.get("friction", 0.0)) != 0.0:
-            raise Cannot(f"stops matter at every plane, also at a {plane['kind']} one with friction")
+            raise Cannot(
+                f"stops matter at every plane, also at a {plane['kind']} one with friction"
+            )
         if normal[axis] < 0.0:
             raise Cannot("has a sliding wall at the sides of its domain only")
         below = math.ceil(float(plane["point"][axis]) / placed.dx - 1e-6) - 1
@@ -94,9 +96,7 @@ class Engine:
             return torch.tensor(np.ascontiguousarray(value, np.float32), device=self.device)
 
         # what load_initial_data_from_torch does, which has cuda:0 written into it
-        solver.import_particle_x_from_torch(
-            tensor(self.placed.inward(scene.x)), True, self.device
-        )
+        solver.import_particle_x_from_torch(tensor(self.placed.inward(scene.x)), True, self.device)
         solver.mpm_state.particle_vol = wp.from_numpy(
             scene.volume.astype(np.float32), dtype=float, device=self.device
         )
