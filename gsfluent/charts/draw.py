@@ -185,8 +185,7 @@ class Chart:
         names = methods(mine, OURS)
         measure = mine[0].measures[0]["quantity"] if mine[0].measures else ""
         fronts = {m: [_dot(r) for r in front(_of(mine, case, m))] for m in names}
-        return Panel(f"{case}: {measure}" if measure else case, [_dot(r) for r in mine], fronts,
-                     band=_band(mine))  # fmt: skip
+        return Panel(case, [_dot(r) for r in mine], fronts, note=measure, band=_band(mine))
 
     def _rates(self) -> Rates | None:
         runs = [
