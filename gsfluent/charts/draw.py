@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -102,12 +103,29 @@ class Chart:
     def tables(self) -> list[tuple[str, list[str], list[list[Any]]]]:
         """Heading, head and rows of every table."""
         found = [
+            ("Against each peer", *self._summary()),
             ("Fronts", *self._fronts()),
             ("At every error level that a peer reaches", *self._levels()),
             ("Measures that trade nothing", *self._free()),
             ("Every run", *self._all()),
         ]
         return [t for t in found if t[2]]
+
+    def _summary(self) -> tuple[list[str], list[list[Any]]]:
+        head = ["case", "peer", "levels", "its least error", "our least error",
+                "least times cheaper", "median", "most", "not reached"]  # fmt: skip
+        rows = []
+        for case, peer in dict.fromkeys((v.case, v.peer.method) for v in self.verdict.rows):
+            mine = [v for v in self.verdict.rows if (v.case, v.peer.method) == (case, peer)]
+            ratios = [v.ratio for v in mine if v.ratio is not None]
+            least = min((counted(r) for r in _of(self.records, case, OURS) if r.ok), default=None)
+            rows.append([
+                case, peer, len(mine), min(counted(v.peer) for v in mine), least,
+                *((min(ratios), statistics.median(ratios), max(ratios)) if ratios
+                  else ("n/a", "n/a", "n/a")),
+                len(mine) - len(ratios),
+            ])  # fmt: skip
+        return head, rows
 
     def _fronts(self) -> tuple[list[str], list[list[Any]]]:
         head = ["case", "method", "setting", "points", "steps", "ms per simulated ms", "error"]

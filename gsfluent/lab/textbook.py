@@ -11,7 +11,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from gsfluent import ops
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab import textbook_laws as laws
+from gsfluent.lab.frozen_fracture import Drives, damage
 from gsfluent.lab.textbook_grid import (
     Stencil,
     collide,
@@ -34,6 +35,11 @@ from gsfluent.lab.textbook_nacc import Nacc, return_map
 from gsfluent.lab.textbook_variant import Birth, Variant
 
 __all__ = ["Birth", "Textbook", "Variant", "play_textbook"]
+
+
+def six(m: Tensor) -> Tensor:
+    """Entries xx, yy, zz, xy, xz, yz of symmetric matrices, [N, 6]."""
+    return m.reshape(-1, 9)[:, [0, 4, 8, 1, 2, 5]]
 
 
 class Textbook:
@@ -86,6 +92,10 @@ class Textbook:
         self.stress = torch.zeros_like(one)
         self.time, self.steps, self.dt = 0.0, 0, 0.0
         self.birth: Birth | None = None
+        self.peak = self.alpha
+        self.deformation = one.clone() if "deformation" in scene.asks else None
+        """Deformation gradient since the start, [N, 3, 3], where the scene asks for it."""
+        self._drives = Drives(scene, dtype, self.device) if scene.drives else None
         self._turn = torch.Generator().manual_seed(self.variant.shuffle or 0)
 
     def _number(self, value: Any) -> Tensor:
@@ -110,10 +120,6 @@ class Textbook:
         self.brittle = torch.tensor(nacc, device=self.device)[self.material]
         self.alpha = self._number(start)[self.material]
         self._brittle = self.brittle.nonzero()[:, 0]
-        for drive in self.scene.drives:
-            more = set(drive) - {"points", "velocity", "start", "end", "name"}
-            if more:
-                raise ValueError(f"Textbook: drives with {', '.join(sorted(more))} are not known")
 
     @property
     def position(self) -> Tensor:
@@ -126,7 +132,7 @@ class Textbook:
     def strain(self) -> Tensor:
         """Elastic strain e = b - I, [N, 6]: xx, yy, zz, xy, xz, yz."""
         e = laws.measure(self.state, self.variant.storage).e
-        return e.reshape(-1, 9)[:, [0, 4, 8, 1, 2, 5]]
+        return six(e)
 
     @property
     def volume_ratio(self) -> Tensor:
@@ -193,12 +199,6 @@ class Textbook:
                 each(self)
         return self
 
-    def _driven(self) -> None:
-        for drive in self.scene.drives:
-            if float(drive.get("start", 0.0)) <= self.time < float(drive.get("end", math.inf)):
-                rows = torch.as_tensor(drive["points"], device=self.device).long()
-                self.velocity[rows] = self._number(drive["velocity"])
-
     def advance(self, dt: float) -> None:
         """Advance by one step of ``dt`` seconds.
 
@@ -206,13 +206,13 @@ class Textbook:
             FloatingPointError: A number is not finite.
         """
         variant, scene = self.variant, self.scene
-        self._driven()
+        if self._drives is not None:
+            self._drives(cast(Any, self), dt)  # reads time and velocity alone
         scaled = self._offset if variant.local_positions else self._offset / scene.dx
         with torch.no_grad():
             s = stencil(self._cell, scaled, scene.dx, variant.kernel)
             mass, new, old = self._grid(s, dt)
             slope = self._gather(s, new, old, dt)
-            self._driven()
             inverted = laws.det(slope * dt + torch.eye(3, dtype=self.dtype, device=self.device))
             self._map(dt * slope, ~(inverted > 0))
             fine = torch.isfinite(self.velocity).all() & torch.isfinite(self.stress).all()
@@ -321,11 +321,6 @@ class Textbook:
             taken = taken + variant.flip * (self.velocity - lost)
         self.velocity = taken
         self.affine = affine if variant.transfer == "apic" else torch.zeros_like(affine)
-        for drive in self.scene.drives:
-            if float(drive.get("start", 0.0)) <= self.time < float(drive.get("end", math.inf)):
-                rows = torch.as_tensor(drive["points"], device=self.device).long()
-                move = move.index_fill(0, rows, 0.0)
-                move[rows] = self._number(drive["velocity"])
         if variant.local_positions:
             here = self._offset + dt / dx * move
             whole = torch.floor(torch.nan_to_num(here))
@@ -336,6 +331,8 @@ class Textbook:
 
     def _map(self, increment: Tensor, inverted: Tensor) -> None:
         variant, m = self.variant, self.nacc
+        if self.deformation is not None:
+            self.deformation = self.deformation + increment @ self.deformation
         state = laws.advance(self.state, increment, variant.storage)
         if variant.clamp is not None:
             state = laws.clamped(state, variant.storage, *variant.clamp, inverted)
@@ -346,6 +343,7 @@ class Textbook:
                 variant.return_map, m.of(rows), own, self.alpha[rows], absolute=variant.absolute
             )
             self.alpha = self.alpha.index_copy(0, rows, alpha)
+            self.peak = torch.maximum(self.peak, self.alpha)
             moved = plastic.nonzero()[:, 0]
             if moved.shape[0]:
                 at, e = rows[moved], e[moved]
@@ -406,8 +404,7 @@ def play_textbook(
         **options: Fields of :class:`Variant`.
 
     Returns:
-        The run; one that broke off says why in ``failed``. ``damage`` is 1 where alpha is not
-        negative.
+        The run; one that broke off says why in ``failed``. Impulses are not kept.
 
     Raises:
         ValueError: A choice that there is not.
@@ -415,9 +412,14 @@ def play_textbook(
     """
     variant = Variant(**options)
     solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt, cfl=cfl)
-    shape = (scene.times.shape[0], scene.count, 3)
-    x, v = np.full(shape, math.nan), np.full(shape, math.nan)
-    damage = np.full(shape[:2], math.nan)
+    count = scene.times.shape[0]
+    x, v = np.full((count, scene.count, 3), math.nan), np.full((count, scene.count, 3), math.nan)
+    intact = solver.alpha
+    kept: dict[str, np.ndarray] = {"damage": np.full(x.shape[:2], math.nan)}
+    if "stress" in scene.asks:
+        kept["stress"] = np.full((*x.shape[:2], 6), math.nan)
+    if "deformation" in scene.asks:
+        kept["deformation"] = np.full((*x.shape, 3), math.nan)
     wall, failed = 0.0, ""
     for i, end in enumerate(scene.times):
         start = time.perf_counter()
@@ -430,12 +432,16 @@ def play_textbook(
             torch.cuda.synchronize()
         wall += time.perf_counter() - start
         x[i], v[i] = solver.position.cpu().numpy(), solver.velocity.double().cpu().numpy()
-        damage[i] = (solver.brittle & (solver.alpha >= 0.0)).double().cpu().numpy()
+        kept["damage"][i] = damage(cast(Any, solver), intact).double().cpu().numpy()
+        if "stress" in kept:
+            kept["stress"][i] = six(solver.stress).double().cpu().numpy()
+        if solver.deformation is not None:
+            kept["deformation"][i] = solver.deformation.double().cpu().numpy()
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         **dataclasses.asdict(variant),
     }  # fmt: skip
     return Run(
         scene.name, method, scene.times, x, v, wall, solver.steps, settings, str(device), failed,
-        damage=damage,
+        **kept,
     )  # fmt: skip

@@ -28,7 +28,7 @@ from gsfluent.pipeline.run_store import StageStore, fingerprint, publish
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.scene import Scene
 
-__all__ = ["chart_shot", "choose_stage"]
+__all__ = ["chart_shot", "choose_stage", "readable"]
 
 _log = logging.getLogger(__name__)
 FILE, PICTURE = "chart.json", "chart.png"
@@ -98,6 +98,58 @@ def _write(result: dict[str, Any], folder: Path) -> None:
 
     write_json(folder / FILE, result)
     draw_choice(result, folder / PICTURE)
+
+
+def readable(result: dict[str, Any]) -> dict[str, Any]:
+    """``chart.json`` for a person: one line per setting, shares as percentages."""
+    chosen = result["chosen"]
+    taken = "none meets it" if chosen is None else _words(chosen)
+    if chosen is None and result["enough"] is not None:
+        taken += f"; {_words(result['enough'])} is as fine as chance lets be seen"
+    probe = result["probe"]
+    return {
+        "asked for": f"{result['bound']:.1%}",
+        "chosen": taken,
+        "sure": f"{result['sure']:.0%}",
+        "reason": result["reason"],
+        "settings": [
+            {
+                "cells": s["cells"],
+                "cfl": s["cfl"],
+                "seconds": s["seconds"],
+                "error": f"{s['error']:.1%}",
+                "5 % to 95 %": f"{s['low']:.1%} to {s['high']:.1%}",
+                "sure": f"{s['sure']:.0%}",
+                "worst": s["worst"],
+            }
+            for s in result["settings"]
+        ],
+        "observables": [
+            {
+                "seen": o["name"],
+                "order": o["order"],
+                f"error at {probe['cells'][-1]} cells": f"{o['error_finest']:.1%}",
+                "run to run": f"{o['band']:.1%}",
+                "growth": o["growth"],
+                "settles": o["asymptotic"],
+            }
+            for o in result["observables"]
+        ],
+        "probed": (
+            f"{probe['cells']} cells, {probe['seeds']} seeds, frames {probe['frames'][0]} to "
+            f"{probe['frames'][1] - 1} of {probe['of_frames']}, in {probe['seconds']:.0f} s; "
+            f"solid: {result['solid']}"
+        ),
+        "seconds from": result["seconds_from"],
+        "outputs": result["outputs"],
+    }
+
+
+def _words(setting: dict[str, Any]) -> str:
+    return (
+        f"{setting['cells']} cells, cfl {setting['cfl']:g}: error {setting['error']:.1%}, "
+        f"{setting['seconds']:.3g} s"
+    )
 
 
 def choose_stage(context: RunContext) -> None:
