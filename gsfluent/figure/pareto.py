@@ -46,21 +46,21 @@ class Panel:
         title: Its heading.
         dots: All runs.
         fronts: Of each method the dots that no other one beats, from cheap to dear.
-        note: What its error is, in small letters under the heading.
         band: Run-to-run spread: errors below mean nothing; None for none.
         xlabel: Of the x axis; empty for the figure's own.
         ylabel: Likewise.
         highest: Errors of this and more are drawn on a rail, with a triangle.
+        note: What its error is, in small letters under the heading.
     """
 
     title: str
     dots: Sequence[Dot]
     fronts: Mapping[str, Sequence[Dot]]
-    note: str = ""
     band: float | None = None
     xlabel: str = ""
     ylabel: str = ""
     highest: float = 1.0
+    note: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
