@@ -296,3 +296,33 @@ def test_one_table_of_several_methods(
     (runs / "glue" / "bar.npz").write_bytes(b"")
     assert call(table, str(runs), *drawn) == 1
     assert len(records.read_text().splitlines()) == 3
+    # a peer's records of a ladder: the frozen resolution counts, and of its variants the best
+    lines = []
+    for dx, points, variant, error in (
+        (0.02, 128, "a", 1e-4), (0.01, 1024, "a", 0.3), (0.01, 1024, "b", 0.2), (0.01, 9, "c", 0.1),
+    ):  # fmt: skip
+        line = next(
+            r for r in map(json.loads, records.read_text().splitlines()) if r["method"] == "glue"
+        )
+        line |= {"method": "peer", "points": points, "variant": variant, "error": error}
+        line["settings"] = {"dx": dx}
+        lines.append(json.dumps(line) + "\n")
+    peers = tmp_path / "peers.jsonl"
+    peers.write_text("".join(lines))
+    assert call(table, str(peers), *drawn) == 0
+    assert "| gsfluent, cpu | glue, cpu | peer, cpu |" in page.read_text()
+    assert "| 0.5 | 0.2 |" in page.read_text()
+
+
+def test_ladder_and_references_enter_the_page(
+    scripts: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ladder, page = scripts("ladder"), tmp_path / "p.md"
+    monkeypatch.setattr(sys, "argv", ["x", "pull_apart", "--page", str(page)])
+    assert ladder.main() == 0
+    text = page.read_text()
+    assert "(128)," in text and "| exact |" in text and "Hertz" in text
+    dx = [0.4, 0.2, 0.1]
+    assert ladder.order(dx, [3.0 * h**1.5 for h in dx]) == pytest.approx(1.5)
+    assert math.isnan(ladder.order(dx, [1e-8, 1e-8, 1e-8]))
+    assert math.isnan(ladder.order(dx, [0.1, 0.1, math.inf]))
