@@ -145,7 +145,7 @@ def tables(records: Sequence[Record]) -> str:
     said = [
         "Error of each method (the first measure of the case); bold within the tolerance.",
         "\n".join([f"| case | tolerance | {head} |", rule, *errors]),
-        "Wall time of the steps [s] for all the simulated time; one run, uninterrupted. "
+        "Wall time of the steps [s] for all the simulated time, without a stop. "
         + "; ".join(f"{device}: {', '.join(m)}" for device, m in where.items()) + ".",
         "\n".join([f"| case | points | {head} |", rule, *times]),
         "Every measure of gsfluent:",
