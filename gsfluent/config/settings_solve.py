@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from gsfluent.config.read import choice, flag, key, whole
+from gsfluent.config.read import choice, flag, key, number, whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,7 +14,6 @@ class SolveSettings:
 
     LATER: ClassVar[dict[str, str]] = {
         "error": "choosing the setting by an error bound",
-        "seconds_per_frame": "choosing the setting by a time budget",
     }
     quality: str = key(
         choice("preview", "shot", "hero"),
@@ -27,6 +26,13 @@ class SolveSettings:
         default=None,
         doc="Cells along the longest side of the largest solid, instead of those of `quality`.",
         example="32",
+    )
+    seconds_per_frame: float | None = key(
+        number(above=0.0),
+        default=None,
+        doc="Wall time that simulating a frame may take on this machine [s], instead of `quality` "
+        "and `cells`: as many cells as that allows, by the cost model of `gsfluent plan`.",
+        example="0.5",
     )
     standing: bool = key(
         flag,
