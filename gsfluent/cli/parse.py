@@ -11,8 +11,9 @@ import tyro
 from gsfluent import __version__
 from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_export import Export
+from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
-from gsfluent.cli.verbs_run import Demo, Render, Run
+from gsfluent.cli.verbs_run import Demo, Render, Report, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
 from gsfluent.cli.verbs_view import View
 
@@ -27,9 +28,12 @@ VERBS: dict[str, type[Verb]] = {
     "plan": Plan,
     "run": Run,
     "render": Render,
+    "report": Report,
     "view": View,
     "export": Export,
     "metrics": Metrics,
+    "chart": Chart,
+    "stability": Stability,
 }
 
 _ABOUT = """\

@@ -190,3 +190,26 @@ class Render(Verb):
                 device=self.torch_device(),
                 progress=progress,
             )
+
+
+@dataclass(kw_only=True)
+class Report(Verb):
+    """Make report.html of a finished run anew: verdict, plan against fact, curves, timings.
+
+    Examples:
+      gsfluent report out               # out/report.html, which `gsfluent run` writes as well
+      gsfluent report out --json        # where it lies, for a program
+
+    One file without scripts that shows the video beside it; nothing is computed again.
+    """
+
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Folder that `gsfluent run` wrote."""
+
+    def execute(self) -> dict[str, Any]:
+        """Write the page."""
+        from gsfluent.pipeline.report import read_run, write_report
+
+        existing(self.out, "OUT", folder=True)
+        values = read_run(self.out)
+        return {"report": str(write_report(self.out, values)), "verdict": values["verdict"]}

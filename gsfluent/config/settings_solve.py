@@ -3,18 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from pathlib import Path
+from typing import Any
 
-from gsfluent.config.read import choice, flag, key, number, whole
+from gsfluent.config.read import Place, Reader, choice, flag, key, mapping, number, section, whole
+from gsfluent.errors import InputError
+
+
+def share(low: float, high: float) -> Reader:
+    """Reader of a share, ``3%`` or ``0.03``, in ``low..high``."""
+
+    def read(value: Any, place: Place) -> float:
+        if isinstance(value, str) and value.strip().endswith("%"):
+            value, unit = value.strip()[:-1].strip(), 0.01
+        else:
+            unit = 1.0
+        try:
+            found = unit * float(number()(value, place))
+        except InputError:
+            raise place.error("be a share such as 3% or 0.03", value) from None
+        if not low <= found <= high:
+            raise place.error(f"lie in {low:.2%}..{high:.0%}", f"{found:.4g}")
+        return round(found, 12)  # 3 * 0.01 is not 0.03
+
+    return read
+
+
+def read_error(text: str, argument: str) -> float:
+    """Read a bound on the error from words, for the command line.
+
+    Raises:
+        InputError: Not a share such as ``3%`` or ``0.03``, or out of range.
+    """
+    return float(_ERROR(text, Place(argument, Path())))
+
+
+_ERROR = share(1e-4, 0.5)
 
 
 @dataclasses.dataclass(frozen=True)
 class SolveSettings:
     """``solve:`` - how accurately."""
 
-    LATER: ClassVar[dict[str, str]] = {
-        "error": "choosing the setting by an error bound",
-    }
     quality: str = key(
         choice("preview", "shot", "hero"),
         default="shot",
@@ -26,6 +56,19 @@ class SolveSettings:
         default=None,
         doc="Cells along the longest side of the largest solid, instead of those of `quality`.",
         example="32",
+    )
+    cfl: float = key(
+        number(0.05, 0.9),
+        default=0.5,
+        doc="Courant number of the automatic time step.",
+        example="0.7",
+    )
+    error: float | None = key(
+        _ERROR,
+        default=None,
+        doc="Largest error, instead of `quality` and `cells`: the cheapest cells and cfl that "
+        "short probes of the shot promise to meet it with.",
+        example="3%",
     )
     seconds_per_frame: float | None = key(
         number(above=0.0),
@@ -55,3 +98,24 @@ class SolveSettings:
         "anyway; a blade at work on a GPU does not, and is refused then.",
         example="true",
     )
+
+
+def read_solve(value: Any, place: Place) -> SolveSettings:
+    """Read ``solve:``; what chooses the cells may be said only once."""
+    solve: SolveSettings = section(SolveSettings, value, place)
+    given = mapping(value, place)
+    # of a resolved shot every default is written out: those say nothing
+    defaults = {"quality": "shot", "cfl": 0.5, "cells": None, "seconds_per_frame": None}
+    for chooser, what, others in (
+        ("error", "the cells and the time step", ("quality", "cells", "cfl", "seconds_per_frame")),
+        ("seconds_per_frame", "the cells", ("quality", "cells")),
+    ):
+        if getattr(solve, chooser) is None:
+            continue
+        for name in others:
+            if given.get(name, defaults[name]) != defaults[name]:
+                raise InputError(
+                    f"{place.path}.{chooser} chooses {what}, and {name} is given too",
+                    f"remove {chooser} or {name}",
+                )
+    return solve

@@ -36,7 +36,7 @@ from gsfluent.config.settings import (
     read_texture,
 )
 from gsfluent.config.settings_light import LightSettings
-from gsfluent.config.settings_solve import SolveSettings
+from gsfluent.config.settings_solve import SolveSettings, read_solve
 from gsfluent.errors import InputError
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -144,7 +144,7 @@ class Shot:
         example="[{type: sphere, at: [0, 0, 0.1], radius: 0.1}]",
     )
     solve: SolveSettings = key(
-        nested(SolveSettings),
+        read_solve,
         default=SolveSettings(),
         doc="How accurately.",
         example="{quality: preview}",

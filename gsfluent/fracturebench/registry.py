@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from collections.abc import Callable, Iterable, Sequence
 
 from .run import Measure, Run
 from .scene import Scene, SceneError
 
 __all__ = ["Case", "case", "cases", "find", "judge"]
+
+MODULES = (
+    "contact",
+    "elastic",
+    "flow",
+    "fracture_bars",
+    "fracture_shatter",
+)
+"""Modules of this package that register cases."""
 
 Build = Callable[[float, int], Scene]
 Judge = Callable[[Scene, Run], Iterable[Measure]]
@@ -62,8 +72,8 @@ def case(
 
 def cases(kind: str | None = None) -> list[Case]:
     """Return all cases, or those of a kind, by name."""
-    from . import elastic  # noqa: F401  (registers its cases)
-
+    for module in MODULES:
+        importlib.import_module(f".{module}", __package__)
     chosen = (c for c in _CASES.values() if kind is None or c.kind == kind)
     return sorted(chosen, key=lambda c: c.name)
 

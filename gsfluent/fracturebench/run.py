@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from .scene import Floats, Scene, SceneError
+from .scene import BROKEN, Floats, Scene, SceneError
 
 __all__ = ["Measure", "Run"]
 
-_OPTIONAL = ("damage", "stress", "impulse")
+_OPTIONAL = ("damage", "stress", "impulse", "deformation")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,8 @@ class Run:
         failed: Why it broke off, or empty.
         damage: 0 intact to 1 broken, [T, N], if the method knows.
         stress: Cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept.
-        impulse: Given by each collider or drive so far [N s], [T, K, 3], if kept.
+        impulse: Given by each collider, and then by each drive, so far [N s], [T, K, 3], if kept.
+        deformation: Deformation gradient of each point since the start, [T, N, 3, 3], if kept.
     """
 
     scene: str
@@ -78,6 +79,7 @@ class Run:
     damage: Floats | None = None
     stress: Floats | None = None
     impulse: Floats | None = None
+    deformation: Floats | None = None
 
     @property
     def finite(self) -> bool:
@@ -100,8 +102,19 @@ class Run:
                     f"{self.method}, {scene.name}: {name} has shape {value.shape}, the scene asks "
                     f"for {shape} (times, points, 3)"
                 )
-        if not np.allclose(self.times, scene.times, rtol=1e-6, atol=0.0):
+        if self.times.shape != scene.times.shape or not np.allclose(
+            self.times, scene.times, rtol=1e-6, atol=0.0
+        ):
             raise SceneError(f"{self.method}, {scene.name}: other times than the scene asks for")
+        each = (*shape[:2],)
+        for name, wanted in (
+            ("damage", each), ("stress", (*each, 6)), ("deformation", (*each, 3, 3)),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and value.shape != wanted:
+                raise SceneError(
+                    f"{self.method}, {scene.name}: {name} has shape {value.shape}, not {wanted}"
+                )
         return self
 
     def save(self, path: str | Path) -> Path:
@@ -128,13 +141,19 @@ class Run:
         """
         try:
             with np.load(path, allow_pickle=False) as data:
-                header = json.loads(str(data["header"]))
+                header = dict(json.loads(str(data["header"])))
                 arrays: dict[str, Any] = {
                     k: np.asarray(data[k], dtype=np.float64) for k in ("times", "x", "v")
                 }
                 more: dict[str, Any] = {
                     k: np.asarray(data[k], np.float64) for k in _OPTIONAL if k in data
                 }
+            header["wall_seconds"] = float(header["wall_seconds"])
+            header["steps"] = int(header["steps"])
+            for key in ("scene", "method", "device", "failed"):
+                header[key] = str(header.get(key, ""))
+            header["settings"] = dict(header.get("settings", {}))
             return cls(**header, **arrays, **more)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SceneError(f"{path}: not a run of FractureBench ({error})") from error
+        except BROKEN as error:
+            said = str(error) or type(error).__name__
+            raise SceneError(f"{path}: not a run of FractureBench ({said})") from error

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,16 +14,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FORMAT", "Scene", "SceneError"]
+__all__ = ["BROKEN", "FORMAT", "Scene", "SceneError", "quantised"]
 
 FORMAT = 1
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
+BROKEN = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, NotImplementedError,
+    RuntimeError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading a file that is cut, or that is something else, may raise."""
 _ARRAYS = ("x", "v", "volume", "material", "body", "affine", "times")
 
 
 class SceneError(ValueError):
     """A scene or a run that is not what it should be; the message says what, where and the mend."""
+
+
+def quantised(value: NDArray[Any]) -> NDArray[np.int64]:
+    """Return an array in whole parts of 1/2^24 of its largest number.
+
+    Sines and sums differ in the last digit from one processor to the next; this does not.
+    """
+    if value.dtype.kind in "iu":
+        return value.astype(np.int64)
+    top = float(np.abs(value).max(initial=0.0))
+    return (
+        np.rint(value * (2.0**24 / top)).astype(np.int64) if top > 0.0 else value.astype(np.int64)
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,11 +65,16 @@ class Scene:
         gravity: [m/s^2].
         colliders: Planes: ``{"point", "normal", "kind": "sticky" | "slip" | "separate",
             "friction"}``.
-        drives: Groups of points whose velocity is prescribed, in place of what the method would
-            give them: ``{"points": [indices], "velocity": [vx, vy, vz], "start": s, "end": s}``.
-            Other keys (a load that depends on time or place) are described by the case.
+        drives: What acts on groups of points. ``points`` is a list of indices or ``"all"``, and
+            one of: ``velocity`` [vx, vy, vz], prescribed in place of what the method would give
+            them (null: this component is free); ``force``, [[fx, fy, fz], ...] in N on each of the
+            points, added; ``damping`` in 1/s, the force ``-damping m v``. ``start`` and ``end`` [s]
+            bound it (default always); over ``ramp`` seconds from the start velocity and force
+            grow linearly from 0 (default at once).
         friction: Coulomb coefficient between bodies.
         facts: Numbers that the judge needs and a simulator does not.
+        asks: Further fields of :class:`~gsfluent.fracturebench.run.Run` that the case is judged
+            by, such as ``deformation``.
     """
 
     name: str
@@ -66,6 +92,7 @@ class Scene:
     drives: tuple[Mapping[str, Any], ...] = ()
     friction: float = 0.0
     facts: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    asks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n, t = self.x.shape[0], self.times.shape[0]
@@ -117,6 +144,15 @@ class Scene:
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {"format": FORMAT} | {k: v for k, v in plain.items() if k not in arrays}
 
+    def digest(self) -> str:
+        """SHA-256 of all arrays, each :func:`quantised`: the same on every machine."""
+        found = hashlib.sha256()
+        for name in _ARRAYS:
+            value = quantised(np.asarray(getattr(self, name)))
+            found.update(f"{name} {value.shape}".encode())
+            found.update(np.ascontiguousarray(value, dtype="<i8").tobytes())
+        return found.hexdigest()
+
     def save(self, path: str | Path) -> Path:
         """Write an ``.npz`` that holds all of it, under a temporary name until it is whole."""
         path = Path(path)
@@ -136,12 +172,20 @@ class Scene:
         """
         try:
             with np.load(path, allow_pickle=False) as data:
-                header = json.loads(str(data["header"]))
+                header = dict(json.loads(str(data["header"])))
                 arrays = {name: data[name] for name in _ARRAYS}
-        except (OSError, ValueError, KeyError) as error:
-            raise SceneError(f"{path}: not a scene of FractureBench ({error})") from error
+        except BROKEN as error:
+            raise SceneError(f"{path}: not a scene of FractureBench ({_said(error)})") from error
         if header.pop("format", None) != FORMAT:
             raise SceneError(f"{path}: not of format {FORMAT}; make the scenes again")
-        for key in ("materials", "colliders", "drives", "gravity"):
-            header[key] = tuple(header[key])
-        return cls(**header, **arrays)
+        try:
+            for key in ("materials", "colliders", "drives", "gravity", "asks"):
+                header[key] = tuple(header.get(key, ()))
+            return cls(**header, **arrays)
+        except BROKEN as error:
+            raise SceneError(f"{path}: {_said(error)}") from error
+
+
+def _said(error: BaseException) -> str:
+    """What an error says, or its name where it says nothing."""
+    return str(error) or type(error).__name__

@@ -120,7 +120,8 @@ class Prospect:
         """What happens on a grid of spacing ``dx``."""
         # the run simulates until its last frame, not until the end
         seconds = (self.frames - 1) / self.shot.output.fps
-        return foresee(self.scene, dx, seconds, self.frames, self.counts(dx))
+        cfl = self.shot.solve.cfl
+        return foresee(self.scene, dx, seconds, self.frames, self.counts(dx), cfl=cfl)
 
     def splats(self, cells: int) -> tuple[float, dict[str, float]]:
         """Splats of the solids, and the features of filling them."""

@@ -129,6 +129,7 @@ def foresee(
     frames: int,
     counts: list[int],
     *,
+    cfl: float = CFL,
     blocks: list[float] | None = None,
 ) -> Outlook:
     """Foresee a scene.
@@ -139,6 +140,7 @@ def foresee(
         seconds: Simulated time [s].
         frames: Frames; the last step before each is shortened.
         counts: Material points of each body.
+        cfl: Courant number.
         blocks: Active blocks of each body while it is whole; :func:`intact_blocks` when absent.
     """
     gravity = torch.tensor(scene.gravity, dtype=torch.float64)
@@ -168,7 +170,7 @@ def foresee(
         )
         # every point has its block in the end
         stored = min(stored, 2.0 * present)
-        rate = (wave + speed) / (CFL * dx)
+        rate = (wave + speed) / (cfl * dx)
         steps += rate * left / _TICKS
         speed_sum += rate * speed
         point_sum += rate * present
@@ -190,7 +192,7 @@ def foresee(
         blocks=block_sum / weight,
         blocks_most=most,
         substeps=math.ceil(steps + 0.5 * begun) if left > 0.0 else 0,
-        dt=CFL * dx / wave if wave > 0 else math.inf,
+        dt=cfl * dx / wave if wave > 0 else math.inf,
         wave=wave,
         speed=speed_sum / weight,
         struck=min((m.strikes for m in strikes), default=math.inf),

@@ -98,7 +98,7 @@ def _chosen(context: RunContext) -> dict[str, Any]:
     shot = context.shot
     source = shot.capture or shot.splats
     digest = content_digest(Path(source)) if source is not None else ""
-    key = fingerprint("choose", context.key(shot.resolved(), digest))
+    key = fingerprint("budget", context.key(shot.resolved(), digest))
 
     def work(folder: Path) -> dict[str, Any]:
         from gsfluent.pipeline.plan import cost_model, plan_shot
@@ -116,4 +116,4 @@ def _chosen(context: RunContext) -> dict[str, Any]:
             "calibrated": model.made,
         }
 
-    return dict(context.store.run("choose", key, work).report)
+    return dict(context.store.run("budget", key, work).report)

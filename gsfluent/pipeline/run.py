@@ -18,7 +18,9 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
+from gsfluent.pipeline.choose_shot import choose_stage
 from gsfluent.pipeline.plan_run import foresee_run, judge_plan
+from gsfluent.pipeline.report import REPORT, write_report
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_prepare import (
     fill_stage,
@@ -89,6 +91,7 @@ def run_shot(
         fill_stage(context)
         texture_stage(context)
         regions_stage(context)
+        choose_stage(context)
         simulate_stage(context)
         render_stage(context)
         export_stage(context)
@@ -107,7 +110,9 @@ def run_shot(
             _kept(out, store),
             "run the same command again to go on; GSFLUENT_DEBUG=1 shows the traceback",
         ) from error
+    record.values["outputs"]["report"] = REPORT
     values = record.finish(store.results)
+    write_report(out, values)
     _log.info(
         "%s in %.1f s: %s (%s)",
         out,

@@ -83,24 +83,29 @@ def _moving(settings: ObjectSettings) -> dict[str, Any]:
     return {k: v for k, v in settings.to_dict().items() if k not in materials.LOOKS}
 
 
-def simulate_stage(context: RunContext) -> None:
-    """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
-    shot = context.shot
+def moving_settings(shot: Shot) -> list[Any]:
+    """All of a shot that its motion hangs on, but for cells and step."""
     objects = {
         # the numbers of a preset, not its name: a retuned preset is another simulation
         name: [_moving(settings), repr(_material(settings))]
         for name, settings in shot.objects.items()
     }
-    settings = [
+    return [
         objects,
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.quality, shot.solve.cells, shot.solve.standing, shot.solve.loose_crumbs],
+        [shot.solve.standing, shot.solve.loose_crumbs],
         shot.output.fps,
         shot.output.seconds,
-        shot.output.cracks,
     ]
+
+
+def simulate_stage(context: RunContext) -> None:
+    """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
+    shot = context.shot
+    solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl]
+    settings = [moving_settings(shot), solve, shot.output.cracks]
     key = fingerprint("simulate", context.key(context.source_key, settings))
 
     def work(folder: Path) -> dict[str, Any]:
@@ -111,6 +116,7 @@ def simulate_stage(context: RunContext) -> None:
             seed=context.seed,
             device=context.device,
             dx=None if cells is None else grid_spacing(scene, cells),
+            cfl=shot.solve.cfl,
             standing=shot.solve.standing,
             loose_crumbs=shot.solve.loose_crumbs,
             deterministic=shot.solve.deterministic,

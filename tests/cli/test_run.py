@@ -58,6 +58,8 @@ def test_a_run_leaves_what_it_promises(finished: Path) -> None:
     record = read(finished)
     assert set(record) >= KEYS
     assert record["verdict"] == "clean"
+    page = (finished / record["outputs"]["report"]).read_text()
+    assert record["outputs"]["video"] in page and "<svg" in page
     assert set(record["simulation"]) >= SIMULATION_KEYS
     per_frame = record["simulation"]["per_frame"]
     assert set(per_frame) >= PER_FRAME_KEYS

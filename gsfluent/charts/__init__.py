@@ -1,0 +1,4 @@
+"""Charts of speed against accuracy: ladders of settings, one JSON line per run, fronts, pages.
+
+:mod:`~gsfluent.charts.record` is the line that every script and verb of the lab reads and writes.
+"""

@@ -1,0 +1,93 @@
+"""Curves over one common axis, a panel per quantity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from gsfluent.figure.style import COLORS, FAILED, INK, OURS, new_figure, to_svg
+
+__all__ = ["Panel", "curves"]
+
+Values = Sequence[float | int | None]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes.
+
+    Attributes:
+        title: Over it.
+        unit: Along its vertical axis.
+        series: Name -> values over the common axis; None and NaN are gaps.
+        bar: A level to draw, such as a limit, or None.
+        whole: Whether values are counts: no fractions along the axis.
+        log: Logarithmic values; zeros are gaps then.
+    """
+
+    title: str
+    unit: str
+    series: Mapping[str, Values] = field(default_factory=dict)
+    bar: float | None = None
+    whole: bool = False
+    log: bool = False
+
+
+def _numbers(values: Values, log: bool) -> list[float]:
+    plain = [math.nan if v is None else float(v) for v in values]
+    return [v if not log or v > 0.0 else math.nan for v in plain]
+
+
+def curves(along: Sequence[float], label: str, panels: Sequence[Panel], *, columns: int = 2) -> str:
+    """Draw panels below and beside each other.
+
+    Args:
+        along: Common horizontal axis, [N].
+        label: Its name and unit.
+        panels: What to draw; a panel without any number is left out.
+        columns: Panels side by side.
+
+    Returns:
+        An ``<svg>`` element; empty when nothing is left to draw.
+
+    Raises:
+        ValueError: A series has another length than ``along``.
+    """
+    for panel in panels:
+        for name, values in panel.series.items():
+            if len(values) != len(along):
+                raise ValueError(f"{panel.title}, {name}: {len(values)} values over {len(along)}")
+    drawn = [
+        p
+        for p in panels
+        if any(math.isfinite(v) for values in p.series.values() for v in _numbers(values, p.log))
+    ]
+    if not drawn:
+        return ""
+    columns = min(columns, len(drawn))
+    rows = math.ceil(len(drawn) / columns)
+    with new_figure(4.6 * columns, 2.7 * rows) as figure:
+        grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes, panel in zip(grid, drawn, strict=False):
+            colors = (OURS, *COLORS)
+            for i, (name, values) in enumerate(panel.series.items()):
+                numbers = _numbers(values, panel.log)
+                # a value between two gaps would be no line at all
+                alone = sum(map(math.isfinite, numbers)) < 0.5 * len(numbers)
+                mark, color = ("." if alone else None), colors[i % len(colors)]
+                axes.plot(along, numbers, color=color, label=name, linewidth=1.4, marker=mark)
+            if panel.bar is not None:
+                axes.axhline(panel.bar, color=FAILED, linewidth=0.9, linestyle=(0, (5, 3)))
+            if panel.log:
+                axes.set_yscale("log")
+            elif panel.whole:
+                axes.yaxis.get_major_locator().set_params(integer=True)
+            axes.set_title(panel.title)
+            axes.set_ylabel(panel.unit)
+            axes.set_xlabel(label, color=INK)
+            if len(panel.series) > 1:
+                axes.legend()
+        for axes in grid[len(drawn) :]:
+            axes.remove()
+        return to_svg(figure)

@@ -1,0 +1,312 @@
+"""The cheapest setting that meets an error on a shot of one's own: ``gsfluent chart SHOT --error``.
+
+Nothing about the truth is known, so the shot is run a few times on coarse grids, from just before
+something happens and for few frames; how fast the answers draw together tells how far the coarse
+ones are from where they are going (:mod:`gsfluent.pipeline.choose_fit`), and what a finer grid
+would cost is told by the cost model. ``solve: {error: 3%}`` does the same within ``gsfluent run``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsfluent.config import Shot
+from gsfluent.errors import InputError
+from gsfluent.pipeline.choose_fit import Fit, History, fit_history
+from gsfluent.pipeline.choose_pick import CELLS, Choice, pick, ranked
+from gsfluent.pipeline.choose_probe import Probe, distance, histories, probe, window
+from gsfluent.pipeline.choose_seconds import cost_of
+from gsfluent.pipeline.simulate_solver import CFL
+from gsfluent.pipeline.stage import Progress, report_progress
+from gsfluent.scene import Scene
+
+__all__ = ["LEVELS", "Probing", "Probes", "choose", "choose_setting", "run_probes", "summary"]
+
+_log = logging.getLogger(__name__)
+
+LEVELS = (10, 14, 20)
+"""Cells of the probes: the finest has half of those of ``quality: shot``."""
+FRAMES = 12
+LONG_STEP = 0.7
+"""The other Courant number that is offered."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Probing:
+    """How a shot is probed.
+
+    Args:
+        levels: Cells of the probes, coarse to fine, at least three.
+        frames: Frames from just before something happens.
+        seeds: Runs per level; None: three where something can break, else two.
+        cfl: Courant numbers to offer beside 0.5.
+    """
+
+    levels: tuple[int, ...] = LEVELS
+    frames: int = FRAMES
+    seeds: int | None = None
+    cfl: tuple[float, ...] = (LONG_STEP,)
+
+    def __post_init__(self) -> None:
+        if len(self.levels) < 3 or list(self.levels) != sorted(set(self.levels)):
+            raise InputError(
+                f"probes need three or more growing numbers of cells, got {list(self.levels)}",
+                "for example 10 14 20",
+            )
+        if min(self.levels) < 6 or self.frames < 2 or (self.seeds or 2) < 2:
+            raise InputError(
+                "probes need 6 cells, 2 frames and 2 seeds at least",
+                "for example levels 10 14 20, frames 12, seeds 2",
+            )
+
+
+QUICK = Probing(levels=(8, 10, 12), frames=6, seeds=2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Probes:
+    """What was run.
+
+    Attributes:
+        whole: The two coarsest levels over the whole shot, or the window where that is all.
+        levels: All levels over the window, by seed.
+        long: With the longer steps, Courant number to its runs on the middle level.
+        first: First frame of the window.
+        last: Last frame + 1.
+        fps: Frames per second.
+    """
+
+    whole: tuple[Probe, Probe]
+    levels: tuple[tuple[Probe, ...], ...]
+    long: Mapping[float, tuple[Probe, ...]]
+    first: int
+    last: int
+    fps: float
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of all runs [s]."""
+        every = [p for level in (*self.levels, *self.long.values()) for p in level]
+        return sum(p.seconds for p in {id(p): p for p in (*self.whole, *every)}.values())
+
+
+def run_probes(
+    scene: Scene,
+    shot: Shot,
+    probing: Probing,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Probes:
+    """Run the probes of a scene.
+
+    Args:
+        scene: The scene of the shot.
+        shot: For its frames and what its ``solve`` leaves as it is.
+        probing: How.
+        device: Where to compute.
+        seed: Of the first run of each level; the others follow it.
+        progress: Told after every run.
+
+    Raises:
+        InputError: A probe broke off.
+    """
+    fps, total = shot.output.fps, max(2, round(shot.output.fps * shot.output.seconds))
+    done, seeds = 0, probing.seeds or 2
+
+    def go(cells: int, number: int, frames: int, cfl: float = CFL) -> Probe:
+        nonlocal done
+        found = probe(
+            scene, cells, fps=fps, frames=frames, cfl=cfl, seed=seed + number, device=device,
+            standing=shot.solve.standing, loose_crumbs=shot.solve.loose_crumbs,
+        )  # fmt: skip
+        if found.failed:
+            raise InputError(
+                f"the probe at {cells} cells broke off: {found.failed}",
+                "change the shot as it says, or set solve.quality instead of solve.error",
+            )
+        done += 1
+        runs = len(probing.levels) * seeds + len(probing.cfl) * seeds
+        report_progress(progress, min(done, runs), runs, f"{cells} cells, seed {number}")
+        return found
+
+    coarse = go(probing.levels[0], 0, total)
+    first, last = window(coarse.seen, probing.frames)
+    if probing.seeds is None and bool((coarse.seen.broken > 0.0).any()):
+        seeds = 3
+    second = go(probing.levels[1], 0, total)
+    levels = []
+    for at, cells in enumerate(probing.levels):
+        known = [coarse, second][at : at + 1]
+        levels.append((*known, *(go(cells, n, last) for n in range(len(known), seeds))))
+    middle = probing.levels[1]
+    long = {cfl: tuple(go(middle, n, last, cfl) for n in range(seeds)) for cfl in probing.cfl}
+    report_progress(progress, done, done, "probed")
+    return Probes((coarse, second), tuple(levels), long, first, last, fps)
+
+
+def choose_setting(
+    probes: Probes,
+    bound: float,
+    seconds: Callable[[int, float], float],
+    *,
+    cells: Sequence[int] = CELLS,
+) -> tuple[Choice, list[Fit], dict[str, float]]:
+    """Fit, extrapolate and choose.
+
+    Args:
+        probes: The runs.
+        bound: Largest error.
+        seconds: Wall time of the whole simulation by cells and Courant number [s].
+        cells: Settings offered.
+
+    Returns:
+        The choice, the fits, and by observable the growth from the window to the whole shot.
+    """
+    scale = probes.whole[0].seen
+    shown = histories(probes.levels, probes.first, probes.last, scale)
+    fits = [fit_history(history) for history in shown]
+    growth = _growth(probes)
+    steps: dict[float, dict[str, tuple[float, float]]] = {CFL: {}}
+    for cfl, runs in probes.long.items():
+        steps[cfl] = _step_error(shown, histories([runs], probes.first, probes.last, scale))
+    settings = ranked(fits, bound, seconds, growth=growth, steps=steps, cells=cells)
+    return pick(fits, settings, bound), fits, growth
+
+
+def _growth(probes: Probes) -> dict[str, float]:
+    """Factor on the error from the window to the whole shot, at least 1, by observable.
+
+    What two coarse levels differ by over all frames, over what they differ by in the window.
+    """
+    coarse, second = probes.whole
+    total = min(coarse.seen.frames, second.seen.frames)
+    pairs = []
+    for first, last in ((probes.first, probes.last), (0, total)):
+        shown = histories([(coarse,), (second,)], first, last, coarse.seen)
+        pairs.append({h.name: distance(h.values[0][0], h.values[1][0]) for h in shown})
+    inside, whole = pairs
+    return {
+        name: max(1.0, whole[name] / inside[name]) if inside.get(name, 0.0) > 0.0 else 1.0
+        for name in whole
+    }
+
+
+def _step_error(
+    usual: Sequence[History], longer: Sequence[History]
+) -> dict[str, tuple[float, float]]:
+    """What a longer step changes on the middle level, and the size of its cells, by observable.
+
+    Of the difference between the means, what their scatter explains is taken off.
+    """
+    found = {}
+    by_name = {history.name: history for history in longer}
+    for history in usual:
+        if history.name not in by_name:  # nothing has broken with the longer step
+            continue
+        runs, size = history.values[1], history.sizes[1]
+        gap = distance(runs.mean(axis=0), by_name[history.name].values[0].mean(axis=0))
+        chance = 2.0 * history.scatter(size) ** 2 / runs.shape[0]
+        found[history.name] = (math.sqrt(max(0.0, gap**2 - chance)), size)
+    return found
+
+
+def choose(
+    scene: Scene,
+    shot: Shot,
+    bound: float,
+    *,
+    probing: Probing | None = None,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Probe a scene and choose.
+
+    Args:
+        scene: The scene of the shot.
+        shot: The shot.
+        bound: Largest error, a share.
+        probing: How to probe.
+        device: Where to compute.
+        seed: Seed of the runs.
+        progress: Told after every run.
+
+    Returns:
+        ``chart.json``: see docs/chart_shot.md.
+
+    Raises:
+        InputError: A probe broke off, or the scene is empty.
+    """
+    probing = probing or Probing()
+    probes = run_probes(scene, shot, probing, device=device, seed=seed, progress=progress)
+    seconds, source = cost_of(probes.whole, probes.levels, scene, shot, device)
+    choice, fits, growth = choose_setting(probes, bound, seconds)
+    _log.info("chart: %s", choice.reason)
+    return summary(choice, fits, growth, probes, probing, source) | {"device": str(device)}
+
+
+def summary(
+    choice: Choice,
+    fits: Sequence[Fit],
+    growth: Mapping[str, float],
+    probes: Probes,
+    probing: Probing,
+    source: str,
+) -> dict[str, Any]:
+    """Plain values of a choice."""
+
+    def plain(setting: Any) -> dict[str, Any]:
+        return {
+            k: _rounded(v) if isinstance(v, float) else v
+            for k, v in dataclasses.asdict(setting).items()
+        } | {"parts": {k: _rounded(v) for k, v in setting.parts.items()}}
+
+    chosen = choice.chosen
+    return {
+        "bound": choice.bound,
+        "met": chosen is not None,
+        "chosen": None if chosen is None else plain(chosen),
+        "enough": None if choice.enough is None else plain(choice.enough),
+        "sure": _rounded(choice.sure),
+        "reason": choice.reason,
+        "within": _rounded(choice.within) if math.isfinite(choice.within) else None,
+        "floor": _rounded(choice.floor),
+        "floor_of": choice.floor_of,
+        "asymptotic": choice.asymptotic,
+        "settings": [plain(setting) for setting in choice.settings],
+        "observables": [
+            {
+                "name": fit.name,
+                "order": _rounded(fit.order),
+                "order_spread": _rounded(float(fit.orders.std())),
+                "error_finest": _rounded(float(np.median(fit.error))),
+                "band": _rounded(fit.history.band),
+                "growth": _rounded(growth.get(fit.name, 1.0)),
+                "misfit": _rounded(fit.misfit),
+                "parallel": _rounded(fit.parallel),
+                "asymptotic": fit.asymptotic,
+            }
+            for fit in fits
+        ],
+        "probe": {
+            "cells": list(probing.levels),
+            "seeds": len(probes.levels[-1]),
+            "frames": [probes.first, probes.last],
+            "of_frames": probes.whole[0].seen.frames,
+            "seconds": _rounded(probes.seconds),
+        },
+        "seconds_from": source,
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")

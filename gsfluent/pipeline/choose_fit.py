@@ -1,0 +1,218 @@
+"""How the error of a setting falls with the size of the cells, from runs that know no truth.
+
+Richardson extrapolation of whole histories: on cells of size ``h`` an observable is
+``f(h) = f* + c h^p``, with ``c`` a history of its own and one order ``p``. ``p`` is searched in
+0.5..2, the range in which quadratic B-splines converge (2 inside, about 1 at free surfaces), as
+Eca and Hoekstra (2014), J. Comput. Phys. 262, section 3, do for grid studies of flows. What the
+probes leave open is drawn at random: the order by how well each value of it fits, the histories by
+their scatter between seeds. The same numbers give the same draws.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ORDERS", "Fit", "History", "fit_history"]
+
+Array = NDArray[np.float64]
+
+ORDERS = (0.5, 2.0)
+"""Least and largest order of convergence that is believed."""
+DRAWS = 400
+_GRID = 61
+_SMALL = 1e-12
+
+
+@dataclasses.dataclass(frozen=True)
+class History:
+    """One observable on several levels of cells.
+
+    Args:
+        name: What it is.
+        sizes: Size of the cells of each level, coarse to fine, [L]; any unit.
+        values: Per level the history of each seed, [S, T, K]: S seeds, T moments, K components; in
+            units of the observable's own scale, so that 0.03 is an error of 3 %.
+        chaotic: Runs differ by chance on every level alike (matter has broken): the scatter between
+            seeds does not shrink with the cells.
+    """
+
+    name: str
+    sizes: tuple[float, ...]
+    values: tuple[Array, ...]
+    chaotic: bool = False
+
+    @property
+    def band(self) -> float:
+        """Run-to-run band on the finest level that has several seeds: rms over the history."""
+        return self.bands[-1][1] if self.bands else 0.0
+
+    @property
+    def bands(self) -> list[tuple[float, float]]:
+        """Size of the cells and rms scatter of a single run, of all levels with several seeds."""
+        found = []
+        for size, runs in zip(self.sizes, self.values, strict=True):
+            if runs.shape[0] > 1:
+                variance = runs.var(axis=0, ddof=1)
+                found.append((size, math.sqrt(float(variance.sum(axis=-1).mean()))))
+        return found
+
+    def scatter(self, size: float) -> float:
+        """Scatter of a single run at a size of cells.
+
+        For what is chaotic it is the mean of the levels at every size; else it is that of sampling
+        the points and falls with the cells, in proportion at most.
+        """
+        bands = self.bands
+        if not bands:
+            return 0.0
+        if self.chaotic:
+            return math.sqrt(sum(b * b for _, b in bands) / len(bands))
+        return size * math.sqrt(sum((b / h) ** 2 for h, b in bands) / len(bands))
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """The error of one observable by size of cells.
+
+    Args:
+        name: What it is.
+        order: Best fitting order.
+        orders: Orders drawn, [D].
+        error: Rms error of the mean at the finest level, drawn, [D].
+        finest: Size of the cells of that level.
+        misfit: Rms of what the law does not explain over the change that it does explain.
+        parallel: Cosine between the successive changes; 1 is steady convergence.
+        history: The data.
+    """
+
+    name: str
+    order: float
+    orders: Array
+    error: Array
+    finest: float
+    misfit: float
+    parallel: float
+    history: History
+
+    def mean_errors(self, size: float) -> Array:
+        """Drawn rms errors of the mean of many runs at a size of cells, [D]."""
+        return np.asarray(self.error * (size / self.finest) ** self.orders)
+
+    def errors(self, size: float) -> Array:
+        """Drawn rms errors of one run at a size of cells, [D]: of the mean, and its scatter."""
+        return np.asarray(np.hypot(self.mean_errors(size), self.history.scatter(size)))
+
+    @property
+    def asymptotic(self) -> bool:
+        """Whether the changes follow a power of the cells at all.
+
+        Where they are no larger than the scatter there is nothing to follow, and nothing wrong.
+        """
+        first, last = self.history.values[0], self.history.values[-1]
+        change = _rms(first.mean(axis=0) - last.mean(axis=0))
+        noise = self.history.scatter(self.finest)
+        if change <= max(noise, _SMALL):
+            return True
+        return bool(self.misfit < 0.5 and self.parallel > 0.0 and self.order > ORDERS[0])
+
+
+def fit_history(history: History, *, seed: int = 0, draws: int = DRAWS) -> Fit:
+    """Fit the law to one observable.
+
+    Args:
+        history: At least three levels.
+        seed: Seed of the draws.
+        draws: How many.
+
+    Raises:
+        ValueError: Fewer than three levels, sizes that do not fall, or histories that do not match.
+    """
+    sizes = np.asarray(history.sizes, dtype=np.float64)
+    if sizes.size < 3 or sizes.size != len(history.values):
+        raise ValueError(f"fit_history: needs three levels with values, got {sizes.size}")
+    if not (np.diff(sizes) < 0).all() or not (sizes > 0).all():
+        raise ValueError(f"fit_history: sizes must fall, got {history.sizes}")
+    if len({runs.shape[1:] for runs in history.values}) != 1:
+        raise ValueError("fit_history: histories of different length")
+    scaled = sizes / sizes[-1]
+    grid = np.linspace(*ORDERS, _GRID)
+    means = np.stack([runs.mean(axis=0).reshape(-1) for runs in history.values])
+    moments, components = history.values[0].shape[1:]
+    rng = np.random.default_rng([seed, *history.name.encode()])
+
+    best, amplitude, _ = _solve(means, scaled, grid)
+    at = int(best.argmin())
+    wave = amplitude[at] / math.sqrt(moments)
+    steps = np.diff(means, axis=0)
+    explained = wave * float(scaled[0] ** grid[at] - 1.0)
+    # residuals of L levels with two unknowns per moment
+    left = math.sqrt(float(best[at]) / (moments * max(1, sizes.size - 2)))
+    # one history is one datum: its moments hang together
+    power = 0.5 * components * (sizes.size - 2)
+
+    orders, error = np.empty(draws), np.empty(draws)
+    for draw in range(draws):
+        noisy = means + _noise(history, rng)
+        residual, amplitude, _ = _solve(noisy, scaled, grid)
+        weight = ((residual.min() + _SMALL) / (residual + _SMALL)) ** power
+        pick = int(rng.choice(grid.size, p=weight / weight.sum()))
+        orders[draw] = grid[pick]
+        error[draw] = amplitude[pick] / math.sqrt(moments) + left * abs(rng.standard_normal())
+    return Fit(
+        name=history.name,
+        order=float(grid[at]),
+        orders=orders,
+        error=error,
+        finest=float(sizes[-1]),
+        misfit=left / explained if explained > _SMALL else 0.0,
+        parallel=_cosine(steps[0], steps[-1]),
+        history=history,
+    )
+
+
+def _solve(means: Array, sizes: Array, grid: Array) -> tuple[Array, Array, Array]:
+    """Least squares of ``f* + c s^p`` for each order: squared residual, norm of c, and weights.
+
+    Args:
+        means: [L, T K].
+        sizes: Over the finest one, [L].
+        grid: Orders [G].
+    """
+    gram = means @ means.T
+    powers = sizes[None, :] ** grid[:, None]
+    centred = powers - powers.mean(axis=1, keepdims=True)
+    weights = centred / (centred**2).sum(axis=1, keepdims=True)
+    count = sizes.size
+    middle = np.eye(count) - np.full((count, count), 1.0 / count)
+    total = float(np.trace(middle @ gram))
+    amplitude = np.sqrt(np.maximum(np.einsum("gi,ij,gj->g", weights, gram, weights), 0.0))
+    residual = np.maximum(total - amplitude**2 * (centred**2).sum(axis=1), 0.0)
+    return residual, amplitude, weights
+
+
+def _noise(history: History, rng: np.random.Generator) -> Array:
+    """What the mean of each level may be off by: its seeds' deviations with random weights."""
+    rows: list[Array] = []
+    for runs in history.values:
+        count = runs.shape[0]
+        off = runs - runs.mean(axis=0)
+        if count == 1:  # no seeds of its own: the scatter of the others, along no known history
+            spread = history.scatter(history.sizes[len(rows)]) / math.sqrt(runs.shape[2])
+            rows.append(spread * rng.standard_normal() * np.ones(off[0].size))
+            continue
+        weights = rng.standard_normal(count) / math.sqrt(count * (count - 1))
+        rows.append(np.tensordot(weights, off, axes=1).reshape(-1))
+    return np.stack(rows)
+
+
+def _rms(history: Array) -> float:
+    return math.sqrt(float((history**2).sum(axis=-1).mean()))
+
+
+def _cosine(first: Array, last: Array) -> float:
+    lengths = float(np.linalg.norm(first) * np.linalg.norm(last))
+    return float(first @ last) / lengths if lengths > _SMALL else 1.0

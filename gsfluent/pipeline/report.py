@@ -1,0 +1,228 @@
+"""``report.html``: a run on one page, from ``run.json`` alone.
+
+Verdict, plan against fact, energy and momentum, damage, pieces, holes, and where the time went.
+Nothing is computed again, so the page of an old run can be made anew.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsfluent.errors import InputError
+from gsfluent.figure.page import Page
+from gsfluent.figure.series import Panel, curves
+
+__all__ = ["REPORT", "read_run", "report_page", "write_report"]
+
+REPORT = "report.html"
+_KINDS = {"clean": "good", "healed": "warn", "failed": "bad"}
+Values = Mapping[str, Any]
+
+
+def read_run(out: Path) -> dict[str, Any]:
+    """Read ``OUT/run.json``.
+
+    Raises:
+        InputError: It is not there, or it is not such a file.
+    """
+    path = out / "run.json"
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: not there", "name the folder of a run, as `gsfluent run -o` was given it"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error})", "run the shot again") from error
+    if not isinstance(values, dict) or "verdict" not in values:
+        raise InputError(f"{path}: not the record of a run", "run the shot again")
+    return values
+
+
+def write_report(out: Path, values: Values) -> Path:
+    """Write the page of a run beside its video.
+
+    Args:
+        out: Folder of the run.
+        values: Content of its ``run.json``.
+
+    Returns:
+        ``OUT/report.html``.
+
+    Raises:
+        RunError: The folder cannot be written.
+    """
+    return report_page(out, values).write(out / REPORT)
+
+
+def report_page(out: Path, values: Values) -> Page:
+    """Make the page; sections of which the run says nothing are left out."""
+    page = Page(out.resolve().name, f"gsfluent {values.get('version', '')} on {values['device']}")
+    verdict = str(values["verdict"])
+    page.text(f"{verdict}: {values.get('reason', '')}", kind=_KINDS.get(verdict, ""))
+    outputs = values.get("outputs") or {}
+    if (video := outputs.get("video")) and (out / video).is_file():
+        page.video(video, "the shot as it was asked for")
+    if (inside := outputs.get("interior")) and (out / inside).is_file():
+        page.picture(out / inside, "cuts through the filled and textured object")
+    _summary(page, values)
+    _plan(page, values.get("plan"))
+    simulation = values.get("simulation") or {}
+    _motion(page, simulation.get("per_frame") or {}, simulation)
+    _pictures(page, values)
+    _stages(page, values.get("stages") or [])
+    _left_out(page, simulation.get("skipped") or {})
+    return page
+
+
+def _summary(page: Page, values: Values) -> None:
+    simulation, render = values.get("simulation") or {}, values.get("render") or {}
+    reconstruction = values.get("reconstruction") or {}
+    fragments = (simulation.get("per_frame") or {}).get("fragments") or []
+    rows = [
+        ("held-out PSNR of the photographs [dB]", reconstruction.get("psnr")),
+        ("Gaussians", reconstruction.get("gaussians")),
+        ("material points", simulation.get("particles")),
+        ("cell of the grid [m]", simulation.get("dx")),
+        ("time steps", simulation.get("substeps")),
+        ("shortest and longest step [s]", _pair(simulation, "dt_min", "dt_max")),
+        ("pieces at the end", fragments[-1] if fragments else None),
+        ("rollbacks", simulation.get("rollbacks")),
+        ("largest error of momentum", simulation.get("momentum_error")),
+        ("rendered frames", render.get("frames")),
+        ("time per rendered frame [s]", render.get("seconds_per_frame")),
+    ]
+    kept = [row for row in rows if row[1] not in (None, "")]
+    if kept:
+        page.heading("In short").table(["figure", "value"], kept)
+
+
+def _pair(values: Values, first: str, second: str) -> str:
+    low, high = values.get(first), values.get(second)
+    return "" if low is None or high is None else f"{low:.3g}, {high:.3g}"
+
+
+def _plan(page: Page, plan: Any) -> None:
+    """What was predicted before the run, beside what it took."""
+    rows = _compared(plan) if isinstance(plan, Mapping) else []
+    if not rows:
+        return
+    page.heading("Plan against fact")
+    page.table(["quantity", "predicted", "actual", "actual / predicted"], rows)
+    page.listing([str(w) for w in plan.get("warnings") or []], kind="warn")
+
+
+def _compared(plan: Values) -> list[tuple[str, Any, Any, Any]]:
+    predicted, actual = plan.get("predicted") or {}, plan.get("actual") or {}
+    rows: list[tuple[str, Any, Any, Any]] = []
+    for name, guess in predicted.items():
+        fact = actual.get(name)
+        if isinstance(guess, Mapping):
+            inner = _compared({"predicted": guess, "actual": fact or {}})
+            rows += [(f"{name}: {part}", *rest) for part, *rest in inner]
+        elif _is_number(guess) and _is_number(fact):
+            rows.append((name, guess, fact, fact / guess if guess else None))
+    return rows
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _sizes(vectors: Sequence[Sequence[float]]) -> list[float]:
+    return [sum(c * c for c in vector) ** 0.5 for vector in vectors]
+
+
+def _motion(page: Page, frames: Values, simulation: Values) -> None:
+    time = frames.get("time") or []
+    if not time:
+        return
+    energies = {
+        name: frames[name]
+        for name in ("kinetic", "elastic", "dissipated", "gravity")
+        if name in frames
+    }
+    if len(energies) == 4:
+        parts = zip(*energies.values(), strict=True)
+        energies["sum"] = [None if None in p else sum(p) for p in parts]
+    panels = [
+        Panel("Energy", "J", energies),
+        Panel("Momentum", "kg m/s", {"momentum": _sizes(frames.get("momentum") or [])}),
+        Panel(
+            "Momentum that no force explains", "share", {"error": frames.get("momentum_error", [])},
+            bar=simulation.get("momentum_bar"), log=True,
+        ),
+        Panel(
+            "Damage", "share of the matter",
+            {"broken": frames.get("damaged_fraction", []),
+             "largest piece": frames.get("largest_fragment", [])},
+        ),
+        Panel(
+            "Pieces", "count",
+            {"all": frames.get("fragments", []),
+             "over 3 % of the matter": frames.get("fragments_over_3_percent", [])},
+            whole=True,
+        ),
+    ]  # fmt: skip
+    panels = [_only(panel, len(time)) for panel in panels]
+    if drawing := curves(time, "time [s]", panels):
+        page.heading("Motion").svg(drawing, "dashed: the largest value that passes")
+
+
+def _only(panel: Panel, count: int) -> Panel:
+    """Without the series that the run did not keep."""
+    kept = {name: values for name, values in panel.series.items() if len(values) == count}
+    return Panel(panel.title, panel.unit, kept, panel.bar, panel.whole, panel.log)
+
+
+def _pictures(page: Page, values: Values) -> None:
+    render = values.get("render") or {}
+    holes = render.get("hole_fraction") or []
+    if not holes:
+        return
+    panels = [
+        Panel(
+            "Holes in the picture", "share of the object",
+            {"with crack faces": holes, "without": render.get("hole_fraction_before", [])},
+        ),
+        Panel("Splats born at cracks", "count", {"born": render.get("transition_gaussians", [])},
+              whole=True),
+    ]  # fmt: skip
+    panels = [_only(panel, len(holes)) for panel in panels]
+    if drawing := curves(list(range(len(holes))), "frame", panels):
+        page.heading("Pictures").svg(drawing)
+
+
+def _stages(page: Page, stages: Sequence[Values]) -> None:
+    if not stages:
+        return
+    total = sum(float(stage.get("seconds") or 0.0) for stage in stages)
+    rows = [
+        (
+            stage["name"],
+            stage.get("seconds"),
+            f"{100.0 * float(stage.get('seconds') or 0.0) / total:.0f} %" if total else "",
+            _gigabytes(stage.get("peak_memory_bytes")),
+            _gigabytes(stage.get("peak_device_memory_bytes")),
+            "taken up from before" if stage.get("resumed") else "",
+        )
+        for stage in stages
+    ]
+    page.heading("Where the time went")
+    head = ["stage", "seconds", "share", "memory [GB]", "on the device [GB]", ""]
+    page.table(head, [*rows, ("all", total, "", None, None, "")])
+
+
+def _gigabytes(size: Any) -> float | None:
+    return round(size / 1e9, 2) if size else None
+
+
+def _left_out(page: Page, skipped: Values) -> None:
+    """What the scene did not need and was not computed."""
+    if skipped:
+        page.heading("What was left out")
+        page.text("Counted while the run went on; docs/simulation.md says what each figure means.")
+        page.table(["figure", "value"], [(k.replace("_", " "), v) for k, v in skipped.items()])
