@@ -99,7 +99,11 @@ def _execute(command: Verb, as_json: bool) -> int:
     else:
         from gsfluent.cli.show import show
 
-        show(result)
+        text = command.text(result)
+        if text is None:
+            show(result)
+        else:
+            sys.stdout.write(text + "\n")
     # only doctor has a verdict of its own to give with its exit code; the others raise
     return 1 if result.get("ok") is False else 0
 

@@ -192,6 +192,7 @@ class CostModel:
             particles, blocks, substeps, fields=fields, laws=chosen, composed_steps=composed_steps
         )
         features |= framing(frames, gaussians, particles, brittle=brittle)
+        features |= {"points": particles, "gaussians": gaussians, "blocks_most": blocks}
         return self.stage("simulate", features, corrected=corrected)
 
     def correction(self, name: str) -> float:

@@ -69,8 +69,8 @@ class Size:
 SIZES = (
     Size("cold", 10, 2000, 64, 24, 8, 2, (64, 48), "rubber"),
     Size("small", 30, 3000, 80, 32, 10, 6, (128, 96), "fruit.watermelon"),
-    Size("large", 30, 9000, 160, 56, 14, 4, (256, 192), "rubber"),
-    Size("large", 30, 9000, 160, 56, 14, 8, (384, 288), "fruit.watermelon"),
+    Size("large", 30, 12000, 160, 56, 14, 4, (256, 192), "rubber"),
+    Size("large", 30, 12000, 160, 56, 14, 8, (384, 288), "fruit.watermelon"),
 )
 """The last is the third, broken, with more and larger frames: its first stages are found done."""
 _TRAININGS = ((80, 3000, 90), (160, 3000, 30))
