@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsfluent.charts import quality, rendering
+from gsfluent.charts import quality, reconstruction, rendering
 from gsfluent.charts.quality import Job, Outcome, chart_quality, gathered, run_jobs
 from gsfluent.charts.record import read
 from gsfluent.errors import InputError, RunError
@@ -116,3 +116,11 @@ def test_every_kind_has_a_ladder_with_names_of_their_own(kind: str) -> None:
     for quick in (False, True):
         keys = [job.key("cpu") for job in module.jobs(device=CPU, quick=quick)]
         assert len(keys) == len(set(keys)) >= 3
+
+
+def test_more_steps_come_nearer_to_the_photographs_held_out() -> None:
+    case = reconstruction._Case(10, 32, CPU)
+    few, many = (case(1, {"iterations": n, "start_gaussians": 800}) for n in (5, 80))
+    assert many.error < 0.8 * few.error < 0.8
+    assert many.measures["PSNR [dB]"] == pytest.approx(-20.0 * math.log10(many.error))
+    assert many.settings["steps"] == 80

@@ -32,12 +32,13 @@ class _Case:
 
     def __init__(self, views: int, size: int, device: torch.device) -> None:
         self.views, self.size, self.device = views, size, device
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     @functools.cached_property
     def capture(self) -> Capture:
-        with tempfile.TemporaryDirectory() as folder:
-            make_capture("watermelon", folder, views=self.views, size=self.size)
-            return load_capture(folder)
+        self._folder = tempfile.TemporaryDirectory()  # photographs are read when they are asked for
+        make_capture("watermelon", self._folder.name, views=self.views, size=self.size)
+        return load_capture(self._folder.name)
 
     def __call__(self, repeat: int, options: Mapping[str, Any]) -> Outcome:
         del repeat  # a training is long, and the same seed gives the same splats
