@@ -2,9 +2,11 @@
 
     python scripts/fracturebench/table.py RUNS ... [--records FILE] [--page FILE]
 
-RUNS are folders of runs on the frozen scenes, by gsfluent or by anyone (scripts/peers writes
-such files). A figure of the same case, method and device replaces the one recorded before. Without
-RUNS the table is drawn again from the records.
+RUNS are folders of runs on the frozen scenes, by gsfluent or by anyone, or .jsonl files of records
+(such as the peers' docs/data/peers_cpu.jsonl), of which those at the frozen resolution count. A
+figure of the same case, method and device replaces the one recorded before; of several variants of
+a peer the one of least error is shown, of gsfluent that of the default settings. Without RUNS the
+table is drawn again from the records.
 """
 
 from __future__ import annotations
@@ -55,11 +57,45 @@ def judge_all(folders: Sequence[Path]) -> tuple[list[Record], list[str]]:
     return records, bad
 
 
+def taken(path: Path) -> list[Record]:
+    """Records of a file that answer the frozen scenes."""
+    sizes: dict[str, int] = {}
+    known = {c.name: c for c in cases()}
+    found = []
+    for r in read(path):
+        case, dx = known.get(r.case), r.settings.get("dx")
+        if case is None or not isinstance(dx, int | float):
+            continue
+        if not math.isclose(dx, case.dx, rel_tol=1e-3) or (r.method == "gsfluent" and r.variant):
+            continue
+        if r.case not in sizes:
+            sizes[r.case] = frozen.build(case).count
+        if r.points == sizes[r.case]:
+            found.append(r)
+    return found
+
+
+def best(records: Sequence[Record]) -> list[Record]:
+    """Of each case, method and device the run of least error, and of these the fastest."""
+    found: dict[tuple[str, str, str], Record] = {}
+    for r in records:
+        key = r.case, r.method, r.device.split(":")[0]
+        old = found.get(key)
+        rank = (r.error, min(r.wall_seconds, default=math.inf))
+        if old is None or rank < (old.error, min(old.wall_seconds, default=math.inf)):
+            found[key] = r
+    return list(found.values())
+
+
 def kept(path: Path, new: Sequence[Record]) -> list[Record]:
     """Records of a file with new ones in place of the old, written back whole."""
-    known = {r.key: r for r in (read(path) if path.is_file() else [])}
-    known |= {r.key: r for r in new}
-    rows = [known[key] for key in sorted(known)]
+
+    def key(r: Record) -> tuple[str, str, str]:
+        return r.case, r.method, r.device.split(":")[0]
+
+    known = {key(r): r for r in (read(path) if path.is_file() else [])}
+    known |= {key(r): r for r in best(new)}
+    rows = [known[k] for k in sorted(known)]
     if new:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(path.name + ".tmp")
@@ -109,7 +145,7 @@ def tables(records: Sequence[Record]) -> str:
     said = [
         "Error of each method (the first measure of the case); bold within the tolerance.",
         "\n".join([f"| case | tolerance | {head} |", rule, *errors]),
-        "Wall time of the steps [s] for all the simulated time; one run, uninterrupted. "
+        "Wall time of the steps [s] for all the simulated time, without a stop. "
         + "; ".join(f"{device}: {', '.join(m)}" for device, m in where.items()) + ".",
         "\n".join([f"| case | points | {head} |", rule, *times]),
         "Every measure of gsfluent:",
@@ -146,9 +182,11 @@ def main() -> int:
     parser.add_argument("--page", type=Path, default=PAGE, metavar="FILE")
     args = parser.parse_args()
     try:
-        if missing := [str(p) for p in args.runs if not p.is_dir()]:
-            raise SceneError(f"no folder {', '.join(missing)}")
-        new, bad = judge_all(args.runs)
+        if missing := [str(p) for p in args.runs if not p.exists()]:
+            raise SceneError(f"no folder or file {', '.join(missing)}")
+        new, bad = judge_all([p for p in args.runs if p.is_dir()])
+        for path in args.runs:
+            new += [] if path.is_dir() else taken(path)
         records = kept(args.records, new)
         if not records:
             raise SceneError(f"no runs given and no records in {args.records}")
