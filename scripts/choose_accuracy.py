@@ -120,8 +120,8 @@ def judge(name: str, trial: Trial, options: argparse.Namespace, device: Any) -> 
     line: Line = {
         "shot": name, "bound": trial.bound, "met": result["met"], "sure": result["sure"],
         "floor": result["floor"], "floor_of": result["floor_of"], "reason": result["reason"],
-        "chosen": result["chosen"], "enough": result["enough"], "within": result["within"], "asymptotic": result["asymptotic"],
-        "probe": result["probe"], "observables": result["observables"],
+        **{k: result[k] for k in ("chosen", "enough", "within", "asymptotic", "probe")},
+        "observables": result["observables"],
         "probe_wall": probed, "device": device.type, "machine": machine(str(device)),
         "commit": commit(), "predicted": taken,
     }  # fmt: skip

@@ -14,7 +14,7 @@ from gsfluent.config import Shot
 from gsfluent.errors import InputError
 from gsfluent.io import write_json
 from gsfluent.pipeline.choose import Probing, choose
-from gsfluent.pipeline.plan import _stand_in
+from gsfluent.pipeline.plan_stand_in import stand_in
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_prepare import (
     fill_stage,
@@ -108,10 +108,10 @@ def shot_scene(
             stage(context)
         return build_scene(shot, load_solids(context), context.frame), f"the stages in {out}"
     warnings: list[str] = []
-    solid, frame, assumed = _stand_in(shot, warnings)
+    standing = stand_in(shot, warnings)
     for warning in warnings:
         _log.warning("chart: %s", warning)
-    return build_scene(shot, dict.fromkeys(shot.objects, solid), frame), assumed
+    return build_scene(shot, dict(standing.solids), standing.frame), standing.assumed
 
 
 def _write(result: dict[str, Any], folder: Path) -> None:
