@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from gsfluent.charts.front import cases, front
+from gsfluent.charts.front import cases, counted, front
 from gsfluent.charts.record import Record, append, commit, machine, read
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.figure.page import Page, shown
@@ -240,7 +240,7 @@ def _panel(records: Sequence[Record], case: str) -> Panel:
 
 def _dot(record: Record) -> Dot:
     return Dot(
-        record.method, record.wall_per_simulated, record.error, record.variant or "as it is",
+        record.method, record.wall_per_simulated, counted(record), record.variant or "as it is",
         failed=bool(record.failed),
     )  # fmt: skip
 

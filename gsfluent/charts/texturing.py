@@ -30,7 +30,8 @@ __all__ = ["XLABEL", "YLABEL", "jobs", "texture", "used"]
 
 XLABEL = "seconds"
 YLABEL = "distance of patches over that of the surface's colours"
-METHODS = ("color_copy", "telea", "profile", "procedural", "preview", "default", "full")
+METHODS = ("color_copy", "telea", "profile", "preview", "default", "full")
+"""Not procedural: its recipes are those that the truths are drawn from."""
 WORST = "color_copy"
 
 
