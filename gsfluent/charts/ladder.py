@@ -156,7 +156,9 @@ def ladder(
     references = [_textbook(case, steps[case.name], device, quick) for case in chosen if textbook]
     found += [s for made in references for s in made if s.knob == "textbook"]
     for case in chosen:
-        for dx in _two(steps[case.name], case.kind):
+        turned = _two(steps[case.name], case.kind)
+        # on a GPU most of a run is its set-up, and the finer rung says the same
+        for dx in turned[-1:] if device.startswith("cuda") else turned:
             found += _knobs(case, dx, device, quick)
     for name in off_grid:
         for dx in _OFF_RUNGS[:1] if quick else _OFF_RUNGS:
@@ -217,9 +219,9 @@ def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> l
         return [variant(steps[0], "textbook", "APIC, F", **base)]
     # plain PyTorch takes 3 ms a step on a GPU and 7 us a point and step on a CPU: few rungs
     coarse = steps[: 2 if case.kind == "fracture" else 3]
-    if device.startswith("cuda"):
-        coarse = coarse[-2:]
     found = [variant(dx, "textbook", "APIC, F", **base) for dx in coarse]
+    if device.startswith("cuda"):
+        found = found[-2:]
     at = coarse[0] if case.kind == "fracture" else coarse[min(1, len(coarse) - 1)]
     return [
         *found,
