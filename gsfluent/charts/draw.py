@@ -95,6 +95,9 @@ class Chart:
         found = []
         if len(self.machines) > 1:
             found.append(f"Times were taken on different machines: {'; '.join(self.machines)}.")
+        commits = list(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
+        if len(commits) > 1:
+            found.append(f"gsfluent's runs are of several commits: {', '.join(commits)}.")
         found += [f"{m} on {c}: on no level ({why})." for c, m, why in self.verdict.absent]
         return found
 

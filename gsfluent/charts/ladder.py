@@ -198,8 +198,8 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("dt", f"fixed dt, c dt/dx {DEMO_COURANT}", courant=DEMO_COURANT)
     yield turned("engine", "composed operators", engine="ops")
     if case.kind != "fracture":  # there riders part, which is the splats' matter (docs/cracks.md)
-        yield turned("gaussians", f"{DENSE} Gaussians a cell ride on 8 points", DENSE, ride_on=8)
-        yield turned("gaussians", f"{DENSE} Gaussians a cell, each a point", DENSE)
+        yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, ride_on=8)
+        yield turned("gaussians", f"{DENSE} per cell", DENSE)
     if device.startswith("cpu"):
         yield turned("free", "one thread", trades=False, threads=1)
     yield turned("free", "a call for every step", trades=False, single_steps=True)
