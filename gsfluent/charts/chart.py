@@ -10,7 +10,8 @@ from pathlib import Path
 
 import torch
 
-from gsfluent.charts.ladder import Setting, work
+from gsfluent.charts.ladder import OFF_GRID, Setting, work
+from gsfluent.charts.off_grid import measure_off_grid
 from gsfluent.charts.play import measure
 from gsfluent.charts.record import Record, append, commit, machine, read
 from gsfluent.pipeline.stage import Progress, report_progress
@@ -110,7 +111,8 @@ def run(
             left_out.append(setting)
             continue
         start = time.monotonic()
-        have[key] = measure(setting, device, repeat)
+        player = measure_off_grid if setting.case in OFF_GRID else measure
+        have[key] = player(setting, device, repeat)
         append(path, have[key])
         fresh += 1
         spent = (time.monotonic() - start) / work(setting)

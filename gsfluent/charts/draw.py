@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -102,12 +103,30 @@ class Chart:
     def tables(self) -> list[tuple[str, list[str], list[list[Any]]]]:
         """Heading, head and rows of every table."""
         found = [
+            ("Against each peer", *self._summary()),
             ("Fronts", *self._fronts()),
             ("At every error level that a peer reaches", *self._levels()),
+            ("What each knob does", *self._knobs()),
             ("Measures that trade nothing", *self._free()),
             ("Every run", *self._all()),
         ]
         return [t for t in found if t[2]]
+
+    def _summary(self) -> tuple[list[str], list[list[Any]]]:
+        head = ["case", "peer", "levels", "its least error", "our least error",
+                "least times cheaper", "median", "most", "not reached"]  # fmt: skip
+        rows = []
+        for case, peer in dict.fromkeys((v.case, v.peer.method) for v in self.verdict.rows):
+            mine = [v for v in self.verdict.rows if (v.case, v.peer.method) == (case, peer)]
+            ratios = [v.ratio for v in mine if v.ratio is not None]
+            least = min((counted(r) for r in _of(self.records, case, OURS) if r.ok), default=None)
+            rows.append([
+                case, peer, len(mine), min(counted(v.peer) for v in mine), least,
+                *((min(ratios), statistics.median(ratios), max(ratios)) if ratios
+                  else ("n/a", "n/a", "n/a")),
+                len(mine) - len(ratios),
+            ])  # fmt: skip
+        return head, rows
 
     def _fronts(self) -> tuple[list[str], list[list[Any]]]:
         head = ["case", "method", "setting", "points", "steps", "ms per simulated ms", "error"]
@@ -133,6 +152,23 @@ class Chart:
             ]
             for v in self.verdict.rows
         ]  # fmt: skip
+        return head, rows
+
+    def _knobs(self) -> tuple[list[str], list[list[Any]]]:
+        head = ["method", "setting", "runs", "median error over the base's", "from", "to",
+                "median time over the base's", "broke off"]  # fmt: skip
+        rows = []
+        turned = [r for r in self.records if r.variant and r.settings.get("trades", True)]
+        for method, variant in dict.fromkeys((r.method, r.variant) for r in turned):
+            mine = [r for r in turned if (r.method, r.variant) == (method, variant)]
+            pairs = [(r, b) for r in mine if r.ok and (b := _base(self.records, r)) and b.ok]
+            errors = [counted(r) / counted(b) for r, b in pairs]
+            times = [r.wall_per_simulated / b.wall_per_simulated for r, b in pairs]
+            if pairs:
+                rows.append([
+                    method, variant, len(mine), statistics.median(errors), min(errors),
+                    max(errors), statistics.median(times), len([r for r in mine if r.failed]),
+                ])  # fmt: skip
         return head, rows
 
     def _free(self) -> tuple[list[str], list[list[Any]]]:
@@ -167,11 +203,13 @@ class Chart:
         names = methods(mine, OURS)
         measure = mine[0].measures[0]["quantity"] if mine[0].measures else ""
         fronts = {m: [_dot(r) for r in front(_of(mine, case, m))] for m in names}
-        return Panel(f"{case}: {measure}" if measure else case, [_dot(r) for r in mine], fronts,
-                     band=_band(mine))  # fmt: skip
+        return Panel(case, [_dot(r) for r in mine], fronts, note=measure, band=_band(mine))
 
     def _rates(self) -> Rates | None:
-        runs = [r for r in self.records if r.ok and r.kind != "machine"]
+        runs = [
+            r for r in self.records
+            if r.ok and r.kind != "machine" and math.isfinite(r.ns_per_point_step)
+        ]  # fmt: skip
         if not runs:
             return None
         names = methods(runs, OURS)
@@ -243,7 +281,7 @@ def _band(records: Iterable[Record]) -> float | None:
 
 
 def _base(records: Iterable[Record], record: Record) -> Record | None:
-    """The run that a measure that trades nothing is compared with."""
+    """The run of the same case, method and rung at the defaults."""
     return next(
         (r for r in records if r.case == record.case and r.method == record.method
          and r.variant == "" and r.settings.get("dx") == record.settings.get("dx")),

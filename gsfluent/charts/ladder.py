@@ -14,8 +14,16 @@ from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import Case, cases
 from gsfluent.fracturebench.scene import Scene
 
-__all__ = ["DEMO_COURANT", "KNOBS", "OURS", "TEXTBOOK", "Setting", "ladder", "rungs", "work"]
+__all__ = [
+    "CASES", "DEMO_COURANT", "KNOBS", "OFF_GRID", "OURS", "TEXTBOOK", "Setting", "ladder", "rungs",
+    "work",
+]  # fmt: skip
 
+CASES = (
+    "bar", "beam", "spin", "two_material_bar", "drop", "collide", "oblique", "pull_apart",
+    "shatter",
+)  # fmt: skip
+"""What is charted by default: a case for each kind of motion, one panel each. Others by name."""
 OURS, TEXTBOOK = "gsfluent", "textbook"
 DEMO_COURANT = 0.09
 """c dt / dx at which the demos of PhysGaussian run: median of its six configurations, 0.366, 0.110,
@@ -39,6 +47,13 @@ KNOBS = {
     "transfer": "textbook: APIC, PIC or FLIP",
 }
 """What may be named in ``--only``."""
+OFF_GRID = {"flight": "flight on the grid", "rest": "no sleep"}
+"""Cases of :mod:`gsfluent.charts.off_grid`, and what their measure is called when it is off."""
+_OFF: dict[str, dict[str, Any]] = {
+    "flight": {"free_flight": False, "piece_flight": False},
+    "rest": {"sleep": False},
+}
+_OFF_RUNGS = (0.025, 0.0167)
 _FINER = (1.5, 2.0, 3.0, 4.0)
 _MOST_NUMBERS = 3e7
 """Times x points that are kept of one run on a GPU: 1.5 GB of positions and velocities."""
@@ -123,29 +138,37 @@ def ladder(
         InputError: An unknown case or knob.
     """
     known = {c.name: c for c in cases()}
-    if missing := [n for n in names if n not in known]:
-        raise InputError(f"--cases: no case {missing[0]!r}", f"there are {', '.join(known)}")
+    if missing := [n for n in names if n not in known and n not in OFF_GRID]:
+        there = ", ".join([*known, *OFF_GRID])
+        raise InputError(f"--cases: no case {missing[0]!r}", f"there are {there}")
     wanted = set(only) or set(KNOBS)
     if wrong := sorted(wanted - set(KNOBS)):
         raise InputError(f"--only: no knob {wrong[0]!r}", f"there are {', '.join(KNOBS)}")
-    chosen = [known[n] for n in dict.fromkeys(names)] or list(known.values())
-    if quick and not names:
-        chosen = [known[n] for n in ("bar", "pull_apart")]
+    given = names or (("bar", "pull_apart") if quick else (*CASES, *OFF_GRID))
+    chosen = [known[n] for n in dict.fromkeys(given) if n in known]
+    off_grid = [n for n in dict.fromkeys(given) if n in OFF_GRID]
     found: list[Setting] = []
     steps = {case.name: rungs(case, device, quick) for case in chosen}
     for case in chosen:
         found += [Setting(case.name, dx) for dx in steps[case.name]]
+    references = [_textbook(case, steps[case.name], device, quick) for case in chosen if textbook]
+    found += [s for made in references for s in made if s.knob == "textbook"]
     for case in chosen:
-        for dx in _two(steps[case.name]):
+        for dx in _two(steps[case.name], case.kind):
             found += _knobs(case, dx, device, quick)
-    if textbook:
-        for case in chosen:
-            found += _textbook(case, steps[case.name], quick)
+    for name in off_grid:
+        for dx in _OFF_RUNGS[:1] if quick else _OFF_RUNGS:
+            words, off = OFF_GRID[name], _OFF[name]
+            found.append(Setting(name, dx, knob="adaptive"))
+            found.append(Setting(name, dx, knob="adaptive", variant=words, options=off))
+    found += [s for made in references for s in made if s.knob != "textbook"]
     return [s for s in found if s.knob in wanted]
 
 
-def _two(steps: Sequence[float]) -> list[float]:
-    """The two rungs on which knobs are turned."""
+def _two(steps: Sequence[float], kind: str) -> list[float]:
+    """The two rungs on which knobs are turned; of fracture (ensembles) the coarse ones."""
+    if kind == "fracture":
+        return list(steps[:2])
     if len(steps) < 4:
         return sorted({steps[0], steps[-1]}, reverse=True)
     return [steps[len(steps) // 2 - 1], steps[-2]]
@@ -170,8 +193,9 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("ppc", "27 per cell", 27)
     yield turned("dt", f"fixed dt, c dt/dx {DEMO_COURANT}", courant=DEMO_COURANT)
     yield turned("engine", "composed operators", engine="ops")
-    yield turned("gaussians", f"{DENSE} Gaussians a cell ride on 8 points", DENSE, ride_on=8)
-    yield turned("gaussians", f"{DENSE} Gaussians a cell, each a point", DENSE)
+    if case.kind != "fracture":  # there riders part, which is the splats' matter (docs/cracks.md)
+        yield turned("gaussians", f"{DENSE} Gaussians a cell ride on 8 points", DENSE, ride_on=8)
+        yield turned("gaussians", f"{DENSE} Gaussians a cell, each a point", DENSE)
     if device.startswith("cpu"):
         yield turned("free", "one thread", trades=False, threads=1)
     yield turned("free", "a call for every step", trades=False, single_steps=True)
@@ -182,16 +206,22 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
         yield turned("return_map", "fixed centre", k=0.0)
 
 
-def _textbook(case: Case, steps: Sequence[float], quick: bool) -> Iterator[Setting]:
+def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> list[Setting]:
     def variant(dx: float, knob: str, words: str, **options: Any) -> Setting:
         return Setting(case.name, dx, 8, TEXTBOOK, knob, words, options)
 
     base: dict[str, Any] = {"transfer": "apic", "storage": "F"}
-    for dx in steps[:1] if quick else steps:
-        yield variant(dx, "textbook", "APIC, F", **base)
     if quick:
-        return
-    for dx in _two(steps):
-        yield variant(dx, "transfer", "PIC, F", **base | {"transfer": "pic"})
-        yield variant(dx, "transfer", "FLIP 0.99, F", **base | {"transfer": "flip"})
-        yield variant(dx, "storage", "APIC, strain", **base | {"storage": "strain"})
+        return [variant(steps[0], "textbook", "APIC, F", **base)]
+    # plain PyTorch takes 3 ms a step on a GPU and 7 us a point and step on a CPU: few rungs
+    coarse = steps[: 2 if case.kind == "fracture" else 3]
+    if device.startswith("cuda"):
+        coarse = coarse[-2:]
+    found = [variant(dx, "textbook", "APIC, F", **base) for dx in coarse]
+    at = coarse[0] if case.kind == "fracture" else coarse[min(1, len(coarse) - 1)]
+    return [
+        *found,
+        variant(at, "transfer", "PIC, F", **base | {"transfer": "pic"}),
+        variant(at, "transfer", "FLIP 0.99, F", **base | {"transfer": "flip"}),
+        variant(at, "storage", "APIC, strain", **base | {"storage": "strain"}),
+    ]

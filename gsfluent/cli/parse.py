@@ -11,7 +11,7 @@ import tyro
 from gsfluent import __version__
 from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_export import Export
-from gsfluent.cli.verbs_lab import Chart
+from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
@@ -33,6 +33,7 @@ VERBS: dict[str, type[Verb]] = {
     "export": Export,
     "metrics": Metrics,
     "chart": Chart,
+    "stability": Stability,
 }
 
 _ABOUT = """\

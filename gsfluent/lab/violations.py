@@ -22,7 +22,7 @@ from gsfluent.lab.resident import Resident
 
 __all__ = [
     "KINDS", "Limits", "Moving", "OfWorld", "State", "Violation", "check", "first_violation",
-    "observe",
+    "observe", "search", "volume_ratio",
 ]  # fmt: skip
 
 KINDS = {
@@ -195,7 +195,7 @@ def first_violation(
         limits: What is allowed.
         every: Steps between two looks.
         start: State that it is judged against; default: the present one.
-        seen: Called with the state at every good look.
+        seen: Called with the state at every good look, those of the halving included.
 
     Returns:
         The first violation, or None when there is none within ``steps``.
@@ -203,26 +203,57 @@ def first_violation(
     Raises:
         ValueError: ``every`` is not positive.
     """
-    if every < 1:
-        raise ValueError(f"first_violation: every must be at least 1, got {every}")
     first = start or moving.look()
-    begin = first.step
-    if (bad := check(first, moving.look(), limits)) is not None:
+
+    def judge() -> Violation | None:
+        now = moving.look()
+        bad = check(first, now, limits)
+        if bad is None and seen is not None and now.step > first.step:
+            seen(now)
         return bad
+
+    return search(moving, judge, steps, every=every, begin=first.step)
+
+
+def search(
+    moving: Moving,
+    judge: Callable[[], Violation | None],
+    steps: int,
+    *,
+    every: int = 8,
+    begin: int = 0,
+) -> Violation | None:
+    """Run on until a judge finds fault, and find the first step at which it does by halving.
+
+    Args:
+        moving: The run.
+        judge: Says what is wrong at present.
+        steps: Steps to go at most.
+        every: Steps between two looks.
+        begin: Number of the present step.
+
+    Returns:
+        The violation, with its step; None when there is none within ``steps``.
+
+    Raises:
+        ValueError: ``every`` is not positive.
+    """
+    if every < 1:
+        raise ValueError(f"search: every must be at least 1, got {every}")
+    if (bad := judge()) is not None:
+        return dataclasses.replace(bad, step=begin)
     done = 0
     while done < steps:
         ahead, saved = min(every, steps - done), moving.save()
-        bad = _trial(moving, first, ahead, begin + done, limits)
+        bad = _trial(moving, judge, ahead)
         if bad is None:
             done += ahead
-            if seen is not None:
-                seen(moving.look())
             continue
         good = 0
         while ahead - good > 1:
             middle = (good + ahead) // 2
             moving.load(saved)
-            found = _trial(moving, first, middle, begin + done, limits)
+            found = _trial(moving, judge, middle)
             if found is None:
                 good = middle
             else:
@@ -231,15 +262,12 @@ def first_violation(
     return None
 
 
-def _trial(
-    moving: Moving, first: State, steps: int, before: int, limits: Limits | None
-) -> Violation | None:
+def _trial(moving: Moving, judge: Callable[[], Violation | None], steps: int) -> Violation | None:
     try:
         moving.advance(steps)
     except (FloatingPointError, ValueError) as error:
-        why = str(error).splitlines()[0]
-        return Violation(before + steps, "stopped", math.inf, 0.0, why)
-    return check(first, moving.look(), limits)
+        return Violation(0, "stopped", math.inf, 0.0, str(error).splitlines()[0])
+    return judge()
 
 
 def observe(

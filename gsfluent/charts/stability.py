@@ -1,0 +1,364 @@
+"""Stability maps: where in a plane of two settings a run first breaks a law, one JSON line a point.
+
+A map is two axes, one or more variants (the first is gsfluent as it comes) and a function that runs
+one point and says what it broke and when (:mod:`gsfluent.lab.violations`). The maps themselves are
+in ``stability_*.py`` beside this file; what is drawn from the lines, in ``stability_report.py``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from gsfluent.charts.record import commit, machine
+from gsfluent.errors import InputError
+from gsfluent.lab.violations import KINDS, Violation
+
+__all__ = [
+    "LETTERS", "Axis", "Map", "Outcome", "Place", "Point", "Value", "all_maps", "chosen", "points",
+    "read", "register", "run_maps",
+]  # fmt: skip
+
+Value = float | str
+KIND_WORDS = {**KINDS, "order": "two numberings of the same points parted by 1e-4 dx"}
+LETTERS = {
+    "finite": "N", "energy": "E", "momentum": "M", "volume": "J", "path": "P", "stopped": "X",
+    "order": "O",
+}  # fmt: skip
+"""How the kinds of violation are lettered on a map."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """One axis of a map.
+
+    Attributes:
+        name: Short name, a key of the tables.
+        label: Words with the unit.
+        values: Numbers in rising order, or words.
+        default: Where gsfluent stands by default, or the ordinary scene; one of ``values``.
+        setting: Whether it is a choice of the method; False for a property of the scene.
+        span: Smallest and largest value for which the default is meant to hold; None: all.
+        log: Whether numbers are spaced by factors.
+    """
+
+    name: str
+    label: str
+    values: tuple[Value, ...]
+    default: Value
+    setting: bool = True
+    span: tuple[float, float] | None = None
+    log: bool = True
+
+    def __post_init__(self) -> None:
+        if self.default not in self.values:
+            raise ValueError(f"axis {self.name}: default {self.default!r} is none of its values")
+
+    @property
+    def words(self) -> bool:
+        """Whether its values are words."""
+        return isinstance(self.values[0], str)
+
+    def within(self, value: Value) -> bool:
+        """Whether the default settings are meant to hold at a value of this axis."""
+        if isinstance(value, str) or self.span is None:
+            return True
+        return self.span[0] <= value <= self.span[1]
+
+    def coarse(self) -> tuple[Value, ...]:
+        """Three of its values: the default, and the ends."""
+        ends = [self.values[0], self.default, self.values[-1]]
+        if self.words:
+            ends = list(self.values[:3])
+        return tuple(v for v in self.values if v in ends)
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a point is run: ``cpu`` or ``cuda``."""
+
+    device: str = "cpu"
+
+    @property
+    def every(self) -> int:
+        """Steps between two looks: a look costs a GPU far more than a step."""
+        return 8 if self.device == "cpu" else 24
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one point gave.
+
+    Attributes:
+        steps: Steps it was run for at most.
+        violation: The first one; None when it held.
+        points: Material points.
+    """
+
+    steps: int
+    violation: Violation | None
+    points: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Map:
+    """A plane of two settings.
+
+    Attributes:
+        name: Of the map, its lines and its picture.
+        title: What is drawn.
+        x: Horizontal axis.
+        y: Vertical axis.
+        variants: One panel each; the first is gsfluent as it comes.
+        run: ``run(x, y, variant, place)`` -> outcome.
+        test: Name of the test of its boundary.
+        note: What to see.
+        gpu: Whether it belongs to the subset that is run on a GPU.
+    """
+
+    name: str
+    title: str
+    x: Axis
+    y: Axis
+    variants: tuple[str, ...]
+    run: Callable[[Any, Any, str, Place], Outcome]
+    test: str
+    note: str = ""
+    gpu: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """One point of one map, run: a line of ``stability.jsonl``.
+
+    Attributes:
+        map: Name of the map.
+        variant: Panel.
+        x: Where.
+        y: Where.
+        limit: Steps it was run for at most.
+        step: Steps to the first violation; None when it held.
+        kind: Of the violation, or empty.
+        value: What was found, None where that is not a number.
+        note: Why a solver stopped.
+        points: Material points.
+        seconds: Wall time.
+        device: ``cpu`` or ``cuda``.
+        machine: Processor and cores, or the GPU.
+        commit: Of gsfluent.
+        date: ISO 8601, UTC.
+    """
+
+    map: str
+    variant: str
+    x: Value
+    y: Value
+    limit: int
+    step: int | None
+    kind: str
+    value: float | None
+    note: str
+    points: int
+    seconds: float
+    device: str
+    machine: str
+    commit: str
+    date: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing was broken."""
+        return self.step is None
+
+    @property
+    def key(self) -> str:
+        """What makes it the same point."""
+        return f"{self.map}|{self.variant}|{_text(self.x)}|{_text(self.y)}|{self.device}"
+
+
+def _text(value: Value) -> str:
+    return value if isinstance(value, str) else f"{value:.8g}"
+
+
+_MAPS: dict[str, Map] = {}
+
+
+def register(made: Map) -> Map:
+    """Add a map.
+
+    Raises:
+        ValueError: There is one of that name.
+    """
+    if made.name in _MAPS:
+        raise ValueError(f"a map {made.name!r} is there already")
+    _MAPS[made.name] = made
+    return made
+
+
+def all_maps() -> dict[str, Map]:
+    """All maps by name, in the order of the page."""
+    from gsfluent.charts import (  # noqa: F401  (they register their maps)
+        stability_contact,
+        stability_matter,
+        stability_rounding,
+        stability_steps,
+        stability_transfer,
+    )
+
+    return dict(_MAPS)
+
+
+def chosen(names: Sequence[str] | None = None, *, gpu: bool = False) -> list[Map]:
+    """The maps of these names; default: all, or with ``gpu`` those of the GPU's subset.
+
+    Raises:
+        InputError: A name that no map has.
+    """
+    known = all_maps()
+    for name in names or ():
+        if name not in known:
+            raise InputError(f"--maps {name}: no such map", f"take of {', '.join(known)}")
+    if names:
+        return [known[name] for name in dict.fromkeys(names)]
+    return [m for m in known.values() if m.gpu or not gpu]
+
+
+def points(wanted: Sequence[Map], *, quick: bool = False) -> list[tuple[str, str, Value, Value]]:
+    """All (map, variant, x, y) to run; ``quick``: three by three of each map."""
+    todo: list[tuple[str, str, Value, Value]] = []
+    for m in wanted:
+        xs = m.x.coarse() if quick else m.x.values
+        ys = m.y.coarse() if quick else m.y.values
+        todo += [(m.name, variant, x, y) for variant in m.variants for y in ys for x in xs]
+    return todo
+
+
+def run_point(task: tuple[str, str, Value, Value, str]) -> Point:
+    """Run one point of a map (also in a worker process)."""
+    name, variant, x, y, device = task
+    m = all_maps()[name]
+    begin = time.perf_counter()
+    outcome = m.run(x, y, variant, Place(device))
+    seconds = time.perf_counter() - begin
+    bad = outcome.violation
+    value = bad.value if bad is not None and math.isfinite(bad.value) else None
+    return Point(
+        map=name, variant=variant, x=x, y=y, limit=outcome.steps,
+        step=None if bad is None else bad.step, kind="" if bad is None else bad.kind, value=value,
+        note="" if bad is None else bad.note, points=outcome.points, seconds=round(seconds, 4),
+        device=device, machine=machine(device), commit="",
+        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    )  # fmt: skip
+
+
+def run_maps(
+    wanted: Sequence[Map],
+    path: str | Path,
+    *,
+    device: str = "cpu",
+    quick: bool = False,
+    jobs: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[Point]:
+    """Run what is missing of these maps; every point is written as soon as it is done.
+
+    Args:
+        wanted: The maps.
+        path: The file of lines; points that it has (of this device) are not run again.
+        device: ``cpu`` or ``cuda``.
+        quick: Three by three points of each map.
+        jobs: Processes.
+        progress: Called with (done, all, what).
+
+    Returns:
+        The points of these maps, those of the file included.
+
+    Raises:
+        InputError: The file holds something else, or jobs is not positive.
+    """
+    if jobs < 1:
+        raise InputError(f"--jobs {jobs}", "give at least 1")
+    path = Path(path)
+    have = {p.key: p for p in read(path)} if path.is_file() else {}
+    tasks = [(*p, device) for p in points(wanted, quick=quick)]
+    keys = [f"{t[0]}|{t[1]}|{_text(t[2])}|{_text(t[3])}|{t[4]}" for t in tasks]
+    todo = [task for task, key in zip(tasks, keys, strict=True) if key not in have]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    version, done = commit(), len(tasks) - len(todo)
+    with path.open("a", encoding="utf-8") as file:
+        if path.stat().st_size and not path.read_bytes().endswith(b"\n"):
+            file.write("\n")  # what a stopped run left: the half line is skipped when read
+        for point in _each(todo, jobs):
+            point = dataclasses.replace(point, commit=version)
+            file.write(json.dumps(dataclasses.asdict(point), allow_nan=False) + "\n")
+            file.flush()
+            have[point.key] = point
+            done += 1
+            if progress is not None:
+                progress(done, len(tasks), point.map)
+    return [have[key] for key in keys]
+
+
+def _each(todo: Sequence[tuple[str, str, Value, Value, str]], jobs: int) -> Iterator[Point]:
+    if jobs == 1 or len(todo) < 2:
+        yield from map(run_point, todo)
+        return
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+
+    context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    with ProcessPoolExecutor(jobs, context, _alone) as pool:
+        futures = [pool.submit(run_point, task) for task in todo]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _alone() -> None:
+    """One thread per worker."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    import torch
+
+    torch.set_num_threads(1)
+
+
+_NAMES = tuple(f.name for f in dataclasses.fields(Point))
+
+
+def read(path: str | Path) -> list[Point]:
+    """The points of a file; of equal ones the last counts, a cut-off line is skipped.
+
+    Raises:
+        InputError: The file cannot be read or holds something else.
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})", "give a .jsonl of points") from error
+    found: dict[str, Point] = {}
+    for number, line in enumerate(lines, 1):
+        try:
+            data = json.loads(line)
+        except ValueError:
+            if not line.strip() or not line.endswith("}"):
+                continue  # cut off when the run was stopped
+            data = None
+        if not isinstance(data, dict) or any(name not in data for name in _NAMES):
+            raise InputError(
+                f"{path}, line {number}: not a point of a stability map",
+                "give the file that `gsfluent stability` wrote, or another name",
+            )
+        point = Point(**{name: data[name] for name in _NAMES})
+        found[point.key] = point
+    return list(found.values())

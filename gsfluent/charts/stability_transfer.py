@@ -1,0 +1,124 @@
+"""Maps of what textbook solvers do otherwise: transfers, unguarded divisions, linear kernels."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from gsfluent.charts.stability import Axis, Map, Outcome, Place, register
+from gsfluent.charts.stability_scenes import DENSITY, DX, YOUNG, block, noise, watched
+from gsfluent.charts.stability_steps import courant_axis, shaken
+from gsfluent.charts.stability_textbook import scene_of, watched_textbook
+from gsfluent.lab.driver import World
+from gsfluent.lab.shapes import box, parameters
+from gsfluent.lab.slab import wave_speed
+
+ELASTIC = {
+    "law": "elastic", "young_modulus": YOUNG, "poisson_ratio": 0.3, "density": DENSITY,
+}  # fmt: skip
+
+# --- the transfer ---
+
+TRANSFERS = ("apic (gsfluent)", "apic", "pic", "flip 0.95", "flip 0.99", "flip 1")
+
+
+def free_scene(courant: float, place: Place, which: str, steps: int) -> Outcome:
+    """The shaken free cube under one transfer."""
+    points, volume = block()
+    if "gsfluent" in which:
+        return watched(shaken(points, volume, courant, place), steps, place)
+    c = wave_speed(parameters(YOUNG, 0.3, DENSITY))
+    name, *share = which.split()
+    return watched_textbook(
+        scene_of(points, 1e-3 * c * noise(len(points)), volume, ELASTIC), steps, place,
+        dt=courant * DX / c, transfer=name, flip=float(share[0]) if share else 1.0,
+        storage="strain", local_positions=True,
+    )  # fmt: skip
+
+
+def transfer_point(courant: float, which: str, variant: str, place: Place) -> Outcome:
+    """A free cube under a transfer."""
+    return free_scene(courant, place, which, 100)
+
+
+register(
+    Map(
+        "transfer", "A free cube, against the transfer", courant_axis(),
+        Axis("transfer", "transfer (textbook solver but for the first)", TRANSFERS, TRANSFERS[0]),
+        ("free cube",), transfer_point, "test_boundary_courant_number_transfer",
+    )
+)  # fmt: skip
+
+# --- divisions ---
+
+
+def lone_point(away: float, which: str, variant: str, place: Place) -> Outcome:
+    """One point alone, near the place where a weight of its stencil is exactly zero."""
+    steps = 4
+    at = torch.full((1, 3), 20.5 * DX, dtype=torch.float64) + away * DX
+    still = torch.zeros(1, 3, dtype=torch.float64)
+    if which == "gsfluent":
+        world = World(
+            at, still, mass=DENSITY * DX**3, volume=DX**3, dx=DX, law=0,
+            params=parameters(YOUNG, 0.3, DENSITY), dt=1e-4, dtype=torch.float32,
+            device=place.device,
+        )  # fmt: skip
+        return watched(world, steps, place)
+    return watched_textbook(
+        scene_of(at, still, DX**3, ELASTIC), steps, place, dt=1e-4,
+        transfer="flip" if "flip" in which else "apic", flip=0.99,
+        guarded="unguarded" not in which, local_positions=True,
+    )  # fmt: skip
+
+
+register(
+    Map(
+        "zero_weight", "A point alone where a weight is exactly zero",
+        Axis("away", "distance from (n + 1/2) dx [dx]", (0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.1),
+             0.0, setting=False, log=False),
+        Axis("division", "division by the mass of a node",
+             ("gsfluent", "apic, guarded", "apic, unguarded", "flip, guarded", "flip, unguarded"),
+             "gsfluent"),
+        ("one step is enough",), lone_point, "test_boundary_weight_of_exactly_zero",
+        "0 / 0 in the first step: GaussianFluent's path to NaN, if a point is alone.", gpu=True,
+    )
+)  # fmt: skip
+
+# --- the kernel ---
+
+KERNELS = ("gsfluent", "quadratic, apic", "linear, apic", "quadratic, flip", "linear, flip")
+
+
+def kernel_point(amplitude: float, which: str, variant: str, place: Place) -> Outcome:
+    """A free bar in its longest wave, whose ends move by ``amplitude`` cells."""
+    steps, length, row = 300, 16, parameters(YOUNG, 0.0, DENSITY)
+    c, volume = wave_speed(row), (0.5 * DX) ** 3
+    points = box([0.013, 0.021, 0.037], [length * DX, DX, DX], 0.5 * DX)
+    velocity = torch.zeros_like(points)
+    phase = math.pi * (points[:, 0] - 0.013) / (length * DX)
+    velocity[:, 0] = math.pi * amplitude / length * c * torch.cos(phase)
+    dt = 0.3 * DX / c
+    if which == "gsfluent":
+        world = World(
+            points, velocity, mass=DENSITY * volume, volume=volume, dx=DX, law=0, params=row,
+            dt=dt, dtype=torch.float32, device=place.device,
+        )  # fmt: skip
+        return watched(world, steps, place)
+    kernel, transfer = which.split(", ")
+    return watched_textbook(
+        scene_of(points, velocity, volume, ELASTIC | {"poisson_ratio": 0.0}), steps, place, dt=dt,
+        kernel=kernel, transfer=transfer, flip=1.0, force="gradient", storage="strain",
+        local_positions=True,
+    )  # fmt: skip
+
+
+register(
+    Map(
+        "kernel", "A free bar whose points cross cells",
+        Axis("amplitude", "amplitude of its ends [dx]",
+             (0.03, 0.1, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), 0.3, setting=False),
+        Axis("kernel", "kernel and transfer", KERNELS, "gsfluent"),
+        ("free bar",), kernel_point, "test_boundary_kernel_of_crossed_cells",
+    )
+)  # fmt: skip

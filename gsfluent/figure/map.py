@@ -1,0 +1,210 @@
+"""Maps over two axes: how long a run held in every cell, and what broke it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsfluent.figure.style import INK, new_figure, save_png
+
+__all__ = ["Cell", "Mark", "Plane", "draw_planes", "place_of"]
+
+HOLDS = "#cfe9dc"
+NOT_RUN = "#f4f4f4"
+Value = float | str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of a map.
+
+    Attributes:
+        step: Steps to the first violation, None where it held.
+        letter: Of the kind of violation.
+    """
+
+    step: int | None
+    letter: str = ""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A named point, such as where another program stands.
+
+    Attributes:
+        x: Value of the horizontal axis, a number between two of its values too.
+        y: Of the vertical one.
+        name: Its words.
+    """
+
+    x: Value
+    y: Value
+    name: str
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One panel.
+
+    Attributes:
+        title: Over it.
+        subtitle: Under the title: the variant.
+        x_label: Words of the horizontal axis.
+        y_label: Words of the vertical axis.
+        xs: Values along x, [X]: rising numbers, or words.
+        ys: Values along y, [Y].
+        cells: (column, row) -> cell; what is missing was not run.
+        limit: Steps that a run had at most.
+        star: Column and row of the default, or None.
+        marks: Named points.
+    """
+
+    title: str
+    subtitle: str
+    x_label: str
+    y_label: str
+    xs: Sequence[Value]
+    ys: Sequence[Value]
+    cells: Mapping[tuple[int, int], Cell]
+    limit: int
+    star: tuple[int, int] | None = None
+    marks: Sequence[Mark] = ()
+
+
+def place_of(values: Sequence[Value], value: Value) -> float | None:
+    """Where a value lies among those of an axis, counted in cells from 0; None outside.
+
+    Numbers between two of them are placed by their logarithm where all are positive.
+    """
+    if isinstance(value, str) or isinstance(values[0], str):
+        return float(values.index(value)) if value in values else None
+    numbers = [float(v) for v in values]
+    if not numbers[0] <= value <= numbers[-1]:
+        return None
+    log = all(v > 0 for v in numbers)
+    for i, (low, high) in enumerate(itertools.pairwise(numbers)):
+        if low <= value <= high:
+            part = math.log(value / low) / math.log(high / low) if log else (value - low)
+            return i + (part if log else part / (high - low))
+    return 0.0  # a single value
+
+
+def _words(value: Value) -> str:
+    if isinstance(value, str):
+        return value
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:.4g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    mantissa = mantissa.removesuffix(".0")
+    return f"{'' if mantissa == '1' else mantissa + '·'}10$^{{{int(exponent)}}}$"
+
+
+def draw_planes(
+    planes: Sequence[Plane],
+    path: str | Path,
+    *,
+    kinds: Mapping[str, str],
+    columns: int = 2,
+    title: str = "",
+    dpi: int = 110,
+) -> Path:
+    """Draw panels beside each other into one PNG.
+
+    A cell is green where the run held, and goes from dark (at once) to light (late) where it did
+    not, with the letter of what broke.
+
+    Args:
+        planes: The panels.
+        path: Of the PNG.
+        kinds: Letter -> words, for the line below; those that occur are named.
+        columns: Panels side by side.
+        title: Over all.
+        dpi: Of the PNG.
+
+    Raises:
+        ValueError: No panels.
+        RunError: The file cannot be written.
+    """
+    if not planes:
+        raise ValueError("draw_planes: no panels")
+    columns = min(columns, len(planes))
+    lines = math.ceil(len(planes) / columns)
+    wide = max(len(p.xs) for p in planes)
+    tall = max(len(p.ys) for p in planes)
+    width = min(1.7 + 0.36 * wide, 6.6)
+    height = 1.35 + 0.24 * tall
+    with new_figure(width * columns, height * lines + 0.35 + 0.3 * bool(title)) as figure:
+        grid = figure.subplots(lines, columns, squeeze=False).ravel()
+        for axes, plane in zip(grid, planes, strict=False):
+            _draw(axes, plane)
+        for axes in grid[len(planes) :]:
+            axes.remove()
+        seen = {c.letter for p in planes for c in p.cells.values() if c.step is not None}
+        words = ["green: holds", *(f"{k}: {kinds[k]}" for k in kinds if k in seen)]
+        if any(p.star for p in planes):
+            words.append("★ default")
+        figure.supxlabel("   ".join(words), fontsize=7.5, color=INK)
+        if title:
+            figure.suptitle(title, fontsize=11, fontweight="bold", x=0.01, ha="left")
+        return save_png(figure, path, dpi=dpi)
+
+
+def _draw(axes: Any, plane: Plane) -> None:
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+    from matplotlib.patches import Rectangle
+
+    heat = colormaps["YlOrRd_r"]
+    axes.grid(False)
+    for i in range(len(plane.xs)):
+        for j in range(len(plane.ys)):
+            cell = plane.cells.get((i, j))
+            color, ink = (NOT_RUN if cell is None else HOLDS), INK
+            if cell is not None and cell.step is not None:
+                late = math.log1p(cell.step) / math.log1p(max(plane.limit, 1))
+                color = to_hex(heat(0.08 + 0.80 * min(late, 1.0)))
+                ink = "#ffffff" if late < 0.5 else INK
+            axes.add_patch(
+                Rectangle((i - 0.5, j - 0.5), 1, 1, facecolor=color, edgecolor="#ffffff", lw=0.8)
+            )
+            if cell is not None and cell.step is not None:
+                axes.text(
+                    i, j, cell.letter, ha="center", va="center", fontsize=6.5, color=ink,
+                    clip_on=True,
+                )  # fmt: skip
+    if plane.star is not None:
+        axes.plot(
+            *plane.star, marker="*", markersize=11, color=INK, markeredgecolor="#ffffff",
+            markeredgewidth=0.8, linestyle="none",
+        )  # fmt: skip
+    for n, mark in enumerate(plane.marks):
+        x, y = place_of(plane.xs, mark.x), place_of(plane.ys, mark.y)
+        if x is None or y is None:
+            continue
+        axes.plot(x, y, marker="o", markersize=5, color="#31579c", markeredgecolor="#ffffff")
+        axes.annotate(
+            mark.name, (x, y), xytext=(5, 6 + 7 * (n % 2)), textcoords="offset points",
+            fontsize=6.5, color="#1b3157",
+            bbox={"facecolor": "#ffffff", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
+        )  # fmt: skip
+    axes.set_xlim(-0.5, len(plane.xs) - 0.5)
+    axes.set_ylim(-0.5, len(plane.ys) - 0.5)
+    crowded = isinstance(plane.xs[0], str) or len(plane.xs) > 9
+    axes.set_xticks(range(len(plane.xs)), [_words(v) for v in plane.xs], fontsize=7,
+                    rotation=45 if crowded else 0)  # fmt: skip
+    axes.set_yticks(range(len(plane.ys)), [_words(v) for v in plane.ys], fontsize=7)
+    axes.tick_params(length=0)
+    axes.set_xlabel(plane.x_label, fontsize=8)
+    if not isinstance(plane.ys[0], str):
+        axes.set_ylabel(plane.y_label, fontsize=8)
+    axes.set_title(f"{plane.title}\n" if plane.subtitle else plane.title, fontsize=8.5)
+    if plane.subtitle:
+        axes.text(
+            0, 1.02, plane.subtitle, transform=axes.transAxes, fontsize=8, color=INK, va="bottom"
+        )  # fmt: skip
+    for side in axes.spines.values():
+        side.set_visible(False)
