@@ -66,7 +66,7 @@ def test_a_row_says_what_its_parameters_mean(name: str) -> None:
         energy = crack_band.fracture_energy(row, m["alpha"], dx=scene.dx)
         # strength of tens of percent: the energy is linear in the softening no more
         soft = name in ("shatter", "struck_rock")
-        assert m["fracture_energy"] == pytest.approx(energy, rel=0.35 if soft else 0.03)
+        assert m["fracture_energy"] == pytest.approx(energy, rel=0.35 if soft else 0.06)
 
 
 def test_no_case_is_left_out_of_these_tests() -> None:
