@@ -63,7 +63,7 @@ class Chart:
     def page(self, path: Path) -> Path:
         """Write the HTML page."""
         commits = ", ".join(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
-        page = Page(self.title, f"{len(self.records)} runs; gsfluent {commits}")
+        page = Page(self.title, f"{len(self.records)} runs; commit {commits}")
         page.text(self.verdict.text(), kind="good" if self.verdict.below_left else "warn")
         for words in self.warnings():
             page.text(words, kind="warn")
