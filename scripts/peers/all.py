@@ -136,8 +136,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scenes = freeze(options.out, options.quick, cases)
     for name in options.peer or PEERS:
         listed, left = jobs(name, scenes, options.out, options)
-        for item in left:
-            sys.stdout.write(f"{name}: left out for its price: {item}\n")
+        if left:
+            sys.stdout.write(
+                f"{name}: {len(left)} of {len(left) + len(listed)} runs left out for their price "
+                f"(--budget), such as {left[0]}\n"
+            )
         lines = options.out / f"{name}.jobs"
         lines.write_text("".join(json.dumps(job) + "\n" for job in listed), encoding="utf-8")
         command = [pythons.get(name, sys.executable), str(HERE / PEERS[name][1]),
