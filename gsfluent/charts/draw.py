@@ -63,7 +63,7 @@ class Chart:
     def page(self, path: Path) -> Path:
         """Write the HTML page."""
         commits = ", ".join(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
-        page = Page(self.title, f"{len(self.records)} runs; gsfluent {commits}")
+        page = Page(self.title, f"{len(self.records)} runs; commit {commits}")
         page.text(self.verdict.text(), kind="good" if self.verdict.below_left else "warn")
         for words in self.warnings():
             page.text(words, kind="warn")
@@ -95,6 +95,9 @@ class Chart:
         found = []
         if len(self.machines) > 1:
             found.append(f"Times were taken on different machines: {'; '.join(self.machines)}.")
+        commits = list(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
+        if len(commits) > 1:
+            found.append(f"gsfluent's runs are of several commits: {', '.join(commits)}.")
         found += [f"{m} on {c}: on no level ({why})." for c, m, why in self.verdict.absent]
         return found
 

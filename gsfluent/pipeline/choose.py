@@ -248,7 +248,7 @@ def choose(
     """
     probing = probing or Probing()
     probes = run_probes(scene, shot, probing, device=device, seed=seed, progress=progress)
-    seconds, source = cost_of(probes.whole, probes.levels, scene, shot, device)
+    seconds, source = cost_of(probes.whole, probes.levels, scene, device)
     choice, fits, growth = choose_setting(probes, bound, seconds)
     _log.info("chart: %s", choice.reason)
     return summary(choice, fits, growth, probes, probing, source) | {"device": str(device)}
