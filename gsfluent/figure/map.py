@@ -185,10 +185,16 @@ def _draw(axes: Any, plane: Plane) -> None:
         x, y = place_of(plane.xs, mark.x), place_of(plane.ys, mark.y)
         if x is None or y is None:
             continue
-        axes.plot(x, y, marker="o", markersize=5, color="#31579c", markeredgecolor="#ffffff")
+        for edge, width in (("#ffffff", 3.0), ("#31579c", 1.6)):  # a ring: the letter stays legible
+            axes.plot(
+                x, y, marker="o", markersize=11, markerfacecolor="none", markeredgecolor=edge,
+                markeredgewidth=width,
+            )  # fmt: skip
+        right = x > 0.5 * len(plane.xs)
         axes.annotate(
-            mark.name, (x, y), xytext=(5, 6 + 7 * (n % 2)), textcoords="offset points",
-            fontsize=6.5, color="#1b3157",
+            mark.name, (x, y), xytext=(-8 if right else 8, 7 + 7 * (n % 2)),
+            textcoords="offset points", ha="right" if right else "left", fontsize=6.5,
+            color="#1b3157",
             bbox={"facecolor": "#ffffff", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
         )  # fmt: skip
     axes.set_xlim(-0.5, len(plane.xs) - 0.5)
