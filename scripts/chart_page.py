@@ -24,7 +24,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "chart.md"
 HEADINGS = {"cpu": "Two cores", "cuda": "H100"}
 MOST_BYTES = 300_000
-TABLES = ("Against each peer", "Fronts", "Measures that trade nothing")
+TABLES = (
+    "Against each peer", "Fronts", "What each knob does", "Measures that trade nothing",
+)  # fmt: skip
 
 
 def load(device: str, data: Path) -> Chart | None:

@@ -14,23 +14,15 @@ import argparse
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from page import enter
 from texture_sheets import draw_sheet
 
-from gsfluent.lab.interiors import KNOWN_INTERIORS, KnownInterior, known_interior
+from gsfluent.charts.texturing import texture
+from gsfluent.lab.interiors import KNOWN_INTERIORS, known_interior
 from gsfluent.lab.interiors_judge import Judge, crossing_error
-from gsfluent.pipeline.texture import InteriorTexture, Texture, load_exemplar
-from gsfluent.pipeline.texture.baselines import telea_slices
-from gsfluent.pipeline.texture.domain import blend_skin
-from gsfluent.pipeline.texture.exemplar import load_exemplars
-from gsfluent.pipeline.texture.photo import open_exemplars
-from gsfluent.pipeline.texture.profile import depth_profile, profile_volume
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "texture_accuracy.md"
@@ -49,61 +41,6 @@ METHODS = (
     "diffusion",
 )
 PATCH_BAR, PROFILE_BAR = 1.3, 0.05
-
-
-def texture(known: KnownInterior, method: str, device: str, model: str | None) -> dict[str, Any]:
-    """Run one method: its volume and report, CPU seconds and wall seconds.
-
-    The steps of ``Texture.forward``, with the true colours of the surface in place of those read
-    off splats, so that the texture is judged and not the reconstruction.
-    """
-    photos = known.exemplars()
-    began, wall = time.process_time(), time.perf_counter()
-    if method == "telea_x":
-        made = telea_slices(known.domain, (0,))
-    elif method == "photo_profile":
-        photo = load_exemplar(next(iter(photos.values())))
-        # photographs of known interiors have one pixel per voxel: depths are equal
-        rgb = profile_volume(known.domain.depth, *depth_profile(photo))
-        made = InteriorTexture(rgb, known.labels, {})
-    else:
-        chosen = stage(known, method, photos, model, device)
-        shown = chosen.exemplar
-        opened = None if shown is None else load_exemplars(open_exemplars(shown, chosen.photo))
-        made = chosen._make(known.domain, opened, None)
-        if device != "cpu":
-            torch.cuda.synchronize()
-    rgb = blend_skin(known.domain, made.rgb.clip(0.0, 1.0))
-    cpu, spent = time.process_time() - began, time.perf_counter() - wall
-    return {"rgb": rgb, "used": used(made.report), "cpu_seconds": cpu, "seconds": spent}
-
-
-def stage(
-    known: KnownInterior,
-    method: str,
-    photos: dict[str, np.ndarray],
-    model: str | None,
-    device: str,
-) -> Texture:
-    """The texture stage as a user would set it for this class."""
-    if method == "procedural":
-        # another seed than the truth's: another object in the same skin
-        return Texture(preset=known.name, seed=known.seed + 1000)
-    if method in ("color_copy", "telea", "profile"):
-        return Texture(method)
-    if method == "diffusion":
-        prompt = f"cross section of {known.name}"
-        return Texture("diffusion", model=model, exemplar=photos, prompt=prompt)
-    quality = {"default": {}}.get(method, {"quality": method})
-    return Texture(exemplar=photos, device=device, **quality, **known.settings)
-
-
-def used(report: dict[str, Any]) -> str:
-    """What the exemplar method made of the surface; empty for the other methods."""
-    surface = report.get("surface")
-    if surface == "copy":
-        return "color_copy"
-    return "" if surface is None else "exemplar" + " from the surface" * (surface == "keep")
 
 
 def read_lines() -> dict[tuple[str, ...], dict[str, Any]]:

@@ -63,7 +63,7 @@ class Chart:
     def page(self, path: Path) -> Path:
         """Write the HTML page."""
         commits = ", ".join(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
-        page = Page(self.title, f"{len(self.records)} runs; gsfluent {commits}")
+        page = Page(self.title, f"{len(self.records)} runs; commit {commits}")
         page.text(self.verdict.text(), kind="good" if self.verdict.below_left else "warn")
         for words in self.warnings():
             page.text(words, kind="warn")
@@ -106,6 +106,7 @@ class Chart:
             ("Against each peer", *self._summary()),
             ("Fronts", *self._fronts()),
             ("At every error level that a peer reaches", *self._levels()),
+            ("What each knob does", *self._knobs()),
             ("Measures that trade nothing", *self._free()),
             ("Every run", *self._all()),
         ]
@@ -153,6 +154,23 @@ class Chart:
         ]  # fmt: skip
         return head, rows
 
+    def _knobs(self) -> tuple[list[str], list[list[Any]]]:
+        head = ["method", "setting", "runs", "median error over the base's", "from", "to",
+                "median time over the base's", "broke off"]  # fmt: skip
+        rows = []
+        turned = [r for r in self.records if r.variant and r.settings.get("trades", True)]
+        for method, variant in dict.fromkeys((r.method, r.variant) for r in turned):
+            mine = [r for r in turned if (r.method, r.variant) == (method, variant)]
+            pairs = [(r, b) for r in mine if r.ok and (b := _base(self.records, r)) and b.ok]
+            errors = [counted(r) / counted(b) for r, b in pairs]
+            times = [r.wall_per_simulated / b.wall_per_simulated for r, b in pairs]
+            if pairs:
+                rows.append([
+                    method, variant, len(mine), statistics.median(errors), min(errors),
+                    max(errors), statistics.median(times), len([r for r in mine if r.failed]),
+                ])  # fmt: skip
+        return head, rows
+
     def _free(self) -> tuple[list[str], list[list[Any]]]:
         head = ["case", "dx", "measure", "error with", "error without", "ms per ms with", "without"]
         rows = []
@@ -185,8 +203,7 @@ class Chart:
         names = methods(mine, OURS)
         measure = mine[0].measures[0]["quantity"] if mine[0].measures else ""
         fronts = {m: [_dot(r) for r in front(_of(mine, case, m))] for m in names}
-        return Panel(f"{case}: {measure}" if measure else case, [_dot(r) for r in mine], fronts,
-                     band=_band(mine))  # fmt: skip
+        return Panel(case, [_dot(r) for r in mine], fronts, note=measure, band=_band(mine))
 
     def _rates(self) -> Rates | None:
         runs = [
@@ -264,7 +281,7 @@ def _band(records: Iterable[Record]) -> float | None:
 
 
 def _base(records: Iterable[Record], record: Record) -> Record | None:
-    """The run that a measure that trades nothing is compared with."""
+    """The run of the same case, method and rung at the defaults."""
     return next(
         (r for r in records if r.case == record.case and r.method == record.method
          and r.variant == "" and r.settings.get("dx") == record.settings.get("dx")),

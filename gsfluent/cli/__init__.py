@@ -99,7 +99,11 @@ def _execute(command: Verb, as_json: bool) -> int:
     else:
         from gsfluent.cli.show import show
 
-        show(result)
+        readable = command.text(result)
+        if readable is None:
+            show(result)
+        else:
+            sys.stdout.write(readable + "\n")
     # only doctor has a verdict of its own to give with its exit code; the others raise
     return 1 if result.get("ok") is False else 0
 

@@ -31,6 +31,10 @@ class Verb:
         """Do the work and return what ``--json`` prints."""
         raise NotImplementedError
 
+    def text(self, result: dict[str, Any]) -> str | None:
+        """What a person reads; None for one line per key of the result."""
+        return None
+
     def torch_device(self) -> Any:
         """The chosen device, with the generators seeded.
 

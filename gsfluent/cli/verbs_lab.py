@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -24,9 +24,20 @@ class Chart(Verb):
       gsfluent chart --cases bar spin --only dx cfl ppc   # some cases, some knobs
       gsfluent chart --draw chart/chart.jsonl peers.jsonl # only draw what was recorded
 
+      gsfluent chart --of rendering --quick               # or reconstruction, texturing
+      gsfluent chart shot.yaml --error 3%                 # the cheapest setting for your own shot
+      gsfluent chart shot.yaml --error 3% -o out          # of the solids of the run in out
+
     Writes chart.jsonl (a line per run), chart.png, chart.html and chart.md. docs/chart.md says how
-    to read them.
+    to read them. With a shot: chart.json and chart.png, see docs/chart_shot.md.
     """
+
+    shot: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="SHOT.yaml")] = None
+    """Probe this shot and choose, instead of charting scenes with known answers."""
+    error: str | None = None
+    """Largest error the shot may have, such as 3%."""
+    of: Literal["simulation", "rendering", "reconstruction", "texturing"] = "simulation"
+    """What is charted: docs/chart_quality.md says what the errors of the others are."""
 
     out: Out = Path("chart")
     """Folder of the results; runs whose lines are there are not done again."""
@@ -48,10 +59,14 @@ class Chart(Verb):
         """Run what is missing and draw all of it."""
         from gsfluent.charts.draw import gathered, of_records
 
+        if self.shot is not None or self.error is not None:
+            return self._shot()
         if self.repeat < 1:
             raise InputError(f"--repeat {self.repeat}", "give at least 1")
         if self.budget is not None and self.budget < 0:
             raise InputError(f"--budget {self.budget}", "give seconds, or 0 for no limit")
+        if self.of != "simulation":
+            return self._quality()
         result: dict[str, Any] = {}
         if self.draw:
             records = gathered(existing(path, "--draw", folder=False) for path in self.draw)
@@ -71,6 +86,45 @@ class Chart(Verb):
                 "verdict": chart.verdict.text(),
             }
         return result
+
+    def _shot(self) -> dict[str, Any]:
+        """Choose the cheapest setting of a shot."""
+        from gsfluent.config import load_shot
+        from gsfluent.config.settings_solve import read_error
+        from gsfluent.pipeline.choose import QUICK
+        from gsfluent.pipeline.choose_shot import chart_shot, readable
+        from gsfluent.progress import reporter
+
+        if self.shot is None or self.error is None:
+            got = "a bound without a shot" if self.shot is None else "a shot without a bound"
+            raise InputError(f"chart: {got}", "for example: gsfluent chart shot.yaml --error 3%")
+        if self.cases or self.only or self.draw or self.of != "simulation":
+            raise InputError(
+                "--cases, --only, --draw and --of do nothing with a shot", "leave them out"
+            )
+        bound = read_error(self.error, "--error")
+        shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        with reporter(quiet=self.json) as progress:
+            result = chart_shot(
+                shot, bound, self.out, probing=QUICK if self.quick else None,
+                device=self.torch_device(), seed=self.seed, reporter=progress,
+            )  # fmt: skip
+        return result if self.json else readable(result)
+
+    def _quality(self) -> dict[str, Any]:
+        """Chart rendering, reconstruction or texturing."""
+        from gsfluent.charts.quality import chart_quality, gathered
+
+        if self.cases or self.only:
+            raise InputError("--cases and --only belong to --of simulation", "leave them out")
+        if self.draw:
+            files = [existing(path, "--draw", folder=False) for path in self.draw]
+            return gathered(self.of, files, self.out)
+        with self.progress("chart") as progress:
+            return chart_quality(
+                self.of, self.out, device=self.torch_device(), quick=self.quick,
+                repeat=1 if self.quick else self.repeat, progress=progress,
+            )  # fmt: skip
 
     def _run(self, result: dict[str, Any]) -> Any:
         from gsfluent.charts.chart import run

@@ -105,23 +105,48 @@ def _regions(path: Path, out: Path) -> dict[str, Any] | None:
 
 @dataclass(kw_only=True)
 class Plan(Verb):
-    """Say what a shot will cost without simulating: grid, steps, particles, memory, time.
+    """Say what a shot will cost without simulating: passes, grid, steps, particles, memory, time.
 
     Examples:
-      gsfluent plan shot.yaml           # before an hour is spent
+      gsfluent plan shot.yaml               # before an hour is spent
       gsfluent plan shot.yaml --json
+      gsfluent plan shot.yaml --recalibrate # measure this machine anew (ten seconds)
+      gsfluent plan shot.yaml --no-probe    # do not measure; no times where nothing was measured
+
+    The first plan on a machine measures for about ten seconds what work costs there and keeps it
+    in the user's cache; every run then corrects it. See docs/plan.md.
     """
 
     shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
     """The shot file."""
+    recalibrate: bool = False
+    """Measure this machine anew, and forget what runs have taught."""
+    probe: bool = True
+    """Measure this machine where it has not been measured yet."""
 
     def execute(self) -> dict[str, Any]:
         """Plan the shot."""
         from gsfluent.config import load_shot
-        from gsfluent.pipeline.plan import plan_shot
+        from gsfluent.pipeline.plan import cost_model, plan_shot
+        from gsfluent.pipeline.plan_cost import CostModel
 
+        if self.recalibrate and not self.probe:
+            raise InputError("--recalibrate measures, --no-probe forbids it", "drop one of them")
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
-        return plan_shot(shot, device=self.torch_device(), seed=self.seed)
+        device = self.torch_device()
+        # what is wrong with the shot is said before anything is measured
+        plan = plan_shot(shot, device=device, seed=self.seed, model=CostModel.load(device))
+        if self.recalibrate or (self.probe and not plan["calibrated"]):
+            with self.progress("measure") as progress:
+                model = cost_model(device, recalibrate=self.recalibrate, progress=progress)
+            plan = plan_shot(shot, device=device, seed=self.seed, model=model)
+        return plan
+
+    def text(self, result: dict[str, Any]) -> str:
+        """The plan as tables."""
+        from gsfluent.cli.plan_table import plan_text
+
+        return plan_text(result)
 
 
 @dataclass(kw_only=True)

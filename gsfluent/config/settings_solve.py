@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from gsfluent.config.read import Place, Reader, choice, flag, key, mapping, number, section, whole
 from gsfluent.errors import InputError
@@ -45,9 +45,6 @@ _ERROR = share(1e-4, 0.5)
 class SolveSettings:
     """``solve:`` - how accurately."""
 
-    LATER: ClassVar[dict[str, str]] = {
-        "seconds_per_frame": "choosing the setting by a time budget",
-    }
     quality: str = key(
         choice("preview", "shot", "hero"),
         default="shot",
@@ -72,6 +69,13 @@ class SolveSettings:
         doc="Largest error, instead of `quality` and `cells`: the cheapest cells and cfl that "
         "short probes of the shot promise to meet it with.",
         example="3%",
+    )
+    seconds_per_frame: float | None = key(
+        number(above=0.0),
+        default=None,
+        doc="Wall time that simulating a frame may take on this machine [s], instead of `quality` "
+        "and `cells`: as many cells as that allows, by the cost model of `gsfluent plan`.",
+        example="0.5",
     )
     standing: bool = key(
         flag,
@@ -101,11 +105,17 @@ def read_solve(value: Any, place: Place) -> SolveSettings:
     solve: SolveSettings = section(SolveSettings, value, place)
     given = mapping(value, place)
     # of a resolved shot every default is written out: those say nothing
-    defaults = {"quality": "shot", "cfl": 0.5}
-    for name in ("quality", "cells", "cfl"):
-        if solve.error is not None and given.get(name, defaults.get(name)) != defaults.get(name):
-            raise InputError(
-                f"{place.path}.error chooses the cells and the time step, and {name} is given too",
-                f"remove error or {name}",
-            )
+    defaults = {"quality": "shot", "cfl": 0.5, "cells": None, "seconds_per_frame": None}
+    for chooser, what, others in (
+        ("error", "the cells and the time step", ("quality", "cells", "cfl", "seconds_per_frame")),
+        ("seconds_per_frame", "the cells", ("quality", "cells")),
+    ):
+        if getattr(solve, chooser) is None:
+            continue
+        for name in others:
+            if given.get(name, defaults[name]) != defaults[name]:
+                raise InputError(
+                    f"{place.path}.{chooser} chooses {what}, and {name} is given too",
+                    f"remove {chooser} or {name}",
+                )
     return solve

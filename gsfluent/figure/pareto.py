@@ -50,6 +50,7 @@ class Panel:
         xlabel: Of the x axis; empty for the figure's own.
         ylabel: Likewise.
         highest: Errors of this and more are drawn on a rail, with a triangle.
+        note: What its error is, in small letters under the heading.
     """
 
     title: str
@@ -59,6 +60,7 @@ class Panel:
     xlabel: str = ""
     ylabel: str = ""
     highest: float = 1.0
+    note: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +144,7 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
     rail = [d for d in panel.dots if d.failed or (d in good and d.error >= panel.highest)]
     ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.set_title(panel.title)
+    _heading(ax, panel.title, panel.note)
     low = min((d.error for d in seen), default=1e-3) / 2.5
     high = max((d.error for d in seen), default=1e-1) * 2.0
     middle = math.sqrt(low * high)  # at least a decade and a half, so that ticks have names
@@ -157,8 +159,8 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
     if panel.band is not None and panel.band > low:
         ax.axhspan(low, panel.band, color="#f0e6c8", alpha=0.7, zorder=0, lw=0)
         ax.annotate(
-            "run-to-run band", (right, panel.band), (-3, -3), textcoords="offset points",
-            ha="right", va="top", fontsize=7, color="#7a6420",
+            "run-to-run band", (right, low), (-4, 4), textcoords="offset points",
+            ha="right", va="bottom", fontsize=7, color="#7a6420",
         )  # fmt: skip
     # what is expensive to see comes first, what matters comes last and lies on top
     order = sorted(color, key=lambda m: m == ours)
@@ -179,6 +181,12 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
             cost = d.cost if _finite(d.cost) else right / 1.15
             ax.plot([cost], [level], "x" if d.failed else "^", ms=4.5, mew=1.2, zorder=4,
                     color=color[d.method])  # fmt: skip
+
+
+def _heading(ax: Axes, title: str, note: str) -> None:
+    ax.set_title(title, pad=15.0 if note else 6.0)
+    ax.annotate(note, (0.0, 1.0), (0, 4), xycoords="axes fraction", textcoords="offset points",
+                fontsize=7.5, color="#555555")  # fmt: skip
 
 
 def _iso(ax: Axes, left: float, right: float, low: float, high: float) -> None:
@@ -220,7 +228,7 @@ def _labels(ax: Axes, dots: Sequence[Dot], color: str) -> None:
 def _rates(ax: Axes, rates: Rates, color: Mapping[str, str]) -> None:
     ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.set_title("cost of a point and a step")
+    _heading(ax, "cost of a point and a step", rates.floor_label and f"line: {rates.floor_label}")
     ax.set_xlabel("points")
     ax.set_ylabel("ns per point and step")
     for name, points in rates.points.items():
@@ -228,10 +236,6 @@ def _rates(ax: Axes, rates: Rates, color: Mapping[str, str]) -> None:
                 color=color.get(name, INK))  # fmt: skip
     if rates.floor is not None:
         ax.axhline(rates.floor, color=FAILED, lw=1.0)
-        ax.annotate(
-            rates.floor_label, (1.0, rates.floor), (-3, 3), xycoords=("axes fraction", "data"),
-            textcoords="offset points", ha="right", va="bottom", fontsize=7, color=FAILED,
-        )  # fmt: skip
 
 
 def _legend(figure: Figure, names: Sequence[str], color: Mapping[str, str]) -> None:

@@ -99,29 +99,33 @@ def _crossings(t: Floats, p: Floats) -> float:
     return second - first
 
 
-def _judge_collide(scene: Scene, run: Run) -> Iterator[Measure]:
+def momentum_history(scene: Scene, run: Run) -> tuple[Floats, Floats, Floats]:
+    """Time since contact [R / c], momentum of the first ball over that at the start, reference."""
     stored = _stored("collide")
     first = scene.body == 0
-    mass = scene.mass
-    size = float(mass[first].sum()) * float(scene.facts["speed"])
-    seen = (run.v[:, first] @ _LINE) @ mass[first] / size
+    mass = scene.mass[first]
+    seen = (run.v[:, first] @ _LINE) @ mass / (float(mass.sum()) * float(scene.facts["speed"]))
     since = (scene.times - float(scene.facts["touch"])) / float(scene.facts["unit"])
-    known = np.asarray(stored["times"]), np.asarray(stored["momentum"])
-    exact = np.interp(since, *known)
+    return since, seen, np.interp(since, stored["times"], stored["momentum"])
+
+
+def _judge_collide(scene: Scene, run: Run) -> Iterator[Measure]:
+    since, seen, exact = momentum_history(scene, run)
     source = "finite elements, scripts/fracturebench/references.py"
     error = float(np.sqrt(np.mean((seen - exact) ** 2)))
     yield Measure(
         "momentum of a ball through the impact, rms over the first", error, 0.0, error, 0.2, "",
         source,
     )  # fmt: skip
-    back, known_back = -float(seen[-1]), -float(known[1][-1])
+    back, known_back = -float(seen[-1]), -float(_stored("collide")["momentum"][-1])
     yield Measure("restitution", back, known_back, abs(back - known_back), 0.05, "", source)
     lasted, known_lasted = _crossings(since, seen), _crossings(since, exact)
     yield Measure(
         "time from 0.9 to -0.5 of the momentum", lasted, known_lasted,
         abs(lasted / known_lasted - 1.0), 0.1, "R/c", source,
     )  # fmt: skip
-    drift = float(np.abs(mass @ run.v).max()) / size
+    size = float(scene.mass[scene.body == 0].sum()) * float(scene.facts["speed"])
+    drift = float(np.abs(scene.mass @ run.v).max()) / size
     yield Measure("momentum of both balls", drift, 0.0, drift, 1e-5, "", "conservation")
 
 
@@ -215,12 +219,17 @@ def oblique(dx: float, per_cell: int) -> Scene:
 _EDGE = 0.1
 
 
-def _judge_drop(scene: Scene, run: Run) -> Iterator[Measure]:
+def height_history(scene: Scene, run: Run) -> tuple[Floats, Floats, Floats]:
+    """Time [edge / c], height of the centre over its start [edge], and its reference."""
     stored = _stored("drop")
     mass = scene.mass / scene.mass.sum()
     seen = (run.x[..., 2] - scene.x[:, 2]) @ mass / _EDGE
     since = scene.times * wave_speed(scene.materials[0]) / _EDGE
-    exact = np.interp(since, np.asarray(stored["times"]), np.asarray(stored["height"]))
+    return since, seen, np.interp(since, stored["times"], stored["height"])
+
+
+def _judge_drop(scene: Scene, run: Run) -> Iterator[Measure]:
+    _, seen, exact = height_history(scene, run)
     source = "finite elements, scripts/fracturebench/references.py"
     error = float(np.sqrt(np.mean((seen - exact) ** 2) / np.mean(exact**2)))
     yield Measure("height of the centre, relative rms", error, 0.0, error, 0.3, "", source)

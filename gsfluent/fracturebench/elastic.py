@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from .registry import case
-from .ritz import ball_rule, box_rule, modes
+from .ritz import Modes, ball_rule, box_rule, modes
 from .run import Measure, Run
 from .scene import Floats, Scene
 from .shapes import ball, box, elastic, free
@@ -20,16 +21,23 @@ def _rms(seen: Floats, exact: Floats) -> float:
     return float(np.sqrt(np.mean((seen - exact) ** 2) / np.mean(exact**2)))
 
 
-def _mode_measures(
-    scene: Scene, run: Run, shape: Floats, what: str, source: str
-) -> Iterator[Measure]:
-    """Judge the motion of one mode: displacements against a sine, and what is left of it."""
+def mode_history(scene: Scene, run: Run, shape: Floats) -> tuple[Floats, Floats, Floats]:
+    """Displacement of a mode over its amplitude, its velocity likewise, and the exact first."""
     omega, size = float(scene.facts["omega"]), float(scene.facts["amplitude"])
     mass = scene.mass[:, None]
     whole = float((mass * shape * shape).sum()) * size
     u = (mass * shape * (run.x - scene.x)).sum(axis=(1, 2)) / whole
     v = (mass * shape * run.v).sum(axis=(1, 2)) / (whole * omega)
-    error = _rms(u, np.sin(omega * scene.times))
+    return u, v, np.sin(omega * scene.times)
+
+
+def _mode_measures(
+    scene: Scene, run: Run, shape: Floats, what: str, source: str
+) -> Iterator[Measure]:
+    """Judge the motion of one mode: displacements against a sine, and what is left of it."""
+    omega = float(scene.facts["omega"])
+    u, v, exact = mode_history(scene, run, shape)
+    error = _rms(u, exact)
     yield Measure(
         f"displacement of {what}, relative rms", error, 0.0, error, 0.1, "", source + " sin(w t)"
     )
@@ -131,19 +139,25 @@ _BEAM = elastic(5e5, 0.3, 1000.0)
 _SIZE = (0.4, 0.05, 0.05)
 
 
-def _bending(points: Floats) -> tuple[float, Floats, Floats]:
-    """Frequency [1/s], shape (1 in the middle) and gradient of the first bending mode."""
+@functools.cache
+def _bending_modes() -> Modes:
     half = [0.5 * s for s in _SIZE]
     # across the beam all sections move as one: even on every axis in y; the rest follows from it
     parity = ((1, 1, 0), (0, 0, 0), (0, 1, 1))
-    found = modes(box_rule(half, (17, 9, 9)), half, _BEAM, parity, (16, 8, 8))
+    return modes(box_rule(half, (17, 9, 9)), half, _BEAM, parity, (16, 8, 8))
+
+
+def _bending(points: Floats) -> tuple[float, Floats, Floats]:
+    """Frequency [1/s], shape (1 in the middle) and gradient of the first bending mode."""
+    half = [0.5 * s for s in _SIZE]
+    found = _bending_modes()
     shape, gradient = found.at(np.vstack([points - half, np.zeros((1, 3))]), 1)
     middle = shape[-1, 1]
     return float(found.omega[1]), shape[:-1] / middle, gradient[:-1] / middle
 
 
 def _judge_beam(scene: Scene, run: Run) -> Iterator[Measure]:
-    _, shape, _ = _bending(scene.x)
+    shape = _bending(scene.x)[1]
     source = "Ritz (Visscher et al. 1991), 6.8192 Hz; Euler-Bernoulli would be 7.181 Hz:"
     yield from _mode_measures(scene, run, shape, "the first bending mode", source)
 
@@ -164,6 +178,7 @@ _JELLY = elastic(1e5, 0.3, 1000.0)
 _RADIUS, _OMEGA, _BREATHS = 0.05, 10.0, 5
 
 
+@functools.cache
 def _breathing() -> tuple[Floats, Floats]:
     """Frequencies [1/s] and shares of the modes that the turning of a ball excites.
 
@@ -186,29 +201,37 @@ def _breathing() -> tuple[Floats, Floats]:
     return found.omega, 2.0 * (_OMEGA * push / found.omega) ** 2 / inertia
 
 
-def _judge_spin(scene: Scene, run: Run) -> Iterator[Measure]:
-    mass = scene.mass
-    center = mass @ run.x / mass.sum()
-    arm = run.x - center[:, None]
+def growth_history(scene: Scene, run: Run) -> tuple[Floats, Floats, Floats]:
+    """Times [s] of the breathing, growth of the moment of inertia, and its reference."""
+    early = scene.times < scene.facts["breathing"]
+    mass, x = scene.mass, run.x[early]
+    arm = x - (mass @ x / mass.sum())[:, None]
     rate, share = _breathing()
-    exact = (share * (1.0 - np.cos(np.outer(scene.times, rate)))).sum(axis=1)
+    exact = (share * (1.0 - np.cos(np.outer(scene.times[early], rate)))).sum(axis=1)
     first = float(mass @ (scene.x[:, :2] ** 2).sum(axis=1))
     seen = (arm[..., :2] ** 2).sum(axis=2) @ mass / first - 1.0
-    early = scene.times < scene.facts["breathing"]
-    error = _rms(seen[early], exact[early])
+    return scene.times[early], seen, exact
+
+
+def _judge_spin(scene: Scene, run: Run) -> Iterator[Measure]:
+    mass = scene.mass
+    end = run.x[-1] - mass @ run.x[-1] / mass.sum()
+    _, seen, exact = growth_history(scene, run)
+    error = _rms(seen, exact)
     source = "modes of a ball by Ritz under centrifugal force"
     yield Measure(
         "growth of the moment of inertia, relative rms", error, 0.0, error, 0.2, "", source
     )
     begun = float((mass[:, None] * np.cross(scene.x, scene.v)).sum(axis=0)[2])
-    kept = float((mass[:, None] * np.cross(arm[-1], run.v[-1])).sum(axis=0)[2]) / begun
+    kept = float((mass[:, None] * np.cross(end, run.v[-1])).sum(axis=0)[2]) / begun
     yield Measure(
         "angular momentum left after a turn", kept, 1.0, abs(kept - 1.0), 1e-3, "",
         "conservation; GaussianBench A1",
     )  # fmt: skip
-    x, start = arm[-1], scene.x
+    x, start = end, scene.x
     sine = float(mass @ (start[:, 0] * x[:, 1] - start[:, 1] * x[:, 0]))
     cosine = float(mass @ (start[:, 0] * x[:, 0] + start[:, 1] * x[:, 1]))
+    rate, share = _breathing()
     turn = _OMEGA * scene.seconds
     # the angular momentum stays, the inertia grows: the mean of the growth slows the turn
     exact_turn = turn - _OMEGA * float(

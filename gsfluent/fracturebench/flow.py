@@ -35,17 +35,27 @@ def _moved(x: Floats, run: float) -> Floats:
     return 0.5 * total
 
 
+def _exact_wave(scene: Scene) -> Floats:
+    """Displacement of all points along the bar [m], [T, N]."""
+    c, x = float(scene.facts["speed"]), scene.x[:, 0]
+    return np.stack([_moved(x, c * t) for t in scene.times]) * float(scene.facts["amplitude"])
+
+
+def wave_history(scene: Scene, run: Run) -> tuple[Floats, Floats, Floats]:
+    """Times [s], mean displacement of the far end [m], and its reference."""
+    far = scene.x[:, 0] > 0.95 * _LENGTH
+    seen = (run.x[:, far, 0] - scene.x[far, 0]).mean(axis=1)
+    return scene.times, seen, _exact_wave(scene)[:, far].mean(axis=1)
+
+
 def _judge_wave(scene: Scene, run: Run) -> Iterator[Measure]:
     c, amplitude = float(scene.facts["speed"]), float(scene.facts["amplitude"])
-    x = scene.x[:, 0]
-    exact = np.stack([_moved(x, c * t) for t in scene.times]) * amplitude
-    seen = run.x[..., 0] - x
+    exact, seen = _exact_wave(scene), run.x[..., 0] - scene.x[:, 0]
     error = float(np.sqrt(np.mean((seen - exact) ** 2) / np.mean(exact**2)))
     source = "d'Alembert between free ends, c = sqrt(E / rho)"
     yield Measure("displacement of all points, relative rms", error, 0.0, error, 0.1, "", source)
     # an end is twice as fast as the wave: it moves by the whole integral, half of it on arrival
-    far = x > 0.95 * _LENGTH
-    end, known = seen[:, far].mean(axis=1), exact[:, far].mean(axis=1)
+    _, end, known = wave_history(scene, run)
     half = 0.5 * amplitude * float(_pushed(np.array(_WIDTH)))
     seconds = []
     for history in (end, known):

@@ -14,6 +14,7 @@ from .scene import BROKEN, Floats, Scene, SceneError
 
 __all__ = ["Measure", "Run"]
 
+_MUST, _MAY = ("scene", "method", "wall_seconds", "steps"), ("settings", "device", "failed")
 _OPTIONAL = ("damage", "stress", "impulse", "deformation")
 
 
@@ -148,12 +149,17 @@ class Run:
                 more: dict[str, Any] = {
                     k: np.asarray(data[k], np.float64) for k in _OPTIONAL if k in data
                 }
+            if missing := [k for k in _MUST if k not in header]:
+                raise SceneError(f"{path}: the header lacks {', '.join(missing)}")
+            header = {k: header[k] for k in (*_MUST, *_MAY) if k in header}
             header["wall_seconds"] = float(header["wall_seconds"])
             header["steps"] = int(header["steps"])
             for key in ("scene", "method", "device", "failed"):
                 header[key] = str(header.get(key, ""))
             header["settings"] = dict(header.get("settings", {}))
             return cls(**header, **arrays, **more)
+        except SceneError:
+            raise
         except BROKEN as error:
             said = str(error) or type(error).__name__
             raise SceneError(f"{path}: not a run of FractureBench ({said})") from error

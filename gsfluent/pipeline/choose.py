@@ -19,7 +19,7 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
-from gsfluent.pipeline.choose_fit import Fit, History, fit_history
+from gsfluent.pipeline.choose_fit import Fit, History, fit_histories
 from gsfluent.pipeline.choose_pick import CELLS, Choice, pick, ranked
 from gsfluent.pipeline.choose_probe import Probe, distance, histories, probe, window
 from gsfluent.pipeline.choose_seconds import cost_of
@@ -173,7 +173,7 @@ def choose_setting(
     """
     scale = probes.whole[0].seen
     shown = histories(probes.levels, probes.first, probes.last, scale)
-    fits = [fit_history(history) for history in shown]
+    fits = fit_histories(shown)
     growth = _growth(probes)
     steps: dict[float, dict[str, tuple[float, float]]] = {CFL: {}}
     for cfl, runs in probes.long.items():
@@ -248,7 +248,7 @@ def choose(
     """
     probing = probing or Probing()
     probes = run_probes(scene, shot, probing, device=device, seed=seed, progress=progress)
-    seconds, source = cost_of(probes.whole, probes.levels, scene, shot, device)
+    seconds, source = cost_of(probes.whole, probes.levels, scene, device)
     choice, fits, growth = choose_setting(probes, bound, seconds)
     _log.info("chart: %s", choice.reason)
     return summary(choice, fits, growth, probes, probing, source) | {"device": str(device)}

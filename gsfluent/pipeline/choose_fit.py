@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ORDERS", "Fit", "History", "fit_history"]
+__all__ = ["ORDERS", "Fit", "History", "fit_histories", "fit_history"]
 
 Array = NDArray[np.float64]
 
@@ -120,11 +121,45 @@ class Fit:
         return bool(self.misfit < 0.5 and self.parallel > 0.0 and self.order > ORDERS[0])
 
 
-def fit_history(history: History, *, seed: int = 0, draws: int = DRAWS) -> Fit:
+def fit_histories(histories: Sequence[History], *, seed: int = 0, draws: int = DRAWS) -> list[Fit]:
+    """Fit all observables of a shot.
+
+    They come from the same runs of the same method: what one leaves open about the order, the
+    others tell, together as much as one of them would.
+    """
+    likely = [_likely(history) for history in histories]
+    found = []
+    for number, history in enumerate(histories):
+        others = likely[:number] + likely[number + 1 :]
+        prior = np.mean(others, axis=0) if others else None
+        found.append(fit_history(history, seed=seed, draws=draws, prior=prior))
+    return found
+
+
+def _likely(history: History) -> Array:
+    """Logarithm of the likelihood of each order, [G], its greatest 0."""
+    sizes = np.asarray(history.sizes) / history.sizes[-1]
+    means = np.stack([runs.mean(axis=0).reshape(-1) for runs in history.values])
+    grid = np.linspace(*ORDERS, _GRID)
+    residual = _solve(means, sizes, grid)[0]
+    power = 0.5 * _data(means, sizes, grid[residual.argmin()], history) * (sizes.size - 2)
+    # what chance explains says nothing against an order
+    chance = sum(
+        history.scatter(size) ** 2 * runs.shape[1] / runs.shape[0]
+        for size, runs in zip(history.sizes, history.values, strict=True)
+    )
+    floor = chance + _SMALL
+    return np.asarray(power * np.log((residual.min() + floor) / (residual + floor)))
+
+
+def fit_history(
+    history: History, *, seed: int = 0, draws: int = DRAWS, prior: Array | None = None
+) -> Fit:
     """Fit the law to one observable.
 
     Args:
         history: At least three levels.
+        prior: Logarithm of how likely each order is by what else is known, [G].
         seed: Seed of the draws.
         draws: How many.
 
@@ -141,7 +176,7 @@ def fit_history(history: History, *, seed: int = 0, draws: int = DRAWS) -> Fit:
     scaled = sizes / sizes[-1]
     grid = np.linspace(*ORDERS, _GRID)
     means = np.stack([runs.mean(axis=0).reshape(-1) for runs in history.values])
-    moments, components = history.values[0].shape[1:]
+    moments = history.values[0].shape[1]
     rng = np.random.default_rng([seed, *history.name.encode()])
 
     best, amplitude, _ = _solve(means, scaled, grid)
@@ -151,14 +186,15 @@ def fit_history(history: History, *, seed: int = 0, draws: int = DRAWS) -> Fit:
     explained = wave * float(scaled[0] ** grid[at] - 1.0)
     # residuals of L levels with two unknowns per moment
     left = math.sqrt(float(best[at]) / (moments * max(1, sizes.size - 2)))
-    # one history is one datum: its moments hang together
-    power = 0.5 * components * (sizes.size - 2)
+    power = 0.5 * _data(means, scaled, grid[at], history) * (sizes.size - 2)
 
     orders, error = np.empty(draws), np.empty(draws)
     for draw in range(draws):
         noisy = means + _noise(history, rng)
         residual, amplitude, _ = _solve(noisy, scaled, grid)
         weight = ((residual.min() + _SMALL) / (residual + _SMALL)) ** power
+        if prior is not None:
+            weight = weight * np.exp(prior)
         pick = int(rng.choice(grid.size, p=weight / weight.sum()))
         orders[draw] = grid[pick]
         error[draw] = amplitude[pick] / math.sqrt(moments) + left * abs(rng.standard_normal())
@@ -192,6 +228,27 @@ def _solve(means: Array, sizes: Array, grid: Array) -> tuple[Array, Array, Array
     amplitude = np.sqrt(np.maximum(np.einsum("gi,ij,gj->g", weights, gram, weights), 0.0))
     residual = np.maximum(total - amplitude**2 * (centred**2).sum(axis=1), 0.0)
     return residual, amplitude, weights
+
+
+def _data(means: Array, sizes: Array, order: float, history: History) -> float:
+    """How many numbers a history is worth, since its moments hang together.
+
+    ``T / (1 + 2 sum_k (1 - k / T) r_k)`` per component (Bayley and Hammersley 1946), with the
+    autocorrelation ``r_k`` of what the best fit leaves, up to where it first falls to zero.
+    """
+    moments, components = history.values[0].shape[1:]
+    matrix = np.stack([np.ones_like(sizes), sizes**order], axis=1)
+    left = means - matrix @ np.linalg.lstsq(matrix, means, rcond=None)[0]
+    series = left.reshape(-1, moments, components)
+    power = float((series**2).sum())
+    total = 1.0
+    for lag in range(1, moments):
+        shared = float((series[:, lag:] * series[:, :-lag]).sum())
+        if power <= _SMALL**2 or shared <= 0.0:
+            break
+        # the sum over fewer pairs holds the factor (1 - lag / T) already
+        total += 2.0 * shared / power
+    return components * max(1.0, moments / total)
 
 
 def _noise(history: History, rng: np.random.Generator) -> Array:

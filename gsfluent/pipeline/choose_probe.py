@@ -76,7 +76,9 @@ class Probe:
         points: Material points.
         point_steps: Points moved on the grid, summed over steps, by frame, [T].
         steps: Steps of the grid.
-        blocks: Most blocks of the grid in use.
+        blocks: Blocks of the grid in use, mean over the steps.
+        fields: Most velocity fields.
+        composed: Steps of the composable operators.
         failed: Why it broke off, or empty.
     """
 
@@ -88,7 +90,9 @@ class Probe:
     points: int
     point_steps: Array
     steps: int
-    blocks: int
+    blocks: float
+    fields: int
+    composed: int
     failed: str = ""
 
 
@@ -152,7 +156,8 @@ def probe(
     return Probe(
         cells=cells, cfl=cfl, seed=seed, seen=seen, seconds=run.seconds,
         points=run.matter.particles.count, point_steps=np.array(spent, dtype=np.float64),
-        steps=counters.steps, blocks=counters.blocks_max, failed=run.failure,
+        steps=counters.steps, blocks=counters.block_steps / max(counters.steps, 1),
+        fields=counters.fields_max, composed=counters.composed_steps, failed=run.failure,
     )  # fmt: skip
 
 

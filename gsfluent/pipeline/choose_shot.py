@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from gsfluent.config import Shot
 from gsfluent.errors import InputError
 from gsfluent.io import write_json
 from gsfluent.pipeline.choose import Probing, choose
-from gsfluent.pipeline.plan import _stand_in
+from gsfluent.pipeline.plan_stand_in import stand_in
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_prepare import (
     fill_stage,
@@ -28,7 +29,7 @@ from gsfluent.pipeline.run_store import StageStore, fingerprint, publish
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.scene import Scene
 
-__all__ = ["chart_shot", "choose_stage"]
+__all__ = ["chart_shot", "choose_stage", "readable", "shot_scene"]
 
 _log = logging.getLogger(__name__)
 FILE, PICTURE = "chart.json", "chart.png"
@@ -63,7 +64,7 @@ def chart_shot(
         InputError: The shot is wrong, or a probe broke off.
     """
     device, reporter = torch.device(device), reporter or LineReporter()
-    scene, solid = _scene(shot, out, device, seed, reporter)
+    scene, solid = shot_scene(shot, out, device=device, seed=seed, reporter=reporter)
     result = choose(
         scene, shot, bound, probing=probing, device=device, seed=seed,
         progress=reporter.task("chart"),
@@ -75,11 +76,31 @@ def chart_shot(
     return result
 
 
-def _scene(
-    shot: Shot, out: Path, device: torch.device, seed: int, reporter: Reporter
+def shot_scene(
+    shot: Shot,
+    out: Path,
+    *,
+    device: torch.device,
+    seed: int = 0,
+    reporter: Reporter | None = None,
+    make: bool = False,
 ) -> tuple[Scene, str]:
-    """The scene of a shot and what its solids are."""
-    if (out / "stages" / "texture" / "stage.json").is_file():
+    """The scene of a shot and what its solids are.
+
+    Args:
+        shot: The shot.
+        out: Folder of a run; its finished stages are taken up.
+        device: Where to compute.
+        seed: Seed of everything random.
+        reporter: Receives progress; log lines by default.
+        make: Do the stages up to the solids where they are not there, instead of a stand-in.
+
+    Raises:
+        InputError: The shot is wrong.
+    """
+    if make or (out / "stages" / "texture" / "stage.json").is_file():
+        out.mkdir(parents=True, exist_ok=True)
+        reporter = reporter or LineReporter()
         record = RunRecord(out / "run.json", shot.resolved(), device, seed)
         store = StageStore(out / "stages")
         context = RunContext(shot, out, device, seed, store, record, reporter)
@@ -87,10 +108,10 @@ def _scene(
             stage(context)
         return build_scene(shot, load_solids(context), context.frame), f"the stages in {out}"
     warnings: list[str] = []
-    solid, frame, assumed = _stand_in(shot, warnings)
+    standing = stand_in(shot, warnings)
     for warning in warnings:
         _log.warning("chart: %s", warning)
-    return build_scene(shot, dict.fromkeys(shot.objects, solid), frame), assumed
+    return build_scene(shot, dict(standing.solids), standing.frame), standing.assumed
 
 
 def _write(result: dict[str, Any], folder: Path) -> None:
@@ -100,18 +121,83 @@ def _write(result: dict[str, Any], folder: Path) -> None:
     draw_choice(result, folder / PICTURE)
 
 
-def choose_stage(context: RunContext) -> None:
+def readable(result: dict[str, Any]) -> dict[str, Any]:
+    """``chart.json`` for a person: a line per setting worth its time, shares as percentages."""
+    chosen = result["chosen"]
+    taken = "none meets it" if chosen is None else _words(chosen)
+    if chosen is None and result["enough"] is not None:
+        taken += f"; {_words(result['enough'])} is as fine as chance lets be seen"
+    probe = result["probe"]
+    return {
+        "asked for": f"{result['bound']:.1%}",
+        "chosen": taken,
+        "sure": f"{result['sure']:.0%}",
+        "reason": result["reason"],
+        "settings": [
+            {
+                "cells": s["cells"],
+                "cfl": s["cfl"],
+                "seconds": s["seconds"],
+                "error": f"{s['error']:.1%}",
+                "5 % to 95 %": f"{s['low']:.1%} to {s['high']:.1%}",
+                "sure": f"{s['sure']:.0%}",
+                "worst": s["worst"],
+            }
+            for s in _front(result["settings"])
+        ],
+        "observables": [
+            {
+                "seen": o["name"],
+                "order": o["order"],
+                f"error at {probe['cells'][-1]} cells": f"{o['error_finest']:.1%}",
+                "run to run": f"{o['band']:.1%}",
+                "growth": o["growth"],
+                "settles": o["asymptotic"],
+            }
+            for o in result["observables"]
+        ],
+        "probed": (
+            f"{probe['cells']} cells, {probe['seeds']} seeds, frames {probe['frames'][0]} to "
+            f"{probe['frames'][1] - 1} of {probe['of_frames']}, in {probe['seconds']:.0f} s; "
+            f"solid: {result['solid']}"
+        ),
+        "seconds from": result["seconds_from"],
+        "outputs": result["outputs"],
+    }
+
+
+def _front(settings: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Settings that no cheaper one equals."""
+    best, found = math.inf, []
+    for setting in settings:  # cheapest first
+        if setting["error"] < best:
+            best = setting["error"]
+            found.append(setting)
+    return found
+
+
+def _words(setting: dict[str, Any]) -> str:
+    return (
+        f"{setting['cells']} cells, cfl {setting['cfl']:g}: error {setting['error']:.1%}, "
+        f"{setting['seconds']:.3g} s"
+    )
+
+
+def choose_stage(context: RunContext) -> bool:
     """``solve: {error: ...}``: put the chosen cells and step in place of the bound.
 
     Where chance alone is larger than the bound, the setting beyond which finer cells change less
     than chance does is taken, with a warning; ``run.json`` says so under ``choice``.
+
+    Returns:
+        Whether there was something to choose.
 
     Raises:
         InputError: No setting meets the bound, and it is not for chance.
     """
     shot = context.shot
     if shot.solve.error is None:
-        return
+        return False
     bound = shot.solve.error
     key = fingerprint("choose", context.key(context.source_key, moving_settings(shot), bound))
 
@@ -145,3 +231,4 @@ def choose_stage(context: RunContext) -> None:
         shot.solve, error=None, cells=int(chosen["cells"]), cfl=float(chosen["cfl"])
     )
     context.shot = dataclasses.replace(shot, solve=solve)
+    return True

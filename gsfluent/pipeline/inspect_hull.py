@@ -48,23 +48,43 @@ def hull_points(capture: Capture, focus: Array) -> tuple[Array, Array]:
         focus: Point the cameras look at [3].
     """
     views = masked_views(capture)
-    if len(views) < 3:
+    grid, inside = hull_grid(views, capture, focus)
+    if not inside.any():
         return np.zeros((0, 3)), np.zeros((0, 3))
+    points = grid[_surface(inside)]
+    return points, _colors(views, points)
+
+
+def hull_grid(
+    views: list[View], capture: Capture, focus: Array, voxels: int = _VOXELS
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Lattice around the visual hull.
+
+    Args:
+        views: From :func:`masked_views`; fewer than three see nothing.
+        capture: Photographs they are of.
+        focus: Point the cameras look at [3].
+        voxels: Points of the lattice along each axis, V.
+
+    Returns:
+        Its points [V, V, V, 3], and which of them lie in the hull, bool [V, V, V]; where nothing
+        does the lattice may be coarser.
+    """
     reach = float(np.median(np.linalg.norm(capture.centers().numpy() - focus, axis=1)))
     low, high = focus - 0.6 * reach, focus + 0.6 * reach
-    occupied = np.zeros((0, 3))
-    for _ in range(3):  # each round fits the grid to what the last one left
-        axes = [np.linspace(a, b, _VOXELS) for a, b in zip(low, high, strict=True)]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        inside = inside_masks(views, torch.from_numpy(grid)) >= _AGREE
+    grid, inside = np.zeros((*(voxels,) * 3, 3)), np.zeros((voxels,) * 3, dtype=bool)
+    # each round fits the grid to what the last left; only the last has to be fine
+    for count in (voxels // 2, voxels // 2, voxels) if len(views) >= 3 else ():
+        axes = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        shares = inside_masks(views, torch.from_numpy(grid.reshape(-1, 3)))
+        inside = (shares >= _AGREE).reshape((count,) * 3)
+        if not inside.any():
+            break
         occupied = grid[inside]
-        if not len(occupied):
-            return occupied, occupied
-        margin = 1.5 * (high - low) / (_VOXELS - 1)
+        margin = 1.5 * (high - low) / (count - 1)
         low, high = occupied.min(axis=0) - margin, occupied.max(axis=0) + margin
-    surface = _surface(inside.reshape(_VOXELS, _VOXELS, _VOXELS)).reshape(-1)
-    points = grid[surface]
-    return points, _colors(views, points)
+    return grid, inside
 
 
 def _surface(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:

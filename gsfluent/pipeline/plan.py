@@ -1,247 +1,329 @@
 """What a shot will cost, before it is paid: ``gsfluent plan``.
 
-Nothing is simulated. A stand-in solid (the splat coarsely filled, or an ellipsoid in the box of a
-capture's sparse points) is given its material points exactly as the run will do it; dx, dt and the
-number of blocks follow from them, and one transfer on these points is timed on this machine.
+Nothing is simulated. A stand-in solid (the splat coarsely filled, the hull that masks carve, or an
+ellipsoid in the box of sparse points) says how much matter there is; what happens to it is foreseen
+in closed form (:mod:`gsfluent.pipeline.plan_motion`); a cost model measured on this machine
+(:mod:`gsfluent.pipeline.plan_cost`) says what that takes.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-import time
-from collections.abc import Sequence
-from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsfluent import ops
-from gsfluent.config import Drop, Shot
-from gsfluent.data import SURFACE, Frame, Gaussians, Solid
-from gsfluent.errors import InputError
-from gsfluent.io import load, load_capture
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.inspect import inspect
-from gsfluent.pipeline.orient import DEFAULT_SIZE, make_frame
-from gsfluent.pipeline.particles import POINTS_PER_CELL, Matter
+from gsfluent.config import Shot
+from gsfluent.pipeline.particles import POINTS_PER_CELL, grid_spacing
+from gsfluent.pipeline.plan_bounds import (
+    THIN_CELLS,
+    bounds_of,
+    budget_spacing,
+    choose_cells,
+    thickness,
+)
+from gsfluent.pipeline.plan_cost import Cost, CostModel
+from gsfluent.pipeline.plan_fact import STAGES
+from gsfluent.pipeline.plan_motion import Outlook, foresee
+from gsfluent.pipeline.plan_passes import laws_of, passes_of
+from gsfluent.pipeline.plan_stand_in import StandIn, stand_in
+from gsfluent.pipeline.plan_work import (
+    NOT_PREDICTED,
+    born_splats,
+    export_work,
+    fill_work,
+    isolate_work,
+    reconstruct_work,
+    render_work,
+    simulate_work,
+    splat_count,
+    texture_method,
+    texture_work,
+)
 from gsfluent.pipeline.run_simulate import build_scene
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_solver import CFL
-from gsfluent.scene import Blade, Body, Collider, Scene
+from gsfluent.pipeline.simulate import QUALITY
+from gsfluent.pipeline.stage import Progress
+from gsfluent.scene import Scene
 
-_STAND_IN_VOXELS = 48
-# State before and after a step, sorted copies, stress and splat binding, in units of one state.
-_STATE_COPIES = 5
-_NODE_VALUES = 4 + 3 + 6
-_GRAVITY = 9.81
+__all__ = ["cost_model", "plan_shot"]
+
+MOST_PARTICLES = 8_000_000
+"""Material points that a simulation refuses to exceed."""
 
 
-def plan_shot(shot: Shot, *, device: torch.device, seed: int = 0) -> dict[str, Any]:
+def cost_model(
+    device: torch.device | str,
+    *,
+    recalibrate: bool = False,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+) -> CostModel:
+    """The cost model of a device: the stored one, or a new one from the probe, which is stored.
+
+    Args:
+        device: Which.
+        recalibrate: Measure anew, and forget what runs have taught.
+        folder: Where models are stored; default: the user's cache.
+        progress: Told what is measured.
+
+    Raises:
+        RunError: The disk is full.
+    """
+    found = None if recalibrate else CostModel.load(device, folder)
+    if found is not None:
+        return found
+    from gsfluent.pipeline.plan_probe import calibrate
+
+    model = calibrate(device, progress)
+    model.save(device, folder)
+    return model
+
+
+@dataclasses.dataclass(frozen=True)
+class Prospect:
+    """A shot with stand-ins: everything that does not hang on the size of the cells.
+
+    Attributes:
+        shot: The shot.
+        standing: Stand-ins of its objects.
+        scene: Its scene with them.
+        frames: Frames.
+        warnings: What was not known.
+    """
+
+    shot: Shot
+    standing: StandIn
+    scene: Scene
+    frames: int
+    warnings: tuple[str, ...]
+
+    @classmethod
+    def of(cls, shot: Shot) -> Prospect:
+        """Look at the input of a shot.
+
+        Raises:
+            InputError: The input cannot be read, or a material or event cannot be.
+        """
+        warnings: list[str] = []
+        standing = stand_in(shot, warnings)
+        scene = build_scene(shot, dict(standing.solids), standing.frame)
+        frames = max(1, round(shot.output.fps * shot.output.seconds))
+        return cls(shot, standing, scene, frames, tuple(warnings))
+
+    def counts(self, dx: float) -> list[int]:
+        """Material points of each body."""
+        return [max(1, round(b.volume * POINTS_PER_CELL / dx**3)) for b in self.scene.bodies]
+
+    def outlook(self, dx: float) -> Outlook:
+        """What happens on a grid of spacing ``dx``."""
+        # the run simulates until its last frame, not until the end
+        seconds = (self.frames - 1) / self.shot.output.fps
+        cfl = self.shot.solve.cfl
+        return foresee(self.scene, dx, seconds, self.frames, self.counts(dx), cfl=cfl)
+
+    def splats(self, cells: int) -> tuple[float, dict[str, float]]:
+        """Splats of the solids, and the features of filling them."""
+        fill, inside = fill_work(
+            self.shot, self.standing, splat_count(self.shot, self.standing), cells
+        )
+        return fill["splats"] + sum(inside.values()), fill
+
+    def simulation(self, dx: float, cells: int) -> tuple[Outlook, dict[str, float]]:
+        """What happens, and the features of simulating it."""
+        outlook = self.outlook(dx)
+        cracks = self.shot.output.cracks != "none"
+        return outlook, simulate_work(
+            outlook, self.scene, self.frames, self.splats(cells)[0], cracks,
+            points=float(sum(self.counts(dx))),
+        )  # fmt: skip
+
+    def frame_seconds(self, model: CostModel, cells: int) -> float:
+        """Seconds that simulating a frame takes with so many cells."""
+        dx = grid_spacing(self.scene, cells)
+        # the voxels of the solid, and so the splats, follow quality, not cells
+        work = self.simulation(dx, QUALITY[self.shot.solve.quality])[1]
+        return model.stage("simulate", work).seconds / self.frames
+
+
+def plan_shot(
+    shot: Shot,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    model: CostModel | None = None,
+) -> dict[str, Any]:
     """Plan a shot.
 
     Args:
         shot: The shot.
         device: Where it would run.
-        seed: Seed of the point positions.
+        seed: Of the run; a plan has nothing random.
+        model: What work costs there; without one times are None.
 
     Returns:
-        ``passes`` (name, needed, why), ``dx``, ``dt``, ``substeps``, ``particles``,
-        ``active_blocks``, ``memory_bytes``, ``simulate_seconds``, ``frames``, ``size_m``,
-        ``assumed`` and ``warnings``.
+        ``passes`` (name, needed, why), ``bounds`` and ``binding``, ``dx``, ``cells``, ``dt``,
+        ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and memory_bytes by
+        name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``, ``size_m``,
+        ``assumed``, ``warnings``, ``calibrated``, ``device`` and ``work`` (features by stage).
 
     Raises:
         InputError: The input cannot be read, or a material or event cannot be.
     """
-    warnings: list[str] = []
-    solid, frame, assumed = _stand_in(shot, warnings)
-    scene = build_scene(shot, dict.fromkeys(shot.objects, solid), frame)
-    stage = Simulate(quality=shot.solve.quality, seed=seed, device=device)
-    matter = stage.prepare(scene)
-    solids = [body for body in scene.bodies if body.solid is not None]
-    speeds = [_impact_speed(body, scene) for body in scene.bodies]
-    speeds += [math.hypot(*thing.velocity) for thing in scene.colliders]
-    speed = max([*speeds, *(blade.speed for blade in scene.blades)])
-    wave = max(_fastest(body) for body in scene.bodies)
-    dt = CFL * matter.dx / (wave + speed)
-    moved = len(scene.bodies) + len(scene.colliders) + len(scene.blades)
-    grid_seconds = max(0.0, shot.output.seconds - _flight_seconds(shot, moved))
-    substeps = math.ceil(grid_seconds / dt)
-    blocks = ops.build_blocks(matter.rest, matter.dx)
-    active = int(blocks.coords.shape[0])
-    per_step = _time_step(matter, blocks, dt)
-    _warn(warnings, solids, speed, matter, shot)
-    low, high = solids[0].bounds()
+    prospect = Prospect.of(shot)
+    chosen = cells_of(prospect, model)
+    dx = grid_spacing(prospect.scene, chosen)
+    quality = QUALITY[shot.solve.quality]
+    outlook, simulated = prospect.simulation(dx, quality)
+    work = _work(prospect, quality, simulated)
+    stages = {name: _costs(model, name, work[name], shot) for name in STAGES if name in work}
+    seconds = [row["seconds"] for row in stages.values()]
+    total = sum(seconds) if all(value is not None for value in seconds) else None
+    counts = prospect.counts(dx)
+    least = None if shot.solve.seconds_per_frame is None or model is None else dx
+    bounds, binding = bounds_of(
+        prospect.scene.bodies, dx, strike=outlook.strike_speed, budget=least
+    )
+    warnings = [*prospect.warnings, *_warnings(prospect, outlook, dx, sum(counts))]
+    if texture_method(shot) in NOT_PREDICTED:
+        warnings.append(
+            f"texture: what {texture_method(shot)} costs hangs on the model you bring and is not "
+            "predicted; mend: texture.method: exemplar is"
+        )
+    first = next(body for body in prospect.scene.bodies if body.solid is not None)
+    low, high = first.bounds()
     return {
-        "passes": _passes(shot, scene),
-        "size_m": (high - low).tolist(),
-        "assumed": assumed,
-        "frames": max(1, round(shot.output.fps * shot.output.seconds)),
-        "dx": matter.dx,
-        "dt": dt,
-        "substeps": substeps,
-        "impact_speed": speed,
-        "wave_speed": wave,
-        "particles": matter.particles.count,
-        "particles_per_cell": POINTS_PER_CELL,
-        "active_blocks": active,
-        "memory_bytes": _memory(matter, active),
-        "simulate_seconds": round(substeps * per_step, 1),
         "device": str(device),
+        "calibrated": model is not None,
+        "passes": passes_of(shot, prospect.scene, outlook),
+        "size_m": (high - low).tolist(),
+        "assumed": prospect.standing.assumed,
+        "frames": prospect.frames,
+        "cells": chosen,
+        "dx": dx,
+        "bounds": [bound.row() for bound in bounds],
+        "binding": binding,
+        "dt": outlook.dt,
+        "substeps": outlook.substeps,
+        "grid_from": outlook.grid_from,
+        "impact_speed": outlook.strike_speed,
+        "wave_speed": outlook.wave,
+        "particles": sum(counts),
+        "particles_per_cell": POINTS_PER_CELL,
+        "active_blocks": outlook.blocks,
+        "stages": stages,
+        "seconds": total,
+        "simulate_seconds": stages["simulate"]["seconds"],
+        "memory_bytes": max(row["memory_bytes"] for row in stages.values()),
+        "work": work,
         "warnings": warnings,
     }
 
 
-def _stand_in(shot: Shot, warnings: list[str]) -> tuple[Solid, Frame, str]:
-    """A solid of about the right size and volume, its frame, and what was assumed."""
-    if shot.splats is not None:
-        gaussians = load(shot.splats).validated(shot.splats.name)
-        frame = make_frame(gaussians, None, shot)
-        options = shot.fill.given(frame.scale) | {"resolution": _STAND_IN_VOXELS}
-        solid = Fill(**options, refine_views=0)(gaussians)
-        return _grey(solid), frame, f"the splat, filled at {_STAND_IN_VOXELS} voxels"
-    if shot.capture is None:
-        raise InputError("the shot has neither capture nor splats", "name one input")
-    load_capture(shot.capture)  # what is wrong with it is an error; what is not in it is a warning
-    try:
-        report = inspect(shot.capture, None, size=shot.size)
-    except InputError as error:
-        size = shot.size or DEFAULT_SIZE
-        warnings.append(f"the object's size is not known ({error.what}): assumed {size:g} m")
-        return _ellipsoid([size] * 3), Frame.identity(), f"a ball of {size:g} m"
-    box = [float(x) for x in report["box"]["size"]]
-    if shot.scale is not None:
-        box = [x * shot.scale / float(report["scale"]["metres_per_unit"]) for x in box]
-    return _ellipsoid(box), Frame.identity(), "an ellipsoid in the box of what is seen"
+def cells_of(prospect: Prospect, model: CostModel | None) -> int:
+    """Cells along the largest body: the shot's, or as many as its time budget allows.
+
+    Raises:
+        InputError: The budget is too small for any grid.
+    """
+    solve = prospect.shot.solve
+    if solve.seconds_per_frame is None or model is None:
+        return solve.cells or QUALITY[solve.quality]
+    return choose_cells(lambda cells: prospect.frame_seconds(model, cells), solve.seconds_per_frame)
 
 
-def _ellipsoid(size: list[float]) -> Solid:
-    """An ellipsoid that stands on z = 0 and fills a box of ``size`` [m]."""
-    extents = torch.tensor(size, dtype=torch.float32).clamp(min=1e-6)
-    voxel = float(extents.amax()) / _STAND_IN_VOXELS
-    counts = [max(2, math.ceil(float(e) / voxel)) for e in extents]
-    axes = [(torch.arange(n) + 0.5) / n * 2.0 - 1.0 for n in counts]
-    x, y, z = torch.meshgrid(*axes, indexing="ij")
-    inside = x * x + y * y + z * z <= 1.0
-    origin = torch.tensor([-0.5, -0.5, 0.0]) * extents
-    radius = (x * x + y * y + z * z).sqrt()
-    depth = (1.0 - radius).clamp(min=0.0) * 0.5 * float(extents.amin())
-    middle = (origin + 0.5 * extents)[None]
-    one = Gaussians.from_colors(
-        middle, torch.full((1,), voxel), torch.full((1, 3), 0.5), label=SURFACE
+def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:
+    """The textbook's answer: only points cost something (:func:`budget_spacing`) [m]."""
+    outlook = prospect.outlook(grid_spacing(prospect.scene, QUALITY["preview"]))
+    per_point = max(v for n, v in model.seconds["simulate"].items() if n.startswith("point_steps"))
+    return budget_spacing(
+        sum(body.volume for body in prospect.scene.bodies),
+        wave=outlook.wave + outlook.speed,
+        frame=1.0 / prospect.shot.output.fps,
+        seconds=budget,
+        per_point_step=per_point,
     )
-    return _grey(Solid(one, inside, depth, origin, voxel))
 
 
-def _grey(solid: Solid) -> Solid:
-    """With a neutral colour everywhere, so that parts chosen by colour can be asked for."""
-    if solid.color is not None:
-        return solid
-    return replace(solid, color=torch.full((*solid.occupancy.shape, 3), 0.5))
+def _work(
+    prospect: Prospect, quality: int, simulated: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """Features of every stage that the shot has."""
+    shot, standing, frames = prospect.shot, prospect.standing, prospect.frames
+    splats, fill = prospect.splats(quality)
+    work = {}
+    if standing.photographs is not None:
+        work["reconstruct"] = reconstruct_work(standing.photographs, shot)
+    work["isolate"] = isolate_work(fill["splats"])
+    work["fill"] = fill
+    work["texture"] = texture_work(texture_method(shot), fill)
+    work["simulate"] = simulated
+    drawn = splats + born_splats(simulated)
+    work["render"] = render_work(shot, frames, drawn)
+    if any(kind != "mp4" for kind in shot.output.what):
+        work["export"] = export_work(shot, frames, drawn)
+    return work
 
 
-def _impact_speed(body: Body, scene: Scene) -> float:
-    """Speed [m/s] with which a body meets something: its own, and what falling adds."""
-    own = math.sqrt(sum(v * v for v in body.velocity))
-    low, _ = body.bounds()
-    fall = 0.0
-    if scene.floor is not None:
-        fall = math.sqrt(2.0 * _GRAVITY * max(0.0, float(low[2]) - scene.floor))
-    return math.hypot(own, fall)
+def _costs(
+    model: CostModel | None, name: str, features: dict[str, float], shot: Shot
+) -> dict[str, Any]:
+    """Seconds and bytes of a stage; seconds are None where nobody can know them."""
+    from gsfluent.pipeline.plan_memory import memory_of
+    from gsfluent.pipeline.plan_probe import resident_bytes
 
-
-def _flight_seconds(shot: Shot, things: int) -> float:
-    """Time [s] in which nothing touches anything and no grid is needed."""
-    drops = [event.height for event in shot.events if isinstance(event, Drop)]
-    if not drops or things > len(shot.objects):
-        return 0.0
-    return math.sqrt(2.0 * min(drops) / _GRAVITY)
-
-
-def _fastest(body: Body) -> float:
-    parts = [part.material(body.material).wave_speed for part in body.parts]
-    return max([body.material.wave_speed, *parts])
-
-
-def _time_step(matter: Matter, blocks: ops.Blocks, dt: float) -> float:
-    """Seconds of one transfer to the grid and back and one return map, timed here, once warm."""
-    p = matter.particles
-    strain_rate = torch.zeros_like(p.affine)
-    seconds = math.inf
-    for _ in range(2):
-        start = time.perf_counter()
-        grid, _ = ops.p2g(
-            p.position, p.velocity, p.affine, p.mass, dx=matter.dx, blocks=blocks, dt=dt
-        )
-        field, _, _ = ops.grid_update(grid, dx=matter.dx, dt=dt, blocks=blocks)
-        ops.g2p(field, p.position, dx=matter.dx, dt=dt, blocks=blocks)
-        ops.return_mapping(
-            p.strain,
-            p.alpha,
-            strain_rate,
-            law=matter.law,
-            params=matter.params,
-            material=p.material,
-            dt=dt,
-        )
-        if p.device.type == "cuda":
-            torch.cuda.synchronize(p.device)
-        seconds = min(seconds, time.perf_counter() - start)
-    return seconds
-
-
-def _memory(matter: Matter, active: int) -> int:
-    values = [value for value in vars(matter.particles).values() if isinstance(value, torch.Tensor)]
-    state = sum(value.numel() * value.element_size() for value in values)
-    return int(_STATE_COPIES * state + 2 * active * 64 * _NODE_VALUES * 4)
-
-
-def _passes(shot: Shot, scene: Scene) -> list[dict[str, Any]]:
-    """Which passes the shot needs, and why."""
-    laws = {
-        material.law
-        for body in scene.bodies
-        for material in [body.material, *(part.material(body.material) for part in body.parts)]
+    if model is None:
+        return {"seconds": None, "memory_bytes": memory_of(name, features, "cpu", resident_bytes())}
+    cost: Cost = model.stage(name, features)
+    unknown = name == "texture" and texture_method(shot) in NOT_PREDICTED
+    return {
+        "seconds": None if unknown else round(cost.seconds, 3),
+        "memory_bytes": cost.bytes,
     }
-    breaks, yields = "nacc" in laws, bool(laws - {"elastic", "corotated", "rigid"})
-    several = len(scene.bodies) > 1
-    drops = any(isinstance(event, Drop) for event in shot.events)
-    exports = [kind for kind in shot.output.what if kind != "mp4"]
-    method = shot.texture.method or ("exemplar" if shot.texture.exemplar else "by default")
-    rows = [
-        ("reconstruct", shot.capture is not None, "photographs", "splats are given"),
-        ("fill", True, "splats are a shell", ""),
-        ("texture", True, f"the inside has no colours yet ({method})", ""),
-        ("free flight", drops, "closed form until something is touched", "nothing falls"),
-        ("contact", several, f"{len(scene.bodies)} bodies", "one body: no second velocity field"),
-        ("rigid things", bool(scene.colliders), _names(scene.colliders), "only the floor"),
-        ("blades", bool(scene.blades), _names(scene.blades), "nothing is cut"),
-        ("return map", yields, "a material that yields", "no material yields"),
-        ("repair", breaks, "cracks open", "nothing can crack"),
-        ("export", bool(exports), ", ".join(exports), "only the video is asked for"),
-    ]
-    return [{"pass": n, "needed": need, "why": yes if need else no} for n, need, yes, no in rows]
 
 
-def _names(things: Sequence[Collider | Blade]) -> str:
-    return ", ".join(thing.name for thing in things)
-
-
-def _warn(
-    warnings: list[str], solids: list[Body], speed: float, matter: Matter, shot: Shot
-) -> None:
-    for body in solids:
-        if not shot.events:
-            warnings.append("the shot has no events: the object will only rest on the floor")
+def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -> list[str]:
+    """What a user should mend before an hour is spent."""
+    shot, scene = prospect.shot, prospect.scene
+    found = []
+    if not shot.events and not shot.colliders:
+        found.append(
+            "the shot has no events: the object will only rest on the floor; mend: add an event"
+        )
+    if particles > MOST_PARTICLES:
+        found.append(
+            f"{particles} material points, more than the {MOST_PARTICLES} that a run takes; mend: "
+            "fewer solve.cells"
+        )
+    movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}
+    for number, body in enumerate(scene.bodies):
+        if body.solid is None:
+            continue
+        mover = movers[number]
         limit = body.material.wave_speed * body.material.failure_strain
-        if math.isfinite(limit) and speed < limit:
-            warnings.append(
-                f"{body.name}: meets something at {speed:.2g} m/s, but {body.material.name} breaks "
-                f"from about {limit:.2g} m/s; raise the drop or lower cohesion"
+        if math.isfinite(limit) and 0.0 < mover.speed < limit and not mover.driven:
+            found.append(
+                f"{body.name}: meets something at {mover.speed:.2g} m/s, but {body.material.name} "
+                f"breaks from about {limit:.2g} m/s; mend: raise the drop or lower cohesion"
             )
-        if body.solid is not None:
-            thickest = 2.0 * float(body.solid.depth.amax()) * body.frame.scale
-            if thickest < 3.0 * matter.dx:
-                warnings.append(
-                    f"{body.name}: at most {thickest:.3g} m thick, under 3 cells of "
-                    f"{matter.dx:.3g} m; use solve.quality: hero"
-                )
+        thin = thickness(body)
+        if thin < THIN_CELLS * dx:
+            cells = math.ceil(QUALITY["preview"] * THIN_CELLS * dx / thin)
+            found.append(
+                f"{body.name}: {1000 * thin:.3g} mm at its thinnest, under {THIN_CELLS:g} cells of "
+                f"{1000 * dx:.3g} mm; mend: a finer solve.quality, or solve.cells: "
+                f"{math.ceil(cells * _cells(scene, dx) / QUALITY['preview'])}"
+            )
+    if outlook.grid_seconds <= 0.0:
+        found.append(
+            "nothing meets anything before the end; mend: a longer output.seconds, or another event"
+        )
+    if "nacc" not in laws_of(scene) and any(e.__class__.__name__ == "Bullet" for e in shot.events):
+        found.append("nothing is brittle, so the bullet breaks nothing; mend: another material")
+    return found
+
+
+def _cells(scene: Scene, dx: float) -> float:
+    """Cells along the largest body at a spacing."""
+    return grid_spacing(scene, 1) / dx

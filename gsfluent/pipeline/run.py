@@ -19,6 +19,7 @@ import torch
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
 from gsfluent.pipeline.choose_shot import choose_stage
+from gsfluent.pipeline.plan_run import foresee_run, judge_plan
 from gsfluent.pipeline.report import REPORT, write_report
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_prepare import (
@@ -50,6 +51,7 @@ def run_shot(
     before: StageResult | None = None,
     after: AfterRun | None = None,
     facts: Mapping[str, Any] | None = None,
+    plan: bool = True,
 ) -> dict[str, Any]:
     """Run a shot into a folder.
 
@@ -63,6 +65,7 @@ def run_shot(
         before: A stage done already, to stand first in ``run.json``.
         after: Called when all stages are done; what it returns is added to ``run.json``.
         facts: What is known before and belongs into ``run.json``.
+        plan: Plan the run first, and put plan and fact beside each other into ``run.json``.
 
     Returns:
         The content of ``run.json``.
@@ -82,17 +85,20 @@ def run_shot(
     context = RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
     start = time.perf_counter()
     try:
+        foreseen = foresee_run(context, plan=plan)
         reconstruct_stage(context)
         isolate_stage(context)
         fill_stage(context)
         texture_stage(context)
         regions_stage(context)
-        choose_stage(context)
+        if choose_stage(context):  # the plan was made with other cells
+            foreseen = foresee_run(context, plan=plan)
         simulate_stage(context)
         render_stage(context)
         export_stage(context)
         if after is not None:
             record.values.update(after(context))
+        judge_plan(context, foreseen)
     except BaseException as error:
         _record_failure(record, error, store)
         if isinstance(error, KeyboardInterrupt):

@@ -63,6 +63,7 @@ class StageResult:
         fingerprint: Of everything that went in.
         report: Figures for ``run.json``.
         seconds: Work time, also of earlier, interrupted tries.
+        cpu_seconds: Processor time of all threads, likewise: on a busy machine the steadier figure.
         peak_memory_bytes: Highest resident memory of the process during the stage.
         peak_device_memory_bytes: Highest memory allocated on the GPU during the stage (0 on CPU).
         resumed: The whole result was found finished.
@@ -73,6 +74,7 @@ class StageResult:
     fingerprint: str
     report: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     peak_memory_bytes: int = 0
     peak_device_memory_bytes: int = 0
     resumed: bool = False
@@ -82,6 +84,7 @@ class StageResult:
         return {
             "name": self.name,
             "seconds": round(self.seconds, 3),
+            "cpu_seconds": round(self.cpu_seconds, 3),
             "peak_memory_bytes": self.peak_memory_bytes,
             "peak_device_memory_bytes": self.peak_device_memory_bytes,
             "resumed": self.resumed,
@@ -121,6 +124,7 @@ class StageStore:
                 key,
                 before["report"],
                 before["seconds"],
+                before.get("cpu_seconds", 0.0),
                 before["peak_memory_bytes"],
                 before["peak_device_memory_bytes"],
                 resumed=True,
@@ -130,8 +134,14 @@ class StageStore:
         if folder.exists() and (not same or self.force):
             shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        spent = float(before.get("seconds", 0.0)) if same and not self.force else 0.0
-        result = StageResult(name, folder, key, seconds=spent)
+        spent = before if same and not self.force else {}
+        result = StageResult(
+            name,
+            folder,
+            key,
+            seconds=float(spent.get("seconds", 0.0)),
+            cpu_seconds=float(spent.get("cpu_seconds", 0.0)),
+        )
         self.results.append(result)
         write_json(marker, _marker(result, complete=False))
         complete = False
@@ -158,11 +168,12 @@ def measured(result: StageResult) -> Iterator[None]:
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
     _reset_peak_memory()
-    start = time.perf_counter()
+    start, busy = time.perf_counter(), time.process_time()
     try:
         yield
     finally:
         result.seconds += time.perf_counter() - start
+        result.cpu_seconds += time.process_time() - busy
         result.peak_memory_bytes = _peak_memory()
         if torch.cuda.is_available() and torch.cuda.is_initialized():
             result.peak_device_memory_bytes = int(torch.cuda.max_memory_allocated())

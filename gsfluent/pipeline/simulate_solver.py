@@ -75,6 +75,8 @@ class Counters:
     """Steps of the composed operators."""
     law_kernel_steps: int = 0
     """Steps of kernels made for the laws of the scene alone."""
+    undamaged_steps: int = 0
+    """Steps in which no point had a damage variable, because none can break."""
     block_steps: int = 0
     """Blocks that were stored, summed over steps."""
     box_steps: int = 0
@@ -204,6 +206,7 @@ class Resident:
             LAWS["elastic"],
             LAWS["nacc"],
         }
+        self._damage = not set(law.tolist()) <= {LAWS["elastic"]}  # as the solver decides it
         self._solver = _guarded(
             p.velocity,
             lambda: ops.Solver(
@@ -240,6 +243,7 @@ class Resident:
         taken, counters = int(self._seen["step"] - before), self._counters
         sites = int(self._seen["sites"])
         counters.law_kernel_steps += taken if self._special else 0
+        counters.undamaged_steps += 0 if self._damage else taken
         counters.block_steps += taken * sites
         counters.contact_block_steps += taken * int(self._seen["shared_sites"])
         counters.box_steps += taken * max(sites, _box(self._position(), self._matter.dx))

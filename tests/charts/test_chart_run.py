@@ -184,16 +184,21 @@ def test_the_verb_draws_recorded_lines_of_several_files(
     same = dataclasses.replace(fast(free, "cpu", 1), settings={"dx": 0.1, "trades": False})
     append(tmp_path / "a.jsonl", fast(Setting("bar", 0.1), "cpu", 1))
     append(tmp_path / "a.jsonl", same)
+    finer = dataclasses.replace(fast(dataclasses.replace(free, variant="CFL 0.1"), "cpu", 1),
+                                wall_per_simulated=5e-3, error=0.11)  # fmt: skip
+    append(tmp_path / "a.jsonl", finer)
     for r in (peer, broken):
         append(tmp_path / "b.jsonl", r)
     out = tmp_path / "out"
     words = ["chart", "--draw", str(tmp_path / "a.jsonl"), str(tmp_path / "b.jsonl")]
     assert main([*words, "-o", str(out), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["chart"]
-    assert said["runs"] == 4 and said["failed"] == 1 and "500" in said["verdict"]
+    assert said["runs"] == 5 and said["failed"] == 1 and "500" in said["verdict"]
     page = (out / "chart.html").read_text()
     assert "<svg" in page and "exploded" in page and "shuffled points" in page
-    assert (out / "chart.md").read_text().count("| bar |") >= 6
+    tables = (out / "chart.md").read_text()
+    assert tables.count("| bar |") >= 6
+    assert "| gsfluent | CFL 0.1 | 1 | 1.1 | 1.1 | 1.1 | 5 | 0 |" in tables
     assert (out / "chart.png").stat().st_size > 5000
 
 

@@ -204,6 +204,6 @@ def test_plan_measures_a_capture_with_masks_only(
         "capture: capture\nscale: 1.0\nup: +z\nsolve: {quality: preview}\n"
         "events: [{type: drop, height: 1}]\n"
     )
-    assert main(["plan", str(shot), "--json"]) == 0
+    assert main(["plan", str(shot), "--json", "--no-probe"]) == 0
     plan = json.loads(capsys.readouterr().out)
     assert max(plan["size_m"]) == pytest.approx(0.26, rel=0.3)  # the melon is 0.26 m long

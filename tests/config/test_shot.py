@@ -152,15 +152,12 @@ def test_unknown_keys_name_their_path_and_the_nearest(
     assert mend in caught.value.mend
 
 
-@pytest.mark.parametrize(
-    "keys",
-    [
-        {"solve": {"seconds_per_frame": 0.5}},
-    ],
-)
-def test_what_would_do_nothing_yet_is_refused(folder: Path, keys: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="arrives with a later issue"):
-        read(folder, **keys)
+@pytest.mark.parametrize("other", [{"quality": "hero"}, {"cells": 30}, {"error": "3%"}])
+def test_a_time_budget_stands_alone(folder: Path, other: dict[str, Any]) -> None:
+    assert read(folder, solve={"seconds_per_frame": 0.5}).solve.seconds_per_frame == 0.5
+    with pytest.raises(InputError, match=next(iter(other))) as caught:
+        read(folder, solve={"seconds_per_frame": 0.5} | other)
+    assert "remove" in caught.value.mend
 
 
 @pytest.mark.parametrize(

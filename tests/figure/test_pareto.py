@@ -28,6 +28,7 @@ def test_axes_hold_every_run_and_failures_stand_above_all_others(tmp_path: Path)
         left, right = ax.get_xlim()
         low, high = ax.get_ylim()
         assert left < 1.0 and right > 30.0 and low < 0.01 and high > 0.1
+        assert float(cost.lines[-1].get_ydata()[0]) == 2.0
         marks = {line.get_marker(): line for line in ax.lines if len(line.get_xdata()) == 1}
         rail = {m: float(marks[m].get_ydata()[0]) for m in ("x", "^")}
         assert rail["x"] == rail["^"] > 0.1 and rail["x"] < high

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -132,6 +133,19 @@ def test_scorer_needs_only_numpy(scene: Scene, run: Run, tmp_path: Path) -> None
     assert table.read_text().count("\n") == 2 + len(row["measures"])
 
 
+def test_the_example_of_the_docs_is_a_submission(
+    scene: Scene, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    page = (ROOT / "docs" / "fracturebench.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    scene.save("scenes/bar.npz")
+    exec(example, {"simulate": lambda *given: (run.x, run.v)})
+    assert main(["score", "scenes", "runs"]) == 0
+    assert "| bar | you |" in capsys.readouterr().out
+
+
 def test_help_teaches_the_format() -> None:
     done = alone("score", "--help")
     assert done.returncode == 0
@@ -163,6 +177,10 @@ BROKEN: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "cut_at_the_end": (lambda b: b[:-10], "not a run"),
     "flipped": (lambda b: b[:5000] + bytes(2000) + b[7000:], "not a run"),
     "no_header": (lambda b: saved(x=np.zeros(3), v=np.zeros(3), times=np.zeros(1)), "header"),
+    "header_short": (
+        lambda b: saved(header="{}", x=np.zeros(3), v=np.zeros(3), times=np.zeros(1)),
+        "lacks scene, method, wall_seconds, steps",
+    ),
     "header_no_object": (
         lambda b: saved(header="[1, 2]", x=np.zeros(3), v=np.zeros(3), times=np.zeros(1)),
         "not a run",
@@ -290,9 +308,39 @@ def test_one_table_of_several_methods(
     assert call(table, str(runs), *drawn) == 0
     first = page.read_text()
     assert "| gsfluent, cpu | glue, cpu |" in first
-    assert "| pull_apart | 0.001 | **" in first and "| 0.5 |" in first
+    assert "| pull_apart | 0.001 | **" in first and "| 0.5 (0/1) |" in first
     assert call(table, *drawn) == 0  # from the records alone
     assert page.read_text() == first
     (runs / "glue" / "bar.npz").write_bytes(b"")
     assert call(table, str(runs), *drawn) == 1
     assert len(records.read_text().splitlines()) == 3
+    # a peer's records of a ladder: the frozen resolution counts, and of its variants the best
+    lines = []
+    for dx, points, variant, error in (
+        (0.02, 128, "a", 1e-4), (0.01, 1024, "a", 0.3), (0.01, 1024, "b", 0.2), (0.01, 9, "c", 0.1),
+    ):  # fmt: skip
+        line = next(
+            r for r in map(json.loads, records.read_text().splitlines()) if r["method"] == "glue"
+        )
+        line |= {"method": "peer", "points": points, "variant": variant, "error": error}
+        line["settings"] = {"dx": dx}
+        lines.append(json.dumps(line) + "\n")
+    peers = tmp_path / "peers.jsonl"
+    peers.write_text("".join(lines))
+    assert call(table, str(peers), *drawn) == 0
+    assert "| gsfluent, cpu | glue, cpu | peer, cpu |" in page.read_text()
+    assert "| 0.5 (0/1) | 0.2 (0/1) |" in page.read_text()
+
+
+def test_ladder_and_references_enter_the_page(
+    scripts: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ladder, page = scripts("ladder"), tmp_path / "p.md"
+    monkeypatch.setattr(sys, "argv", ["x", "pull_apart", "--page", str(page)])
+    assert ladder.main() == 0
+    text = page.read_text()
+    assert "(128)," in text and "| exact |" in text and "Hertz" in text
+    dx = [0.4, 0.2, 0.1]
+    assert ladder.order(dx, [3.0 * h**1.5 for h in dx]) == pytest.approx(1.5)
+    assert math.isnan(ladder.order(dx, [1e-8, 1e-8, 1e-8]))
+    assert math.isnan(ladder.order(dx, [0.1, 0.1, math.inf]))

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import math
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,6 +18,7 @@ from gsfluent.fracturebench import contact, elastic, flow, ritz, shapes
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
+from gsfluent.lab.frozen import play
 
 Answer = tuple[np.ndarray, np.ndarray]
 
@@ -332,3 +337,61 @@ def test_stored_impact_is_near_hertz() -> None:
     assert 1.05 < push.max() / force < 1.2
     assert 0.99 < -stored["momentum"][-1] < 1.0
     assert stored["error"] < 1e-3 and contact._stored("drop")["error"] < 5e-3
+
+
+@pytest.fixture(scope="module")
+def elements() -> ModuleType:
+    folder = str(Path(__file__).resolve().parents[2] / "scripts" / "fracturebench")
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    return importlib.import_module("references")
+
+
+def test_coarse_elements_come_near_the_stored_references(elements: ModuleType) -> None:
+    impact = contact._stored("collide")
+    times = np.asarray(impact["times"])
+    p = elements.ball_on_mirror(8, impact["speed"], impact["poisson_ratio"], times)
+    assert np.sqrt(np.mean((p - impact["momentum"]) ** 2)) < 0.01
+    fall = contact._stored("drop")
+    times, exact = np.asarray(fall["times"]), np.asarray(fall["height"])
+    height = elements.cube_on_floor(3, fall["speed"], fall["gravity"], fall["poisson_ratio"], times)
+    assert np.sqrt(np.mean((height - exact) ** 2) / np.mean(exact**2)) < 0.06
+
+
+def test_the_elements_laws_are_linear_elasticity_at_small_strains(elements: ModuleType) -> None:
+    mu, kappa = elements.moduli(0.3)
+    assert kappa + 4.0 / 3.0 * mu == pytest.approx(1.0)  # the pressure wave
+    grad = 1e-6 * np.random.default_rng(0).standard_normal((3, 3))
+    strain = 0.5 * (grad + grad.T)
+    stress = (kappa - 2.0 / 3.0 * mu) * np.trace(strain) * np.eye(3) + 2.0 * mu * strain
+    for law in (elements.piola, elements.corotated):
+        assert law(np.eye(3) + grad, mu, kappa) == pytest.approx(stress, abs=1e-11)
+    # a turn is no strain
+    c, s = math.cos(0.7), math.sin(0.7)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    for law in (elements.piola, elements.corotated):
+        assert np.abs(law(turn, mu, kappa)).max() < 1e-14
+
+
+def test_fitted_stiffening_is_found_again(elements: ModuleType) -> None:
+    impact = contact._stored("collide")
+    found = elements.stiffening(
+        np.asarray(impact["times"]), np.asarray(impact["momentum"]), impact["speed"],
+        impact["poisson_ratio"],
+    )  # fmt: skip
+    assert found == pytest.approx(impact["stiffening"], abs=5e-3)
+    assert impact["stiffening"] > 0.0
+    # slower impacts are nearer to Hertz
+    force = contact._stored("hertz")["force_over_hertz"]
+    assert force == sorted(force, reverse=True) and 1.0 < force[-1] < 1.05
+
+
+@pytest.mark.parametrize("name, at_least", [("bar", 1.8), ("bar_wave", 1.8), ("beam", 1.4)])
+def test_gsfluent_converges_to_the_exact_motion(name: str, at_least: float) -> None:
+    case = find(name)
+    errors = []
+    for dx in case.ladder[:2]:
+        scene = case.build(dx, 8)
+        errors.append(judge(scene, play(scene))[0].error)
+    ratio = case.ladder[0] / case.ladder[1]
+    assert math.log(errors[0] / errors[1]) / math.log(ratio) > at_least

@@ -1,0 +1,75 @@
+"""A plan as a person reads it: passes, bounds, stages, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["plan_text"]
+
+
+def plan_text(plan: Mapping[str, Any]) -> str:
+    """The plan as lines of text.
+
+    Args:
+        plan: From :func:`gsfluent.pipeline.plan.plan_shot`.
+    """
+    calibrated = plan["calibrated"]
+    size = " x ".join(f"{100 * side:.3g}" for side in plan["size_m"])
+    total = _seconds(plan["seconds"]) if calibrated else "not calibrated"
+    lines = [
+        f"{total} and {_bytes(plan['memory_bytes'])} on {plan['device']}; {size} cm "
+        f"({plan['assumed']})",
+        "",
+        "passes",
+        *_table([["+" if row["needed"] else "-", row["pass"], row["why"]]
+                 for row in plan["passes"]]),
+        "",
+        f"grid: {plan['cells']} cells along the largest body, dx = {1000 * plan['dx']:.3g} mm, "
+        f"dt = {1e6 * plan['dt']:.3g} us, {plan['substeps']} steps in {plan['frames']} frames",
+        f"      {plan['particles']} points, {plan['particles_per_cell']} a cell, about "
+        f"{plan['active_blocks']:.0f} active blocks",
+        f"      waves at {plan['wave_speed']:.3g} m/s, strikes at {plan['impact_speed']:.3g} m/s",
+        "",
+        f"bounds of dx: {plan['binding']} binds",
+        *_table([["ok" if row["kept"] else "!", row["bound"], f"{row['side']} "
+                  f"{1000 * row['dx']:.3g} mm", row["why"]] for row in plan["bounds"]]),
+        "",
+        "stages",
+        *_table(
+            [[name, _seconds(row["seconds"]), _bytes(row["memory_bytes"])]
+             for name, row in plan["stages"].items()]
+            + [["in all", _seconds(plan["seconds"]), _bytes(plan["memory_bytes"])]],
+            right=(1, 2),
+        ),
+    ]  # fmt: skip
+    if not calibrated:
+        lines += ["", "no times: not calibrated; gsfluent plan without --no-probe measures them"]
+    if plan["warnings"]:
+        lines += ["", "warnings", *(f"  ! {warning}" for warning in plan["warnings"])]
+    return "\n".join(lines)
+
+
+def _table(rows: list[list[str]], right: tuple[int, ...] = ()) -> list[str]:
+    """Rows in columns."""
+    if not rows:
+        return ["  none"]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  "
+        + "  ".join(
+            cell.rjust(w) if i in right else cell.ljust(w)
+            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _seconds(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2g} s" if value < 10 else f"{value:.0f} s"
+
+
+def _bytes(value: float) -> str:
+    return f"{value / 2**20:.0f} MiB" if value < 2**30 else f"{value / 2**30:.2f} GiB"

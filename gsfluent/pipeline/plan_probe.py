@@ -1,0 +1,301 @@
+"""The ten-second probe: small runs of the real stages, timed, and the costs fitted to them.
+
+Three small shots of a drawn melon go through :func:`gsfluent.pipeline.run.run_shot` itself, each
+larger than the last; the first also pays for what a fresh process pays once (libraries, kernels, a
+GPU's context). The solver is measured apart (:mod:`gsfluent.pipeline.plan_probe_solver`), because
+there one number for all laws would not do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from gsfluent.config import Shot
+from gsfluent.io import load_capture, save_image
+from gsfluent.pipeline.inspect_hull import masked_views
+from gsfluent.pipeline.plan_cost import CostModel, machine_key
+from gsfluent.pipeline.plan_fact import actual_work
+from gsfluent.pipeline.plan_fit import Sample, fit
+from gsfluent.pipeline.plan_stand_in import look_at_photographs
+from gsfluent.pipeline.plan_work import isolate_work, reconstruct_work, render_work
+from gsfluent.pipeline.stage import Progress, report_progress
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["FEATURES", "calibrate"]
+
+_log = logging.getLogger(__name__)
+
+FEATURES: dict[str, tuple[str, ...]] = {
+    "reconstruct": ("start", "images", "steps", "step_pixels", "step_splats"),
+    "isolate": ("start", "splats"),
+    "fill": ("start", "objects", "voxels", "inner"),
+    "texture": ("start", "exemplar_objects", "exemplar_voxels", "volume"),
+    "render": ("start", "frames", "frame_pixels", "frame_gaussians"),
+}
+"""What each stage's cost is made of; ``simulate`` has its own module, exports are per kind."""
+FRAME_FEATURES = ("start", "frames", "frame_gaussians", "cracked_gaussians")
+_VIEWS = 10
+_PHOTOGRAPH = 160
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """One small shot."""
+
+    name: str
+    iterations: int
+    splats: int
+    image_size: int
+    resolution: int
+    cells: int
+    frames: int
+    picture: tuple[int, int]
+    material: str
+
+
+SIZES = (
+    Size("cold", 10, 2000, 64, 24, 8, 2, (64, 48), "rubber"),
+    Size("small", 30, 3000, 80, 32, 10, 6, (128, 96), "fruit.watermelon"),
+    Size("large", 30, 12000, 160, 56, 14, 4, (256, 192), "rubber"),
+    Size("large", 30, 12000, 160, 56, 14, 8, (384, 288), "fruit.watermelon"),
+)
+"""The last is the third, broken, with more and larger frames: its first stages are found done."""
+_TRAININGS = ((80, 3000, 90), (160, 3000, 30))
+"""Longest side [pixels], splats and steps of trainings beside those of the shots."""
+
+
+def calibrate(device: torch.device | str, progress: Progress | None = None) -> CostModel:
+    """Measure what work costs on a device; takes about ten seconds on two quiet cores.
+
+    Args:
+        device: Which.
+        progress: Told what is measured.
+    """
+    from gsfluent.pipeline.plan_probe_solver import measure_solver
+
+    device = torch.device(device)
+    began = time.perf_counter()
+    base = resident_bytes()
+    total = len(SIZES) + 2
+    with tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name, _quiet():
+        folder = Path(name)
+        draw_capture(folder / "photographs")
+        report_progress(progress, 1, total, "photographs")
+        samples: list[Sample] = []
+        simulated: list[tuple[Sample, float]] = []
+        for number, size in enumerate(SIZES):
+            values, planned = run_small(folder, size, device)
+            samples += stage_samples(values, planned, cold=number == 0)
+            simulated.append(simulation_sample(values, planned, cold=number == 0))
+            report_progress(progress, number + 2, total, f"stages, {size.name}")
+        samples += other_samples(folder / "small", device)
+        samples += training_samples(folder, device)
+    costs: dict[str, dict[str, float]] = {}
+    errors: dict[str, float] = {}
+    for stage, features in FEATURES.items():
+        mine = [s for s in samples if s.stage == stage and "procedural_voxels" not in s.features]
+        costs[stage], errors[stage] = fit(mine, features)
+    more = [s for s in samples if s.stage == "texture" and "procedural_voxels" in s.features]
+    found, _ = fit(more, ("procedural_objects", "procedural_voxels"),
+                   {"volume": costs["texture"]["volume"]})  # fmt: skip
+    costs["texture"] |= found
+    exports = [s for s in samples if s.stage == "export"]
+    kinds = sorted({name for s in exports for name in s.features})
+    costs["export"], errors["export"] = fit(exports, kinds)
+    costs["simulate"], errors["simulate"] = measure_solver(device)
+    frame_costs, _ = fit([sample for sample, _ in simulated], FRAME_FEATURES)
+    costs["simulate"] |= frame_costs
+    report_progress(progress, total, total, "solver")
+    model = CostModel(
+        machine=machine_key(device),
+        seconds=costs,
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        probe_seconds=time.perf_counter() - began,
+        errors=errors,
+        base_bytes=base,
+    )
+    _log.info("measured what work costs on this device in %.1f s", model.probe_seconds)
+    return model
+
+
+def draw_capture(folder: Path) -> None:
+    """Photographs of a drawn melon and of a cut through another one, in a capture folder."""
+    from gsfluent.demo.capture import cut_photograph, make_object, photograph, ring_cameras
+
+    (folder / "images").mkdir(parents=True)
+    melon = make_object("watermelon", 0)
+    frames = []
+    for number, view in enumerate(ring_cameras(melon, _VIEWS, on_table=False)):
+        image, mask = photograph(melon, view, _PHOTOGRAPH)
+        save_image(torch.cat([image, mask[..., None]], -1), folder / f"images/{number:03d}.png")
+        pose = torch.linalg.inv(view) @ torch.diag(view.new_tensor([1.0, -1.0, -1.0, 1.0]))
+        frames.append({"file_path": f"images/{number:03d}.png", "transform_matrix": pose.tolist()})
+    image, mask = cut_photograph(make_object("watermelon", 1000).one(), 192)
+    save_image(torch.cat([image, mask[..., None]], -1), folder / "cut.png")
+    focal = 0.5 * _PHOTOGRAPH / 0.36397  # half the angle of view of the generator: 20 degrees
+    document = {
+        "camera_model": "PINHOLE", "w": _PHOTOGRAPH, "h": _PHOTOGRAPH, "fl_x": focal,
+        "fl_y": focal, "cx": 0.5 * _PHOTOGRAPH, "cy": 0.5 * _PHOTOGRAPH, "frames": frames,
+    }  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
+
+
+def run_small(
+    folder: Path, size: Size, device: torch.device
+) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
+    """Run one small shot: ``run.json``, and the features known before."""
+    from gsfluent.pipeline.run import run_shot
+
+    fps = 200.0
+    shot = Shot.from_dict(
+        {
+            "capture": str(folder / "photographs"),
+            "scale": 1.0,
+            "up": "+z",
+            "reconstruct": {
+                "iterations": size.iterations,
+                "max_gaussians": size.splats,
+                "image_size": size.image_size,
+            },
+            "fill": {"resolution": size.resolution},
+            "texture": {
+                "method": "exemplar",
+                "exemplar": str(folder / "photographs" / "cut.png"),
+            },
+            "objects": {"melon": {"material": size.material}},
+            "events": [
+                {"type": "drop", "height": 0.01},
+                {"type": "throw", "velocity": [0, 0, -4]},
+            ],
+            "solve": {"quality": "preview", "cells": size.cells},
+            "output": {"fps": fps, "seconds": size.frames / fps, "size": list(size.picture)},
+        }
+    )
+    values = run_shot(shot, folder / size.name, device=device, reporter=_Silent(), plan=False)
+    assert shot.capture is not None  # given above
+    capture = load_capture(shot.capture)
+    photographs = look_at_photographs(shot, capture, masked_views(capture))
+    empty = {"start": 1.0, "splats": 0.0, "objects": 1.0}
+    planned = {
+        "reconstruct": reconstruct_work(photographs, shot),
+        "isolate": isolate_work(0.0),
+        "fill": empty | {"images": float(_VIEWS)},
+        "texture": {"start": 1.0, "exemplar_objects": 1.0, "exemplar_voxels": 0.0},
+        "simulate": {
+            "point_steps_nacc": 0.0,
+            "gaussians": 0.0,
+            "cracked_gaussians": float(size.material != "rubber"),
+        },
+        "render": render_work(shot, size.frames, 0.0),
+    }
+    return values, actual_work(planned, values)
+
+
+def training_samples(folder: Path, device: torch.device) -> list[Sample]:
+    """Trainings alone: more steps at one size, and more pixels with as many splats."""
+    from gsfluent.pipeline.reconstruct import Reconstruct
+
+    found = []
+    for side, splats, steps in _TRAININGS:
+        settings = {"iterations": steps, "max_gaussians": splats, "image_size": side}
+        shot = Shot.from_dict({"capture": str(folder / "photographs"), "reconstruct": settings})
+        assert shot.capture is not None  # given above
+        capture = load_capture(shot.capture)
+        start = time.perf_counter()
+        gaussians, _ = Reconstruct(**settings, device=device)(capture)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds = time.perf_counter() - start
+        photographs = look_at_photographs(shot, capture, masked_views(capture))
+        features = reconstruct_work(photographs, shot, float(gaussians.count)) | {"start": 0.0}
+        found.append(Sample("reconstruct", features, seconds))
+    return found
+
+
+def stage_samples(
+    values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]], *, cold: bool
+) -> list[Sample]:
+    """One sample per stage that was not found finished."""
+    done = {s["name"]: s["seconds"] for s in values["stages"] if not s["resumed"]}
+    return [
+        Sample(name, dict(work[name]) | {"start": float(cold)}, max(done[name], 1e-4))
+        for name in FEATURES
+        if name in done
+    ]
+
+
+def simulation_sample(
+    values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]], *, cold: bool
+) -> tuple[Sample, float]:
+    """What a simulation took beside its steps."""
+    stage = next(s for s in values["stages"] if s["name"] == "simulate")
+    stepped = float(values["simulation"]["seconds"])
+    features = dict(work["simulate"]) | {"start": float(cold)}
+    return Sample("simulate", features, max(stage["seconds"] - stepped, 1e-4)), stepped
+
+
+def other_samples(out: Path, device: torch.device) -> list[Sample]:
+    """Textures by rule, and every kind of export, of a finished small run."""
+    from gsfluent.config.settings import EXPORTS
+    from gsfluent.data import Solid
+    from gsfluent.pipeline.export import write_exports
+    from gsfluent.pipeline.texture import Texture
+
+    solid = Solid.load(out / "stages" / "fill" / "melon.ply")
+    voxels = {"procedural_objects": 1.0, "procedural_voxels": float(solid.occupancy.sum())}
+    voxels["volume"] = float(solid.occupancy.numel())
+    start = time.perf_counter()
+    Texture(method="procedural", preset="bone", device=str(device))(solid)
+    samples = [Sample("texture", voxels, time.perf_counter() - start)]
+    values = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    frames = values["render"]["frames"]
+    splats = values["isolation"]["gaussians_kept"] + values["fill"]["interior_gaussians"]
+    for kind in EXPORTS:
+        start = time.perf_counter()
+        write_exports(out, [kind])
+        samples.append(
+            Sample("export", {f"{kind}_gaussians": frames * splats}, time.perf_counter() - start)
+        )
+    return samples
+
+
+class _Silent:
+    """A reporter that says nothing."""
+
+    def task(self, name: str) -> Progress:
+        """A callback that does nothing."""
+        return lambda done, total, text: None
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the small runs' log lines to themselves."""
+    log = logging.getLogger("gsfluent")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process now [bytes]; 0 where the system does not say."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return next((int(s.split()[1]) * 1024 for s in lines if s.startswith("VmRSS:")), 0)

@@ -1,0 +1,345 @@
+"""What PhysGaussian's own demo settings cost, and what the same error costs in gsfluent.
+
+python scripts/peers/demo_settings.py peer PhysGaussian -o demo.jsonl [--device cuda]  # its env
+python scripts/peers/demo_settings.py ours PhysGaussian -o demo.jsonl [--device cuda]  # gsfluent's
+python scripts/peers/demo_settings.py table demo.jsonl --markdown docs/peers.md
+
+PhysGaussian is the folder of a checkout. `peer` runs its solver at exactly each config's grid, step
+and matter on the stand-in of demo_scenes.py: error against the exact mode, and wall milliseconds
+per simulated millisecond, as shipped and as a CUDA graph. On the CPU its steps are only timed
+(--steps of them): a run takes days, and the error is the device's. `ours` looks for gsfluent's
+cheapest setting with at most that error, which it takes from the same file, and adds the price of
+moving the Gaussians with the points once a frame. Resumable: a JSON line per run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import demo_scenes
+import numpy as np
+import peerlib
+from demo_scenes import Mode, Setting
+from peerlib import Run, Scene
+
+CELLS = (2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20)  # of ours across the thinnest side
+OURS = tuple((cfl, ppc) for ppc in (1, 8) for cfl in (0.8, 0.5))
+MATTER = ("pipeline", "lattice")
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    """The records of a file, none if it is not there."""
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+
+
+def add(path: Path, record: Mapping[str, Any]) -> None:
+    """Append one record."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record, allow_nan=False) + "\n")
+
+
+def where(device: str, gpu: Callable[[], str]) -> str:
+    """Name of the machine."""
+    if device == "cuda":
+        return gpu()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{platform.processor() or platform.machine()}, {cores} cores"
+
+
+def record(
+    setting: Setting, method: str, matter: str, scene: Scene, *, device: str, machine: str,
+    steps: int, walls: Sequence[float], per_simulated: float, error: float, failed: str = "",
+    commit: str = "", **more: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """A line in the form of gsfluent.charts.record."""
+    bad = failed or not math.isfinite(error)
+    return {
+        "case": f"demo_{setting.name}", "kind": "elastic", "method": method, "variant": matter,
+        "settings": {"dx": scene.dx, "dt": setting.dt, "n_grid": setting.n_grid, **more},
+        "device": device, "machine": machine, "points": scene.count, "steps": steps,
+        "simulated_seconds": scene.seconds, "wall_seconds": list(walls),
+        "wall_per_simulated": per_simulated,
+        "ns_per_point_step": 1e9 * float(np.median(walls)) / scene.count / max(1, steps),
+        "error": None if bad else error, "measures": [], "failed": failed, "commit": commit,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }  # fmt: skip
+
+
+def key(line: Mapping[str, Any]) -> tuple[str, ...]:
+    """What makes two lines the same run."""
+    return tuple(str(line[k]) for k in ("case", "method", "variant", "device"))
+
+
+def timed(engine: Any, count: int, dt: float, repeat: int) -> list[float]:
+    """Wall seconds of so many steps, after as many as a tenth of them."""
+    engine.advance(max(2, count // 10), dt)
+    out = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        engine.advance(count, dt)
+        out.append(time.perf_counter() - start)
+    return out
+
+
+def peer(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
+    """Run PhysGaussian at its own settings."""
+    from physgaussian import Engine, PhysGaussian
+
+    solver = PhysGaussian()
+    missing = peerlib.absent(solver)
+    if missing:
+        sys.stdout.write(missing + "\n")
+        return 0
+    version = solver.load(options.checkout / "mpm_solver_warp")
+    gpu = options.device == "cuda"
+
+    def name() -> str:
+        import torch
+
+        return str(torch.cuda.get_device_name())
+
+    machine, done = where(options.device, name), {key(line) for line in lines(options.out)}
+    for setting in chosen:
+        mode = Mode(setting)
+        for matter in options.matter:
+            case = f"demo_{setting.name}"
+            variants = [
+                v for v in solver.variants[options.device]
+                if (case, peerlib.method(solver, v), matter, options.device) not in done
+            ]  # fmt: skip
+            if not variants:
+                continue
+            if matter == "pipeline":
+                x, volume = demo_scenes.pipeline(setting, options.gaussians)
+            else:
+                x, volume = demo_scenes.lattice(setting, setting.dx, 8)
+            scene = demo_scenes.scene(setting, x, volume, setting.dx, mode)
+            placed = demo_scenes.domain(setting)
+            error, failed, steps = math.inf, "only timed here", 0
+            if gpu:
+                engine = Engine(solver, scene, "graph", options.device, placed)
+                engine.advance(1, setting.dt)
+                engine = Engine(solver, scene, "graph", options.device, placed)
+                plan = peerlib.intervals(scene.times, setting.dt)
+                x_all, v_all, _, failed = peerlib.drive(engine, scene, plan)
+                run = Run(scene.name, "", scene.times, x_all, v_all, 0.0, 0, {}, "", failed)
+                error, steps = demo_scenes.error(scene, run, mode), engine.steps
+            for variant in variants:
+                engine = Engine(solver, scene, variant, options.device, placed)
+                count = options.steps or (200 if gpu else 3)
+                walls = timed(engine, count, setting.dt, 3)
+                per_step = float(np.median(walls)) / count
+                add(options.out, record(
+                    setting, peerlib.method(solver, variant), matter, scene,
+                    device=options.device, machine=machine, steps=steps or count, walls=walls,
+                    per_simulated=per_step / setting.dt, error=error, failed=failed,
+                    courant=scene.wave_speed * setting.dt / scene.dx,
+                    commit=version, timed_steps=count,
+                    ms_per_step=1e3 * per_step,
+                    gaussians=options.gaussians,
+                ))  # fmt: skip
+                sys.stderr.write(
+                    f"{case} {matter} {variant}: {scene.count:,} points, {1e3 * per_step:.3f} ms "
+                    f"a step, {per_step / setting.dt:.4g} ms/ms, error {error:.4f} {failed}\n"
+                )
+    return 0
+
+
+def riding(setting: Setting, x: Any, width: float, options: argparse.Namespace) -> float:
+    """Seconds to move all Gaussians with the points once: gsfluent's own op, median of five."""
+    import torch
+    from scipy.spatial import cKDTree
+
+    from gsfluent import ops
+
+    places, _ = demo_scenes.pipeline(setting, options.gaussians)
+    places = places[: options.gaussians]  # fill points carry no splat
+    tree = cKDTree(x)
+    device = torch.device(options.device)
+
+    def on(value: Any, dtype: Any = torch.float32) -> Any:
+        return torch.as_tensor(value, dtype=dtype, device=device).contiguous()
+
+    near = on(tree.query(x, k=8)[1], torch.int64)
+    n = x.shape[0]
+    maps = torch.eye(3, device=device).expand(n, 3, 3).contiguous()
+    parted = torch.zeros(n, 8, dtype=torch.bool, device=device)
+    arguments = (on(places), on(tree.query(places)[1], torch.int64), near, parted, on(x), on(x),
+                 maps, on(np.full(n, width)))  # fmt: skip
+    walls = []
+    for _ in range(6):
+        start = time.perf_counter()
+        ops.carry_place(*arguments)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        walls.append(time.perf_counter() - start)
+    return float(np.median(walls[1:]))
+
+
+def target(found: Sequence[Mapping[str, Any]], setting: Setting, matter: str) -> float:
+    """PhysGaussian's error at a setting: the largest that gsfluent may have."""
+    errors = [
+        float(line["error"]) for line in found
+        if line["case"] == f"demo_{setting.name}" and line["variant"] == matter
+        and line["method"].startswith("physgaussian") and line["error"] is not None
+    ]  # fmt: skip
+    return max(errors) if errors else 0.0
+
+
+def ours(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
+    """Find gsfluent's cheapest setting whose error is at most PhysGaussian's."""
+    import torch
+
+    from gsfluent.charts.record import commit, machine
+    from gsfluent.lab.frozen import clock, play
+
+    version, name = commit(), machine(options.device)
+    for setting in chosen:
+        mode = Mode(setting)
+        for matter in options.matter:
+            found = lines(options.out) + (lines(options.errors) if options.errors else [])
+            wanted = target(found, setting, matter)
+            label = f"at most the error of {matter}"
+            if (f"demo_{setting.name}", "gsfluent", label, options.device) in map(key, found):
+                continue
+            if not wanted:
+                sys.stdout.write(
+                    f"{setting.name}: no error of PhysGaussian's ({matter}) to reach\n"
+                )
+                continue
+            best: dict[str, Any] | None = None
+            nearest = math.inf
+            for cfl, ppc in OURS:
+                for cells in CELLS:
+                    dx = float(setting.size.min()) / cells
+                    scene = demo_scenes.scene(
+                        setting, *demo_scenes.lattice(setting, dx, ppc), dx, mode
+                    )
+                    run = play(scene, device=options.device, dtype=torch.float32, cfl=cfl)
+                    error = demo_scenes.error(scene, run, mode)
+                    nearest = min(nearest, error)
+                    if not error <= wanted:
+                        continue
+                    walls = clock(scene, repeat=3, device=options.device, cfl=cfl)
+                    ride = riding(setting, scene.x, dx, options)
+                    wall = float(np.median(walls)) / scene.seconds
+                    made = record(
+                        setting, "gsfluent", label, scene, device=options.device, machine=name,
+                        steps=run.steps, walls=walls, per_simulated=wall + ride / setting.frame,
+                        error=error, commit=version, cfl=cfl, ppc=ppc, cells_across=cells,
+                        riding_seconds=ride, gaussians=options.gaussians, dtype="float32",
+                    )  # fmt: skip
+                    if best is None or made["wall_per_simulated"] < best["wall_per_simulated"]:
+                        best = made
+                    break  # finer ones of this CFL and count are dearer
+            if best is None:
+                sys.stdout.write(
+                    f"{setting.name} ({matter}): no setting tried reaches {wanted:.4f}; the "
+                    f"nearest was {nearest:.4f}\n"
+                )
+                continue
+            add(options.out, best)
+            chosen_by = best["settings"]
+            sys.stderr.write(
+                f"demo_{setting.name} {matter}: wanted {wanted:.4f}, got {best['error']:.4f} with "
+                f"{chosen_by['cells_across']} cells, cfl {chosen_by['cfl']}, {chosen_by['ppc']} a "
+                f"cell: {best['wall_per_simulated']:.4g} ms/ms\n"
+            )
+    return 0
+
+
+def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
+    """Markdown of one device."""
+    out = [
+        "| config | matter | its points | its error | its c dt/dx | as shipped, ms/ms "
+        "| graph, ms/ms | gsfluent: points, dx over its dx, c dt/dx | error | ms/ms "
+        "| cheaper than shipped | than graph |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    by = {key(line): line for line in found}
+    errors = {(i["case"], i["variant"]): i["error"] for i in found if i["error"] is not None}
+    for case in sorted({line["case"] for line in found}):
+        for matter in MATTER:
+            shipped = by.get((case, "physgaussian", matter, device))
+            graph = by.get((case, "physgaussian, graph", matter, device))
+            mine = by.get((case, "gsfluent", f"at most the error of {matter}", device))
+            if shipped is None:
+                continue
+            error = errors.get((case, matter))
+            steps = shipped["settings"]
+            cells = [case.removeprefix("demo_"), matter, f"{shipped['points']:,}",
+                     "" if error is None else f"{error:.4f}",
+                     f"{steps['courant']:.3f}" if "courant" in steps else "",
+                     f"{shipped['wall_per_simulated']:.4g}",
+                     f"{graph['wall_per_simulated']:.4g}" if graph else ""]  # fmt: skip
+            if mine is None:
+                cells += ["not reached", "", "", "", ""]
+            else:
+                own, wall = mine["settings"], mine["wall_per_simulated"]
+                cells += [f"{mine['points']:,}, {own['dx'] / steps['dx']:.2f}, {own['cfl']}",
+                          f"{mine['error']:.4f}", f"{wall:.4g}",
+                          f"{shipped['wall_per_simulated'] / wall:,.0f}",
+                          f"{graph['wall_per_simulated'] / wall:,.0f}" if graph else "",
+                ]  # fmt: skip
+            out.append(f"| {' | '.join(cells)} |")
+    return "\n".join(out)
+
+
+def enter_table(options: argparse.Namespace) -> int:
+    """Print the tables of a file, or enter them into a page."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from page import enter
+
+    found = lines(options.out)
+    for device in sorted({line["device"] for line in found}):
+        machines = sorted({line["machine"] for line in found if line["device"] == device})
+        part = f"Machine: {'; '.join(machines)}.\n\n{table(found, device)}"
+        if options.markdown is None:
+            sys.stdout.write(part + "\n")
+            continue
+        text = options.markdown.read_text(encoding="utf-8")
+        options.markdown.write_text(enter(text, f"demo {device}", part), encoding="utf-8")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("peer", "ours", "table"))
+    parser.add_argument("checkout", type=Path, help="PhysGaussian; for table: the records")
+    parser.add_argument("-o", "--out", type=Path, help="file of records, added to")
+    parser.add_argument("--errors", type=Path, help="more records, for the errors to reach")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--config", action="append", help="only these")
+    parser.add_argument("--matter", action="append", choices=MATTER, help="default: both")
+    parser.add_argument("--gaussians", type=int, default=demo_scenes.GAUSSIANS)
+    parser.add_argument("--steps", type=int, help="timed steps; default 200, on the CPU 3")
+    parser.add_argument("--markdown", type=Path, help="enter the tables into this page")
+    options = parser.parse_args(arguments)
+    if options.what == "table":
+        options.out = options.checkout
+        return enter_table(options)
+    if options.out is None:
+        parser.error("give -o")
+    options.matter = options.matter or list(MATTER)
+    known = demo_scenes.settings(options.checkout)
+    chosen = [s for s in known if not options.config or s.name in options.config]
+    return peer(options, chosen) if options.what == "peer" else ours(options, chosen)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
