@@ -13,16 +13,20 @@ from pathlib import Path
 from page import enter
 
 from gsfluent.charts import stability, stability_report
-from gsfluent.charts.stability_peers import marks
-from gsfluent.figure.map import draw_planes
+from gsfluent.charts.stability_peers import marks, measured
+from gsfluent.figure.map import Plane, draw_planes
 
 ROOT = Path(__file__).resolve().parents[1]
+# rows of maps whose panels fit beside each other
 SHEETS = {
-    "steps": ("speed", "poisson", "points_per_cell", "fragments", "gradient_limit",
-              "stiffness_speed", "ratios"),
-    "matter": ("fields", "early_contact", "centre", "impact", "softening", "order", "return_map"),
-    "numbers": ("precision", "creep", "storage", "transfer", "zero_weight", "kernel", "released"),
+    "steps": (("speed", "ratios"), ("stiffness_speed", "points_per_cell"),
+              ("poisson", "fragments", "gradient_limit")),
+    "matter": (("fields", "early_contact"), ("impact", "softening"), ("centre", "return_map"),
+               ("order",)),
+    "numbers": (("precision", "creep"), ("storage", "transfer", "zero_weight", "kernel"),
+                ("released",)),
 }  # fmt: skip
+COLUMNS = 4
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -58,21 +62,30 @@ def main() -> int:
     parser.add_argument("lines", nargs="+", type=Path)
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "stability.md")
     parser.add_argument("--images", type=Path, default=ROOT / "docs" / "images")
+    parser.add_argument(
+        "--peers", type=Path, default=ROOT / "docs" / "data" / "peers_failures.json"
+    )
     given = parser.parse_args()
+    programs = measured(given.peers) if given.peers.is_file() else []
     points = [p for path in given.lines for p in stability.read(path)]
     known = stability.all_maps()
     cpu = [p for p in points if p.device == "cpu"] or points
     maps = [m for m in known.values() if any(p.map == m.name for p in cpu)]
-    for sheet, names in SHEETS.items():
-        panels = [
-            plane
-            for name in names
-            if name in known
-            for plane in stability_report.planes(known[name], cpu, marks(maps))
-        ]
+    for sheet, rows in SHEETS.items():
+        panels: list[Plane | None] = []
+        for names in rows:
+            line = [
+                plane
+                for name in names
+                for plane in stability_report.planes(known[name], cpu, marks(maps, programs))
+            ]
+            panels += [*line, *[None] * (COLUMNS - len(line))] if line else []
         if panels:
             path = given.images / f"stability_{sheet}.png"
-            draw_planes(panels, path, kinds=stability_report.LETTER_WORDS, columns=4, dpi=62)
+            draw_planes(
+                panels, path, kinds=stability_report.LETTER_WORDS, columns=COLUMNS, dpi=78,
+                cell=(0.21, 0.17),
+            )  # fmt: skip
             sys.stdout.write(f"{path}: {path.stat().st_size // 1000} kB\n")
     wrong = stability_report.verdict(maps, cpu)
     seconds = sum(p.seconds for p in cpu)
@@ -86,7 +99,7 @@ def main() -> int:
     tests = [
         (*r, f"`{known[r[0]].test}`") for r in stability_report.table(maps, cpu)
     ]  # fmt: skip
-    named = [line for m in maps for line in stability_report.named(m, cpu, marks(maps))]
+    named = [line for m in maps for line in stability_report.named(m, cpu, marks(maps, programs))]
     others = [
         (m.name, variant, f"{failed} of {count}")
         for m in maps
@@ -95,6 +108,15 @@ def main() -> int:
     page = given.page.read_text(encoding="utf-8")
     page = enter(page, "verdict", text)
     page = enter(page, "margins", markdown((*stability_report.HEAD, "test"), tests))
+    page = enter(
+        page, "programs",
+        markdown(
+            ("map", "program", "what", "seen", "right", "fails"),
+            [(m.map, m.peer, m.what + (f"; {m.note}" if m.note else ""),
+              "-" if "signal" in m.note else f"{m.seen:.3g}",
+              f"{m.right:.3g}", "yes" if m.failed else "no") for m in programs],
+        ),
+    )  # fmt: skip
     page = enter(page, "named", "\n".join(f"* {line}" for line in named))
     page = enter(
         page, "variants", markdown(("map", "variant", "fails where gsfluent holds"), others)

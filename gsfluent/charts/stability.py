@@ -73,10 +73,12 @@ class Axis:
         return self.span[0] <= value <= self.span[1]
 
     def coarse(self) -> tuple[Value, ...]:
-        """Three of its values: the default, and the ends."""
-        ends = [self.values[0], self.default, self.values[-1]]
+        """Three of its values: the default, the ends, or the middle where these are two."""
         if self.words:
-            ends = list(self.values[:3])
+            return self.values[:3]
+        ends = {self.values[0], self.default, self.values[-1]}
+        if len(ends) == 2:
+            ends.add(self.values[len(self.values) // 2])
         return tuple(v for v in self.values if v in ends)
 
 

@@ -8,12 +8,18 @@ not that program; scripts/peers runs the programs.
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 from gsfluent.charts.stability import Map
+from gsfluent.errors import InputError
 from gsfluent.figure.map import Mark
 
-__all__ = ["KNOWN", "marks"]
+__all__ = ["KNOWN", "Measured", "marks", "measured"]
 
 _GS = "PhysGaussian, GaussianFluent, Taichi"
 # map -> (variant whose panel shows it, x, y, name)
@@ -42,9 +48,90 @@ KNOWN: dict[str, tuple[tuple[str, float | str, float | str, str], ...]] = {
 }
 
 
-def marks(maps: Sequence[Map]) -> dict[tuple[str, str], list[Mark]]:
-    """Named points of these maps by (map, variant)."""
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A failure looked for in a program itself, by ``scripts/peers/failures.py``.
+
+    Attributes:
+        map: The map it belongs to.
+        name: Of the experiment.
+        peer: The program and its version.
+        what: What was measured.
+        seen: The figure; NaN where there is none.
+        right: What it should be.
+        failed: Whether the failure was there.
+        note: More.
+        mark: Panel and point of the map, where it has one.
+    """
+
+    map: str
+    name: str
+    peer: str
+    what: str
+    seen: float
+    right: float
+    failed: bool
+    note: str
+    mark: tuple[str, Mark] | None = None
+
+
+# name of the experiment -> map, panel, and the keys of "axes" that are its coordinates
+_EXPERIMENTS: dict[str, tuple[str, str, str | float | None, str | float | None]] = {
+    "pull_apart": ("fields", "one field", 0.0, "v_over_c"),
+    "step_limit": ("poisson", "gsfluent", "courant", "poisson_ratio"),
+    "stagnation": ("creep", "absolute positions", None, None),
+    "rotation_drift": ("storage", "gsfluent", None, None),
+    "half_cell": ("zero_weight", "one step is enough", None, None),
+    "stiffness_ratio": ("ratios", "fixed step of the first", None, None),
+}
+
+
+def measured(path: str | Path) -> list[Measured]:
+    """Read what ``scripts/peers/failures.py`` wrote, as far as it belongs to a map.
+
+    Raises:
+        InputError: The file cannot be read or holds something else.
+    """
+
+    def coordinate(key: str | float | None, axes: dict[str, Any]) -> float | None:
+        if isinstance(key, str):
+            return float(axes[key]) if key in axes else None
+        return key
+
+    found = []
+    try:
+        for item in json.loads(Path(path).read_text(encoding="utf-8")):
+            if item["name"] not in _EXPERIMENTS:
+                continue
+            name, panel, x_key, y_key = _EXPERIMENTS[item["name"]]
+            x, y = (coordinate(key, item.get("axes", {})) for key in (x_key, y_key))
+            peer = f"{item['peer']} {item.get('version', '')}".strip()
+            mark = None
+            if x is not None and y is not None:
+                mark = panel, Mark(x, y, f"{item['peer']}, measured")
+            seen = item.get("seen")
+            found.append(
+                Measured(
+                    name, item["name"], peer, item["what"], math.nan if seen is None else seen,
+                    float(item["right"]), bool(item["reproduced"]), item.get("note", ""), mark,
+                )
+            )  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: not the failures of the peers ({type(error).__name__}: {error})",
+            "give the file that scripts/peers/failures.py wrote",
+        ) from error
+    return found
+
+
+def marks(
+    maps: Sequence[Map], programs: Sequence[Measured] = ()
+) -> dict[tuple[str, str], list[Mark]]:
+    """Named points of these maps by (map, variant), those measured on programs with them."""
     found: dict[tuple[str, str], list[Mark]] = {}
+    for one in programs:
+        if one.mark is not None and any(m.name == one.map for m in maps):
+            found.setdefault((one.map, one.mark[0]), []).append(one.mark[1])
     for m in maps:
         for variant, x, y, name in KNOWN.get(m.name, ()):
             found.setdefault((m.name, variant), []).append(Mark(x, y, name))

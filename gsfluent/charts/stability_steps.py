@@ -184,7 +184,7 @@ def stiffness_point(young: float, speed: float, variant: str, place: Place) -> O
 
 register(
     Map(
-        "stiffness_speed", "A ball hits a floor: squeezed flat, or too stiff for the step",
+        "stiffness_speed", "A ball: squeezed flat, or too stiff",
         Axis("young", "Young's modulus [Pa]", (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8), 1e5,
              setting=False, span=(1e3, 1e8)),
         Axis("speed", "speed [m/s]", (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0), 1.0, setting=False,

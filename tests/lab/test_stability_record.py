@@ -10,7 +10,7 @@ import pytest
 
 from gsfluent.charts import stability, stability_report
 from gsfluent.charts.stability import Axis, Map, Outcome, Place, Point, Violation
-from gsfluent.charts.stability_peers import KNOWN, marks
+from gsfluent.charts.stability_peers import KNOWN, marks, measured
 from gsfluent.cli import main
 from gsfluent.errors import InputError
 from gsfluent.figure.map import Cell, Plane, draw_planes, place_of
@@ -75,6 +75,24 @@ def test_named_points_of_the_peers_lie_where_their_choice_fails(recorded: list[P
     assert len(lines) == sum(map(len, KNOWN.values()))
     holding = [line for line in lines if line.endswith("holds")]
     assert len(holding) == 3 and all("step" in x or "ficus" in x for x in holding)
+
+
+def test_failures_measured_on_programs_become_points(tmp_path: Path) -> None:
+    path = tmp_path / "failures.json"
+    item = {
+        "name": "pull_apart", "peer": "physgaussian", "version": "1", "what": "speed kept",
+        "axes": {"fields": 1, "v_over_c": 0.02}, "seen": 0.46, "right": 1.0, "reproduced": True,
+        "note": "",
+    }  # fmt: skip
+    path.write_text(json.dumps([item, item | {"name": "unknown"}, item | {"axes": {}}]))
+    found = measured(path)
+    assert [m.failed for m in found] == [True, True] and found[1].mark is None
+    maps = list(stability.all_maps().values())
+    added = marks(maps, found)["fields", "one field"][0]
+    assert (added.x, added.y, added.name) == (0.0, 0.02, "physgaussian, measured")
+    path.write_text('{"a": 1}')
+    with pytest.raises(InputError, match="failures of the peers"):
+        measured(path)
 
 
 RUNS: list[tuple[float, str]] = []
@@ -169,7 +187,7 @@ def test_the_verb_runs_a_map_and_draws_recorded_lines(
     words = ["stability", "--device", "cpu", "--json", "-o", str(out)]
     assert main([*words, "--maps", "zero_weight,precision", "--quick"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["maps"] == 2 and result["points"] == 9 + 9
+    assert result["maps"] == 2 and result["points"] == 9 + 12
     assert result["not inside with margin"] == []
     page = (out / "stability.html").read_text()
     assert "zero_weight" in page and page.count("<img") == 2
