@@ -117,11 +117,13 @@ def test_planes_become_physgaussians_walls_or_are_refused(peers: dict[str, Modul
         return walls(given, lib.place(given))
 
     _, sticky, box = on("sticky", (0.0, 0.0, 2.0))
-    assert not box and sticky[0].tolist() == [0.0, 0.0, -0.02, 0.0, 0.0, 1.0]
+    assert not box and sticky[0][3:].tolist() == [0.0, 0.0, 1.0]
+    # its planes take nodes strictly below them; the scene's node on the wall is the wall's
+    assert -0.02 < sticky[0][2] < -0.02 + 0.01 * 0.01
     placed, sticky, box = on("separate", (0.0, 0.0, 1.0))
     assert box and not sticky
-    # its bounding box stops nodes 0 to 2: node 2 is the last one below the plane
-    assert (placed.shift[2] + 2) * 0.01 == pytest.approx(-0.03)
+    # its bounding box stops nodes 0 to 2: node 2 is the one on the plane
+    assert (placed.shift[2] + 2) * 0.01 == pytest.approx(-0.02)
     for wrong in (("slip", (0.0, 0.0, 1.0)), ("separate", (0.0, 1.0, 1.0))):
         with pytest.raises(lib.Cannot):
             on(*wrong)

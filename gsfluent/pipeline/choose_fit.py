@@ -103,6 +103,15 @@ class Fit:
         """Drawn rms errors of the mean of many runs at a size of cells, [D]."""
         return np.asarray(self.error * (size / self.finest) ** self.orders)
 
+    def gaps(self, size: float, finer: float, growth: float = 1.0) -> Array:
+        """Drawn rms differences of one run from the mean of many on finer cells, [D].
+
+        What both are off by in the same direction is not in it. ``growth`` is a factor on the
+        difference of the means.
+        """
+        mean = growth * (self.mean_errors(size) - self.mean_errors(finer))
+        return np.asarray(np.hypot(mean, self.history.scatter(size)))
+
     def errors(self, size: float) -> Array:
         """Drawn rms errors of one run at a size of cells, [D]: of the mean, and its scatter."""
         return np.asarray(np.hypot(self.mean_errors(size), self.history.scatter(size)))

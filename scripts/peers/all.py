@@ -25,23 +25,27 @@ from newton_mpm import Newton
 from peerlib import Peer, Scene
 from physgaussian import PhysGaussian
 from taichi_mpm import TaichiElements
+from textbook_nacc import Textbook
 
 HERE = Path(__file__).resolve().parent
 PEERS: dict[str, tuple[Peer, str]] = {
     "physgaussian": (PhysGaussian(), "physgaussian.py"),
     "taichi_elements": (TaichiElements(), "taichi_mpm.py"),
     "newton": (Newton(), "newton_mpm.py"),
+    "textbook": (Textbook(), "textbook_nacc.py"),
 }
 KINDS = ("elastic", "contact")
 NOT = ("covariance_transport",)  # asks for what Gaussians become, which is no part of a solver
 # rough seconds: of a run whatever its size, of a step, of a point's step, of a node's step
 COST: Mapping[tuple[str, str], tuple[float, float, float, float]] = {
     ("physgaussian", "cpu"): (0.5, 2e-4, 1.5e-6, 5e-8),
-    ("physgaussian", "cuda"): (0.1, 2e-4, 2e-9, 2e-11),
+    ("physgaussian", "cuda"): (0.05, 8e-5, 2e-9, 2e-11),
     ("taichi_elements", "cpu"): (4.0, 2e-2, 3e-6, 0.0),
     ("taichi_elements", "cuda"): (1.5, 3e-4, 2e-9, 0.0),
     ("newton", "cpu"): (3.0, 4e-2, 4e-5, 0.0),
     ("newton", "cuda"): (0.5, 1e-2, 1e-8, 0.0),
+    ("textbook", "cpu"): (0.2, 2e-3, 5e-6, 0.0),
+    ("textbook", "cuda"): (0.2, 3e-3, 1e-8, 0.0),
 }
 
 
@@ -132,8 +136,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scenes = freeze(options.out, options.quick, cases)
     for name in options.peer or PEERS:
         listed, left = jobs(name, scenes, options.out, options)
-        for item in left:
-            sys.stdout.write(f"{name}: left out for its price: {item}\n")
+        if left:
+            sys.stdout.write(
+                f"{name}: {len(left)} of {len(left) + len(listed)} runs left out for their price "
+                f"(--budget), such as {left[0]}\n"
+            )
         lines = options.out / f"{name}.jobs"
         lines.write_text("".join(json.dumps(job) + "\n" for job in listed), encoding="utf-8")
         command = [pythons.get(name, sys.executable), str(HERE / PEERS[name][1]),

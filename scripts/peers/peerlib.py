@@ -29,6 +29,9 @@ from fracturebench.run import Run
 from fracturebench.scene import Scene
 
 Floats = NDArray[np.float64]
+# a node on a wall is the wall's in the scenes; peers take those strictly below a plane, so a plane
+# is given to them by this share of a cell higher
+NODE_ON_WALL = 1e-3
 MARGIN = 4  # cells between the matter and the side of a bounded domain
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import peerlib
-from peerlib import Cannot, Floats, Placement, Scene
+from peerlib import NODE_ON_WALL, Cannot, Floats, Placement, Scene
 
 # c dt/dx of its six configs: 0.366, 0.110, 0.367, 0.028, 0.070, 0.013
 COURANT = (0.37, 0.7, 0.1, 0.9, 0.03)
@@ -43,7 +43,8 @@ def walls(scene: Scene, placed: Placement) -> tuple[Placement, list[Floats], boo
         if abs(normal[axis]) < 1.0 - 1e-9:
             raise Cannot("was given a plane that lies across the grid")
         if plane["kind"] == "sticky":
-            sticky.append(np.array([*plane["point"], *normal], float))
+            point = np.array(plane["point"], float) + NODE_ON_WALL * placed.dx * normal
+            sticky.append(np.array([*point, *normal]))
             continue
         # its surface collider stops a node wholly, whatever kind it is given; only its bounding
         # box lets matter slide and leave
@@ -53,7 +54,7 @@ def walls(scene: Scene, placed: Placement) -> tuple[Placement, list[Floats], boo
             )
         if normal[axis] < 0.0:
             raise Cannot("has a sliding wall at the sides of its domain only")
-        below = math.ceil(float(plane["point"][axis]) / placed.dx - 1e-6) - 1
+        below = math.floor(float(plane["point"][axis]) / placed.dx + 1e-6)
         shift[axis] = below - (WALL_NODES - 1)
         box = True
     return Placement(placed.n, placed.dx, shift), sticky, box

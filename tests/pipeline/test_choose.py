@@ -68,6 +68,12 @@ def test_a_scalar_gives_the_order_of_roache() -> None:
     assert fit_history(history).order == pytest.approx(p, abs=0.0126)
 
 
+def test_the_distance_to_a_finer_grid_leaves_out_what_both_are_off_by() -> None:
+    fit = fit_history(made(1.0, 4.0))
+    wanted = true_error(1.0, 4.0, 1 / 20) - true_error(1.0, 4.0, 1 / 40)
+    assert np.median(fit.gaps(1 / 20, 1 / 40)) == pytest.approx(wanted, rel=1e-4)
+
+
 def test_an_order_beyond_what_the_method_has_is_not_believed() -> None:
     fit = fit_history(made(4.0, 40.0))
     assert fit.order == pytest.approx(2.0)
