@@ -210,7 +210,8 @@ def _written(of: str, records: Sequence[Record], out: Path, name: str) -> dict[s
     xlabel, ylabel = _module(of).XLABEL, _module(of).YLABEL
     panels = [_panel(records, case) for case in cases(records)]
     page = Page(title, f"{len(records)} settings; gsfluent {records[0].commit}")
-    with draw(panels, title=title, xlabel=xlabel, ylabel=ylabel) as figure:
+    above = title if len(panels) > 1 else title.replace(", ", "\n", 1)  # one panel is narrow
+    with draw(panels, title=above, xlabel=xlabel, ylabel=ylabel) as figure:
         save_png(figure, out / f"{name}.png")
         page.svg(to_svg(figure), "Every setting a dot; the best as a staircase.")
     head, rows = table(records)

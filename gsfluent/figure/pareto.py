@@ -257,4 +257,5 @@ def _legend(figure: Figure, names: Sequence[str], color: Mapping[str, str]) -> N
         Line2D([], [], marker="^", ms=5, label="as wrong as no answer", **grey),
         Line2D([], [], color="#c9c9c9", ls="--", lw=0.8, label="time x error the same"),
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=min(len(marks), 9))
+    columns = min(len(marks), 9, max(2, int(figure.get_figwidth() / 1.9)))
+    figure.legend(handles=marks, loc="outside lower center", ncols=columns)

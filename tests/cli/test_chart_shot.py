@@ -41,6 +41,8 @@ def test_a_run_takes_the_cells_that_meet_its_error(done: Path) -> None:
     assert values["shot"]["solve"]["error"] == 0.4  # what was asked for, not what came of it
     for name in ("chart.json", "chart.png"):
         assert (done / "out" / name).is_file()
+    page = (done / "out" / "report.html").read_text()
+    assert "The setting, chosen by error" in page and choice["reason"].split(";")[0] in page
 
 
 def test_a_second_run_does_not_choose_again(done: Path) -> None:
