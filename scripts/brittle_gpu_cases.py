@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +15,7 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab import brittle
 from gsfluent.lab.driver import World
 from gsfluent.lab.frozen import rows
+from gsfluent.lab.peers_known import POINTS, find
 from gsfluent.lab.slab import SEPARATE, plane
 from gsfluent.lab.textbook import Variant
 
@@ -132,9 +134,12 @@ def jobs(parts: list[str], device: str, quick: bool) -> Iterator[Job]:
                     "dt", "rubber" if name == "elastic" else "drop", {**base, **chosen}, "float64",
                     80 * scale, courant=0.3 / scale,
                 )  # fmt: skip
+    if "known" in parts:
+        for point in POINTS[:1] if quick else POINTS:
+            yield Job("known", point.name, {}, "", 0)
 
 
-PARTS = ("order", "division", "debris", "ejecta", "inversion", "bug", "dt")
+PARTS = ("order", "division", "debris", "ejecta", "inversion", "bug", "dt", "known")
 
 
 def scene_of(job: Job) -> Scene:
@@ -179,8 +184,22 @@ def ours(scene: Scene, job: Job, dt: float, device: str) -> list[brittle.Outcome
     return made
 
 
+def known(job: Job, device: str) -> dict[str, Any]:
+    """A named point of a peer, with its fault and without; always on the CPU."""
+    point = find(job.scene)
+    value, sound = (point.measure(v, point.parameters) for v in (point.variant, point.sound))
+    finite = {"value": value, "sound": sound}
+    return {
+        **dataclasses.asdict(job), "key": job.key, "device": device,
+        **{k: v if math.isfinite(v) else None for k, v in finite.items()},
+        "failing": point.failing(value), "shown": point.shown, "birth": None,
+    }  # fmt: skip
+
+
 def perform(job: Job, device: str) -> dict[str, Any]:
     """Make a run (or a pair) and return its record."""
+    if job.part == "known":
+        return known(job, device)
     scene = scene_of(job)
     if job.courant == 0.6:  # GaussianFluent's and PhysGaussian's rule: the speed does not count
         dt = 0.6 * scene.dx / scene.wave_speed

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent.figure.style import COLORS, INK, OURS, new_figure, save_png
+from gsfluent.lab.peers_known import POINTS
 
 Record = dict[str, Any]
 NAMES = {
@@ -182,6 +183,26 @@ def dt_table(found: list[Record]) -> str:
     return table(["map", "broken, %, at dt / dt/2 / dt/4", "kinetic energy over the start"], rows)
 
 
+def known_table(found: list[Record]) -> str:
+    rows = []
+    for point in POINTS:
+        mine = [r for r in found if r["part"] == "known" and r["scene"] == point.name]
+        if not mine:
+            continue
+        value, sound = (
+            "NaN" if mine[-1][k] is None else f"{mine[-1][k]:.3g}" for k in ("value", "sound")
+        )
+        said = "" if point.reported is None else f"{point.reported:g}"
+        seen = "yes" if mine[-1]["failing"] else "no"
+        at = ", ".join(f"{k} {v:.3g}" for k, v in point.parameters.items())
+        rows.append([
+            point.name, point.failure + (f" ({at})" if at else ""), point.quantity, value, said,
+            sound, seen,
+        ])  # fmt: skip
+    head = ["point", "failure", "measured", "with it", "reported", "without", "seen"]
+    return table(head, rows)
+
+
 def tables(found: list[Record]) -> dict[str, str]:
     """Markers of docs/brittle_gpu.md and what stands between them."""
     made: dict[str, str] = {}
@@ -195,6 +216,8 @@ def tables(found: list[Record]) -> dict[str, str]:
         made["brittle debris"] = debris_table(found)
     if any(r["part"] == "dt" for r in cpu):
         made["brittle dt"] = dt_table(cpu)
+    if any(r["part"] == "known" for r in found):
+        made["brittle known"] = known_table(found)
     return made
 
 

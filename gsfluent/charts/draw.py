@@ -95,6 +95,9 @@ class Chart:
         found = []
         if len(self.machines) > 1:
             found.append(f"Times were taken on different machines: {'; '.join(self.machines)}.")
+        ours = cases(r for r in self.records if r.method == OURS)
+        if theirs := [c for c in cases(self.records) if ours and c not in ours]:
+            found.append(f"Run by peers only, and not drawn: {', '.join(theirs)}.")
         commits = list(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
         if len(commits) > 1:
             found.append(f"gsfluent's runs are of several commits: {', '.join(commits)}.")
@@ -199,7 +202,9 @@ class Chart:
     # --- figure ---
 
     def _panels(self) -> list[Panel]:
-        return [self._panel(case) for case in cases(self.records)]
+        """Of the cases that gsfluent ran; of all if it ran none."""
+        ours = cases(r for r in self.records if r.method == OURS)
+        return [self._panel(case) for case in ours or cases(self.records)]
 
     def _panel(self, case: str) -> Panel:
         mine = [r for r in self.records if r.case == case]

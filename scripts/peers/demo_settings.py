@@ -331,7 +331,7 @@ def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
                      f"{shipped['wall_per_simulated']:.4g}",
                      f"{graph['wall_per_simulated']:.4g}" if graph else ""]  # fmt: skip
             if mine is None:
-                cells += ["not reached", "", "", "", ""]
+                cells += ["no run", "", "", "", ""]
             else:
                 own, wall = mine["settings"], mine["wall_per_simulated"]
                 cells += [f"{mine['points']:,}, {own['dx'] / steps['dx']:.2f}, {own['cfl']}",
