@@ -79,8 +79,8 @@ def where(device: str, gpu: Callable[[], str]) -> str:
 
 def record(
     setting: Setting, method: str, matter: str, scene: Scene, *, device: str, machine: str,
-    steps: int, walls: Sequence[float], per_simulated: float, error: float, timed: int = 0, failed: str = "",
-    commit: str = "", **more: Any,
+    steps: int, walls: Sequence[float], per_simulated: float, error: float, timed: int = 0,
+    failed: str = "", commit: str = "", **more: Any,
 ) -> dict[str, Any]:  # fmt: skip
     """A line in the form of gsfluent.charts.record; ``timed`` steps took the walls, or all did."""
     bad = failed or not math.isfinite(error)
