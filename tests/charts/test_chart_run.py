@@ -143,8 +143,8 @@ def test_a_run_that_breaks_off_is_kept_with_its_reason() -> None:
 
 def fast(setting: Setting, device: str, repeat: int) -> Record:
     return Record(
-        setting.case, "elastic", setting.method, setting.variant, {"dx": setting.dx}, device, "m",
-        8, 10, 1.0, [1e-3], 1e-3, 1.0, 0.1,
+        setting.case, "elastic", setting.method, setting.variant,
+        {"dx": setting.dx, "knob": setting.knob}, device, "m", 8, 10, 1.0, [1e-3], 1e-3, 1.0, 0.1,
     )  # fmt: skip
 
 
@@ -184,11 +184,13 @@ def test_the_verb_draws_recorded_lines_of_several_files(
                                wall_per_simulated=0.5, error=0.2)  # fmt: skip
     broken = dataclasses.replace(peer, variant="b", error=math.inf, failed="exploded")
     free = Setting("bar", 0.1, knob="free", variant="shuffled points")
-    same = dataclasses.replace(fast(free, "cpu", 1), settings={"dx": 0.1, "trades": False})
+    same = dataclasses.replace(
+        fast(free, "cpu", 1), settings={"dx": 0.1, "knob": "free", "trades": False}
+    )
     append(tmp_path / "a.jsonl", fast(Setting("bar", 0.1), "cpu", 1))
     append(tmp_path / "a.jsonl", same)
-    finer = dataclasses.replace(fast(dataclasses.replace(free, variant="CFL 0.1"), "cpu", 1),
-                                wall_per_simulated=5e-3, error=0.11)  # fmt: skip
+    short = Setting("bar", 0.1, knob="cfl", variant="CFL 0.1")
+    finer = dataclasses.replace(fast(short, "cpu", 1), wall_per_simulated=5e-3, error=0.11)
     append(tmp_path / "a.jsonl", finer)
     for r in (peer, broken):
         append(tmp_path / "b.jsonl", r)
