@@ -28,8 +28,9 @@ from gsfluent.charts.record import commit, machine
 from gsfluent.cli.common import choose_device
 from gsfluent.config import Shot, load_shot
 from gsfluent.config.yaml_file import read_yaml
-from gsfluent.pipeline.choose import choose
+from gsfluent.pipeline.choose import Probing, choose_setting, run_probes, summary
 from gsfluent.pipeline.choose_probe import Probe, distance, histories, probe
+from gsfluent.pipeline.choose_seconds import cost_of
 from gsfluent.pipeline.choose_shot import shot_scene
 from gsfluent.pipeline.run_demo import SIZES, photograph_demo
 from gsfluent.pipeline.simulate_solver import CFL
@@ -61,14 +62,14 @@ class Trial:
 
 TRIALS = {
     "orange_dropped": Trial(
-        "orange", "milk_poured", 0.03,
+        "orange", "milk_poured", 0.1,
         {"objects": {"orange": {"material": "rubber"}},
          "events": [{"type": "drop", "height": 0.4}],
          "output": {"fps": 120, "seconds": 0.5}},
     ),
-    "milk_poured": Trial("orange", "milk_poured", 0.3),
-    "bread_torn": Trial("bread", "bread_torn", 0.3),
-    "watermelon_dropped": Trial("watermelon", "watermelon_dropped", 0.3),
+    "milk_poured": Trial("orange", "milk_poured", 0.4),
+    "bread_torn": Trial("bread", "bread_torn", 0.4),
+    "watermelon_dropped": Trial("watermelon", "watermelon_dropped", 0.5),
 }  # fmt: skip
 
 
@@ -109,8 +110,12 @@ def judge(name: str, trial: Trial, options: argparse.Namespace, device: Any) -> 
     shot = shot_of(trial)
     scene, _ = shot_scene(shot, options.out / name, device=device, make=True)
     start = time.perf_counter()
-    result = choose(scene, shot, trial.bound, device=device)
+    probing = Probing()
+    probes = run_probes(scene, shot, probing, device=device)
     probed = time.perf_counter() - start
+    seconds, source = cost_of(probes.whole, probes.levels, scene, device)
+    choice, fits, growth = choose_setting(probes, trial.bound, seconds)
+    result = summary(choice, fits, growth, probes, probing, source)
     settings = [s for s in result["settings"] if s["cfl"] == CFL]
     taken = result["chosen"] or result["enough"]
     if taken is None or taken["seconds"] > 0.2 * options.most:
@@ -135,15 +140,28 @@ def judge(name: str, trial: Trial, options: argparse.Namespace, device: Any) -> 
     ours = runs(scene, shot, taken["cells"], taken["cfl"], 3 if brittle else 2, FRESH, device)
     truth = runs(scene, shot, reference, CFL, 4 if brittle else 1, 0, device)
     frames = min(p.seen.frames for p in (*ours, *truth))
-    shown = histories([ours, truth], 0, frames, ours[0].seen)
+    shown = histories([ours, truth], probes.first, frames, ours[0].seen)
     actual = {}
     for history in shown:
         mean = history.values[1].mean(axis=0)
         gaps = [distance(run, mean) for run in history.values[0]]
         actual[history.name] = math.sqrt(float(np.mean(np.square(gaps))))
+    apart = {
+        fit.name: fit.gaps(
+            1 / taken["cells"],
+            1 / reference,
+            growth.mean.get(fit.name, 1.0),
+            growth.spread.get(fit.name, 1.0),
+        )
+        for fit in fits
+    }
     worst = max(actual, key=lambda key: actual[key])
+    drawn = np.max(list(apart.values()), axis=0)
     return line | {
         "reference": {"cells": reference, "seeds": len(truth), "predicted": at["error"]},
+        "gap": [float(v) for v in np.quantile(drawn, [0.05, 0.5, 0.95])],
+        "gap_parts": {k: [float(q) for q in np.quantile(v, [0.05, 0.5, 0.95])]
+                      for k, v in apart.items()},
         "actual": actual, "actual_worst": worst, "actual_error": actual[worst],
         "actual_seconds": min(p.seconds for p in ours),
     }  # fmt: skip
@@ -152,27 +170,32 @@ def judge(name: str, trial: Trial, options: argparse.Namespace, device: Any) -> 
 def table(lines: list[Line]) -> str:
     """The table of the page."""
     head = (
-        "| shot | asked | chosen | sure | judged at | predicted (5 % to 95 %) | actual "
-        "| worst in (predicted) | run to run | reference | seconds predicted | actual | probes |"
+        "| shot | asked | chosen | sure | run to run | judged at | its error | reference "
+        "| distance, predicted (5 % to 95 %) | actual | worst | observables within "
+        "| seconds predicted | actual | probes |"
     )
-    rows = [head, "| --- " * 13 + "|"]
+    rows = [head, "| --- " * 15 + "|"]
     for line in lines:
         chosen, enough, judged = (line[k] for k in ("chosen", "enough", "predicted"))
         words = "none" if chosen is None else _words(chosen)
         if chosen is None and enough is not None:
             words += f"; chance hides more than {_words(enough)}"
         row = f"| {line['shot']} | {line['bound']:.0%} | {words} | {line['sure']:.0%} "
+        row += f"| {line['floor']:.1%} "
         if "actual" in line:
-            ref = line["reference"]
+            ref, (low, middle, high) = line["reference"], line["gap"]
+            within = sum(line["gap_parts"][k][0] <= v <= line["gap_parts"][k][2]
+                         for k, v in line["actual"].items() if k in line["gap_parts"])  # fmt: skip
             row += (
-                f"| {_words(judged)} | {judged['error']:.1%} ({judged['low']:.1%} to "
-                f"{judged['high']:.1%}) | {line['actual_error']:.1%} | {line['actual_worst']} "
-                f"({judged['worst']}) | {line['floor']:.1%} | {ref['cells']} cells, "
-                f"{ref['seeds']} seeds | {judged['seconds']:.1f} | {line['actual_seconds']:.1f} "
+                f"| {_words(judged)} | {judged['error']:.1%} | {ref['cells']} cells, "
+                f"{ref['seeds']} {'seeds' if ref['seeds'] > 1 else 'seed'} "
+                f"| {middle:.1%} ({low:.1%} to {high:.1%}) | {line['actual_error']:.1%} "
+                f"| {line['actual_worst']} | {within} of {len(line['actual'])} "
+                f"| {judged['seconds']:.1f} | {line['actual_seconds']:.1f} "
                 f"| {line['probe_wall']:.0f} s |"
             )
         else:
-            row += f"| not judged: too dear here | | | | {line['floor']:.1%} | | | | |"
+            row += "| not judged: too dear here " + "| " * 9 + "|"
         rows.append(row)
     return "\n".join(rows) + "\n"
 

@@ -104,9 +104,10 @@ def front(
 ) -> list[Record]:
     """Runs that no other one beats in both time and error, from cheap and rough to dear and good.
 
-    Runs that broke off, and errors of :data:`NO_ANSWER` or more, are on no front.
+    Runs that broke off, errors of :data:`NO_ANSWER` or more, and runs that are there to differ in
+    time only (``settings["trades"]`` false) are on no front.
     """
-    good = [r for r in records if r.ok and r.error < NO_ANSWER]
+    good = [r for r in _counting(records) if r.error < NO_ANSWER]
     kept: list[Record] = []
     for record in sorted(good, key=lambda r: (cost(r), counted(r))):
         if not kept or counted(record) < counted(kept[-1]):
@@ -114,9 +115,13 @@ def front(
     return kept
 
 
+def _counting(records: Iterable[Record]) -> list[Record]:
+    return [r for r in records if r.ok and r.settings.get("trades", True)]
+
+
 def cheapest(records: Iterable[Record], error: float) -> Record | None:
     """The cheapest run of at most this error, or None."""
-    good = [r for r in records if r.ok and counted(r) <= max(error, ROUND_OFF)]
+    good = [r for r in _counting(records) if counted(r) <= max(error, ROUND_OFF)]
     return min(good, key=lambda r: r.wall_per_simulated, default=None)
 
 

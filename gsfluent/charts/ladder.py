@@ -7,6 +7,7 @@ the chart it moves a run. What is changed by no knob stands at gsfluent's defaul
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -54,10 +55,12 @@ _OFF: dict[str, dict[str, Any]] = {
     "rest": {"sleep": False},
 }
 _OFF_RUNGS = (0.025, 0.0167)
+_COARSER = {"collide": 0.025, "oblique": 0.025, "pull_apart": 0.04}
+"""Where the coarsest rung is far better than any peer: grids on which few cells make a body."""
 _FINER = (1.5, 2.0, 3.0, 4.0)
-_MOST_NUMBERS = 3e7
-"""Times x points that are kept of one run on a GPU: 1.5 GB of positions and velocities."""
-_MOST_STEPS = 40_000
+_MOST_POINTS = 4.5e5
+_MOST_NUMBERS = 1.2e7
+"""Times x points that are kept of one run on a GPU: 0.6 GB of positions and velocities."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,17 +104,19 @@ def work(setting: Setting) -> float:
 def rungs(case: Case, device: str, quick: bool = False) -> list[float]:
     """Node spacings of a case from coarse to fine; a GPU goes on where a CPU stops.
 
-    A GPU's rungs end where a run would keep more than 3e7 point positions.
+    A GPU's rungs end at 4.5e5 points, or where a run would keep more than 1.2e7 positions; those of
+    fracture are the CPU's, since no grid is finer than that of the ensemble they are judged by.
     """
     steps = sorted(case.ladder, reverse=True)
     if quick:
         return steps[:2]
-    if not device.startswith("cuda"):
+    if not device.startswith("cuda") or case.kind == "fracture":
         return steps
     found = list(steps)
     coarse: Scene = case.build(steps[-1], 8)
     for factor in _FINER:
-        if coarse.count * factor**3 * coarse.times.shape[0] > _MOST_NUMBERS:
+        points = coarse.count * factor**3
+        if points > _MOST_POINTS or points * coarse.times.shape[0] > _MOST_NUMBERS:
             break
         found.append(steps[-1] / factor)
     return found
@@ -125,7 +130,7 @@ def ladder(
     quick: bool = False,
     textbook: bool = True,
 ) -> list[Setting]:
-    """All settings, base ladders of all cases first, so that a budget cuts knobs and not cases.
+    """All settings, ladders over all rungs first, so that a budget cuts knobs and not cases.
 
     Args:
         names: Cases; default: all.
@@ -151,10 +156,14 @@ def ladder(
     steps = {case.name: rungs(case, device, quick) for case in chosen}
     for case in chosen:
         found += [Setting(case.name, dx) for dx in steps[case.name]]
+    for case in chosen if not quick else ():
+        found += _cheap(case, steps[case.name])
     references = [_textbook(case, steps[case.name], device, quick) for case in chosen if textbook]
     found += [s for made in references for s in made if s.knob == "textbook"]
     for case in chosen:
-        for dx in _two(steps[case.name], case.kind):
+        turned = _two(steps[case.name], case.kind)
+        # on a GPU most of a run is its set-up, and the finer rung says the same
+        for dx in turned[-1:] if device.startswith("cuda") else turned:
             found += _knobs(case, dx, device, quick)
     for name in off_grid:
         for dx in _OFF_RUNGS[:1] if quick else _OFF_RUNGS:
@@ -165,17 +174,29 @@ def ladder(
     return [s for s in found if s.knob in wanted]
 
 
+def _cheap(case: Case, steps: Sequence[float]) -> Iterator[Setting]:
+    """Settings that cost little, over all rungs: long steps, few points, and both."""
+    coarser = [_COARSER[case.name]] if case.name in _COARSER else []
+    for dx in coarser:
+        yield Setting(case.name, dx)
+    for dx in [*coarser, *steps]:
+        yield Setting(case.name, dx, knob="cfl", variant="CFL 0.8", options={"cfl": 0.8})
+        if case.kind != "fracture":
+            both = {"cfl": 0.8}
+            yield Setting(case.name, dx, 1, OURS, "ppc", "1 per cell, CFL 0.8", both)
+
+
 def _two(steps: Sequence[float], kind: str) -> list[float]:
     """The two rungs on which knobs are turned; of fracture (ensembles) the coarse ones."""
     if kind == "fracture":
         return list(steps[:2])
     if len(steps) < 4:
         return sorted({steps[0], steps[-1]}, reverse=True)
-    return [steps[len(steps) // 2 - 1], steps[-2]]
+    return [steps[len(steps) // 2 - 1], steps[min(len(steps) - 2, len(steps) // 2 + 1)]]
 
 
 def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]:
-    scene: Scene = case.build(dx, 8)
+    scene: Scene = case.build(max(case.ladder), 8)  # for its bodies and laws
 
     def turned(
         knob: str, variant: str, ppc: int = 8, trades: bool = True, **options: Any
@@ -187,15 +208,14 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("free", "shuffled points", trades=False, shuffle=1)
     if quick:
         return
-    yield turned("cfl", "CFL 0.8", cfl=0.8)
     yield turned("cfl", "CFL 0.1", cfl=0.1)
     yield turned("ppc", "1 per cell", 1)
     yield turned("ppc", "27 per cell", 27)
     yield turned("dt", f"fixed dt, c dt/dx {DEMO_COURANT}", courant=DEMO_COURANT)
     yield turned("engine", "composed operators", engine="ops")
     if case.kind != "fracture":  # there riders part, which is the splats' matter (docs/cracks.md)
-        yield turned("gaussians", f"{DENSE} Gaussians a cell ride on 8 points", DENSE, ride_on=8)
-        yield turned("gaussians", f"{DENSE} Gaussians a cell, each a point", DENSE)
+        yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, ride_on=8)
+        yield turned("gaussians", f"{DENSE} per cell", DENSE)
     if device.startswith("cpu"):
         yield turned("free", "one thread", trades=False, threads=1)
     yield turned("free", "a call for every step", trades=False, single_steps=True)
@@ -203,7 +223,7 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
         yield turned("fields", "one field", fields=False)
     if any(m["law"] == "nacc" for m in scene.materials):
         yield turned("return_map", "explicit alpha", implicit=False)
-        yield turned("return_map", "fixed centre", k=0.0)
+        yield turned("return_map", "fixed centre", k=math.inf)
 
 
 def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> list[Setting]:
@@ -215,9 +235,9 @@ def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> l
         return [variant(steps[0], "textbook", "APIC, F", **base)]
     # plain PyTorch takes 3 ms a step on a GPU and 7 us a point and step on a CPU: few rungs
     coarse = steps[: 2 if case.kind == "fracture" else 3]
-    if device.startswith("cuda"):
-        coarse = coarse[-2:]
     found = [variant(dx, "textbook", "APIC, F", **base) for dx in coarse]
+    if device.startswith("cuda"):
+        return found[-1:]
     at = coarse[0] if case.kind == "fracture" else coarse[min(1, len(coarse) - 1)]
     return [
         *found,

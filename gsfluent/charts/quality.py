@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from gsfluent.charts.front import cases, front
+from gsfluent.charts.front import cases, counted, front
 from gsfluent.charts.record import Record, append, commit, machine, read
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.figure.page import Page, shown
@@ -210,7 +210,8 @@ def _written(of: str, records: Sequence[Record], out: Path, name: str) -> dict[s
     xlabel, ylabel = _module(of).XLABEL, _module(of).YLABEL
     panels = [_panel(records, case) for case in cases(records)]
     page = Page(title, f"{len(records)} settings; gsfluent {records[0].commit}")
-    with draw(panels, title=title, xlabel=xlabel, ylabel=ylabel) as figure:
+    above = title if len(panels) > 1 else title.replace(", ", "\n", 1)  # one panel is narrow
+    with draw(panels, title=above, xlabel=xlabel, ylabel=ylabel) as figure:
         save_png(figure, out / f"{name}.png")
         page.svg(to_svg(figure), "Every setting a dot; the best as a staircase.")
     head, rows = table(records)
@@ -240,7 +241,7 @@ def _panel(records: Sequence[Record], case: str) -> Panel:
 
 def _dot(record: Record) -> Dot:
     return Dot(
-        record.method, record.wall_per_simulated, record.error, record.variant or "as it is",
+        record.method, record.wall_per_simulated, counted(record), record.variant or "as it is",
         failed=bool(record.failed),
     )  # fmt: skip
 

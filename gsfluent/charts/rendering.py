@@ -235,7 +235,7 @@ class _Case:
         error = float(off.square().mean().sqrt())
         return Outcome(
             error, [w / len(views) for w in wall], splats.means.shape[0],
-            {"PSNR [dB]": -20.0 * math.log10(max(error, 1e-12)),
+            {"PSNR [dB]": -20.0 * math.log10(error) if error > 0.0 else math.inf,
              "largest": float(off.abs().max())},
         )  # fmt: skip
 

@@ -30,7 +30,8 @@ __all__ = ["XLABEL", "YLABEL", "jobs", "texture", "used"]
 
 XLABEL = "seconds"
 YLABEL = "distance of patches over that of the surface's colours"
-METHODS = ("color_copy", "telea", "profile", "procedural", "preview", "default", "full")
+METHODS = ("color_copy", "telea", "profile", "preview", "default", "full")
+"""Not procedural: its recipes are those that the truths are drawn from."""
 WORST = "color_copy"
 
 
@@ -133,7 +134,5 @@ def jobs(*, device: torch.device, quick: bool = False) -> list[Job]:
         for method in methods:
             settings = {"voxels": size, "method": method}
             work = functools.partial(case, method=method)
-            # the truth is another draw of the same recipe: as good as an answer can be
-            words = "procedural, the truth's recipe" if method == "procedural" else method
-            found.append(Job(f"{name}, {size} voxels", words, settings, work))
+            found.append(Job(f"{name}, {size} voxels", method, settings, work))
     return found

@@ -151,6 +151,8 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
     low, high = min(low, middle / 5.6), max(high, middle * 5.6)
     costs = [d.cost for d in panel.dots if _finite(d.cost)] or [1.0]
     left, right = min(costs) / 3.0, max(costs) * 2.0
+    middle = math.sqrt(left * right)
+    left, right = min(left, middle / 5.6), max(right, middle * 5.6)
     top = high * (high / low) ** 0.09
     ax.set_xlim(left, right)
     ax.set_ylim(low, top)
@@ -210,6 +212,8 @@ def _stairs(ax: Axes, dots: Sequence[Dot], color: str, right: float, *, strong: 
 
 def _labels(ax: Axes, dots: Sequence[Dot], color: str) -> None:
     """Names along a front, each once while it stays the same, none over another."""
+    from matplotlib.patheffects import withStroke
+
     width, height = (math.log10(b / a) for a, b in (ax.get_xlim(), ax.get_ylim()))
     placed: list[tuple[float, float]] = []
     said = None
@@ -221,8 +225,14 @@ def _labels(ax: Axes, dots: Sequence[Dot], color: str) -> None:
             continue
         placed.append((x, y))
         said = d.label
-        ax.annotate(d.label, (d.cost, d.error), (-4, -4), textcoords="offset points", ha="right",
-                    va="top", fontsize=6.5, color=color, zorder=7)  # fmt: skip
+        # left of a staircase is room, but for what stands at the edge
+        share = x - math.log10(ax.get_xlim()[0]) / width
+        side, shift = ("right", -4) if share > 0.011 * len(d.label) else ("left", 2)
+        ax.annotate(
+            d.label, (d.cost, d.error), (shift, -4), textcoords="offset points", ha=side, va="top",
+            fontsize=6.5, color=color, zorder=7, path_effects=[withStroke(linewidth=2.0,
+            foreground="white")],
+        )  # fmt: skip
 
 
 def _rates(ax: Axes, rates: Rates, color: Mapping[str, str]) -> None:
@@ -249,4 +259,5 @@ def _legend(figure: Figure, names: Sequence[str], color: Mapping[str, str]) -> N
         Line2D([], [], marker="^", ms=5, label="as wrong as no answer", **grey),
         Line2D([], [], color="#c9c9c9", ls="--", lw=0.8, label="time x error the same"),
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=min(len(marks), 9))
+    columns = min(len(marks), 9, max(2, int(figure.get_figwidth() / 1.9)))
+    figure.legend(handles=marks, loc="outside lower center", ncols=columns)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from .registry import case
-from .ritz import ball_rule, box_rule, modes
+from .ritz import Modes, ball_rule, box_rule, modes
 from .run import Measure, Run
 from .scene import Floats, Scene
 from .shapes import ball, box, elastic, free
@@ -138,12 +139,18 @@ _BEAM = elastic(5e5, 0.3, 1000.0)
 _SIZE = (0.4, 0.05, 0.05)
 
 
-def _bending(points: Floats) -> tuple[float, Floats, Floats]:
-    """Frequency [1/s], shape (1 in the middle) and gradient of the first bending mode."""
+@functools.cache
+def _bending_modes() -> Modes:
     half = [0.5 * s for s in _SIZE]
     # across the beam all sections move as one: even on every axis in y; the rest follows from it
     parity = ((1, 1, 0), (0, 0, 0), (0, 1, 1))
-    found = modes(box_rule(half, (17, 9, 9)), half, _BEAM, parity, (16, 8, 8))
+    return modes(box_rule(half, (17, 9, 9)), half, _BEAM, parity, (16, 8, 8))
+
+
+def _bending(points: Floats) -> tuple[float, Floats, Floats]:
+    """Frequency [1/s], shape (1 in the middle) and gradient of the first bending mode."""
+    half = [0.5 * s for s in _SIZE]
+    found = _bending_modes()
     shape, gradient = found.at(np.vstack([points - half, np.zeros((1, 3))]), 1)
     middle = shape[-1, 1]
     return float(found.omega[1]), shape[:-1] / middle, gradient[:-1] / middle
@@ -171,6 +178,7 @@ _JELLY = elastic(1e5, 0.3, 1000.0)
 _RADIUS, _OMEGA, _BREATHS = 0.05, 10.0, 5
 
 
+@functools.cache
 def _breathing() -> tuple[Floats, Floats]:
     """Frequencies [1/s] and shares of the modes that the turning of a ball excites.
 

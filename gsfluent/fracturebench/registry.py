@@ -16,6 +16,9 @@ MODULES = (
     "elastic",
     "flow",
     "fracture_bars",
+    "fracture_cantilever",
+    "fracture_plane",
+    "fracture_rock",
     "fracture_shatter",
 )
 """Modules of this package that register cases."""

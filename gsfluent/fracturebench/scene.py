@@ -64,7 +64,7 @@ class Scene:
             ``alpha`` (at the start).
         gravity: [m/s^2].
         colliders: Planes: ``{"point", "normal", "kind": "sticky" | "slip" | "separate",
-            "friction"}``.
+            "friction"}``. A grid node that lies on a plane belongs to the wall.
         drives: What acts on groups of points. ``points`` is a list of indices or ``"all"``, and
             one of: ``velocity`` [vx, vy, vz], prescribed in place of what the method would give
             them (null: this component is free); ``force``, [[fx, fy, fz], ...] in N on each of the

@@ -33,6 +33,7 @@ __all__ = [
     "lost_energy",
     "mass_ks",
     "spacing",
+    "stored_energy",
 ]
 
 MEASURES = (
@@ -76,11 +77,26 @@ def spacing(scene: Scene) -> float:
     return float(np.cbrt(np.median(scene.volume)))
 
 
+def stored_energy(scene: Scene, stress: Floats) -> Floats:
+    """Elastic energy of each point by its stress, of small strains [J], [T, N].
+
+    ``V (p^2 / (2 kappa) + s : s / (4 mu))`` with the deviator s.
+    """
+    young = np.array([float(m["young_modulus"]) for m in scene.materials])
+    nu = np.array([float(m["poisson_ratio"]) for m in scene.materials])
+    mu = (young / (2.0 * (1.0 + nu)))[scene.material]
+    kappa = (young / (3.0 * (1.0 - 2.0 * nu)))[scene.material]
+    p = stress[..., :3].mean(axis=-1)
+    normal = stress[..., :3] - p[..., None]
+    square = (normal**2).sum(axis=-1) + 2.0 * (stress[..., 3:] ** 2).sum(axis=-1)
+    return np.asarray(scene.volume * (0.5 * p * p / kappa + 0.25 * square / mu))
+
+
 def lost_energy(scene: Scene, run: Run) -> Floats:
     """Energy that is neither kinetic, nor of weight, nor (by the stresses, if any) stored [J], [T].
 
-    Counted from the start of the scene. Stored energy is that of small strains,
-    ``V (p^2 / (2 kappa) + q^2 / (6 mu))``; without stresses it counts as lost until it comes back.
+    Counted from the start of the scene; without stresses what is stored counts as lost until it
+    comes back.
     """
     mass, g = scene.mass, np.asarray(scene.gravity)
 
@@ -90,14 +106,7 @@ def lost_energy(scene: Scene, run: Run) -> Floats:
     start = total(scene.x, scene.v)
     left = np.array([total(x, v) for x, v in zip(run.x, run.v, strict=True)])
     if run.stress is not None:
-        young = np.array([float(m["young_modulus"]) for m in scene.materials])
-        nu = np.array([float(m["poisson_ratio"]) for m in scene.materials])
-        mu = (young / (2.0 * (1.0 + nu)))[scene.material]
-        kappa = (young / (3.0 * (1.0 - 2.0 * nu)))[scene.material]
-        p = run.stress[..., :3].mean(axis=-1)
-        normal = run.stress[..., :3] - p[..., None]
-        square = (normal**2).sum(axis=-1) + 2.0 * (run.stress[..., 3:] ** 2).sum(axis=-1)
-        left = left + (scene.volume * (0.5 * p * p / kappa + 0.25 * square / mu)).sum(axis=-1)
+        left = left + stored_energy(scene, run.stress).sum(axis=1)
     return start - left
 
 

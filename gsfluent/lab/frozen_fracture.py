@@ -46,7 +46,7 @@ class _Drive:
         """Change the velocities of a step in place."""
         if not self.start <= time < self.end:
             return
-        before = v[self.rows].double()
+        before = v[self.rows].double().clone()
         share = min(1.0, (time - self.start) / self.ramp) if self.ramp > 0.0 else 1.0
         if self.damping:
             v[self.rows] *= 1.0 - dt * self.damping

@@ -61,7 +61,8 @@ def stencil(cell: Tensor, offset: Tensor, dx: float, kernel: str) -> Stencil:
         kernel: ``quadratic`` (27 nodes) or ``linear`` (8 nodes).
 
     Raises:
-        FloatingPointError: A point is nowhere or farther than 2^40 cells away.
+        FloatingPointError: A point is nowhere or farther than 2^40 cells away, or the box around
+            the points is longer than 2^20 cells.
     """
     shift = 0.5 if kernel == "quadratic" else 0.0
     first = torch.floor(offset - shift)
@@ -80,6 +81,8 @@ def stencil(cell: Tensor, offset: Tensor, dx: float, kernel: str) -> Stencil:
     corner = torch.cartesian_prod(axis, axis, axis)
     low = base.amin(0)
     extent = [int(n) for n in (base.amax(0) - low + width).tolist()]
+    if max(extent) > 2**20:  # indices of 60 bits
+        raise FloatingPointError(f"points fly apart: the box around them is {max(extent)} cells")
     stride = torch.tensor([extent[1] * extent[2], extent[2], 1], device=base.device)
     node = ((base - low) * stride).sum(1)[:, None] + (corner * stride).sum(1)
     size = extent[0] * extent[1] * extent[2]

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 REACH = (0.05, 0.95)
 """Shares of a body's points between which its extents are taken: splinters do not count."""
+_SHARES = ("broken share", "largest piece")
 ACTIVE = 0.05
 """Share of the largest stored and dissipated energy from which something is happening."""
 
@@ -76,7 +77,9 @@ class Probe:
         points: Material points.
         point_steps: Points moved on the grid, summed over steps, by frame, [T].
         steps: Steps of the grid.
-        blocks: Most blocks of the grid in use.
+        blocks: Blocks of the grid in use, mean over the steps.
+        fields: Most velocity fields.
+        composed: Steps of the composable operators.
         failed: Why it broke off, or empty.
     """
 
@@ -88,7 +91,9 @@ class Probe:
     points: int
     point_steps: Array
     steps: int
-    blocks: int
+    blocks: float
+    fields: int
+    composed: int
     failed: str = ""
 
 
@@ -152,7 +157,8 @@ def probe(
     return Probe(
         cells=cells, cfl=cfl, seed=seed, seen=seen, seconds=run.seconds,
         points=run.matter.particles.count, point_steps=np.array(spent, dtype=np.float64),
-        steps=counters.steps, blocks=counters.blocks_max, failed=run.failure,
+        steps=counters.steps, blocks=counters.block_steps / max(counters.steps, 1),
+        fields=counters.fields_max, composed=counters.composed_steps, failed=run.failure,
     )  # fmt: skip
 
 
@@ -218,14 +224,15 @@ def histories(
     if energy > 0.0:
         rows.append(("energy", lambda seen: ((seen.kinetic + seen.elastic) / energy)[:, None]))
     if chaotic:
-        rows.append(("broken share", lambda seen: seen.broken[:, None]))
-        rows.append(("largest piece", lambda seen: seen.largest[:, None]))
+        rows.append((_SHARES[0], lambda seen: seen.broken[:, None]))
+        rows.append((_SHARES[1], lambda seen: seen.largest[:, None]))
     return [
         History(
             name=name,
             sizes=sizes,
             values=tuple(np.stack([read(p.seen)[first:last] for p in level]) for level in levels),
             chaotic=chaotic,
+            most=1.0 if name in _SHARES else math.inf,
         )
         for name, read in rows
     ]

@@ -2,61 +2,113 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
-from gsfluent.config import Shot
 from gsfluent.pipeline.choose_probe import Probe
+from gsfluent.pipeline.plan_cost import CostModel
 from gsfluent.pipeline.simulate_solver import CFL
 from gsfluent.scene import Scene
 
-__all__ = ["cost_of", "measured_rates", "work_of"]
+__all__ = ["Work", "cost_of", "measured_rates", "work_of"]
 
 Seconds = Callable[[int, float], float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What a simulation does.
+
+    Attributes:
+        steps: Steps of the grid.
+        points: Points on it in the mean step.
+        blocks: Blocks in use in the mean step.
+        composed: Steps of the composable operators, among them.
+    """
+
+    steps: float
+    points: float
+    blocks: float
+    composed: float
 
 
 def cost_of(
     whole: Sequence[Probe],
     levels: Sequence[Sequence[Probe]],
     scene: Scene,
-    shot: Shot,
     device: torch.device | str,
+    model: CostModel | None = None,
 ) -> tuple[Seconds, str]:
     """Wall time of the whole simulation by cells and Courant number, and where it comes from.
 
     Args:
         whole: Runs over the whole shot, coarse to fine.
         levels: All probes.
-        scene: The scene.
-        shot: The shot.
+        scene: The scene, for its laws.
         device: Where it would run.
+        model: The machine's cost model; the stored one when None. Its times are multiplied by what
+            the finest probes took over what it says of them. Without one the probes' own times
+            are carried on.
     """
-    per_step, per_point = measured_rates([p for level in levels for p in level])
+    every = [p for level in levels for p in level]
+    model = CostModel.load(device) if model is None else model
+    if model is None:
+        per_step, per_point = measured_rates(every)
 
-    def seconds(cells: int, cfl: float) -> float:
-        steps, points = work_of(whole, cells, cfl)
-        return steps * (per_step + per_point * points)
+        def measured(cells: int, cfl: float) -> float:
+            work = work_of(whole, cells, cfl)
+            return work.steps * (per_step + per_point * work.points)
 
-    return seconds, "the probes' own times"
+        return measured, "the probes' own times"
+    known, fields = model, max(p.fields for p in every)
+    laws = {body.material.law for body in scene.bodies}
+    laws |= {part.material(body.material).law for body in scene.bodies for part in body.parts}
+
+    def said(work: Work) -> float:
+        return known.predict(
+            work.points, work.blocks, work.steps, fields=fields, laws=laws,
+            composed_steps=work.composed,
+        ).seconds  # fmt: skip
+
+    finest = min(levels[-1], key=lambda p: p.seconds)
+    predicted = said(_done(finest))
+    factor = finest.seconds / predicted if predicted > 0.0 and finest.seconds > 0.0 else 1.0
+    source = f"the cost model, times {factor:.2f} as the probes took"
+    return (lambda cells, cfl: factor * said(work_of(whole, cells, cfl))), source
 
 
-def work_of(whole: Sequence[Probe], cells: int, cfl: float) -> tuple[float, float]:
-    """Steps of the grid, and points on it in the mean step, of the whole shot at a setting.
+def _done(run: Probe) -> Work:
+    """What a probe did."""
+    steps = max(run.steps, 1)
+    return Work(run.steps, float(run.point_steps[-1]) / steps, run.blocks, run.composed)
 
-    Points go as the cube of the cells. Steps go as the cells over the Courant number, or a little
-    slower where colliders and frames bound them: by the power that the two runs show.
+
+def work_of(whole: Sequence[Probe], cells: int, cfl: float) -> Work:
+    """What the whole shot would do at a setting.
+
+    Points go as the cube of the cells; steps and blocks by the power of the cells that the two runs
+    show, steps over the Courant number.
     """
     first, last = whole[0], whole[-1]
-    ratio = cells / last.cells
-    power = 1.0
-    if first.steps > 0 and last.steps > 0 and last.cells > first.cells:
-        shown = np.log(last.steps / first.steps) / np.log(last.cells / first.cells)
-        power = float(np.clip(shown, 0.5, 1.5))
-    steps = last.steps * ratio**power * (CFL / cfl)
-    mean = float(last.point_steps[-1]) / max(last.steps, 1)
-    return steps, mean * ratio**3
+    ratio, done = cells / last.cells, _done(last)
+    apart = math.log(last.cells / first.cells)
+
+    def power(coarse: float, fine: float, usual: float, low: float, high: float) -> float:
+        if coarse <= 0.0 or fine <= 0.0 or apart <= 0.0:
+            return usual
+        return min(max(math.log(fine / coarse) / apart, low), high)
+
+    faster = CFL / cfl * ratio ** power(first.steps, last.steps, 1.0, 0.5, 1.5)
+    return Work(
+        steps=done.steps * faster,
+        points=done.points * ratio**3,
+        blocks=done.blocks * ratio ** power(first.blocks, last.blocks, 3.0, 2.0, 3.0),
+        composed=done.composed * faster,
+    )
 
 
 def measured_rates(probes: Sequence[Probe]) -> tuple[float, float]:

@@ -183,18 +183,21 @@ def _words(setting: dict[str, Any]) -> str:
     )
 
 
-def choose_stage(context: RunContext) -> None:
+def choose_stage(context: RunContext) -> bool:
     """``solve: {error: ...}``: put the chosen cells and step in place of the bound.
 
     Where chance alone is larger than the bound, the setting beyond which finer cells change less
     than chance does is taken, with a warning; ``run.json`` says so under ``choice``.
+
+    Returns:
+        Whether there was something to choose.
 
     Raises:
         InputError: No setting meets the bound, and it is not for chance.
     """
     shot = context.shot
     if shot.solve.error is None:
-        return
+        return False
     bound = shot.solve.error
     key = fingerprint("choose", context.key(context.source_key, moving_settings(shot), bound))
 
@@ -228,3 +231,4 @@ def choose_stage(context: RunContext) -> None:
         shot.solve, error=None, cells=int(chosen["cells"]), cfl=float(chosen["cfl"])
     )
     context.shot = dataclasses.replace(shot, solve=solve)
+    return True

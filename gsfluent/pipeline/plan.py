@@ -286,6 +286,12 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
     """What a user should mend before an hour is spent."""
     shot, scene = prospect.shot, prospect.scene
     found = []
+    if shot.solve.error is not None:
+        found.append(
+            "solve.error chooses the cells by probes when the shot is run, this plan has those of "
+            f"quality: {shot.solve.quality}; mend: gsfluent chart SHOT.yaml --error "
+            f"{shot.solve.error:.3g} chooses now"
+        )
     if not shot.events and not shot.colliders:
         found.append(
             "the shot has no events: the object will only rest on the floor; mend: add an event"

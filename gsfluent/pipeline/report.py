@@ -69,6 +69,7 @@ def report_page(out: Path, values: Values) -> Page:
     if (inside := outputs.get("interior")) and (out / inside).is_file():
         page.picture(out / inside, "cuts through the filled and textured object")
     _summary(page, values)
+    _choice(page, out, values)
     _plan(page, values.get("plan"))
     simulation = values.get("simulation") or {}
     _motion(page, simulation.get("per_frame") or {}, simulation)
@@ -103,6 +104,28 @@ def _summary(page: Page, values: Values) -> None:
 def _pair(values: Values, first: str, second: str) -> str:
     low, high = values.get(first), values.get(second)
     return "" if low is None or high is None else f"{low:.3g}, {high:.3g}"
+
+
+def _choice(page: Page, out: Path, values: Values) -> None:
+    """What ``solve.error`` has chosen, and how sure that is."""
+    choice = values.get("choice")
+    if not isinstance(choice, Mapping):
+        return
+    taken = choice.get("chosen") or choice.get("enough") or {}
+    page.heading("The setting, chosen by error")
+    page.text(str(choice.get("reason", "")), kind="" if choice.get("met") else "warn")
+    rows = [
+        ("asked for", choice.get("bound")),
+        ("expected (median)", taken.get("error")),
+        ("5 % to 95 %", _pair(taken, "low", "high")),
+        ("share of the draws that meet it", choice.get("sure")),
+        ("cells along the largest solid", taken.get("cells")),
+        ("Courant number", taken.get("cfl")),
+    ]
+    page.table(["figure", "value"], [row for row in rows if row[1] not in (None, "")])
+    picture = (values.get("outputs") or {}).get("chart")
+    if picture and (out / picture).is_file():
+        page.picture(out / picture, "what every setting costs, and what is expected of it")
 
 
 def _plan(page: Page, plan: Any) -> None:

@@ -91,7 +91,8 @@ def run_shot(
         fill_stage(context)
         texture_stage(context)
         regions_stage(context)
-        choose_stage(context)
+        if choose_stage(context):  # the plan was made with other cells
+            foreseen = foresee_run(context, plan=plan)
         simulate_stage(context)
         render_stage(context)
         export_stage(context)

@@ -61,7 +61,13 @@ def references() -> str:
     force = ", ".join(
         f"{f:.2f} at {s:g} c" for s, f in zip(slow["speeds"], slow["force_over_hertz"], strict=True)
     )
-    lines += ["", f"Largest force of an impact over Hertz's: {force}."]
+    law = known["laws"]
+    lines += [
+        "",
+        f"Largest force of an impact over Hertz's: {force}. The fixed corotated law instead of the "
+        f"neo-Hookean changes the first measure of collide by {law['collide']:.2g} and that of "
+        f"drop by {law['drop']:.2g}.",
+    ]
     return "\n".join(lines)
 
 
@@ -69,6 +75,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--references", action="store_true", help="only the table of references")
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases; default all of motion")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument(
@@ -78,9 +85,10 @@ def main() -> int:
     try:
         chosen = [find(n) for n in args.names] or [c for c in cases() if c.kind != "fracture"]
         lines = ["| case | error (points), coarse to fine | order |", "|---|---|---|"]
-        lines += [row(case, args.device) for case in chosen]
         text = args.page.read_text(encoding="utf-8") if args.page.is_file() else ""
-        text = enter(text, "fracturebench_ladder", "\n".join(lines), "## Convergence")
+        if not args.references:
+            lines += [row(case, args.device) for case in chosen]
+            text = enter(text, "fracturebench_ladder", "\n".join(lines), "## Convergence")
         text = enter(text, "fracturebench_references", references(), "## References")
         temporary = args.page.with_name(args.page.name + ".tmp")
         temporary.write_text(text, encoding="utf-8")

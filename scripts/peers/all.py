@@ -25,23 +25,27 @@ from newton_mpm import Newton
 from peerlib import Peer, Scene
 from physgaussian import PhysGaussian
 from taichi_mpm import TaichiElements
+from textbook_nacc import Textbook
 
 HERE = Path(__file__).resolve().parent
 PEERS: dict[str, tuple[Peer, str]] = {
     "physgaussian": (PhysGaussian(), "physgaussian.py"),
     "taichi_elements": (TaichiElements(), "taichi_mpm.py"),
     "newton": (Newton(), "newton_mpm.py"),
+    "textbook": (Textbook(), "textbook_nacc.py"),
 }
 KINDS = ("elastic", "contact")
 NOT = ("covariance_transport",)  # asks for what Gaussians become, which is no part of a solver
 # rough seconds: of a run whatever its size, of a step, of a point's step, of a node's step
 COST: Mapping[tuple[str, str], tuple[float, float, float, float]] = {
     ("physgaussian", "cpu"): (0.5, 2e-4, 1.5e-6, 5e-8),
-    ("physgaussian", "cuda"): (0.1, 2e-4, 2e-9, 2e-11),
+    ("physgaussian", "cuda"): (0.05, 8e-5, 2e-9, 2e-11),
     ("taichi_elements", "cpu"): (4.0, 2e-2, 3e-6, 0.0),
     ("taichi_elements", "cuda"): (1.5, 3e-4, 2e-9, 0.0),
     ("newton", "cpu"): (3.0, 4e-2, 4e-5, 0.0),
     ("newton", "cuda"): (0.5, 1e-2, 1e-8, 0.0),
+    ("textbook", "cpu"): (0.2, 2e-3, 5e-6, 0.0),
+    ("textbook", "cuda"): (0.2, 3e-3, 1e-8, 0.0),
 }
 
 
@@ -121,19 +125,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--python", action="append", default=[], metavar="PEER=INTERPRETER")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--repeat", type=int, help="timed runs; default 0 (cpu), 2 (cuda)")
-    parser.add_argument("--budget", type=float, help="seconds per peer; 90 (cpu), 40 (cuda)")
+    parser.add_argument("--budget", type=float, help="seconds per peer; default 60")
     parser.add_argument("--quick", action="store_true", help="two dx, one step, one variant each")
     options = parser.parse_args(arguments)
     gpu = options.device == "cuda"
     options.repeat = (2 if gpu else 0) if options.repeat is None else options.repeat
-    options.budget = options.budget or (10.0 if options.quick else 40.0 if gpu else 90.0)
+    options.budget = options.budget or (10.0 if options.quick else 60.0)
     folders, pythons = pairs(options.folder), pairs(options.python)
     cases = options.case or (["bar", "pull_apart"] if options.quick else [])
     scenes = freeze(options.out, options.quick, cases)
     for name in options.peer or PEERS:
         listed, left = jobs(name, scenes, options.out, options)
-        for item in left:
-            sys.stdout.write(f"{name}: left out for its price: {item}\n")
+        if left:
+            sys.stdout.write(
+                f"{name}: {len(left)} of {len(left) + len(listed)} runs left out for their price "
+                f"(--budget), such as {left[0]}\n"
+            )
         lines = options.out / f"{name}.jobs"
         lines.write_text("".join(json.dumps(job) + "\n" for job in listed), encoding="utf-8")
         command = [pythons.get(name, sys.executable), str(HERE / PEERS[name][1]),

@@ -19,15 +19,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-try:
-    from fracturebench.run import Run
-    from fracturebench.scene import Scene
-except ImportError:  # not on PYTHONPATH: the one of this checkout, last, so that it hides nothing
-    sys.path.append(str(Path(__file__).resolve().parents[2] / "gsfluent"))
-    from fracturebench.run import Run
-    from fracturebench.scene import Scene
+# the format of this checkout, last on the path so that it hides nothing; a folder of that name
+# elsewhere on it is no package
+sys.path.append(str(Path(__file__).resolve().parents[2] / "gsfluent"))
+if getattr(sys.modules.get("fracturebench"), "__file__", None) is None:
+    sys.modules.pop("fracturebench", None)
+
+from fracturebench.run import Run
+from fracturebench.scene import Scene
 
 Floats = NDArray[np.float64]
+# a node on a wall is the wall's in the scenes; peers take those strictly below a plane, so a plane
+# is given to them by this share of a cell higher
+NODE_ON_WALL = 1e-3
 MARGIN = 4  # cells between the matter and the side of a bounded domain
 
 
@@ -223,14 +227,25 @@ def play(
             walls = [clock(peer.start(scene, variant, device), plan) for _ in range(repeat)]
     except Cannot as reason:
         return failed_run(scene, name, f"{peer.name} {reason}", device, **settings)
+    except Exception as error:  # whatever it raises is what its user would get
+        told = (str(error).strip().splitlines() or [""])[0]
+        return failed_run(scene, name, f"{type(error).__name__}: {told}", device, **settings)
     settings |= {"dx": scene.dx, "walls": walls, "dt": plan[-1][1]}
     wall = float(np.median(walls))
     return Run(scene.name, name, scene.times, x, v, wall, engine.steps, settings, device, failed)
 
 
+def prepare(engine: Engine, plan: Sequence[tuple[int, float]]) -> None:
+    """Let an engine make what it needs for the steps of a plan, such as CUDA graphs, untimed."""
+    if hasattr(engine, "prepare"):
+        for dt in sorted({dt for count, dt in plan if count}):
+            engine.prepare(dt)
+
+
 def clock(engine: Engine, plan: Sequence[tuple[int, float]]) -> float:
     """Wall seconds of all steps of a plan, without a stop."""
     stretches = merged(plan)
+    prepare(engine, stretches)
     start = time.perf_counter()
     for count, dt in stretches:
         engine.advance(count, dt)
@@ -244,6 +259,7 @@ def drive(
     shape = (scene.times.shape[0], scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
     wall = 0.0
+    prepare(engine, plan)
     for i, (count, dt) in enumerate(plan):
         try:
             if count:
@@ -278,7 +294,8 @@ def parser(peer: Peer, description: str) -> argparse.ArgumentParser:
     made.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     made.add_argument("--dt", type=float, help="step [s]; or")
     made.add_argument("--courant", type=float, default=peer.courant[0])
-    made.add_argument("--variant", choices=sorted({v for d in peer.variants.values() for v in d}))
+    known = {v for d in peer.variants.values() for v in d} | set(getattr(peer, "tried", ()))
+    made.add_argument("--variant", choices=sorted(known))
     made.add_argument("--repeat", type=int, default=1)
     return made
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import peerlib
-from peerlib import Cannot, Floats, Scene
+from peerlib import NODE_ON_WALL, Cannot, Floats, Scene
 
 SOFTER = 0.3  # what its elastic material makes of the Lame parameters
 # dt = 0.02 dx (unit domain) at E = 1e6, nu 0.2, density 1000 (0.3 E): 0.37 at most
@@ -147,9 +147,11 @@ class TaichiElements:
         kinds = {"sticky": made.surface_sticky, "slip": made.surface_slip,
                  "separate": made.surface_separate}  # fmt: skip
         for plane in scene.colliders:
+            normal = np.array(plane["normal"], float)
+            raised = NODE_ON_WALL * scene.dx * normal / np.linalg.norm(normal)
             made.add_surface_collider(
-                list(plane["point"]),
-                list(plane["normal"]),
+                (np.array(plane["point"], float) + raised).tolist(),
+                normal.tolist(),
                 kinds[str(plane["kind"])],
                 float(plane.get("friction", 0.0)),
             )

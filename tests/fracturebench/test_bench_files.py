@@ -308,7 +308,7 @@ def test_one_table_of_several_methods(
     assert call(table, str(runs), *drawn) == 0
     first = page.read_text()
     assert "| gsfluent, cpu | glue, cpu |" in first
-    assert "| pull_apart | 0.001 | **" in first and "| 0.5 |" in first
+    assert "| pull_apart | 0.001 | **" in first and "| 0.5 (0/1) |" in first
     assert call(table, *drawn) == 0  # from the records alone
     assert page.read_text() == first
     (runs / "glue" / "bar.npz").write_bytes(b"")
@@ -329,7 +329,7 @@ def test_one_table_of_several_methods(
     peers.write_text("".join(lines))
     assert call(table, str(peers), *drawn) == 0
     assert "| gsfluent, cpu | glue, cpu | peer, cpu |" in page.read_text()
-    assert "| 0.5 | 0.2 |" in page.read_text()
+    assert "| 0.5 (0/1) | 0.2 (0/1) |" in page.read_text()
 
 
 def test_ladder_and_references_enter_the_page(

@@ -19,7 +19,8 @@ from gsfluent.figure.choice import draw_choice
 from gsfluent.pipeline.choose import Probing, choose
 from gsfluent.pipeline.choose_fit import History, fit_history
 from gsfluent.pipeline.choose_pick import pick, ranked
-from gsfluent.pipeline.choose_probe import Seen, window
+from gsfluent.pipeline.choose_probe import Probe, Seen, window
+from gsfluent.pipeline.choose_seconds import measured_rates, work_of
 from gsfluent.scene import Scene
 
 SIZES = (1 / 10, 1 / 14, 1 / 20)
@@ -65,6 +66,12 @@ def test_a_scalar_gives_the_order_of_roache() -> None:
     history = History("x", (0.4, 0.2, 0.1), tuple(np.full((1, 1, 1), v) for v in values))
     # the order is looked for on a grid of 0.025
     assert fit_history(history).order == pytest.approx(p, abs=0.0126)
+
+
+def test_the_distance_to_a_finer_grid_leaves_out_what_both_are_off_by() -> None:
+    fit = fit_history(made(1.0, 4.0))
+    wanted = true_error(1.0, 4.0, 1 / 20) - true_error(1.0, 4.0, 1 / 40)
+    assert np.median(fit.gaps(1 / 20, 1 / 40)) == pytest.approx(wanted, rel=1e-4)
 
 
 def test_an_order_beyond_what_the_method_has_is_not_believed() -> None:
@@ -233,3 +240,33 @@ def test_a_resolved_shot_with_an_error_reads_back(tmp_path: Path) -> None:
     _, shot = ball_shot(tmp_path, solve={"error": "3%"})
     assert shot.solve.error == 0.03
     assert Shot.from_dict(shot.resolved(), tmp_path) == shot
+
+
+def run_of(cells: int, steps: int, points: int, seconds: float) -> Probe:
+    empty = np.zeros(1)
+    seen = Seen({}, empty, empty, empty, np.zeros((1, 3)), empty, empty, 1.0, 1.0)
+    return Probe(
+        cells=cells, cfl=0.5, seed=0, seen=seen, seconds=seconds, points=points,
+        point_steps=np.array([float(steps * points)]), steps=steps, blocks=(cells / 4) ** 3,
+        fields=1, composed=0,
+    )  # fmt: skip
+
+
+def test_work_goes_with_the_cells() -> None:
+    """Points as the cube, steps as the cells and as one over the Courant number."""
+    whole = [run_of(10, 100, 1000, 1.0), run_of(20, 200, 8000, 16.0)]
+    work = work_of(whole, 40, 0.25)
+    assert work.points == pytest.approx(64_000)
+    assert work.steps == pytest.approx(800)
+    assert work.blocks == pytest.approx(1000)
+
+
+def test_rates_are_those_that_the_probes_were_made_with() -> None:
+    runs = [
+        run_of(cells, 10 * cells, cells**3, 10 * cells * (2e-3 + 1e-7 * cells**3))
+        for cells in (10, 14, 20)
+    ]
+    slow = run_of(20, 200, 8000, 99.0)  # disturbed: the fastest seed of a level counts
+    per_step, per_point = measured_rates([*runs, slow])
+    assert per_step == pytest.approx(2e-3, rel=1e-6)
+    assert per_point == pytest.approx(1e-7, rel=1e-6)
