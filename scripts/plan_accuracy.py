@@ -78,8 +78,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         "device": device.type,
         "commit": commit(),
         "taught": max((len(r) for r in model.ratios.values()), default=0),
-        "probe": {"seconds": model.seconds, "base_bytes": model.base_bytes,
-                  "probe_seconds": model.probe_seconds, "machine": model.machine},
+        "probe": {name: getattr(model, name) for name in ("seconds", "probe_seconds", "machine")},
         "alone": alone["stages"],
         "plan": plan["stages"],
         "actual": {
@@ -107,9 +106,7 @@ def shot_text(name: str, quality: str | None) -> str:
 def taught(line: dict[str, Any], others: list[dict[str, Any]]) -> dict[str, Cost]:
     """What a model says to a shot that has learned from other shots, by stage."""
     probe = line["probe"]
-    model = CostModel(
-        machine=probe["machine"], seconds=probe["seconds"], base_bytes=probe["base_bytes"]
-    )
+    model = CostModel(machine=probe["machine"], seconds=probe["seconds"])
     for other in others:
         for name, fact in other["actual"].items():
             said = model.stage(name, other["work_actual"][name], corrected=False)
@@ -210,8 +207,7 @@ def fit_memory(lines: list[dict[str, Any]]) -> dict[str, Any]:
                 Sample(
                     stage,
                     line["work_actual"][stage],
-                    line["actual"][stage]["memory_bytes"]
-                    - (line["probe"]["base_bytes"] if device == "cpu" else 0),
+                    line["actual"][stage]["memory_bytes"],
                 )
                 for line in mine
                 if stage in line["actual"]

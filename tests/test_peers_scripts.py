@@ -291,6 +291,10 @@ def test_the_table_of_demos_divides_times_at_equal_error(peers: dict[str, Module
     ]  # fmt: skip
     last = demo.table(rows, "cuda").splitlines()[-1]
     assert last.endswith("| 200 | 120 |") and "| 0.2000 |" in last and ", 2.00, 0.5" in last
+    setting = importlib.import_module("types").SimpleNamespace(name="thing")
+    assert demo.target(rows, setting, "pipeline") == 0.2
+    rows[0]["error"] = 1.2
+    assert demo.target(rows, setting, "pipeline") == 0.5, "an error of one is no answer"
     assert demo.table(rows[:2], "cuda").splitlines()[-1].count("no run") == 1
 
 
