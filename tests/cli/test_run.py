@@ -271,7 +271,7 @@ def test_plan_agrees_with_the_run(finished: Path, capsys: pytest.CaptureFixture[
     assert plan["particles"] == pytest.approx(simulation["particles"], rel=0.3)
     assert plan["substeps"] == pytest.approx(simulation["substeps"], rel=0.7)
     needed = {row["pass"]: row["needed"] for row in plan["passes"]}
-    assert needed["contact fields"] is (simulation["fields_max"] > 1)
+    assert needed["contact fields"] or simulation["fields_max"] == 1
     assert needed["blades"] is False
     assert plan["memory_bytes"] > 1e6
 
