@@ -62,14 +62,14 @@ class Trial:
 
 TRIALS = {
     "orange_dropped": Trial(
-        "orange", "milk_poured", 0.03,
+        "orange", "milk_poured", 0.1,
         {"objects": {"orange": {"material": "rubber"}},
          "events": [{"type": "drop", "height": 0.4}],
          "output": {"fps": 120, "seconds": 0.5}},
     ),
-    "milk_poured": Trial("orange", "milk_poured", 0.3),
-    "bread_torn": Trial("bread", "bread_torn", 0.3),
-    "watermelon_dropped": Trial("watermelon", "watermelon_dropped", 0.3),
+    "milk_poured": Trial("orange", "milk_poured", 0.4),
+    "bread_torn": Trial("bread", "bread_torn", 0.4),
+    "watermelon_dropped": Trial("watermelon", "watermelon_dropped", 0.5),
 }  # fmt: skip
 
 
@@ -140,14 +140,19 @@ def judge(name: str, trial: Trial, options: argparse.Namespace, device: Any) -> 
     ours = runs(scene, shot, taken["cells"], taken["cfl"], 3 if brittle else 2, FRESH, device)
     truth = runs(scene, shot, reference, CFL, 4 if brittle else 1, 0, device)
     frames = min(p.seen.frames for p in (*ours, *truth))
-    shown = histories([ours, truth], 0, frames, ours[0].seen)
+    shown = histories([ours, truth], probes.first, frames, ours[0].seen)
     actual = {}
     for history in shown:
         mean = history.values[1].mean(axis=0)
         gaps = [distance(run, mean) for run in history.values[0]]
         actual[history.name] = math.sqrt(float(np.mean(np.square(gaps))))
     apart = {
-        fit.name: fit.gaps(1 / taken["cells"], 1 / reference, growth.get(fit.name, 1.0))
+        fit.name: fit.gaps(
+            1 / taken["cells"],
+            1 / reference,
+            growth.mean.get(fit.name, 1.0),
+            growth.spread.get(fit.name, 1.0),
+        )
         for fit in fits
     }
     worst = max(actual, key=lambda key: actual[key])

@@ -205,7 +205,8 @@ def test_runs_are_judged_once_and_failures_are_told(
     assert good.settings["dx"] == 0.02 and "walls" not in good.settings
     assert collect.collect(tmp_path, out, "a machine") == []
     text = collect.table(collect.read(out))
-    assert "1 of 2 runs" in text and "not finite" in text and "before t" not in text
+    assert text.splitlines()[-1].startswith("| pull_apart | flight | 2 | ")
+    assert text.endswith("| not finite (1) |"), "told without the time at which it happened"
     page = tmp_path / "peers.md"
     page.write_text("# Peers\n")
     data, collect.DATA = collect.DATA, tmp_path
@@ -225,7 +226,7 @@ def test_dear_runs_are_left_out_and_said(peers: dict[str, ModuleType], tmp_path:
     taken, left = every.jobs("physgaussian", scenes, tmp_path, options)
     whole = len(every.PEERS["physgaussian"][0].courant) * len(scenes)
     assert taken and left and len(taken) + len(left) == whole
-    assert {job["courant"] for job in taken} >= {0.37}, "its own step comes first"
+    assert {job["courant"] for job in taken} >= {0.7}, "its fastest step comes first"
 
 
 def write_config(folder: Path, **keys: Any) -> Path:
@@ -290,7 +291,11 @@ def test_the_table_of_demos_divides_times_at_equal_error(peers: dict[str, Module
     ]  # fmt: skip
     last = demo.table(rows, "cuda").splitlines()[-1]
     assert last.endswith("| 200 | 120 |") and "| 0.2000 |" in last and ", 2.00, 0.5" in last
-    assert demo.table(rows[:2], "cuda").splitlines()[-1].count("not reached") == 1
+    setting = importlib.import_module("types").SimpleNamespace(name="thing")
+    assert demo.target(rows, setting, "pipeline") == 0.2
+    rows[0]["error"] = 1.2
+    assert demo.target(rows, setting, "pipeline") == 0.5, "an error of one is no answer"
+    assert demo.table(rows[:2], "cuda").splitlines()[-1].count("no run") == 1
 
 
 def test_the_file_of_failures_says_what_was_seen(peers: dict[str, ModuleType]) -> None:

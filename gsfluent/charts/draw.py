@@ -20,6 +20,8 @@ from gsfluent.io.atomic import atomic_path
 __all__ = ["Chart", "gathered", "of_records"]
 
 OURS = "gsfluent"
+_BASES = ("dx", "textbook", "adaptive")
+"""Knobs whose runs are a method's base."""
 _XLABEL = "wall ms per simulated ms"
 
 
@@ -95,6 +97,9 @@ class Chart:
         found = []
         if len(self.machines) > 1:
             found.append(f"Times were taken on different machines: {'; '.join(self.machines)}.")
+        ours = cases(r for r in self.records if r.method == OURS)
+        if theirs := [c for c in cases(self.records) if ours and c not in ours]:
+            found.append(f"Run by peers only, and not drawn: {', '.join(theirs)}.")
         commits = list(dict.fromkeys(r.commit for r in self.records if r.method == OURS))
         if len(commits) > 1:
             found.append(f"gsfluent's runs are of several commits: {', '.join(commits)}.")
@@ -161,7 +166,10 @@ class Chart:
         head = ["method", "setting", "runs", "median error over the base's", "from", "to",
                 "median time over the base's", "broke off"]  # fmt: skip
         rows = []
-        turned = [r for r in self.records if r.variant and r.settings.get("trades", True)]
+        turned = [
+            r for r in self.records
+            if r.settings.get("knob", "dx") not in _BASES and r.settings.get("trades", True)
+        ]  # fmt: skip
         for method, variant in dict.fromkeys((r.method, r.variant) for r in turned):
             mine = [r for r in turned if (r.method, r.variant) == (method, variant)]
             pairs = [(r, b) for r in mine if r.ok and (b := _base(self.records, r)) and b.ok]
@@ -199,7 +207,9 @@ class Chart:
     # --- figure ---
 
     def _panels(self) -> list[Panel]:
-        return [self._panel(case) for case in cases(self.records)]
+        """Of the cases that gsfluent ran; of all if it ran none."""
+        ours = cases(r for r in self.records if r.method == OURS)
+        return [self._panel(case) for case in ours or cases(self.records)]
 
     def _panel(self, case: str) -> Panel:
         mine = [r for r in self.records if r.case == case]
@@ -285,11 +295,11 @@ def _band(records: Iterable[Record]) -> float | None:
 
 def _base(records: Iterable[Record], record: Record) -> Record | None:
     """The run of the same case, method and rung at the defaults."""
+    dx = record.settings.get("dx")
+    same = (r for r in records if (r.case, r.method) == (record.case, record.method))
     return next(
-        (r for r in records if r.case == record.case and r.method == record.method
-         and r.variant == "" and r.settings.get("dx") == record.settings.get("dx")),
-        None,
-    )  # fmt: skip
+        (r for r in same if r.settings.get("knob") in _BASES and r.settings.get("dx") == dx), None
+    )
 
 
 def _row(cells: Sequence[Any]) -> str:

@@ -7,6 +7,7 @@ the chart it moves a run. What is changed by no knob stands at gsfluent's defaul
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -54,6 +55,8 @@ _OFF: dict[str, dict[str, Any]] = {
     "rest": {"sleep": False},
 }
 _OFF_RUNGS = (0.025, 0.0167)
+_COARSER = {"collide": 0.025, "oblique": 0.025, "pull_apart": 0.04}
+"""Where the coarsest rung is far better than any peer: grids on which few cells make a body."""
 _FINER = (1.5, 2.0, 3.0, 4.0)
 _MOST_POINTS = 4.5e5
 _MOST_NUMBERS = 1.2e7
@@ -127,7 +130,7 @@ def ladder(
     quick: bool = False,
     textbook: bool = True,
 ) -> list[Setting]:
-    """All settings, base ladders of all cases first, so that a budget cuts knobs and not cases.
+    """All settings, ladders over all rungs first, so that a budget cuts knobs and not cases.
 
     Args:
         names: Cases; default: all.
@@ -153,6 +156,8 @@ def ladder(
     steps = {case.name: rungs(case, device, quick) for case in chosen}
     for case in chosen:
         found += [Setting(case.name, dx) for dx in steps[case.name]]
+    for case in chosen if not quick else ():
+        found += _cheap(case, steps[case.name])
     references = [_textbook(case, steps[case.name], device, quick) for case in chosen if textbook]
     found += [s for made in references for s in made if s.knob == "textbook"]
     for case in chosen:
@@ -169,6 +174,18 @@ def ladder(
     return [s for s in found if s.knob in wanted]
 
 
+def _cheap(case: Case, steps: Sequence[float]) -> Iterator[Setting]:
+    """Settings that cost little, over all rungs: long steps, few points, and both."""
+    coarser = [_COARSER[case.name]] if case.name in _COARSER else []
+    for dx in coarser:
+        yield Setting(case.name, dx)
+    for dx in [*coarser, *steps]:
+        yield Setting(case.name, dx, knob="cfl", variant="CFL 0.8", options={"cfl": 0.8})
+        if case.kind != "fracture":
+            both = {"cfl": 0.8}
+            yield Setting(case.name, dx, 1, OURS, "ppc", "1 per cell, CFL 0.8", both)
+
+
 def _two(steps: Sequence[float], kind: str) -> list[float]:
     """The two rungs on which knobs are turned; of fracture (ensembles) the coarse ones."""
     if kind == "fracture":
@@ -179,7 +196,7 @@ def _two(steps: Sequence[float], kind: str) -> list[float]:
 
 
 def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]:
-    scene: Scene = case.build(dx, 8)
+    scene: Scene = case.build(max(case.ladder), 8)  # for its bodies and laws
 
     def turned(
         knob: str, variant: str, ppc: int = 8, trades: bool = True, **options: Any
@@ -191,7 +208,6 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("free", "shuffled points", trades=False, shuffle=1)
     if quick:
         return
-    yield turned("cfl", "CFL 0.8", cfl=0.8)
     yield turned("cfl", "CFL 0.1", cfl=0.1)
     yield turned("ppc", "1 per cell", 1)
     yield turned("ppc", "27 per cell", 27)
@@ -207,7 +223,7 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
         yield turned("fields", "one field", fields=False)
     if any(m["law"] == "nacc" for m in scene.materials):
         yield turned("return_map", "explicit alpha", implicit=False)
-        yield turned("return_map", "fixed centre", k=0.0)
+        yield turned("return_map", "fixed centre", k=math.inf)
 
 
 def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> list[Setting]:
@@ -221,7 +237,7 @@ def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> l
     coarse = steps[: 2 if case.kind == "fracture" else 3]
     found = [variant(dx, "textbook", "APIC, F", **base) for dx in coarse]
     if device.startswith("cuda"):
-        found = found[-2:]
+        return found[-1:]
     at = coarse[0] if case.kind == "fracture" else coarse[min(1, len(coarse) - 1)]
     return [
         *found,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import json
 import math
 import os
@@ -231,6 +232,7 @@ def of_run(
     )  # fmt: skip
 
 
+@functools.cache
 def machine(device: str) -> str:
     """Name of a device: the GPU, or the processor with the cores this process may use."""
     if device.startswith("cuda"):
@@ -250,6 +252,7 @@ def machine(device: str) -> str:
     return f"{name}, {threads or cores} of {cores} cores"
 
 
+@functools.cache
 def commit() -> str:
     """Short commit of the checkout that gsfluent is imported from, else its version."""
     import gsfluent

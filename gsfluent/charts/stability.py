@@ -13,7 +13,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,10 +73,12 @@ class Axis:
         return self.span[0] <= value <= self.span[1]
 
     def coarse(self) -> tuple[Value, ...]:
-        """Three of its values: the default, and the ends."""
-        ends = [self.values[0], self.default, self.values[-1]]
+        """Three of its values: the default, the ends, or the middle where these are two."""
         if self.words:
-            ends = list(self.values[:3])
+            return self.values[:3]
+        ends = {self.values[0], self.default, self.values[-1]}
+        if len(ends) == 2:
+            ends.add(self.values[len(self.values) // 2])
         return tuple(v for v in self.values if v in ends)
 
 
@@ -89,7 +91,7 @@ class Place:
     @property
     def every(self) -> int:
         """Steps between two looks: a look costs a GPU far more than a step."""
-        return 8 if self.device == "cpu" else 24
+        return 8 if self.device == "cpu" else 40
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +123,7 @@ class Map:
         test: Name of the test of its boundary.
         note: What to see.
         gpu: Whether it belongs to the subset that is run on a GPU.
+        x_labels: Words of the horizontal axis of variants for which it is another quantity.
     """
 
     name: str
@@ -132,6 +135,7 @@ class Map:
     test: str
     note: str = ""
     gpu: bool = False
+    x_labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,16 +148,16 @@ class Point:
         x: Where.
         y: Where.
         limit: Steps it was run for at most.
-        step: Steps to the first violation; None when it held.
-        kind: Of the violation, or empty.
-        value: What was found, None where that is not a number.
-        note: Why a solver stopped.
         points: Material points.
         seconds: Wall time.
         device: ``cpu`` or ``cuda``.
         machine: Processor and cores, or the GPU.
         commit: Of gsfluent.
         date: ISO 8601, UTC.
+        step: Steps to the first violation; None when it held.
+        kind: Of the violation, or empty.
+        value: What was found, None where that is not a number.
+        note: Why a solver stopped.
     """
 
     map: str
@@ -161,21 +165,26 @@ class Point:
     x: Value
     y: Value
     limit: int
-    step: int | None
-    kind: str
-    value: float | None
-    note: str
     points: int
     seconds: float
     device: str
     machine: str
     commit: str
     date: str
+    step: int | None = None
+    kind: str = ""
+    value: float | None = None
+    note: str = ""
 
     @property
     def holds(self) -> bool:
         """Whether nothing was broken."""
         return self.step is None
+
+    def line(self) -> str:
+        """One line of strict JSON without what is empty."""
+        plain = {k: v for k, v in dataclasses.asdict(self).items() if v not in (None, "")}
+        return json.dumps(plain, allow_nan=False, separators=(",", ":")) + "\n"
 
     @property
     def key(self) -> str:
@@ -297,7 +306,7 @@ def run_maps(
             file.write("\n")  # what a stopped run left: the half line is skipped when read
         for point in _each(todo, jobs):
             point = dataclasses.replace(point, commit=version)
-            file.write(json.dumps(dataclasses.asdict(point), allow_nan=False) + "\n")
+            file.write(point.line())
             file.flush()
             have[point.key] = point
             done += 1
@@ -333,6 +342,7 @@ def _alone() -> None:
 
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Point))
+_MUST = _NAMES[: _NAMES.index("device") + 1]
 
 
 def read(path: str | Path) -> list[Point]:
@@ -354,11 +364,12 @@ def read(path: str | Path) -> list[Point]:
             if not line.strip() or not line.endswith("}"):
                 continue  # cut off when the run was stopped
             data = None
-        if not isinstance(data, dict) or any(name not in data for name in _NAMES):
+        if not isinstance(data, dict) or any(name not in data for name in _MUST):
             raise InputError(
                 f"{path}, line {number}: not a point of a stability map",
                 "give the file that `gsfluent stability` wrote, or another name",
             )
-        point = Point(**{name: data[name] for name in _NAMES})
+        given = dict.fromkeys(("machine", "commit", "date"), "")
+        point = Point(**(given | {name: data[name] for name in _NAMES if name in data}))
         found[point.key] = point
     return list(found.values())

@@ -69,8 +69,8 @@ def early_point(reach: float, gap: float, variant: str, place: Place) -> Outcome
 
 register(
     Map(
-        "early_contact", "Two bodies approach and have not touched yet",
-        Axis("reach", "contact_gap: distance of centroids that counts as contact [dx]",
+        "early_contact", "Two bodies that have not touched yet",
+        Axis("reach", "contact_gap [dx]",
              (0.6, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.75, 2.0, 2.5), 1.0),
         Axis("gap", "gap that is left [dx]",
              (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5), 0.5, setting=False,

@@ -87,7 +87,7 @@ def map_point(k: float, epsilon: float, variant: str, place: Place) -> Outcome:
 
 register(
     Map(
-        "return_map", "A brittle ball: exponent and regularisation of the return map",
+        "return_map", "A brittle ball: k and epsilon of the return map",
         Axis("k", "k, exponent of the dynamic centre (100: fixed centre)",
              (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0, 100.0), 2.0),
         Axis("epsilon", "epsilon, its regularisation", (0.0, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5), 0.1,
@@ -114,7 +114,7 @@ def centre_point(courant: float, which: str, variant: str, place: Place) -> Outc
 
 register(
     Map(
-        "centre", "A brittle ball: fixed or dynamic centre, explicit or implicit alpha",
+        "centre", "A brittle ball: variants of the return map",
         COURANT, Axis("map", "return map", tuple(MAPS), "dynamic, implicit"),
         ("gsfluent",), centre_point, "test_boundary_courant_number_brittle_ball",
         "Sums are exact and divisions guarded here, so that the map alone is seen.", gpu=True,
@@ -153,7 +153,7 @@ def impact_point(courant: float, mach: float, variant: str, place: Place) -> Out
 
 register(
     Map(
-        "impact", "A brittle ball hits a floor: from a touch to twice the speed of sound", COURANT,
+        "impact", "A brittle ball hits a floor", COURANT,
         Axis("mach", "speed over wave speed, v / c", (0.03, 0.1, 0.2, IMPACT, 0.5, 0.7, 1.0, 2.0),
              IMPACT, setting=False),
         ("gsfluent", "fixed centre, explicit"), impact_point,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from gsfluent.charts.stability import KIND_WORDS, LETTERS, Axis, Map, Point, Value
-from gsfluent.figure.map import Cell, Mark, Plane, draw_planes
+from gsfluent.figure.map import Cell, Mark, Plane, draw_planes, place_of
 from gsfluent.figure.page import Page
 
 __all__ = ["Boundary", "boundaries", "others", "planes", "table", "worst", "write_all"]
@@ -138,8 +139,13 @@ def others(m: Map, points: Iterable[Point]) -> list[tuple[str, int, int]]:
     return rows
 
 
-def planes(m: Map, points: Iterable[Point], marks: Sequence[Mark] = ()) -> list[Plane]:
+Marks = Mapping[tuple[str, str], Sequence[Mark]]
+"""Named points by (map, variant)."""
+
+
+def planes(m: Map, points: Iterable[Point], marks: Marks | None = None) -> list[Plane]:
     """The panels of a map."""
+    marks = marks or {}
     points = [p for p in points if p.map == m.name]
     result = []
     for n, variant in enumerate(m.variants):
@@ -154,13 +160,38 @@ def planes(m: Map, points: Iterable[Point], marks: Sequence[Mark] = ()) -> list[
         star = (m.x.values.index(m.x.default), m.y.values.index(m.y.default))
         result.append(
             Plane(
-                title=m.title if n == 0 else "", subtitle=variant, x_label=m.x.label,
+                title=m.title if n == 0 else "", subtitle=variant, 
+                x_label=m.x_labels.get(variant, m.x.label),
                 y_label=m.y.label, xs=m.x.values, ys=m.y.values, cells=cells,
                 limit=max(p.limit for p in own), star=star if n == 0 else None,
-                marks=marks if n == len(m.variants) - 1 else (),
+                marks=marks.get((m.name, variant), ()),
             )
         )  # fmt: skip
     return result
+
+
+def named(m: Map, points: Sequence[Point], marks: Marks) -> list[str]:
+    """What became of the named points of a map; one between cells is judged by those around it."""
+    lines = []
+    for variant in m.variants:
+        found = {(p.x, p.y): p for p in points if p.map == m.name and p.variant == variant}
+        for mark in marks.get((m.name, variant), ()):
+            x, y = place_of(m.x.values, mark.x), place_of(m.y.values, mark.y)
+            if x is None or y is None:
+                continue
+            around = [
+                found.get((m.x.values[i], m.y.values[j]))
+                for i in {math.floor(x), math.ceil(x)} for j in {math.floor(y), math.ceil(y)}
+            ]  # fmt: skip
+            bad = [p for p in around if p is not None and not p.holds]
+            what = "holds"
+            if bad:
+                what = f"{bad[0].kind}, step {bad[0].step}"
+            elif None in around:
+                continue
+            at = f"{_shown(mark.x)} and {_shown(mark.y)}"
+            lines.append(f"{mark.name}: {m.name}, {variant}, at {at}: {what}")
+    return lines
 
 
 MARGIN = 1.2
@@ -195,19 +226,22 @@ def least(found: Sequence[Boundary]) -> Boundary | None:
 
 
 def table(maps: Sequence[Map], points: Sequence[Point]) -> list[tuple[str, ...]]:
-    """One row per map and numeric axis: the walk of least margin within the span."""
+    """One row per map and axis that is no list of words.
+
+    Of a setting the walk of least margin over the scenes it is meant for, of a scene the walk from
+    the star.
+    """
     rows = []
     for m in maps:
         walks = worst(m, points)
         for axis in (m.x, m.y):
             own = [b for b in walks if b.axis is axis]
-            if not own:
+            if not axis.setting:
+                own = [b for b in own if b.at == _star(m, axis)]
+            if axis.words or not own:
                 continue
-            tight = least(own)
-            if tight is None:
-                bounded = [b for b in own if b.fails is not None]
-                tight = (bounded or [b for b in own if b.at == _star(m, axis)] or own)[0]
-            rows.append(row(tight))
+            bounded = [b for b in own if b.fails is not None]
+            rows.append(row(least(own) or (bounded or own)[0]))
     return rows
 
 
@@ -243,7 +277,7 @@ def write_all(
     maps: Sequence[Map],
     points: Sequence[Point],
     out: Path,
-    marks: dict[str, list[Mark]] | None = None,
+    marks: Marks | None = None,
 ) -> Path:
     """Draw every map into ``out`` and put all on one page.
 
@@ -268,7 +302,7 @@ def write_all(
     page.heading("Least margins").table(HEAD, table(drawn, points))
     for m in drawn:
         picture = draw_planes(
-            planes(m, points, marks.get(m.name, ())), out / f"stability_{m.name}.png",
+            planes(m, points, marks), out / f"stability_{m.name}.png",
             kinds=LETTER_WORDS, columns=3,
         )  # fmt: skip
         page.heading(m.title)
@@ -280,6 +314,5 @@ def write_all(
             f"{variant}: fails {failed} of {count} points where gsfluent holds"
             for variant, failed, count in others(m, points)
         )
-        page.listing(f"{mark.name}: {_shown(mark.x)}, {_shown(mark.y)}" for mark in
-                     marks.get(m.name, ()))  # fmt: skip
+        page.listing(named(m, points, marks))
     return page.write(out / "stability.html")

@@ -40,7 +40,7 @@ def block(cells: float = 3.0, per_cell: int = 8) -> tuple[Tensor, float]:
     return box([0.0] * 3, [cells * DX] * 3, spacing) + SHIFT, spacing**3
 
 
-def clusters(size: int, count: int = 16, seed: int = 3) -> tuple[Tensor, float]:
+def clusters(size: int, count: int = 64, seed: int = 3) -> tuple[Tensor, float]:
     """Clusters of ``size`` points within a cell, twelve cells apart, and the volume of a point."""
     generator = torch.Generator().manual_seed(seed)
     side = math.ceil(count ** (1.0 / 3.0))

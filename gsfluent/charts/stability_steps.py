@@ -72,8 +72,9 @@ register(
              (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0), 0.1, setting=False,
              span=(0.0, 1.0)),
         (AUTOMATIC, FIXED), speed_point, "test_boundary_courant_number_ball_on_a_floor",
-        "A fixed step knows the waves and not the speed (its axis: c dt / dx). Above the wave "
-        "speed matter is squeezed to the end of the range of J, whatever the step.", gpu=True,
+        "A fixed step knows the waves and not the speed. At three times the wave speed matter is "
+        "squeezed to the end of the range of J, whatever the step.", gpu=True,
+        x_labels={FIXED: "c dt / dx"},
     )
 )  # fmt: skip
 
@@ -121,7 +122,7 @@ register(
 
 
 def fragment_point(courant: float, size: float, variant: str, place: Place) -> Outcome:
-    """Sixteen shaken clusters of a few points each."""
+    """Sixty-four shaken clusters of a few points each."""
     return watched(shaken(*clusters(int(size)), courant, place), STEPS, place)
 
 
@@ -131,7 +132,7 @@ register(
         Axis("size", "points in a cluster", tuple(float(n) for n in range(1, 9)), 8.0,
              setting=False, log=False),
         ("gsfluent",), fragment_point, "test_boundary_courant_number_isolated_fragments",
-        "Sixteen random clusters each. What broke off is the first to blow up: its nodes have "
+        "Sixty-four random clusters each. What broke off is the first to blow up: its nodes have "
         "little mass.", gpu=True,
     )
 )  # fmt: skip
@@ -183,7 +184,7 @@ def stiffness_point(young: float, speed: float, variant: str, place: Place) -> O
 
 register(
     Map(
-        "stiffness_speed", "A ball hits a floor: squeezed flat, or too stiff for the step",
+        "stiffness_speed", "A ball: squeezed flat, or too stiff",
         Axis("young", "Young's modulus [Pa]", (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8), 1e5,
              setting=False, span=(1e3, 1e8)),
         Axis("speed", "speed [m/s]", (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0), 1.0, setting=False,

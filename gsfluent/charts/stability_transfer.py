@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
 from gsfluent.charts.stability import Axis, Map, Outcome, Place, register
-from gsfluent.charts.stability_scenes import DENSITY, DX, YOUNG, block, noise, watched
+from gsfluent.charts.stability_matter import COURANT, HARDENING, STEPS
+from gsfluent.charts.stability_scenes import (
+    BRITTLE,
+    DENSITY,
+    DX,
+    IMPACT,
+    SPACING,
+    STRENGTH,
+    YOUNG,
+    block,
+    brittle,
+    brittle_points,
+    noise,
+    watched,
+)
 from gsfluent.charts.stability_steps import courant_axis, shaken
 from gsfluent.charts.stability_textbook import scene_of, watched_textbook
 from gsfluent.lab.driver import World
 from gsfluent.lab.shapes import box, parameters
-from gsfluent.lab.slab import wave_speed
+from gsfluent.lab.slab import nacc, wave_speed
+from gsfluent.lab.violations import Limits
 
 ELASTIC = {
     "law": "elastic", "young_modulus": YOUNG, "poisson_ratio": 0.3, "density": DENSITY,
@@ -120,5 +136,65 @@ register(
              (0.03, 0.1, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), 0.3, setting=False),
         Axis("kernel", "kernel and transfer", KERNELS, "gsfluent"),
         ("free bar",), kernel_point, "test_boundary_kernel_of_crossed_cells",
+    )
+)  # fmt: skip
+
+# --- what released solvers do with brittle matter ---
+
+SOLVERS: dict[str, dict[str, Any]] = {
+    "gsfluent": {},
+    "dynamic, implicit": {"return_map": "dynamic_implicit"},
+    "dynamic, explicit": {"return_map": "dynamic_explicit"},
+    "fixed, explicit": {"return_map": "fixed_explicit"},
+    "as released by ziran": {"return_map": "fixed_explicit", "absolute": True},
+    "flip 0.99": {"return_map": "fixed_explicit", "transfer": "flip", "flip": 0.99},
+    "stress of claymore": {
+        "return_map": "fixed_explicit", "absolute": True, "energy_as_pressure": True,
+    },
+    "force of GaussianFluent": {
+        "return_map": "released_explicit", "absolute": True, "transfer": "flip", "flip": 0.99,
+        "force": "twice", "guarded": False,
+    },
+}  # fmt: skip
+"""Variants of the textbook solver (but for the first); what they are called after is what they
+have in common with that code (equations.md, 2.3 and section 13), not a run of it."""
+
+
+def released_point(courant: float, which: str, variant: str, place: Place) -> Outcome:
+    """The brittle ball by a textbook solver; its momentum is not judged, the floor's is unknown."""
+    if which == "gsfluent":
+        return watched(brittle(courant=courant, place=place), STEPS, place)
+    hardening = float(HARDENING.default)
+    row = nacc(
+        BRITTLE["young_modulus"], BRITTLE["poisson_ratio"], BRITTLE["density"],
+        friction=BRITTLE["friction"], cohesion=BRITTLE["cohesion"], hardening=hardening,
+    )  # fmt: skip
+    points, c = brittle_points(), wave_speed(row)
+    velocity = torch.zeros_like(points)
+    velocity[:, 2] = -IMPACT * c
+    material = {**BRITTLE, "law": "nacc", "hardening": hardening, "alpha": -STRENGTH / hardening}
+    floor = {
+        "point": [0.0, 0.0, 3.0 * SPACING], "normal": [0.0, 0.0, 1.0], "kind": "separate",
+        "friction": 0.3,
+    }  # fmt: skip
+    scene = scene_of(
+        points, velocity, (0.5 * SPACING) ** 3, material, dx=SPACING, gravity=(0.0, 0.0, -9.81),
+        colliders=[floor],
+    )  # fmt: skip
+    return watched_textbook(
+        scene, STEPS, place, dt=courant * SPACING / (c * (1.0 + IMPACT)),
+        limits=Limits(momentum=math.inf), **SOLVERS[which],
+    )  # fmt: skip
+
+
+register(
+    Map(
+        "released", "A brittle ball by other solvers",
+        Axis("courant", COURANT.label, (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.2, 1.5, 2.0, 3.0),
+             0.5),
+        Axis("solver", "solver", tuple(SOLVERS), "gsfluent"),
+        ("textbook variants",), released_point, "test_boundary_released_solvers",
+        "Two of them gain energy at any step: claymore's stress is the energy where its derivative "
+        "belongs, GaussianFluent's released force carries the weight twice.",
     )
 )  # fmt: skip

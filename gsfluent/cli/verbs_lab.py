@@ -173,13 +173,16 @@ class Stability(Verb):
     """Processes that share the work."""
     draw: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.jsonl ...")] = ()
     """Draw these lines and run nothing."""
+    peers: Path | None = None
+    """What scripts/peers/failures.py found in other programs, to be drawn with them."""
 
     def execute(self) -> dict[str, Any]:
         """Run what is missing and draw all of it."""
         from gsfluent.charts import stability
-        from gsfluent.charts.stability_peers import marks
+        from gsfluent.charts.stability_peers import marks, measured
         from gsfluent.charts.stability_report import verdict, write_all
 
+        programs = measured(existing(self.peers, "--peers", folder=False)) if self.peers else []
         maps = [m for name in self.maps for m in name.split(",") if m]
         if self.draw:
             wanted = stability.chosen(maps)
@@ -201,7 +204,7 @@ class Stability(Verb):
                     wanted, self.out / "stability.jsonl", device=device.type, quick=self.quick,
                     jobs=self.jobs, progress=progress,
                 )  # fmt: skip
-        page = write_all(wanted, points, self.out, marks(wanted))
+        page = write_all(wanted, points, self.out, marks(wanted, programs))
         drawn = [m for m in wanted if any(p.map == m.name for p in points)]
         return {
             "page": page,

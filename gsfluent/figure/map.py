@@ -104,13 +104,14 @@ def _words(value: Value) -> str:
 
 
 def draw_planes(
-    planes: Sequence[Plane],
+    planes: Sequence[Plane | None],
     path: str | Path,
     *,
     kinds: Mapping[str, str],
     columns: int = 2,
     title: str = "",
     dpi: int = 110,
+    cell: tuple[float, float] = (0.36, 0.24),
 ) -> Path:
     """Draw panels beside each other into one PNG.
 
@@ -118,34 +119,39 @@ def draw_planes(
     not, with the letter of what broke.
 
     Args:
-        planes: The panels.
+        planes: The panels, row by row; None leaves a gap.
         path: Of the PNG.
         kinds: Letter -> words, for the line below; those that occur are named.
         columns: Panels side by side.
         title: Over all.
         dpi: Of the PNG.
+        cell: Least width and height of a cell [inches].
 
     Raises:
         ValueError: No panels.
         RunError: The file cannot be written.
     """
-    if not planes:
+    drawn = [p for p in planes if p is not None]
+    if not drawn:
         raise ValueError("draw_planes: no panels")
     columns = min(columns, len(planes))
     lines = math.ceil(len(planes) / columns)
-    wide = max(len(p.xs) for p in planes)
-    tall = max(len(p.ys) for p in planes)
-    width = min(1.7 + 0.36 * wide, 6.6)
-    height = 1.35 + 0.24 * tall
+    wide = max(len(p.xs) for p in drawn)
+    tall = max(len(p.ys) for p in drawn)
+    width = min(1.7 + cell[0] * wide, 6.6)
+    height = 1.35 + cell[1] * tall
     with new_figure(width * columns, height * lines + 0.35 + 0.3 * bool(title)) as figure:
         grid = figure.subplots(lines, columns, squeeze=False).ravel()
         for axes, plane in zip(grid, planes, strict=False):
-            _draw(axes, plane)
+            if plane is None:
+                axes.remove()
+            else:
+                _draw(axes, plane)
         for axes in grid[len(planes) :]:
             axes.remove()
-        seen = {c.letter for p in planes for c in p.cells.values() if c.step is not None}
+        seen = {c.letter for p in drawn for c in p.cells.values() if c.step is not None}
         words = ["green: holds", *(f"{k}: {kinds[k]}" for k in kinds if k in seen)]
-        if any(p.star for p in planes):
+        if any(p.star for p in drawn):
             words.append("★ default")
         figure.supxlabel("   ".join(words), fontsize=7.5, color=INK)
         if title:
@@ -185,10 +191,16 @@ def _draw(axes: Any, plane: Plane) -> None:
         x, y = place_of(plane.xs, mark.x), place_of(plane.ys, mark.y)
         if x is None or y is None:
             continue
-        axes.plot(x, y, marker="o", markersize=5, color="#31579c", markeredgecolor="#ffffff")
+        for edge, width in (("#ffffff", 3.0), ("#31579c", 1.6)):  # a ring: the letter stays legible
+            axes.plot(
+                x, y, marker="o", markersize=11, markerfacecolor="none", markeredgecolor=edge,
+                markeredgewidth=width,
+            )  # fmt: skip
+        right = x > 0.5 * len(plane.xs)
         axes.annotate(
-            mark.name, (x, y), xytext=(5, 6 + 7 * (n % 2)), textcoords="offset points",
-            fontsize=6.5, color="#1b3157",
+            mark.name, (x, y), xytext=(-8 if right else 8, 7 + 7 * (n % 2)),
+            textcoords="offset points", ha="right" if right else "left", fontsize=6.5,
+            color="#1b3157",
             bbox={"facecolor": "#ffffff", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
         )  # fmt: skip
     axes.set_xlim(-0.5, len(plane.xs) - 0.5)

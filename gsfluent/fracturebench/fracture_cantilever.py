@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from .fracture_rows import BROKEN, brittle, damage_of
-from .fracture_slabs import sheet, slab_volume, walls
+from .fracture_slabs import heavy, sheet, slab_volume, walls
 from .registry import case
 from .run import Measure, Run
 from .scene import Floats, Scene, SceneError
@@ -17,7 +17,7 @@ from .statistics import stored_energy
 
 __all__ = ["crack_tip", "double_cantilever", "energy_beyond"]
 
-_HEIGHT, _NOTCH, _SPEED = 0.375, 0.25, 0.004
+_HEIGHT, _NOTCH, _SPEED = 0.375, 0.25, 0.001
 _SECTION = (0.125, 0.1875)
 _PLAIN = elastic(1e9, 0.2, 1000.0)
 
@@ -76,7 +76,7 @@ def _judge(scene: Scene, run: Run) -> Iterator[Measure]:
 def double_cantilever(dx: float, per_cell: int) -> Scene:
     """Double cantilever: a crack takes the energy per area that its material says, at every dx.
 
-    Arms of a notched slab are wedged apart at 0.004 c each after a ramp. A layer of an eighth of a
+    Arms of a notched slab are wedged apart at 0.001 c each after a ramp. A layer of an eighth of a
     metre around the middle can break, the rest is elastic.
     """
     row = brittle(
@@ -89,10 +89,12 @@ def double_cantilever(dx: float, per_cell: int) -> Scene:
     keep = (points[:, 0] > _NOTCH) | (np.abs(middle) > 1.01 * dx)
     points, middle = points[keep], middle[keep]
     end, edge = points[:, 0] < 0.0626, 0.5 * _HEIGHT - 0.0626
-    times = np.linspace(0.0, 10.0 / c, 161)[1:]
+    held = end & (np.abs(middle) > edge)
+    times = np.linspace(0.0, 14.0 / c, 141)[1:]
     return free(
-        "double_cantilever", points, [0.0, 0.0, 0.0], dx, per_cell, times, (_PLAIN, row),
-        material=(np.abs(middle) < 0.0625).astype(np.int32),
+        "double_cantilever", points, [0.0, 0.0, 0.0], dx, per_cell, times,
+        (_PLAIN, row, heavy(_PLAIN)),
+        material=np.where(held, 2, np.abs(middle) < 0.0625).astype(np.int32),
         volume=np.full(middle.size, slab_volume(dx, per_cell)), colliders=walls(dx),
         drives=tuple(
             {

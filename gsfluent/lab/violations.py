@@ -266,7 +266,9 @@ def _trial(moving: Moving, judge: Callable[[], Violation | None], steps: int) ->
     try:
         moving.advance(steps)
     except (FloatingPointError, ValueError) as error:
-        return Violation(0, "stopped", math.inf, 0.0, str(error).splitlines()[0])
+        why = str(error).splitlines()[0]
+        kind = "finite" if "not finite after" in why or "is not finite" in why else "stopped"
+        return Violation(0, kind, math.inf, 0.0, why)
     return judge()
 
 

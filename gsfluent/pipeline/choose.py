@@ -27,7 +27,16 @@ from gsfluent.pipeline.simulate_solver import CFL
 from gsfluent.pipeline.stage import Progress, report_progress
 from gsfluent.scene import Scene
 
-__all__ = ["LEVELS", "Probing", "Probes", "choose", "choose_setting", "run_probes", "summary"]
+__all__ = [
+    "LEVELS",
+    "Growth",
+    "Probing",
+    "Probes",
+    "choose",
+    "choose_setting",
+    "run_probes",
+    "summary",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -71,12 +80,25 @@ QUICK = Probing(levels=(8, 10, 12), frames=6, seeds=2)
 
 
 @dataclasses.dataclass(frozen=True)
+class Growth:
+    """Factors from the window to the end of the shot, by observable.
+
+    Attributes:
+        mean: On the error of the mean of many runs.
+        spread: On the scatter between runs.
+    """
+
+    mean: Mapping[str, float]
+    spread: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
 class Probes:
     """What was run.
 
     Attributes:
-        whole: The two coarsest levels over the whole shot, or the window where that is all.
-        levels: All levels over the window, by seed.
+        whole: Over the whole shot: the first runs of the two coarsest levels.
+        levels: All levels by seed, at least to the end of the window; the coarsest to the end.
         long: With the longer steps, Courant number to its runs on the middle level.
         first: First frame of the window.
         last: Last frame + 1.
@@ -146,7 +168,8 @@ def run_probes(
     levels = []
     for at, cells in enumerate(probing.levels):
         known = [coarse, second][at : at + 1]
-        levels.append((*known, *(go(cells, n, last) for n in range(len(known), seeds))))
+        until = total if at == 0 else last
+        levels.append((*known, *(go(cells, n, until) for n in range(len(known), seeds))))
     middle = probing.levels[1]
     long = {cfl: tuple(go(middle, n, last, cfl) for n in range(seeds)) for cfl in probing.cfl}
     report_progress(progress, done, done, "probed")
@@ -159,7 +182,7 @@ def choose_setting(
     seconds: Callable[[int, float], float],
     *,
     cells: Sequence[int] = CELLS,
-) -> tuple[Choice, list[Fit], dict[str, float]]:
+) -> tuple[Choice, list[Fit], Growth]:
     """Fit, extrapolate and choose.
 
     Args:
@@ -169,35 +192,49 @@ def choose_setting(
         cells: Settings offered.
 
     Returns:
-        The choice, the fits, and by observable the growth from the window to the whole shot.
+        The choice, the fits, and the growth from the window to the whole shot.
     """
     scale = probes.whole[0].seen
     shown = histories(probes.levels, probes.first, probes.last, scale)
     fits = fit_histories(shown)
-    growth = _growth(probes)
+    growth, spread = _growth(probes)
     steps: dict[float, dict[str, tuple[float, float]]] = {CFL: {}}
     for cfl, runs in probes.long.items():
         steps[cfl] = _step_error(shown, histories([runs], probes.first, probes.last, scale))
-    settings = ranked(fits, bound, seconds, growth=growth, steps=steps, cells=cells)
-    return pick(fits, settings, bound), fits, growth
+    settings = ranked(fits, bound, seconds, growth=growth, spread=spread, steps=steps, cells=cells)
+    return pick(fits, settings, bound, spread=spread), fits, Growth(growth, spread)
 
 
-def _growth(probes: Probes) -> dict[str, float]:
-    """Factor on the error from the window to the whole shot, at least 1, by observable.
+def _growth(probes: Probes) -> tuple[dict[str, float], dict[str, float]]:
+    """Factors from the window to the end of the shot, by observable.
 
-    What two coarse levels differ by over all frames, over what they differ by in the window.
+    On the error of the mean: what two coarse levels differ by beyond chance from the window's first
+    frame on, over the same in the window. On the scatter: that of the coarsest level. Frames before
+    anything happens have no error and would only dilute it.
     """
-    coarse, second = probes.whole
-    total = min(coarse.seen.frames, second.seen.frames)
-    pairs = []
-    for first, last in ((probes.first, probes.last), (0, total)):
-        shown = histories([(coarse,), (second,)], first, last, coarse.seen)
-        pairs.append({h.name: distance(h.values[0][0], h.values[1][0]) for h in shown})
-    inside, whole = pairs
-    return {
-        name: max(1.0, whole[name] / inside[name]) if inside.get(name, 0.0) > 0.0 else 1.0
-        for name in whole
-    }
+    coarse, second = probes.levels[0], probes.whole[1]
+    total = min(p.seen.frames for p in (*coarse, second))
+    change: list[dict[str, float]] = []
+    chance: list[dict[str, float]] = []
+    for first, last in ((probes.first, probes.last), (probes.first, total)):
+        shown = histories([coarse, (second,)], first, last, coarse[0].seen)
+        change.append({})
+        chance.append({})
+        for h in shown:
+            band = h.bands[0][1]
+            gap = distance(h.values[0].mean(axis=0), h.values[1][0])
+            beyond = gap**2 - band**2 * (1.0 + 1.0 / len(coarse))
+            change[-1][h.name] = math.sqrt(max(0.0, beyond))
+            chance[-1][h.name] = band
+
+    def ratio(pair: list[dict[str, float]]) -> dict[str, float]:
+        inside, whole = pair
+        return {
+            name: value / inside[name] if value > 0.0 and inside.get(name, 0.0) > 0.0 else 1.0
+            for name, value in whole.items()
+        }
+
+    return ratio(change), ratio(chance)
 
 
 def _step_error(
@@ -257,7 +294,7 @@ def choose(
 def summary(
     choice: Choice,
     fits: Sequence[Fit],
-    growth: Mapping[str, float],
+    growth: Growth,
     probes: Probes,
     probing: Probing,
     source: str,
@@ -290,7 +327,8 @@ def summary(
                 "order_spread": _rounded(float(fit.orders.std())),
                 "error_finest": _rounded(float(np.median(fit.error))),
                 "band": _rounded(fit.history.band),
-                "growth": _rounded(growth.get(fit.name, 1.0)),
+                "growth": _rounded(growth.mean.get(fit.name, 1.0)),
+                "spread": _rounded(growth.spread.get(fit.name, 1.0)),
                 "misfit": _rounded(fit.misfit),
                 "parallel": _rounded(fit.parallel),
                 "asymptotic": fit.asymptotic,

@@ -39,12 +39,14 @@ class History:
             units of the observable's own scale, so that 0.03 is an error of 3 %.
         chaotic: Runs differ by chance on every level alike (matter has broken): the scatter between
             seeds does not shrink with the cells.
+        most: No error is larger: 1 for shares.
     """
 
     name: str
     sizes: tuple[float, ...]
     values: tuple[Array, ...]
     chaotic: bool = False
+    most: float = math.inf
 
     @property
     def band(self) -> float:
@@ -103,18 +105,20 @@ class Fit:
         """Drawn rms errors of the mean of many runs at a size of cells, [D]."""
         return np.asarray(self.error * (size / self.finest) ** self.orders)
 
-    def gaps(self, size: float, finer: float, growth: float = 1.0) -> Array:
+    def gaps(self, size: float, finer: float, growth: float = 1.0, spread: float = 1.0) -> Array:
         """Drawn rms differences of one run from the mean of many on finer cells, [D].
 
         What both are off by in the same direction is not in it. ``growth`` is a factor on the
-        difference of the means.
+        difference of the means, ``spread`` one on the scatter.
         """
         mean = growth * (self.mean_errors(size) - self.mean_errors(finer))
-        return np.asarray(np.hypot(mean, self.history.scatter(size)))
+        whole = np.hypot(mean, spread * self.history.scatter(size))
+        return np.asarray(np.minimum(whole, self.history.most))
 
     def errors(self, size: float) -> Array:
         """Drawn rms errors of one run at a size of cells, [D]: of the mean, and its scatter."""
-        return np.asarray(np.hypot(self.mean_errors(size), self.history.scatter(size)))
+        whole = np.hypot(self.mean_errors(size), self.history.scatter(size))
+        return np.asarray(np.minimum(whole, self.history.most))
 
     @property
     def asymptotic(self) -> bool:

@@ -88,6 +88,7 @@ def ranked(
     seconds: Callable[[int, float], float],
     *,
     growth: Mapping[str, float] | None = None,
+    spread: Mapping[str, float] | None = None,
     steps: Mapping[float, Mapping[str, tuple[float, float]]] | None = None,
     cells: Sequence[int] = CELLS,
 ) -> list[Setting]:
@@ -97,7 +98,9 @@ def ranked(
         fits: Errors of each observable; sizes of the cells are 1 / cells.
         bound: What was asked for.
         seconds: Wall time of (cells, cfl) [s].
-        growth: Factor by observable from the frames that were probed to all; 1 when absent.
+        growth: Factor by observable on the error of the mean, from the frames that were probed to
+            all; 1 when absent.
+        spread: The same on the scatter between runs.
         steps: By Courant number what it adds: observable to (error, size of the cells it was
             measured at). The probes' own has an empty mapping.
         cells: Those offered; coarser ones than were probed are left out.
@@ -112,12 +115,14 @@ def ranked(
             size = 1.0 / count
             if size > coarsest * (1.0 + 1e-9):
                 continue
-            pairs = [_errors(fit, size, growth or {}, added) for fit in fits]
-            rows = np.stack([error for error, _ in pairs])
+            bands = [_band(fit, size, spread or {}) for fit in fits]
+            means = [_mean(fit, size, growth or {}, added) for fit in fits]
+            rows = np.stack([
+                np.minimum(np.hypot(mean, band), fit.history.most)
+                for fit, mean, band in zip(fits, means, bands, strict=True)
+            ])  # fmt: skip
             worst = rows.max(axis=0)
-            settled = np.stack([mean for _, mean in pairs]) <= np.array(
-                [[max(bound, fit.history.scatter(size))] for fit in fits]
-            )
+            settled = np.stack(means) <= np.array([[max(bound, band)] for band in bands])
             low, middle, high = np.quantile(worst, [0.05, 0.5, 0.95])
             most = np.bincount(rows.argmax(axis=0), minlength=len(fits)).argmax()
             found.append(
@@ -139,29 +144,41 @@ def ranked(
     return sorted(found, key=lambda s: (s.seconds, s.cells, -s.cfl))
 
 
-def _errors(
+def _band(fit: Fit, size: float, spread: Mapping[str, float]) -> float:
+    """Scatter of a single run over the whole shot."""
+    return min(spread.get(fit.name, 1.0) * fit.history.scatter(size), fit.history.most)
+
+
+def _mean(
     fit: Fit,
     size: float,
     growth: Mapping[str, float],
     added: Mapping[str, tuple[float, float]],
-) -> tuple[Array, Array]:
-    """Drawn errors of one observable at a setting, of one run and of the mean of many, [D]."""
+) -> Array:
+    """Drawn errors of the mean of many runs at a setting, over the whole shot, [D]."""
     more, at = added.get(fit.name, (0.0, size))
     # a longer step is longer in proportion to the cells: its error falls like theirs
-    mean = fit.mean_errors(size) * growth.get(fit.name, 1.0) + more * (size / at) ** fit.orders
-    return np.asarray(np.hypot(mean, fit.history.scatter(size))), mean
+    stepping = more * (size / at) ** fit.orders
+    return np.asarray(fit.mean_errors(size) * growth.get(fit.name, 1.0) + stepping)
 
 
-def pick(fits: Sequence[Fit], settings: Sequence[Setting], bound: float) -> Choice:
+def pick(
+    fits: Sequence[Fit],
+    settings: Sequence[Setting],
+    bound: float,
+    *,
+    spread: Mapping[str, float] | None = None,
+) -> Choice:
     """Take the cheapest setting that meets the bound in :data:`SURE` of the draws.
 
     Args:
         fits: Errors of each observable.
         settings: From :func:`ranked`.
         bound: What was asked for.
+        spread: As given to :func:`ranked`.
     """
     finest = min(1.0 / s.cells for s in settings)
-    bands = {fit.name: fit.history.scatter(finest) for fit in fits if fit.history.chaotic}
+    bands = {f.name: _band(f, finest, spread or {}) for f in fits if f.history.chaotic}
     floor_of = max(bands, key=lambda name: bands[name]) if bands else ""
     floor = bands.get(floor_of, 0.0)
     usable = [s for s in settings if math.isfinite(s.seconds)]

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 
 REACH = (0.05, 0.95)
 """Shares of a body's points between which its extents are taken: splinters do not count."""
+_SHARES = ("broken share", "largest piece")
 ACTIVE = 0.05
 """Share of the largest stored and dissipated energy from which something is happening."""
 
@@ -223,14 +224,15 @@ def histories(
     if energy > 0.0:
         rows.append(("energy", lambda seen: ((seen.kinetic + seen.elastic) / energy)[:, None]))
     if chaotic:
-        rows.append(("broken share", lambda seen: seen.broken[:, None]))
-        rows.append(("largest piece", lambda seen: seen.largest[:, None]))
+        rows.append((_SHARES[0], lambda seen: seen.broken[:, None]))
+        rows.append((_SHARES[1], lambda seen: seen.largest[:, None]))
     return [
         History(
             name=name,
             sizes=sizes,
             values=tuple(np.stack([read(p.seen)[first:last] for p in level]) for level in levels),
             chaotic=chaotic,
+            most=1.0 if name in _SHARES else math.inf,
         )
         for name, read in rows
     ]

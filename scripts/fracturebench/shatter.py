@@ -1,12 +1,13 @@
-"""Run the reference ensemble of FractureBench's case ``shatter``, store it, and compare with it.
+"""The reference ensemble of FractureBench's case ``shatter``, and settings compared with it.
 
     python scripts/fracturebench/shatter.py record [-o FILE] [--device cpu|cuda]
     python scripts/fracturebench/shatter.py compare [-o FILE.jsonl] [--quick] [--device cpu|cuda]
+    python scripts/fracturebench/shatter.py page [-o FILE.jsonl]
 
-``record`` writes the figures of eight runs at dx = R / 10 in float64 (4 minutes on one core).
-``compare`` runs ensembles over dx, CFL and precision and prints how far each is from the record,
-in every measure beside its run-to-run band; a line of ``-o`` per setting, and what is there is not
-run again.
+``record`` writes the figures of eight runs at dx = R / 10 in float64 (2 minutes on one core).
+``compare`` runs ensembles over dx, CFL, precision and return map (4 minutes on one core): one line
+per setting, and what is there is not run again. ``page`` enters the table into
+docs/fracturebench_fracture.md and draws docs/images/shatter.png from those lines.
 """
 
 from __future__ import annotations
@@ -19,17 +20,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from page import enter
+
+from gsfluent.figure.style import COLORS, OURS, new_figure, save_png
 from gsfluent.fracturebench.fracture_shatter import RADIUS, RECORD, SEEDS, reference
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.fracturebench.statistics import distance, ensemble
+from gsfluent.fracturebench.statistics import MEASURES, Figures, distance, ensemble
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.frozen import play
 
+ROOT = Path(__file__).resolve().parents[2]
 CELLS, CFL = 10, 0.3
+LINES = ROOT / "docs" / "data" / "shatter.jsonl"
+PAGE = ROOT / "docs" / "fracturebench_fracture.md"
+PICTURE = ROOT / "docs" / "images" / "shatter.png"
 SETTINGS: tuple[dict[str, Any], ...] = (
     *({"cells": n, "cfl": 0.5, "dtype": "float32"} for n in (4, 5, 6, 7, 8)),
     {"cells": 6, "cfl": 0.25, "dtype": "float32"},
@@ -42,7 +52,7 @@ SETTINGS: tuple[dict[str, Any], ...] = (
 def player(device: str, cfl: float, dtype: str, explicit: bool = False) -> Callable[[Scene], Run]:
     """How a scene is run."""
     more: dict[str, Any] = {}
-    if explicit:  # the map as published for a fixed centre
+    if explicit:  # a fixed centre and the explicit alpha
         more = {"k": float("inf"), "epsilon": 0.0, "implicit": False}
     return partial(play, device=device, cfl=cfl, dtype=getattr(torch, dtype), **more)
 
@@ -56,48 +66,129 @@ def record(out: Path, device: str) -> None:
         file.write_text(json.dumps(header | {"runs": runs}) + "\n", encoding="utf-8")
 
 
+def name_of(settings: dict[str, Any]) -> str:
+    """A setting in words."""
+    more = ", fixed centre, explicit" if settings.get("explicit") else ""
+    return f"R / {settings['cells']}, CFL {settings['cfl']}, {settings['dtype']}{more}"
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Lines of a file, none if it is not there."""
+    if not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def figures_of(row: dict[str, Any]) -> list[Figures]:
+    """Figures of the runs of a line."""
+    return [Figures.of_plain(p) for p in row["runs"]]
+
+
 def compare(out: Path | None, device: str, quick: bool) -> None:
-    """Print and store the distance of every setting to the record."""
-    done: dict[str, dict[str, Any]] = {}
-    if out is not None and out.exists():
-        lines = out.read_text(encoding="utf-8").splitlines()
-        done = {json.dumps(row["settings"]): row for row in map(json.loads, lines)}
-    for setting in SETTINGS[:2] if quick else SETTINGS:
+    """Run every setting that is not there yet, and say how far each is from the record."""
+    done = {json.dumps(row["settings"]): row for row in read(out)} if out else {}
+    chosen = SETTINGS[:2] if quick else SETTINGS
+    for i, setting in enumerate(chosen, 1):
         settings = {**setting, "device": device, "seeds": 2 if quick else len(SEEDS)}
         row = done.get(json.dumps(settings))
         if row is None:
-            chosen = {k: v for k, v in setting.items() if k != "cells"}
+            options = {k: v for k, v in setting.items() if k != "cells"}
             members = ensemble(
                 find("shatter"), RADIUS / setting["cells"], 8, range(settings["seeds"]),
-                player(device, **chosen),
+                player(device, **options),
             )  # fmt: skip
-            found = distance(reference(), members)
-            row = {
-                "case": "shatter", "method": "gsfluent", "settings": settings,
-                "distance": {k: [d.value, d.band] for k, d in found.items()},
-                "pieces": [int((m.figures.pieces > 0.01).sum()) for m in members],
-            }  # fmt: skip
+            runs = [m.figures.plain() for m in members]
+            row = {"case": "shatter", "method": "gsfluent", "settings": settings, "runs": runs}
             if out is not None:
+                out.parent.mkdir(parents=True, exist_ok=True)
                 with out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
-        print(" ".join(f"{k} {v}" for k, v in row["settings"].items()))
-        for name, (value, band) in row["distance"].items():
-            said = "within the band" if value <= band else f"{value / band:.1f} bands"
-            print(f"    {name:24} {value:.3f}, band {band:.3f}: {said}")
+        found = distance(reference(), figures_of(row))
+        sys.stderr.write(f"{i}/{len(chosen)} {name_of(settings)}\n")
+        for measure in MEASURES:
+            sys.stderr.write(f"    {measure:24} {found[measure]}\n")
+
+
+def page(lines: Path) -> int:
+    """Enter the table into the page and draw the picture."""
+    rows = read(lines)
+    if not rows:
+        sys.stderr.write(f"{lines}: no lines; run `shatter.py compare -o {lines}` first\n")
+        return 1
+    ours = reference()
+    bands = distance(ours, ours)
+    head = "| setting | " + " | ".join(MEASURES) + " | pieces above 1 % |"
+    table = [head, "|" + "---|" * (len(MEASURES) + 2)]
+    table.append(
+        "| run-to-run band | " + " | ".join(f"{bands[m].band:.3f}" for m in MEASURES)
+        + f" | {median_count(ours):.0f} |"
+    )  # fmt: skip
+    for row in rows:
+        runs = figures_of(row)
+        found = distance(ours, runs)
+        cells = [
+            "within the band" if found[m].within else f"{found[m].value:.3f}" for m in MEASURES
+        ]
+        name = name_of(row["settings"])
+        table.append(f"| {name} | " + " | ".join(cells) + f" | {median_count(runs):.0f} |")
+    text = enter(PAGE.read_text(encoding="utf-8"), "shatter", "\n".join(table))
+    with atomic_path(PAGE) as file:
+        file.write_text(text, encoding="utf-8")
+    draw(rows, ours)
+    return 0
+
+
+def median_count(runs: list[Figures]) -> float:
+    """Median number of pieces above a hundredth of the mass."""
+    return float(np.median([(f.pieces > 0.01).sum() for f in runs]))
+
+
+def draw(rows: list[dict[str, Any]], ours: list[Figures]) -> None:
+    """Momentum over time and mass over pieces, the reference as a band."""
+    places = np.geomspace(1e-4, 0.7, 200)
+
+    def below(f: Figures) -> np.ndarray:
+        return np.array([f.pieces[f.pieces <= m].sum() for m in places])
+
+    steps = np.arange(1, ours[0].momentum.shape[0] + 1) * 30.0 / ours[0].momentum.shape[0]
+    ladder = [r for r in rows if r["settings"]["cfl"] == 0.5 and r["settings"]["dtype"] == "float32"
+              and not r["settings"].get("explicit")]  # fmt: skip
+    with new_figure(9.0, 3.4) as figure:
+        left, right = figure.subplots(1, 2)
+        for axes, along, of in (
+            (left, steps, lambda f: f.momentum[:, 2]),
+            (right, places, below),
+        ):
+            reach = np.array([of(f) for f in ours])
+            axes.fill_between(along, reach.min(0), reach.max(0), color=OURS, alpha=0.35, lw=0,
+                              label="reference, 8 runs")  # fmt: skip
+            for color, row in zip(COLORS, ladder, strict=False):
+                runs = [of(f) for f in figures_of(row)]
+                axes.plot(along, np.median(runs, axis=0), color=color, lw=1.2,
+                          label=f"R / {row['settings']['cells']}")  # fmt: skip
+        left.set(xlabel="time [R / c]", ylabel="momentum over the first, upward", title="Momentum")
+        right.set(xlabel="mass of a piece over the whole", xscale="log",
+                  ylabel="mass in lighter pieces", title="Mass over pieces")  # fmt: skip
+        left.legend()
+        save_png(figure, PICTURE)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line and run it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("record", "compare"))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("record", "compare", "page"))
     parser.add_argument("-o", "--out", type=Path)
-    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--quick", action="store_true", help="two settings, two seeds")
     args = parser.parse_args(argv)
     if args.what == "record":
         record(args.out or RECORD, args.device)
-    else:
+    elif args.what == "compare":
         compare(args.out, args.device, args.quick)
+    else:
+        return page(args.out or LINES)
     return 0
 
 

@@ -162,6 +162,28 @@ def tables(records: Sequence[Record]) -> str:
     return "\n\n".join(said)
 
 
+def fracture_cases(records: Sequence[Record]) -> str:
+    """What each fracture case is and how it is judged, from gsfluent's records."""
+    lines = [
+        "| case | what happens | judged by (reference; tolerance) | source |",
+        "|---|---|---|---|",
+    ]
+    seen: dict[str, Record] = {r.case: r for r in records if r.method == "gsfluent"}
+    for case in cases("fracture"):
+        if case.name not in seen:
+            continue
+        measures = seen[case.name].measures
+        quantities = "; ".join(
+            f"{m['quantity']} ({float(m['reference']):.3g}{' ' + m['unit'] if m['unit'] else ''}; "
+            f"{float(m['tolerance']):.2g})"
+            for m in measures
+        )
+        # what stands after the last semicolon of a statistic is its figure, not its source
+        sources = list(dict.fromkeys(m["source"].split(";")[0] for m in measures))
+        lines.append(f"| `{case.name}` | {case.summary} | {quantities} | {'; '.join(sources)} |")
+    return "\n".join(lines)
+
+
 def _measures(records: Sequence[Record]) -> str:
     lines = [
         "| case | device | quantity | value | reference | error | tolerance | within |",
@@ -199,8 +221,10 @@ def main() -> int:
         if not records:
             raise SceneError(f"no runs given and no records in {args.records}")
         known = {c.name for c in cases()}
-        text = tables([r for r in records if r.case in known])
+        records = [r for r in records if r.case in known]
+        text = tables(records)
         page = args.page.read_text(encoding="utf-8") if args.page.is_file() else ""
+        page = enter(page, "fracturebench_fracture", fracture_cases(records), "## Fracture cases")
         temporary = args.page.with_name(args.page.name + ".tmp")
         temporary.write_text(enter(page, "fracturebench", text, "## Results"), encoding="utf-8")
         temporary.replace(args.page)

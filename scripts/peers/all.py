@@ -125,12 +125,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--python", action="append", default=[], metavar="PEER=INTERPRETER")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--repeat", type=int, help="timed runs; default 0 (cpu), 2 (cuda)")
-    parser.add_argument("--budget", type=float, help="seconds per peer; 90 (cpu), 40 (cuda)")
+    parser.add_argument("--budget", type=float, help="seconds per peer; default 60")
     parser.add_argument("--quick", action="store_true", help="two dx, one step, one variant each")
     options = parser.parse_args(arguments)
     gpu = options.device == "cuda"
     options.repeat = (2 if gpu else 0) if options.repeat is None else options.repeat
-    options.budget = options.budget or (10.0 if options.quick else 40.0 if gpu else 90.0)
+    options.budget = options.budget or (10.0 if options.quick else 60.0)
     folders, pythons = pairs(options.folder), pairs(options.python)
     cases = options.case or (["bar", "pull_apart"] if options.quick else [])
     scenes = freeze(options.out, options.quick, cases)

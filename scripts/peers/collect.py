@@ -79,23 +79,24 @@ def front(records: Sequence[Record]) -> list[Record]:
 def table(records: Sequence[Record]) -> str:
     """Markdown: the front of every peer on every case, and what it could not do."""
     lines = [
-        "| case | peer | setting | dx [m] | steps | error | wall ms per simulated ms |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| case | peer | runs | front: error at wall ms per simulated ms (dx in mm, c dt/dx) | "
+        "could not |",
+        "| --- | --- | --- | --- | --- |",
     ]
     for case in sorted({r.case for r in records}):
         for method in sorted({r.method for r in records if r.case == case}):
             own = [r for r in records if r.case == case and r.method == method]
-            for r in front(own):
-                lines.append(
-                    f"| {case} | {method} | {r.variant} | {r.settings['dx']:.4g} | {r.steps:,} | "
-                    f"{r.error:.4f} | {r.wall_per_simulated:.4g} |"
-                )
+            best = [
+                f"{r.error:.3g} at {r.wall_per_simulated:.3g} "
+                f"({1e3 * r.settings['dx']:.3g}, {r.settings['courant']:.2g})"
+                for r in front(own)
+            ]
             why: dict[str, int] = {}
             for r in own:
                 if r.failed:
                     why[reason(r)] = why.get(reason(r), 0) + 1
-            for text, count in why.items():
-                lines.append(f"| {case} | {method} | {count} of {len(own)} runs | | | {text} | |")
+            not_done = "; ".join(f"{text} ({count})" for text, count in why.items())
+            lines.append(f"| {case} | {method} | {len(own)} | {'; '.join(best)} | {not_done} |")
     return "\n".join(lines)
 
 

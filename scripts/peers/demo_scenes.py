@@ -121,7 +121,7 @@ class Mode:
 
 def lattice(setting: Setting, dx: float, per_cell: int) -> tuple[Floats, Floats]:
     """Points that fill the stand-in evenly, about ``per_cell`` per cell of dx, and volumes."""
-    step = dx / round(per_cell ** (1.0 / 3.0))
+    step = dx / per_cell ** (1.0 / 3.0)
     counts = np.maximum(1, np.round(setting.size / step)).astype(int)
     axes = [(np.arange(n) + 0.5) / n - 0.5 for n in counts]
     unit = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -227,14 +227,25 @@ def play(
             walls = [clock(peer.start(scene, variant, device), plan) for _ in range(repeat)]
     except Cannot as reason:
         return failed_run(scene, name, f"{peer.name} {reason}", device, **settings)
+    except Exception as error:  # whatever it raises is what its user would get
+        told = (str(error).strip().splitlines() or [""])[0]
+        return failed_run(scene, name, f"{type(error).__name__}: {told}", device, **settings)
     settings |= {"dx": scene.dx, "walls": walls, "dt": plan[-1][1]}
     wall = float(np.median(walls))
     return Run(scene.name, name, scene.times, x, v, wall, engine.steps, settings, device, failed)
 
 
+def prepare(engine: Engine, plan: Sequence[tuple[int, float]]) -> None:
+    """Let an engine make what it needs for the steps of a plan, such as CUDA graphs, untimed."""
+    if hasattr(engine, "prepare"):
+        for dt in sorted({dt for count, dt in plan if count}):
+            engine.prepare(dt)
+
+
 def clock(engine: Engine, plan: Sequence[tuple[int, float]]) -> float:
     """Wall seconds of all steps of a plan, without a stop."""
     stretches = merged(plan)
+    prepare(engine, stretches)
     start = time.perf_counter()
     for count, dt in stretches:
         engine.advance(count, dt)
@@ -248,6 +259,7 @@ def drive(
     shape = (scene.times.shape[0], scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
     wall = 0.0
+    prepare(engine, plan)
     for i, (count, dt) in enumerate(plan):
         try:
             if count:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from simulation_scenes import SOFT, at, resting
+from simulation_scenes import SOFT, at, near_miss, resting
 from simulation_shapes import ellipsoid
 from trades import COARSE, all_laws, apart, judged, same_bits, same_error
 
@@ -281,6 +281,43 @@ def test_free_flight(turn: float) -> None:
     # better than unchanged: symplectic Euler falls g t dt / 2 behind the parabola
     assert closed < (1e-6 if turn == 0.0 else 1e-3) < gridded
     assert gridded - closed < 1.2 * 0.5 * 9.81 * 0.2 * without["dt_max"] / 0.05 + 0.01
+
+
+def _straight_error(frames: list[SimulationFrame]) -> float:
+    """Largest distance of the centres of two free balls from straight lines, over their radius."""
+    start = frames[0].particles
+    worst = 0.0
+    for ball in (0, 1):
+        own = start.body == ball
+        mass = start.mass[own].double()[:, None]
+
+        def center(value: torch.Tensor, own: torch.Tensor = own, mass: torch.Tensor = mass) -> Any:
+            return (mass * value[own].double()).sum(dim=0) / mass.sum()
+
+        place, speed = center(start.position), center(start.velocity)
+        for frame in frames[1:]:
+            gap = center(frame.particles.position) - place - frame.time * speed
+            worst = max(worst, float(gap.norm()) / 0.05)
+    return worst
+
+
+@pytest.mark.parametrize("measure", ["piece_flight", "contact_near"])
+def test_bodies_that_pass_each_other(measure: str) -> None:
+    """Two balls that come near and do not touch fly straight on.
+
+    ``piece_flight`` takes them off the grid again behind each other; ``contact_near`` looks for
+    contact only while they are near.
+    """
+    (on, with_), (off, without) = (
+        _frames(near_miss(), 40, 0.3, resident=False, **{measure: flag}) for flag in (True, False)
+    )
+    if measure == "piece_flight":
+        assert with_["pieces_flown"] == 2 and with_["substeps"] < without["substeps"]
+    else:
+        skipped = [r["skipped"]["contact_steps"] for r in (with_, without)]
+        assert skipped[0] > skipped[1]
+    errors = _straight_error(on), _straight_error(off)
+    assert max(errors) < 1e-3 and abs(errors[0] - errors[1]) < 1e-4
 
 
 def test_sleep() -> None:

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from ball_shot import write_shot
 
 from gsfluent.cli import main
+from gsfluent.config import load_shot
+from gsfluent.pipeline.plan import plan_shot
 
 SOFT = {
     "objects": {"ball": {"material": "rubber", "young_modulus": 2e4}},
@@ -65,6 +68,11 @@ def test_the_verb_takes_the_solids_of_the_run(
     assert result["solid"] == f"the stages in {done / 'out'}"
     assert result["probe"]["cells"] == [8, 10, 12]
     assert json.loads((done / "out" / "chart.json").read_text())["bound"] == 0.45
+
+
+def test_a_plan_says_that_the_cells_are_not_chosen_yet(done: Path) -> None:
+    plan = plan_shot(load_shot(done / "shot.yaml"), device=torch.device("cpu"), model=None)
+    assert any("solve.error chooses the cells" in warning for warning in plan["warnings"])
 
 
 @pytest.mark.parametrize(

@@ -89,13 +89,12 @@ def test_a_crack_of_known_speed_is_judged_at_that_speed(share: float) -> None:
     limit = fracture_plane.rayleigh_speed(1e9, 0.2, 1000.0)
     x, y = scene.x[:, 0], np.abs(scene.x[:, 1])
     on_line = (y < scene.dx) & (x > 0.2)
-    start = scene.times[4] - 0.2 / (share * limit)
+    start = scene.times[35] - 0.2 / (share * limit)  # where samples are dense
     when = np.where(on_line, start + x / (share * limit), np.inf)
     fastest, mean, off = judge(scene, submit(scene, damage=damage_at(scene, when)))
-    assert fastest.value == pytest.approx(
-        share, rel=0.25 if share > 1.0 else 0.1
-    ) and fastest.passed == (share < 1.0)
-    assert mean.value == pytest.approx(share, rel=0.02) and mean.passed == (0.15 < share < 0.75)
+    assert fastest.value == pytest.approx(share, rel=0.25 if share > 1.0 else 0.1)
+    assert mean.value == pytest.approx(share, rel=0.02)
+    assert fastest.passed == mean.passed == (share < 1.0)
     assert off.value == pytest.approx(0.75) and off.passed
 
 
