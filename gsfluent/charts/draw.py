@@ -20,6 +20,8 @@ from gsfluent.io.atomic import atomic_path
 __all__ = ["Chart", "gathered", "of_records"]
 
 OURS = "gsfluent"
+_BASES = ("dx", "textbook", "adaptive")
+"""Knobs whose runs are a method's base."""
 _XLABEL = "wall ms per simulated ms"
 
 
@@ -164,7 +166,10 @@ class Chart:
         head = ["method", "setting", "runs", "median error over the base's", "from", "to",
                 "median time over the base's", "broke off"]  # fmt: skip
         rows = []
-        turned = [r for r in self.records if r.variant and r.settings.get("trades", True)]
+        turned = [
+            r for r in self.records
+            if r.settings.get("knob", "dx") not in _BASES and r.settings.get("trades", True)
+        ]  # fmt: skip
         for method, variant in dict.fromkeys((r.method, r.variant) for r in turned):
             mine = [r for r in turned if (r.method, r.variant) == (method, variant)]
             pairs = [(r, b) for r in mine if r.ok and (b := _base(self.records, r)) and b.ok]
@@ -290,11 +295,11 @@ def _band(records: Iterable[Record]) -> float | None:
 
 def _base(records: Iterable[Record], record: Record) -> Record | None:
     """The run of the same case, method and rung at the defaults."""
+    dx = record.settings.get("dx")
+    same = (r for r in records if (r.case, r.method) == (record.case, record.method))
     return next(
-        (r for r in records if r.case == record.case and r.method == record.method
-         and r.variant == "" and r.settings.get("dx") == record.settings.get("dx")),
-        None,
-    )  # fmt: skip
+        (r for r in same if r.settings.get("knob") in _BASES and r.settings.get("dx") == dx), None
+    )
 
 
 def _row(cells: Sequence[Any]) -> str:

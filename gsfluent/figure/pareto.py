@@ -151,6 +151,8 @@ def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
     low, high = min(low, middle / 5.6), max(high, middle * 5.6)
     costs = [d.cost for d in panel.dots if _finite(d.cost)] or [1.0]
     left, right = min(costs) / 3.0, max(costs) * 2.0
+    middle = math.sqrt(left * right)
+    left, right = min(left, middle / 5.6), max(right, middle * 5.6)
     top = high * (high / low) ** 0.09
     ax.set_xlim(left, right)
     ax.set_ylim(low, top)

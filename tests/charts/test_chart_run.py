@@ -15,6 +15,7 @@ from gsfluent.charts import play as playing
 from gsfluent.charts.chart import run
 from gsfluent.charts.draw import gathered, of_records
 from gsfluent.charts.ladder import KNOBS, Setting, ladder, rungs, work
+from gsfluent.charts.off_grid import measure_off_grid
 from gsfluent.charts.play import measure, shuffled
 from gsfluent.charts.record import Record, append, read
 from gsfluent.charts.ride import Riders
@@ -111,6 +112,24 @@ def test_gaussians_that_ride_move_like_points_of_their_own() -> None:
     assert riding.error == pytest.approx(each.error, rel=0.05)
 
 
+def test_fracture_is_judged_as_an_ensemble_and_no_better_than_its_band() -> None:
+    case = find("shatter")
+    made = measure(Setting("shatter", max(case.ladder), 1), "cpu", 1)
+    errors = made.settings["errors"]
+    assert len(errors) == 3 and made.error == sorted(errors)[1]
+    assert made.error >= made.settings["band"] > 0.0
+    (chart,) = of_records([made])
+    assert chart._panels()[0].band == made.settings["band"]
+
+
+def test_leaving_the_grid_is_measured_beside_staying_on_it() -> None:
+    on, off = (measure_off_grid(s, "cpu", 1) for s in ladder(("flight",))[:2])
+    assert (on.steps, on.variant) == (0, "") and off.steps > 0
+    assert on.error < 0.1 * off.error < 0.1
+    with pytest.raises(ValueError, match="flight, rest"):
+        measure_off_grid(Setting("bar", 0.1), "cpu", 1)
+
+
 def test_time_is_that_of_runs_without_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     lengths = []
 
@@ -143,8 +162,8 @@ def test_a_run_that_breaks_off_is_kept_with_its_reason() -> None:
 
 def fast(setting: Setting, device: str, repeat: int) -> Record:
     return Record(
-        setting.case, "elastic", setting.method, setting.variant, {"dx": setting.dx}, device, "m",
-        8, 10, 1.0, [1e-3], 1e-3, 1.0, 0.1,
+        setting.case, "elastic", setting.method, setting.variant,
+        {"dx": setting.dx, "knob": setting.knob}, device, "m", 8, 10, 1.0, [1e-3], 1e-3, 1.0, 0.1,
     )  # fmt: skip
 
 
@@ -184,11 +203,13 @@ def test_the_verb_draws_recorded_lines_of_several_files(
                                wall_per_simulated=0.5, error=0.2)  # fmt: skip
     broken = dataclasses.replace(peer, variant="b", error=math.inf, failed="exploded")
     free = Setting("bar", 0.1, knob="free", variant="shuffled points")
-    same = dataclasses.replace(fast(free, "cpu", 1), settings={"dx": 0.1, "trades": False})
+    same = dataclasses.replace(
+        fast(free, "cpu", 1), settings={"dx": 0.1, "knob": "free", "trades": False}
+    )
     append(tmp_path / "a.jsonl", fast(Setting("bar", 0.1), "cpu", 1))
     append(tmp_path / "a.jsonl", same)
-    finer = dataclasses.replace(fast(dataclasses.replace(free, variant="CFL 0.1"), "cpu", 1),
-                                wall_per_simulated=5e-3, error=0.11)  # fmt: skip
+    short = Setting("bar", 0.1, knob="cfl", variant="CFL 0.1")
+    finer = dataclasses.replace(fast(short, "cpu", 1), wall_per_simulated=5e-3, error=0.11)
     append(tmp_path / "a.jsonl", finer)
     for r in (peer, broken):
         append(tmp_path / "b.jsonl", r)
