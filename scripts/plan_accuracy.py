@@ -61,7 +61,8 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
     text = shot_text(name, options.quality)
     path.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "gsfluent", "run", str(path), "-o", str(out), "--force"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     done = subprocess.run(
         [*command, "--device", str(device), "--json"],
         env=environment, capture_output=True, text=True, check=False,
@@ -78,8 +79,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         "device": device.type,
         "commit": commit(),
         "taught": max((len(r) for r in model.ratios.values()), default=0),
-        "probe": {"seconds": model.seconds, "base_bytes": model.base_bytes,
-                  "probe_seconds": model.probe_seconds, "machine": model.machine},
+        "probe": {name: getattr(model, name) for name in ("seconds", "probe_seconds", "machine")},
         "alone": alone["stages"],
         "plan": plan["stages"],
         "actual": {
@@ -107,9 +107,7 @@ def shot_text(name: str, quality: str | None) -> str:
 def taught(line: dict[str, Any], others: list[dict[str, Any]]) -> dict[str, Cost]:
     """What a model says to a shot that has learned from other shots, by stage."""
     probe = line["probe"]
-    model = CostModel(
-        machine=probe["machine"], seconds=probe["seconds"], base_bytes=probe["base_bytes"]
-    )
+    model = CostModel(machine=probe["machine"], seconds=probe["seconds"])
     for other in others:
         for name, fact in other["actual"].items():
             said = model.stage(name, other["work_actual"][name], corrected=False)
@@ -210,8 +208,7 @@ def fit_memory(lines: list[dict[str, Any]]) -> dict[str, Any]:
                 Sample(
                     stage,
                     line["work_actual"][stage],
-                    line["actual"][stage]["memory_bytes"]
-                    - (line["probe"]["base_bytes"] if device == "cpu" else 0),
+                    line["actual"][stage]["memory_bytes"],
                 )
                 for line in mine
                 if stage in line["actual"]

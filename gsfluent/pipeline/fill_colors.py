@@ -31,6 +31,7 @@ _OUT, _IN = 1.5, 3.0  # voxels outside and below the skin that still belong to i
 _HIDDEN = 0.02  # share of its size below which a splat says nothing about the skin
 _SHOWS = 0.003  # share of its size by which an interior Gaussian shows from outside: it is skin
 _REACH = 2.0  # voxels; farther from every splat, a wider surrounding gives the colour
+_CHUNK = 8192  # points that are given such a surrounding at a time
 
 
 def surface_colors(
@@ -84,9 +85,12 @@ def surface_colors(
     if away.any() and len(rows) > count:
         # from every direction at about the same distance, or the nearest rim would draw rays
         wide = min(16 * _NEIGHBOURS, len(rows))
-        distance, rank = nearest(means, np.asarray(points)[away], wide, 4.0 * width)
-        spread = 0.35 * distance[:, :1] + width
-        result[away] = _robust_mean(distance, rank, weight, colors, spread)
+        index = np.flatnonzero(away)
+        for first in range(0, len(index), _CHUNK):  # 10 kB a point: a GB for a side nobody saw
+            part = index[first : first + _CHUNK]
+            distance, rank = nearest(means, np.asarray(points)[part], wide, 4.0 * width)
+            spread = 0.35 * distance[:, :1] + width
+            result[part] = _robust_mean(distance, rank, weight, colors, spread)
     return result.astype(np.float32)
 
 

@@ -26,6 +26,7 @@ from gsfluent.pipeline.plan_bounds import (
 )
 from gsfluent.pipeline.plan_cost import Cost, CostModel
 from gsfluent.pipeline.plan_fact import STAGES
+from gsfluent.pipeline.plan_memory import memory_of
 from gsfluent.pipeline.plan_motion import Outlook, foresee
 from gsfluent.pipeline.plan_passes import laws_of, passes_of
 from gsfluent.pipeline.plan_stand_in import StandIn, stand_in
@@ -177,7 +178,8 @@ def plan_shot(
     quality = QUALITY[shot.solve.quality]
     outlook, simulated = prospect.simulation(dx, quality)
     work = _work(prospect, quality, simulated)
-    stages = {name: _costs(model, name, work[name], shot) for name in STAGES if name in work}
+    kind = torch.device(device).type
+    stages = {name: _costs(model, name, work[name], shot, kind) for name in STAGES if name in work}
     seconds = [row["seconds"] for row in stages.values()]
     total = sum(seconds) if all(value is not None for value in seconds) else None
     counts = prospect.counts(dx)
@@ -267,14 +269,11 @@ def _work(
 
 
 def _costs(
-    model: CostModel | None, name: str, features: dict[str, float], shot: Shot
+    model: CostModel | None, name: str, features: dict[str, float], shot: Shot, kind: str
 ) -> dict[str, Any]:
     """Seconds and bytes of a stage; seconds are None where nobody can know them."""
-    from gsfluent.pipeline.plan_memory import memory_of
-    from gsfluent.pipeline.plan_probe import resident_bytes
-
     if model is None:
-        return {"seconds": None, "memory_bytes": memory_of(name, features, "cpu", resident_bytes())}
+        return {"seconds": None, "memory_bytes": memory_of(name, features, kind)}
     cost: Cost = model.stage(name, features)
     unknown = name == "texture" and texture_method(shot) in NOT_PREDICTED
     return {

@@ -44,6 +44,9 @@ PRIOR = 0.5
 CORRECTION = (0.25, 4.0)
 """Corrections stay in this range, so that a run on a machine that was busy cannot spoil a model."""
 
+SHARED = 0.2
+"""Share of the blocks in which fields meet, where there are several (median of the gallery)."""
+
 Features = Mapping[str, float]
 
 
@@ -119,7 +122,6 @@ class CostModel:
         errors: Stage: largest relative error of the fit at the sizes that were measured.
         ratios: Stage: actual over predicted seconds of the last runs, without correction.
         memory_ratios: The same for memory.
-        base_bytes: Resident memory of the process before any work.
     """
 
     machine: dict[str, Any]
@@ -129,7 +131,6 @@ class CostModel:
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
     ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     memory_ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
-    base_bytes: int = 0
 
     # --- asking ---
 
@@ -153,7 +154,7 @@ class CostModel:
         if known is None:
             raise ValueError(f"CostModel: no stage {name!r}; known: {', '.join(self.seconds)}")
         seconds = sum(value * features.get(feature, 0.0) for feature, value in known.items())
-        size = memory_of(name, features, self.device, self.base_bytes)
+        size = memory_of(name, features, self.device)
         if corrected:
             seconds *= self.correction(name)
             size = int(size * _mean_ratio(self.memory_ratios.get(name, [])))
@@ -192,7 +193,12 @@ class CostModel:
             particles, blocks, substeps, fields=fields, laws=chosen, composed_steps=composed_steps
         )
         features |= framing(frames, gaussians, particles, brittle=brittle)
-        features |= {"points": particles, "gaussians": gaussians, "blocks_most": blocks}
+        features |= {
+            "start": 0.0,
+            "points": particles,
+            "gaussians": gaussians,
+            "blocks_most": blocks,
+        }
         return self.stage("simulate", features, corrected=corrected)
 
     def correction(self, name: str) -> float:
@@ -245,7 +251,6 @@ class CostModel:
             errors=_numbers(values["errors"]),
             ratios={name: _ratios(row) for name, row in values["ratios"].items()},
             memory_ratios={name: _ratios(row) for name, row in values["memory_ratios"].items()},
-            base_bytes=int(values["base_bytes"]),
         )
         if not model.seconds:
             raise ValueError("no stage in it")
@@ -271,15 +276,15 @@ def stepping(
     fields: int,
     laws: str,
     composed_steps: float = 0.0,
+    shared: float = SHARED,
 ) -> dict[str, float]:
-    """Features of moving matter over the grid."""
+    """Features of moving matter over the grid; ``shared``: share of the blocks with contact."""
     resident = max(0.0, substeps - composed_steps)
-    contact = resident if fields > 1 else 0.0
+    contact = resident * shared if fields > 1 else 0.0
     return {
         "steps": resident,
         f"point_steps_{laws}": resident * particles,
         "block_steps": resident * blocks,
-        "contact_point_steps": contact * particles,
         "contact_block_steps": contact * blocks,
         "composed_steps": composed_steps,
         "composed_point_steps": composed_steps * particles,
@@ -303,6 +308,7 @@ def framing(
         "frames": float(frames),
         "frame_gaussians": frames * gaussians,
         "frame_points": frames * particles,
+        "start_gaussians": gaussians if frames else 0.0,
         "cracked_gaussians": cracked * gaussians,
         "broken_frames": frames * broken if brittle else 0.0,
     }

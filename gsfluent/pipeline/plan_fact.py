@@ -98,7 +98,7 @@ def _textured(work: Work) -> None:
         return
     for name in features:
         if name.endswith("_voxels"):
-            features[name] = fill["matter_voxels"]
+            features[name] = fill["voxels"]
     features |= {"volume": fill["voxels"], "splats": fill["splats"] + fill["inner"]}
 
 
@@ -118,6 +118,7 @@ def _simulated(work: Work, report: Mapping[str, Any], gaussians: float, born: li
         fields=int(report["fields_max"]),
         laws=laws,
         composed_steps=report["composed_steps"],
+        shared=1.0 - report["skipped"]["contact_block_fraction"],
     )
     features |= framing(
         report["frames"], gaussians, report["particles"], brittle=brittle, broken=share

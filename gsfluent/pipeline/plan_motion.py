@@ -291,7 +291,10 @@ def _meet(
             low, _, velocity = now[i]
             found: list[float] = []
             if scene.floor is not None and float(low[2]) - scene.floor < near:
-                found.append(max(0.0, -float(velocity[2])))
+                # on the grid it falls the rest of the way
+                rest = max(0.0, float(low[2]) - scene.floor)
+                pull = max(0.0, -float(gravity[2]))
+                found.append(math.hypot(min(0.0, float(velocity[2])), math.sqrt(2 * pull * rest)))
             for j, other in enumerate(bodies):
                 if j != i and not (other.held and time < other.start):
                     found += _closing(now[i], now[j], near)

@@ -29,6 +29,7 @@ from gsfluent.pipeline.plan_fact import actual_work
 from gsfluent.pipeline.plan_fit import Sample, fit
 from gsfluent.pipeline.plan_stand_in import look_at_photographs
 from gsfluent.pipeline.plan_work import isolate_work, reconstruct_work, render_work
+from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.stage import Progress, report_progress
 
 if TYPE_CHECKING:
@@ -41,12 +42,12 @@ _log = logging.getLogger(__name__)
 FEATURES: dict[str, tuple[str, ...]] = {
     "reconstruct": ("start", "images", "steps", "step_pixels", "step_splats"),
     "isolate": ("start", "splats"),
-    "fill": ("start", "objects", "voxels", "inner"),
-    "texture": ("start", "exemplar_objects", "exemplar_voxels", "volume"),
+    "fill": ("start", "images", "voxels", "inner"),
+    "texture": ("start", "exemplar_objects", "exemplar_voxels"),
     "render": ("start", "frames", "frame_pixels", "frame_gaussians"),
 }
 """What each stage's cost is made of; ``simulate`` has its own module, exports are per kind."""
-FRAME_FEATURES = ("start", "frames", "frame_gaussians", "cracked_gaussians")
+FRAME_FEATURES = ("frames", "frame_gaussians", "start_gaussians", "cracked_gaussians")
 _VIEWS = 10
 _PHOTOGRAPH = 160
 
@@ -84,40 +85,42 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         device: Which.
         progress: Told what is measured.
     """
+    from gsfluent.pipeline.plan_probe_frames import frame_samples
     from gsfluent.pipeline.plan_probe_solver import measure_solver
 
     device = torch.device(device)
     began = time.perf_counter()
-    base = resident_bytes()
     total = len(SIZES) + 2
     with tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name, _quiet():
         folder = Path(name)
         draw_capture(folder / "photographs")
         report_progress(progress, 1, total, "photographs")
         samples: list[Sample] = []
-        simulated: list[tuple[Sample, float]] = []
         for number, size in enumerate(SIZES):
             values, planned = run_small(folder, size, device)
             samples += stage_samples(values, planned, cold=number == 0)
-            simulated.append(simulation_sample(values, planned, cold=number == 0))
+            if number == 0:
+                first = simulation_sample(values, planned)
             report_progress(progress, number + 2, total, f"stages, {size.name}")
         samples += other_samples(folder / "small", device)
         samples += training_samples(folder, device)
+        framed = [s for name in ("small", "large") for s in frame_samples(folder / name, device)]
     costs: dict[str, dict[str, float]] = {}
     errors: dict[str, float] = {}
     for stage, features in FEATURES.items():
         mine = [s for s in samples if s.stage == stage and "procedural_voxels" not in s.features]
         costs[stage], errors[stage] = fit(mine, features)
     more = [s for s in samples if s.stage == "texture" and "procedural_voxels" in s.features]
-    found, _ = fit(more, ("procedural_objects", "procedural_voxels"),
-                   {"volume": costs["texture"]["volume"]})  # fmt: skip
+    found, _ = fit(more, ("procedural_objects", "procedural_voxels"))
     costs["texture"] |= found
     exports = [s for s in samples if s.stage == "export"]
     kinds = sorted({name for s in exports for name in s.features})
     costs["export"], errors["export"] = fit(exports, kinds)
     costs["simulate"], errors["simulate"] = measure_solver(device)
-    frame_costs, _ = fit([sample for sample, _ in simulated], FRAME_FEATURES)
-    costs["simulate"] |= frame_costs
+    frame_costs, _ = fit(framed, FRAME_FEATURES)
+    # what a fresh process pays once shows in the first small shot
+    cold, _ = fit([first], ("start",), frame_costs)
+    costs["simulate"] |= frame_costs | cold
     report_progress(progress, total, total, "solver")
     model = CostModel(
         machine=machine_key(device),
@@ -125,7 +128,6 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         probe_seconds=time.perf_counter() - began,
         errors=errors,
-        base_bytes=base,
     )
     _log.info("measured what work costs on this device in %.1f s", model.probe_seconds)
     return model
@@ -215,7 +217,8 @@ def training_samples(folder: Path, device: torch.device) -> list[Sample]:
         assert shot.capture is not None  # given above
         capture = load_capture(shot.capture)
         start = time.perf_counter()
-        gaussians, _ = Reconstruct(**settings, device=device)(capture)
+        stage = Reconstruct(steps, splats, image_size=side, device=device)
+        gaussians, _ = stage(capture)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         seconds = time.perf_counter() - start
@@ -237,14 +240,11 @@ def stage_samples(
     ]
 
 
-def simulation_sample(
-    values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]], *, cold: bool
-) -> tuple[Sample, float]:
-    """What a simulation took beside its steps."""
+def simulation_sample(values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]) -> Sample:
+    """What the first simulation of this process took beside its steps."""
     stage = next(s for s in values["stages"] if s["name"] == "simulate")
-    stepped = float(values["simulation"]["seconds"])
-    features = dict(work["simulate"]) | {"start": float(cold)}
-    return Sample("simulate", features, max(stage["seconds"] - stepped, 1e-4)), stepped
+    rest = stage["seconds"] - float(values["simulation"]["seconds"])
+    return Sample("simulate", dict(work["simulate"]) | {"start": 1.0}, max(rest, 1e-4))
 
 
 def other_samples(out: Path, device: torch.device) -> list[Sample]:
@@ -254,12 +254,15 @@ def other_samples(out: Path, device: torch.device) -> list[Sample]:
     from gsfluent.pipeline.export import write_exports
     from gsfluent.pipeline.texture import Texture
 
-    solid = Solid.load(out / "stages" / "fill" / "melon.ply")
-    voxels = {"procedural_objects": 1.0, "procedural_voxels": float(solid.occupancy.sum())}
-    voxels["volume"] = float(solid.occupancy.numel())
-    start = time.perf_counter()
-    Texture(method="procedural", preset="bone", device=str(device))(solid)
-    samples = [Sample("texture", voxels, time.perf_counter() - start)]
+    samples = []
+    for folder in (out, out.parent / "large"):
+        solid = Solid.load(folder / "stages" / "fill" / "melon.ply")
+        voxels = {"procedural_objects": 1.0, "procedural_voxels": float(solid.occupancy.numel())}
+        start = time.perf_counter()
+        textured = Texture(method="procedural", preset="bone", device=str(device))(solid)
+        textured.save(folder / "procedural.ply")
+        save_cut_views(textured, folder / "procedural.png")
+        samples.append(Sample("texture", voxels, time.perf_counter() - start))
     values = json.loads((out / "run.json").read_text(encoding="utf-8"))
     frames = values["render"]["frames"]
     splats = values["isolation"]["gaussians_kept"] + values["fill"]["interior_gaussians"]
@@ -290,12 +293,3 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         log.setLevel(before)
-
-
-def resident_bytes() -> int:
-    """Resident memory of this process now [bytes]; 0 where the system does not say."""
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return 0
-    return next((int(s.split()[1]) * 1024 for s in lines if s.startswith("VmRSS:")), 0)

@@ -43,6 +43,9 @@ _FULL = 0.9
 """How full the budget of splats is in the end (0.63 to 1.0 in the gallery)."""
 _SCENE_SHARE = 0.6
 """Share of the steps that learn everything, where there are no masks."""
+_SCENE_GROWTH = 0.6
+"""Splats of a training without masks, in which the object starts anew, over those of one with
+(apple 0.52, skull 0.68)."""
 _SPACING = 1.25
 """Distance of interior splats [voxels]."""
 _PRUNED = 0.12
@@ -69,7 +72,10 @@ def reconstruct_work(photographs: Photographs, shot: Shot, splats: float | None 
     steps = wanted.iterations or _ITERATIONS
     recipe = recipe_for(wanted.recipe or "auto", steps)
     most = wanted.max_gaussians or recipe.max_gaussians
-    mean = splats if splats is not None else splat_growth(most, recipe.start_gaussians)
+    grown = splat_growth(most, recipe.start_gaussians)
+    if not photographs.masked:
+        grown *= _SCENE_GROWTH
+    mean = grown if splats is None else splats
     small = recipe.half_until * 0.25 + (1.0 - recipe.half_until)
     pixels = photographs.object_pixels
     if not photographs.masked:
@@ -81,6 +87,7 @@ def reconstruct_work(photographs: Photographs, shot: Shot, splats: float | None 
         "steps": float(steps),
         "step_pixels": steps * pixels * small,
         "step_splats": steps * mean,
+        "splats_most": float(most),
     }
 
 
@@ -160,7 +167,7 @@ def texture_work(method: str, fill: Mapping[str, float]) -> Features:
     return {
         "start": 1.0,
         f"{kind}_objects": fill["objects"],
-        f"{kind}_voxels": fill["matter_voxels"],
+        f"{kind}_voxels": fill["voxels"],
         "volume": fill["voxels"],
         "splats": fill["splats"] + fill["inner"],
     }
@@ -222,7 +229,8 @@ def render_work(shot: Shot, frames: int, gaussians: float) -> Features:
 def export_work(shot: Shot, frames: int, gaussians: float) -> Features:
     """Exporting: splats of all frames, by kind of file."""
     kinds = [kind for kind in shot.output.what if kind != "mp4"]
-    return {"start": 1.0} | {f"{kind}_gaussians": frames * gaussians for kind in kinds}
+    costs = {f"{kind}_gaussians": frames * gaussians for kind in kinds}
+    return {"start": 1.0, "gaussians": gaussians} | costs
 
 
 def mean_splats(history: list[list[Any]], iterations: int) -> float | None:

@@ -135,7 +135,7 @@ def simulate_stage(context: RunContext) -> None:
             save_frame(folder, saved(frame, scene))
             # after the frame: a state on disk always has its picture
             stage.save_state(state)
-        return stage.report() | {"thin": _thin_walls(scene, stage.report()["dx"])}
+        return stage.report() | {"thin": thin_walls(scene, stage.report()["dx"])}
 
     result = context.store.run("simulate", key, work)
     report = dict(result.report)
@@ -148,7 +148,7 @@ def simulate_stage(context: RunContext) -> None:
     context.source_key = result.fingerprint
 
 
-def _thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
+def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
     """Walls that the grid cannot carry, by body, in scene metres; a warning for each with some."""
     found = {}
     for body in scene.bodies:

@@ -15,6 +15,7 @@ from gsfluent.charts import play as playing
 from gsfluent.charts.chart import run
 from gsfluent.charts.draw import gathered, of_records
 from gsfluent.charts.ladder import KNOBS, Setting, ladder, rungs, work
+from gsfluent.charts.off_grid import measure_off_grid
 from gsfluent.charts.play import measure, shuffled
 from gsfluent.charts.record import Record, append, read
 from gsfluent.charts.ride import Riders
@@ -109,6 +110,24 @@ def test_gaussians_that_ride_move_like_points_of_their_own() -> None:
     assert riding.points == each.points // 8 and riding.settings["gaussians"] == each.points
     # eight points a cell are a little softer than 64: the difference of their errors, and no more
     assert riding.error == pytest.approx(each.error, rel=0.05)
+
+
+def test_fracture_is_judged_as_an_ensemble_and_no_better_than_its_band() -> None:
+    case = find("shatter")
+    made = measure(Setting("shatter", max(case.ladder), 1), "cpu", 1)
+    errors = made.settings["errors"]
+    assert len(errors) == 3 and made.error == sorted(errors)[1]
+    assert made.error >= made.settings["band"] > 0.0
+    (chart,) = of_records([made])
+    assert chart._panels()[0].band == made.settings["band"]
+
+
+def test_leaving_the_grid_is_measured_beside_staying_on_it() -> None:
+    on, off = (measure_off_grid(s, "cpu", 1) for s in ladder(("flight",))[:2])
+    assert (on.steps, on.variant) == (0, "") and off.steps > 0
+    assert on.error < 0.1 * off.error < 0.1
+    with pytest.raises(ValueError, match="flight, rest"):
+        measure_off_grid(Setting("bar", 0.1), "cpu", 1)
 
 
 def test_time_is_that_of_runs_without_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:

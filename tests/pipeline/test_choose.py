@@ -142,6 +142,14 @@ def test_no_setting_claims_less_than_chance() -> None:
     assert choice.enough is not None  # where finer cells change less than chance does
 
 
+def test_few_seeds_know_their_scatter_badly() -> None:
+    """Three levels of three seeds and two components: 12 free values, chi^2_12 / 12 of variance."""
+    fit = fit_history(made(1.0, 0.0, noise=0.05, chaotic=True), draws=4000)
+    low, high = np.quantile(fit.chance, [0.05, 0.95])
+    assert low == pytest.approx(np.sqrt(12 / 21.03), rel=0.03)  # tables of chi^2_12: 5.226, 21.03
+    assert high == pytest.approx(np.sqrt(12 / 5.226), rel=0.03)
+
+
 def test_a_bound_beyond_the_finest_grid_is_refused() -> None:
     fits = [fit_history(made(0.6, 3.0))]
     choice = pick(fits, ranked(fits, 1e-3, fourth_power), 1e-3)

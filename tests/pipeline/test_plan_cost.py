@@ -19,12 +19,11 @@ def model(**keys: Any) -> CostModel:
         "machine": machine_key("cpu"),
         "seconds": {
             "simulate": {"steps": 1e-4, "point_steps_nacc": 1e-7, "point_steps_elastic": 5e-8,
-                         "block_steps": 1e-6, "contact_point_steps": 2e-8, "frames": 0.01,
+                         "block_steps": 1e-6, "contact_block_steps": 2e-6, "frames": 0.01,
                          "cracked_gaussians": 1e-6},
             "render": {"frames": 0.02, "frame_pixels": 1e-7},
         },
         "made": "2026-01-01T00:00:00+00:00",
-        "base_bytes": 200_000_000,
     }  # fmt: skip
     return CostModel(**made | keys)
 
@@ -61,8 +60,8 @@ def test_a_simulation_costs_its_steps_and_its_frames() -> None:
     elastic = made.predict(1000, 10, 100, laws="elastic")
     assert steps.seconds - elastic.seconds == pytest.approx(100 * 1000 * 5e-8)
     contact = made.predict(1000, 10, 100, laws={"nacc"}, fields=2)
-    assert contact.seconds - steps.seconds == pytest.approx(100 * 1000 * 2e-8)
-    assert framed.bytes > made.base_bytes
+    assert contact.seconds - steps.seconds == pytest.approx(100 * 10 * plan_cost.SHARED * 2e-6)
+    assert framed.bytes > steps.bytes > 0
     with pytest.raises(ValueError, match="known: simulate, render"):
         made.stage("wash", {})
 
