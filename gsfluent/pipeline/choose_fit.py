@@ -210,16 +210,24 @@ def fit_history(
     free = components * sum(runs.shape[0] - 1 for runs in history.values)
     # a variance of so many free values is known up to chi^2 / free
     chance = np.sqrt(free / rng.chisquare(free, draws)) if free else np.ones(draws)
+    # chance lengthens every change: once in the runs, once more in the draws
+    variance = moments * np.array(
+        [
+            history.scatter(size) ** 2 / runs.shape[0]
+            for size, runs in zip(history.sizes, history.values, strict=True)
+        ]
+    )
     orders, error = np.empty(draws), np.empty(draws)
     for draw in range(draws):
         noisy = means + _noise(history, rng)
-        residual, amplitude, _ = _solve(noisy, scaled, grid)
+        residual, amplitude, along = _solve(noisy, scaled, grid)
         weight = ((residual.min() + _SMALL) / (residual + _SMALL)) ** power
         if prior is not None:
             weight = weight * np.exp(prior)
         pick = int(rng.choice(grid.size, p=weight / weight.sum()))
         orders[draw] = grid[pick]
-        error[draw] = amplitude[pick] / math.sqrt(moments) + left * abs(rng.standard_normal())
+        length = math.sqrt(max(0.0, amplitude[pick] ** 2 - 2.0 * along[pick] ** 2 @ variance))
+        error[draw] = length / math.sqrt(moments) + left * abs(rng.standard_normal())
     return Fit(
         name=history.name,
         order=float(grid[at]),
