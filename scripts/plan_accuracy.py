@@ -61,7 +61,8 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
     text = shot_text(name, options.quality)
     path.write_text(text, encoding="utf-8")
     command = [sys.executable, "-m", "gsfluent", "run", str(path), "-o", str(out), "--force"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     done = subprocess.run(
         [*command, "--device", str(device), "--json"],
         env=environment, capture_output=True, text=True, check=False,

@@ -226,7 +226,7 @@ def test_dear_runs_are_left_out_and_said(peers: dict[str, ModuleType], tmp_path:
     taken, left = every.jobs("physgaussian", scenes, tmp_path, options)
     whole = len(every.PEERS["physgaussian"][0].courant) * len(scenes)
     assert taken and left and len(taken) + len(left) == whole
-    assert {job["courant"] for job in taken} >= {0.37}, "its own step comes first"
+    assert {job["courant"] for job in taken} >= {0.7}, "its fastest step comes first"
 
 
 def write_config(folder: Path, **keys: Any) -> Path:

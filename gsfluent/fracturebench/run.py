@@ -58,7 +58,8 @@ class Run:
         v: Velocities [m/s], [T, N, 3].
         wall_seconds: Time the steps took, without set-up, compilation and copying out [s].
         steps: Steps taken.
-        settings: What was chosen: ``dx``, ``dt`` or ``cfl``, precision, ... plain values.
+        settings: What was chosen: ``dx``, ``dt`` or ``cfl``, precision, ... plain values; with
+            ``sha256``, that of the scene, a run is never judged by another version of it.
         device: On what.
         failed: Why it broke off, or empty.
         damage: 0 intact to 1 broken, [T, N], if the method knows.
@@ -91,10 +92,15 @@ class Run:
         """Return itself if it answers this scene.
 
         Raises:
-            SceneError: Another case, other times or another number of points.
+            SceneError: Another case, other times or another number of points; or ``settings`` hold
+                a ``sha256`` that is not the scene's: it answers another version of it.
         """
         if self.scene != scene.name:
             raise SceneError(f"a run of {self.scene!r} cannot be judged as {scene.name!r}")
+        if self.settings.get("sha256", digest := scene.digest()) != digest:
+            raise SceneError(
+                f"{self.method}, {scene.name}: answers another version of the scene; run it again"
+            )
         shape = (scene.times.shape[0], scene.count, 3)
         for name in ("x", "v"):
             value = getattr(self, name)

@@ -47,7 +47,7 @@ def answer(name: str, args: argparse.Namespace, path: Path) -> Run:
         wall = statistics.median(clock(scene, args.repeat, **options))
     settings = {
         **run.settings, "timing": "uninterrupted", "repeat": args.repeat,
-        "machine": machine(args.device), "commit": commit(),
+        "machine": machine(args.device), "commit": commit(), "sha256": scene.digest(),
     }  # fmt: skip
     run = dataclasses.replace(run, wall_seconds=wall, settings=settings)
     run.save(path)
@@ -87,8 +87,9 @@ def main() -> int:
                         f"{path} was computed on {was.device} with {dict(was.settings)}: give "
                         "another -o or --method, or remove it"
                     )
-                sys.stderr.write(f"{i}/{len(names)} {name}: {path} is there\n")
-                continue
+                if was.settings.get("sha256") == frozen.build(find(name)).digest():
+                    sys.stderr.write(f"{i}/{len(names)} {name}: {path} is there\n")
+                    continue
             try:
                 run = answer(name, args, path)
             except (SceneError, NotImplementedError, RuntimeError) as error:

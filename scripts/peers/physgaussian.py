@@ -24,7 +24,7 @@ import peerlib
 from peerlib import NODE_ON_WALL, Cannot, Floats, Placement, Scene
 
 # c dt/dx of its six configs: 0.366, 0.110, 0.367, 0.028, 0.070, 0.013
-COURANT = (0.37, 0.7, 0.1, 0.9, 0.03)
+COURANT = (0.7, 0.37, 0.1, 0.9, 0.03)
 WALL_NODES = 3  # nodes at each side that its bounding box stops
 
 

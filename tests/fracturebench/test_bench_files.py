@@ -218,6 +218,10 @@ def test_a_broken_file_is_an_error_that_says_which(
         (lambda r: dataclasses.replace(r, scene="cube"), "answers 'cube'; the scenes are bar"),
         (lambda r: dataclasses.replace(r, x=r.x[:, 1:], v=r.v[:, 1:]), "x has shape"),
         (lambda r: dataclasses.replace(r, times=r.times + 1.0), "other times"),
+        (
+            lambda r: dataclasses.replace(r, settings={"sha256": "0"}),
+            "another version of the scene",
+        ),
         (lambda r: r, "a second run of 'bar' by 'gsfluent'"),
     ],
 )
