@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from brittle_gpu_cases import PARTS, jobs, perform
+from brittle_gpu_cases import PARTS, Job, jobs, perform
 from brittle_gpu_tables import draw, tables
 from page import enter
 
@@ -55,7 +55,7 @@ def main() -> int:
         parser.error("no CUDA device here")
     torch.set_num_threads(1)
     if not options.only_tables:
-        done = {(r["key"], r["device"]) for r in records(options.output)}
+        done = {(Job.of(r).key, r["device"]) for r in records(options.output)}
         todo = [
             job
             for job in jobs(options.parts, options.device, options.quick)

@@ -15,9 +15,9 @@ from .scene import Floats, Scene, SceneError
 from .shapes import elastic, free, wave_speed
 from .statistics import stored_energy
 
-__all__ = ["crack_tip", "double_cantilever", "energy_beyond"]
+__all__ = ["cantilever", "crack_tip", "double_cantilever", "energy_beyond"]
 
-_HEIGHT, _NOTCH, _SPEED = 0.375, 0.25, 0.001
+_HEIGHT, _NOTCH = 0.375, 0.25
 _SECTION = (0.125, 0.1875)
 _PLAIN = elastic(1e9, 0.2, 1000.0)
 
@@ -72,12 +72,14 @@ def _judge(scene: Scene, run: Run) -> Iterator[Measure]:
     )  # fmt: skip
 
 
-@case(kind="fracture", dx=1 / 32, ladder=(1 / 32, 1 / 48, 1 / 64), judge=_judge)
-def double_cantilever(dx: float, per_cell: int) -> Scene:
-    """Double cantilever: a crack takes the energy per area that its material says, at every dx.
+def cantilever(dx: float, per_cell: int, speed: float, seconds: float) -> Scene:
+    """The scene of :func:`double_cantilever` at any speed.
 
-    Arms of a notched slab are wedged apart at 0.001 c each after a ramp. A layer of an eighth of a
-    metre around the middle can break, the rest is elastic.
+    Args:
+        dx: Node spacing [m].
+        per_cell: Points per cell.
+        speed: Of each arm over that of a pressure wave.
+        seconds: Duration in travel times along the slab.
     """
     row = brittle(
         1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, strength=0.02, softening=0.01,
@@ -90,7 +92,7 @@ def double_cantilever(dx: float, per_cell: int) -> Scene:
     points, middle = points[keep], middle[keep]
     end, edge = points[:, 0] < 0.0626, 0.5 * _HEIGHT - 0.0626
     held = end & (np.abs(middle) > edge)
-    times = np.linspace(0.0, 14.0 / c, 141)[1:]
+    times = np.linspace(0.0, seconds / c, 141)[1:]
     return free(
         "double_cantilever", points, [0.0, 0.0, 0.0], dx, per_cell, times,
         (_PLAIN, row, heavy(_PLAIN)),
@@ -99,9 +101,19 @@ def double_cantilever(dx: float, per_cell: int) -> Scene:
         drives=tuple(
             {
                 "points": np.flatnonzero(end & (sign * middle > edge)).tolist(),
-                "velocity": [None, sign * _SPEED * c, None], "ramp": 1.0 / c,
+                "velocity": [None, sign * speed * c, None], "ramp": 1.0 / c,
             }
             for sign in (1.0, -1.0)
         ),
         asks=("damage", "stress"),
     )  # fmt: skip
+
+
+@case(kind="fracture", dx=1 / 32, ladder=(1 / 32, 1 / 48, 1 / 64), judge=_judge)
+def double_cantilever(dx: float, per_cell: int) -> Scene:
+    """Double cantilever: a crack takes the energy per area that its material says, at every dx.
+
+    Arms of a notched slab are wedged apart at 0.001 c each after a ramp. A layer of an eighth of a
+    metre around the middle can break, the rest is elastic.
+    """
+    return cantilever(dx, per_cell, 0.001, 14.0)

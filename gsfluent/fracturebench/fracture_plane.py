@@ -9,13 +9,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from .fracture_rows import BROKEN, brittle, damage_of
-from .fracture_slabs import heavy, sheet, slab_volume, walls
+from .fracture_slabs import HEAVY, heavy, sheet, slab_volume, walls
 from .registry import case
 from .run import Measure, Run
 from .scene import Floats, Scene, SceneError
 from .shapes import elastic, free, wave_speed
 
-__all__ = ["brazilian_disc", "front_speed", "kalthoff", "notch_tension", "rayleigh_speed"]
+__all__ = ["brazilian_disc", "front_speed", "kalthoff", "notch", "notch_tension", "rayleigh_speed"]
 
 _PLAIN = elastic(1e9, 0.2, 1000.0)
 
@@ -174,18 +174,20 @@ def _judge_notch(scene: Scene, run: Run) -> Iterator[Measure]:
     )
 
 
-@case(kind="fracture", dx=1 / 32, ladder=(1 / 24, 1 / 32, 1 / 48), judge=_judge_notch)
-def notch_tension(dx: float, per_cell: int) -> Scene:
-    """Single-edge notch in tension: its crack runs straight and slower than a Rayleigh wave.
+def notch(dx: float, per_cell: int, pull: float, weight: float) -> Scene:
+    """The scene of :func:`notch_tension` at any load.
 
-    The strip is torn so slowly that waves cross it many times before the crack starts. Torn faster,
-    all of it reaches its strength before a crack has passed, and what then runs is no crack.
+    Args:
+        dx: Node spacing [m].
+        per_cell: Points per cell.
+        pull: Speed of each grip over that of a pressure wave.
+        weight: Density and stiffness of the grips over those of the strip.
     """
     row = brittle(
         1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, strength=0.005, softening=0.001,
         energy=0.0887, dx=dx, reference=1.0 / 32.0,
     )  # fmt: skip
-    c, pull = wave_speed(_PLAIN), 6e-6
+    c = wave_speed(_PLAIN)
     points = sheet([0.0, -0.5 * _HEIGHT], [1.0, _HEIGHT], dx, per_cell)
     points = points[(points[:, 0] > _NOTCH) | (np.abs(points[:, 1]) > 1.01 * dx)]
     y = points[:, 1]
@@ -193,10 +195,14 @@ def notch_tension(dx: float, per_cell: int) -> Scene:
     velocity[:, 1] = 2.0 * pull * c * y / _HEIGHT
     edge = 0.5 * _HEIGHT - 2.0 * dx
     # finely while a crack may run
-    times = np.concatenate([np.linspace(0.0, 9.0, 31)[1:], np.linspace(9.0, 16.0, 141)[1:]]) / c
+    start = 9.0 * 6e-6 / pull
+    times = np.concatenate(
+        [np.linspace(0.0, start, 31)[1:], np.linspace(start, start + 7.0, 141)[1:]]
+    )
+    times /= c
     return free(
         "notch_tension", points, velocity, dx, per_cell, times,
-        (_PLAIN, row, heavy(_PLAIN)),
+        (_PLAIN, row, heavy(_PLAIN, weight)),
         material=np.where(np.abs(y) > edge, 2, np.abs(y) < 0.125).astype(np.int32),
         volume=np.full(y.size, slab_volume(dx, per_cell)), colliders=walls(dx),
         drives=(
@@ -205,6 +211,16 @@ def notch_tension(dx: float, per_cell: int) -> Scene:
         ),
         asks=("damage",),
     )  # fmt: skip
+
+
+@case(kind="fracture", dx=1 / 32, ladder=(1 / 24, 1 / 32, 1 / 48), judge=_judge_notch)
+def notch_tension(dx: float, per_cell: int) -> Scene:
+    """Single-edge notch in tension: its crack runs straight and slower than a Rayleigh wave.
+
+    The strip is torn so slowly that waves cross it many times before the crack starts. Torn faster,
+    all of it reaches its strength before a crack has passed, and what then runs is no crack.
+    """
+    return notch(dx, per_cell, 6e-6, HEAVY)
 
 
 # --- Kalthoff and Winkler -------------------------------------------------------------------------

@@ -10,7 +10,10 @@ import numpy as np
 from .scene import Floats
 from .shapes import elastic
 
-__all__ = ["edge_points", "heavy", "sheet", "slab_volume", "walls"]
+__all__ = ["HEAVY", "edge_points", "heavy", "sheet", "slab_volume", "walls"]
+
+HEAVY = 30.0
+"""Density and stiffness of grips over those of what they hold."""
 
 
 def edge_points(per_cell: int) -> int:
@@ -52,15 +55,16 @@ def walls(dx: float, axes: Sequence[int] = (2,)) -> tuple[dict[str, Any], ...]:
     return tuple(rows)
 
 
-def heavy(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row for grips: thirty times as stiff and dense, so that waves in it are as fast.
+def heavy(row: Mapping[str, Any], weight: float = HEAVY) -> dict[str, Any]:
+    """A row for grips: as many times as stiff and dense, so that waves in it are as fast.
 
     A method that sets the velocity of points before a step, and not that of nodes, moves what is
-    held with a force of at most about ``density dx speed / dt`` per area: a heavy grip makes that
-    bound thirty times as high.
+    held with a force of at most about ``density dx speed / dt`` per area: the grip gives way, and
+    more so with long steps. A heavy grip raises that bound.
+
+    Args:
+        row: Elastic row.
+        weight: Factor.
     """
-    return elastic(
-        30.0 * float(row["young_modulus"]),
-        float(row["poisson_ratio"]),
-        30.0 * float(row["density"]),
-    )
+    young, density = float(row["young_modulus"]), float(row["density"])
+    return elastic(weight * young, float(row["poisson_ratio"]), weight * density)

@@ -17,9 +17,22 @@ import torch
 from gsfluent.fracturebench.scene import Floats, Scene
 from gsfluent.lab.shapes import ball, box
 from gsfluent.lab.textbook import Textbook, Variant
+from gsfluent.lab.textbook_grid import stencil
 from gsfluent.lab.textbook_variant import Birth
 
-__all__ = ["DX", "FLESH", "SPEED", "Outcome", "apart", "debris", "drop", "hit_rate", "run", "step"]
+__all__ = [
+    "DX",
+    "FLESH",
+    "SPEED",
+    "Outcome",
+    "apart",
+    "debris",
+    "drop",
+    "exposure",
+    "hit_rate",
+    "run",
+    "step",
+]
 
 DX = 1.0 / 32.0
 """Node spacing of these scenes [m]; a power of two, so that x / dx rounds nothing."""
@@ -100,6 +113,25 @@ def hit_rate(scene: Scene, dtype: torch.dtype, *, local: bool = False) -> float:
     return float((np.exp2(np.floor(np.log2(np.abs(scene.x / DX)))) * eps).sum())
 
 
+def exposure(solver: Textbook) -> float:
+    """Expected points per step that an unguarded division kills, in the present state.
+
+    A point is exposed along an axis if one of its far nodes is reached by no other point: half-way
+    between nodes its weight there is exactly zero. Times the chance to lie there in this precision.
+    """
+    position = solver.position
+    s = stencil(torch.zeros_like(position, dtype=torch.int64), position / DX, DX, "quadratic")
+    reached = torch.bincount(s.node.reshape(-1), minlength=s.size)
+    lonely = reached[s.node] == 1
+    chance = torch.exp2(torch.floor(torch.log2((position / DX).abs())))
+    chance = chance * torch.finfo(solver.dtype).eps
+    total = 0.0
+    for axis in range(3):
+        far = (lonely & (s.corner[:, axis] == 2)).any(1)
+        total += float((far * chance[:, axis]).sum())
+    return total
+
+
 def step(scene: Scene, courant: float = 0.3) -> float:
     """Fixed time step [s] from the wave speed at rest and the speed at the start."""
     fastest = scene.wave_speed + float(np.linalg.norm(scene.v, axis=1).max())
@@ -117,6 +149,7 @@ class Outcome(NamedTuple):
         broken: Share of points without strength.
         kinetic: Kinetic energy over that at the start.
         smallest: Smallest volume ratio met.
+        exposure: Expected deaths by an unguarded division so far (:func:`exposure`), if asked for.
         track: Positions after every ``every`` steps, float32 [T, N, 3], if asked for.
     """
 
@@ -127,6 +160,7 @@ class Outcome(NamedTuple):
     broken: float
     kinetic: float
     smallest: float
+    exposure: float
     track: Floats | None
 
 
@@ -139,6 +173,7 @@ def run(
     dtype: torch.dtype = torch.float32,
     device: str = "cpu",
     every: int = 0,
+    exposed: int = 0,
 ) -> Outcome:
     """Run a scene by the textbook solver for a number of steps, or until a number is none.
 
@@ -150,17 +185,20 @@ def run(
         dtype: Precision.
         device: Where.
         every: Keep the positions of every so manieth step; 0 keeps none.
+        exposed: Look at :func:`exposure` every so manieth step; 0 never.
     """
     solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt)
     start = solver.kinetic()
-    last, track, smallest = solver.position, [], 1.0
+    last, track, smallest, expected = solver.position, [], 1.0, 0.0
 
     def watch(s: Textbook) -> None:
-        nonlocal last, smallest
+        nonlocal last, smallest, expected
         if s.steps % 5 == 0:
             smallest = min(smallest, float(s.volume_ratio.min()))
         if every and s.steps % every == 0:
             track.append(s.position.cpu().numpy())
+        if exposed and s.steps % exposed == 0:
+            expected += exposed * exposure(s)
         last = s.position
 
     try:
@@ -170,7 +208,7 @@ def run(
     broken = float((solver.brittle & (solver.alpha >= 0.0)).double().mean())
     return Outcome(
         last.cpu().numpy(), solver.alpha.double().cpu().numpy(), solver.steps, solver.birth,
-        broken, solver.kinetic() / start, smallest, np.stack(track) if track else None,
+        broken, solver.kinetic() / start, smallest, expected, np.stack(track) if track else None,
     )  # fmt: skip
 
 

@@ -86,6 +86,7 @@ class Fit:
         order: Best fitting order.
         orders: Orders drawn, [D].
         error: Rms error of the mean at the finest level, drawn, [D].
+        chance: Factor on the scatter, drawn, [D]: few seeds do not know it well.
         finest: Size of the cells of that level.
         misfit: Rms of what the law does not explain over the change that it does explain.
         parallel: Cosine between the successive changes; 1 is steady convergence.
@@ -96,6 +97,7 @@ class Fit:
     order: float
     orders: Array
     error: Array
+    chance: Array
     finest: float
     misfit: float
     parallel: float
@@ -111,13 +113,17 @@ class Fit:
         What both are off by in the same direction is not in it. ``growth`` is a factor on the
         difference of the means, ``spread`` one on the scatter.
         """
-        mean = growth * (self.mean_errors(size) - self.mean_errors(finer))
-        whole = np.hypot(mean, spread * self.history.scatter(size))
-        return np.asarray(np.minimum(whole, self.history.most))
+        return self.around(
+            growth * (self.mean_errors(size) - self.mean_errors(finer)), size, spread
+        )
 
     def errors(self, size: float) -> Array:
         """Drawn rms errors of one run at a size of cells, [D]: of the mean, and its scatter."""
-        whole = np.hypot(self.mean_errors(size), self.history.scatter(size))
+        return self.around(self.mean_errors(size), size)
+
+    def around(self, mean: Array, size: float, spread: float = 1.0) -> Array:
+        """Drawn rms errors of one run, [D], from those of the mean and the scatter at a size."""
+        whole = np.hypot(mean, spread * self.chance * self.history.scatter(size))
         return np.asarray(np.minimum(whole, self.history.most))
 
     @property
@@ -189,7 +195,7 @@ def fit_history(
     scaled = sizes / sizes[-1]
     grid = np.linspace(*ORDERS, _GRID)
     means = np.stack([runs.mean(axis=0).reshape(-1) for runs in history.values])
-    moments = history.values[0].shape[1]
+    moments, components = history.values[0].shape[1:]
     rng = np.random.default_rng([seed, *history.name.encode()])
 
     best, amplitude, _ = _solve(means, scaled, grid)
@@ -201,21 +207,33 @@ def fit_history(
     left = math.sqrt(float(best[at]) / (moments * max(1, sizes.size - 2)))
     power = 0.5 * _data(means, scaled, grid[at], history) * (sizes.size - 2)
 
+    free = components * sum(runs.shape[0] - 1 for runs in history.values)
+    # a variance of so many free values is known up to chi^2 / free
+    chance = np.sqrt(free / rng.chisquare(free, draws)) if free else np.ones(draws)
+    # chance lengthens every change: once in the runs, once more in the draws
+    variance = moments * np.array(
+        [
+            history.scatter(size) ** 2 / runs.shape[0]
+            for size, runs in zip(history.sizes, history.values, strict=True)
+        ]
+    )
     orders, error = np.empty(draws), np.empty(draws)
     for draw in range(draws):
         noisy = means + _noise(history, rng)
-        residual, amplitude, _ = _solve(noisy, scaled, grid)
+        residual, amplitude, along = _solve(noisy, scaled, grid)
         weight = ((residual.min() + _SMALL) / (residual + _SMALL)) ** power
         if prior is not None:
             weight = weight * np.exp(prior)
         pick = int(rng.choice(grid.size, p=weight / weight.sum()))
         orders[draw] = grid[pick]
-        error[draw] = amplitude[pick] / math.sqrt(moments) + left * abs(rng.standard_normal())
+        length = math.sqrt(max(0.0, amplitude[pick] ** 2 - 2.0 * along[pick] ** 2 @ variance))
+        error[draw] = length / math.sqrt(moments) + left * abs(rng.standard_normal())
     return Fit(
         name=history.name,
         order=float(grid[at]),
         orders=orders,
         error=error,
+        chance=chance,
         finest=float(sizes[-1]),
         misfit=left / explained if explained > _SMALL else 0.0,
         parallel=_cosine(steps[0], steps[-1]),

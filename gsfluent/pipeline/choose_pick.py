@@ -118,8 +118,8 @@ def ranked(
             bands = [_band(fit, size, spread or {}) for fit in fits]
             means = [_mean(fit, size, growth or {}, added) for fit in fits]
             rows = np.stack([
-                np.minimum(np.hypot(mean, band), fit.history.most)
-                for fit, mean, band in zip(fits, means, bands, strict=True)
+                fit.around(mean, size, (spread or {}).get(fit.name, 1.0))
+                for fit, mean in zip(fits, means, strict=True)
             ])  # fmt: skip
             worst = rows.max(axis=0)
             settled = np.stack(means) <= np.array([[max(bound, band)] for band in bands])

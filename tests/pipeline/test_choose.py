@@ -142,6 +142,26 @@ def test_no_setting_claims_less_than_chance() -> None:
     assert choice.enough is not None  # where finer cells change less than chance does
 
 
+def test_chance_is_not_taken_for_an_error_of_the_cells() -> None:
+    """No error at all, only scatter: what is said of the cells stays below the scatter's own."""
+    fit = fit_history(made(1.0, 0.0, noise=0.05, chaotic=True))
+    scatter = fit.history.scatter(1 / 20)
+    assert scatter == pytest.approx(0.05 * np.sqrt(2.0), rel=0.5)
+    assert np.median(fit.mean_errors(1 / 20)) < 0.7 * scatter
+    plain = fit_history(made(1.0, 4.0, noise=0.05, chaotic=True))
+    assert np.median(plain.mean_errors(1 / 20)) == pytest.approx(
+        true_error(1.0, 4.0, 1 / 20), rel=0.6
+    )
+
+
+def test_few_seeds_know_their_scatter_badly() -> None:
+    """Three levels of three seeds and two components: 12 free values, chi^2_12 / 12 of variance."""
+    fit = fit_history(made(1.0, 0.0, noise=0.05, chaotic=True), draws=4000)
+    low, high = np.quantile(fit.chance, [0.05, 0.95])
+    assert low == pytest.approx(np.sqrt(12 / 21.03), rel=0.03)  # tables of chi^2_12: 5.226, 21.03
+    assert high == pytest.approx(np.sqrt(12 / 5.226), rel=0.03)
+
+
 def test_a_bound_beyond_the_finest_grid_is_refused() -> None:
     fits = [fit_history(made(0.6, 3.0))]
     choice = pick(fits, ranked(fits, 1e-3, fourth_power), 1e-3)
