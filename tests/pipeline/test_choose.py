@@ -155,11 +155,11 @@ def test_chance_is_not_taken_for_an_error_of_the_cells() -> None:
 
 
 def test_few_seeds_know_their_scatter_badly() -> None:
-    """Three levels of three seeds and two components: 12 free values, chi^2_12 / 12 of variance."""
+    """Two levels count, of three seeds and two components: 8 free values, chi^2_8 / 8."""
     fit = fit_history(made(1.0, 0.0, noise=0.05, chaotic=True), draws=4000)
     low, high = np.quantile(fit.chance, [0.05, 0.95])
-    assert low == pytest.approx(np.sqrt(12 / 21.03), rel=0.03)  # tables of chi^2_12: 5.226, 21.03
-    assert high == pytest.approx(np.sqrt(12 / 5.226), rel=0.03)
+    assert low == pytest.approx(np.sqrt(8 / 15.51), rel=0.03)  # tables of chi^2_8: 2.733, 15.51
+    assert high == pytest.approx(np.sqrt(8 / 2.733), rel=0.03)
 
 
 def test_a_bound_beyond_the_finest_grid_is_refused() -> None:
