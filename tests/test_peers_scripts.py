@@ -50,6 +50,8 @@ class Flight:
         self.advances += 1
 
     def state(self) -> tuple[Any, Any]:
+        if self.end == "raises":
+            raise RuntimeError("no more of it\nat line 7")
         if self.end == "leaves":
             raise self.lib.Cannot("points reached the side of its domain")
         return (self.x * math.nan if self.end == "nan" else self.x.copy()), self.v.copy()
@@ -159,7 +161,12 @@ def test_error_and_time_come_from_separate_runs(peers: dict[str, ModuleType]) ->
 
 @pytest.mark.parametrize(
     ("end", "reason"),
-    [("nan", "not finite before"), ("leaves", "side of its domain"), ("cannot", "has no law")],
+    [
+        ("nan", "not finite before"),
+        ("leaves", "side of its domain"),
+        ("cannot", "has no law"),
+        ("raises", "RuntimeError: no more of it"),
+    ],
 )
 def test_a_run_that_breaks_off_says_why(
     peers: dict[str, ModuleType], end: str, reason: str

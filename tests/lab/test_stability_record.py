@@ -74,7 +74,7 @@ def test_named_points_of_the_peers_lie_where_their_choice_fails(recorded: list[P
     lines = [x for m in maps for x in stability_report.named(m, recorded, marks(maps))]
     assert len(lines) == sum(map(len, KNOWN.values()))
     holding = [line for line in lines if line.endswith("holds")]
-    assert len(holding) == 3 and all("step" in x or "ficus" in x for x in holding)
+    assert len(holding) == 3 and all("its demo" in x or "step (0.6)" in x for x in holding)
 
 
 def test_failures_measured_on_programs_become_points(tmp_path: Path) -> None:
