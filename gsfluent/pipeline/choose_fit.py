@@ -66,13 +66,15 @@ class History:
     def scatter(self, size: float) -> float:
         """Scatter of a single run at a size of cells.
 
-        For what is chaotic it is the mean of the levels at every size; else it is that of sampling
-        the points and falls with the cells, in proportion at most.
+        For what is chaotic it is the mean of the levels at every size, without the coarsest, whose
+        few points scatter most; else it is that of sampling the points and falls with the cells, in
+        proportion at most.
         """
         bands = self.bands
         if not bands:
             return 0.0
         if self.chaotic:
+            bands = bands[1:] or bands
             return math.sqrt(sum(b * b for _, b in bands) / len(bands))
         return size * math.sqrt(sum((b / h) ** 2 for h, b in bands) / len(bands))
 
@@ -207,7 +209,8 @@ def fit_history(
     left = math.sqrt(float(best[at]) / (moments * max(1, sizes.size - 2)))
     power = 0.5 * _data(means, scaled, grid[at], history) * (sizes.size - 2)
 
-    free = components * sum(runs.shape[0] - 1 for runs in history.values)
+    known = history.values[1:] if history.chaotic else history.values
+    free = components * sum(runs.shape[0] - 1 for runs in known)
     # a variance of so many free values is known up to chi^2 / free
     chance = np.sqrt(free / rng.chisquare(free, draws)) if free else np.ones(draws)
     # chance lengthens every change: once in the runs, once more in the draws
