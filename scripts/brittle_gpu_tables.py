@@ -78,11 +78,22 @@ def born(some: list[Record]) -> str:
     return ", ".join(stages)
 
 
+def between(steps: list[int]) -> str:
+    low, high = min(steps), max(steps)
+    return f"step {low}" if low == high else f"step {low} to {high}"
+
+
 def share(some: list[Record]) -> str:
     dead = [r for r in some if r["birth"]]
-    steps = sorted({int(r["birth"]["step"]) for r in dead})
-    when = f"step {steps[0]}" + (f" to {steps[-1]}" if len(steps) > 1 else "") if steps else ""
-    return f"{len(dead)} of {len(some)}" + (f" ({born(dead)}, {when})" if dead else "")
+    text = f"{len(dead)} of {len(some)}"
+    if dead:
+        text += f" ({born(dead)}, {between([int(r['birth']['step']) for r in dead])})"
+    wrong = [r for r in some if not r["birth"] and r.get("violation")]
+    if wrong:
+        kinds = ", ".join(sorted({str(r["violation"]["kind"]) for r in wrong}))
+        text += f" + {len(wrong)} finite but wrong ({kinds}, "
+        text += f"{between([int(r['violation']['step']) for r in wrong])})"
+    return text
 
 
 def factor_table(found: list[Record]) -> str:

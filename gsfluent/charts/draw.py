@@ -214,7 +214,7 @@ class Chart:
     def _panel(self, case: str) -> Panel:
         mine = [r for r in self.records if r.case == case]
         names = methods(mine, OURS)
-        measure = mine[0].measures[0]["quantity"] if mine[0].measures else ""
+        measure = next((r.measures[0]["quantity"] for r in mine if r.measures), "")
         fronts = {m: [_dot(r) for r in front(_of(mine, case, m))] for m in names}
         return Panel(case, [_dot(r) for r in mine], fronts, note=measure, band=_band(mine))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,10 +13,10 @@ import numpy as np
 import torch
 
 from gsfluent.charts.ladder import TEXTBOOK, Setting
-from gsfluent.charts.record import Record, of_run
+from gsfluent.charts.record import Record, commit, machine, of_run
 from gsfluent.charts.ride import Riders
 from gsfluent.fracturebench.fracture_shatter import reference
-from gsfluent.fracturebench.registry import find
+from gsfluent.fracturebench.registry import Case, find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.statistics import distance, jitter
@@ -64,13 +65,14 @@ def measure(setting: Setting, device: str, repeat: int = 3) -> Record:
             facts["threads"] = torch.get_num_threads()
         try:
             runs, wall, steps, more = _runs(setting, scene, device, options, repeat, seeds)
-        except (FloatingPointError, RuntimeError, ValueError, MemoryError) as error:
-            runs, wall, steps, more = [_broken(setting, scene, device, error)], None, None, {}
-    if seeds > 1:
-        more["band"] = _band()
-    return of_run(
-        case, scene, runs, variant=setting.variant, wall=wall, steps=steps, **facts, **more
-    )
+            if seeds > 1:
+                more["band"] = _band()
+            return of_run(
+                case, scene, runs, variant=setting.variant, wall=wall, steps=steps, **facts, **more
+            )
+        # a scene of so few points that its measure divides by none cannot be judged either
+        except (ArithmeticError, RuntimeError, ValueError, MemoryError) as error:
+            return _broken(setting, case, scene, device, facts, error)
 
 
 def _band() -> float:
@@ -199,10 +201,20 @@ def _threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _broken(setting: Setting, scene: Scene, device: str, error: BaseException) -> Run:
-    nowhere = np.full((scene.times.shape[0], scene.count, 3), math.nan)
+def _broken(
+    setting: Setting,
+    case: Case,
+    scene: Scene,
+    device: str,
+    facts: dict[str, Any],
+    error: BaseException,
+) -> Record:
     words = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-    return Run(
-        scene.name, setting.method, scene.times, nowhere, nowhere, math.nan, 0,
-        {"dx": scene.dx}, device, words.rstrip(": "),
+    return Record(
+        case=case.name, kind=case.kind, method=setting.method, variant=setting.variant,
+        settings={"dx": setting.dx, "ppc": setting.ppc, **facts}, device=device,
+        machine=machine(device), points=scene.count, steps=0, simulated_seconds=scene.seconds,
+        wall_seconds=[], wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
+        failed=words.rstrip(": "), commit=commit(),
+        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )  # fmt: skip

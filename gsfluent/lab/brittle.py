@@ -19,6 +19,7 @@ from gsfluent.lab.shapes import ball, box
 from gsfluent.lab.textbook import Textbook, Variant
 from gsfluent.lab.textbook_grid import stencil
 from gsfluent.lab.textbook_variant import Birth
+from gsfluent.lab.violations import Limits, State, Violation, check, observe
 
 __all__ = [
     "DX",
@@ -149,6 +150,8 @@ class Outcome(NamedTuple):
         broken: Share of points without strength.
         kinetic: Kinetic energy over that at the start.
         smallest: Smallest volume ratio met.
+        violation: The first law that it broke (:mod:`gsfluent.lab.violations`; momentum is not
+            judged, the floor takes it), if asked for.
         exposure: Expected deaths by an unguarded division so far (:func:`exposure`), if asked for.
         track: Positions after every ``every`` steps, float32 [T, N, 3], if asked for.
     """
@@ -160,8 +163,23 @@ class Outcome(NamedTuple):
     broken: float
     kinetic: float
     smallest: float
+    violation: Violation | None
     exposure: float
     track: Floats | None
+
+
+def _state(s: Textbook, start: State | None) -> State:
+    m = s.nacc
+    params = torch.zeros(s.scene.count, 8, dtype=torch.float64, device=s.device)
+    params[:, 0], params[:, 1] = m.mu.double(), m.kappa.double()
+    params[:, 6] = s.mass.double() / s.volume.double()
+    return observe(
+        step=s.steps, time=s.time, dx=s.scene.dx, position=s.position, velocity=s.velocity,
+        affine=s.affine, mass=s.mass, volume=s.volume,
+        law=torch.zeros(s.scene.count, dtype=torch.int32, device=s.device), params=params,
+        strain=s.strain, gravity=s.scene.gravity, start=start,
+        pulled_back=int((s.volume_ratio <= 0).sum()),
+    )  # fmt: skip
 
 
 def run(
@@ -174,6 +192,7 @@ def run(
     device: str = "cpu",
     every: int = 0,
     exposed: int = 0,
+    judged: int = 0,
 ) -> Outcome:
     """Run a scene by the textbook solver for a number of steps, or until a number is none.
 
@@ -186,19 +205,24 @@ def run(
         device: Where.
         every: Keep the positions of every so manieth step; 0 keeps none.
         exposed: Look at :func:`exposure` every so manieth step; 0 never.
+        judged: Judge energy and volume every so manieth step; 0 never.
     """
     solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt)
     start = solver.kinetic()
     last, track, smallest, expected = solver.position, [], 1.0, 0.0
+    limits, violation = Limits(momentum=math.inf), None
+    first = _state(solver, None) if judged else None
 
     def watch(s: Textbook) -> None:
-        nonlocal last, smallest, expected
+        nonlocal last, smallest, expected, violation
         if s.steps % 5 == 0:
             smallest = min(smallest, float(s.volume_ratio.min()))
         if every and s.steps % every == 0:
             track.append(s.position.cpu().numpy())
         if exposed and s.steps % exposed == 0:
             expected += exposed * exposure(s)
+        if first is not None and violation is None and s.steps % judged == 0:
+            violation = check(first, _state(s, first), limits)
         last = s.position
 
     try:
@@ -208,7 +232,8 @@ def run(
     broken = float((solver.brittle & (solver.alpha >= 0.0)).double().mean())
     return Outcome(
         last.cpu().numpy(), solver.alpha.double().cpu().numpy(), solver.steps, solver.birth,
-        broken, solver.kinetic() / start, smallest, expected, np.stack(track) if track else None,
+        broken, solver.kinetic() / start, smallest, violation, expected,
+        np.stack(track) if track else None,
     )  # fmt: skip
 
 

@@ -23,8 +23,9 @@ __all__ = [
     "stencil",
 ]
 
-DENSE_NODES = 2**23
-"""Nodes beyond which the box around the points is compacted to the nodes that are used."""
+DENSE_NODES, DENSE_SHARE = 2**16, 8
+"""Nodes, and nodes per node of a point, beyond which the box around the points is compacted to the
+nodes that are used: points that fly apart make a box of air."""
 _BITS = 40
 """Of the largest summand in the fixed-point sums."""
 
@@ -86,7 +87,7 @@ def stencil(cell: Tensor, offset: Tensor, dx: float, kernel: str) -> Stencil:
     stride = torch.tensor([extent[1] * extent[2], extent[2], 1], device=base.device)
     node = ((base - low) * stride).sum(1)[:, None] + (corner * stride).sum(1)
     size = extent[0] * extent[1] * extent[2]
-    if size > DENSE_NODES:
+    if size > max(DENSE_NODES, DENSE_SHARE * node.numel()):
         used, node = torch.unique(node, return_inverse=True)
         size = used.shape[0]
     else:

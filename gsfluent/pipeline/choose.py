@@ -98,7 +98,8 @@ class Probes:
 
     Attributes:
         whole: Over the whole shot: the first runs of the two coarsest levels.
-        levels: All levels by seed, at least to the end of the window; the coarsest to the end.
+        levels: All levels by seed, at least to the end of the window; the two coarsest to the end
+            where matter breaks, else their first seeds.
         long: With the longer steps, Courant number to its runs on the middle level.
         first: First frame of the window.
         last: Last frame + 1.
@@ -162,13 +163,14 @@ def run_probes(
 
     coarse = go(probing.levels[0], 0, total)
     first, last = window(coarse.seen, probing.frames)
-    if probing.seeds is None and bool((coarse.seen.broken > 0.0).any()):
+    breaks = bool((coarse.seen.broken > 0.0).any())
+    if probing.seeds is None and breaks:
         seeds = 3
     second = go(probing.levels[1], 0, total)
     levels = []
     for at, cells in enumerate(probing.levels):
         known = [coarse, second][at : at + 1]
-        until = total if at == 0 else last
+        until = total if at < 2 and breaks else last
         levels.append((*known, *(go(cells, n, until) for n in range(len(known), seeds))))
     middle = probing.levels[1]
     long = {cfl: tuple(go(middle, n, last, cfl) for n in range(seeds)) for cfl in probing.cfl}
@@ -209,23 +211,26 @@ def _growth(probes: Probes) -> tuple[dict[str, float], dict[str, float]]:
     """Factors from the window to the end of the shot, by observable.
 
     On the error of the mean: what two coarse levels differ by beyond chance from the window's first
-    frame on, over the same in the window. On the scatter: that of the coarsest level. Frames before
-    anything happens have no error and would only dilute it.
+    frame on, over the same in the window. On the scatter: that of the finer one of them. Frames
+    before anything happens have no error and would only dilute it.
     """
-    coarse, second = probes.levels[0], probes.whole[1]
-    total = min(p.seen.frames for p in (*coarse, second))
+    total = min(probe.seen.frames for probe in probes.whole)
+    pair = [[p for p in level if p.seen.frames >= total] for level in probes.levels[:2]]
     change: list[dict[str, float]] = []
     chance: list[dict[str, float]] = []
     for first, last in ((probes.first, probes.last), (probes.first, total)):
-        shown = histories([coarse, (second,)], first, last, coarse[0].seen)
+        shown = histories(pair, first, last, probes.whole[0].seen)
         change.append({})
         chance.append({})
         for h in shown:
-            band = h.bands[0][1]
-            gap = distance(h.values[0].mean(axis=0), h.values[1][0])
-            beyond = gap**2 - band**2 * (1.0 + 1.0 / len(coarse))
-            change[-1][h.name] = math.sqrt(max(0.0, beyond))
-            chance[-1][h.name] = band
+            bands = dict(h.bands)
+            gap = distance(h.values[0].mean(axis=0), h.values[1].mean(axis=0))
+            off = sum(
+                bands.get(size, 0.0) ** 2 / runs.shape[0]
+                for size, runs in zip(h.sizes, h.values, strict=True)
+            )
+            change[-1][h.name] = math.sqrt(max(0.0, gap**2 - off))
+            chance[-1][h.name] = bands.get(h.sizes[1], 0.0)
 
     def ratio(pair: list[dict[str, float]]) -> dict[str, float]:
         inside, whole = pair

@@ -66,13 +66,15 @@ class History:
     def scatter(self, size: float) -> float:
         """Scatter of a single run at a size of cells.
 
-        For what is chaotic it is the mean of the levels at every size; else it is that of sampling
-        the points and falls with the cells, in proportion at most.
+        For what is chaotic it is the mean of the levels at every size, without the coarsest, whose
+        few points scatter most; else it is that of sampling the points and falls with the cells, in
+        proportion at most.
         """
         bands = self.bands
         if not bands:
             return 0.0
         if self.chaotic:
+            bands = bands[1:] or bands
             return math.sqrt(sum(b * b for _, b in bands) / len(bands))
         return size * math.sqrt(sum((b / h) ** 2 for h, b in bands) / len(bands))
 
@@ -207,19 +209,28 @@ def fit_history(
     left = math.sqrt(float(best[at]) / (moments * max(1, sizes.size - 2)))
     power = 0.5 * _data(means, scaled, grid[at], history) * (sizes.size - 2)
 
-    free = components * sum(runs.shape[0] - 1 for runs in history.values)
+    known = history.values[1:] if history.chaotic else history.values
+    free = components * sum(runs.shape[0] - 1 for runs in known)
     # a variance of so many free values is known up to chi^2 / free
     chance = np.sqrt(free / rng.chisquare(free, draws)) if free else np.ones(draws)
+    # chance lengthens every change: once in the runs, once more in the draws
+    variance = moments * np.array(
+        [
+            history.scatter(size) ** 2 / runs.shape[0]
+            for size, runs in zip(history.sizes, history.values, strict=True)
+        ]
+    )
     orders, error = np.empty(draws), np.empty(draws)
     for draw in range(draws):
         noisy = means + _noise(history, rng)
-        residual, amplitude, _ = _solve(noisy, scaled, grid)
+        residual, amplitude, along = _solve(noisy, scaled, grid)
         weight = ((residual.min() + _SMALL) / (residual + _SMALL)) ** power
         if prior is not None:
             weight = weight * np.exp(prior)
         pick = int(rng.choice(grid.size, p=weight / weight.sum()))
         orders[draw] = grid[pick]
-        error[draw] = amplitude[pick] / math.sqrt(moments) + left * abs(rng.standard_normal())
+        length = math.sqrt(max(0.0, amplitude[pick] ** 2 - 2.0 * along[pick] ** 2 @ variance))
+        error[draw] = length / math.sqrt(moments) + left * abs(rng.standard_normal())
     return Fit(
         name=history.name,
         order=float(grid[at]),

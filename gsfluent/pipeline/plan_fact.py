@@ -8,6 +8,7 @@ the model's, and only that corrects it.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -81,13 +82,15 @@ def _filled(work: Work, report: Mapping[str, Any], splats: float) -> float:
     if features is None or "interior_gaussians" not in report:
         return 0.0
     objects = report.get("objects") or [report]
-    voxels = matter = inner = 0.0
-    for one in objects:
-        x, y, z = one["grid"]
-        voxels += x * y * z
-        matter += one["volume"] / one["voxel"] ** 3
-        inner += one["interior_gaussians"] + one.get("pruned", 0)
-    features |= {"voxels": voxels, "matter_voxels": matter, "inner": inner}
+    boxes = [float(math.prod(one["grid"])) for one in objects]
+    placed = [float(one["interior_gaussians"] + one.get("pruned", 0)) for one in objects]
+    features |= {
+        "voxels": sum(boxes),
+        "voxels_most": max(boxes),
+        "matter_voxels": sum(one["volume"] / one["voxel"] ** 3 for one in objects),
+        "inner": sum(placed),
+        "inner_most": max(placed),
+    }
     features["splats"] = splats or features["splats"]
     return features["splats"] + float(report["interior_gaussians"])
 
@@ -99,7 +102,7 @@ def _textured(work: Work) -> None:
     for name in features:
         if name.endswith("_voxels"):
             features[name] = fill["voxels"]
-    features |= {"volume": fill["voxels"], "splats": fill["splats"] + fill["inner"]}
+    features |= {"volume_most": fill["voxels_most"], "splats": fill["splats"] + fill["inner"]}
 
 
 def _simulated(work: Work, report: Mapping[str, Any], gaussians: float, born: list[float]) -> None:
@@ -196,16 +199,21 @@ def learn(
     values: Mapping[str, Any],
     device: torch.device | str,
     folder: Path | None = None,
-) -> None:
-    """Correct a stored model by a finished run.
+) -> CostModel:
+    """Correct the stored model of a device by a finished run.
 
     Args:
-        model: The model that the plan was made with; changed and stored.
+        model: The model that the plan was made with, taken where none is stored any more.
         plan: The plan.
         values: ``run.json``.
         device: Where it ran.
         folder: Where the model is stored, if not in the user's cache.
+
+    Returns:
+        The corrected model, which has been stored.
     """
+    # another run may have taught the stored model since
+    model = CostModel.load(device, folder) or model
     section = compare(plan, values)
     work = actual_work(plan["work"], values)
     for name, took in section["actual"]["stages"].items():
@@ -216,3 +224,4 @@ def learn(
         model.save(device, folder)
     except (GsfluentError, OSError) as error:
         _log.warning("the cost model could not be stored: %s", error)
+    return model

@@ -14,8 +14,8 @@ BYTES: dict[str, dict[str, dict[str, float]]] = {
     "cpu": {
         "reconstruct": {"start": 412e6, "source_pixels": 4.3, "splats_most": 1000.0},
         "isolate": {"start": 407e6, "splats": 264.0},
-        "fill": {"start": 410e6, "voxels": 283.0, "inner": 2820.0},
-        "texture": {"start": 567e6, "volume": 496.0},
+        "fill": {"start": 410e6, "voxels_most": 283.0, "inner_most": 2820.0},
+        "texture": {"start": 567e6, "volume_most": 496.0},
         "simulate": {"start": 535e6, "gaussians": 1050.0, "points": 5300.0, "blocks_most": 6000.0},
         "render": {"start": 450e6, "gaussians": 688.0, "pixels": 674.0},
         "export": {"start": 450e6, "gaussians": 688.0},
@@ -23,8 +23,8 @@ BYTES: dict[str, dict[str, dict[str, float]]] = {
     "cuda": {
         "reconstruct": {"start": 20e6, "source_pixels": 16.0, "splats_most": 1000.0},
         "isolate": {"splats": 264.0},
-        "fill": {"start": 20e6, "voxels": 100.0, "inner": 1000.0},
-        "texture": {"start": 20e6, "volume": 200.0},
+        "fill": {"start": 20e6, "voxels_most": 100.0, "inner_most": 1000.0},
+        "texture": {"start": 20e6, "volume_most": 200.0},
         "simulate": {"start": 20e6, "gaussians": 1050.0, "points": 1000.0, "blocks_most": 9000.0},
         "render": {"start": 20e6, "gaussians": 688.0, "pixels": 300.0},
         "export": {"start": 20e6, "gaussians": 688.0},

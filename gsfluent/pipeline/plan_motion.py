@@ -105,6 +105,8 @@ class Outlook:
         struck: Time of the first strike [s].
         strike_speed: Fastest closing speed [m/s].
         composed_seconds: Time in which a blade is at work [s].
+        shatters: Whether something strikes fast enough to break what it strikes, or cuts or tears
+            it.
     """
 
     movers: tuple[Mover, ...]
@@ -120,6 +122,7 @@ class Outlook:
     struck: float
     strike_speed: float
     composed_seconds: float
+    shatters: bool
 
 
 def foresee(
@@ -198,6 +201,8 @@ def foresee(
         struck=min((m.strikes for m in strikes), default=math.inf),
         strike_speed=max((m.speed for m in strikes), default=0.0),
         composed_seconds=cutting,
+        shatters=cutting > 0.0
+        or any(m.speed >= n > 0.0 or m.driven for m, n in zip(bodies, limits, strict=True)),
     )
 
 

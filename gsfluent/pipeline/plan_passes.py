@@ -6,7 +6,6 @@ tests/pipeline/test_plan_left_out.py holds the two together.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,7 +40,6 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
     several = len(scene.bodies) > 1
     flies = outlook.grid_from > 0.0
     gridded = outlook.grid_seconds > 0.0
-    strikes = math.isfinite(outlook.struck)
     exports = [kind for kind in shot.output.what if kind != "mp4"]
     things = _names(scene.colliders)
     rests = scene.floor is not None and any(scene.gravity)
@@ -59,7 +57,7 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
          "nothing touches anything: free flight in closed form"),
         ("free flight", flies, f"closed form until t = {outlook.grid_from:.3g} s",
          "something touches something from the start"),
-        ("contact fields", gridded and (several or (breaks and strikes)), fields,
+        ("contact fields", gridded and (several or (breaks and outlook.shatters)), fields,
          "one body that stays in one piece: one velocity field"),
         ("damage variable", gridded and breaks, "brittle matter (nacc)", "no brittle matter"),
         ("return map", gridded and bool(laws - {"elastic"}),
@@ -71,8 +69,8 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
         ("sleep", rests, "what comes to rest leaves the grid", "nothing to rest on"),
         ("repair", breaks and shot.output.cracks != "none", f"cracks open ({shot.output.cracks})",
          "cracks are not drawn" if breaks else "nothing can crack"),
-        ("light", True, f"{len(lamps)} lamps", ""),
-        ("shadows", bool(casting), f"{len(casting)} lamps cast them", "no lamp casts any"),
+        ("light", True, _counted(len(lamps), "lamp"), ""),
+        ("shadows", bool(casting), f"of {_counted(len(casting), 'lamp')}", "no lamp casts any"),
         ("export", bool(exports), ", ".join(exports), "only the video is asked for"),
     ]  # fmt: skip
     return [{"pass": n, "needed": need, "why": yes if need else no} for n, need, yes, no in rows]
@@ -80,3 +78,7 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
 
 def _names(things: Sequence[Any]) -> str:
     return ", ".join(thing.name for thing in things)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -64,6 +64,7 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
     if model is None:
         _log.info("plan: this machine is not calibrated (gsfluent plan does it): no times")
     section = {"calibrated": made["calibrated"], "predicted": predicted_of(made)}
+    section |= {"binding": made["binding"], "warnings": made["warnings"]}
     context.record.values["plan"] = section | ({} if chosen is None else {"chosen": chosen})
     return Foresight(made, model)
 

@@ -126,23 +126,27 @@ def fill_work(
     extents = {name: _extent(solid) for name, solid in solids.items()}
     largest = max(extents.values())
     given = shot.fill.given(standing.frame.scale).get("resolution")
-    voxels = matter = 0.0
-    inside = {}
+    voxels = matter = most = 0.0
+    inside, placed = {}, []
     for name, solid in solids.items():
         wanted = given or fill_resolution(extents[name], largest, cells)
         voxel = extents[name] / wanted
         sides = _sides(solid)
-        voxels += math.prod(side / voxel + _PADDING for side in sides)
+        box = math.prod(side / voxel + _PADDING for side in sides)
+        voxels, most = voxels + box, max(most, box)
         own = solid.volume / voxel**3
         matter += own
-        inside[name] = (1.0 - _PRUNED) * min(_MOST_INTERIOR, own / _SPACING**3)
+        placed.append(min(_MOST_INTERIOR, own / _SPACING**3))
+        inside[name] = (1.0 - _PRUNED) * placed[-1]
     photographs = standing.photographs
     return {
         "start": 1.0,
         "objects": float(len(solids)),
         "voxels": voxels,
         "matter_voxels": matter,
-        "inner": sum(inside.values()),
+        "inner": sum(placed),
+        "voxels_most": most,
+        "inner_most": max(placed),
         "images": 0.0 if photographs is None else float(photographs.images * len(solids)),
         "splats": splats,
     }, inside
@@ -168,7 +172,7 @@ def texture_work(method: str, fill: Mapping[str, float]) -> Features:
         "start": 1.0,
         f"{kind}_objects": fill["objects"],
         f"{kind}_voxels": fill["voxels"],
-        "volume": fill["voxels"],
+        "volume_most": fill["voxels_most"],
         "splats": fill["splats"] + fill["inner"],
     }
 
@@ -191,10 +195,10 @@ def simulate_work(
         for body in scene.bodies
         for material in [body.material, *(part.material(body.material) for part in body.parts)]
     }
-    breaks = cracks and "nacc" in laws
+    breaks = cracks and "nacc" in laws and outlook.shatters
     seconds = max(outlook.grid_from + outlook.grid_seconds, 1e-12)
     broken = max(0.0, 1.0 - outlook.struck / seconds) if math.isfinite(outlook.struck) else 0.0
-    fields = len(scene.bodies) + (1 if breaks and broken > 0.0 else 0)
+    fields = len(scene.bodies) + (1 if "nacc" in laws and outlook.shatters else 0)
     composed = outlook.substeps * outlook.composed_seconds / max(outlook.grid_seconds, 1e-12)
     return (
         {"start": 1.0}

@@ -270,7 +270,9 @@ def test_plan_agrees_with_the_run(finished: Path, capsys: pytest.CaptureFixture[
     assert plan["dx"] == pytest.approx(simulation["dx"], rel=0.1)
     assert plan["particles"] == pytest.approx(simulation["particles"], rel=0.3)
     assert plan["substeps"] == pytest.approx(simulation["substeps"], rel=0.7)
-    assert {row["pass"]: row["needed"] for row in plan["passes"]}["contact"] is False
+    needed = {row["pass"]: row["needed"] for row in plan["passes"]}
+    assert needed["contact fields"] or simulation["fields_max"] == 1
+    assert needed["blades"] is False
     assert plan["memory_bytes"] > 1e6
 
 

@@ -284,3 +284,9 @@ def test_gsfluent_on_a_small_setting_passes_or_misses_what_the_page_says(
     run = play(scene)
     assert not run.failed
     assert {m.quantity for m in judge(scene, run) if not m.passed} == missed
+
+
+def test_heavy_grips_make_the_speed_of_a_crack_that_of_the_strip_and_not_of_the_time_step() -> None:
+    scene = fracture_plane.notch(1 / 24, 8, 3e-5, 30.0)
+    means = [judge(scene, play(scene, cfl=cfl))[1].value for cfl in (0.5, 0.3)]
+    assert means[1] == pytest.approx(means[0], rel=0.1) and means[0] > 0.5

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from gsfluent.charts import stability_report as report
 from gsfluent.charts.stability import Place, Value, Violation, all_maps
+from gsfluent.charts.stability_scenes import block, clusters
+from gsfluent.charts.stability_steps import shaken
+from gsfluent.lab.violations import OfWorld, first_violation
 
 CPU = Place("cpu")
 
@@ -179,6 +184,32 @@ def test_boundary_released_solvers() -> None:
     fails("released", 2.0, "fixed, explicit", "energy")
     fails("released", 0.3, "stress of claymore", "energy")
     fails("released", 0.3, "force of GaussianFluent", "energy")
+
+
+def test_boundary_courant_number_of_loose_points() -> None:
+    """A point that nothing holds: sqrt((1 - nu) / (1 + nu)), where its bulk wave alone gives out.
+
+    With all nodes its own, C' = C - 4 dt / (rho dx^2) tau: an oscillator of its volume with
+    omega^2 = 12 K / (rho dx^2), which symplectic Euler keeps up to omega dt = 2.
+    """
+    few = Place("cuda").every
+    for nu in (0.0, 0.3, 0.45, 0.495):
+        limit = math.sqrt((1.0 - nu) / (1.0 + nu))
+        for factor in (0.97, 1.03):
+            world = shaken(*clusters(1, 200), factor * limit, CPU, poisson=nu)
+            found = first_violation(OfWorld(world), 300, every=few)
+            assert (found is None) == (factor < 1.0)
+    assert run("loose", 0.6, 0.45) is None and run("loose", 0.55, 0.495) is None
+    fails("loose", 0.65, 0.495, "energy")
+    fails("loose", 0.6, 0.4, "energy", 1)  # a step at which ours holds
+
+
+def test_the_default_step_holds_ten_times_as_long() -> None:
+    """No slow growth at c dt / dx of 0.6 over 3000 steps: fragments, and nearly no compression."""
+    few = Place("cuda").every  # steps between two looks: slow growth does not go away
+    for points, nu in ((clusters(2, 8), 0.45), (clusters(8, 8), 0.3), (block(2.0), 0.495)):
+        world = shaken(*points, 0.6, CPU, poisson=nu)
+        assert first_violation(OfWorld(world), 3000, every=few) is None
 
 
 def test_every_boundary_has_its_test() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,16 @@ from gsfluent.config.settings_solve import read_error
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.figure.choice import draw_choice
-from gsfluent.pipeline.choose import Probing, choose
-from gsfluent.pipeline.choose_fit import History, fit_history
+from gsfluent.pipeline import choose_shot
+from gsfluent.pipeline.choose import Growth, Probes, Probing, choose, summary
+from gsfluent.pipeline.choose_fit import Fit, History, fit_history
 from gsfluent.pipeline.choose_pick import pick, ranked
 from gsfluent.pipeline.choose_probe import Probe, Seen, window
 from gsfluent.pipeline.choose_seconds import measured_rates, work_of
+from gsfluent.pipeline.run_context import RunContext
+from gsfluent.pipeline.run_record import RunRecord
+from gsfluent.pipeline.run_store import StageStore
+from gsfluent.progress import LineReporter
 from gsfluent.scene import Scene
 
 SIZES = (1 / 10, 1 / 14, 1 / 20)
@@ -142,12 +148,24 @@ def test_no_setting_claims_less_than_chance() -> None:
     assert choice.enough is not None  # where finer cells change less than chance does
 
 
+def test_chance_is_not_taken_for_an_error_of_the_cells() -> None:
+    """No error at all, only scatter: what is said of the cells stays below the scatter's own."""
+    fit = fit_history(made(1.0, 0.0, noise=0.05, chaotic=True))
+    scatter = fit.history.scatter(1 / 20)
+    assert scatter == pytest.approx(0.05 * np.sqrt(2.0), rel=0.5)
+    assert np.median(fit.mean_errors(1 / 20)) < 0.7 * scatter
+    plain = fit_history(made(1.0, 4.0, noise=0.05, chaotic=True))
+    assert np.median(plain.mean_errors(1 / 20)) == pytest.approx(
+        true_error(1.0, 4.0, 1 / 20), rel=0.6
+    )
+
+
 def test_few_seeds_know_their_scatter_badly() -> None:
-    """Three levels of three seeds and two components: 12 free values, chi^2_12 / 12 of variance."""
+    """Two levels count, of three seeds and two components: 8 free values, chi^2_8 / 8."""
     fit = fit_history(made(1.0, 0.0, noise=0.05, chaotic=True), draws=4000)
     low, high = np.quantile(fit.chance, [0.05, 0.95])
-    assert low == pytest.approx(np.sqrt(12 / 21.03), rel=0.03)  # tables of chi^2_12: 5.226, 21.03
-    assert high == pytest.approx(np.sqrt(12 / 5.226), rel=0.03)
+    assert low == pytest.approx(np.sqrt(8 / 15.51), rel=0.03)  # tables of chi^2_8: 2.733, 15.51
+    assert high == pytest.approx(np.sqrt(8 / 2.733), rel=0.03)
 
 
 def test_a_bound_beyond_the_finest_grid_is_refused() -> None:
@@ -278,3 +296,46 @@ def test_rates_are_those_that_the_probes_were_made_with() -> None:
     per_step, per_point = measured_rates([*runs, slow])
     assert per_step == pytest.approx(2e-3, rel=1e-6)
     assert per_point == pytest.approx(1e-7, rel=1e-6)
+
+
+def staged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit: Fit, bound: str) -> RunContext:
+    """A run about to choose, its probes replaced by one history."""
+    scene, shot = ball_shot(tmp_path, solve={"error": bound})
+    device = torch.device("cpu")
+    record = RunRecord(tmp_path / "run.json", shot.resolved(), device, 0)
+    store = StageStore(tmp_path / "stages")
+
+    def chosen(_scene: Scene, _shot: Shot, limit: float, **_keys: Any) -> dict[str, Any]:
+        found = pick([fit], ranked([fit], limit, fourth_power), limit)
+        empty = Seen({}, *[np.zeros(1)] * 3, np.zeros((1, 3)), *[np.zeros(1)] * 2, 1.0, 1.0)
+        one = dataclasses.replace(run_of(10, 1, 1, 1.0), seen=empty)
+        probes = Probes((one, one), ((one,),), {}, 0, 1, 1.0)
+        return summary(found, [fit], Growth({}, {}), probes, Probing(), "a test")
+
+    monkeypatch.setattr(choose_shot, "load_solids", lambda _context: {})
+    monkeypatch.setattr(choose_shot, "build_scene", lambda *_: scene)
+    monkeypatch.setattr(choose_shot, "choose", chosen)
+    return RunContext(shot, tmp_path, device, 0, store, record, LineReporter())
+
+
+def test_a_run_that_chance_limits_takes_what_is_fine_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fit = fit_history(made(1.0, 0.5, noise=0.05, chaotic=True))
+    context = staged(tmp_path, monkeypatch, fit, "2%")
+    assert choose_shot.choose_stage(context)
+    choice = context.record.values["choice"]
+    assert not choice["met"] and choice["chosen"] is None
+    assert context.shot.solve.cells == choice["enough"]["cells"]
+    assert context.shot.solve.error is None
+    assert "no setting can claim 2.0%" in caplog.text
+
+
+def test_a_run_whose_error_cannot_be_met_is_refused_with_what_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = staged(tmp_path, monkeypatch, fit_history(made(0.6, 3.0)), "0.1%")
+    with pytest.raises(InputError, match="cannot be met") as caught:
+        choose_shot.choose_stage(context)
+    least = true_error(0.6, 3.0, 1 / 128)
+    assert f"least that can be promised is solve.error: {least:.1%}" in caught.value.mend

@@ -1,0 +1,50 @@
+"""The probe measures the real thing: its capture can be reconstructed, its steps are counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from gsfluent import materials
+from gsfluent.io import load_capture
+from gsfluent.pipeline.inspect_hull import hull_grid, masked_views
+from gsfluent.pipeline.orient import look_at_point
+from gsfluent.pipeline.plan_probe import draw_capture
+from gsfluent.pipeline.plan_probe_solver import _STEPS, _measure, ball
+
+
+def test_the_drawn_photographs_fit_their_cameras(tmp_path: Path) -> None:
+    draw_capture(tmp_path / "photographs")
+    capture = load_capture(tmp_path / "photographs")
+    views = masked_views(capture)
+    assert len(views) == len(capture) == 10
+    # a wrong pose or focal length leaves no hull, or one of another size: the melon is 0.26 m long
+    grid, inside = hull_grid(views, capture, look_at_point(capture.cameras))
+    places = torch.from_numpy(grid[inside])
+    extent = float((places.amax(0) - places.amin(0)).max())
+    assert 0.24 < extent < 0.29
+
+
+def test_steps_points_and_blocks_of_a_measurement_are_counted() -> None:
+    soft = materials.get("elastic").override(young_modulus=1e6)
+    for resident in (True, False):
+        features, seconds = _measure(soft, 6, "cpu", resident=resident)[1:]
+        steps = features["steps"] + features["composed_steps"]
+        assert _STEPS <= steps <= 1.5 * _STEPS and seconds > 0.0
+        assert (features["composed_steps"] == 0.0) is resident
+        points = features["point_steps_elastic"] + features["composed_point_steps"]
+        # 8 a cell of pi/6 times 6^3 cells
+        assert 800 < points / steps < 1100
+
+
+def test_contact_is_seen_only_between_two() -> None:
+    soft = materials.get("elastic").override(young_modulus=1e6)
+    alone, pair = (_measure(soft, 6, "cpu", two=two).features for two in (False, True))
+    assert alone["contact_block_steps"] == 0.0 < pair["contact_block_steps"]
+    assert pair["contact_block_steps"] <= pair["block_steps"]
+
+
+def test_crumbs_fill_more_blocks_than_their_volume() -> None:
+    whole, crumbs = ball(0.1, 40), ball(0.1, 40, crumbs=True)
+    assert float(crumbs.occupancy.sum()) < 0.02 * float(whole.occupancy.sum())
