@@ -167,7 +167,8 @@ def plan_shot(
         ``passes`` (name, needed, why), ``bounds`` and ``binding``, ``dx``, ``cells``, ``dt``,
         ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and memory_bytes by
         name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``, ``size_m``,
-        ``assumed``, ``warnings``, ``calibrated``, ``device`` and ``work`` (features by stage).
+        ``assumed``, ``warnings``, ``calibrated``, ``model`` (when it was measured, corrections by
+        runs), ``device`` and ``work`` (features by stage).
 
     Raises:
         InputError: The input cannot be read, or a material or event cannot be.
@@ -198,6 +199,7 @@ def plan_shot(
     return {
         "device": str(device),
         "calibrated": model is not None,
+        "model": None if model is None else _about(model),
         "passes": passes_of(shot, prospect.scene, outlook),
         "size_m": (high - low).tolist(),
         "assumed": prospect.standing.assumed,
@@ -246,6 +248,16 @@ def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:
         seconds=budget,
         per_point_step=per_point,
     )
+
+
+def _about(model: CostModel) -> dict[str, Any]:
+    """When a model was measured, and what runs have taught it."""
+    return {
+        "measured": model.made,
+        "corrections": {name: model.correction(name) for name in model.ratios},
+        "runs": max((len(ratios) for ratios in model.ratios.values()), default=0),
+        "fit_errors": dict(model.errors),
+    }
 
 
 def _work(

@@ -44,7 +44,7 @@ FEATURES: dict[str, tuple[str, ...]] = {
     "isolate": ("start", "splats"),
     "fill": ("start", "images", "voxels", "inner"),
     "texture": ("start", "exemplar_objects", "exemplar_voxels"),
-    "render": ("start", "frames", "frame_pixels", "frame_gaussians"),
+    "render": ("start", "gaussians", "frames", "frame_pixels", "frame_gaussians"),
 }
 """What each stage's cost is made of; ``simulate`` has its own module, exports are per kind."""
 FRAME_FEATURES = ("frames", "frame_gaussians", "start_gaussians", "cracked_gaussians")
@@ -103,7 +103,7 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
                 first = simulation_sample(values, planned)
             report_progress(progress, number + 2, total, f"stages, {size.name}")
         samples += other_samples(folder / "small", device)
-        samples += training_samples(folder, device)
+        samples += [*training_samples(folder, device), figures_sample(folder / "large", device)]
         framed = [s for name in ("small", "large") for s in frame_samples(folder / name, device)]
     costs: dict[str, dict[str, float]] = {}
     errors: dict[str, float] = {}
@@ -204,6 +204,23 @@ def run_small(
         "render": render_work(shot, size.frames, 0.0),
     }
     return values, actual_work(planned, values)
+
+
+def figures_sample(out: Path, device: torch.device) -> Sample:
+    """What a film costs once, however long it is: the splats as they ride without any care."""
+    from gsfluent.pipeline.light_shot import light_of
+    from gsfluent.pipeline.render_figures import FilmFigures
+    from gsfluent.pipeline.run_show import Film, shot_of
+
+    shot = shot_of(out)
+    start = time.perf_counter()
+    film = Film.of(out, shot, light_of(shot), device)
+    first = film.frame(0)
+    FilmFigures(first, film.around)
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    features = {"gaussians": float(first.gaussians.count)}
+    return Sample("render", features, time.perf_counter() - start)
 
 
 def training_samples(folder: Path, device: torch.device) -> list[Sample]:

@@ -173,7 +173,8 @@ def test_work_that_was_foreseen_wrongly_is_not_the_models_fault(shot: Shot, stor
     assert work["simulate"]["steps"] == values["simulation"]["substeps"]
     made, stages = model(), {s["name"]: s for s in values["stages"]}
     exact = made.stage("simulate", work["simulate"], corrected=False).seconds
-    learn(made, plan, values, "cpu", stored)
+    made = learn(made, plan, values, "cpu", stored)
+    assert made == CostModel.load("cpu", stored)
     assert made.ratios["simulate"][0] == pytest.approx(stages["simulate"]["seconds"] / exact)
     section = compare(plan, values)
     planned = plan["stages"]["simulate"]["seconds"]
