@@ -195,3 +195,13 @@ def test_the_verb_runs_a_map_and_draws_recorded_lines(
     assert json.loads(capsys.readouterr().out)["points"] == 9
     assert main([*words, "--maps", "nonsense"]) == 2
     assert main([*words, "--draw", str(out / "stability.jsonl"), "--maps", "kernel"]) == 2
+
+
+@pytest.mark.slow
+def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
+    wanted = stability.chosen(["zero_weight"])
+    one, two = (
+        stability.run_maps(wanted, tmp_path / f"{jobs}.jsonl", quick=True, jobs=jobs)
+        for jobs in (1, 2)
+    )
+    assert [(p.key, p.step, p.kind) for p in one] == [(p.key, p.step, p.kind) for p in two]
