@@ -30,6 +30,8 @@ if [ -z "${PYTHON:-}" ]; then
 fi
 export PYTHONPATH="$PWD:$PWD/scripts${PYTHONPATH:+:$PYTHONPATH}" OMP_WAIT_POLICY=PASSIVE
 mkdir -p "$out" || exit 1
+jobs=1
+[ "$device" = cpu ] && jobs=$(getconf _NPROCESSORS_ONLN)
 status=0 began=$SECONDS summary=()
 
 # part NAME COMMAND...: run it if it was asked for; what it says goes to OUT/NAME.txt
@@ -62,7 +64,7 @@ if [ -z "$enter" ]; then
   part bench bench
   part shatter "$PYTHON" scripts/fracturebench/shatter.py compare -o "$out/shatter.jsonl" --device "$device" $quick
   part chart "$PYTHON" -m gsfluent chart -o "$out/chart" --device "$device" $quick
-  part stability "$PYTHON" -m gsfluent stability -o "$out/stability" --device "$device" $quick
+  part stability "$PYTHON" -m gsfluent stability -o "$out/stability" --device "$device" --jobs $jobs $quick
   part brittle brittle
   printf '%s\n' "${summary[@]}" "$(printf '%-10s %6d s' all $((SECONDS - began)))" | tee "$out/seconds.txt"
   exit $status
