@@ -79,7 +79,7 @@ if [ "$device" = cpu ]; then
 elif have ops.json; then
   "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null
 fi
-if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" > /dev/null; fi
+if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" docs/data/peers_*.jsonl > /dev/null; fi
 if keep chart/chart.jsonl "chart_$device.jsonl"; then "$PYTHON" scripts/chart_page.py; fi
 if keep stability/stability.jsonl "stability_$device.jsonl"; then
   "$PYTHON" scripts/stability_page.py docs/data/stability_*.jsonl
