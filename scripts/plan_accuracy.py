@@ -28,6 +28,7 @@ from gallery import SCENES, commit, machine, shot_of
 from page import enter
 
 from gsfluent.cli.common import choose_device
+from gsfluent.errors import GsfluentError
 from gsfluent.pipeline.plan import cost_model, plan_shot
 from gsfluent.pipeline.plan_cost import Cost, CostModel
 from gsfluent.pipeline.plan_fact import actual_work
@@ -246,6 +247,7 @@ def main() -> int:
         sys.stdout.write(json.dumps(fit_memory(read(LINES) + read(path)), indent=1) + "\n")
         return 0
     kind = "" if options.page else choose_device(options.device).type
+    failed = 0
     for name in [] if options.page else options.names or list(SCENES):
         if any(line["scene"] == name and line["device"] == kind for line in read(path)):
             logging.info("%s: has a line in %s", name, path)
@@ -254,7 +256,12 @@ def main() -> int:
             logging.info("%s: left out, no data folder; set GSFLUENT_DATA", name)
             continue
         options.out.mkdir(parents=True, exist_ok=True)
-        line = run(name, options)
+        try:
+            line = run(name, options)
+        except (SystemExit, GsfluentError) as error:  # the others' lines are worth having
+            failed += 1
+            logging.info("%s", error)
+            continue
         for target in [path, LINES] if options.keep else [path]:
             target.parent.mkdir(parents=True, exist_ok=True)
             with target.open("a", encoding="utf-8") as stream:
@@ -268,7 +275,7 @@ def main() -> int:
         PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), "plan", text), encoding="utf-8")
     else:
         sys.stdout.write(tables(read(path)) + "\n")
-    return 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":
