@@ -73,6 +73,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         raise SystemExit(f"{name}: the run failed: {done.stderr[-2000:]}")
     values = json.loads((out / "run.json").read_text(encoding="utf-8"))
     section = values["plan"]
+    kept = ("seconds", "memory", "probe_seconds", "machine")
     simulation = values["simulation"]
     return {
         "scene": name,
@@ -80,7 +81,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         "device": device.type,
         "commit": commit(),
         "taught": max((len(r) for r in model.ratios.values()), default=0),
-        "probe": {name: getattr(model, name) for name in ("seconds", "probe_seconds", "machine")},
+        "probe": {name: getattr(model, name) for name in kept},
         "alone": alone["stages"],
         "plan": plan["stages"],
         "actual": {
@@ -108,7 +109,7 @@ def shot_text(name: str, quality: str | None) -> str:
 def taught(line: dict[str, Any], others: list[dict[str, Any]]) -> dict[str, Cost]:
     """What a model says to a shot that has learned from other shots, by stage."""
     probe = line["probe"]
-    model = CostModel(machine=probe["machine"], seconds=probe["seconds"])
+    model = CostModel(probe["machine"], probe["seconds"], memory=probe.get("memory", {}))
     for other in others:
         for name, fact in other["actual"].items():
             said = model.stage(name, other["work_actual"][name], corrected=False)

@@ -29,6 +29,7 @@ from gsfluent.pipeline.inspect_hull import masked_views
 from gsfluent.pipeline.plan_cost import CostModel, machine_key
 from gsfluent.pipeline.plan_fact import actual_work
 from gsfluent.pipeline.plan_fit import Sample, fit
+from gsfluent.pipeline.plan_memory import BYTES
 from gsfluent.pipeline.plan_stand_in import look_at_photographs
 from gsfluent.pipeline.plan_work import isolate_work, reconstruct_work, render_work
 from gsfluent.pipeline.render_cuts import save_cut_views
@@ -104,9 +105,12 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         draw_capture(folder / "photographs")
         report(1, "photographs")
         samples: list[Sample] = []
+        sizes: list[Sample] = []
         for number, size in enumerate(SIZES):
             values, planned = run_small(folder, size, device)
             samples += stage_samples(values, planned, cold=number == 0)
+            if device.type == "cuda":
+                sizes += memory_samples(values, planned)
             if number == 0:
                 first = simulation_sample(values, planned)
             report(number + 2, f"{size.name} shot")
@@ -136,6 +140,7 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         probe_seconds=time.perf_counter() - began,
         errors=errors,
+        memory=memory_costs(sizes),
     )
     _log.info(
         "measured what work costs on this device in %.1f s: %s",
@@ -267,6 +272,27 @@ def stage_samples(
         for name in FEATURES
         if name in done
     ]
+
+
+def memory_samples(
+    values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]
+) -> list[Sample]:
+    """Bytes that each stage that was not found finished has allocated on the GPU."""
+    return [
+        Sample(name, dict(work[name]) | {"start": 1.0}, float(stage["peak_device_memory_bytes"]))
+        for stage in values["stages"]
+        if (name := stage["name"]) in work
+        and not stage["resumed"]
+        and stage["peak_device_memory_bytes"] > 0
+    ]
+
+
+def memory_costs(samples: Sequence[Sample]) -> dict[str, dict[str, float]]:
+    """Bytes per unit of work of each stage, fitted to what the small shots have allocated."""
+    return {
+        stage: fit([s for s in samples if s.stage == stage], list(BYTES["cuda"][stage]))[0]
+        for stage in {sample.stage for sample in samples}
+    }
 
 
 def simulation_sample(values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]) -> Sample:
