@@ -1,7 +1,7 @@
 """Choose settings by error on four shots, then see what the error is: docs/chart_shot.md.
 
     python scripts/choose_accuracy.py [--device cuda] [-o choose_out] [--only orange_dropped ...]
-    python scripts/choose_accuracy.py --write docs/data/choose_accuracy.jsonl   # only the table
+    python scripts/choose_accuracy.py --write docs/data/choose_cpu.jsonl [--no-times]  # the page
 
 Every shot is probed as `gsfluent chart SHOT.yaml --error` does; then the setting it chose is run
 over the whole shot with seeds that the probes have not seen, and a finer one with more seeds, whose
@@ -167,14 +167,14 @@ def judge(name: str, trial: Trial, options: argparse.Namespace, device: Any) -> 
     }  # fmt: skip
 
 
-def table(lines: list[Line]) -> str:
-    """The table of the page."""
+def table(lines: list[Line], *, times: bool = True) -> str:
+    """The table of the page, with or without the wall times."""
     head = (
         "| shot | asked | chosen | sure | run to run | judged at | its error | reference "
-        "| distance, predicted (5 % to 95 %) | actual | worst | observables within "
-        "| seconds predicted | actual | probes |"
+        "| distance, predicted (5 % to 95 %) | actual | worst | observables within |"
     )
-    rows = [head, "| --- " * 15 + "|"]
+    head += " seconds predicted | actual | probes |" if times else ""
+    rows = [head, "| --- " * (15 if times else 12) + "|"]
     for line in lines:
         chosen, enough, judged = (line[k] for k in ("chosen", "enough", "predicted"))
         words = "none" if chosen is None else _words(chosen)
@@ -190,12 +190,15 @@ def table(lines: list[Line]) -> str:
                 f"| {_words(judged)} | {judged['error']:.1%} | {ref['cells']} cells, "
                 f"{ref['seeds']} {'seeds' if ref['seeds'] > 1 else 'seed'} "
                 f"| {middle:.1%} ({low:.1%} to {high:.1%}) | {line['actual_error']:.1%} "
-                f"| {line['actual_worst']} | {within} of {len(line['actual'])} "
-                f"| {judged['seconds']:.1f} | {line['actual_seconds']:.1f} "
-                f"| {line['probe_wall']:.0f} s |"
+                f"| {line['actual_worst']} | {within} of {len(line['actual'])} |"
             )
+            if times:
+                row += (
+                    f" {judged['seconds']:.1f} | {line['actual_seconds']:.1f} "
+                    f"| {line['probe_wall']:.0f} s |"
+                )
         else:
-            row += "| not judged: too dear here " + "| " * 9 + "|"
+            row += "| not judged: too dear here " + "| " * (9 if times else 6) + "|"
         rows.append(row)
     return "\n".join(rows) + "\n"
 
@@ -214,6 +217,7 @@ def main(arguments: list[str]) -> int:
     add("--device", default="auto")
     add("--most", type=float, default=60.0, help="predicted seconds of one run of the reference")
     add("--write", type=Path, nargs="*", default=[], help="only enter these lines in the page")
+    add("--no-times", action="store_true", help="with --write: leave out wall times")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     if options.write:
@@ -221,7 +225,12 @@ def main(arguments: list[str]) -> int:
         found = [json.loads(s) for p in options.write for s in p.read_text().splitlines()]
         for kind in dict.fromkeys(line["device"] for line in found):
             mine = [line for line in found if line["device"] == kind]
-            text = enter(text, f"choice {kind}", table(mine), f"### {mine[0]['machine']}")
+            text = enter(
+                text,
+                f"choice {kind}",
+                table(mine, times=not options.no_times),
+                f"### {mine[0]['machine']}",
+            )
         PAGE.write_text(text, encoding="utf-8")
         return 0
     device = choose_device(options.device)

@@ -58,7 +58,7 @@ if [ -z "$enter" ]; then
   part ops "$PYTHON" scripts/accuracy.py --device "$device" --json "$out/ops.json" $quick
   battery_tier=(--tier all)
   [ -n "$quick" ] && battery_tier=(--only wave)
-  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" "${battery_tier[@]}"
+  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" --known docs/accuracy.md "${battery_tier[@]}"
   part bench bench
   part shatter "$PYTHON" scripts/fracturebench/shatter.py compare -o "$out/shatter.jsonl" --device "$device" $quick
   part chart "$PYTHON" -m gsfluent chart -o "$out/chart" --device "$device" $quick
@@ -79,7 +79,7 @@ if [ "$device" = cpu ]; then
 elif have ops.json; then
   "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null
 fi
-if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" > /dev/null; fi
+if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" docs/data/peers_*.jsonl > /dev/null; fi
 if keep chart/chart.jsonl "chart_$device.jsonl"; then "$PYTHON" scripts/chart_page.py; fi
 if keep stability/stability.jsonl "stability_$device.jsonl"; then
   "$PYTHON" scripts/stability_page.py docs/data/stability_*.jsonl

@@ -260,7 +260,11 @@ def test_the_stand_in_has_its_matter_and_its_mode(
 ) -> None:
     demo, lib = peers["demo_scenes"], peers["peerlib"]
     fill = {"n_grid": 20, "max_partciels_per_cell": 2, "max_particles_num": 10**6}
+    boxed = {**fill, "boundary": [0.4, 1.4, 0.0, 0.5, 0.0, 0.5]}
     soft = demo.read_config(write_config(tmp_path, E=1e4, density=1000, particle_filling=fill))
+    assert demo.fill_cell(soft) == pytest.approx(0.1)
+    # with a boundary its grid spans that, so its cells are finer
+    assert demo.fill_cell(dataclasses.replace(soft, fill=boxed)) == pytest.approx(0.05)
     stiff = dataclasses.replace(soft, young=9e4)
     mode = demo.Mode(soft)
     assert demo.Mode(stiff).omega / mode.omega == pytest.approx(3.0, rel=1e-9)
@@ -282,6 +286,8 @@ def test_the_stand_in_has_its_matter_and_its_mode(
     exact = scene.x + mode.amplitude * phase * shape
     run = lib.Run(scene.name, "", scene.times, exact, np.zeros_like(exact), 0.0, 0, {}, "", "")
     assert demo.error(scene, run, mode) < 1e-9
+    slow = np.sin(0.8 * mode.omega * scene.times)
+    assert demo.pitch(scene.times, slow, mode.omega) == pytest.approx(0.8, abs=1e-3)
     still = dataclasses.replace(run, x=np.broadcast_to(scene.x, exact.shape))
     assert demo.error(scene, still, mode) == pytest.approx(1.0)
 
@@ -289,7 +295,17 @@ def test_the_stand_in_has_its_matter_and_its_mode(
 def test_the_table_of_demos_divides_times_at_equal_error(peers: dict[str, ModuleType]) -> None:
     demo = peers["demo_settings"]
     base = {"case": "demo_thing", "device": "cuda", "points": 1000, "machine": "a GPU"}
-    theirs = {**base, "variant": "pipeline", "error": 0.2, "settings": {"dx": 0.02, "courant": 0.1}}
+    theirs = {
+        **base,
+        "variant": "pipeline",
+        "error": 0.2,
+        "settings": {
+            "dx": 0.02,
+            "courant": 0.1,
+            "mass_over_exact": 1.5,
+            "frequency_over_exact": 0.9,
+        },
+    }
     rows = [
         {**theirs, "method": "physgaussian", "wall_per_simulated": 50.0},
         {**theirs, "method": "physgaussian, graph", "wall_per_simulated": 30.0},
@@ -297,7 +313,12 @@ def test_the_table_of_demos_divides_times_at_equal_error(peers: dict[str, Module
          "wall_per_simulated": 0.25, "settings": {"dx": 0.04, "cfl": 0.5}},
     ]  # fmt: skip
     last = demo.table(rows, "cuda").splitlines()[-1]
-    assert last.endswith("| 200 | 120 |") and "| 0.2000 |" in last and ", 2.00, 0.5" in last
+    assert (
+        "| 1.50, 0.90 |" in last
+        and last.endswith("| 200 | 120 |")
+        and "| 0.2000 |" in last
+        and ", 2.00, 0.5" in last
+    )
     setting = importlib.import_module("types").SimpleNamespace(name="thing")
     assert demo.target(rows, setting, "pipeline") == 0.2
     rows[0]["error"] = 1.2

@@ -323,6 +323,7 @@ def _each(todo: Sequence[tuple[str, str, Value, Value, str]], jobs: int) -> Iter
     from concurrent.futures import ProcessPoolExecutor, as_completed
 
     context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the workers: read when they start
     with ProcessPoolExecutor(jobs, context, _alone) as pool:
         futures = [pool.submit(run_point, task) for task in todo]
         try:
@@ -335,7 +336,6 @@ def _each(todo: Sequence[tuple[str, str, Value, Value, str]], jobs: int) -> Iter
 
 def _alone() -> None:
     """One thread per worker."""
-    os.environ["OMP_NUM_THREADS"] = "1"
     import torch
 
     torch.set_num_threads(1)

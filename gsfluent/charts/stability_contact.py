@@ -47,7 +47,7 @@ register(
              setting=False),
         (TWO, ONE), part_point, "test_boundary_gap_of_two_bodies_in_one_field",
         "Each body must keep its momentum (1e-5): in one field they are glued as long as they "
-        "share nodes, up to a gap of 2.5 dx.", gpu=True,
+        "share nodes, up to a gap of 2 dx.", gpu=True,
     )
 )  # fmt: skip
 
@@ -76,6 +76,7 @@ register(
              (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5), 0.5, setting=False,
              span=(0.3, 2.5), log=False),
         (TWO, ONE), early_point, "test_boundary_contact_before_touching",
-        "One field does not know a contact_gap: bodies feel each other from 2.5 dx on.",
+        "One field does not know a contact_gap: bodies feel each other across 1.5 dx. What is left "
+        "below 0.25 dx is contact.",
     )
 )  # fmt: skip

@@ -1,9 +1,9 @@
 """Where other programs stand on the maps: named points, from what their released code does.
 
-Sources: users.md section 0 and equations.md sections 2.3 and 19 of the specification, which were
-read from the code of CD-MPM (ziran), claymore, GaussianFluent, PhysGaussian (warp-mpm) and Taichi's
-MPM. What is run at such a point is gsfluent's or the textbook solver's variant of the same choice,
-not that program; scripts/peers runs the programs.
+Sources: :mod:`gsfluent.lab.peers_known`, which has them one by one, for CD-MPM (ziran), claymore,
+GaussianFluent, PhysGaussian (warp-mpm) and Taichi's MPM. What is run at such a point is gsfluent's
+or the textbook solver's variant of the same choice, not that program; scripts/peers runs the
+programs, and what it found there is read by :func:`measured`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 from gsfluent.charts.stability import Map
 from gsfluent.errors import InputError
 from gsfluent.figure.map import Mark
+from gsfluent.lab.peers_known import find
 
 __all__ = ["KNOWN", "Measured", "marks", "measured"]
 
@@ -34,10 +35,22 @@ KNOWN: dict[str, tuple[tuple[str, float | str, float | str, str], ...]] = {
     "precision": (("absolute positions", 1e5, "float32", _GS),),
     "creep": (("absolute positions", 1e3, 1e-3, _GS),),
     "storage": (("gsfluent", 1e-5, "F, float32", _GS),),
-    # demo settings against the automatic step: solver.md, section 6, row 1
-    "speed": (
-        ("fixed step", 0.5 / 1.37, 0.1, "PhysGaussian ficus, wolf"),
-        ("fixed step", 0.5 / 0.81, 0.03, "ficus, light part"),
+    "speed": tuple(
+        (
+            "fixed step",
+            find(f"PhysGaussian {name}").parameters["courant"],
+            mach,
+            f"{name}, its demo",
+        )
+        for name, mach in (("ficus", 0.1), ("vasedeck", 0.3))
+    ),
+    "loose": (
+        (
+            "force by gradients, F (PhysGaussian)",
+            find("PhysGaussian ficus, leaves").parameters["courant"],
+            0.4,
+            "ficus, its leaves",
+        ),
     ),
     "zero_weight": (("one step is enough", 0.0, "flip, unguarded", "GaussianFluent g2p_flip"),),
     "transfer": (("free cube", 0.6, "flip 0.99", "GaussianFluent's step (0.6)"),),

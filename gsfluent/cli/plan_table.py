@@ -43,7 +43,12 @@ def plan_text(plan: Mapping[str, Any]) -> str:
             right=(1, 2),
         ),
     ]  # fmt: skip
-    if not calibrated:
+    if calibrated:
+        taught = plan["model"]
+        factors = ", ".join(f"{n} x{f:.2f}" for n, f in taught["corrections"].items())
+        after = f"; corrected by the last {taught['runs']} runs: {factors}" if factors else ""
+        lines += ["", f"costs measured {taught['measured']}{after}"]
+    else:
         lines += ["", "no times: not calibrated; gsfluent plan without --no-probe measures them"]
     if plan["warnings"]:
         lines += ["", "warnings", *(f"  ! {warning}" for warning in plan["warnings"])]

@@ -199,16 +199,21 @@ def learn(
     values: Mapping[str, Any],
     device: torch.device | str,
     folder: Path | None = None,
-) -> None:
-    """Correct a stored model by a finished run.
+) -> CostModel:
+    """Correct the stored model of a device by a finished run.
 
     Args:
-        model: The model that the plan was made with; changed and stored.
+        model: The model that the plan was made with, taken where none is stored any more.
         plan: The plan.
         values: ``run.json``.
         device: Where it ran.
         folder: Where the model is stored, if not in the user's cache.
+
+    Returns:
+        The corrected model, which has been stored.
     """
+    # another run may have taught the stored model since
+    model = CostModel.load(device, folder) or model
     section = compare(plan, values)
     work = actual_work(plan["work"], values)
     for name, took in section["actual"]["stages"].items():
@@ -219,3 +224,4 @@ def learn(
         model.save(device, folder)
     except (GsfluentError, OSError) as error:
         _log.warning("the cost model could not be stored: %s", error)
+    return model

@@ -69,8 +69,8 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
         ("sleep", rests, "what comes to rest leaves the grid", "nothing to rest on"),
         ("repair", breaks and shot.output.cracks != "none", f"cracks open ({shot.output.cracks})",
          "cracks are not drawn" if breaks else "nothing can crack"),
-        ("light", True, f"{len(lamps)} lamps", ""),
-        ("shadows", bool(casting), f"{len(casting)} lamps cast them", "no lamp casts any"),
+        ("light", True, _counted(len(lamps), "lamp"), ""),
+        ("shadows", bool(casting), f"of {_counted(len(casting), 'lamp')}", "no lamp casts any"),
         ("export", bool(exports), ", ".join(exports), "only the video is asked for"),
     ]  # fmt: skip
     return [{"pass": n, "needed": need, "why": yes if need else no} for n, need, yes, no in rows]
@@ -78,3 +78,7 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
 
 def _names(things: Sequence[Any]) -> str:
     return ", ".join(thing.name for thing in things)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -129,6 +129,14 @@ def lattice(setting: Setting, dx: float, per_cell: int) -> tuple[Floats, Floats]
     return MIDDLE + unit * setting.size, np.full(unit.shape[0], volume)
 
 
+def fill_cell(setting: Setting) -> float:
+    """Edge of a cell of its filling grid [m]: the grid spans ``boundary``, or its whole domain."""
+    fill = setting.fill or {}
+    box = fill.get("boundary")
+    edge = max(box[1] - box[0], box[3] - box[2], box[5] - box[4]) if box else 2.0
+    return float(edge) / int(fill["n_grid"])
+
+
 def pipeline(setting: Setting, gaussians: int, seed: int = 0) -> tuple[Floats, Floats]:
     """Points and volumes as their pipeline makes them of a splat model (see the module)."""
     rng = np.random.default_rng(seed)
@@ -136,7 +144,7 @@ def pipeline(setting: Setting, gaussians: int, seed: int = 0) -> tuple[Floats, F
     if setting.fill is None:
         x = corner + rng.random((gaussians, 3)) * size
     else:
-        cell = 2.0 / int(setting.fill["n_grid"])
+        cell = fill_cell(setting)
         area = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
         axis = rng.choice(3, gaussians, p=area / area.sum())
         x = rng.random((gaussians, 3)) * size
@@ -174,15 +182,30 @@ def scene(setting: Setting, x: Floats, volume: Floats, dx: float, mode: Mode) ->
     )  # fmt: skip
 
 
+def displacement(given: Scene, run: Run, mode: Mode) -> Floats:
+    """Of the mode over its amplitude, [T]: the exact one is ``sin(w t)``."""
+    shape, _ = mode.at(given.x)
+    weight = given.mass[:, None] * shape
+    u = (weight * (run.x - given.x)).sum(axis=(1, 2)) / float((weight * shape).sum())
+    return np.asarray(u / mode.amplitude)
+
+
+def pitch(times: Floats, u: Floats, omega: float) -> float:
+    """Frequency of a displacement over ``omega``: of the free sine that fits it best."""
+    tried = np.arange(0.2, 2.0, 0.001)
+    left = []
+    for share in tried:
+        wave = np.stack([np.sin(share * omega * times), np.cos(share * omega * times)], axis=1)
+        left.append(float(((u - wave @ np.linalg.lstsq(wave, u, rcond=None)[0]) ** 2).sum()))
+    return float(tried[int(np.argmin(left))])
+
+
 def error(given: Scene, run: Run, mode: Mode) -> float:
     """Displacement of the mode against ``sin(w t)``, relative rms; infinite if it broke off."""
     if not run.finite:
         return math.inf
-    shape, _ = mode.at(given.x)
-    weight = given.mass[:, None] * shape
-    u = (weight * (run.x - given.x)).sum(axis=(1, 2)) / float((weight * shape).sum())
     exact = np.sin(mode.omega * given.times)
-    u = u / mode.amplitude
+    u = displacement(given, run, mode)
     return float(np.sqrt(np.mean((u - exact) ** 2) / np.mean(exact**2)))
 
 

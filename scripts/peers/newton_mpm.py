@@ -22,7 +22,7 @@ import numpy as np
 import peerlib
 from peerlib import Cannot, Floats, Scene
 
-COURANT = (0.37, 0.1, 1.0, 0.03)
+COURANT = (1.0, 0.37, 3.0, 10.0, 0.1)
 UNREACHED = 1e15  # yield pressure and stress [Pa], its own default for "never"
 # `default` is its best: B-splines, GIMP, other strain bases, more iterations and no air drag were
 # tried on the bar and cost more for the same error or a larger one
@@ -68,14 +68,20 @@ class Engine:
             radius=(0.5 * np.cbrt(scene.volume)).tolist(),  # it takes (2 r)^3 for the volume
             custom_attributes=attributes,
         )
+        stiff = max(float(m["young_modulus"]) for m in scene.materials)
         for plane in scene.colliders:
-            if plane["kind"] != "separate":
-                raise Cannot(f"has no plane of kind {plane['kind']!r}: matter may always leave")
+            if plane["kind"] == "slip":
+                raise Cannot("has no plane along which matter slides without leaving it")
             normal = np.array(plane["normal"], float)
             normal /= np.linalg.norm(normal)
             offset = -float(normal @ np.array(plane["point"], float))
-            config = builder.ShapeConfig(mu=float(plane.get("friction", 0.0)))
-            builder.add_shape_plane(plane=(*normal.tolist(), offset), cfg=config)
+            sticky = plane["kind"] == "sticky"
+            # nothing in the scenes pulls at a wall with ten times Young's modulus
+            config = builder.ShapeConfig(mu=1.0 if sticky else float(plane.get("friction", 0.0)))
+            builder.add_shape_plane(
+                plane=(*normal.tolist(), offset), cfg=config,
+                custom_attributes={"mpm:collider_adhesion": 10.0 * stiff if sticky else 0.0},
+            )  # fmt: skip
         name = "cuda:0" if device == "cuda" else "cpu"
         with contextlib.redirect_stdout(io.StringIO()):
             self.model = builder.finalize(device=name)

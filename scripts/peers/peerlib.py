@@ -228,6 +228,8 @@ def play(
     except Cannot as reason:
         return failed_run(scene, name, f"{peer.name} {reason}", device, **settings)
     except Exception as error:  # whatever it raises is what its user would get
+        if hasattr(peer, "forget"):
+            peer.forget()
         told = (str(error).strip().splitlines() or [""])[0]
         return failed_run(scene, name, f"{type(error).__name__}: {told}", device, **settings)
     settings |= {"dx": scene.dx, "walls": walls, "dt": plan[-1][1]}

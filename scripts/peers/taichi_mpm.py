@@ -129,10 +129,13 @@ class TaichiElements:
         volume = uniform(scene.volume, "volume", 0.01)
         ti = self.ti
         ti.reset()
-        ti.init(
-            arch=ti.cuda if device == "cuda" else ti.cpu, log_level=ti.ERROR, random_seed=0,
-            offline_cache=True,
-        )  # fmt: skip
+        # its sparse grids take their memory from a pool that is too small for them on a GPU
+        pool = (
+            {"arch": ti.cuda, "device_memory_fraction": 0.3}
+            if device == "cuda"
+            else {"arch": ti.cpu}
+        )
+        ti.init(log_level=ti.ERROR, random_seed=0, offline_cache=True, **pool)
         n = grid_cells(scene)
         # unbounded: its grid is sparse about the origin, so nothing is moved
         made = self.module.MPMSolver(
@@ -157,6 +160,10 @@ class TaichiElements:
             )
         self.made = (scene, made)
         return made
+
+    def forget(self) -> None:
+        """Start anew: what an error on a device leaves is of no use."""
+        self.made = None
 
     def start(self, scene: Scene, variant: str, device: str) -> Engine:
         return Engine(self, scene, variant, device)

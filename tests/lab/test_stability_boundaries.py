@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
+import torch
 
 from gsfluent.charts import stability_report as report
 from gsfluent.charts.stability import Place, Value, Violation, all_maps
+from gsfluent.charts.stability_scenes import DENSITY, DX, YOUNG, block, clusters, noise
+from gsfluent.charts.stability_steps import shaken
+from gsfluent.lab.driver import World
+from gsfluent.lab.slab import nacc, wave_speed
+from gsfluent.lab.violations import OfWorld, first_violation
 
 CPU = Place("cpu")
 
@@ -179,6 +187,47 @@ def test_boundary_released_solvers() -> None:
     fails("released", 2.0, "fixed, explicit", "energy")
     fails("released", 0.3, "stress of claymore", "energy")
     fails("released", 0.3, "force of GaussianFluent", "energy")
+
+
+def test_boundary_courant_number_of_loose_points() -> None:
+    """A point that nothing holds: sqrt((1 - nu) / (1 + nu)), where its bulk wave alone gives out.
+
+    With all nodes its own, C' = C - 4 dt / (rho dx^2) tau: an oscillator of its volume with
+    omega^2 = 12 K / (rho dx^2), which symplectic Euler keeps up to omega dt = 2.
+    """
+    few = Place("cuda").every
+    for nu in (0.0, 0.3, 0.45, 0.495):
+        limit = math.sqrt((1.0 - nu) / (1.0 + nu))
+        for factor in (0.97, 1.03):
+            world = shaken(*clusters(1, 200), factor * limit, CPU, poisson=nu)
+            found = first_violation(OfWorld(world), 300, every=few)
+            assert (found is None) == (factor < 1.0)
+    assert run("loose", 0.6, 0.45) is None and run("loose", 0.55, 0.495) is None
+    fails("loose", 0.65, 0.495, "energy")
+    fails("loose", 0.6, 0.4, "energy", 1)  # a step at which ours holds
+
+
+def test_intact_crumbs_break_by_themselves_beyond_the_limit_of_loose_points() -> None:
+    """Brittle crumbs at rest but for a thousandth of c, nu 0.4: whole at 0.6, dust at 0.7."""
+    row = nacc(YOUNG, 0.4, DENSITY, friction=1.85, cohesion=0.6, hardening=3.0)
+    points, volume = clusters(1, 64)
+    broken = []
+    for courant in (0.6, 0.7):
+        world = World(
+            points, 1e-3 * wave_speed(row) * noise(len(points)), mass=DENSITY * volume,
+            volume=volume, dx=DX, law=1, params=row, alpha=torch.full((len(points),), -0.04),
+            dt=courant * DX / wave_speed(row), dtype=torch.float32,
+        ).run(steps=200)  # fmt: skip
+        broken.append(float((world.alpha >= 0.0).double().mean()))
+    assert broken[0] == 0.0 and broken[1] > 0.9
+
+
+def test_the_default_step_holds_ten_times_as_long() -> None:
+    """No slow growth at c dt / dx of 0.6 over 3000 steps: fragments, and nearly no compression."""
+    few = Place("cuda").every  # steps between two looks: slow growth does not go away
+    for points, nu in ((clusters(2, 8), 0.45), (clusters(8, 8), 0.3), (block(2.0), 0.495)):
+        world = shaken(*points, 0.6, CPU, poisson=nu)
+        assert first_violation(OfWorld(world), 3000, every=few) is None
 
 
 def test_every_boundary_has_its_test() -> None:

@@ -74,7 +74,7 @@ def test_named_points_of_the_peers_lie_where_their_choice_fails(recorded: list[P
     lines = [x for m in maps for x in stability_report.named(m, recorded, marks(maps))]
     assert len(lines) == sum(map(len, KNOWN.values()))
     holding = [line for line in lines if line.endswith("holds")]
-    assert len(holding) == 3 and all("step" in x or "ficus" in x for x in holding)
+    assert len(holding) == 3 and all("its demo" in x or "step (0.6)" in x for x in holding)
 
 
 def test_failures_measured_on_programs_become_points(tmp_path: Path) -> None:
@@ -195,3 +195,13 @@ def test_the_verb_runs_a_map_and_draws_recorded_lines(
     assert json.loads(capsys.readouterr().out)["points"] == 9
     assert main([*words, "--maps", "nonsense"]) == 2
     assert main([*words, "--draw", str(out / "stability.jsonl"), "--maps", "kernel"]) == 2
+
+
+@pytest.mark.slow
+def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
+    wanted = stability.chosen(["zero_weight"])
+    one, two = (
+        stability.run_maps(wanted, tmp_path / f"{jobs}.jsonl", quick=True, jobs=jobs)
+        for jobs in (1, 2)
+    )
+    assert [(p.key, p.step, p.kind) for p in one] == [(p.key, p.step, p.kind) for p in two]

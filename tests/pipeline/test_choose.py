@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,16 @@ from gsfluent.config.settings_solve import read_error
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.figure.choice import draw_choice
-from gsfluent.pipeline.choose import Probing, choose
-from gsfluent.pipeline.choose_fit import History, fit_history
+from gsfluent.pipeline import choose_shot
+from gsfluent.pipeline.choose import Growth, Probes, Probing, choose, summary
+from gsfluent.pipeline.choose_fit import Fit, History, fit_history
 from gsfluent.pipeline.choose_pick import pick, ranked
 from gsfluent.pipeline.choose_probe import Probe, Seen, window
 from gsfluent.pipeline.choose_seconds import measured_rates, work_of
+from gsfluent.pipeline.run_context import RunContext
+from gsfluent.pipeline.run_record import RunRecord
+from gsfluent.pipeline.run_store import StageStore
+from gsfluent.progress import LineReporter
 from gsfluent.scene import Scene
 
 SIZES = (1 / 10, 1 / 14, 1 / 20)
@@ -290,3 +296,46 @@ def test_rates_are_those_that_the_probes_were_made_with() -> None:
     per_step, per_point = measured_rates([*runs, slow])
     assert per_step == pytest.approx(2e-3, rel=1e-6)
     assert per_point == pytest.approx(1e-7, rel=1e-6)
+
+
+def staged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fit: Fit, bound: str) -> RunContext:
+    """A run about to choose, its probes replaced by one history."""
+    scene, shot = ball_shot(tmp_path, solve={"error": bound})
+    device = torch.device("cpu")
+    record = RunRecord(tmp_path / "run.json", shot.resolved(), device, 0)
+    store = StageStore(tmp_path / "stages")
+
+    def chosen(_scene: Scene, _shot: Shot, limit: float, **_keys: Any) -> dict[str, Any]:
+        found = pick([fit], ranked([fit], limit, fourth_power), limit)
+        empty = Seen({}, *[np.zeros(1)] * 3, np.zeros((1, 3)), *[np.zeros(1)] * 2, 1.0, 1.0)
+        one = dataclasses.replace(run_of(10, 1, 1, 1.0), seen=empty)
+        probes = Probes((one, one), ((one,),), {}, 0, 1, 1.0)
+        return summary(found, [fit], Growth({}, {}), probes, Probing(), "a test")
+
+    monkeypatch.setattr(choose_shot, "load_solids", lambda _context: {})
+    monkeypatch.setattr(choose_shot, "build_scene", lambda *_: scene)
+    monkeypatch.setattr(choose_shot, "choose", chosen)
+    return RunContext(shot, tmp_path, device, 0, store, record, LineReporter())
+
+
+def test_a_run_that_chance_limits_takes_what_is_fine_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fit = fit_history(made(1.0, 0.5, noise=0.05, chaotic=True))
+    context = staged(tmp_path, monkeypatch, fit, "2%")
+    assert choose_shot.choose_stage(context)
+    choice = context.record.values["choice"]
+    assert not choice["met"] and choice["chosen"] is None
+    assert context.shot.solve.cells == choice["enough"]["cells"]
+    assert context.shot.solve.error is None
+    assert "no setting can claim 2.0%" in caplog.text
+
+
+def test_a_run_whose_error_cannot_be_met_is_refused_with_what_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = staged(tmp_path, monkeypatch, fit_history(made(0.6, 3.0)), "0.1%")
+    with pytest.raises(InputError, match="cannot be met") as caught:
+        choose_shot.choose_stage(context)
+    least = true_error(0.6, 3.0, 1 / 128)
+    assert f"least that can be promised is solve.error: {least:.1%}" in caught.value.mend

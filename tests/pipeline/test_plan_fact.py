@@ -149,6 +149,8 @@ def test_a_time_budget_becomes_cells_and_stays(shot: Shot, stored: Path) -> None
     for plan, seconds in ((free, 1.0), (tight, 0.1)):
         assert plan["simulate_seconds"] / plan["frames"] <= seconds * 1.001
         assert "time budget" in [row["bound"] for row in plan["bounds"]]
+        assert plan["budget"]["seconds_per_frame"] == seconds
+        assert plan["budget"]["dx_by_formula"] == pytest.approx(plan["dx"], rel=0.8)
     with pytest.raises(InputError, match="seconds_per_frame 1e-05"):
         plan_shot(budget(1e-5), model=model())
     values = run_shot(budget(0.1), stored / "out")
@@ -173,7 +175,8 @@ def test_work_that_was_foreseen_wrongly_is_not_the_models_fault(shot: Shot, stor
     assert work["simulate"]["steps"] == values["simulation"]["substeps"]
     made, stages = model(), {s["name"]: s for s in values["stages"]}
     exact = made.stage("simulate", work["simulate"], corrected=False).seconds
-    learn(made, plan, values, "cpu", stored)
+    made = learn(made, plan, values, "cpu", stored)
+    assert made == CostModel.load("cpu", stored)
     assert made.ratios["simulate"][0] == pytest.approx(stages["simulate"]["seconds"] / exact)
     section = compare(plan, values)
     planned = plan["stages"]["simulate"]["seconds"]
