@@ -58,7 +58,7 @@ if [ -z "$enter" ]; then
   part ops "$PYTHON" scripts/accuracy.py --device "$device" --json "$out/ops.json" $quick
   battery_tier=(--tier all)
   [ -n "$quick" ] && battery_tier=(--only wave)
-  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" "${battery_tier[@]}"
+  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" --known docs/accuracy.md "${battery_tier[@]}"
   part bench bench
   part shatter "$PYTHON" scripts/fracturebench/shatter.py compare -o "$out/shatter.jsonl" --device "$device" $quick
   part chart "$PYTHON" -m gsfluent chart -o "$out/chart" --device "$device" $quick

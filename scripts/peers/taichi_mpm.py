@@ -130,7 +130,11 @@ class TaichiElements:
         ti = self.ti
         ti.reset()
         # its sparse grids take their memory from a pool that is too small for them on a GPU
-        pool = {"arch": ti.cuda, "device_memory_fraction": 0.3} if device == "cuda" else {"arch": ti.cpu}
+        pool = (
+            {"arch": ti.cuda, "device_memory_fraction": 0.3}
+            if device == "cuda"
+            else {"arch": ti.cpu}
+        )
         ti.init(log_level=ti.ERROR, random_seed=0, offline_cache=True, **pool)
         n = grid_cells(scene)
         # unbounded: its grid is sparse about the origin, so nothing is moved
