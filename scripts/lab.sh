@@ -30,6 +30,8 @@ if [ -z "${PYTHON:-}" ]; then
 fi
 export PYTHONPATH="$PWD:$PWD/scripts${PYTHONPATH:+:$PYTHONPATH}" OMP_WAIT_POLICY=PASSIVE
 mkdir -p "$out" || exit 1
+jobs=1
+[ "$device" = cpu ] && jobs=$(getconf _NPROCESSORS_ONLN)
 status=0 began=$SECONDS summary=()
 
 # part NAME COMMAND...: run it if it was asked for; what it says goes to OUT/NAME.txt
@@ -58,11 +60,11 @@ if [ -z "$enter" ]; then
   part ops "$PYTHON" scripts/accuracy.py --device "$device" --json "$out/ops.json" $quick
   battery_tier=(--tier all)
   [ -n "$quick" ] && battery_tier=(--only wave)
-  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" "${battery_tier[@]}"
+  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" --known docs/accuracy.md "${battery_tier[@]}"
   part bench bench
   part shatter "$PYTHON" scripts/fracturebench/shatter.py compare -o "$out/shatter.jsonl" --device "$device" $quick
   part chart "$PYTHON" -m gsfluent chart -o "$out/chart" --device "$device" $quick
-  part stability "$PYTHON" -m gsfluent stability -o "$out/stability" --device "$device" $quick
+  part stability "$PYTHON" -m gsfluent stability -o "$out/stability" --device "$device" --jobs $jobs $quick
   part brittle brittle
   printf '%s\n' "${summary[@]}" "$(printf '%-10s %6d s' all $((SECONDS - began)))" | tee "$out/seconds.txt"
   exit $status

@@ -28,6 +28,7 @@ from gallery import SCENES, commit, machine, shot_of
 from page import enter
 
 from gsfluent.cli.common import choose_device
+from gsfluent.errors import GsfluentError
 from gsfluent.pipeline.plan import cost_model, plan_shot
 from gsfluent.pipeline.plan_cost import Cost, CostModel
 from gsfluent.pipeline.plan_fact import actual_work
@@ -72,6 +73,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         raise SystemExit(f"{name}: the run failed: {done.stderr[-2000:]}")
     values = json.loads((out / "run.json").read_text(encoding="utf-8"))
     section = values["plan"]
+    kept = ("seconds", "memory", "probe_seconds", "machine")
     simulation = values["simulation"]
     return {
         "scene": name,
@@ -79,7 +81,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         "device": device.type,
         "commit": commit(),
         "taught": max((len(r) for r in model.ratios.values()), default=0),
-        "probe": {name: getattr(model, name) for name in ("seconds", "probe_seconds", "machine")},
+        "probe": {name: getattr(model, name) for name in kept},
         "alone": alone["stages"],
         "plan": plan["stages"],
         "actual": {
@@ -107,7 +109,7 @@ def shot_text(name: str, quality: str | None) -> str:
 def taught(line: dict[str, Any], others: list[dict[str, Any]]) -> dict[str, Cost]:
     """What a model says to a shot that has learned from other shots, by stage."""
     probe = line["probe"]
-    model = CostModel(machine=probe["machine"], seconds=probe["seconds"])
+    model = CostModel(probe["machine"], probe["seconds"], memory=probe.get("memory", {}))
     for other in others:
         for name, fact in other["actual"].items():
             said = model.stage(name, other["work_actual"][name], corrected=False)
@@ -246,6 +248,7 @@ def main() -> int:
         sys.stdout.write(json.dumps(fit_memory(read(LINES) + read(path)), indent=1) + "\n")
         return 0
     kind = "" if options.page else choose_device(options.device).type
+    failed = 0
     for name in [] if options.page else options.names or list(SCENES):
         if any(line["scene"] == name and line["device"] == kind for line in read(path)):
             logging.info("%s: has a line in %s", name, path)
@@ -254,7 +257,12 @@ def main() -> int:
             logging.info("%s: left out, no data folder; set GSFLUENT_DATA", name)
             continue
         options.out.mkdir(parents=True, exist_ok=True)
-        line = run(name, options)
+        try:
+            line = run(name, options)
+        except (SystemExit, GsfluentError) as error:  # the others' lines are worth having
+            failed += 1
+            logging.info("%s", error)
+            continue
         for target in [path, LINES] if options.keep else [path]:
             target.parent.mkdir(parents=True, exist_ok=True)
             with target.open("a", encoding="utf-8") as stream:
@@ -268,7 +276,7 @@ def main() -> int:
         PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), "plan", text), encoding="utf-8")
     else:
         sys.stdout.write(tables(read(path)) + "\n")
-    return 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -123,7 +123,8 @@ def main() -> int:
     text = (
         f"{len(cpu)} points of {len(maps)} maps, {seconds:.0f} s of computing on {machine}, "
         f"{sum(p.holds for p in cpu)} held. "
-        + ("Every default is inside, settings with a margin of 1.2 or more."
+        + ("Every default is inside, settings with a margin of 1.2 or more (within the spans named "
+           "under Margins)."
            if not wrong else "NOT inside with margin: " + "; ".join(wrong) + ".")
     )  # fmt: skip
     tests = [

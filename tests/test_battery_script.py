@@ -74,3 +74,14 @@ def test_the_accuracy_script_keeps_the_battery(tmp_path: Path, battery: ModuleTy
     assert "table of problems" in accuracy.enter(page, "cpu", "table of ops")
     both = battery.enter(accuracy.enter(page, "cpu", "table of ops"), "battery", "new table")
     assert "table of ops" in both and "table of problems" not in both and "new table" in both
+
+
+def test_only_a_miss_that_the_page_has_already_is_no_news(
+    battery: ModuleType, tmp_path: Path
+) -> None:
+    add("fall", 0.2, [])
+    page = tmp_path / "accuracy.md"
+    assert battery.main(["--markdown", str(page)]) == 1
+    assert battery.main(["--known", str(page)]) == 0
+    page.write_text(page.read_text().replace("| figure |", "| another |"))
+    assert battery.main(["--known", str(page)]) == 1

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from gsfluent import materials
 from gsfluent.charts.ladder import OFF_GRID, Setting
+from gsfluent.charts.play import broken
 from gsfluent.charts.record import Record, commit, machine
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
@@ -42,11 +43,22 @@ def measure_off_grid(setting: Setting, device: str, repeat: int) -> Record:
         device: Where.
         repeat: Timed runs.
 
+    Returns:
+        The record; a run that raises is one that failed.
+
     Raises:
         ValueError: Another case.
     """
     if setting.case not in OFF_GRID:
         raise ValueError(f"measure_off_grid: case must be one of {', '.join(OFF_GRID)}")
+    try:
+        return _runs(setting, device, repeat)
+    except (ArithmeticError, RuntimeError, ValueError) as error:
+        return broken(setting, device, error, kind="elastic", points=0,
+                      seconds=_SECONDS[setting.case], knob=setting.knob)  # fmt: skip
+
+
+def _runs(setting: Setting, device: str, repeat: int) -> Record:
     walls: list[float] = []
     scene = _scene(setting.case)
     for _ in range(repeat + 1):  # the first one warms up

@@ -16,14 +16,14 @@ from gsfluent.charts.ladder import TEXTBOOK, Setting
 from gsfluent.charts.record import Record, commit, machine, of_run
 from gsfluent.charts.ride import Riders
 from gsfluent.fracturebench.fracture_shatter import reference
-from gsfluent.fracturebench.registry import Case, find
+from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.statistics import distance, jitter
 from gsfluent.lab.driver import World
 from gsfluent.lab.frozen import play
 
-__all__ = ["even_dt", "measure", "shuffled", "stepwise"]
+__all__ = ["broken", "even_dt", "measure", "shuffled", "stepwise"]
 
 MASS = "mass over pieces, KS"
 _SEEDS = 3
@@ -72,7 +72,10 @@ def measure(setting: Setting, device: str, repeat: int = 3) -> Record:
             )
         # a scene of so few points that its measure divides by none cannot be judged either
         except (ArithmeticError, RuntimeError, ValueError, MemoryError) as error:
-            return _broken(setting, case, scene, device, facts, error)
+            return broken(
+                setting, device, error, kind=case.kind, points=scene.count, seconds=scene.seconds,
+                **facts,
+            )  # fmt: skip
 
 
 def _band() -> float:
@@ -201,19 +204,32 @@ def _threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _broken(
+def broken(
     setting: Setting,
-    case: Case,
-    scene: Scene,
     device: str,
-    facts: dict[str, Any],
     error: BaseException,
+    *,
+    kind: str,
+    points: int,
+    seconds: float,
+    **facts: Any,
 ) -> Record:
+    """The record of a setting that raised.
+
+    Args:
+        setting: What was to be run.
+        device: Where.
+        error: What it raised.
+        kind: Of the case.
+        points: Material points.
+        seconds: To be simulated [s].
+        **facts: Further settings.
+    """
     words = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
     return Record(
-        case=case.name, kind=case.kind, method=setting.method, variant=setting.variant,
+        case=setting.case, kind=kind, method=setting.method, variant=setting.variant,
         settings={"dx": setting.dx, "ppc": setting.ppc, **facts}, device=device,
-        machine=machine(device), points=scene.count, steps=0, simulated_seconds=scene.seconds,
+        machine=machine(device), points=points, steps=0, simulated_seconds=seconds,
         wall_seconds=[], wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
         failed=words.rstrip(": "), commit=commit(),
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

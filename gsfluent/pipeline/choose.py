@@ -25,6 +25,7 @@ from gsfluent.pipeline.choose_probe import Probe, distance, histories, probe, wi
 from gsfluent.pipeline.choose_seconds import cost_of
 from gsfluent.pipeline.simulate_solver import CFL
 from gsfluent.pipeline.stage import Progress, report_progress
+from gsfluent.pipeline.step_limit import safe_steps
 from gsfluent.scene import Scene
 
 __all__ = [
@@ -289,6 +290,7 @@ def choose(
         InputError: A probe broke off, or the scene is empty.
     """
     probing = probing or Probing()
+    probing = dataclasses.replace(probing, cfl=safe_steps(scene, probing.cfl))
     probes = run_probes(scene, shot, probing, device=device, seed=seed, progress=progress)
     seconds, source = cost_of(probes.whole, probes.levels, scene, device)
     choice, fits, growth = choose_setting(probes, bound, seconds)

@@ -59,8 +59,8 @@ class Choice:
         bound: What was asked for.
         settings: All that were weighed, cheapest first.
         chosen: The one to take, or None when none meets the bound.
-        enough: The cheapest that differs from finer ones by no more than the bound or the
-            run-to-run band, whichever is larger; None when there is none.
+        enough: The cheapest that in most draws differs from finer ones by no more than the bound
+            or the run-to-run band, whichever is larger; None when there is none.
         sure: Share of the draws in which the chosen one meets the bound, 0 without one.
         floor: Least error that any setting can claim: the run-to-run band of the observable with
             the widest one.
@@ -184,7 +184,8 @@ def pick(
     usable = [s for s in settings if math.isfinite(s.seconds)]
     meeting = [s for s in usable if s.sure >= SURE]
     chosen = min(meeting, key=lambda s: s.seconds) if meeting else None
-    settled = [s for s in usable if s.settled >= SURE]
+    # nothing can be promised there: what is more likely than not is as much as a scene needs
+    settled = [s for s in usable if s.settled > 0.5]
     enough = min(settled, key=lambda s: s.seconds) if settled else None
     # the 90th percentile lies between the median and the 95th: the latter promises enough
     within = min((s.high for s in usable), default=math.inf)

@@ -164,11 +164,11 @@ def plan_shot(
         model: What work costs there; without one times are None.
 
     Returns:
-        ``passes`` (name, needed, why), ``bounds`` and ``binding``, ``dx``, ``cells``, ``dt``,
-        ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and memory_bytes by
-        name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``, ``size_m``,
-        ``assumed``, ``warnings``, ``calibrated``, ``model`` (when it was measured, corrections by
-        runs), ``device`` and ``work`` (features by stage).
+        ``passes`` (name, needed, why), ``bounds``, ``binding`` and ``budget``, ``dx``, ``cells``,
+        ``dt``, ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and
+        memory_bytes by name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``,
+        ``size_m``, ``assumed``, ``warnings``, ``calibrated``, ``model`` (when it was measured,
+        corrections by runs), ``device`` and ``work`` (features by stage).
 
     Raises:
         InputError: The input cannot be read, or a material or event cannot be.
@@ -208,6 +208,7 @@ def plan_shot(
         "dx": dx,
         "bounds": [bound.row() for bound in bounds],
         "binding": binding,
+        "budget": _budget(prospect, model),
         "dt": outlook.dt,
         "substeps": outlook.substeps,
         "grid_from": outlook.grid_from,
@@ -235,6 +236,17 @@ def cells_of(prospect: Prospect, model: CostModel | None) -> int:
     if solve.seconds_per_frame is None or model is None:
         return solve.cells or QUALITY[solve.quality]
     return choose_cells(lambda cells: prospect.frame_seconds(model, cells), solve.seconds_per_frame)
+
+
+def _budget(prospect: Prospect, model: CostModel | None) -> dict[str, float] | None:
+    """The time budget of a shot, and what the formula that counts points alone makes of it."""
+    seconds = prospect.shot.solve.seconds_per_frame
+    if seconds is None or model is None:
+        return None
+    return {
+        "seconds_per_frame": seconds,
+        "dx_by_formula": rough_spacing(prospect, model, seconds),
+    }
 
 
 def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:

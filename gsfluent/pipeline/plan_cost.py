@@ -122,6 +122,8 @@ class CostModel:
         errors: Stage: largest relative error of the fit at the sizes that were measured.
         ratios: Stage: actual over predicted seconds of the last runs, without correction.
         memory_ratios: The same for memory.
+        memory: Stage, feature: bytes per unit, where the probe could measure them (on a GPU, whose
+            allocator counts exactly).
     """
 
     machine: dict[str, Any]
@@ -131,6 +133,7 @@ class CostModel:
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
     ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     memory_ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    memory: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
 
     # --- asking ---
 
@@ -154,7 +157,7 @@ class CostModel:
         if known is None:
             raise ValueError(f"CostModel: no stage {name!r}; known: {', '.join(self.seconds)}")
         seconds = sum(value * features.get(feature, 0.0) for feature, value in known.items())
-        size = memory_of(name, features, self.device)
+        size = memory_of(name, features, self.device, self.memory.get(name))
         if corrected:
             seconds *= self.correction(name)
             size = int(size * _mean_ratio(self.memory_ratios.get(name, [])))
@@ -251,6 +254,7 @@ class CostModel:
             errors=_numbers(values["errors"]),
             ratios={name: _ratios(row) for name, row in values["ratios"].items()},
             memory_ratios={name: _ratios(row) for name, row in values["memory_ratios"].items()},
+            memory={name: _numbers(row) for name, row in values["memory"].items()},
         )
         if not model.seconds:
             raise ValueError("no stage in it")

@@ -33,16 +33,23 @@ BYTES: dict[str, dict[str, dict[str, float]]] = {
 """``cpu``: fitted to six gallery shots, each in a process of its own (scripts/plan_accuracy.py
 --fit-memory); residuals are 5 % in the median, 20 % at most. What those shots are too small to show
 is counted from the tensors: training state of a splat (``splats_most``), the solver's buffers of a
-block (``blocks_most``, gsfluent/ops/solver_buffers.py)."""
+block (``blocks_most``, gsfluent/ops/solver_buffers.py). ``cuda``: counted from tensors, and taken
+only until the probe has measured the machine."""
 
 
-def memory_of(stage: str, features: Mapping[str, float], device: str) -> int:
+def memory_of(
+    stage: str,
+    features: Mapping[str, float],
+    device: str,
+    measured: Mapping[str, float] | None = None,
+) -> int:
     """Most memory of a stage [bytes].
 
     Args:
         stage: Stage, as in ``run.json``.
         features: Amounts of work.
         device: ``cpu`` or ``cuda``.
+        measured: Bytes per unit that were measured on this machine, instead of :data:`BYTES`.
     """
-    rows = BYTES[device].get(stage, {})
+    rows = measured or BYTES[device].get(stage, {})
     return int(sum(value * features.get(name, 0.0) for name, value in rows.items()))

@@ -13,7 +13,7 @@ import json
 import logging
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,11 +22,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gsfluent.config import Shot
+from gsfluent.config.settings import EXPORTS
+from gsfluent.errors import GsfluentError
 from gsfluent.io import load_capture, save_image
 from gsfluent.pipeline.inspect_hull import masked_views
 from gsfluent.pipeline.plan_cost import CostModel, machine_key
 from gsfluent.pipeline.plan_fact import actual_work
 from gsfluent.pipeline.plan_fit import Sample, fit
+from gsfluent.pipeline.plan_memory import BYTES
 from gsfluent.pipeline.plan_stand_in import look_at_photographs
 from gsfluent.pipeline.plan_work import isolate_work, reconstruct_work, render_work
 from gsfluent.pipeline.render_cuts import save_cut_views
@@ -69,9 +72,9 @@ class Size:
 
 SIZES = (
     Size("cold", 10, 2000, 64, 24, 8, 2, (64, 48), "rubber"),
-    Size("small", 30, 3000, 80, 32, 10, 6, (128, 96), "fruit.watermelon"),
-    Size("large", 30, 12000, 160, 56, 14, 4, (256, 192), "rubber"),
-    Size("large", 30, 12000, 160, 56, 14, 8, (384, 288), "fruit.watermelon"),
+    Size("small", 30, 3000, 80, 28, 10, 4, (128, 96), "fruit.watermelon"),
+    Size("large", 30, 12000, 160, 50, 14, 3, (256, 192), "rubber"),
+    Size("large", 30, 12000, 160, 50, 14, 6, (384, 288), "fruit.watermelon"),
 )
 """The last is the third, broken, with more and larger frames: its first stages are found done."""
 _TRAININGS = ((80, 3000, 90), (160, 3000, 30))
@@ -90,21 +93,31 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
 
     device = torch.device(device)
     began = time.perf_counter()
-    total = len(SIZES) + 2
+    total = len(SIZES) + 3
+    parts: list[tuple[str, float]] = []
+
+    def report(number: int, what: str) -> None:
+        parts.append((what, time.perf_counter() - began - sum(took for _, took in parts)))
+        report_progress(progress, number, total, what)
+
     with tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name, _quiet():
         folder = Path(name)
         draw_capture(folder / "photographs")
-        report_progress(progress, 1, total, "photographs")
+        report(1, "photographs")
         samples: list[Sample] = []
+        sizes: list[Sample] = []
         for number, size in enumerate(SIZES):
             values, planned = run_small(folder, size, device)
             samples += stage_samples(values, planned, cold=number == 0)
+            if device.type == "cuda":
+                sizes += memory_samples(values, planned)
             if number == 0:
                 first = simulation_sample(values, planned)
-            report_progress(progress, number + 2, total, f"stages, {size.name}")
+            report(number + 2, f"{size.name} shot")
         samples += other_samples(folder / "small", device)
         samples += [*training_samples(folder, device), figures_sample(folder / "large", device)]
         framed = [s for name in ("small", "large") for s in frame_samples(folder / name, device)]
+        report(total - 1, "exports, trainings, frames")
     costs: dict[str, dict[str, float]] = {}
     errors: dict[str, float] = {}
     for stage, features in FEATURES.items():
@@ -114,22 +127,26 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
     found, _ = fit(more, ("procedural_objects", "procedural_voxels"))
     costs["texture"] |= found
     exports = [s for s in samples if s.stage == "export"]
-    kinds = sorted({name for s in exports for name in s.features})
-    costs["export"], errors["export"] = fit(exports, kinds)
+    costs["export"], errors["export"] = export_costs(exports)
     costs["simulate"], errors["simulate"] = measure_solver(device)
     frame_costs, _ = fit(framed, FRAME_FEATURES)
     # what a fresh process pays once shows in the first small shot
     cold, _ = fit([first], ("start",), frame_costs)
     costs["simulate"] |= frame_costs | cold
-    report_progress(progress, total, total, "solver")
+    report(total, "solver")
     model = CostModel(
         machine=machine_key(device),
         seconds=costs,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         probe_seconds=time.perf_counter() - began,
         errors=errors,
+        memory=memory_costs(sizes),
     )
-    _log.info("measured what work costs on this device in %.1f s", model.probe_seconds)
+    _log.info(
+        "measured what work costs on this device in %.1f s: %s",
+        model.probe_seconds,
+        ", ".join(f"{what} {took:.1f} s" for what, took in parts),
+    )
     return model
 
 
@@ -257,6 +274,27 @@ def stage_samples(
     ]
 
 
+def memory_samples(
+    values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]
+) -> list[Sample]:
+    """Bytes that each stage that was not found finished has allocated on the GPU."""
+    return [
+        Sample(name, dict(work[name]) | {"start": 1.0}, float(stage["peak_device_memory_bytes"]))
+        for stage in values["stages"]
+        if (name := stage["name"]) in work
+        and not stage["resumed"]
+        and stage["peak_device_memory_bytes"] > 0
+    ]
+
+
+def memory_costs(samples: Sequence[Sample]) -> dict[str, dict[str, float]]:
+    """Bytes per unit of work of each stage, fitted to what the small shots have allocated."""
+    return {
+        stage: fit([s for s in samples if s.stage == stage], list(BYTES["cuda"][stage]))[0]
+        for stage in {sample.stage for sample in samples}
+    }
+
+
 def simulation_sample(values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]) -> Sample:
     """What the first simulation of this process took beside its steps."""
     stage = next(s for s in values["stages"] if s["name"] == "simulate")
@@ -266,9 +304,7 @@ def simulation_sample(values: Mapping[str, Any], work: Mapping[str, Mapping[str,
 
 def other_samples(out: Path, device: torch.device) -> list[Sample]:
     """Textures by rule, and every kind of export, of a finished small run."""
-    from gsfluent.config.settings import EXPORTS
     from gsfluent.data import Solid
-    from gsfluent.pipeline.export import write_exports
     from gsfluent.pipeline.texture import Texture
 
     samples = []
@@ -283,13 +319,38 @@ def other_samples(out: Path, device: torch.device) -> list[Sample]:
     values = json.loads((out / "run.json").read_text(encoding="utf-8"))
     frames = values["render"]["frames"]
     splats = values["isolation"]["gaussians_kept"] + values["fill"]["interior_gaussians"]
+    return samples + export_samples(out, frames * splats)
+
+
+def export_samples(out: Path, splats: float) -> list[Sample]:
+    """Every kind of export of a run whose frames have so many splats in all, where it can be."""
+    found = []
     for kind in EXPORTS:
-        start = time.perf_counter()
-        write_exports(out, [kind])
-        samples.append(
-            Sample("export", {f"{kind}_gaussians": frames * splats}, time.perf_counter() - start)
-        )
-    return samples
+        try:
+            found.append(export_sample(out, kind, splats))
+        except GsfluentError as error:  # an extra that is not installed: nobody can use it either
+            _log.debug("export %s is not measured: %s", kind, error)
+    return found
+
+
+def export_sample(out: Path, kind: str, splats: float) -> Sample:
+    """One kind of export.
+
+    Raises:
+        InputError: What it needs is not installed.
+    """
+    from gsfluent.pipeline.export import write_exports
+
+    start = time.perf_counter()
+    write_exports(out, [kind])
+    return Sample("export", {f"{kind}_gaussians": splats}, time.perf_counter() - start)
+
+
+def export_costs(samples: Sequence[Sample]) -> tuple[dict[str, float], float]:
+    """Cost of each kind; what could not be measured is as dear as the others on average."""
+    found, error = fit(samples, sorted({name for s in samples for name in s.features}))
+    mean = sum(found.values()) / len(found)
+    return {f"{kind}_gaussians": mean for kind in EXPORTS} | found, error
 
 
 class _Silent:

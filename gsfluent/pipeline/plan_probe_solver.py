@@ -40,15 +40,15 @@ def measure_solver(device: torch.device | str) -> tuple[dict[str, float], float]
     liquid = materials.get("water")
     samples = [
         _measure(soft, 8, device),
-        _measure(soft, 18, device),
+        _measure(soft, 16, device),
         _measure(brittle, 8, device),
         _measure(brittle, 14, device),
-        _measure(brittle, 18, device),
+        _measure(brittle, 17, device),
         _measure(liquid, 12, device),
         _measure(soft, 12, device, law_kernels=False),
         _measure(brittle, 40, device, crumbs=True),
         _measure(brittle, 10, device, two=True),
-        _measure(brittle, 14, device, two=True),
+        _measure(brittle, 13, device, two=True),
         _measure(soft, 8, device, resident=False),
         _measure(soft, 16, device, resident=False),
     ]

@@ -112,6 +112,7 @@ def _chosen(context: RunContext) -> dict[str, Any]:
             "predicted_seconds_per_frame": made["simulate_seconds"] / made["frames"],
             "cells": made["cells"],
             "dx": made["dx"],
+            "dx_by_formula": made["budget"]["dx_by_formula"],
             "binding": made["binding"],
             "bounds": made["bounds"],
             "calibrated": model.made,

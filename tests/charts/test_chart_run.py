@@ -126,6 +126,8 @@ def test_leaving_the_grid_is_measured_beside_staying_on_it() -> None:
     on, off = (measure_off_grid(s, "cpu", 1) for s in ladder(("flight",))[:2])
     assert (on.steps, on.variant) == (0, "") and off.steps > 0
     assert on.error < 0.1 * off.error < 0.1
+    wrong = measure_off_grid(Setting("rest", -1.0), "cpu", 1)
+    assert "dx must be positive" in wrong.failed and not wrong.ok
     with pytest.raises(ValueError, match="flight, rest"):
         measure_off_grid(Setting("bar", 0.1), "cpu", 1)
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 
 import pytest
+import torch
 
 from gsfluent.charts import stability_report as report
 from gsfluent.charts.stability import Place, Value, Violation, all_maps
-from gsfluent.charts.stability_scenes import block, clusters
+from gsfluent.charts.stability_scenes import DENSITY, DX, YOUNG, block, clusters, noise
 from gsfluent.charts.stability_steps import shaken
+from gsfluent.lab.driver import World
+from gsfluent.lab.slab import nacc, wave_speed
 from gsfluent.lab.violations import OfWorld, first_violation
 
 CPU = Place("cpu")
@@ -202,6 +205,21 @@ def test_boundary_courant_number_of_loose_points() -> None:
     assert run("loose", 0.6, 0.45) is None and run("loose", 0.55, 0.495) is None
     fails("loose", 0.65, 0.495, "energy")
     fails("loose", 0.6, 0.4, "energy", 1)  # a step at which ours holds
+
+
+def test_intact_crumbs_break_by_themselves_beyond_the_limit_of_loose_points() -> None:
+    """Brittle crumbs at rest but for a thousandth of c, nu 0.4: whole at 0.6, dust at 0.7."""
+    row = nacc(YOUNG, 0.4, DENSITY, friction=1.85, cohesion=0.6, hardening=3.0)
+    points, volume = clusters(1, 64)
+    broken = []
+    for courant in (0.6, 0.7):
+        world = World(
+            points, 1e-3 * wave_speed(row) * noise(len(points)), mass=DENSITY * volume,
+            volume=volume, dx=DX, law=1, params=row, alpha=torch.full((len(points),), -0.04),
+            dt=courant * DX / wave_speed(row), dtype=torch.float32,
+        ).run(steps=200)  # fmt: skip
+        broken.append(float((world.alpha >= 0.0).double().mean()))
+    assert broken[0] == 0.0 and broken[1] > 0.9
 
 
 def test_the_default_step_holds_ten_times_as_long() -> None:

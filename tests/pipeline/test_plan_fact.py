@@ -149,6 +149,8 @@ def test_a_time_budget_becomes_cells_and_stays(shot: Shot, stored: Path) -> None
     for plan, seconds in ((free, 1.0), (tight, 0.1)):
         assert plan["simulate_seconds"] / plan["frames"] <= seconds * 1.001
         assert "time budget" in [row["bound"] for row in plan["bounds"]]
+        assert plan["budget"]["seconds_per_frame"] == seconds
+        assert plan["budget"]["dx_by_formula"] == pytest.approx(plan["dx"], rel=0.8)
     with pytest.raises(InputError, match="seconds_per_frame 1e-05"):
         plan_shot(budget(1e-5), model=model())
     values = run_shot(budget(0.1), stored / "out")

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from gsfluent import materials
+from gsfluent.config.settings import EXPORTS
+from gsfluent.errors import InputError
 from gsfluent.io import load_capture
+from gsfluent.pipeline import plan_probe
 from gsfluent.pipeline.inspect_hull import hull_grid, masked_views
 from gsfluent.pipeline.orient import look_at_point
+from gsfluent.pipeline.plan_fit import Sample
 from gsfluent.pipeline.plan_probe import draw_capture
 from gsfluent.pipeline.plan_probe_solver import _STEPS, _measure, ball
 
@@ -48,3 +53,46 @@ def test_contact_is_seen_only_between_two() -> None:
 def test_crumbs_fill_more_blocks_than_their_volume() -> None:
     whole, crumbs = ball(0.1, 40), ball(0.1, 40, crumbs=True)
     assert float(crumbs.occupancy.sum()) < 0.02 * float(whole.occupancy.sum())
+
+
+def test_an_export_whose_extra_is_missing_is_not_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def measured(_: Path, kind: str, splats: float) -> Sample:
+        asked.append(kind)
+        if kind == "usd":
+            raise InputError("usd: usd-core is not installed", "install it")
+        return Sample("export", {f"{kind}_gaussians": splats}, 1.0)
+
+    monkeypatch.setattr(plan_probe, "export_sample", measured)
+    found = plan_probe.export_samples(tmp_path, 10.0)
+    assert asked == list(EXPORTS)
+    assert {name for sample in found for name in sample.features} == {
+        f"{kind}_gaussians" for kind in EXPORTS if kind != "usd"
+    }
+    costs = plan_probe.export_costs(found)[0]
+    # as dear as the others are
+    assert costs["usd_gaussians"] == pytest.approx(costs["spz_gaussians"]) == pytest.approx(0.1)
+
+
+def test_memory_of_a_gpu_is_fitted_to_what_was_allocated() -> None:
+    truth = {"start": 3e7, "gaussians": 900.0, "pixels": 250.0}
+    sizes = [(2e3, 3e3), (9e3, 12e3), (3e4, 5e4), (3e4, 1.1e5)]
+    values, samples = {}, []
+    for splats, pixels in sizes:
+        work = {"render": {"gaussians": splats, "pixels": pixels, "start": 0.0}}
+        held = truth["start"] + 900.0 * splats + 250.0 * pixels
+        stages = [("render", held), ("regions", 1.0)]
+        values = {
+            "stages": [
+                {"name": name, "resumed": False, "peak_device_memory_bytes": size}
+                for name, size in stages
+            ]
+        }
+        samples += plan_probe.memory_samples(values, work)
+    values["stages"][0]["resumed"] = True
+    assert len(samples) == 4 and plan_probe.memory_samples(values, {"render": {}}) == []
+    assert plan_probe.memory_costs(samples)["render"] == pytest.approx(truth, rel=0.1)
+    assert plan_probe.memory_costs([]) == {}
