@@ -158,20 +158,25 @@ def check(first: State, now: State, limits: Limits | None = None) -> Violation |
     rounding = 1e-6 * (start + abs(now.work)) + mass * now.floor**2
     most = limits.energy * start + now.work + rounding
     if not now.kinetic + now.elastic <= most:
-        return broken("energy", (now.kinetic + now.elastic) / most, 1.0)
+        return broken("energy", _ratio(now.kinetic + now.elastic, most), 1.0)
     scale = math.sqrt(2.0 * mass * (start + max(now.work, 0.0))) + mass * now.floor
     for before, after, gave in zip(first.momentum, now.momentum, now.given, strict=True):
         change = math.dist(after, [p + g for p, g in zip(before, gave, strict=True)])
         if not change <= limits.momentum * scale:
-            return broken("momentum", change / scale if scale else math.inf, limits.momentum)
+            return broken("momentum", _ratio(change, scale), limits.momentum)
     if limits.path < math.inf:
         time = now.time - first.time
         for before, after, p in zip(first.moment, now.moment, first.momentum, strict=True):
             way = [v * time for v in p]
             lag = math.dist(after, [a + b for a, b in zip(before, way, strict=True)])
             if lag > limits.path * math.hypot(*way):
-                return broken("path", lag / math.hypot(*way), limits.path)
+                return broken("path", _ratio(lag, math.hypot(*way)), limits.path)
     return None
+
+
+def _ratio(value: float, scale: float) -> float:
+    """How many times the scale; infinite where matter at rest has none."""
+    return value / scale if scale > 0.0 else math.inf
 
 
 def first_violation(

@@ -204,3 +204,12 @@ def test_a_crushed_ball_breaks_the_range_of_j() -> None:
     )  # fmt: skip
     found = first_violation(OfWorld(world), 100)
     assert isinstance(found, Violation) and found.kind == "volume" and found.value <= 0.05
+
+
+def test_matter_at_rest_has_no_scale_to_divide_by() -> None:
+    rest = dataclasses.replace(REST, kinetic=0.0, elastic=0.0, momentum=((0.0, 0.0, 0.0),))
+    moved = dataclasses.replace(rest, step=1, kinetic=1e-30)
+    assert check(rest, rest) is None
+    assert check(rest, moved) == Violation(1, "energy", math.inf, 1.0)
+    pushed = dataclasses.replace(rest, step=1, momentum=((1e-30, 0.0, 0.0),))
+    assert check(rest, pushed) == Violation(1, "momentum", math.inf, Limits().momentum)
