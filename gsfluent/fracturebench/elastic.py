@@ -98,6 +98,10 @@ def _halves(x: Floats) -> tuple[Floats, Floats]:
     return u, slope
 
 
+def _over(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
+
+
 def _judge_halves(scene: Scene, run: Run) -> Iterator[Measure]:
     start = scene.x[:, 0]
     shape = np.zeros_like(scene.x)
@@ -110,8 +114,8 @@ def _judge_halves(scene: Scene, run: Run) -> Iterator[Measure]:
     for low, high in ((0.5, 0.9), (1.1, 1.5)):
         near = (start > low * _HALF) & (start < high * _HALF)
         x = start[near] - start[near].mean()
-        ratio.append(float(x @ u[near]) / float(x @ shape[near, 0]))
-    jump = ratio[0] / ratio[1]
+        ratio.append(_over(float(x @ u[near]), float(x @ shape[near, 0])))
+    jump = _over(*ratio)  # not a number where a half has but one layer there, or nothing moved
     yield Measure(
         "traction in the soft half over the stiff one's", jump, 1.0, abs(jump - 1.0), 0.15, "",
         "equal tractions, strains 4 to 1; GaussianBench B1 allows 15 %",

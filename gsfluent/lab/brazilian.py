@@ -63,7 +63,7 @@ def loaded_disc(
     def press(world: World, dt: float) -> None:
         share = min(1.0, world.time * c / (crossings * DIAMETER))
         v = world.velocity * (1.0 - dt * c / DIAMETER)
-        v[loaded, :2] += (push * (share * dt / mass)).to(v.dtype)
+        v[loaded, :2] += (push * (share * dt / mass)).to(v)
         world.velocity = v
 
     world = World(
@@ -121,14 +121,14 @@ def brazilian_disc(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     first: list[float] = []
 
     def watch(w: World) -> None:
-        broken = w.alpha >= 0.0
+        broken = (w.alpha >= 0.0).cpu()
         if not first and bool(broken.any()):
             first.append(float(points[broken, :2].norm(dim=1).mean()) / dx)
 
     while not first and world.time < 12.0 * DIAMETER / c:
         world.run(seconds=0.25 * DIAMETER / c, each=watch)
     world.run(seconds=1.5 * DIAMETER / c)
-    broken = points[world.alpha >= 0.0, :2].abs()
+    broken = points[(world.alpha >= 0.0).cpu(), :2].abs()
     middle = broken[broken[:, 1] < 0.25 * DIAMETER]
     place = first[0] if first else math.nan
     width = float(middle[:, 0].max()) / dx if len(middle) else math.nan

@@ -140,7 +140,7 @@ def oblique_spheres(
         world, balls, _ = _impact(radius, 45.0, speed, q, one_field=one_field)
         world.run(1.0 / speed + 6.0 * radius * speed**-0.2)
         axis = q @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        spin = [float(turning(world, of) @ axis) * radius / speed for of in balls]
+        spin = [float(turning(world, of).cpu() @ axis) * radius / speed for of in balls]
         worst = max(spin, key=abs)
         yield compare(
             "oblique_spheres", f"omega R / v_0, direction {number}", worst, 0.0, tolerance=0.02,
@@ -171,16 +171,16 @@ def hertz_spheres(
     force = 4.0 / 3.0 * stiffness * math.sqrt(curve) * depth**1.5
     time = 2.87 * (reduced**2 / (curve * stiffness**2 * meeting)) ** 0.2
     pushes: list[tuple[float, float]] = []
-    last = [float(world.momentum(balls[0]) @ line), 0.0]
+    last = [float(world.momentum(balls[0]).cpu() @ line), 0.0]
 
     def watch(now: World) -> None:
-        given = float(now.momentum(balls[0]) @ line)
+        given = float(now.momentum(balls[0]).cpu() @ line)
         pushes.append((now.time, (last[0] - given) / (now.time - last[1])))
         last[:] = [given, now.time]
 
     world.run(1.0 / meeting + 2.0 * time, each=watch)
     touching = [t for t, f in pushes if f > 0.02 * force]
-    after = -float(world.momentum(balls[0]) @ line) / mass / speed
+    after = -float(world.momentum(balls[0]).cpu() @ line) / mass / speed
     source = "Hertz (Johnson 1985)"
     note = f"R = {radius:g} dx, v = {speed:g} c each, deepest {depth:.2f} dx"
     return [

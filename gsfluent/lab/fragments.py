@@ -72,7 +72,7 @@ def mean_size(rate: float, seed: int = 0, dtype: torch.dtype = torch.float32) ->
     # to the elastic limit, and on until waves have crossed the longest pieces
     world.run(seconds=1.2 * limit / rate + 1.2 / c * min(1.0, 0.01 * c / rate))
     broken = torch.zeros(CELLS, dtype=torch.bool)
-    broken[cell[world.peak >= 0.0]] = True
+    broken[cell[(world.peak >= 0.0).cpu()]] = True
     places = broken.nonzero()[:, 0]
     cracks = 1 + int((places.diff() > 1).sum()) if len(places) else 0
     return 1.0 / (cracks + 1)

@@ -157,9 +157,9 @@ def ball_rolls(radius: float = 6.0, angle: float = 20.0, friction: float = 0.5) 
     def gravity(now: World, dt: float) -> None:
         # Lower the ball gently, then tilt: a ball that hops is in contact half of the time.
         if now.time < calm:
-            now.velocity = now.velocity * (1.0 - 0.05 * dt) + dt * level
+            now.velocity = now.velocity * (1.0 - 0.05 * dt) + dt * level.to(now.velocity)
         else:
-            now.velocity = now.velocity + dt * tilted
+            now.velocity = now.velocity + dt * tilted.to(now.velocity)
 
     world, ball = _on_slab(
         points, 24.0, 12.0, 0.0, friction, pull=0.0, force=gravity, mass=volume, volume=volume

@@ -68,7 +68,7 @@ def shear_notch(cells: int, *, speed: float = 33.0, dtype: torch.dtype = torch.f
         colliders=torch.cat([between_planes(dx), symmetry]), dtype=dtype,
     )  # fmt: skip
     world.run(seconds=80e-6)
-    broken = points[breakable & (world.peak >= 0.0), :2]
+    broken = points[breakable & (world.peak >= 0.0).cpu(), :2]
     arm = broken - torch.tensor([NOTCH, HEIGHT], dtype=torch.float64)
     reach = arm.norm(dim=1)
     above = (arm[:, 1] > 0.0) & (reach > 0.004)  # beyond the blunt tip

@@ -167,8 +167,8 @@ def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     pressures: list[Tensor] = []
 
     def watch(w: World) -> None:
-        x, y = w.position[:, 0].double(), w.position[:, 1].double()
-        pressure = -w.stress[:, :3].double().mean(dim=1)
+        x, y = w.position[:, 0].double().cpu(), w.position[:, 1].double().cpu()
+        pressure = -w.stress[:, :3].double().mean(dim=1).cpu()
         column = (x / dx).long().clamp(0, cells - 1)
         layer = (y / dx).long().clamp(0, layers)
         tops.append(torch.zeros(cells, dtype=torch.float64).scatter_reduce(0, column, y, "amax"))

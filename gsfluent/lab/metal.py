@@ -48,7 +48,7 @@ def taylor_bar(cells: int = 4, dtype: torch.dtype = torch.float32) -> list[Resul
     )  # fmt: skip
     world.run(seconds=80e-6)
     assert world.deformation is not None
-    position, stretch = world.position.double(), world.deformation.double()
+    position, stretch = world.position.double().cpu(), world.deformation.double().cpu()
     top = int(position[:, 2].argmax())
     end = float(position[top, 2] + 0.5 * step * stretch[top, 2, 2])
     distance = position[:, :2].norm(dim=1)

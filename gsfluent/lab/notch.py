@@ -72,7 +72,7 @@ def run_crack(
 
     def hold(world: World, _dt: float) -> None:
         v = world.velocity.clone()
-        v[grip, 1] = speed
+        v[grip, 1] = speed.to(v)
         world.velocity = v
 
     volume = 0.25 * dx**3
@@ -85,7 +85,7 @@ def run_crack(
     trace: list[tuple[float, float]] = []
 
     def watch(w: World) -> None:
-        broken = (w.alpha >= 0.0) & (x > NOTCH)
+        broken = (w.alpha >= 0.0).cpu() & (x > NOTCH)
         trace.append((w.time, float(x[broken].max()) if bool(broken.any()) else NOTCH))
 
     world.run(seconds=crossings * WIDTH / c, each=watch)
@@ -100,7 +100,7 @@ def run_crack(
         return (high - low) / (end - begin) / limit if end > begin else math.inf
 
     places = [0.25 + 0.1 * i for i in range(6)]
-    broken = (world.alpha >= 0.0) & (x > NOTCH)
+    broken = (world.alpha >= 0.0).cpu() & (x > NOTCH)
     return Run(
         fastest=max(over(a, b) for a, b in itertools.pairwise(places)),
         mean=over(0.3, 0.75),

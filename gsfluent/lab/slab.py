@@ -97,7 +97,7 @@ class Dissipation:
     """
 
     def __init__(self, world: World) -> None:
-        self.work = torch.zeros(world.position.shape[0], dtype=torch.float64)
+        self.work = torch.zeros_like(world.position[:, 0], dtype=torch.float64)
         self._world, self._stress = world, world.stress
 
     def __call__(self, world: World) -> None:

@@ -59,7 +59,7 @@ def pull_bar(cells: int, *, regularised: bool, softening: float = 0.05) -> float
 
     def grip(world: World, _dt: float) -> None:
         v, affine = world.velocity.clone(), world.affine.clone()
-        v[held, 0] = pull * away[held].sign()
+        v[held, 0] = (pull * away[held].sign()).to(v)
         affine[held] = 0.0
         world.velocity, world.affine = v, affine
 
@@ -160,7 +160,7 @@ def open_cantilever(
 
     def wedge(world: World, _dt: float) -> None:
         v = world.velocity.clone()
-        v[ends, 1] = min(1.0, world.time * c) * opening
+        v[ends, 1] = min(1.0, world.time * c) * opening.to(v)
         world.velocity = v
 
     volume = 0.25 * dx**3
@@ -175,7 +175,7 @@ def open_cantilever(
     world.run(seconds=crossings / c, each=meter)
     low, high = notch + 0.0625, 0.5
     passed = layer & (x > low) & (x < high)
-    broken = layer & (world.alpha >= 0.0)
+    broken = layer & (world.alpha >= 0.0).cpu()
     tip = float(x[broken].max()) if bool(broken.any()) else notch
     energy = float(meter.of_points()[passed].sum()) / (dx * (high - low))
     return Opening(energy, tip, points.shape[0], world.steps)

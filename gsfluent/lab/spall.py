@@ -67,7 +67,7 @@ def plate_impact_spall(
 
     def watch(w: World) -> None:
         trace.append(float(w.velocity[face, 0].mean()))
-        broken = w.alpha >= 0.0
+        broken = (w.alpha >= 0.0).cpu()
         if not first and bool(broken.any()):
             first.append((length - float(x[broken].mean())) / dx)
 

@@ -395,3 +395,10 @@ def test_gsfluent_converges_to_the_exact_motion(name: str, at_least: float) -> N
         errors.append(judge(scene, play(scene))[0].error)
     ratio = case.ladder[0] / case.ladder[1]
     assert math.log(errors[0] / errors[1]) / math.log(ratio) > at_least
+
+
+def test_too_few_points_for_a_figure_are_no_number_and_no_error() -> None:
+    scene = find("two_material_bar").build(0.02, 1)  # one layer beside the joint
+    still = np.broadcast_to(scene.x, (len(scene.times), *scene.x.shape)).copy()
+    measures = judge(scene, Run(scene.name, "still", scene.times, still, 0.0 * still, 1.0, 1))
+    assert measures[0].error == pytest.approx(1.0) and not measures[-1].passed
