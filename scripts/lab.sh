@@ -52,7 +52,8 @@ bench() {
 
 brittle() {
   local which=()
-  [ "$device" = cuda ] && which=(--parts order debris ejecta)
+  # on a GPU torch makes a thousand small calls a step; orders and debris are what a GPU can add
+  [ "$device" = cuda ] && which=(--quick --parts order debris ejecta)
   "$PYTHON" scripts/brittle_gpu.py -o "$out/brittle.jsonl" --device "$device" $quick "${which[@]}"
 }
 
@@ -76,7 +77,7 @@ keep() { have "$1" && mkdir -p docs/data && cp "$out/$1" "docs/data/$2"; }
 set -e
 if [ "$device" = cpu ]; then
   if have ops.json; then "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null; fi
-  if have battery.json; then "$PYTHON" scripts/battery.py --json "$out/battery.json" --markdown docs/accuracy.md > /dev/null; fi
+  if have battery.json; then "$PYTHON" scripts/battery.py --json "$out/battery.json" --known docs/accuracy.md --markdown docs/accuracy.md > /dev/null; fi
   if keep shatter.jsonl shatter.jsonl; then "$PYTHON" scripts/fracturebench/shatter.py page; fi
 elif have ops.json; then
   "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null

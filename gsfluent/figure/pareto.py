@@ -139,11 +139,14 @@ def _finite(value: float) -> bool:
 
 
 def _panel(ax: Axes, panel: Panel, color: Mapping[str, str], ours: str) -> None:
+    from matplotlib.ticker import NullFormatter
+
     good = [d for d in panel.dots if not d.failed and _finite(d.cost) and _finite(d.error)]
     seen = [d for d in good if d.error < panel.highest]
     rail = [d for d in panel.dots if d.failed or (d in good and d.error >= panel.highest)]
     ax.set_xscale("log")
     ax.set_yscale("log")
+    ax.xaxis.set_minor_formatter(NullFormatter())  # within a decade their names would overlap
     _heading(ax, panel.title, panel.note)
     low = min((d.error for d in seen), default=1e-3) / 2.5
     high = max((d.error for d in seen), default=1e-1) * 2.0

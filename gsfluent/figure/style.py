@@ -17,7 +17,7 @@ __all__ = ["COLORS", "FAILED", "GRID", "INK", "OURS", "new_figure", "save_png", 
 
 OURS = "#0b6e4f"
 """Colour of gsfluent wherever it stands beside others."""
-COLORS = ("#c1440e", "#31579c", "#8a5fb0", "#b58900", "#4c4c4c", "#2a9db0", "#a83264")
+COLORS = ("#c1440e", "#31579c", "#8a5fb0", "#111111", "#b58900", "#2a9db0", "#a83264")
 """Colours of the others, told apart by people who see no red or green."""
 FAILED = "#b00020"
 INK = "#222222"

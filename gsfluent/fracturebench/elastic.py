@@ -122,7 +122,12 @@ def _judge_halves(scene: Scene, run: Run) -> Iterator[Measure]:
     )  # fmt: skip
 
 
-@case(kind="elastic", dx=0.005, ladder=(0.02, 0.0125, 0.01, 0.00625, 0.005), judge=_judge_halves)
+@case(
+    kind="elastic",
+    dx=0.005,
+    ladder=(0.02, 0.0125, 0.01, 0.00625, 0.005, 0.004),
+    judge=_judge_halves,
+)
 def two_material_bar(dx: float, per_cell: int) -> Scene:
     """Free bar of a soft and a stiff half (1 to 4) in its first mode: the joint carries it."""
     thick = 0.04
