@@ -21,8 +21,8 @@ __all__ = [
 ]  # fmt: skip
 
 CASES = (
-    "bar", "beam", "spin", "two_material_bar", "drop", "collide", "oblique", "pull_apart",
-    "shatter",
+    "bar", "bar_wave", "beam", "spin", "two_material_bar", "drop", "collide", "oblique",
+    "pull_apart", "shatter",
 )  # fmt: skip
 """What is charted by default: a case for each kind of motion, one panel each. Others by name."""
 OURS, TEXTBOOK = "gsfluent", "textbook"

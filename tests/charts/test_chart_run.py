@@ -154,10 +154,12 @@ def test_what_raises_is_a_run_that_failed(monkeypatch: pytest.MonkeyPatch) -> No
     assert made.failed == "RuntimeError: out of memory" and made.error == math.inf and not made.ok
 
 
-def test_a_scene_of_too_few_points_to_be_judged_is_a_run_that_failed() -> None:
+def test_a_measure_of_too_few_points_is_no_number_and_still_a_line(tmp_path: Path) -> None:
     coarse = max(find("two_material_bar").ladder)
     made = measure(Setting("two_material_bar", coarse, 1), "cpu", 1)
-    assert "ZeroDivisionError" in made.failed and not made.ok and made.points > 0
+    assert made.ok and math.isnan(made.measures[-1]["value"])
+    append(tmp_path / "a.jsonl", made)
+    assert read(tmp_path / "a.jsonl")[0].error == made.error
 
 
 def test_a_run_that_breaks_off_is_kept_with_its_reason() -> None:
