@@ -102,3 +102,20 @@ def reporter(*, quiet: bool = False) -> Iterator[Reporter]:
     bars = BarReporter()
     with bars.bars:
         yield bars
+
+
+@contextmanager
+def quiet_logs(name: str, level: int = logging.WARNING) -> Iterator[None]:
+    """Keep log lines below ``level`` of a logger to itself, while many small runs are made.
+
+    Args:
+        name: Of the logger.
+        level: The least level that is still heard.
+    """
+    log = logging.getLogger(name)
+    before = log.level
+    log.setLevel(level)
+    try:
+        yield
+    finally:
+        log.setLevel(before)

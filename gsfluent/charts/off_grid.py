@@ -8,13 +8,10 @@ stays where it came to rest).
 
 from __future__ import annotations
 
-import contextlib
 import datetime
-import logging
 import math
 import statistics
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -26,6 +23,7 @@ from gsfluent.charts.play import broken
 from gsfluent.charts.record import Record, commit, machine
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
+from gsfluent.progress import quiet_logs
 from gsfluent.scene import Scene
 
 __all__ = ["measure_off_grid"]
@@ -62,7 +60,7 @@ def _runs(setting: Setting, device: str, repeat: int) -> Record:
     walls: list[float] = []
     scene = _scene(setting.case)
     for _ in range(repeat + 1):  # the first one warms up
-        with _quiet():
+        with quiet_logs("gsfluent.pipeline"):
             simulate = Simulate(dx=setting.dx, splats=False, device=device, **setting.options)
             coming = simulate(scene, fps=_FPS, seconds=_SECONDS[setting.case])  # samples points
         start = time.perf_counter()
@@ -98,18 +96,6 @@ def _record(
         error=math.inf if failed else error, measures=[measure], failed=failed, commit=commit(),
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )  # fmt: skip
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the line about points that every run of the stage writes."""
-    log = logging.getLogger("gsfluent.pipeline")
-    before = log.level
-    log.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        log.setLevel(before)
 
 
 def _scene(case: str) -> Scene:

@@ -14,10 +14,9 @@ import logging
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -34,9 +33,7 @@ from gsfluent.pipeline.plan_stand_in import look_at_photographs
 from gsfluent.pipeline.plan_work import isolate_work, reconstruct_work, render_work
 from gsfluent.pipeline.render_cuts import save_cut_views
 from gsfluent.pipeline.stage import Progress, report_progress
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from gsfluent.progress import quiet_logs
 
 __all__ = ["FEATURES", "calibrate"]
 
@@ -100,7 +97,10 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         parts.append((what, time.perf_counter() - began - sum(took for _, took in parts)))
         report_progress(progress, number, total, what)
 
-    with tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name, _quiet():
+    with (
+        tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name,
+        quiet_logs("gsfluent", logging.ERROR),
+    ):
         folder = Path(name)
         draw_capture(folder / "photographs")
         report(1, "photographs")
@@ -359,15 +359,3 @@ class _Silent:
     def task(self, name: str) -> Progress:
         """A callback that does nothing."""
         return lambda done, total, text: None
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the small runs' log lines to themselves."""
-    log = logging.getLogger("gsfluent")
-    before = log.level
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        log.setLevel(before)
