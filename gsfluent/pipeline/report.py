@@ -130,24 +130,31 @@ def _choice(page: Page, out: Path, values: Values) -> None:
 
 def _plan(page: Page, plan: Any) -> None:
     """What was predicted before the run, beside what it took."""
-    rows = _compared(plan) if isinstance(plan, Mapping) else []
+    rows = _compared(plan.get("predicted"), plan.get("actual")) if isinstance(plan, Mapping) else []
     if not rows:
         return
     page.heading("Plan against fact")
+    if plan.get("calibrated") is False:
+        page.text(
+            "No times were foreseen: `gsfluent plan` measures what work costs on this machine, once"
+        )
     page.table(["quantity", "predicted", "actual", "actual / predicted"], rows)
     page.listing([str(w) for w in plan.get("warnings") or []], kind="warn")
 
 
-def _compared(plan: Values) -> list[tuple[str, Any, Any, Any]]:
-    predicted, actual = plan.get("predicted") or {}, plan.get("actual") or {}
+def _compared(predicted: Any, actual: Any, of: str = "") -> list[tuple[str, Any, Any, Any]]:
+    """Rows of what stands on both sides, stage by stage, bytes as megabytes."""
     rows: list[tuple[str, Any, Any, Any]] = []
-    for name, guess in predicted.items():
-        fact = actual.get(name)
+    for name, guess in (predicted or {}).items():
+        fact: Any = (actual or {}).get(name)
         if isinstance(guess, Mapping):
-            inner = _compared({"predicted": guess, "actual": fact or {}})
-            rows += [(f"{name}: {part}", *rest) for part, *rest in inner]
+            rows += _compared(guess, fact, of if name == "stages" else f"{of}{name}: ")
         elif _is_number(guess) and _is_number(fact):
-            rows.append((name, guess, fact, fact / guess if guess else None))
+            ratio, label = (fact / guess if guess else None), name.replace("_", " ")
+            if name.endswith("_bytes"):
+                guess, fact = round(guess / 1e6), round(fact / 1e6)
+                label = label.removesuffix(" bytes") + " [MB]"
+            rows.append((of + label, guess, fact, ratio))
     return rows
 
 

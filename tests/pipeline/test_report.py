@@ -52,13 +52,23 @@ def test_what_went_wrong_is_coloured(verdict: str, kind: str, tmp_path: Path) ->
 
 def test_plan_stands_against_fact(tmp_path: Path) -> None:
     plan = {
-        "predicted": {"particles": 1000, "seconds": {"fill": 2.0, "texture": 5.0}},
-        "actual": {"particles": 1234, "seconds": {"fill": 1.0}},
+        "calibrated": False,
+        "predicted": {
+            "particles": 1000,
+            "memory_bytes": 2_000_000,
+            "stages": {"fill": {"seconds": 2.0}, "texture": {"seconds": 5.0}},
+        },
+        "actual": {
+            "particles": 1234,
+            "memory_bytes": 3_000_000,
+            "stages": {"fill": {"seconds": 1.0}},
+        },
         "warnings": ["too <thin>"],
     }
     text = report_page(tmp_path, record(plan=plan)).render()
-    assert "1.234" in text and "seconds: fill" in text and "too &lt;thin&gt;" in text
-    assert "seconds: texture" not in text  # it did not run, so nothing can be said
+    assert "1.234" in text and "fill: seconds" in text and "too &lt;thin&gt;" in text
+    assert "memory [MB]" in text and ">1.5<" in text and "measures what work costs" in text
+    assert "texture: seconds" not in text  # it did not run, so nothing can be said
 
 
 def test_a_page_is_written_whole_and_by_the_verb(tmp_path: Path) -> None:
