@@ -11,6 +11,7 @@ import torch
 
 from gsfluent.pipeline.choose_probe import Probe
 from gsfluent.pipeline.plan_cost import CostModel
+from gsfluent.pipeline.plan_passes import laws_of
 from gsfluent.pipeline.simulate_solver import CFL
 from gsfluent.scene import Scene
 
@@ -65,8 +66,7 @@ def cost_of(
 
         return measured, "the probes' own times"
     known, fields = model, max(p.fields for p in every)
-    laws = {body.material.law for body in scene.bodies}
-    laws |= {part.material(body.material).law for body in scene.bodies for part in body.parts}
+    laws = laws_of(scene)
 
     def said(work: Work) -> float:
         return known.predict(

@@ -16,16 +16,10 @@ from gsfluent.io import write_json
 from gsfluent.pipeline.choose import Probing, choose
 from gsfluent.pipeline.plan_stand_in import stand_in
 from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_prepare import (
-    fill_stage,
-    isolate_stage,
-    reconstruct_stage,
-    texture_stage,
-)
-from gsfluent.pipeline.run_record import RunRecord
-from gsfluent.pipeline.run_regions import load_solids, regions_stage
+from gsfluent.pipeline.run_regions import load_solids
 from gsfluent.pipeline.run_simulate import build_scene, moving_settings
-from gsfluent.pipeline.run_store import StageStore, fingerprint, publish
+from gsfluent.pipeline.run_solids import context_of, make_solids
+from gsfluent.pipeline.run_store import fingerprint, publish
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.scene import Scene
 
@@ -100,12 +94,8 @@ def shot_scene(
     """
     if make or (out / "stages" / "texture" / "stage.json").is_file():
         out.mkdir(parents=True, exist_ok=True)
-        reporter = reporter or LineReporter()
-        record = RunRecord(out / "run.json", shot.resolved(), device, seed)
-        store = StageStore(out / "stages")
-        context = RunContext(shot, out, device, seed, store, record, reporter)
-        for stage in (reconstruct_stage, isolate_stage, fill_stage, texture_stage, regions_stage):
-            stage(context)
+        context = context_of(shot, out, device, seed, reporter)
+        make_solids(context)
         return build_scene(shot, load_solids(context), context.frame), f"the stages in {out}"
     warnings: list[str] = []
     standing = stand_in(shot, warnings)

@@ -11,17 +11,14 @@ from gsfluent import materials
 from gsfluent.config import Shot
 from gsfluent.data import Solid
 from gsfluent.errors import InputError
-from gsfluent.progress import LineReporter, Reporter
+from gsfluent.progress import Reporter
 from gsfluent.scene import Scene
 
 from .inspect_parts import PartMap, body_parts, solid_regions
 from .inspect_parts_picture import save_parts_picture
 from .particles import grid_spacing
-from .run_context import RunContext
-from .run_prepare import fill_stage, isolate_stage, reconstruct_stage, texture_stage
-from .run_record import RunRecord
-from .run_regions import load_solids, regions_stage
-from .run_store import StageStore
+from .run_regions import load_solids
+from .run_solids import context_of, make_solids
 from .simulate import QUALITY
 
 __all__ = ["inspect_shot", "inspect_solid"]
@@ -58,12 +55,8 @@ def inspect_shot(
         InputError: The shot is wrong, or a part asks for what the solid does not have.
     """
     run.mkdir(parents=True, exist_ok=True)
-    device = torch.device(device)
-    record = RunRecord(run / "run.json", shot.resolved(), device, seed)
-    store = StageStore(run / "stages")
-    context = RunContext(shot, run, device, seed, store, record, reporter or LineReporter())
-    for stage in (reconstruct_stage, isolate_stage, fill_stage, texture_stage, regions_stage):
-        stage(context)
+    context = context_of(shot, run, device, seed, reporter)
+    make_solids(context)
     scene = Scene(floor=None)
     solids = load_solids(context)
     for name, settings in shot.objects.items():

@@ -12,20 +12,12 @@ from gsfluent.config import Shot, load_shot
 from gsfluent.data import Solid
 from gsfluent.data.solid import volume_path
 from gsfluent.errors import InputError
-from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_prepare import (
-    fill_stage,
-    isolate_stage,
-    read_frame,
-    reconstruct_stage,
-    texture_stage,
-)
-from gsfluent.pipeline.run_record import RunRecord
-from gsfluent.pipeline.run_regions import load_solids, regions_stage
+from gsfluent.pipeline.run_prepare import read_frame
+from gsfluent.pipeline.run_regions import load_solids
 from gsfluent.pipeline.run_show import shot_of
 from gsfluent.pipeline.run_simulate import build_scene
-from gsfluent.pipeline.run_store import StageStore
-from gsfluent.progress import LineReporter, Reporter
+from gsfluent.pipeline.run_solids import context_of, make_solids
+from gsfluent.progress import Reporter
 from gsfluent.scene import Scene
 
 HELP = "give a run folder (OUT), a shot (SHOT.yaml) or a filled solid (.ply) with a material"
@@ -80,7 +72,7 @@ def open_stage(
         return _of_solid(source, material)
     if source.is_dir():
         shot, out = shot_of(source), source
-        context = _context(shot, out, device, seed, reporter)
+        context = context_of(shot, out, device, seed, reporter)
         if not all((out / "stages" / "texture" / f"{name}.ply").is_file() for name in shot.objects):
             raise InputError(
                 f"live: the objects of {out} are not filled and textured yet",
@@ -94,10 +86,9 @@ def open_stage(
                 f"live: the objects of {source} are prepared in a run folder",
                 mend="name it (-o OUT); `gsfluent run` goes on from there",
             )
-        context = _context(shot, out, device, seed, reporter)
+        context = context_of(shot, out, device, seed, reporter)
         out.mkdir(parents=True, exist_ok=True)
-        for stage in (reconstruct_stage, isolate_stage, fill_stage, texture_stage, regions_stage):
-            stage(context)
+        make_solids(context)
     shot = dataclasses.replace(shot, events=())
     scene = build_scene(shot, load_solids(context), context.frame)
     return Stage(out.resolve().name, _stood(scene), shot)
@@ -126,12 +117,3 @@ def _stood(scene: Scene) -> Scene:
         lowest = min(float(body.bounds()[0][2]) for body in scene.bodies)
         scene.lift(scene.floor - lowest)
     return scene
-
-
-def _context(
-    shot: Shot, out: Path, device: torch.device | str, seed: int, reporter: Reporter | None
-) -> RunContext:
-    device = torch.device(device)
-    store = StageStore(out / "stages")
-    record = RunRecord(out / "run.json", shot.resolved(), device, seed)
-    return RunContext(shot, out, device, seed, store, record, reporter or LineReporter())

@@ -22,16 +22,10 @@ from gsfluent.pipeline.choose_shot import choose_stage
 from gsfluent.pipeline.plan_run import foresee_run, judge_plan
 from gsfluent.pipeline.report import REPORT, write_report
 from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_prepare import (
-    fill_stage,
-    isolate_stage,
-    reconstruct_stage,
-    texture_stage,
-)
 from gsfluent.pipeline.run_record import RunRecord
-from gsfluent.pipeline.run_regions import regions_stage
 from gsfluent.pipeline.run_show import export_stage, render_stage
 from gsfluent.pipeline.run_simulate import simulate_stage
+from gsfluent.pipeline.run_solids import make_solids
 from gsfluent.pipeline.run_store import StageResult, StageStore
 from gsfluent.progress import LineReporter, Reporter
 
@@ -86,11 +80,7 @@ def run_shot(
     start = time.perf_counter()
     try:
         foreseen = foresee_run(context, plan=plan)
-        reconstruct_stage(context)
-        isolate_stage(context)
-        fill_stage(context)
-        texture_stage(context)
-        regions_stage(context)
+        make_solids(context)
         if choose_stage(context):  # the plan was made with other cells
             foreseen = foresee_run(context, plan=plan)
         simulate_stage(context)
