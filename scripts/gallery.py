@@ -31,6 +31,7 @@ from page import enter
 from gsfluent.cli.common import choose_device
 from gsfluent.config import Shot, load_shot
 from gsfluent.errors import GsfluentError
+from gsfluent.hardware import processor
 from gsfluent.pipeline.run import run_shot
 from gsfluent.pipeline.run_demo import SIZES, photograph_demo
 from gsfluent.progress import LineReporter
@@ -73,16 +74,7 @@ def machine(device: torch.device) -> str:
     """The processor and its cores, or the GPU."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    name = "CPU"
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-        names = [
-            s.split(":", 1)[1].strip() for s in text.splitlines() if s.startswith("model name")
-        ]
-        name = names[0] if names else name
-    except OSError:
-        name = "CPU"
-    return f"{name}, {len(os.sched_getaffinity(0))} cores"
+    return f"{processor()}, {len(os.sched_getaffinity(0))} cores"
 
 
 def shot_of(name: str, quality: str | None) -> Shot:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from gsfluent.charts.ladder import OFF_GRID, Setting, work
 from gsfluent.charts.off_grid import measure_off_grid
 from gsfluent.charts.play import measure
-from gsfluent.charts.record import Record, append, commit, machine, read
+from gsfluent.charts.record import Record, append, commit, machine, now, read
 from gsfluent.pipeline.stage import Progress, report_progress
 
 __all__ = ["BYTES", "Done", "bandwidth", "run"]
@@ -65,7 +64,7 @@ def bandwidth(device: str, mebibytes: int = 256, repeat: int = 5) -> Record:
         device=device, machine=machine(device), points=0, steps=0, simulated_seconds=0.0,
         wall_seconds=seconds[1:], wall_per_simulated=0.0, ns_per_point_step=1e9 * BYTES / rate,
         error=0.0, commit=commit(),
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=now(),
     )  # fmt: skip
 
 

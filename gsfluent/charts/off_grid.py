@@ -8,7 +8,6 @@ stays where it came to rest).
 
 from __future__ import annotations
 
-import datetime
 import math
 import statistics
 import time
@@ -20,7 +19,7 @@ from torch import Tensor
 from gsfluent import materials
 from gsfluent.charts.ladder import OFF_GRID, Setting
 from gsfluent.charts.play import broken
-from gsfluent.charts.record import Record, commit, machine
+from gsfluent.charts.record import Record, commit, machine, now
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.pipeline.simulate import Simulate, SimulationFrame
 from gsfluent.progress import quiet_logs
@@ -94,7 +93,7 @@ def _record(
         simulated_seconds=seconds, wall_seconds=walls, wall_per_simulated=middle / seconds,
         ns_per_point_step=1e9 * middle / (points * steps) if steps else math.nan,
         error=math.inf if failed else error, measures=[measure], failed=failed, commit=commit(),
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=now(),
     )  # fmt: skip
 
 

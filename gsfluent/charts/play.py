@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 
 from gsfluent.charts.ladder import TEXTBOOK, Setting
-from gsfluent.charts.record import Record, commit, machine, of_run
+from gsfluent.charts.record import Record, commit, machine, now, of_run
 from gsfluent.charts.ride import Riders
 from gsfluent.fracturebench.fracture_shatter import reference
 from gsfluent.fracturebench.registry import find
@@ -70,7 +69,6 @@ def measure(setting: Setting, device: str, repeat: int = 3) -> Record:
             return of_run(
                 case, scene, runs, variant=setting.variant, wall=wall, steps=steps, **facts, **more
             )
-        # a scene of so few points that its measure divides by none cannot be judged either
         except (ArithmeticError, RuntimeError, ValueError, MemoryError) as error:
             return broken(
                 setting, device, error, kind=case.kind, points=scene.count, seconds=scene.seconds,
@@ -232,5 +230,5 @@ def broken(
         machine=machine(device), points=points, steps=0, simulated_seconds=seconds,
         wall_seconds=[], wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
         failed=words.rstrip(": "), commit=commit(),
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=now(),
     )  # fmt: skip

@@ -9,7 +9,6 @@ voxels. Fronts, figure and tables are those of the solver's chart.
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import importlib
 import math
 import statistics
@@ -20,7 +19,7 @@ from typing import Any
 import torch
 
 from gsfluent.charts.front import cases, counted, front
-from gsfluent.charts.record import Record, append, commit, machine, read
+from gsfluent.charts.record import Record, append, commit, machine, now, read
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.figure.page import Page, shown
 from gsfluent.figure.pareto import Dot, Panel, draw
@@ -148,7 +147,7 @@ def _record(kind: str, job: Job, repeat: int, device: str, where: str, version: 
         ns_per_point_step=1e9 * wall / max(1, out.count), error=out.error,
         measures=[{"quantity": name, "value": value} for name, value in out.measures.items()],
         failed=failed, commit=version,
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=now(),
     )  # fmt: skip
 
 

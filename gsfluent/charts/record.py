@@ -8,7 +8,6 @@ import functools
 import json
 import math
 import os
-import platform
 import statistics
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,8 +18,9 @@ from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import Case, judge
 from gsfluent.fracturebench.run import Measure, Run
 from gsfluent.fracturebench.scene import Scene
+from gsfluent.hardware import processor
 
-__all__ = ["Record", "append", "commit", "machine", "of_run", "read"]
+__all__ = ["Record", "append", "commit", "machine", "now", "of_run", "read"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,7 +228,7 @@ def of_run(
         error=math.inf if broken else float(measures[0].error),
         measures=[dataclasses.asdict(m) for m in measures], failed=failed,
         commit=_commit() if commit is None else commit,
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=now(),
     )  # fmt: skip
 
 
@@ -239,17 +239,9 @@ def machine(device: str) -> str:
         import torch
 
         return torch.cuda.get_device_name(torch.device(device))
-    name = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                name = line.split(":", 1)[1].strip()
-                break
-    except OSError:
-        pass  # no such file on this system: the plain name stays
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     threads = os.environ.get("OMP_NUM_THREADS", "")
-    return f"{name}, {threads or cores} of {cores} cores"
+    return f"{processor()}, {threads or cores} of {cores} cores"
 
 
 @functools.cache
@@ -266,6 +258,11 @@ def commit() -> str:
         return done.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return f"gsfluent {gsfluent.__version__}"
+
+
+def now() -> str:
+    """The date of a record: ISO 8601 in UTC, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 # the names that of_run's arguments hide

@@ -8,7 +8,6 @@ in ``stability_*.py`` beside this file; what is drawn from the lines, in ``stabi
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import json
 import math
 import os
@@ -17,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsfluent.charts.record import commit, machine
+from gsfluent.charts.record import commit, machine, now
 from gsfluent.errors import InputError
 from gsfluent.lab.violations import KINDS, Violation
 
@@ -189,7 +188,12 @@ class Point:
     @property
     def key(self) -> str:
         """What makes it the same point."""
-        return f"{self.map}|{self.variant}|{_text(self.x)}|{_text(self.y)}|{self.device}"
+        return key_of(self.map, self.variant, self.x, self.y, self.device)
+
+
+def key_of(name: str, variant: str, x: Value, y: Value, device: str) -> str:
+    """What makes a point of a map the same point, before it is run and after."""
+    return f"{name}|{variant}|{_text(x)}|{_text(y)}|{device}"
 
 
 def _text(value: Value) -> str:
@@ -263,7 +267,7 @@ def run_point(task: tuple[str, str, Value, Value, str]) -> Point:
         step=None if bad is None else bad.step, kind="" if bad is None else bad.kind, value=value,
         note="" if bad is None else bad.note, points=outcome.points, seconds=round(seconds, 4),
         device=device, machine=machine(device), commit="",
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        date=now(),
     )  # fmt: skip
 
 
@@ -297,7 +301,7 @@ def run_maps(
     path = Path(path)
     have = {p.key: p for p in read(path)} if path.is_file() else {}
     tasks = [(*p, device) for p in points(wanted, quick=quick)]
-    keys = [f"{t[0]}|{t[1]}|{_text(t[2])}|{_text(t[3])}|{t[4]}" for t in tasks]
+    keys = [key_of(*task) for task in tasks]
     todo = [task for task, key in zip(tasks, keys, strict=True) if key not in have]
     path.parent.mkdir(parents=True, exist_ok=True)
     version, done = commit(), len(tasks) - len(todo)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -42,6 +43,13 @@ def quantised(value: NDArray[Any]) -> NDArray[np.int64]:
     return (
         np.rint(value * (2.0**24 / top)).astype(np.int64) if top > 0.0 else value.astype(np.int64)
     )
+
+
+def wave_speed(material: Mapping[str, Any]) -> float:
+    """Speed of the pressure wave [m/s]."""
+    young, nu = float(material["young_modulus"]), float(material["poisson_ratio"])
+    modulus = young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    return math.sqrt(modulus / float(material["density"]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,13 +133,7 @@ class Scene:
     @property
     def wave_speed(self) -> float:
         """Fastest pressure wave [m/s]."""
-
-        def speed(row: Mapping[str, Any]) -> float:
-            young, nu = float(row["young_modulus"]), float(row["poisson_ratio"])
-            modulus = young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-            return float(np.sqrt(modulus / float(row["density"])))
-
-        return max(speed(row) for row in self.materials)
+        return max(wave_speed(row) for row in self.materials)
 
     @property
     def seconds(self) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .scene import Floats, Scene
+from .scene import Floats, Scene, wave_speed
 
 __all__ = ["ball", "box", "elastic", "free", "spacing", "wave_speed"]
 
@@ -70,13 +70,6 @@ def elastic(young: float, poisson: float, density: float) -> dict[str, Any]:
     return {
         "law": "elastic", "young_modulus": young, "poisson_ratio": poisson, "density": density,
     }  # fmt: skip
-
-
-def wave_speed(material: Mapping[str, Any]) -> float:
-    """Speed of the pressure wave [m/s]."""
-    young, nu = float(material["young_modulus"]), float(material["poisson_ratio"])
-    modulus = young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return math.sqrt(modulus / float(material["density"]))
 
 
 def free(

@@ -27,6 +27,8 @@ from gsfluent.scene_parts import quaternion_to, turned
 _log = logging.getLogger(__name__)
 
 POINTS_PER_CELL = 8
+MAX_PARTICLES = 8_000_000
+"""Material points that a simulation refuses to exceed unless told otherwise."""
 _WAVES = 128
 ALPHA_JITTER = 0.15
 """Relative half-width of the uniform weakness noise that seeds cracks (equations.md section 17)."""
@@ -121,7 +123,7 @@ def build_matter(
     seed: int = 0,
     jitter: float = ALPHA_JITTER,
     device: torch.device | str = "cpu",
-    max_particles: int = 8_000_000,
+    max_particles: int = MAX_PARTICLES,
 ) -> Matter:
     """Sample all bodies of a scene at :data:`POINTS_PER_CELL` points per cell of edge ``dx``.
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from gsfluent.config import Shot
-from gsfluent.pipeline.particles import POINTS_PER_CELL, grid_spacing
+from gsfluent.pipeline.particles import MAX_PARTICLES, POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.plan_bounds import (
     THIN_CELLS,
     bounds_of,
@@ -49,9 +49,6 @@ from gsfluent.pipeline.stage import Progress
 from gsfluent.scene import Scene
 
 __all__ = ["cost_model", "plan_shot"]
-
-MOST_PARTICLES = 8_000_000
-"""Material points that a simulation refuses to exceed."""
 
 
 def cost_model(
@@ -320,9 +317,9 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
         found.append(
             "the shot has no events: the object will only rest on the floor; mend: add an event"
         )
-    if particles > MOST_PARTICLES:
+    if particles > MAX_PARTICLES:
         found.append(
-            f"{particles} material points, more than the {MOST_PARTICLES} that a run takes; mend: "
+            f"{particles} material points, more than the {MAX_PARTICLES} that a run takes; mend: "
             "fewer solve.cells"
         )
     movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}

@@ -17,7 +17,6 @@ import json
 import logging
 import math
 import os
-import platform
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Any, NamedTuple
 import torch
 
 import gsfluent
+from gsfluent.hardware import processor
 from gsfluent.io import write_json
 from gsfluent.pipeline.plan_memory import memory_of
 
@@ -79,21 +79,12 @@ def machine_key(device: torch.device | str) -> dict[str, Any]:
         "version": gsfluent.__version__,
         "build": _build(device.type),
         "torch": str(torch.__version__),
-        "processor": _processor(),
+        "processor": processor(),
         "threads": torch.get_num_threads(),
     }
     if device.type == "cuda":
         key["gpu"] = torch.cuda.get_device_name(device)
     return key
-
-
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        text = ""
-    names = [s.split(":", 1)[1].strip() for s in text.splitlines() if s.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _build(kind: str) -> str:

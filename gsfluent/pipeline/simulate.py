@@ -24,7 +24,13 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.carry import Carry, Motion, Points
 from gsfluent.pipeline.crack_gaps import Cracks
 from gsfluent.pipeline.fragments import Fragments
-from gsfluent.pipeline.particles import ALPHA_JITTER, Matter, build_matter, grid_spacing
+from gsfluent.pipeline.particles import (
+    ALPHA_JITTER,
+    MAX_PARTICLES,
+    Matter,
+    build_matter,
+    grid_spacing,
+)
 from gsfluent.pipeline.repair import METHODS, Repair, Repaired
 from gsfluent.pipeline.rigid import RigidSet
 from gsfluent.pipeline.simulate_run import Run
@@ -190,7 +196,7 @@ class Simulate(Stage):
         loose_crumbs: bool = False,
         return_map: dict[str, float | bool] | None = None,
         max_rollbacks: int = 6,
-        max_particles: int = 8_000_000,
+        max_particles: int = MAX_PARTICLES,
         step_hook: Callable[[State], State] | None = None,
     ) -> None:
         super().__init__(seed=seed)
