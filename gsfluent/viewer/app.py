@@ -23,6 +23,7 @@ from gsfluent.viewer.artist import Artist
 from gsfluent.viewer.look import Look
 from gsfluent.viewer.look_panel import LookPanel
 from gsfluent.viewer.pace import Pace
+from gsfluent.viewer.page import Page
 from gsfluent.viewer.picture import PictureMaker, browser_camera
 from gsfluent.viewer.playback import Playback
 from gsfluent.viewer.plot_panel import PlotPanel
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-AddPanel = Callable[["viser.ViserServer", "App"], None]
+AddPanel = Callable[["viser.ViserServer", Page], None]
 """Adds controls of its own to the page, for example to throw and shoot at a live object."""
 
 _TICK = 1.0 / 60.0

@@ -10,11 +10,10 @@ from gsfluent.pipeline.light import Lighting
 from gsfluent.viewer import look
 from gsfluent.viewer.light_panel import LightPanel
 from gsfluent.viewer.look import Cut, Look
+from gsfluent.viewer.page import Page
 
 if TYPE_CHECKING:
     import viser
-
-    from gsfluent.viewer.app import App
 
 _FREE = "free"
 _STEPS = 48  # of the cut's slider over the object
@@ -31,7 +30,7 @@ class LookPanel:
     """
 
     def __init__(
-        self, server: viser.ViserServer, app: App, first: Lighting, *, lit: bool = True
+        self, server: viser.ViserServer, app: Page, first: Lighting, *, lit: bool = True
     ) -> None:
         self._app = app
         gui = server.gui

@@ -15,11 +15,10 @@ import numpy as np
 from gsfluent.errors import GsfluentError
 from gsfluent.pipeline.live_player import FAILED, PAUSED, RUNNING, LivePlayer, Status
 from gsfluent.viewer.live_source import factor
+from gsfluent.viewer.page import Page
 
 if TYPE_CHECKING:
     import viser
-
-    from gsfluent.viewer.app import App
 
 _log = logging.getLogger(__name__)
 _SAY_EVERY = 0.25  # seconds between two updates of the figures
@@ -40,13 +39,13 @@ class PokePanel:
 
     def __init__(self, player: LivePlayer, takes: Path) -> None:
         self.player, self.takes = player, takes
-        self._app: App | None = None
+        self._app: Page | None = None
         self._stop = threading.Event()
         self._drawn: collections.deque[tuple[float, int]] = collections.deque()
         self._looked = time.monotonic()
         self._thread = threading.Thread(target=self._watch, name="gsfluent-poke", daemon=True)
 
-    def __call__(self, server: viser.ViserServer, app: App) -> None:
+    def __call__(self, server: viser.ViserServer, app: Page) -> None:
         """Add the controls."""
         self._app = app
         gui = server.gui
@@ -190,7 +189,7 @@ class PokePanel:
             if time.monotonic() - self._looked > _SAY_EVERY:
                 self._say(self.player.status)
 
-    def _show(self, app: App, plotted: float) -> float:
+    def _show(self, app: Page, plotted: float) -> float:
         """Go to the newest frame; the charts follow less often."""
         moment = time.monotonic()
         if moment - plotted > _PLOT_EVERY:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import torch
 
-from gsfluent.data import Frame, Gaussians, Solid
+from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError, RunError
+from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.run_frames import SavedFrame
 from gsfluent.pipeline.run_prepare import read_frame
 
@@ -29,7 +30,7 @@ def still_frame(isolate: Path, solids: list[Path]) -> SavedFrame:
 
     try:
         frame = read_frame(isolate) if (isolate / "frame.json").is_file() else Frame.identity()
-        loaded = [Solid.load(path) for path in solids]
+        loaded = [load_solid(path) for path in solids]
     except (InputError, OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise RunError(f"the solid cannot be read ({error})", "", "look again in a moment") from (
             error

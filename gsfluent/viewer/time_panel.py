@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+from gsfluent.viewer.page import Page
+
 if TYPE_CHECKING:
     import viser
-
-    from gsfluent.viewer.app import App
 
 _SPEEDS = {f"1/{n}": 1.0 / n for n in (256, 128, 64, 32, 16, 8, 4, 2)}
 _SPEEDS |= {"1 (real time)": 1.0, "2": 2.0}
@@ -24,7 +24,7 @@ class TimePanel:
         app: What they control.
     """
 
-    def __init__(self, server: viser.ViserServer, app: App) -> None:
+    def __init__(self, server: viser.ViserServer, app: Page) -> None:
         gui = server.gui
         self._app = app
         self._held = 0.0
