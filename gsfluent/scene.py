@@ -12,9 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsfluent import materials
-from gsfluent.data import Capture, Frame, Solid
+from gsfluent.data import Frame, Solid
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
+from gsfluent.pipeline.regions_table import require_labels
 from gsfluent.scene_colliders import MODES
 from gsfluent.scene_events import Events
 from gsfluent.scene_parts import Blade, Body, Collider, Part, known_key, number, vector
@@ -59,7 +60,6 @@ class Scene(Events):
         velocity: Sequence[float] = (0.0, 0.0, 0.0),
         angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
         parts: Sequence[Part | Mapping[str, Any]] | None = None,
-        capture: Capture | None = None,
         name: str | None = None,
     ) -> str:
         """Add a filled object where its frame puts it; events move it.
@@ -71,9 +71,9 @@ class Scene(Events):
                 it is, but is lifted onto the floor when it starts below it.
             velocity: Velocity of the centre of mass at time 0 [m/s].
             angular_velocity: Spin about the centre of mass at time 0 [rad/s].
-            parts: Regions with parameters of their own; default: those of the material.
-            capture: The photographs that masks and labels among the parts' conditions belong to;
-                not needed where :func:`gsfluent.pipeline.label_regions` has projected them.
+            parts: Regions with parameters of their own; default: those of the material. Masks,
+                labels and label images among their conditions must have been projected onto the
+                solid before (:class:`gsfluent.pipeline.Regions`).
             name: Name of the body; default ``object``, ``object2``, ...
 
         Returns:
@@ -81,14 +81,12 @@ class Scene(Events):
 
         Raises:
             InputError: An empty solid, an unknown preset or parameter, or a name taken twice,
-                or masks that cannot be projected.
+                or a part whose labels the solid does not have.
         """
         if not bool(solid.occupancy.any()):
             raise InputError(
                 "scene.add: the solid holds no matter", mend="fill it first (gsfluent fill)"
             )
-        from gsfluent.pipeline.regions import label_parts
-
         chosen = materials.get(material) if isinstance(material, str) else material
         regions = tuple(Part.parse(part) for part in (chosen.parts if parts is None else parts))
         for part in regions:
@@ -96,7 +94,8 @@ class Scene(Events):
                 chosen
             )  # refuse bad parameters here, where the user can see which call is meant
         placed = frame or solid.frame
-        solid = label_parts(solid, regions, capture, frame=placed)
+        for part in regions:
+            require_labels(solid, part.where, part.name)
         body = Body(
             name=self._name(name, "object"),
             material=chosen,

@@ -24,9 +24,8 @@ from .stage import Progress
 
 if TYPE_CHECKING:
     from gsfluent.data import Solid
-    from gsfluent.scene_parts import Part
 
-__all__ = ["SkinLabels", "label_parts", "label_regions", "project_labels"]
+__all__ = ["SkinLabels", "label_regions", "project_labels"]
 
 _log = logging.getLogger(__name__)
 
@@ -186,31 +185,6 @@ def label_regions(
         for note in found.segmentation.notes:
             _log.info("regions: %s: %s", segmentation.source, note)
     return _written(solid, volumes, reports)
-
-
-def label_parts(
-    solid: Solid,
-    parts: Iterable[Part],
-    capture: Capture | None = None,
-    *,
-    frame: Frame | None = None,
-    progress: Progress | None = None,
-) -> Solid:
-    """Project what the conditions of parts need and the solid does not have yet.
-
-    Args:
-        solid: The solid.
-        parts: Parts of a body.
-        capture: The photographs; only needed for masks and labels not yet projected.
-        frame: World to scene.
-        progress: Optional callback.
-
-    Raises:
-        InputError: As :func:`label_regions`.
-    """
-    have = solid.report.get("region_sources") or {}
-    missing = [part.where for part in parts if source_key(part.where) not in (None, *have)]
-    return label_regions(solid, missing, capture, frame=frame, progress=progress)
 
 
 def _written(

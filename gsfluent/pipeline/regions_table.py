@@ -28,6 +28,7 @@ __all__ = [
     "SOURCES",
     "region_entry",
     "region_mask",
+    "require_labels",
     "source_key",
     "source_paths",
     "source_volume",
@@ -96,6 +97,21 @@ def region_entry(solid: Solid, number: int) -> dict[str, Any]:
     return {"name": f"region {number}", "kind": "region"}
 
 
+def require_labels(solid: Solid, where: Mapping[str, Any], part: str) -> None:
+    """Refuse a part whose conditions ask for labels that were not projected onto the solid.
+
+    Raises:
+        InputError: It asks for such labels.
+    """
+    key = source_key(where)
+    if key is not None and key not in (solid.report.get("region_sources") or {}):
+        files = ", ".join(map(str, source_paths(where).values()))
+        raise InputError(
+            f"part {part!r}: the labels of {files} were not projected onto this solid",
+            "solid = gf.pipeline.label_regions(solid, [part['where'] for part in parts], capture)",
+        )
+
+
 def region_mask(solid: Solid, where: Mapping[str, Any], part: str) -> NDArray[np.bool_]:
     """Voxels that fulfil ``mask``, ``labels``, ``label_image`` and ``label``, bool [X, Y, Z].
 
@@ -112,12 +128,7 @@ def region_mask(solid: Solid, where: Mapping[str, Any], part: str) -> NDArray[np
     present = [] if regions is None else [int(n) for n in np.unique(regions) if n > 0]
     entries = {number: region_entry(solid, number) for number in present}
     if key is not None:
-        if key not in (solid.report.get("region_sources") or {}):
-            raise InputError(
-                f"part {part!r}: the labels of {', '.join(map(str, source_paths(where).values()))} "
-                "were not projected onto this solid",
-                "give the photographs: scene.add(..., capture=...), or label_regions first",
-            )
+        require_labels(solid, where, part)
         names = solid.report["region_sources"][key]["labels"]
         if label is not None and not _known(label, names):
             raise InputError(

@@ -24,6 +24,7 @@ from gsfluent import geometry
 from gsfluent.data import Frame, Solid
 from gsfluent.errors import InputError
 from gsfluent.io.segmentation import LabelView, Segmentation
+from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.pipeline.particles import build_matter, grid_spacing
 from gsfluent.pipeline.regions import label_regions, project_labels
 from gsfluent.pipeline.regions_associate import associate
@@ -181,8 +182,8 @@ def test_saved_labels_come_back(solid: Solid, tmp_path: Path) -> None:
     cameras = ring(6)
     folder = write_masks(tmp_path / "cap", cameras, 3)
     labelled = label_regions(solid, [{"mask": folder}], capture_of(cameras))
-    labelled.save(tmp_path / "solid.ply")
-    back = Solid.load(tmp_path / "solid.ply")
+    save_solid(labelled, tmp_path / "solid.ply")
+    back = load_solid(tmp_path / "solid.ply")
     where = {"mask": folder}
     assert np.array_equal(region_mask(back, where, "cap"), region_mask(labelled, where, "cap"))
 
@@ -201,16 +202,13 @@ def test_points_get_the_material_of_their_part(solid: Solid, tmp_path: Path) -> 
     cameras = ring()
     folder = write_masks(tmp_path / "all", cameras)
     scene = Scene(floor=None)
-    scene.add(
-        solid,
-        "fruit.watermelon",
-        parts=[
-            {"name": "right", "where": {"labels": folder, "label": 1}, "density": 1500.0},
-            {"name": "cap", "where": {"labels": folder, "label": 3, "depth_below": 0.02},
-             "material": "wood", "density": 500.0},
-        ],
-        capture=capture_of(cameras),
-    )  # fmt: skip
+    parts = [
+        {"name": "right", "where": {"labels": folder, "label": 1}, "density": 1500.0},
+        {"name": "cap", "where": {"labels": folder, "label": 3, "depth_below": 0.02},
+         "material": "wood", "density": 500.0},
+    ]  # fmt: skip
+    labelled = label_regions(solid, [part["where"] for part in parts], capture_of(cameras))
+    scene.add(labelled, "fruit.watermelon", parts=parts)
     matter = build_matter(scene, grid_spacing(scene, 20))
     at = matter.particles.position.numpy()
     density = (matter.particles.mass / matter.particles.volume).numpy()
@@ -265,6 +263,8 @@ def test_what_is_missing_is_said(solid: Solid, tmp_path: Path) -> None:
     folder = write_masks(tmp_path / "cap", cameras, 3)
     part = {"name": "cap", "where": {"mask": folder}, "cohesion": 2.0}
     with pytest.raises(InputError, match="need the photographs"):
+        label_regions(solid, [part["where"]])
+    with pytest.raises(InputError, match=r"not projected onto this solid[\s\S]*label_regions"):
         Scene().add(solid, parts=[part])
     with pytest.raises(InputError, match="no region called 'leaf'"):
         scene = Scene()
