@@ -32,6 +32,7 @@ _PUBLIC: dict[str, tuple[str, str | None]] = {
     "Particles": ("gsfluent.data", "Particles"),
     "Scene": ("gsfluent.scene", "Scene"),
     "load": ("gsfluent.io", "load"),
+    "save": ("gsfluent.io", "save"),
     "load_capture": ("gsfluent.io", "load_capture"),
     "load_shot": ("gsfluent.config", "load_shot"),
     "has_cuda": ("gsfluent._load", "has_cuda"),

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
-from gsfluent.io import load, save_image
+from gsfluent.io import load_splats, save_image
 from gsfluent.lab import light_truth as truth
 from gsfluent.pipeline.delight import delight
 from gsfluent.pipeline.environment import sky_and_ground
@@ -72,7 +72,7 @@ def run_pictures(out: Path, index: int, size: tuple[int, int]) -> Tensor:
 
 def splat_pictures(path: Path, up: Tensor, front: Tensor, size: tuple[int, int]) -> Tensor:
     """As captured, lit from left and right; below, with the captured light divided out."""
-    splats = load(path)
+    splats = load_splats(path)
     center, radius, _ = bulk(splats)
     above = up / up.norm()
     front = front - (front @ above) * above

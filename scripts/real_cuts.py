@@ -20,7 +20,7 @@ import numpy as np
 from real_interiors_cases import data_folder
 
 import gsfluent as gf
-from gsfluent.pipeline.fill import cut_view
+from gsfluent.pipeline.fill_view import cut_view
 from gsfluent.pipeline.orient import make_frame
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"

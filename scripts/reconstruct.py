@@ -125,7 +125,7 @@ def main(arguments: list[str]) -> int:
     if options.out is not None:
         if options.isolate:
             gaussians = gf.pipeline.Isolate()(gaussians, capture)
-        gaussians.save(options.out)
+        gf.save(gaussians, options.out)
     line: dict[str, Any] = {
         "capture": name,
         "trainer": f"gsfluent {report['recipe']} {report['densify']}",

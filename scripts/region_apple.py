@@ -19,7 +19,7 @@ import torch
 from page import enter
 
 from gsfluent.data import Capture, Frame, Solid
-from gsfluent.io import load, load_capture
+from gsfluent.io import load_capture, load_splats
 from gsfluent.io.segmentation import LabelView, Segmentation, load_segmentation
 from gsfluent.pipeline import Fill, Isolate, Reconstruct, label_regions
 from gsfluent.pipeline.draw import draw
@@ -111,7 +111,7 @@ def apple(capture: Capture, path: Path | None) -> Solid:
     if path is None:
         splats, _ = Reconstruct(3000, 60_000, image_size=800)(capture)
     else:
-        splats = load(path)
+        splats = load_splats(path)
     return Fill(resolution=96)(Isolate()(splats, capture), capture)
 
 

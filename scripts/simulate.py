@@ -19,7 +19,7 @@ def main(
     height: str = "1.0",
     size: str = "0.25",
 ) -> None:
-    solid = gf.Solid.load(solid_file)
+    solid = gf.load(solid_file)
     frame = solid.frame or make_frame(solid.gaussians)
     low, high = solid.gaussians.bounds()
     if solid.frame is None:

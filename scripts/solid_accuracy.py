@@ -24,6 +24,7 @@ from page import enter
 from gsfluent import demo
 from gsfluent.data import Capture, Gaussians
 from gsfluent.io import load_capture
+from gsfluent.io.images import load_view
 from gsfluent.pipeline import Reconstruct
 from gsfluent.pipeline.mesh_distance import load_mesh
 from gsfluent.pipeline.reconstruct_init import _quats_of
@@ -103,7 +104,9 @@ def masked_capture(mesh: Any, folder: Path) -> Capture:
         path = folder / f"{index:03d}.png"
         Image.fromarray(picture).save(path)
         cameras.append(camera.replace(image_path=path, name=path.name))
-    return Capture(cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder)
+    return Capture(
+        cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder, load_view
+    )
 
 
 def trained() -> tuple[Gaussians, SignedDistance, Any]:

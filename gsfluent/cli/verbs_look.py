@@ -10,6 +10,7 @@ import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
 from gsfluent.errors import InputError
+from gsfluent.io.solid import load_solid
 
 
 @dataclass(kw_only=True)
@@ -94,11 +95,10 @@ class Inspect(Verb):
 
 def _regions(path: Path, out: Path) -> dict[str, Any] | None:
     """The regions of a solid; None for a splat, or a solid without any."""
-    from gsfluent.data import Solid
-    from gsfluent.data.solid import volume_path
+    from gsfluent.io.solid import volume_path
     from gsfluent.pipeline.inspect_shot import inspect_solid
 
-    if not volume_path(path).is_file() or Solid.load(path).regions is None:
+    if not volume_path(path).is_file() or load_solid(path).regions is None:
         return None
     return inspect_solid(path, out)
 

@@ -34,7 +34,7 @@ from gsfluent.config.physgaussian_space import Space, camera_path, in_box, model
 from gsfluent.config.read import nearest
 from gsfluent.data import BACKGROUND
 from gsfluent.errors import InputError
-from gsfluent.io import atomic_path, load, save_splats, write_json
+from gsfluent.io import atomic_path, load_splats, save_splats, write_json
 
 _log = logging.getLogger(__name__)
 _CELLS = {"preview": 20, "shot": 40, "hero": 64}
@@ -85,7 +85,7 @@ def convert(model: Path, config: Path, folder: Path) -> Conversion:
     import yaml
 
     values, notes = read_config(config)
-    space, gaussians = space_of(load(model_file(model)).validated(str(model)), values)
+    space, gaussians = space_of(load_splats(model_file(model)).validated(str(model)), values)
     points = in_box(space, gaussians)
     frame_dt = _frame_time(values, notes)
     frames = max(1, round(number(values, "frame_num", 100.0)))

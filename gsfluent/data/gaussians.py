@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -228,12 +227,6 @@ class Gaussians(TensorContainer):
             "pass activated values, not logits",
         )
         return self
-
-    def save(self, path: str | Path) -> None:
-        """Write an INRIA-layout 3DGS ``.ply`` (see :func:`gsfluent.io.save_splats`)."""
-        from gsfluent.io.splats import save_splats
-
-        save_splats(self, path)
 
 
 def _filled(labels: Tensor | None, means: Tensor, value: int) -> Tensor:

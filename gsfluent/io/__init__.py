@@ -5,9 +5,8 @@ from gsfluent.io.capture import load_capture
 from gsfluent.io.delta import DeltaReader
 from gsfluent.io.images import load_image, save_image
 from gsfluent.io.ply import read_ply, write_ply
+from gsfluent.io.solid import load, load_solid, save, save_solid
 from gsfluent.io.splats import load_splats, save_splats
-
-load = load_splats
 
 __all__ = [
     "DeltaReader",
@@ -15,9 +14,12 @@ __all__ = [
     "load",
     "load_capture",
     "load_image",
+    "load_solid",
     "load_splats",
     "read_ply",
+    "save",
     "save_image",
+    "save_solid",
     "save_splats",
     "write_json",
     "write_ply",

@@ -17,6 +17,7 @@ import torch
 
 from gsfluent.errors import InputError
 from gsfluent.io.images import IMAGE_SUFFIXES
+from gsfluent.io.solid import load_solid
 
 from . import compare_weights as weights
 from .texture import metrics
@@ -71,9 +72,8 @@ def load_pictures(path: str | Path) -> Pictures:
 
 
 def _solid_slices(path: Path) -> Pictures:
-    from gsfluent.data import Solid
 
-    solid = Solid.load(path)
+    solid = load_solid(path)
     if solid.color is None:
         raise InputError(
             f"{path}: this solid has no colours inside", "run `gsfluent texture` first"

@@ -15,7 +15,6 @@ from .fill_hollow import cavity_volume
 from .fill_interior import populate
 from .fill_refine import refine_opacity
 from .fill_skin import skin_gaussians
-from .fill_view import cut_view
 from .fill_vote import VoteOptions, evidence
 from .solid_field import SignedDistance
 from .solid_thin import walls
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
     Source = SignedDistance | trimesh.Trimesh | str | Path
 
-__all__ = ["Fill", "cut_view"]
+__all__ = ["Fill"]
 
 logger = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ import torch
 
 from gsfluent import materials
 from gsfluent.config import Shot
-from gsfluent.data import Solid
 from gsfluent.errors import InputError
+from gsfluent.io.solid import load_solid
 from gsfluent.progress import Reporter
 from gsfluent.scene import Scene
 
@@ -79,7 +79,7 @@ def inspect_solid(path: Path, out: Path | None = None) -> dict[str, Any]:
     Raises:
         InputError: The solid cannot be read.
     """
-    solid = Solid.load(path)
+    solid = load_solid(path)
     if solid.regions is None or not bool((solid.regions > 0).any()):
         raise InputError(f"{path}: the solid has no regions", "inspect the shot that has the parts")
     return _shown(solid_regions(solid), out, path.name)

@@ -9,9 +9,8 @@ import torch
 
 from gsfluent import materials
 from gsfluent.config import Shot, load_shot
-from gsfluent.data import Solid
-from gsfluent.data.solid import volume_path
 from gsfluent.errors import InputError
+from gsfluent.io.solid import load_solid, volume_path
 from gsfluent.pipeline.run_prepare import read_frame
 from gsfluent.pipeline.run_regions import load_solids
 from gsfluent.pipeline.run_show import shot_of
@@ -100,7 +99,7 @@ def _of_solid(path: Path, material: str | None) -> Stage:
             f"live: {path} is no filled solid (no {volume_path(path).name} beside it)",
             mend="fill it first: gsfluent fill",
         )
-    solid = Solid.load(path)
+    solid = load_solid(path)
     name = path.stem
     preset = "fruit.watermelon" if material is None else material
     scene = Scene()

@@ -24,6 +24,7 @@ from gsfluent.config import Shot
 from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import GsfluentError
 from gsfluent.io import load_capture, save_image
+from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.pipeline.inspect_hull import masked_views
 from gsfluent.pipeline.plan_cost import CostModel, machine_key
 from gsfluent.pipeline.plan_fact import actual_work
@@ -304,16 +305,15 @@ def simulation_sample(values: Mapping[str, Any], work: Mapping[str, Mapping[str,
 
 def other_samples(out: Path, device: torch.device) -> list[Sample]:
     """Textures by rule, and every kind of export, of a finished small run."""
-    from gsfluent.data import Solid
     from gsfluent.pipeline.texture import Texture
 
     samples = []
     for folder in (out, out.parent / "large"):
-        solid = Solid.load(folder / "stages" / "fill" / "melon.ply")
+        solid = load_solid(folder / "stages" / "fill" / "melon.ply")
         voxels = {"procedural_objects": 1.0, "procedural_voxels": float(solid.occupancy.numel())}
         start = time.perf_counter()
         textured = Texture(method="procedural", preset="bone", device=str(device))(solid)
-        textured.save(folder / "procedural.ply")
+        save_solid(textured, folder / "procedural.ply")
         save_cut_views(textured, folder / "procedural.png")
         samples.append(Sample("texture", voxels, time.perf_counter() - start))
     values = json.loads((out / "run.json").read_text(encoding="utf-8"))

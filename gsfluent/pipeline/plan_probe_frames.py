@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from gsfluent.data import Frame, Solid
+from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.plan_cost import framing
 from gsfluent.pipeline.plan_fit import Sample
 from gsfluent.pipeline.run_frames import save_frame
@@ -35,7 +36,7 @@ def frame_samples(out: Path, device: torch.device) -> list[Sample]:
         What setting up costs, what frames in which nothing is broken cost, and what the breaking
         adds to them.
     """
-    solid = Solid.load(out / "stages" / "texture" / "melon.ply")
+    solid = load_solid(out / "stages" / "texture" / "melon.ply")
     splats = float(solid.gaussians.count)
     setup, plain, _ = _times(solid, "rubber", device)
     _, broken, points = _times(solid, "fruit.watermelon", device)

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsfluent.config import Shot
 from gsfluent.data import INTERIOR, SURFACE, Capture, Frame, Gaussians, Solid, View
 from gsfluent.errors import InputError
-from gsfluent.io import load, load_capture
+from gsfluent.io import load_capture, load_splats
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.inspect import inspect
 from gsfluent.pipeline.inspect_hull import hull_grid, masked_views
@@ -88,7 +88,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
         InputError: The input cannot be read, or an object selects nothing of it.
     """
     if shot.splats is not None:
-        gaussians = load(shot.splats).validated(shot.splats.name)
+        gaussians = load_splats(shot.splats).validated(shot.splats.name)
         frame = make_frame(gaussians, None, shot)
         options = shot.fill.given(frame.scale) | {"resolution": _VOXELS}
         solids = {}

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 
 from gsfluent.config import Shot
-from gsfluent.data import Solid
 from gsfluent.demo import interior_error, load_truth, make_capture
 from gsfluent.errors import InputError
 from gsfluent.io import atomic_path
+from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.run import run_shot
 from gsfluent.pipeline.run_context import RunContext
 from gsfluent.pipeline.run_store import StageStore, fingerprint
@@ -149,7 +149,7 @@ def run_demo(
     shot = Shot.from_dict(values)
 
     def judge(context: RunContext) -> dict[str, Any]:
-        solid = Solid.load(context.store.root / "texture" / f"{name}.ply")
+        solid = load_solid(context.store.root / "texture" / f"{name}.ply")
         error = interior_error(solid, load_truth(made.folder / "truth.npz"), seed=seed)
         reconstruction = context.record.values["reconstruction"]
         return {"demo": {"interior_error": error, "psnr": reconstruction["psnr"]}}

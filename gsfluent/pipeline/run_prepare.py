@@ -9,8 +9,10 @@ from typing import Any
 
 import torch
 
-from gsfluent.data import Frame, Solid
-from gsfluent.io import load, load_capture, write_json
+from gsfluent.data import Frame
+from gsfluent.io import load_capture, load_splats, write_json
+from gsfluent.io.solid import load_solid, save_solid
+from gsfluent.io.splats import save_splats
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.fill_resolution import fill_resolution, visible_extent
 from gsfluent.pipeline.isolate import Isolate
@@ -46,7 +48,7 @@ def reconstruct_stage(context: RunContext) -> None:
             seed=context.seed,
         )
         gaussians, report = stage(capture, progress=context.reporter.task("reconstruct"))
-        gaussians.save(folder / "model.ply")
+        save_splats(gaussians, folder / "model.ply")
         write_report(folder, gaussians, capture, report)
         return dict(report)
 
@@ -69,14 +71,14 @@ def isolate_stage(context: RunContext) -> None:
     key = fingerprint("isolate", context.key(context.source_key, placing))
 
     def work(folder: Path) -> dict[str, Any]:
-        gaussians = load(source).validated(source.name)
+        gaussians = load_splats(source).validated(source.name)
         stage = Isolate(seed=context.seed)
         whole, background = stage.split(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
-        whole.save(folder / "object.ply")
+        save_splats(whole, folder / "object.ply")
         if background.count:
-            background.save(folder / "background.ply")
+            save_splats(background, folder / "background.ply")
         elif captured:
             raise no_background()
         write_json(folder / "frame.json", frame.to_dict())
@@ -126,7 +128,7 @@ def fill_stage(context: RunContext) -> None:
     key = fingerprint("fill", context.key(context.source_key, options, fine, selections, labels))
 
     def work(folder: Path) -> dict[str, Any]:
-        everything = load(context.store.root / "isolate" / "object.ply")
+        everything = load_splats(context.store.root / "isolate" / "object.ply")
         objects = {}
         taken = torch.zeros(everything.count, dtype=torch.bool)
         for name, settings in shot.objects.items():
@@ -164,7 +166,7 @@ def texture_stage(context: RunContext) -> None:
     def work(folder: Path) -> dict[str, Any]:
         reports = []
         for name in shot.objects:
-            solid = Solid.load(context.store.root / "fill" / f"{name}.ply")
+            solid = load_solid(context.store.root / "fill" / f"{name}.ply")
             # slices finished before a kill are found again: the folder outlives it
             stage = Texture(
                 **options,
@@ -173,7 +175,7 @@ def texture_stage(context: RunContext) -> None:
                 seed=context.seed,
             )
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
-            textured.save(folder / f"{name}.ply")
+            save_solid(textured, folder / f"{name}.ply")
             save_cut_views(textured, folder / f"{name}.png")
             reports.append({k: v for k, v in textured.report.items() if k != "fill"})
         return _merged(reports)

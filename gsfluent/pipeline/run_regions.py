@@ -11,6 +11,7 @@ import torch
 from gsfluent.data import Solid
 from gsfluent.errors import InputError
 from gsfluent.io import atomic_path, write_json
+from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.regions import label_regions
 from gsfluent.pipeline.regions_table import source_key, source_paths
 from gsfluent.pipeline.run_context import RunContext
@@ -52,7 +53,7 @@ def regions_stage(context: RunContext) -> None:
     def work(folder: Path) -> dict[str, Any]:
         reports = {}
         for name, sources in wanted.items():
-            solid = Solid.load(context.store.root / "texture" / f"{name}.ply").to(context.device)
+            solid = load_solid(context.store.root / "texture" / f"{name}.ply").to(context.device)
             labelled = label_regions(
                 solid,
                 sources,
@@ -80,7 +81,7 @@ def load_solids(context: RunContext) -> dict[str, Solid]:
     root, labelled = context.store.root, _sources(context)
     solids = {}
     for name in context.shot.objects:
-        solid = Solid.load(root / "texture" / f"{name}.ply")
+        solid = load_solid(root / "texture" / f"{name}.ply")
         if name in labelled:
             solid = _with_labels(solid, root / "regions" / name)
         solids[name] = solid

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 
 from gsfluent.config import Shot
-from gsfluent.data import Camera, Solid
+from gsfluent.data import Camera
 from gsfluent.errors import InputError
-from gsfluent.io import load, load_capture, save_image
+from gsfluent.io import load_capture, load_splats, save_image
+from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.delight import Delit
 from gsfluent.pipeline.export import write_exports
 from gsfluent.pipeline.light import Light, Lighting, lighting_of
@@ -147,11 +148,11 @@ def captured_backdrop(stages: Path, objects: list[str], device: torch.device) ->
     if not path.is_file():
         raise no_background()
     frame = read_frame(stages / "isolate")
-    around = load(path)
+    around = load_splats(path)
     for name in objects:
-        solid = SignedDistance.of_solid(Solid.load(stages / "fill" / f"{name}.ply"))
+        solid = SignedDistance.of_solid(load_solid(stages / "fill" / f"{name}.ply"))
         around = around.select(solid.at(around.means) > _RESIDUE * solid.voxel)
-    whole = load(stages / "isolate" / "object.ply").transformed(frame).means
+    whole = load_splats(stages / "isolate" / "object.ply").transformed(frame).means
     around = covered_floor(around.transformed(frame), whole, 0.0)
     return Backdrop(around.to(device), object_radius(whole))
 

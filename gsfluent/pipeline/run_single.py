@@ -8,8 +8,10 @@ from typing import Any
 
 import torch
 
-from gsfluent.data import Capture, Solid
-from gsfluent.io import load, load_capture
+from gsfluent.data import Capture
+from gsfluent.io import load_capture, load_splats
+from gsfluent.io.solid import load_solid, save_solid
+from gsfluent.io.splats import save_splats
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.isolate import Isolate
 from gsfluent.pipeline.reconstruct import Reconstruct
@@ -52,7 +54,7 @@ def reconstruct_to(
     stage = Reconstruct(**options, device=device, seed=seed)
     gaussians, report = stage(photographs, progress=progress)
     kept = gaussians if keep_background else Isolate(seed=seed)(gaussians, photographs)
-    kept.save(out)
+    save_splats(kept, out)
     values = dict(report) | {"gaussians_saved": kept.count, "output": str(out)}
     write_report(out.parent, gaussians, photographs, values)
     return values
@@ -83,11 +85,11 @@ def fill_to(
     elif is_mesh(model):
         solid = model
     else:
-        gaussians = load(model).to(device)
+        gaussians = load_splats(model).to(device)
     start = time.perf_counter()
     stage = Fill(**options, seed=seed)
     filled = stage(gaussians, photographs, progress=progress, solid=solid)
-    filled.save(out)
+    save_solid(filled, out)
     return dict(filled.report) | {"seconds": time.perf_counter() - start, "output": str(out)}
 
 
@@ -107,10 +109,10 @@ def texture_to(
         InputError: The solid or the exemplar cannot be read.
         RunError: The disk is full.
     """
-    filled = Solid.load(solid).to(device)
+    filled = load_solid(solid).to(device)
     start = time.perf_counter()
     textured = Texture(**options, seed=seed)(filled, _photographs(capture), progress=progress)
-    textured.save(out)
+    save_solid(textured, out)
     cuts = out.with_suffix(".cuts.png")
     save_cut_views(textured, cuts)
     seconds = time.perf_counter() - start

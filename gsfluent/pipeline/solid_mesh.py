@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsfluent.data import BACKGROUND, Gaussians, Solid
-from gsfluent.data.solid import volume_path
+from gsfluent.data import BACKGROUND, Gaussians
 from gsfluent.errors import InputError, RunError
-from gsfluent.io import atomic_path, load, load_capture
+from gsfluent.io import atomic_path, load_capture, load_splats
+from gsfluent.io.solid import load_solid, volume_path
 from gsfluent.pipeline.fill_colors import surface_colors
 from gsfluent.pipeline.solid_field import SignedDistance
 from gsfluent.pipeline.solid_source import find_solid
@@ -152,11 +152,11 @@ def mesh_to(
     elif is_mesh(source):
         field = find_solid(mesh=source, method=method, resolution=resolution)
     elif method == "auto" and volume_path(source).is_file():
-        solid = Solid.load(source)
+        solid = load_solid(source)
         field, gaussians = SignedDistance.of_solid(solid), solid.gaussians
         field.report["why"] = "the solid is decided already"
     else:
-        gaussians = load(source).validated(source.name)
+        gaussians = load_splats(source).validated(source.name)
         if gaussians.labels is not None and bool((gaussians.labels != BACKGROUND).any()):
             gaussians = gaussians.select(gaussians.labels != BACKGROUND)
         field = find_solid(gaussians, photographs, method=method, resolution=resolution)

@@ -11,6 +11,7 @@ import torch
 
 from gsfluent.cli import main
 from gsfluent.data import Gaussians
+from gsfluent.io.splats import save_splats
 from gsfluent.pipeline import plan_probe
 from gsfluent.pipeline.plan_cost import CostModel, machine_key
 
@@ -23,7 +24,7 @@ def shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     splats = Gaussians.from_colors(
         means, torch.full((len(means), 3), 0.006), torch.full((len(means), 3), 0.5), opacities=0.95
     )
-    splats.save(tmp_path / "slab.ply")
+    save_splats(splats, tmp_path / "slab.ply")
     path = tmp_path / "shot.yaml"
     path.write_text(
         "splats: slab.ply\nscale: 1.0\nup: +z\nobjects: {slab: {material: fruit.watermelon}}\n"

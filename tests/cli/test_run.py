@@ -18,7 +18,7 @@ import torch
 from ball_shot import write_shot
 
 from gsfluent.cli import main
-from gsfluent.io import load
+from gsfluent.io import load_splats
 from gsfluent.pipeline.run_show import poster_frame
 
 FRAMES = 10
@@ -102,7 +102,7 @@ def test_the_pictures_show_something(finished: Path) -> None:
 def test_the_ply_sequence_is_standard_and_falls(finished: Path) -> None:
     files = sorted((finished / "frames").glob("frame_*.ply"))
     assert [f.name for f in files] == [f"frame_{i:04d}.ply" for i in range(1, FRAMES + 1)]
-    first, later = load(files[0]), load(files[4])
+    first, later = load_splats(files[0]), load_splats(files[4])
     assert float(first.means[:, 2].mean() - later.means[:, 2].mean()) > 0.1
     header = files[0].read_bytes().split(b"end_header")[0]
     for name in (b"f_dc_0", b"opacity", b"scale_0", b"rot_0"):
@@ -253,8 +253,8 @@ def test_export_hands_a_real_run_on(
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 3
     assert main(["export", str(tmp_path / "splats.gsd"), "--to", "ply-seq"]) == 0
     for number in (1, 2, 3):
-        unpacked = load(tmp_path / "splats" / "frames" / f"frame_{number:04d}.ply")
-        straight = load(tmp_path / "frames" / f"frame_{4 * number - 3:04d}.ply")
+        unpacked = load_splats(tmp_path / "splats" / "frames" / f"frame_{number:04d}.ply")
+        straight = load_splats(tmp_path / "frames" / f"frame_{4 * number - 3:04d}.ply")
         assert unpacked.count == straight.count
         gap = unpacked.means[::50, None].double() - straight.means
         off = gap.norm(dim=2).amin(dim=1)

@@ -10,6 +10,7 @@ import torch
 from gsfluent import geometry
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Frame, Gaussians, Particles, Solid
 from gsfluent.errors import InputError
+from gsfluent.io.solid import load_solid, save_solid
 
 
 def make_gaussians(count: int = 20, degree: int = 3, **extra: object) -> Gaussians:
@@ -293,9 +294,9 @@ def test_particles_validated_names_the_field() -> None:
 
 def test_solid_survives_saving(tmp_path: Path) -> None:
     solid = make_solid()
-    solid.save(tmp_path / "melon.ply")
+    save_solid(solid, tmp_path / "melon.ply")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["melon.ply", "melon.volume.npz"]
-    again = Solid.load(tmp_path / "melon.ply")
+    again = load_solid(tmp_path / "melon.ply")
     for name in ("occupancy", "depth", "origin", "color", "regions"):
         assert torch.equal(getattr(again, name), getattr(solid, name)), name
     assert again.report == solid.report and again.voxel == solid.voxel
@@ -345,7 +346,7 @@ def test_solid_load_says_what_is_missing_or_damaged(tmp_path: Path) -> None:
     whole = volume.read_bytes()
     volume.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="volume file is damaged"):
-        Solid.load(tmp_path / "melon.ply")
+        load_solid(tmp_path / "melon.ply")
     volume.unlink()
     with pytest.raises(InputError, match=r"needs melon\.volume\.npz beside it"):
-        Solid.load(tmp_path / "melon.ply")
+        load_solid(tmp_path / "melon.ply")

@@ -177,9 +177,9 @@ def test_a_run_goes_there_and_back(tmp_path: Path) -> None:
     for place, moment in enumerate(Reel(run)):
         check(reader.frame(place), delta_frame(moment, place), reader.header["error"])
     export(tmp_path / "splats.gsd", ["ply-seq"], device=CPU)
-    from gsfluent.io import load
+    from gsfluent.io import load_splats
 
-    back = load(tmp_path / "splats" / "frames" / f"frame_{FRAMES:04d}.ply")
+    back = load_splats(tmp_path / "splats" / "frames" / f"frame_{FRAMES:04d}.ply")
     truth = load_frame(run / "stages" / "simulate", FRAMES - 1).gaussians
     assert psnr(picture(back), picture(truth)) > 42.0
     assert back.count == truth.count

@@ -12,6 +12,7 @@ from gsfluent.config import Shot
 from gsfluent.data import BACKGROUND, Camera, Capture, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
+from gsfluent.io.images import load_view
 from gsfluent.pipeline.light import Light
 from gsfluent.pipeline.orient import make_frame, orient
 from gsfluent.pipeline.render import Render
@@ -127,7 +128,7 @@ def test_a_floor_without_a_plane_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(b"")
     with pytest.raises(InputError, match="found in a capture"):
         Shot.from_dict({"splats": str(tmp_path / "a.ply"), "floor": "plane"})
-    capture = Capture([CAMERA], torch.zeros(0, 3).double(), torch.zeros(0, 3), tmp_path)
+    capture = Capture([CAMERA], torch.zeros(0, 3).double(), torch.zeros(0, 3), tmp_path, load_view)
     splats = Gaussians.from_colors(torch.rand(500, 3), torch.full((500,), 0.01), torch.rand(500, 3))
     shot = Shot.from_dict({"capture": str(tmp_path), "floor": "plane"})
     with pytest.raises(InputError, match="no plane"):

@@ -14,6 +14,7 @@ from scipy import linalg, ndimage
 
 from gsfluent.cli import main
 from gsfluent.errors import InputError
+from gsfluent.io.solid import save_solid
 from gsfluent.lab.interiors import known_interior
 from gsfluent.pipeline.compare import compare, load_pictures
 from gsfluent.pipeline.compare_weights import (
@@ -75,7 +76,7 @@ def test_objects_are_brought_to_one_size(folders: dict[str, Path], tmp_path: Pat
 def test_a_textured_solid_is_compared_by_its_slices(tmp_path: Path) -> None:
     known = known_interior("marble", 32)
     solid = known.solid()
-    solid.save(tmp_path / "bare.ply")
+    save_solid(solid, tmp_path / "bare.ply")
     with pytest.raises(InputError, match="no colours inside"):
         load_pictures(tmp_path / "bare.ply")
     replace(solid, color=torch.from_numpy(known.rgb)).save(tmp_path / "stone.ply")

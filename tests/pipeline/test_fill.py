@@ -14,9 +14,11 @@ from gsfluent import demo
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
-from gsfluent.pipeline.fill import Fill, cut_view
+from gsfluent.io.images import load_view
+from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.fill_density import GridBox, density_field
 from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, find_leaks
+from gsfluent.pipeline.fill_view import cut_view
 
 
 def _bottom_missing(points: torch.Tensor) -> torch.Tensor:
@@ -229,7 +231,7 @@ def _silhouettes(folder: Path, count: int = 8) -> Capture:
         path = folder / f"view_{i}.png"
         Image.fromarray(pixels).save(path)
         cameras.append(replace(camera, name=path.name, image_path=path))
-    return Capture(cameras, torch.zeros(0, 3).double(), torch.zeros(0, 3), folder)
+    return Capture(cameras, torch.zeros(0, 3).double(), torch.zeros(0, 3), folder, load_view)
 
 
 def test_masks_remove_what_is_not_the_object(tmp_path: Path) -> None:
@@ -296,10 +298,10 @@ def test_errors() -> None:
 
 @pytest.mark.data
 def test_real_plush_dog(data_root: Path) -> None:
-    from gsfluent.io import load
+    from gsfluent.io import load_splats
 
     path = data_root / "splats" / "plush_dog" / "point_cloud_29999_clean.ply"
-    dog = load(path)
+    dog = load_splats(path)
     filled = Fill(64)(dog)
     report = filled.report
     assert report["interior_gaussians"] > 2000

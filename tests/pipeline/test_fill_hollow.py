@@ -17,6 +17,7 @@ from gsfluent.cli import main
 from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
+from gsfluent.io.solid import load_solid
 from gsfluent.pipeline import find_solid
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.fill_density import GridBox
@@ -234,7 +235,7 @@ def test_masks_alone_make_a_solid_in_the_colours_of_the_photographs(tmp_path: Pa
     out = tmp_path / "solid.ply"
     code = main(["fill", str(paths.root), "-o", str(out), "--resolution", "32"])
     assert code == 0
-    solid = Solid.load(out)
+    solid = load_solid(out)
     truth = demo.make_object("watermelon", 0)
     assert overlap(solid, lambda p: truth.inside(p.double())) > 0.9
     skin = solid.gaussians.select(solid.gaussians.labels == SURFACE).colors().mean(0)

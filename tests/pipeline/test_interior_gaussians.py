@@ -12,6 +12,7 @@ import torch
 from gsfluent import demo
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
 from gsfluent.io import load_capture
+from gsfluent.io.images import load_view
 from gsfluent.pipeline.draw import draw
 from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.fill_colors import keep_skin, skin_colors, stray_splats
@@ -158,7 +159,7 @@ def watched(folder: Path, color: float, *, masks: bool = True) -> Capture:
         path = folder / f"{i}.png"
         Image.fromarray(picture).save(path)
         cameras.append(replace(camera, name=path.name, image_path=path))
-    return Capture(cameras, torch.zeros(0, 3).double(), torch.zeros(0, 3), folder)
+    return Capture(cameras, torch.zeros(0, 3).double(), torch.zeros(0, 3), folder, load_view)
 
 
 def shell(color: float, *, cap: bool = False) -> Gaussians:

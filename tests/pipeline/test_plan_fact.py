@@ -11,6 +11,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
+from gsfluent.io.splats import save_splats
 from gsfluent.pipeline import plan_probe
 from gsfluent.pipeline.plan import cost_model, plan_shot
 from gsfluent.pipeline.plan_cost import CostModel, machine_key
@@ -39,7 +40,7 @@ def model() -> CostModel:
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
     folder = tmp_path_factory.mktemp("shot")
-    ellipsoid((0.1, 0.1, 0.1), splats=1500).gaussians.save(folder / "ball.ply")
+    save_splats(ellipsoid((0.1, 0.1, 0.1), splats=1500).gaussians, folder / "ball.ply")
     return Shot.from_dict(
         {
             "splats": str(folder / "ball.ply"),

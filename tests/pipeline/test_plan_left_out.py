@@ -12,6 +12,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.config import Shot
+from gsfluent.io.splats import save_splats
 from gsfluent.pipeline.plan_motion import foresee
 from gsfluent.pipeline.plan_passes import passes_of
 from gsfluent.pipeline.simulate import Simulate
@@ -25,7 +26,7 @@ DX = 0.0125
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
     """Only its light, texture and output are read here."""
     splats = tmp_path_factory.mktemp("shot") / "ball.ply"
-    ellipsoid().gaussians.save(splats)
+    save_splats(ellipsoid().gaussians, splats)
     return Shot.from_dict({"splats": str(splats), "events": [{"type": "drop", "height": 0.1}]})
 
 

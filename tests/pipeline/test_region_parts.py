@@ -16,6 +16,7 @@ from gsfluent.cli import main
 from gsfluent.config import Shot
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.errors import InputError
+from gsfluent.io.solid import save_solid
 from gsfluent.pipeline.inspect_parts import body_parts, solid_regions
 from gsfluent.pipeline.inspect_parts_picture import part_colors, save_parts_picture
 from gsfluent.pipeline.particles import build_matter, grid_spacing
@@ -119,7 +120,7 @@ def test_a_solid_shows_its_regions(tmp_path: Path, capsys: pytest.CaptureFixture
     rows = solid_regions(labelled).rows
     assert [row["part"] for row in rows] == ["rest", "inclusion (2)", tmp_path.name]
     assert rows[2]["agreement"] > 0.8 and rows[1]["volume"] == pytest.approx(9 * solid.voxel**3)
-    labelled.save(tmp_path / "solid.ply")
+    save_solid(labelled, tmp_path / "solid.ply")
     out = tmp_path / "regions_of_it.png"
     assert main(["inspect", str(tmp_path / "solid.ply"), "-o", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)

@@ -19,6 +19,7 @@ from gsfluent.cli import main
 from gsfluent.data import BACKGROUND, SURFACE, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
+from gsfluent.io.splats import save_splats
 from gsfluent.pipeline.mesh_distance import load_mesh
 from gsfluent.pipeline.solid_field import SignedDistance, distances_of
 from gsfluent.pipeline.solid_mesh import closed_mesh, mesh_to, save_mesh
@@ -281,7 +282,7 @@ def test_the_verb_writes_a_mesh_and_leaves_the_background_out(
         shell.replace(labels=torch.full((shell.count,), SURFACE, dtype=torch.int32)),
         wall.replace(labels=torch.full((wall.count,), BACKGROUND, dtype=torch.int32)),
     ])  # fmt: skip
-    both.save(tmp_path / "in.ply")
+    save_splats(both, tmp_path / "in.ply")
     out = tmp_path / "out.glb"
     assert main(["mesh", str(tmp_path / "in.ply"), "-o", str(out), "--resolution", "48"]) == 0
     assert "watertight: yes" in capsys.readouterr().out

@@ -17,6 +17,7 @@ import gsfluent as gf
 from gsfluent.cli import main
 from gsfluent.data import SURFACE
 from gsfluent.errors import InputError, RunError
+from gsfluent.io.solid import save_solid
 from gsfluent.pipeline.run_frames import frame_path, save_frame
 from gsfluent.viewer.color import splat_colors
 from gsfluent.viewer.look import BODY
@@ -86,7 +87,7 @@ def test_a_filled_solid_is_shown_until_frames_come(tmp_path: Path) -> None:
     solid = gf.pipeline.Fill(resolution=20)(skin)
     out = tmp_path / "ball"
     (out / "stages" / "fill").mkdir(parents=True)
-    solid.save(out / "stages" / "fill" / "ball.ply")
+    save_solid(solid, out / "stages" / "fill" / "ball.ply")
     (out / "stages" / "fill" / "stage.json").write_text('{"complete": true}')
     source = RunSource(out)
     timeline = Timeline(source, CPU)
