@@ -15,8 +15,8 @@ from pathlib import Path
 
 import gsfluent as gf
 from gsfluent.demo import make_capture
-from gsfluent.pipeline.light import Light
-from gsfluent.pipeline.render_floor import Studio
+from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.render.studio import Studio
 
 
 def main() -> int:

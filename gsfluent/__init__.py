@@ -30,7 +30,7 @@ _PUBLIC: dict[str, tuple[str, str | None]] = {
     "Frame": ("gsfluent.data", "Frame"),
     "Solid": ("gsfluent.data", "Solid"),
     "Particles": ("gsfluent.data", "Particles"),
-    "Scene": ("gsfluent.scene", "Scene"),
+    "Scene": ("gsfluent.scene.scene", "Scene"),
     "load": ("gsfluent.io", "load"),
     "save": ("gsfluent.io", "save"),
     "load_capture": ("gsfluent.io", "load_capture"),

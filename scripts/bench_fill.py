@@ -23,9 +23,9 @@ from typing import Any
 import torch
 
 from gsfluent.data import Camera, Capture, Gaussians
+from gsfluent.draw import draw
 from gsfluent.io.images import load_view
 from gsfluent.pipeline import Fill
-from gsfluent.pipeline.draw import draw
 
 AXES = (0.13, 0.11, 0.10)
 SIZE = 400  # pixels of the photographs

@@ -15,8 +15,8 @@ import torch
 from PIL import Image  # noqa: TID253
 
 from gsfluent.io.solid import load_solid
-from gsfluent.pipeline.fill_colors import skin_weights
-from gsfluent.pipeline.fill_view import cut_view
+from gsfluent.pipeline.render.cuts import cut_view
+from gsfluent.pipeline.solid.colors import skin_weights
 
 TILT = 25.0  # degrees that the viewer of the last cut stands above it
 

@@ -15,7 +15,7 @@ import torch
 
 from gsfluent.data import Capture, Gaussians
 from gsfluent.io.images import load_view
-from gsfluent.lab.photograph import Mesh, around, marbled, photograph, textured
+from gsfluent.lab.truth.photograph import Mesh, around, marbled, photograph, textured
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data")) / "meshes"

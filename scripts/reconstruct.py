@@ -32,7 +32,7 @@ import gsfluent as gf
 from gsfluent import demo
 from gsfluent.data import Capture
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.reconstruct_report import write_report
+from gsfluent.pipeline.reconstruct.evaluate import write_report
 
 
 def opened(options: argparse.Namespace, scratch: str) -> tuple[str, Capture]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 
 import gsfluent as gf
-from gsfluent.pipeline.orient import make_frame
+from gsfluent.pipeline.capture.orient import make_frame
 
 
 def main(

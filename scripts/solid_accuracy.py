@@ -26,11 +26,11 @@ from gsfluent.data import Capture, Gaussians
 from gsfluent.io import load_capture
 from gsfluent.io.images import load_view
 from gsfluent.pipeline import Reconstruct
-from gsfluent.pipeline.mesh_distance import load_mesh
-from gsfluent.pipeline.reconstruct_init import _quats_of
-from gsfluent.pipeline.solid_field import SignedDistance
-from gsfluent.pipeline.solid_source import find_solid
-from gsfluent.pipeline.solid_tsdf import ring_of_cameras
+from gsfluent.pipeline.reconstruct.init import _quats_of
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.source import find_solid
+from gsfluent.pipeline.solid.tsdf import ring_of_cameras
+from gsfluent.spatial.mesh_distance import load_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data")) / "meshes"

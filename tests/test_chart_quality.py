@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsfluent.charts import quality, reconstruction, rendering
-from gsfluent.charts.quality import Job, Outcome, chart_quality, gathered, run_jobs
-from gsfluent.charts.record import read
 from gsfluent.errors import InputError, RunError
+from gsfluent.lab.charts import quality, reconstruction, rendering
+from gsfluent.lab.charts.quality import Job, Outcome, chart_quality, gathered, run_jobs
+from gsfluent.lab.charts.record import read
 
 CPU = torch.device("cpu")
 

@@ -9,7 +9,7 @@ import torch
 
 import gsfluent as gf
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import Light
+from gsfluent.pipeline.light.lamps import Light
 
 
 def shell(radius: float = 0.1, count: int = 4000) -> gf.Gaussians:

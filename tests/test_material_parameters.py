@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsfluent import materials, ops
 from gsfluent.errors import InputError
-from gsfluent.lab.driver import World
+from gsfluent.lab.world.driver import World
 from gsfluent.materials import LAWS, READS, Material, table
 
 DX = 0.05

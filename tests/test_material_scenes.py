@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials
-from gsfluent.lab.driver import World
+from gsfluent.lab.world.driver import World
 from gsfluent.materials import LAWS, Material
 from gsfluent.ops import collider_row
 

@@ -12,8 +12,8 @@ from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.ops.plasticity import LAWS
-from gsfluent.pipeline.particles import build_matter, sample_points
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.points import build_matter, sample_points
+from gsfluent.scene.scene import Scene
 
 
 def test_parameters_follow_isotropic_elasticity():

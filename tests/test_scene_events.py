@@ -13,8 +13,8 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
-from gsfluent.scene import Scene
-from gsfluent.scene_parts import quaternion, quaternion_to, turned
+from gsfluent.scene.parts import quaternion, quaternion_to, turned
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.stage import Progress
+from gsfluent.progress import Progress
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 
-from .scene import Floats
+from gsfluent.fracturebench.scene import Floats
 
 __all__ = ["Modes", "ball_rule", "box_rule", "modes"]
 

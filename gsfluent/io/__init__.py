@@ -2,11 +2,11 @@
 
 from gsfluent.io.atomic import atomic_path, write_json
 from gsfluent.io.capture import load_capture
-from gsfluent.io.delta import DeltaReader
 from gsfluent.io.images import load_image, save_image
-from gsfluent.io.ply import read_ply, write_ply
 from gsfluent.io.solid import load, load_solid, save, save_solid
-from gsfluent.io.splats import load_splats, save_splats
+from gsfluent.io.splats.delta import DeltaReader
+from gsfluent.io.splats.load import load_splats, save_splats
+from gsfluent.io.splats.ply import read_ply, write_ply
 
 __all__ = [
     "DeltaReader",

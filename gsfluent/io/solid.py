@@ -16,7 +16,7 @@ from gsfluent.data.gaussians import Gaussians
 from gsfluent.data.solid import Solid
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
-from gsfluent.io.splats import load_splats, save_splats
+from gsfluent.io.splats.load import load_splats, save_splats
 
 
 def load(path: str | Path) -> Gaussians | Solid:

@@ -20,7 +20,7 @@ from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
 from gsfluent.io.colmap import find_mask
 from gsfluent.io.images import IMAGE_SUFFIXES, image_size, load_view
-from gsfluent.io.ply import read_ply
+from gsfluent.io.splats.ply import read_ply
 
 _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _RIGID_TOLERANCE = 1e-3

@@ -6,10 +6,10 @@ import threading
 from typing import TYPE_CHECKING, Protocol
 
 from gsfluent.data import Camera
-from gsfluent.viewer.look import Look
-from gsfluent.viewer.playback import Playback
-from gsfluent.viewer.source import Source
-from gsfluent.viewer.timeline import Timeline
+from gsfluent.viewer.model.look import Look
+from gsfluent.viewer.model.playback import Playback
+from gsfluent.viewer.model.source import Source
+from gsfluent.viewer.model.timeline import Timeline
 
 if TYPE_CHECKING:
     import viser

@@ -8,8 +8,8 @@ import random
 
 import pytest
 
-from gsfluent.charts.front import cheapest, compare, counted, front, verdict
-from gsfluent.charts.record import Record
+from gsfluent.lab.charts.front import cheapest, compare, counted, front, verdict
+from gsfluent.lab.charts.record import Record
 
 
 def record(

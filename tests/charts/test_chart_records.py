@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsfluent.charts.record import Record, append, of_run, read
 from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
+from gsfluent.lab.charts.record import Record, append, of_run, read
 
 
 def record(case: str = "bar", dx: float = 0.1, variant: str = "", error: float = 0.02) -> Record:

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.charts import play as playing
-from gsfluent.charts.chart import run
-from gsfluent.charts.draw import gathered, of_records
-from gsfluent.charts.ladder import KNOBS, Setting, ladder, rungs, work
-from gsfluent.charts.off_grid import measure_off_grid
-from gsfluent.charts.play import measure, shuffled
-from gsfluent.charts.record import Record, append, read
-from gsfluent.charts.ride import Riders
 from gsfluent.cli import main
 from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen import play
+from gsfluent.lab.charts import play as playing
+from gsfluent.lab.charts.chart import run
+from gsfluent.lab.charts.draw import gathered, of_records
+from gsfluent.lab.charts.ladder import KNOBS, Setting, ladder, rungs, work
+from gsfluent.lab.charts.off_grid import measure_off_grid
+from gsfluent.lab.charts.play import measure, shuffled
+from gsfluent.lab.charts.record import Record, append, read
+from gsfluent.lab.charts.ride import Riders
+from gsfluent.lab.frozen.answer import play
 
 COARSE = max(find("pull_apart").ladder)
 
@@ -188,7 +188,7 @@ def test_a_ladder_is_resumed_and_keeps_to_its_budget(
         done.append(setting.key(device))
         return fast(setting, device, repeat)
 
-    monkeypatch.setattr("gsfluent.charts.chart.measure", counted)
+    monkeypatch.setattr("gsfluent.lab.charts.chart.measure", counted)
     first = run(settings[:2], path, device="cpu")
     assert first.fresh == 2 and not first.left_out
     path.write_text(path.read_text()[:-30])  # the machine went down while the last was written

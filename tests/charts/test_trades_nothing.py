@@ -20,14 +20,14 @@ from simulation_shapes import ellipsoid
 from trades import COARSE, all_laws, apart, judged, same_bits, same_error
 
 from gsfluent import ops
-from gsfluent.charts.play import even_dt, shuffled, stepwise
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene as Frozen
-from gsfluent.lab import stepper
-from gsfluent.lab.frozen import play
+from gsfluent.lab.charts.play import even_dt, shuffled, stepwise
+from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.world import stepper
 from gsfluent.ops.reference import plasticity
-from gsfluent.pipeline.simulate import Simulate, SimulationFrame
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.scene.scene import Scene
 
 CASES = ("bar", "pull_apart")
 both_precisions = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -11,10 +11,10 @@ import torch
 from trades import all_laws, apart, coarse, same_bits, same_error
 
 from gsfluent import has_cuda, ops
-from gsfluent.charts.play import even_dt, shuffled, stepwise
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen import play
+from gsfluent.lab.charts.play import even_dt, shuffled, stepwise
+from gsfluent.lab.frozen.answer import play
 
 pytestmark = [
     pytest.mark.cuda,

@@ -14,7 +14,7 @@ from PIL import Image
 from gsfluent.cli import main
 from gsfluent.data import BACKGROUND, Gaussians
 from gsfluent.io import load_splats
-from gsfluent.io.splats import save_splats
+from gsfluent.io.splats.load import save_splats
 
 OUTPUT = {"fps": 20, "seconds": 0.2, "size": [96, 64]}
 

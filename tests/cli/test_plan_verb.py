@@ -11,9 +11,9 @@ import torch
 
 from gsfluent.cli import main
 from gsfluent.data import Gaussians
-from gsfluent.io.splats import save_splats
-from gsfluent.pipeline import plan_probe
-from gsfluent.pipeline.plan_cost import CostModel, machine_key
+from gsfluent.io.splats.load import save_splats
+from gsfluent.plan import probe as plan_probe
+from gsfluent.plan.cost import CostModel, machine_key
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from ball_shot import write_shot
 
 from gsfluent.cli import main
 from gsfluent.io import load_splats
-from gsfluent.pipeline.run_show import poster_frame
+from gsfluent.pipeline.render.film import poster_frame
 
 FRAMES = 10
 KEYS = {
@@ -197,13 +197,13 @@ def test_full_disk_during_the_simulation_keeps_what_is_done(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         save(stream, **arrays)
 
-    monkeypatch.setattr("gsfluent.pipeline.run_frames.np.savez", filling)
+    monkeypatch.setattr("gsfluent.results.frames.np.savez", filling)
     assert main(["run", str(shot), "-o", str(out)]) == 1
     said = capsys.readouterr().err
     assert os.strerror(errno.ENOSPC) in said
     assert not list(out.rglob("*partial*"))
     assert read(out)["verdict"] == "failed"
-    monkeypatch.setattr("gsfluent.pipeline.run_frames.np.savez", save)
+    monkeypatch.setattr("gsfluent.results.frames.np.savez", save)
     assert main(["run", str(shot), "-o", str(out)]) == 0
     assert read(out)["verdict"] == "clean"
 
@@ -286,7 +286,7 @@ def test_the_poster_follows_the_largest_break(fragments: list[int], expected: in
 
 def test_a_bullet_can_be_seen(finished: Path, ball: Path, tmp_path: Path) -> None:
     from gsfluent.data import TRANSITION
-    from gsfluent.pipeline.run_frames import load_frame
+    from gsfluent.results.frames import load_frame
 
     out = tmp_path / "out"
     shutil.copytree(finished, out)

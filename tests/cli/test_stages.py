@@ -62,7 +62,7 @@ def test_fill_then_texture(ball: Path, tmp_path: Path, capsys: pytest.CaptureFix
 def test_demo_small_tells_the_truth_about_its_inside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gsfluent.pipeline import run_demo
+    from gsfluent.run import demo as run_demo
 
     tiny = run_demo.DemoSize(9, 64, 40, 1500, 24, "preview", (64, 48), 0.3, 10.0)
     monkeypatch.setitem(run_demo.SIZES, "preview", tiny)

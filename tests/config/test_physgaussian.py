@@ -16,13 +16,14 @@ import pytest
 import torch
 from physgaussian_model import CENTER, RADIUS, config, write_model
 
-from gsfluent.config import load_shot, physgaussian_page
-from gsfluent.config.physgaussian import Conversion, convert
-from gsfluent.config.physgaussian_keys import FILLING, KEYS, MATERIALS
+from gsfluent.config import load_shot
+from gsfluent.config.physgaussian import page as physgaussian_page
+from gsfluent.config.physgaussian.keys import FILLING, KEYS, MATERIALS
+from gsfluent.config.physgaussian.read import Conversion, convert
 from gsfluent.errors import InputError
 from gsfluent.io import load_splats
-from gsfluent.pipeline.run_simulate import build_scene
-from gsfluent.scene import Scene
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import build_scene
 
 SCALE = 1.0 / (2.0 * RADIUS)
 
@@ -187,7 +188,7 @@ def test_a_cylinder_that_turns_turns_the_same_way(model: Path, tmp_path: Path) -
     theirs = 0.05 * 1.9 * (-math.sin(0.7) * h1 + math.cos(0.7) * h2) + 0.5 * n
     ours = np.cross(found["spin"], offset) + np.array(found["velocity"])
     assert ours == pytest.approx(theirs, abs=1e-9)
-    from gsfluent.scene_parts import quaternion, turned
+    from gsfluent.scene.parts import quaternion, turned
 
     axis = turned(quaternion("turn", found["turn"]), (0.0, 0.0, 1.0))
     assert np.abs(axis) == pytest.approx(np.abs(n), abs=1e-9)

@@ -16,15 +16,16 @@ from export_run import FPS, FRAMES, make_run, picture
 from gsfluent import geometry
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import axes, delta, delta_write
+from gsfluent.export.delta import delta_frame
+from gsfluent.export.frames import Reel
+from gsfluent.export.write import ExportOptions, export
+from gsfluent.io import axes
 from gsfluent.io.axes import nearest_axes
-from gsfluent.io.delta import DeltaFrame, DeltaReader, unpack_arrays
-from gsfluent.io.delta_write import Roster, bounds, pack_arrays, steps, write_delta
+from gsfluent.io.splats import delta, delta_write
+from gsfluent.io.splats.delta import DeltaFrame, DeltaReader, unpack_arrays
+from gsfluent.io.splats.delta_write import Roster, bounds, pack_arrays, steps, write_delta
 from gsfluent.metrics import psnr
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.export_delta import delta_frame
-from gsfluent.pipeline.export_frames import Reel
-from gsfluent.pipeline.run_frames import load_frame
+from gsfluent.results.frames import load_frame
 
 CPU = torch.device("cpu")
 

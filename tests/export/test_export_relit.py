@@ -12,15 +12,15 @@ from export_run import add_record, make_run
 from gsfluent.config import Shot
 from gsfluent.data import SURFACE, Camera, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.export.write import ExportOptions, export
 from gsfluent.io import load_splats
 from gsfluent.metrics import psnr
 from gsfluent.pipeline import Render
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.light import Lighting
-from gsfluent.pipeline.light_shot import light_of
-from gsfluent.pipeline.render_normals import occupancy_cell
-from gsfluent.pipeline.run_frames import load_frame, save_frame
-from gsfluent.pipeline.run_show import shot_of
+from gsfluent.pipeline.light.from_shot import light_of
+from gsfluent.pipeline.light.lamps import Lighting
+from gsfluent.pipeline.light.normals import occupancy_cell
+from gsfluent.results.frames import load_frame, save_frame
+from gsfluent.results.record import shot_of
 
 CPU = torch.device("cpu")
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from gsfluent.charts.stability import Place, all_maps
-from gsfluent.charts.stability_scenes import block
-from gsfluent.charts.stability_steps import shaken
-from gsfluent.lab.violations import OfWorld, first_violation
+from gsfluent.lab.stability.maps import Place
+from gsfluent.lab.stability.run import all_maps
+from gsfluent.lab.stability.scenes import block
+from gsfluent.lab.stability.steps import shaken
+from gsfluent.lab.world.violations import OfWorld, first_violation
 
 pytestmark = pytest.mark.cuda
 GPU = Place("cuda")

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from gsfluent.charts import stability, stability_report
-from gsfluent.charts.stability import Axis, Map, Outcome, Place, Point, Violation
-from gsfluent.charts.stability_peers import KNOWN, marks, measured
 from gsfluent.cli import main
 from gsfluent.errors import InputError
 from gsfluent.figure.map import Cell, Plane, draw_planes, place_of
+from gsfluent.lab.stability import maps as stability
+from gsfluent.lab.stability import report as stability_report
+from gsfluent.lab.stability import run as running
+from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place, Point, Violation
+from gsfluent.lab.stability.peers import KNOWN, marks, measured
 
 RECORDED = Path(__file__).resolve().parents[2] / "docs" / "data" / "stability_cpu.jsonl"
 
@@ -24,15 +26,15 @@ def recorded() -> list[Point]:
 
 
 def test_every_point_of_every_map_is_recorded(recorded: list[Point]) -> None:
-    maps = list(stability.all_maps().values())
-    wanted = {f"{m}|{v}|{x}|{y}" for m, v, x, y in stability.points(maps)}
+    maps = list(running.all_maps().values())
+    wanted = {f"{m}|{v}|{x}|{y}" for m, v, x, y in running.points(maps)}
     assert wanted == {f"{p.map}|{p.variant}|{p.x}|{p.y}" for p in recorded}
     assert len(maps) >= 12 and len(recorded) > 2000
 
 
-@pytest.mark.parametrize("name", sorted(stability.all_maps()))
+@pytest.mark.parametrize("name", sorted(running.all_maps()))
 def test_the_default_is_inside_with_margin(name: str, recorded: list[Point]) -> None:
-    m = stability.all_maps()[name]
+    m = running.all_maps()[name]
     assert stability_report.verdict([m], recorded) == []
     walks = stability_report.worst(m, recorded)
     assert walks and all(w.inside for w in walks)
@@ -42,7 +44,7 @@ def test_the_default_is_inside_with_margin(name: str, recorded: list[Point]) -> 
 
 
 def test_the_verdict_sees_a_default_that_fails_or_is_near_failing(recorded: list[Point]) -> None:
-    m = stability.all_maps()["poisson"]
+    m = running.all_maps()["poisson"]
 
     def spoilt(x: float, y: float) -> list[str]:
         points = [
@@ -70,7 +72,7 @@ def test_stable_courant_numbers_of_the_specification(recorded: list[Point]) -> N
 
 
 def test_named_points_of_the_peers_lie_where_their_choice_fails(recorded: list[Point]) -> None:
-    maps = list(stability.all_maps().values())
+    maps = list(running.all_maps().values())
     lines = [x for m in maps for x in stability_report.named(m, recorded, marks(maps))]
     assert len(lines) == sum(map(len, KNOWN.values()))
     holding = [line for line in lines if line.endswith("holds")]
@@ -87,7 +89,7 @@ def test_failures_measured_on_programs_become_points(tmp_path: Path) -> None:
     path.write_text(json.dumps([item, item | {"name": "unknown"}, item | {"axes": {}}]))
     found = measured(path)
     assert [m.failed for m in found] == [True, True] and found[1].mark is None
-    maps = list(stability.all_maps().values())
+    maps = list(running.all_maps().values())
     added = marks(maps, found)["fields", "one field"][0]
     assert (added.x, added.y, added.name) == (0.0, 0.02, "physgaussian, measured")
     path.write_text('{"a": 1}')
@@ -118,22 +120,22 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Map:
 
 def test_a_broken_run_goes_on_and_nothing_is_run_twice(toy: Map, tmp_path: Path) -> None:
     path = tmp_path / "new" / "stability.jsonl"
-    points = stability.run_maps([toy], path)
+    points = running.run_maps([toy], path)
     assert len(points) == len(RUNS) == 10
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:6]) + "\n" + lines[6][:40])  # stopped while writing
     RUNS.clear()
     seen: list[tuple[int, int, str]] = []
-    again = stability.run_maps([toy], path, progress=lambda *args: seen.append(args))
+    again = running.run_maps([toy], path, progress=lambda *args: seen.append(args))
     assert len(RUNS) == 4 and seen[-1] == (10, 10, "toy")
     assert [(p.x, p.y, p.step) for p in again] == [(p.x, p.y, p.step) for p in points]
     assert len(stability.read(path)) == 10
-    quick = stability.points([toy], quick=True)
+    quick = running.points([toy], quick=True)
     assert [(x, y) for _, _, x, y in quick] == [(x, y) for y in "ab" for x in (0.5, 1.0, 4.0)]
 
 
 def test_walks_margins_and_tables(toy: Map, tmp_path: Path) -> None:
-    points = stability.run_maps([toy], tmp_path / "s.jsonl")
+    points = running.run_maps([toy], tmp_path / "s.jsonl")
     up, down, word = stability_report.boundaries(toy, points)
     assert (up.holds, up.fails, up.kind, up.step, up.margin) == (2.0, 3.0, "energy", 10, 2.0)
     assert (down.holds, down.fails, down.margin) == (0.5, None, 2.0)
@@ -147,13 +149,13 @@ def test_lines_that_are_none_are_refused_in_words(toy: Map, tmp_path: Path) -> N
     path = tmp_path / "s.jsonl"
     path.write_text(json.dumps({"case": "bar"}) + "\n")
     with pytest.raises(InputError, match="line 1"):
-        stability.run_maps([toy], path)
+        running.run_maps([toy], path)
     with pytest.raises(InputError, match="cannot be read"):
         stability.read(tmp_path)
     with pytest.raises(InputError, match="no such map"):
-        stability.chosen(["toy", "nonsense"])
+        running.chosen(["toy", "nonsense"])
     with pytest.raises(InputError, match="jobs"):
-        stability.run_maps([toy], path, jobs=0)
+        running.run_maps([toy], path, jobs=0)
 
 
 def test_where_a_value_lies_on_an_axis() -> None:
@@ -199,9 +201,9 @@ def test_the_verb_runs_a_map_and_draws_recorded_lines(
 
 @pytest.mark.slow
 def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
-    wanted = stability.chosen(["zero_weight"])
+    wanted = running.chosen(["zero_weight"])
     one, two = (
-        stability.run_maps(wanted, tmp_path / f"{jobs}.jsonl", quick=True, jobs=jobs)
+        running.run_maps(wanted, tmp_path / f"{jobs}.jsonl", quick=True, jobs=jobs)
         for jobs in (1, 2)
     )
     assert [(p.key, p.step, p.kind) for p in one] == [(p.key, p.step, p.kind) for p in two]

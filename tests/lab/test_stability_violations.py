@@ -8,10 +8,10 @@ import math
 import pytest
 import torch
 
-from gsfluent.lab.driver import World
-from gsfluent.lab.shapes import ball, box, parameters
-from gsfluent.lab.slab import SEPARATE, plane, wave_speed
-from gsfluent.lab.violations import (
+from gsfluent.lab.problems.fracture.slab import SEPARATE, plane, wave_speed
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.shapes import ball, box, parameters
+from gsfluent.lab.world.violations import (
     Limits,
     OfWorld,
     State,

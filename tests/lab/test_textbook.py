@@ -13,11 +13,11 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen import play
-from gsfluent.lab.shapes import ball
-from gsfluent.lab.textbook import Textbook, Variant, play_textbook
-from gsfluent.lab.textbook_laws import Elastic, measure
-from gsfluent.lab.textbook_nacc import MAPS, Nacc, return_map
+from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.textbook.laws import Elastic, measure
+from gsfluent.lab.textbook.nacc import MAPS, Nacc, return_map
+from gsfluent.lab.textbook.solver import Textbook, Variant, play_textbook
+from gsfluent.lab.world.shapes import ball
 
 DX = 1.0 / 32.0
 DOUBLE = torch.float64

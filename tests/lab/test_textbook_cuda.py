@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from gsfluent.lab import brittle
-from gsfluent.lab.textbook import Textbook, Variant
+from gsfluent.lab.problems.fracture import brittle
+from gsfluent.lab.textbook.solver import Textbook, Variant
 
 pytestmark = pytest.mark.cuda
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from gsfluent.data import SURFACE, Camera, Capture, Gaussians, Solid
-from gsfluent.io.segmentation import LabelView, Segmentation
+from gsfluent.io.segmentation.masks import LabelView, Segmentation
 
 RADIUS = 0.1
 SIZE = 96

@@ -13,10 +13,10 @@ from gsfluent.data import BACKGROUND, Camera, Capture, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
 from gsfluent.io.images import load_view
-from gsfluent.pipeline.light import Light
-from gsfluent.pipeline.orient import make_frame, orient
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_backdrop import Backdrop, covered_floor, object_radius
+from gsfluent.pipeline.capture.orient import make_frame, orient
+from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, object_radius
+from gsfluent.pipeline.render.stage import Render
 
 RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
 

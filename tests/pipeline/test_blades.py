@@ -11,10 +11,10 @@ from torch import Tensor
 
 from gsfluent import materials, ops
 from gsfluent.data import Frame
-from gsfluent.pipeline.blades import BladeSet
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.simulate_run import Run
-from gsfluent.scene import Scene
+from gsfluent.pipeline.colliders.blades import BladeSet
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.run import Run
+from gsfluent.scene.scene import Scene
 
 DX = 0.1
 ZERO = (0.0, 0.0, 0.0)

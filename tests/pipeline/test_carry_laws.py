@@ -10,10 +10,10 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import geometry, materials, ops
 from gsfluent.data import Frame
-from gsfluent.pipeline.carry import STRETCH, Carry, Points
-from gsfluent.pipeline.crack_cuts import cut_at
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.scene import Scene
+from gsfluent.pipeline.cracks.cuts import cut_at
+from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.scene.scene import Scene
 
 TURN = geometry.quaternion_to_matrix(torch.tensor([0.72, 0.16, -0.32, 0.24]))
 

@@ -12,22 +12,22 @@ import torch
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials
+from gsfluent.choose import shot as choose_shot
+from gsfluent.choose.choose import Growth, Probes, Probing, choose, summary
+from gsfluent.choose.fit import Fit, History, fit_history
+from gsfluent.choose.pick import pick, ranked
+from gsfluent.choose.probe import Probe, Seen, window
+from gsfluent.choose.seconds import measured_rates, work_of
 from gsfluent.config import Shot
 from gsfluent.config.settings_solve import read_error
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.figure.choice import draw_choice
-from gsfluent.pipeline import choose_shot
-from gsfluent.pipeline.choose import Growth, Probes, Probing, choose, summary
-from gsfluent.pipeline.choose_fit import Fit, History, fit_history
-from gsfluent.pipeline.choose_pick import pick, ranked
-from gsfluent.pipeline.choose_probe import Probe, Seen, window
-from gsfluent.pipeline.choose_seconds import measured_rates, work_of
-from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_record import RunRecord
-from gsfluent.pipeline.run_store import StageStore
 from gsfluent.progress import LineReporter
-from gsfluent.scene import Scene
+from gsfluent.results.record import RunRecord
+from gsfluent.results.store import StageStore
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.context import RunContext
 
 SIZES = (1 / 10, 1 / 14, 1 / 20)
 TIME = np.linspace(0.0, 1.0, 12)[:, None]

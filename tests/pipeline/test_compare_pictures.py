@@ -14,16 +14,16 @@ from scipy import linalg, ndimage
 
 from gsfluent.cli import main
 from gsfluent.errors import InputError
-from gsfluent.io.solid import save_solid
-from gsfluent.lab.interiors import known_interior
-from gsfluent.pipeline.compare import compare, load_pictures
-from gsfluent.pipeline.compare_weights import (
+from gsfluent.inspect.compare import compare, load_pictures
+from gsfluent.inspect.compare_weights import (
     Lpips,
     clip_scores,
     frechet_distance,
     inception_features,
     kernel_distance,
 )
+from gsfluent.io.solid import save_solid
+from gsfluent.lab.truth.interiors import known_interior
 
 CPU = torch.device("cpu")
 

@@ -9,12 +9,12 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import TRANSITION
 from gsfluent.errors import InputError
-from gsfluent.pipeline.carry import Carry, Points
-from gsfluent.pipeline.crack_gaps import OPACITY
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.repair import Repair
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.pipeline.cracks.gaps import OPACITY
+from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.matter.carry import Carry, Points
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")

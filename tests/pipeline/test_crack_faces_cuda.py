@@ -7,11 +7,11 @@ import torch
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials
-from gsfluent.pipeline.carry import Carry, Points
-from gsfluent.pipeline.neighbours import nearest_rows
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.repair import Repair
-from gsfluent.scene import Scene
+from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.matter.carry import Carry, Points
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.scene.scene import Scene
+from gsfluent.spatial.neighbours import nearest_rows
 
 pytestmark = pytest.mark.cuda
 

@@ -13,16 +13,16 @@ import pytest
 import torch
 
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.texture.diffusers_adapter import DiffusersInpainter, _Frame
-from gsfluent.pipeline.texture.diffusers_load import (
+from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter, _Frame
+from gsfluent.pipeline.texture.inpaint.diffusers_load import (
     _pipeline_class,
     dtype_argument,
     load_pipeline,
     offline_asked,
 )
-from gsfluent.pipeline.texture.inpaint_options import InpaintOptions
-from gsfluent.pipeline.texture.inpainter import SliceContext
-from gsfluent.pipeline.texture.photo import Exemplar, load_exemplar
+from gsfluent.pipeline.texture.inpaint.inpainter import SliceContext
+from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
 
 diffusers = pytest.importorskip("diffusers")
 pytest.importorskip("transformers")
@@ -218,7 +218,7 @@ def test_memory_modes_set_the_vae(tiny_sdxl: Path) -> None:
 
 
 def test_big_models_on_a_cpu_are_refused(tiny_sdxl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsfluent.pipeline.texture import diffusers_adapter
+    from gsfluent.pipeline.texture.inpaint import diffusers as diffusers_adapter
 
     monkeypatch.setattr(diffusers_adapter, "_CPU_PARAMETERS", 1000)
     with pytest.raises(InputError, match="allow_slow"):
@@ -441,7 +441,7 @@ def test_long_runs_say_how_long(
 ) -> None:
     from test_inpaint_loop import ball
 
-    from gsfluent.pipeline.texture import inpaint
+    from gsfluent.pipeline.texture.inpaint import method as inpaint
 
     clock = iter(np.arange(0.0, 1e6, 30.0))
     monkeypatch.setattr(inpaint.time, "perf_counter", lambda: float(next(clock)))

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.pipeline.texture.diffusers_adapter import DiffusersInpainter, InpaintOptions
-from gsfluent.pipeline.texture.domain import InteriorTexture
-from gsfluent.pipeline.texture.inpaint import diffusion_texture
+from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter, InpaintOptions
+from gsfluent.pipeline.texture.inpaint.method import diffusion_texture
+from gsfluent.pipeline.texture.volume.domain import InteriorTexture
 
 pytest.importorskip("diffusers")
 pytest.importorskip("transformers")

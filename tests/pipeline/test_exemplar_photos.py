@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError
-from gsfluent.lab.interiors import KNOWN_INTERIORS, known_interior
-from gsfluent.pipeline.texture.photo import (
+from gsfluent.lab.truth.interiors import KNOWN_INTERIORS, known_interior
+from gsfluent.pipeline.texture.photo.exemplar import (
     PhotoOptions,
     load_exemplar,
     open_exemplars,
     rgb_to_lab,
     with_skin,
 )
-from gsfluent.pipeline.texture.photo_color import linear, srgb
-from gsfluent.pipeline.texture.photo_light import (
+from gsfluent.pipeline.texture.photo.light import (
     remove_glints,
     remove_shading,
     shading_field,
     white_gains,
 )
-from gsfluent.pipeline.texture.photo_stain import remove_stain
+from gsfluent.pipeline.texture.photo.stain import remove_stain
+from gsfluent.pipeline.texture.volume.color import linear, srgb
 
 DATA = Path(
     os.environ.get("GSFLUENT_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")

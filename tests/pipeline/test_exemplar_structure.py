@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.domain import InteriorDomain, InteriorTexture
-from gsfluent.pipeline.texture.photo import Exemplar, PhotoOptions, load_exemplar
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, PhotoOptions, load_exemplar
 from gsfluent.pipeline.texture.structure import (
     Structure,
     impose_structure,
@@ -19,6 +18,7 @@ from gsfluent.pipeline.texture.structure import (
 )
 from gsfluent.pipeline.texture.sweep import Sweep, outline
 from gsfluent.pipeline.texture.unseen_skin import mend_unseen_skin
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
 RAW = PhotoOptions("auto", False, False, False, False, "none")
 FLESH = np.array([0.92, 0.86, 0.60])
@@ -112,7 +112,7 @@ def test_the_star_stands_across_the_axis_and_closes_along_it(axis) -> None:  # t
 
 
 def _frame(axis: tuple[float, float, float]) -> np.ndarray:
-    from gsfluent.pipeline.texture.domain import axis_frame
+    from gsfluent.pipeline.texture.volume.domain import axis_frame
 
     return axis_frame(np.array(axis, float))
 

@@ -15,10 +15,10 @@ from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
 from gsfluent.io.images import load_view
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.fill_density import GridBox, density_field
-from gsfluent.pipeline.fill_inside import DIRECTIONS, cast_votes, find_leaks
-from gsfluent.pipeline.fill_view import cut_view
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.render.cuts import cut_view
+from gsfluent.pipeline.solid.inside import DIRECTIONS, cast_votes, find_leaks
+from gsfluent.spatial.density import GridBox, density_field
 
 
 def _bottom_missing(points: torch.Tensor) -> torch.Tensor:

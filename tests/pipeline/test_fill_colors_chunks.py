@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsfluent.data import SURFACE, Gaussians
-from gsfluent.pipeline import fill_colors
+from gsfluent.pipeline.solid import colors as fill_colors
 
 
 def test_the_size_of_the_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

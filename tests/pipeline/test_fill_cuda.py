@@ -7,7 +7,7 @@ import torch
 
 from gsfluent.data import Gaussians
 from gsfluent.pipeline import Fill
-from gsfluent.pipeline.fill_density import choose_grid, density_field
+from gsfluent.spatial.density import choose_grid, density_field
 
 pytestmark = [
     pytest.mark.cuda,

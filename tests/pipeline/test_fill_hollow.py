@@ -19,14 +19,14 @@ from gsfluent.errors import InputError
 from gsfluent.io import load_capture
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline import find_solid
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.fill_density import GridBox
-from gsfluent.pipeline.fill_hollow import cavity_volume, hidden_cavity
-from gsfluent.pipeline.fill_inside import find_leaks
-from gsfluent.pipeline.fill_vote import Closed
-from gsfluent.pipeline.solid_splats import _hollowed
-from gsfluent.pipeline.solid_tsdf import Fused
-from gsfluent.pipeline.winding import winding_numbers
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.solid.hollow import cavity_volume, hidden_cavity
+from gsfluent.pipeline.solid.inside import find_leaks
+from gsfluent.pipeline.solid.splats import _hollowed
+from gsfluent.pipeline.solid.tsdf import Fused
+from gsfluent.pipeline.solid.vote import Closed
+from gsfluent.spatial.density import GridBox
+from gsfluent.spatial.winding import winding_numbers
 
 
 def discs(mesh: trimesh.Trimesh, count: int) -> Gaussians:

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gsfluent.data import Gaussians
-from gsfluent.pipeline.fill_resolution import VOXELS_PER_CELL, fill_resolution, visible_extent
-from gsfluent.pipeline.simulate import QUALITY
+from gsfluent.pipeline.fill.stage import VOXELS_PER_CELL, fill_resolution, visible_extent
+from gsfluent.pipeline.simulate.stage import QUALITY
 
 
 @pytest.mark.parametrize("cells", [*QUALITY.values(), 96, 128])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsfluent.pipeline import fragments
-from gsfluent.pipeline.fragments import components, find_fragments, rest_links
+from gsfluent.pipeline.matter import fragments
+from gsfluent.pipeline.matter.fragments import components, find_fragments, rest_links
 
 
 def rope(count: int) -> tuple[torch.Tensor, torch.Tensor]:

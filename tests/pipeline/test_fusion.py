@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent.pipeline.texture.fusion import (
+from gsfluent.pipeline.texture.polish import (
     SlabRenderer,
     SlicePlane,
     Steps,
@@ -134,7 +134,7 @@ def test_fixed_and_unseen_gaussians_keep_their_colours() -> None:
 
 
 def test_nothing_depends_on_what_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsfluent.pipeline.texture import fusion
+    from gsfluent.pipeline.texture import polish as fusion
 
     means, where = lattice(), planes(3)
     targets = [pattern(torch.rand(*p.shape, 3) * 8) for p in where]
@@ -158,8 +158,8 @@ def test_gpu_gives_the_colours_of_the_cpu() -> None:
 
 def test_polish_brings_coarse_gaussians_nearer_to_the_slices() -> None:
     """Gaussians at twice the voxels: cuts through them show the volume better than sampled ones."""
-    from gsfluent.pipeline.texture.domain import InteriorDomain, InteriorTexture
     from gsfluent.pipeline.texture.polish import polish_colors
+    from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
     grid = torch.stack(torch.meshgrid(*[torch.arange(24)] * 3, indexing="ij"), -1) + 0.5
     depth = (11.0 - (grid - 12).norm(dim=-1)).clamp(min=0).numpy()

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.domain import InteriorDomain
-from gsfluent.pipeline.texture.inpaint import (
+from gsfluent.pipeline.texture.inpaint.inpainter import MaskedInpainter, SliceContext
+from gsfluent.pipeline.texture.inpaint.levels import coarse_domain, fuse_stacks, slice_positions
+from gsfluent.pipeline.texture.inpaint.method import (
     InpaintOptions,
     SliceStore,
     inpaint_plan,
     inpaint_volume,
     make_inpainter,
 )
-from gsfluent.pipeline.texture.inpaint_levels import coarse_domain, fuse_stacks, slice_positions
-from gsfluent.pipeline.texture.inpainter import MaskedInpainter, SliceContext
-from gsfluent.pipeline.texture.photo import Exemplar, load_exemplar
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
 
 def ball(size: int = 20) -> InteriorDomain:
@@ -295,7 +295,7 @@ def test_a_program_does_the_first_pass(tmp_path: Path) -> None:
 
     from test_inpainter_contract import program
 
-    from gsfluent.pipeline.texture.inpaint import diffusion_texture
+    from gsfluent.pipeline.texture.inpaint.method import diffusion_texture
 
     options = InpaintOptions(
         backend="telea", coarse="command", command=program(tmp_path), window=4, overlap=1,

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.texture.inpaint_command import CommandInpainter
-from gsfluent.pipeline.texture.inpaint_local import (
+from gsfluent.pipeline.texture.inpaint.command import CommandInpainter
+from gsfluent.pipeline.texture.inpaint.inpainter import Inpainter, SliceContext
+from gsfluent.pipeline.texture.inpaint.local import (
     ColorDiffusionInpainter,
     ExemplarInpainter,
     TeleaInpainter,
 )
-from gsfluent.pipeline.texture.inpaint_options import InpaintOptions
-from gsfluent.pipeline.texture.inpaint_tiles import TiledInpainter
-from gsfluent.pipeline.texture.inpainter import Inpainter, SliceContext
-from gsfluent.pipeline.texture.photo import Exemplar, load_exemplar
+from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
+from gsfluent.pipeline.texture.inpaint.tiles import TiledInpainter
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
 
 # fills holes with a colour made of the seed and the reference; counts its runs in a file
 PROGRAM = """
@@ -63,7 +63,7 @@ def program(folder: Path) -> str:
 
 
 def diffusers(folder: Path, model: Path) -> Inpainter:
-    from gsfluent.pipeline.texture.diffusers_adapter import DiffusersInpainter
+    from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter
 
     return DiffusersInpainter(model, InpaintOptions(size=64, steps=2, device="cpu"))
 

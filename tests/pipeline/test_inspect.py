@@ -14,11 +14,17 @@ from gsfluent import geometry
 from gsfluent.config import Select, Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.inspect.capture import inspect
 from gsfluent.io import load_capture, load_image, load_splats, save_image
-from gsfluent.pipeline.inspect import inspect
-from gsfluent.pipeline.inspect_shape import cluster, lone_points, robust_box, thin_parts
-from gsfluent.pipeline.orient import camera_up, look_at_point, make_frame, orient, support_plane
-from gsfluent.pipeline.select import select_mask
+from gsfluent.pipeline.capture.orient import (
+    camera_up,
+    look_at_point,
+    make_frame,
+    orient,
+    support_plane,
+)
+from gsfluent.spatial.shape import cluster, lone_points, robust_box, thin_parts
+from gsfluent.stages.select import select_mask
 
 
 def ball(

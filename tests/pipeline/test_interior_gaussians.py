@@ -11,15 +11,15 @@ import torch
 
 from gsfluent import demo
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Gaussians, Solid
+from gsfluent.draw import draw
 from gsfluent.io import load_capture
 from gsfluent.io.images import load_view
-from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.fill_colors import keep_skin, skin_colors, stray_splats
-from gsfluent.pipeline.fill_interior import INTERIOR_OPACITY, interior_gaussians
-from gsfluent.pipeline.fill_pieces import hilbert_code, small_pieces
-from gsfluent.pipeline.fill_refine import refine_opacity, witness
-from gsfluent.pipeline.fill_view import cut_view
+from gsfluent.pipeline.fill.interior import INTERIOR_OPACITY, interior_gaussians
+from gsfluent.pipeline.fill.refine import refine_opacity, witness
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.render.cuts import cut_view
+from gsfluent.pipeline.solid.colors import keep_skin, skin_colors, stray_splats
+from gsfluent.spatial.pieces import hilbert_code, small_pieces
 
 SIZE = 40
 RADIUS = 15.0

@@ -11,15 +11,15 @@ from interior_shapes import ellipsoid_shell
 from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
-from gsfluent.pipeline.isolate_views import (
+from gsfluent.pipeline.capture.hull import visual_hull
+from gsfluent.pipeline.capture.views import TrainView, cropped
+from gsfluent.pipeline.reconstruct.evaluate import render_view
+from gsfluent.pipeline.reconstruct.masks import (
     agreed_hull,
     hull_silhouette,
     object_views,
     seen_background,
 )
-from gsfluent.pipeline.reconstruct_evaluate import render_view
-from gsfluent.pipeline.reconstruct_init import visual_hull
-from gsfluent.pipeline.reconstruct_views import TrainView, cropped
 
 SIZE = 56
 GREEN = torch.tensor([0.1, 0.6, 0.2])

@@ -17,17 +17,17 @@ from torch.nn.functional import normalize
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.lab import light_truth as truth
-from gsfluent.pipeline import environment
-from gsfluent.pipeline.bake import bake_light
-from gsfluent.pipeline.delight import Delit, delight, estimate_shading
-from gsfluent.pipeline.light import Lamp, Light, Lighting, lighting_of, pack_lamps, to_linear
-from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
-from gsfluent.pipeline.light_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.shade import irradiance
-from gsfluent.pipeline.shade_shadow import transmittance
+from gsfluent.lab.truth import light as truth
+from gsfluent.pipeline.light import environment
+from gsfluent.pipeline.light.bake import bake_light
+from gsfluent.pipeline.light.delight import Delit, delight, estimate_shading
+from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of
+from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, lighting_of, pack_lamps, to_linear
+from gsfluent.pipeline.light.shade import irradiance
+from gsfluent.pipeline.light.shadow import transmittance
+from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
 
 BALL = truth.Ball((0.0, 0.0, 0.0), 0.1)
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from gsfluent.data import Camera
-from gsfluent.lab import light_truth as truth
-from gsfluent.pipeline.light import Lamp, Lighting, to_linear
-from gsfluent.pipeline.render import Render
+from gsfluent.lab.truth import light as truth
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, to_linear
+from gsfluent.pipeline.render.stage import Render
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))

@@ -10,13 +10,13 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.errors import InputError
-from gsfluent.pipeline.live import MOST_LOOSE, LiveSession
-from gsfluent.pipeline.run_simulate import saved
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_grow import copy_of, grow, shrink
-from gsfluent.pipeline.simulate_health import figures_of
-from gsfluent.pipeline.simulate_strays import find_lonely
-from gsfluent.scene import Scene
+from gsfluent.live.session import MOST_LOOSE, LiveSession
+from gsfluent.pipeline.simulate.grow import copy_of, grow, shrink
+from gsfluent.pipeline.simulate.health import figures_of
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.pipeline.simulate.strays import find_lonely
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import saved
 
 DX = 0.0125
 SOFT = materials.elastic.override(young_modulus=2e4)

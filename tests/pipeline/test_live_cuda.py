@@ -6,10 +6,10 @@ import pytest
 import torch
 from simulation_shapes import ellipsoid
 
-from gsfluent.pipeline.live import LiveSession
-from gsfluent.pipeline.live_player import LivePlayer
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.live.player import LivePlayer
+from gsfluent.live.session import LiveSession
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 pytestmark = pytest.mark.cuda
 DX = 0.0125

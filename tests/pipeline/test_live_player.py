@@ -11,15 +11,15 @@ from simulation_shapes import ellipsoid
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline import live_player
-from gsfluent.pipeline.live import LiveSession
-from gsfluent.pipeline.live_player import AT_REST, FAILED, RUNNING, LivePlayer
-from gsfluent.pipeline.live_scene import open_stage
-from gsfluent.pipeline.run_frames import count_frames, load_frame
-from gsfluent.pipeline.run_show import shot_of
-from gsfluent.pipeline.run_simulate import build_scene
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.live import player as live_player
+from gsfluent.live.player import AT_REST, FAILED, RUNNING, LivePlayer
+from gsfluent.live.scene import open_stage
+from gsfluent.live.session import LiveSession
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.results.frames import count_frames, load_frame
+from gsfluent.results.record import shot_of
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import build_scene
 
 DX = 0.0125
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.pipeline.neighbours import grid_search, nearest
+from gsfluent.spatial.neighbours import grid_search, nearest
 
 
 def _cloud(kind: str) -> tuple[torch.Tensor, np.ndarray]:

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from gsfluent.pipeline import plan_cost
-from gsfluent.pipeline.plan_cost import Cost, CostModel, law_set, machine_key, model_path, stepping
-from gsfluent.pipeline.plan_fit import Sample, fit
+from gsfluent.plan import cost as plan_cost
+from gsfluent.plan.cost import Cost, CostModel, law_set, machine_key, model_path, stepping
+from gsfluent.plan.fit import Sample, fit
 
 
 def model(**keys: Any) -> CostModel:

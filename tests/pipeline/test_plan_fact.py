@@ -11,12 +11,12 @@ from simulation_shapes import ellipsoid
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
-from gsfluent.io.splats import save_splats
-from gsfluent.pipeline import plan_probe
-from gsfluent.pipeline.plan import cost_model, plan_shot
-from gsfluent.pipeline.plan_cost import CostModel, machine_key
-from gsfluent.pipeline.plan_fact import actual_work, compare, learn
-from gsfluent.pipeline.run import run_shot
+from gsfluent.io.splats.load import save_splats
+from gsfluent.plan import probe as plan_probe
+from gsfluent.plan.cost import CostModel, machine_key
+from gsfluent.plan.fact import actual_work, compare, learn
+from gsfluent.plan.plan import cost_model, plan_shot
+from gsfluent.run.shot import run_shot
 
 
 def model() -> CostModel:

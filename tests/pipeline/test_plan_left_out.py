@@ -12,11 +12,11 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.config import Shot
-from gsfluent.io.splats import save_splats
-from gsfluent.pipeline.plan_motion import foresee
-from gsfluent.pipeline.plan_passes import passes_of
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.io.splats.load import save_splats
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.plan.motion import foresee
+from gsfluent.plan.work import passes_of
+from gsfluent.scene.scene import Scene
 
 APPLE = materials.fruit.apple.override(variation=0.0)
 DX = 0.0125

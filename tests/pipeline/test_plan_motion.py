@@ -10,7 +10,9 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.errors import InputError
-from gsfluent.pipeline.plan_bounds import (
+from gsfluent.pipeline.simulate.groups import LANDING
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.plan.bounds import (
     PIECE_CELLS,
     THIN_CELLS,
     bounds_of,
@@ -19,10 +21,8 @@ from gsfluent.pipeline.plan_bounds import (
     fragment_size,
     thickness,
 )
-from gsfluent.pipeline.plan_motion import foresee
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_groups import LANDING
-from gsfluent.scene import Scene
+from gsfluent.plan.motion import foresee
+from gsfluent.scene.scene import Scene
 
 APPLE = materials.fruit.apple.override(variation=0.0)
 DX = 0.01

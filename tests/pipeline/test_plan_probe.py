@@ -11,12 +11,12 @@ from gsfluent import materials
 from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
-from gsfluent.pipeline import plan_probe
-from gsfluent.pipeline.inspect_hull import hull_grid, masked_views
-from gsfluent.pipeline.orient import look_at_point
-from gsfluent.pipeline.plan_fit import Sample
-from gsfluent.pipeline.plan_probe import draw_capture
-from gsfluent.pipeline.plan_probe_solver import _STEPS, _measure, ball
+from gsfluent.pipeline.capture.coarse_hull import hull_grid, masked_views
+from gsfluent.pipeline.capture.orient import look_at_point
+from gsfluent.plan import probe as plan_probe
+from gsfluent.plan.fit import Sample
+from gsfluent.plan.probe import draw_capture
+from gsfluent.plan.probe_parts import _STEPS, _measure, ball
 
 
 def test_the_drawn_photographs_fit_their_cameras(tmp_path: Path) -> None:

@@ -11,11 +11,12 @@ from gsfluent import demo
 from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import load_capture, save_image
-from gsfluent.pipeline.isolate import Isolate, find_plane
-from gsfluent.pipeline.reconstruct import Reconstruct
-from gsfluent.pipeline.reconstruct_init import focus_point, hull_gaussians, visual_hull
-from gsfluent.pipeline.reconstruct_masks import refined_mask
-from gsfluent.pipeline.reconstruct_views import halved, read_views
+from gsfluent.pipeline.capture.hull import focus_point, visual_hull
+from gsfluent.pipeline.capture.views import halved, read_views
+from gsfluent.pipeline.reconstruct.init import hull_gaussians
+from gsfluent.pipeline.reconstruct.isolate import Isolate, find_plane
+from gsfluent.pipeline.reconstruct.masks import refined_mask
+from gsfluent.pipeline.reconstruct.stage import Reconstruct
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +233,7 @@ def test_a_diverged_loss_names_the_step(capture: Capture, monkeypatch: pytest.Mo
     def broken(model: object) -> torch.Tensor:
         return torch.tensor(float("nan"))
 
-    monkeypatch.setattr("gsfluent.pipeline.reconstruct_train.shape_loss", broken)
+    monkeypatch.setattr("gsfluent.pipeline.reconstruct.train.shape_loss", broken)
     with pytest.raises(RunError, match="loss became nan at step 0"):
         stage(capture)
 

@@ -15,8 +15,8 @@ from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture, load_image
 from gsfluent.metrics import psnr
-from gsfluent.pipeline.reconstruct import Reconstruct
-from gsfluent.pipeline.reconstruct_density import (
+from gsfluent.pipeline.capture.views import TrainView
+from gsfluent.pipeline.reconstruct.density import (
     Adc,
     Mcmc,
     Place,
@@ -28,12 +28,11 @@ from gsfluent.pipeline.reconstruct_density import (
     reset_opacities,
     shared_out,
 )
-from gsfluent.pipeline.reconstruct_error import ErrorTarget, attributed
-from gsfluent.pipeline.reconstruct_exposure import Exposure
-from gsfluent.pipeline.reconstruct_model import SplatModel
-from gsfluent.pipeline.reconstruct_recipe import LONG, QUICK, LearningRates, recipe_for
-from gsfluent.pipeline.reconstruct_report import write_report
-from gsfluent.pipeline.reconstruct_views import TrainView
+from gsfluent.pipeline.reconstruct.evaluate import write_report
+from gsfluent.pipeline.reconstruct.model import Exposure, SplatModel
+from gsfluent.pipeline.reconstruct.recipe import LONG, QUICK, LearningRates, recipe_for
+from gsfluent.pipeline.reconstruct.stage import Reconstruct
+from gsfluent.pipeline.reconstruct.target import ErrorTarget, attributed
 
 SIZE = 48
 

@@ -15,20 +15,20 @@ from region_scene import ball_solid, capture_of, label_map, ring
 from gsfluent.cli import main
 from gsfluent.config import Shot
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
+from gsfluent.data.regions import with_inclusions
 from gsfluent.errors import InputError
+from gsfluent.inspect.parts import body_parts, solid_regions
+from gsfluent.inspect.parts_picture import part_colors, save_parts_picture
 from gsfluent.io.solid import save_solid
-from gsfluent.pipeline.inspect_parts import body_parts, solid_regions
-from gsfluent.pipeline.inspect_parts_picture import part_colors, save_parts_picture
-from gsfluent.pipeline.particles import build_matter, grid_spacing
-from gsfluent.pipeline.regions import label_regions
-from gsfluent.pipeline.regions_table import with_inclusions
-from gsfluent.pipeline.run_context import RunContext
-from gsfluent.pipeline.run_record import RunRecord
-from gsfluent.pipeline.run_regions import load_solids, regions_stage
-from gsfluent.pipeline.run_store import StageStore
-from gsfluent.pipeline.simulate import Simulate
+from gsfluent.pipeline.matter.points import build_matter, grid_spacing
+from gsfluent.pipeline.regions.project import label_regions
+from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.progress import LineReporter
-from gsfluent.scene import Scene
+from gsfluent.results.record import RunRecord
+from gsfluent.results.store import StageStore
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.context import RunContext
+from gsfluent.stages.solids import load_solids, regions_stage
 
 
 def stripes(path: Path) -> Path:

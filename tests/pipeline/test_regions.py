@@ -22,16 +22,16 @@ from region_scene import (
 
 from gsfluent import geometry
 from gsfluent.data import Frame, Solid
+from gsfluent.data.regions import FIRST_LABEL, region_mask
 from gsfluent.errors import InputError
-from gsfluent.io.segmentation import LabelView, Segmentation
+from gsfluent.io.segmentation.masks import LabelView, Segmentation
 from gsfluent.io.solid import load_solid, save_solid
-from gsfluent.pipeline.particles import build_matter, grid_spacing
-from gsfluent.pipeline.regions import label_regions, project_labels
-from gsfluent.pipeline.regions_associate import associate
-from gsfluent.pipeline.regions_image import image_labels
-from gsfluent.pipeline.regions_table import FIRST_LABEL, region_mask
-from gsfluent.pipeline.regions_vote import find_skin, label_votes
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.points import build_matter, grid_spacing
+from gsfluent.pipeline.regions.associate import associate
+from gsfluent.pipeline.regions.image import image_labels
+from gsfluent.pipeline.regions.project import label_regions, project_labels
+from gsfluent.pipeline.regions.vote import find_skin, label_votes
+from gsfluent.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def write_masks(folder: Path, cameras: list, number: int | None = None) -> Path:
 def test_votes_are_the_pixels_each_splat_makes_up(solid: Solid) -> None:
     # every label's pixels, blended: the votes of all splats for a label sum to the label's
     # covered pixels, which the accumulated opacity counts
-    from gsfluent.pipeline.draw import draw
+    from gsfluent.draw import draw
 
     skin, camera = find_skin(solid), ring(1)[0]
     labels = label_map(camera)

@@ -12,16 +12,16 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import Lamp, Light, Lighting, pack_lamps, to_display, to_linear
-from gsfluent.pipeline.light_maps import bulk, shadow_maps
-from gsfluent.pipeline.occlusion import ambient_occlusion
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_camera import Action, cameras_for, orbit
-from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.render_holes import hole_fraction
-from gsfluent.pipeline.render_normals import estimate_normals, grid_for, splat_normals
-from gsfluent.pipeline.shade import shade_points, surface_points
-from gsfluent.pipeline.shade_shadow import transmittance
+from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, pack_lamps, to_display, to_linear
+from gsfluent.pipeline.light.normals import estimate_normals, grid_for, splat_normals
+from gsfluent.pipeline.light.occlusion import ambient_occlusion
+from gsfluent.pipeline.light.shade import shade_points, surface_points
+from gsfluent.pipeline.light.shadow import transmittance
+from gsfluent.pipeline.light.shadow_maps import bulk, shadow_maps
+from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
+from gsfluent.pipeline.render.holes import hole_fraction
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
 
 SIZE = 96
 

@@ -9,11 +9,11 @@ import torch
 
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
-from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.flicker import Flow, flicker
-from gsfluent.pipeline.render_figures import FilmFigures, RawCarry, cameras_around
-from gsfluent.pipeline.render_holes import REACH, RIM, Holes, MatterView, hole_fraction
-from gsfluent.pipeline.run_frames import SavedFrame
+from gsfluent.draw import draw
+from gsfluent.pipeline.render.figures import FilmFigures, RawCarry, cameras_around
+from gsfluent.pipeline.render.flicker import Flow, flicker
+from gsfluent.pipeline.render.holes import REACH, RIM, Holes, MatterView, hole_fraction
+from gsfluent.results.frames import SavedFrame
 
 STEP = 0.01
 WIDE = 0.3  # metres across the picture

@@ -8,10 +8,10 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import geometry, materials
 from gsfluent.data import INTERIOR, TRANSITION, Frame
-from gsfluent.pipeline.carry import STRETCH, Carry
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.repair import Repair
-from gsfluent.scene import Scene
+from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.matter.carry import STRETCH, Carry
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.scene.scene import Scene
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 from gsfluent.cli import main
 from gsfluent.errors import InputError
 from gsfluent.figure.series import Panel, curves
-from gsfluent.pipeline.report import read_run, report_page, write_report
+from gsfluent.run.report import read_run, report_page, write_report
 
 
 def record(**more: Any) -> dict[str, Any]:

@@ -13,13 +13,13 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials, ops
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
-from gsfluent.pipeline.mesh_distance import mesh_body
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.rigid import RigidSet
-from gsfluent.pipeline.run_simulate import saved
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_run import Run
-from gsfluent.scene import Scene
+from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.run import Run
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
+from gsfluent.spatial.mesh_distance import mesh_body
+from gsfluent.stages.simulate import saved
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 DX = 0.05

@@ -13,10 +13,10 @@ import torch
 
 from gsfluent.data import INTERIOR, TRANSITION, Gaussians
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.run_frames import SavedFrame, count_frames, load_frame, save_frame
-from gsfluent.pipeline.run_record import RunRecord
-from gsfluent.pipeline.run_store import StageStore, content_digest, fingerprint, publish
-from gsfluent.pipeline.video import to_bytes, write_video
+from gsfluent.pipeline.render.video import to_bytes, write_video
+from gsfluent.results.frames import SavedFrame, count_frames, load_frame, save_frame
+from gsfluent.results.record import RunRecord
+from gsfluent.results.store import StageStore, content_digest, fingerprint, publish
 
 
 def test_fingerprint_sees_every_part() -> None:

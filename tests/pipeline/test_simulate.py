@@ -12,8 +12,8 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 

@@ -10,9 +10,9 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.data import Frame
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.simulate_run import Run
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.run import Run
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 DX = 0.05

@@ -12,9 +12,9 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import has_cuda, materials
 from gsfluent.errors import InputError
-from gsfluent.pipeline.run_simulate import saved
-from gsfluent.pipeline.simulate import Simulate, SimulationFrame
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import saved
 
 pytestmark = [
     pytest.mark.cuda,

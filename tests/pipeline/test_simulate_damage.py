@@ -10,8 +10,8 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.ops.solver_state import UNBROKEN
-from gsfluent.pipeline.simulate import Simulate, SimulationFrame
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.scene.scene import Scene
 
 METAL = materials.get("aluminium").override(young_modulus=1e6, yield_stress=2e4)
 SOFT = {

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from gsfluent import materials
 from gsfluent.data import Frame
-from gsfluent.pipeline.fragments import find_fragments, rest_links
-from gsfluent.pipeline.particles import Matter, build_matter
-from gsfluent.pipeline.simulate_fields import breakable, number_fields, units
-from gsfluent.pipeline.simulate_run import Run
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.fields import breakable, number_fields, units
+from gsfluent.pipeline.matter.fragments import find_fragments, rest_links
+from gsfluent.pipeline.matter.points import Matter, build_matter
+from gsfluent.pipeline.simulate.run import Run
+from gsfluent.scene.scene import Scene
 
 DX = 0.02
 APPLE = materials.fruit.apple.override(variation=0.0)

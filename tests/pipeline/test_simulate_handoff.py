@@ -10,15 +10,14 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.data import Frame
-from gsfluent.pipeline.particles import Matter, build_matter
-from gsfluent.pipeline.rigid import RigidSet
-from gsfluent.pipeline.simulate_figures import Figures
-from gsfluent.pipeline.simulate_flight import Flight
-from gsfluent.pipeline.simulate_groups import CALM_FRAMES, Leaving
-from gsfluent.pipeline.simulate_health import figures_of
-from gsfluent.pipeline.simulate_state import State
-from gsfluent.pipeline.simulate_step import Stepper
-from gsfluent.scene import Scene
+from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.matter.points import Matter, build_matter
+from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.simulate.flight import Flight
+from gsfluent.pipeline.simulate.groups import CALM_FRAMES, Leaving
+from gsfluent.pipeline.simulate.health import Figures, figures_of
+from gsfluent.pipeline.simulate.step import Stepper
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 GRAVITY = (0.5, 0.0, -9.81)

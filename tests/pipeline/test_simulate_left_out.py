@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gsfluent import materials, ops
 from gsfluent.ops.reference import plasticity
-from gsfluent.pipeline.simulate import Simulate, SimulationFrame
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.scene.scene import Scene
 
 APPLE = materials.fruit.apple.override(variation=0.0)
 DX = 0.02

@@ -8,8 +8,8 @@ import pytest
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ import pytest
 import torch
 from simulation_scenes import near_miss, resting
 
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 FIELDS = ("position", "velocity", "affine", "strain", "alpha", "deformation")
 

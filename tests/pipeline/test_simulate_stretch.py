@@ -8,11 +8,11 @@ import pytest
 import torch
 from simulation_shapes import ellipsoid
 
-from gsfluent.pipeline.carry import STRETCH
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.simulate_state import State
-from gsfluent.pipeline.simulate_stretch import LARGE, WILD, bounded, tamed
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.carry import STRETCH
+from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.simulate.run import LARGE, WILD, bounded, tamed
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 
 def scene() -> Scene:

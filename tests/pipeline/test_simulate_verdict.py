@@ -14,12 +14,12 @@ from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.ops.solver import Solver, SolverError
 from gsfluent.ops.solver_buffers import SITE_FIELDS
-from gsfluent.pipeline import simulate_run
-from gsfluent.pipeline.simulate import Simulate, SimulationFrame
-from gsfluent.pipeline.simulate_health import CHECK_EVERY
-from gsfluent.pipeline.simulate_run import Run
-from gsfluent.pipeline.simulate_state import State
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.simulate import run as simulate_run
+from gsfluent.pipeline.simulate.health import CHECK_EVERY
+from gsfluent.pipeline.simulate.run import Run
+from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 FPS, SECONDS = 20.0, 0.3

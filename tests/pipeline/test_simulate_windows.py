@@ -12,10 +12,10 @@ from gsfluent import materials
 from gsfluent.config import Shot
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.run_simulate import build_scene
-from gsfluent.pipeline.simulate_run import Run
-from gsfluent.scene import Scene
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.run import Run
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import build_scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 DX = 0.05
@@ -61,7 +61,7 @@ def test_a_moving_box_moves_only_while_it_is_there() -> None:
 
 
 def test_a_thing_that_is_not_shown_has_no_surface_and_a_heavy_one_cannot_vanish() -> None:
-    from gsfluent.pipeline.rigid import RigidSet
+    from gsfluent.pipeline.colliders.rigid import RigidSet
 
     scene = Scene()
     scene.add_collider("box", size=(0.4, 0.4, 0.4), shown=False)
@@ -109,7 +109,7 @@ def test_slow_motion_plays_slower_and_paths_take_environment_variables(
 
 
 def test_a_blade_is_drawn_behind_its_edge_and_goes_back_the_way_it_came() -> None:
-    from gsfluent.pipeline.rigid_splats import blade_splats
+    from gsfluent.pipeline.colliders.splats import blade_splats
 
     scene = Scene()
     assert blade_splats(scene, 0.0) is None

@@ -19,14 +19,14 @@ from gsfluent.cli import main
 from gsfluent.data import BACKGROUND, SURFACE, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
-from gsfluent.io.splats import save_splats
-from gsfluent.pipeline.mesh_distance import load_mesh
-from gsfluent.pipeline.solid_field import SignedDistance, distances_of
-from gsfluent.pipeline.solid_mesh import closed_mesh, mesh_to, save_mesh
-from gsfluent.pipeline.solid_skin import match_outline
-from gsfluent.pipeline.solid_source import find_solid
-from gsfluent.pipeline.solid_thin import thin_shells, wall_thickness
-from gsfluent.pipeline.solid_tsdf import ring_of_cameras, zoomed
+from gsfluent.io.splats.load import save_splats
+from gsfluent.pipeline.solid.field import SignedDistance, distances_of
+from gsfluent.pipeline.solid.mesh import closed_mesh, mesh_to, save_mesh
+from gsfluent.pipeline.solid.outline import match_outline
+from gsfluent.pipeline.solid.source import find_solid
+from gsfluent.pipeline.solid.tsdf import ring_of_cameras, zoomed
+from gsfluent.pipeline.solid.walls import thin_shells, wall_thickness
+from gsfluent.spatial.mesh_distance import load_mesh
 
 
 def discs(mesh: trimesh.Trimesh, count: int = 30_000) -> Gaussians:

@@ -11,8 +11,8 @@ from interior_shapes import ellipsoid_shell
 from gsfluent import ops
 from gsfluent.data import BACKGROUND, SURFACE, Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.reconstruct_init import Hull
-from gsfluent.pipeline.solid_clean import REASONS, CleanLimits, clean_floaters
+from gsfluent.pipeline.capture.hull import Hull
+from gsfluent.pipeline.reconstruct.floaters import REASONS, CleanLimits, clean_floaters
 
 
 def ring(count: int = 12, distance: float = 4.0, size: int = 96) -> list[Camera]:

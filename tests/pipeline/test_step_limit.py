@@ -8,9 +8,9 @@ import pytest
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials
+from gsfluent.choose.choose import loose_limit, safe_steps
 from gsfluent.materials import Material
-from gsfluent.pipeline.step_limit import loose_limit, safe_steps
-from gsfluent.scene import Scene
+from gsfluent.scene.scene import Scene
 
 
 def scene(*matter: Material) -> Scene:

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from gsfluent.data import INTERIOR, SURFACE, Solid
 from gsfluent.errors import InputError
-from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.texture import (
     InteriorDomain,
     InteriorTexture,
@@ -21,17 +21,17 @@ from gsfluent.pipeline.texture import (
     load_exemplar,
     preset_names,
 )
-from gsfluent.pipeline.texture.domain import SHELL
-from gsfluent.pipeline.texture.inclusions import find_inclusions
-from gsfluent.pipeline.texture.metrics import (
+from gsfluent.pipeline.texture.photo.metrics import (
     depth_profile_error,
     lab_histogram_distance,
     neighbour_slice_ratio,
     patch_distance,
     volume_slices,
 )
-from gsfluent.pipeline.texture.procedural import procedural_texture
-from gsfluent.pipeline.texture.profile import match_colors
+from gsfluent.pipeline.texture.photo.profile import match_colors
+from gsfluent.pipeline.texture.presets.procedural import procedural_texture
+from gsfluent.pipeline.texture.synthesis.inclusions import find_inclusions
+from gsfluent.pipeline.texture.volume.domain import SHELL
 
 SIZE = 40
 
@@ -154,7 +154,7 @@ def test_same_seed_same_texture(melon: tuple[Solid, np.ndarray, InteriorTexture]
 
 
 def test_patch_synthesis_is_deterministic() -> None:
-    from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
+    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
 
     domain = _domain(24)
     photo = load_exemplars(_photo(domain, procedural_texture(domain, "watermelon", 0)))
@@ -163,7 +163,7 @@ def test_patch_synthesis_is_deterministic() -> None:
 
 
 def test_inclusions_are_found_counted_and_labelled() -> None:
-    from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
+    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
 
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:400, :400]
@@ -201,7 +201,7 @@ def _star_photo() -> np.ndarray:
 
 
 def test_axis_guide_keeps_the_star_across_the_axis() -> None:
-    from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
+    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
 
     domain = _domain(40)
     photo = load_exemplars(_star_photo())

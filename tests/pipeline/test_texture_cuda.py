@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.lab.interiors import known_interior
+from gsfluent.lab.truth.interiors import known_interior
 from gsfluent.pipeline import Texture
-from gsfluent.pipeline.fill_view import cut_view
-from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
+from gsfluent.pipeline.render.cuts import cut_view
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
 
 pytestmark = [
     pytest.mark.cuda,

@@ -13,9 +13,9 @@ from interior_shapes import ellipsoid_shell
 
 from gsfluent.data import Solid
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.fill import Fill
+from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.texture import Texture
-from gsfluent.pipeline.texture.diffusers_adapter import DiffusersInpainter, InpaintOptions
+from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter, InpaintOptions
 
 pytest.importorskip("diffusers")
 pytest.importorskip("transformers")

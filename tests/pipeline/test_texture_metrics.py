@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from gsfluent.pipeline.texture.domain import SHELL, InteriorDomain
-from gsfluent.pipeline.texture.metrics import (
+from gsfluent.pipeline.texture.photo.exemplar import rgb_to_lab
+from gsfluent.pipeline.texture.photo.metrics import (
     Slice,
     depth_profile_difference,
     draw_patches,
@@ -23,7 +23,7 @@ from gsfluent.pipeline.texture.metrics import (
     sharpness,
     volume_slices,
 )
-from gsfluent.pipeline.texture.photo import rgb_to_lab
+from gsfluent.pipeline.texture.volume.domain import SHELL, InteriorDomain
 
 SIZE = 48
 

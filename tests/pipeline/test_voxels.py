@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.pipeline.fill_inside import DIRECTIONS, _blocked, blocked_by_doubling
-from gsfluent.pipeline.voxels import _separable, distance_transform, nearest_empty
+from gsfluent.pipeline.solid.inside import DIRECTIONS, _blocked, blocked_by_doubling
+from gsfluent.spatial.voxels import _separable, distance_transform, nearest_empty
 
 SHAPES = [(7, 9, 5), (30, 41, 22), (1, 1, 17), (64, 3, 3)]
 

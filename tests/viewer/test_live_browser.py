@@ -19,12 +19,12 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from test_viewer_browser import FLAGS, greens, reds, until
 
-from gsfluent.pipeline.live import LiveSession
-from gsfluent.pipeline.live_player import AT_REST, RUNNING, LivePlayer
-from gsfluent.pipeline.live_scene import open_stage
+from gsfluent.live.player import AT_REST, RUNNING, LivePlayer
+from gsfluent.live.scene import open_stage
+from gsfluent.live.session import LiveSession
 from gsfluent.viewer.app import App
-from gsfluent.viewer.live_source import LiveSource
-from gsfluent.viewer.poke import PokePanel
+from gsfluent.viewer.model.live_source import LiveSource
+from gsfluent.viewer.panels.poke import PokePanel
 
 
 @pytest.fixture(scope="module")

@@ -18,12 +18,12 @@ from gsfluent.cli import main
 from gsfluent.data import SURFACE
 from gsfluent.errors import InputError, RunError
 from gsfluent.io.solid import save_solid
-from gsfluent.pipeline.run_frames import frame_path, save_frame
-from gsfluent.viewer.color import splat_colors
-from gsfluent.viewer.look import BODY
+from gsfluent.results.frames import frame_path, save_frame
+from gsfluent.viewer.model.color import splat_colors
+from gsfluent.viewer.model.look import BODY
+from gsfluent.viewer.model.source import RunSource
+from gsfluent.viewer.model.timeline import Timeline
 from gsfluent.viewer.server import free_port
-from gsfluent.viewer.source import RunSource
-from gsfluent.viewer.timeline import Timeline
 
 CPU = torch.device("cpu")
 

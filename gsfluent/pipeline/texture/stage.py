@@ -12,27 +12,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from gsfluent.data.regions import with_inclusions
 from gsfluent.errors import InputError
-
-from ..regions_table import with_inclusions
-from ..stage import Progress, Stage, report_progress
-from .baselines import color_copy, telea_slices
-from .domain import InteriorDomain, InteriorTexture, blend_skin
-from .exemplar import QUALITIES, exemplar_texture, load_exemplars
-from .inpaint_options import InpaintOptions
-from .metrics import (
+from gsfluent.pipeline.stage import Stage
+from gsfluent.pipeline.texture.baselines import color_copy, telea_slices
+from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
+from gsfluent.pipeline.texture.photo.exemplar import (
+    Exemplar,
+    PhotoOptions,
+    open_exemplars,
+    with_skin,
+)
+from gsfluent.pipeline.texture.photo.metrics import (
     depth_profile_error,
     lab_histogram_distance,
     neighbour_slice_ratio,
     patch_distance,
     volume_slices,
 )
-from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
-from .procedural import PRESETS, preset_names, procedural_texture
-from .profile import surface_profile
-from .structure import take_apart, with_structure
-from .sweep import CUTS
-from .unseen_skin import mend_unseen_skin
+from gsfluent.pipeline.texture.photo.profile import surface_profile
+from gsfluent.pipeline.texture.presets.procedural import PRESETS, preset_names, procedural_texture
+from gsfluent.pipeline.texture.structure import take_apart, with_structure
+from gsfluent.pipeline.texture.sweep import CUTS
+from gsfluent.pipeline.texture.synthesis.method import QUALITIES, exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.unseen_skin import mend_unseen_skin
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, blend_skin
+from gsfluent.progress import Progress, report_progress
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
@@ -242,7 +247,7 @@ class Texture(Stage):
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
         # brings the compiled renderer with it, which texturing itself does without
-        from ..fill_colors import keep_skin
+        from gsfluent.pipeline.solid.colors import keep_skin
 
         colored = keep_skin(solid, colored)
         report = self._report(domain, texture, shown) | polished
@@ -290,7 +295,7 @@ class Texture(Stage):
         if self.method == "telea":
             return telea_slices(domain)
         if self.method in ("diffusion", "inpaint"):
-            from .inpaint import diffusion_texture
+            from gsfluent.pipeline.texture.inpaint.method import diffusion_texture
 
             return diffusion_texture(
                 domain,
@@ -364,7 +369,7 @@ def _color_interior(
     color = texture.sample(place, domain.inside)
     report: dict[str, Any] = {}
     if polish:
-        from .polish import polish_colors
+        from gsfluent.pipeline.texture.polish import polish_colors
 
         color, figures = polish_colors(
             domain, texture.rgb, place, color, device=solid.occupancy.device

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from gsfluent.errors import InputError
-
-from .domain import InteriorDomain, InteriorTexture, smoothstep
-from .photo import Exemplar, rgb_to_lab
-from .sweep import Sweep, outline
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.pipeline.texture.sweep import Sweep, outline
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, smoothstep
 
 __all__ = ["Structure", "impose_structure", "split_structure", "take_apart", "with_structure"]
 
@@ -127,7 +126,7 @@ def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float
     """The photograph with ``hole`` painted in given Lab colours and the grain from beside it."""
     from scipy import ndimage
 
-    from .photo_color import lab_to_rgb
+    from gsfluent.pipeline.texture.volume.color import lab_to_rgb
 
     if not hole.any():
         return photo

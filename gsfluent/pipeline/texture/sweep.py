@@ -17,9 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 from gsfluent.errors import InputError
-
-from .domain import axis_frame
-from .noise import value_noise
+from gsfluent.pipeline.texture.volume.domain import axis_frame
+from gsfluent.pipeline.texture.volume.noise import value_noise
 
 __all__ = ["CUTS", "Sweep", "outline"]
 
