@@ -20,7 +20,7 @@ from gsfluent.pipeline.texture.volume.domain import InteriorTexture
 pytest.importorskip("diffusers")
 pytest.importorskip("transformers")
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 OPTIONS = InpaintOptions(slices=5, refine=(0.3,), size=64, steps=2, dtype="float32")
 

@@ -231,7 +231,7 @@ def run(folder: Path, die_at: int, store: bool = True) -> Any:
 def test_killed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     def start(die_at: int) -> int:
         words = [sys.executable, "-c", SCRIPT, str(Path(__file__).parent), str(tmp_path)]
-        root = Path(__file__).resolve().parents[2]
+        root = Path(__file__).resolve().parents[3]
         done = subprocess.run([*words, str(die_at)], cwd=root, capture_output=True, text=True)
         assert done.returncode in (0, -signal.SIGKILL), done.stderr
         return done.returncode

@@ -3,7 +3,7 @@
 What gsfluent leaves out, sorts or reuses (docs/solver.md, docs/solver_cpu.md, docs/simulation.md),
 by name: a case with a known answer is run with the measure and without it, and the two errors may
 differ by at most 1 % of the case's tolerance (``solver.md`` section 6). Where the pages promise the
-same bits, the runs have the same bits. On a GPU: tests/charts/test_trades_nothing_cuda.py.
+same bits, the runs have the same bits. On a GPU: tests/lab/charts/test_trades_nothing_cuda.py.
 """
 
 from __future__ import annotations

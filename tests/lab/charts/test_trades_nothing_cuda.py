@@ -1,6 +1,6 @@
 """Measures that trade nothing on a GPU: with and without each, the error of a case is the same.
 
-As tests/charts/test_trades_nothing.py; here are the graph of a round of steps, the sums in fixed
+As ``test_trades_nothing.py`` beside it; here are the graph of a round of steps, the sums in fixed
 point and the sorting of points, which only a GPU has in this form.
 """
 

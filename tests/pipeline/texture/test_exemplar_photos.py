@@ -27,7 +27,7 @@ from gsfluent.pipeline.texture.photo.stain import remove_stain
 from gsfluent.pipeline.texture.volume.color import linear, srgb
 
 DATA = Path(
-    os.environ.get("GSFLUENT_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")
+    os.environ.get("GSFLUENT_DATA", Path(__file__).resolve().parents[4] / "shared" / "data")
 )
 EXEMPLARS = DATA / "exemplars"
 UNTOUCHED = PhotoOptions("auto", False, False, False, False, "none")

@@ -13,7 +13,7 @@ from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, to_linear
 from gsfluent.pipeline.render.stage import Render
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+SCRIPTS = Path(__file__).parents[3] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
 import light_accuracy  # noqa: E402
 
