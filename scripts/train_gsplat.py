@@ -38,6 +38,7 @@ from torch import Tensor
 import gsfluent as gf
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import GsfluentError, InputError
+from gsfluent.io import save_splats
 from gsfluent.metrics import psnr, ssim
 from gsfluent.pipeline.capture.hull import focus_point, visual_hull
 from gsfluent.pipeline.capture.views import read_views
@@ -308,7 +309,7 @@ def main(arguments: list[str] | None = None) -> int:
             capture, options.iterations, options.image_size, device, options.seed
         )
         if options.out is not None:
-            gaussians.to("cpu").save(options.out)
+            save_splats(gaussians.to("cpu"), options.out)
     except GsfluentError as error:
         sys.stderr.write(f"error: {error}\n")
         return 1

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsfluent.fracturebench.registry import cases
-from gsfluent.fracturebench.scene import SceneError
-from gsfluent.fracturebench.score import markdown, plain, read_scenes, score
+from .registry import cases
+from .scene import SceneError
+from .score import markdown, plain, read_scenes, score
 
 _ABOUT = """FractureBench: frozen scenes with known answers for simulators of elastic and brittle
 bodies, and their scorer. A scene is an .npz of points, velocities, volumes, materials and the times

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.fracturebench.scene import Floats, SceneError
+from .scene import Floats, SceneError
 
 __all__ = ["REACH", "STRETCH", "components", "neighbours", "parted", "piece_masses"]
 

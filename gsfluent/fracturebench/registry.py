@@ -6,8 +6,8 @@ import dataclasses
 import importlib
 from collections.abc import Callable, Iterable, Sequence
 
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Scene, SceneError
+from .run import Measure, Run
+from .scene import Scene, SceneError
 
 __all__ = ["Case", "case", "cases", "find", "judge"]
 

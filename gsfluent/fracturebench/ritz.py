@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import legendre
 
-from gsfluent.fracturebench.scene import Floats
+from .scene import Floats
 
 __all__ = ["Modes", "ball_rule", "box_rule", "modes"]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.scene import BROKEN, Floats, Scene, SceneError
+from .scene import BROKEN, Floats, Scene, SceneError
 
 __all__ = ["Measure", "Run"]
 

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsfluent.fracturebench.registry import judge
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Scene, SceneError
+from .registry import judge
+from .run import Measure, Run
+from .scene import Scene, SceneError
 
 __all__ = ["Score", "markdown", "plain", "read_scenes", "score"]
 

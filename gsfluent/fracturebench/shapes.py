@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.fracturebench.scene import Floats, Scene, wave_speed
+from .scene import Floats, Scene, wave_speed
 
 __all__ = ["ball", "box", "elastic", "free", "spacing", "wave_speed"]
 

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.pieces import REACH, neighbours, parted, piece_masses
-from gsfluent.fracturebench.registry import Case
-from gsfluent.fracturebench.run import Run
-from gsfluent.fracturebench.scene import Floats, Scene, SceneError
+from .pieces import REACH, neighbours, parted, piece_masses
+from .registry import Case
+from .run import Run
+from .scene import Floats, Scene, SceneError
 
 __all__ = [
     "MEASURES",

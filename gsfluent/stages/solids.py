@@ -148,7 +148,7 @@ def fill_stage(context: RunContext) -> None:
                 context.capture,
                 progress=context.reporter.task("fill"),
             )
-            solid.transformed(frame).save(folder / f"{name}.ply")
+            save_solid(solid.transformed(frame), folder / f"{name}.ply")
             reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
         return _merged(reports)
 

@@ -341,7 +341,7 @@ def test_solid_refuses_missing_labels_and_bad_voxel() -> None:
 
 
 def test_solid_load_says_what_is_missing_or_damaged(tmp_path: Path) -> None:
-    make_solid().save(tmp_path / "melon.ply")
+    save_solid(make_solid(), tmp_path / "melon.ply")
     volume = tmp_path / "melon.volume.npz"
     whole = volume.read_bytes()
     volume.write_bytes(whole[: len(whole) // 2])

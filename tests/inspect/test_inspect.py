@@ -15,7 +15,7 @@ from gsfluent.config import Select, Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.inspect.capture import inspect
-from gsfluent.io import load_capture, load_image, load_splats, save_image
+from gsfluent.io import load_capture, load_image, load_splats, save_image, save_splats
 from gsfluent.pipeline.capture.orient import (
     camera_up,
     look_at_point,
@@ -205,7 +205,7 @@ def test_select_by_place_color_and_label(tmp_path: Path) -> None:
 
 def test_inspect_splats_reports_and_draws(tmp_path: Path) -> None:
     points = np.concatenate([ball(3000, 1.0), ball(4, 0.05, (0, -4, 0))])
-    splats(points).save(tmp_path / "a.ply")
+    save_splats(splats(points), tmp_path / "a.ply")
     report = inspect(tmp_path / "a.ply", tmp_path / "a.png", size=0.5)
     assert report["kind"] == "splats" and report["gaussians"] == 3004
     assert report["box"]["size"] == pytest.approx([0.5, 0.5, 0.5], rel=0.02)

@@ -11,6 +11,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError, RunError
+from gsfluent.io import save_solid
 from gsfluent.live import player as live_player
 from gsfluent.live.player import AT_REST, FAILED, RUNNING, LivePlayer
 from gsfluent.live.scene import open_stage
@@ -27,7 +28,7 @@ DX = 0.0125
 @pytest.fixture
 def solid(tmp_path: Path) -> Path:
     path = tmp_path / "ball.ply"
-    ellipsoid((0.05,) * 3, splats=200).save(path)
+    save_solid(ellipsoid((0.05,) * 3, splats=200), path)
     return path
 
 

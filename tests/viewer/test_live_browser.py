@@ -11,6 +11,8 @@ import pytest
 import torch
 from live_ball import ball
 
+from gsfluent.io import save_solid
+
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 pytest.importorskip("selenium", reason="no selenium to drive a browser with")
 
@@ -33,7 +35,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LivePlayer,
     if browser is None or driver is None:
         pytest.skip("no chromium and chromedriver on this machine")
     home = tmp_path_factory.mktemp("live")
-    ball().save(home / "ball.ply")
+    save_solid(ball(), home / "ball.ply")
     stage = open_stage(home / "ball.ply", material="fruit.watermelon")
     session = LiveSession(stage.scene, dx=0.025, slow=4.0)
     player = LivePlayer(session, stage.shot)

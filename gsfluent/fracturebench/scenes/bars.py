@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene
-from gsfluent.fracturebench.scenes.rows import BROKEN, brittle, damage_of, levels
-from gsfluent.fracturebench.scenes.slabs import walls
-from gsfluent.fracturebench.shapes import box, free, wave_speed
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene
+from ..scenes.rows import BROKEN, brittle, damage_of, levels
+from ..scenes.slabs import walls
+from ..shapes import box, free, wave_speed
 
 __all__ = ["expected_size", "spall", "stretched_bar"]
 

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene, SceneError
-from gsfluent.fracturebench.scenes.rows import BROKEN, brittle, damage_of
-from gsfluent.fracturebench.scenes.slabs import heavy, sheet, slab_volume, walls
-from gsfluent.fracturebench.shapes import elastic, free, wave_speed
-from gsfluent.fracturebench.statistics import stored_energy
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene, SceneError
+from ..scenes.rows import BROKEN, brittle, damage_of
+from ..scenes.slabs import heavy, sheet, slab_volume, walls
+from ..shapes import elastic, free, wave_speed
+from ..statistics import stored_energy
 
 __all__ = ["cantilever", "crack_tip", "double_cantilever", "energy_beyond"]
 

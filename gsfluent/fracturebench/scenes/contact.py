@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene
-from gsfluent.fracturebench.shapes import ball, box, elastic, free, wave_speed
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene
+from ..shapes import ball, box, elastic, free, wave_speed
 
 __all__ = ["collide", "drop", "oblique", "pull_apart"]
 

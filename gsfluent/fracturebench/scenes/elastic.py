@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.ritz import Modes, ball_rule, box_rule, modes
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene
-from gsfluent.fracturebench.shapes import ball, box, elastic, free
+from ..registry import case
+from ..ritz import Modes, ball_rule, box_rule, modes
+from ..run import Measure, Run
+from ..scene import Floats, Scene
+from ..shapes import ball, box, elastic, free
 
 __all__ = ["bar", "beam", "box", "spin", "two_material_bar"]
 

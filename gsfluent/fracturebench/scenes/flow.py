@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene
-from gsfluent.fracturebench.shapes import box, elastic, free
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene
+from ..shapes import box, elastic, free
 
 __all__ = ["bar_wave", "covariance_transport"]
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.pieces import REACH, components, neighbours, parted
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene, SceneError
-from gsfluent.fracturebench.scenes.rows import brittle, levels, shape_noise
-from gsfluent.fracturebench.shapes import box, free, wave_speed
-from gsfluent.fracturebench.statistics import spacing
+from ..pieces import REACH, components, neighbours, parted
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene, SceneError
+from ..scenes.rows import brittle, levels, shape_noise
+from ..shapes import box, free, wave_speed
+from ..statistics import spacing
 
 __all__ = ["EXPERIMENT", "Piece", "experiment", "pieces_of", "rock_press", "rosin_rammler",
            "struck_rock"]  # fmt: skip

@@ -32,9 +32,9 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.run import Run
-from gsfluent.fracturebench.scene import Floats, Ints, Scene, SceneError
-from gsfluent.fracturebench.shapes import elastic
+from ..run import Run
+from ..scene import Floats, Ints, Scene, SceneError
+from ..shapes import elastic
 
 __all__ = [
     "BAND_CELLS",

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gsfluent.fracturebench.registry import case
-from gsfluent.fracturebench.run import Measure, Run
-from gsfluent.fracturebench.scene import Floats, Scene, SceneError
-from gsfluent.fracturebench.scenes.rows import brittle, levels, shape_noise
-from gsfluent.fracturebench.shapes import box, free, wave_speed
-from gsfluent.fracturebench.statistics import MEASURES, Figures, distance, figures
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene, SceneError
+from ..scenes.rows import brittle, levels, shape_noise
+from ..shapes import box, free, wave_speed
+from ..statistics import MEASURES, Figures, distance, figures
 
 __all__ = ["RADIUS", "RECORD", "SEEDS", "lattice_ball", "reference", "shatter"]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.scene import Floats
-from gsfluent.fracturebench.shapes import elastic
+from ..scene import Floats
+from ..shapes import elastic
 
 __all__ = ["HEAVY", "edge_points", "heavy", "sheet", "slab_volume", "walls"]
 

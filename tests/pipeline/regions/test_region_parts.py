@@ -157,9 +157,9 @@ def test_a_run_projects_masks_once_and_again_when_they_change(tmp_path: Path) ->
         volume = body_parts(scene.bodies[0]).rows[1]["volume"]
         return store.results[-1].resumed, round(volume / solid.voxel**3)
 
-    ball_solid(24).save(tmp_path / "texture.ply")
+    save_solid(ball_solid(24), tmp_path / "texture.ply")
     (tmp_path / "stages" / "texture").mkdir(parents=True)
-    ball_solid(24).save(tmp_path / "stages" / "texture" / "ball.ply")
+    save_solid(ball_solid(24), tmp_path / "stages" / "texture" / "ball.ply")
     first, count = run()
     assert not first and count > 50
     assert run() == (True, count)
