@@ -210,10 +210,10 @@ def choose_stage(context: RunContext) -> bool:
         chosen = found["enough"]
     if chosen is None:
         least = found["within"]
-        mend = "set solve.quality or solve.cells instead"
+        hint = "set solve.quality or solve.cells instead"
         if least is not None:
-            mend = f"the least that can be promised is solve.error: {least:.1%}; or {mend[4:]}"
-        raise InputError(f"solve.error {bound:.3g} cannot be met: {found['reason']}", mend)
+            hint = f"the least that can be promised is solve.error: {least:.1%}; or {hint[4:]}"
+        raise InputError(f"solve.error {bound:.3g} cannot be met: {found['reason']}", hint)
     if found["chosen"] is None:
         _log.warning("solve.error: %s; taken: %d cells", found["reason"], chosen["cells"])
     solve = dataclasses.replace(

@@ -170,7 +170,7 @@ def _chosen(text: str | None, count: int) -> list[int]:
     Raises:
         InputError: Not such a text, or no frame.
     """
-    mend = f"give a frame or a range such as 12, 10:40 or ::2; the run has frames 0 to {count - 1}"
+    hint = f"give a frame or a range such as 12, 10:40 or ::2; the run has frames 0 to {count - 1}"
     if text is None:
         return list(range(count))
     parts = text.strip().split(":")
@@ -183,9 +183,9 @@ def _chosen(text: str | None, count: int) -> list[int]:
         else:
             raise ValueError
     except (ValueError, IndexError):
-        raise InputError(f"--frames {text}", mend) from None
+        raise InputError(f"--frames {text}", hint) from None
     if not chosen:
-        raise InputError(f"--frames {text}: no frame", mend)
+        raise InputError(f"--frames {text}: no frame", hint)
     return chosen
 
 

@@ -155,9 +155,9 @@ def write_exports(
 
 def _instead(kind: str) -> str:
     """What to ask for in place of a format there is not."""
-    for names, mend in _OTHERS.items():
+    for names, hint in _OTHERS.items():
         if kind.lower() in names:
-            return mend
+            return hint
     return nearest(kind, FORMATS)
 
 

@@ -174,7 +174,7 @@ class LivePlayer:
 
         def act() -> None:
             if self._take is not None:
-                raise InputError("a take has one speed", mend="end the recording first")
+                raise InputError("a take has one speed", hint="end the recording first")
             self.automatic = slow is None
             if slow is not None:
                 self.session.set_slow(slow)
@@ -217,7 +217,7 @@ class LivePlayer:
 
         def act() -> None:
             if self.shot is None:
-                raise InputError("record: the session has no shot", mend="open a run or a shot")
+                raise InputError("record: the session has no shot", hint="open a run or a shot")
             self._reset()
             self._take = Take(out, self.session, self.shot)
 
@@ -228,7 +228,7 @@ class LivePlayer:
 
         def act() -> Path:
             if self._take is None:
-                raise InputError("record: nothing is being recorded", mend="begin a take first")
+                raise InputError("record: nothing is being recorded", hint="begin a take first")
             return self._finish_take()
 
         return self._enqueue(act)
@@ -237,7 +237,7 @@ class LivePlayer:
         future: Future[Any] = Future()
         with self._wake:
             if self._stop:
-                raise InputError("live: the session has ended", mend="open it again")
+                raise InputError("live: the session has ended", hint="open it again")
             self._queue.append((act, future))
             self._wake.notify_all()
         return future

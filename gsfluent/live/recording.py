@@ -30,9 +30,9 @@ class Take:
 
     def __init__(self, out: Path, session: LiveSession, shot: Shot) -> None:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"record: {out} is there already", mend="name a new folder")
+            raise InputError(f"record: {out} is there already", hint="name a new folder")
         if session.pokes:
-            raise InputError("record: a take begins at rest", mend="reset() first")
+            raise InputError("record: a take begins at rest", hint="reset() first")
         self.out, self.session, self.shot = out, session, shot
         self.folder = out / "stages" / "simulate"
         self.folder.mkdir(parents=True, exist_ok=True)

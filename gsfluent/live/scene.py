@@ -59,12 +59,12 @@ def open_stage(
         InputError: Nothing of the kind is there, or an argument does not belong to it.
     """
     if not source.exists():
-        raise InputError(f"live: there is no {source}", mend=HELP)
+        raise InputError(f"live: there is no {source}", hint=HELP)
     solid = source.suffix.lower() == ".ply"
     if material is not None and not solid:
         raise InputError(
             f"live: {source} says itself what its objects are made of",
-            mend="leave out the material, or change objects.*.material in the shot",
+            hint="leave out the material, or change objects.*.material in the shot",
         )
     if solid:
         return _of_solid(source, material)
@@ -74,7 +74,7 @@ def open_stage(
         if not all((out / "stages" / "texture" / f"{name}.ply").is_file() for name in shot.objects):
             raise InputError(
                 f"live: the objects of {out} are not filled and textured yet",
-                mend="finish `gsfluent run` first, or give its shot",
+                hint="finish `gsfluent run` first, or give its shot",
             )
         context.frame = read_frame(out / "stages" / "isolate")
     else:
@@ -82,7 +82,7 @@ def open_stage(
         if out is None:
             raise InputError(
                 f"live: the objects of {source} are prepared in a run folder",
-                mend="name it (-o OUT); `gsfluent run` goes on from there",
+                hint="name it (-o OUT); `gsfluent run` goes on from there",
             )
         context = context_of(shot, out, device, seed, reporter)
         out.mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ def _of_solid(path: Path, material: str | None) -> Stage:
     if not volume_path(path).is_file():
         raise InputError(
             f"live: {path} is no filled solid (no {volume_path(path).name} beside it)",
-            mend="fill it first: gsfluent fill",
+            hint="fill it first: gsfluent fill",
         )
     solid = load_solid(path)
     name = path.stem

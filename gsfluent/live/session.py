@@ -88,7 +88,7 @@ class LiveSession:
         **options: Any,
     ) -> None:
         if not any(body.solid is not None for body in scene.bodies):
-            raise InputError("live: there is no object to poke", mend="give a solid or a run")
+            raise InputError("live: there is no object to poke", hint="give a solid or a run")
         number("live: fps", fps, low=1.0, high=1e4)
         if quality == "live":
             cells = live_cells(scene, torch.device(device))
@@ -96,7 +96,7 @@ class LiveSession:
             cells = QUALITY[quality]
         else:
             known = ", ".join(("live", *QUALITY))
-            raise InputError(f"live: unknown quality {quality!r}", mend=f"known: {known}")
+            raise InputError(f"live: unknown quality {quality!r}", hint=f"known: {known}")
         self.device, self.seed, self.quality = torch.device(device), seed, quality
         self.cells, self.dx = cells, grid_spacing(scene, cells)
         if dx is not None:
@@ -299,10 +299,10 @@ class LiveSession:
             InputError: A bad event, one that cannot come later, or the simulation has failed.
         """
         if self.failure:
-            raise InputError(f"live: the simulation has failed: {self.failure}", mend="reset()")
+            raise InputError(f"live: the simulation has failed: {self.failure}", hint="reset()")
         kind = event.get("type")
         if kind not in POKES:
-            raise InputError(f"live: {kind!r} is no poke", mend=f"one of {', '.join(POKES)}")
+            raise InputError(f"live: {kind!r} is no poke", hint=f"one of {', '.join(POKES)}")
         now = dict(event) | {"at": self.time}
         scene = self._with(now)
         if len(scene.bodies) - self.solids > MOST_LOOSE:
@@ -434,7 +434,7 @@ class LiveSession:
         place = self.run.state.position
         gap = (place - torch.tensor(start, dtype=place.dtype, device=place.device)).norm(dim=1)
         if float(gap.min()) < radius + self.dx:
-            raise InputError("live: the bullet would start inside the matter", mend="step back")
+            raise InputError("live: the bullet would start inside the matter", hint="step back")
 
     # --- figures ---
 

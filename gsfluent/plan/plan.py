@@ -183,7 +183,7 @@ def plan_shot(
     if texture_method(shot) in NOT_PREDICTED:
         warnings.append(
             f"texture: what {texture_method(shot)} costs hangs on the model you bring and is not "
-            "predicted; mend: texture.method: exemplar is"
+            "predicted; hint: texture.method: exemplar is"
         )
     first = next(body for body in prospect.scene.bodies if body.solid is not None)
     low, high = first.bounds()
@@ -304,16 +304,16 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
     if shot.solve.error is not None:
         found.append(
             "solve.error chooses the cells by probes when the shot is run, this plan has those of "
-            f"quality: {shot.solve.quality}; mend: gsfluent chart SHOT.yaml --error "
+            f"quality: {shot.solve.quality}; hint: gsfluent chart SHOT.yaml --error "
             f"{shot.solve.error:.3g} chooses now"
         )
     if not shot.events and not shot.colliders:
         found.append(
-            "the shot has no events: the object will only rest on the floor; mend: add an event"
+            "the shot has no events: the object will only rest on the floor; hint: add an event"
         )
     if particles > MAX_PARTICLES:
         found.append(
-            f"{particles} material points, more than the {MAX_PARTICLES} that a run takes; mend: "
+            f"{particles} material points, more than the {MAX_PARTICLES} that a run takes; hint: "
             "fewer solve.cells"
         )
     movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}
@@ -325,22 +325,22 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
         if math.isfinite(limit) and 0.0 < mover.speed < limit and not mover.driven:
             found.append(
                 f"{body.name}: meets something at {mover.speed:.2g} m/s, but {body.material.name} "
-                f"breaks from about {limit:.2g} m/s; mend: raise the drop or lower cohesion"
+                f"breaks from about {limit:.2g} m/s; hint: raise the drop or lower cohesion"
             )
         thin = thickness(body)
         if thin < THIN_CELLS * dx:
             cells = math.ceil(QUALITY["preview"] * THIN_CELLS * dx / thin)
             found.append(
                 f"{body.name}: {1000 * thin:.3g} mm at its thinnest, under {THIN_CELLS:g} cells of "
-                f"{1000 * dx:.3g} mm; mend: a finer solve.quality, or solve.cells: "
+                f"{1000 * dx:.3g} mm; hint: a finer solve.quality, or solve.cells: "
                 f"{math.ceil(cells * _cells(scene, dx) / QUALITY['preview'])}"
             )
     if outlook.grid_seconds <= 0.0:
         found.append(
-            "nothing meets anything before the end; mend: a longer output.seconds, or another event"
+            "nothing meets anything before the end; hint: a longer output.seconds, or another event"
         )
     if "nacc" not in laws_of(scene) and any(e.__class__.__name__ == "Bullet" for e in shot.events):
-        found.append("nothing is brittle, so the bullet breaks nothing; mend: another material")
+        found.append("nothing is brittle, so the bullet breaks nothing; hint: another material")
     return found
 
 

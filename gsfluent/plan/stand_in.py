@@ -114,7 +114,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
     except InputError as error:
         size = shot.size or DEFAULT_SIZE
         warnings.append(
-            f"the object's size is not known ({error.what}): assumed {size:g} m; mend: add masks "
+            f"the object's size is not known ({error.what}): assumed {size:g} m; hint: add masks "
             "or sparse points to the capture"
         )
         box, what = [size] * 3, f"a ball of {size:g} m"
@@ -129,7 +129,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
         if len(shot.objects) > 1:
             warnings.append(
                 "objects are told apart only in the reconstruction: each is planned as the whole; "
-                "mend: add masks to the capture"
+                "hint: add masks to the capture"
             )
     solids = dict.fromkeys(shot.objects, _ellipsoid(box, _SOLID_SHARE))
     return StandIn(solids, Frame.identity(), what, photographs)

@@ -158,8 +158,8 @@ def frame_rate(folder: Path, default: float = 30.0) -> float:
 
 
 def _unreadable(path: Path, error: Exception) -> RunError:
-    mend = "run the shot again; only this stage is redone (use --force if it is not)"
-    return RunError(f"{path}: no readable frame ({error})", "the other frames", mend)
+    hint = "run the shot again; only this stage is redone (use --force if it is not)"
+    return RunError(f"{path}: no readable frame ({error})", "the other frames", hint)
 
 
 def _packed(name: str, value: Tensor) -> np.ndarray:

@@ -94,7 +94,7 @@ class RigidThings:
             edges = [3.0 * float(half @ axis.abs()) for axis in axes]
         else:
             if isinstance(size, str) or len(size) != 2:
-                raise InputError("press size must have two numbers", mend="give [width, depth]")
+                raise InputError("press size must have two numbers", hint="give [width, depth]")
             edges = [number("press size", edge, low=1e-6) for edge in size]
         thick = 0.1 * max(edges) if thickness is None else number("thickness", thickness, low=1e-6)
         plate = Collider(
@@ -139,7 +139,7 @@ class RigidThings:
             InputError: Fewer than two points, a point twice in a row, or an edge along the path.
         """
         if isinstance(path, str) or not isinstance(path, Sequence) or len(path) < 2:
-            raise InputError("blade: 'path' must have two or more points", mend="give [[x, y, z], "
+            raise InputError("blade: 'path' must have two or more points", hint="give [[x, y, z], "
                              "[x, y, z]]")  # fmt: skip
         points = tuple(vector("blade path", point) for point in path)
         legs = [add(b, scaled(-1.0, a)) for a, b in itertools.pairwise(points)]
@@ -153,7 +153,7 @@ class RigidThings:
             way = unit("blade: a leg of 'path'", leg)
             if abs(sum(p * q for p, q in zip(way, line, strict=True))) > 0.95:
                 raise InputError(
-                    "blade: the edge must not lie along the path", mend="give another 'edge'"
+                    "blade: the edge must not lie along the path", hint="give another 'edge'"
                 )
         knife = Blade(
             name=self._name(None, "blade"),
@@ -226,20 +226,20 @@ class RigidThings:
         if shape == "cylinder":
             number(f"{where}: length", length, low=1e-9)
         if shape == "box" and size is None:
-            raise InputError(f"{where}: 'size' is missing", mend="give its edges [x, y, z]")
+            raise InputError(f"{where}: 'size' is missing", hint="give its edges [x, y, z]")
         if shape == "mesh" and (mesh is None or not Path(mesh).is_file()):
-            raise InputError(f"{where}: no file {str(mesh)!r}", mend="give the mesh's file")
+            raise InputError(f"{where}: no file {str(mesh)!r}", hint="give the mesh's file")
         if shape == "plane" and mass is not None:
-            raise InputError(f"{where}: a plane has no mass", mend="use a box")
+            raise InputError(f"{where}: a plane has no mass", hint="use a box")
         appears = number(f"{where}: appears", appears, low=0.0)
         gone = math.inf if vanishes is None else number(f"{where}: vanishes", vanishes)
         if not gone > appears:
             raise InputError(f"{where}: it vanishes at {gone:g} s, before it appears at "
-                             f"{appears:g} s", mend="let it vanish later")  # fmt: skip
+                             f"{appears:g} s", hint="let it vanish later")  # fmt: skip
         if mass is not None and (appears > 0.0 or math.isfinite(gone)):
             raise InputError(
                 f"{where}: one with a mass is there all the time",
-                mend="leave out its mass, or appears and vanishes",
+                hint="leave out its mass, or appears and vanishes",
             )
         edges = (0.0, 0.0, 0.0) if size is None else vector(f"{where}: size", size)
         for edge in edges if shape == "box" else ():
@@ -282,11 +282,11 @@ class RigidThings:
                     return [index]
             names = [body.name for body in self.bodies]
             raise InputError(
-                f"event: no object is called {name!r}", mend=f"known: {', '.join(names) or 'none'}"
+                f"event: no object is called {name!r}", hint=f"known: {', '.join(names) or 'none'}"
             )
         found = [index for index, body in enumerate(self.bodies) if body.solid is not None]
         if not found:
-            raise InputError("event: the scene has no solid", mend="scene.add(...) before events")
+            raise InputError("event: the scene has no solid", hint="scene.add(...) before events")
         return found
 
     def _name(self, name: str | None, stem: str) -> str:
@@ -295,7 +295,7 @@ class RigidThings:
         if name is not None:
             if name in taken:
                 raise InputError(
-                    f"scene: two bodies are called {name!r}", mend="give each its own name"
+                    f"scene: two bodies are called {name!r}", hint="give each its own name"
                 )
             return name
         number_ = 1

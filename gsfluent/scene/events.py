@@ -119,14 +119,14 @@ class Events(RigidThings):
         if isinstance(objects, str) or len(objects) != 2 or objects[0] == objects[1]:
             raise InputError(
                 f"collide: 'objects' must name two different objects, got {objects!r}",
-                mend="give [first, second]",
+                hint="give [first, second]",
             )
         speed = number("collide speed", speed, low=0.0)
         a, b = (self._targets(name)[0] for name in objects)
         boxes = [torch.stack(self.bodies[i].bounds()) for i in (a, b)]
         between = (boxes[1] - boxes[0]).mean(dim=0).tolist()
         if direction is None and math.hypot(*between) == 0.0:
-            raise InputError("collide: both objects have the same middle", mend="give 'direction'")
+            raise InputError("collide: both objects have the same middle", hint="give 'direction'")
         way = unit("collide direction", between if direction is None else direction)
         if distance is not None:
             gap = number("collide distance", distance, low=0.0)
@@ -179,11 +179,11 @@ class Events(RigidThings):
         """
         solids = [body for body in self.bodies if body.solid is not None]
         if not solids:
-            raise InputError("bullet: the scene has no solid to hit", mend="scene.add(...) first")
+            raise InputError("bullet: the scene has no solid to hit", hint="scene.add(...) first")
         origin, target = vector("bullet from", start), vector("bullet toward", toward)
         if math.dist(origin, target) == 0.0:
             raise InputError(
-                "bullet: 'toward' must differ from 'from'", mend="aim at another point"
+                "bullet: 'toward' must differ from 'from'", hint="aim at another point"
             )
         way = unit("bullet", [b - a for a, b in zip(origin, target, strict=True)])
         velocity = scaled(number("bullet speed", speed, low=0.0), way)
@@ -253,13 +253,13 @@ class Events(RigidThings):
         speed = number("pour speed", speed, low=0.0)
         radius = number("pour radius", radius, low=1e-6)
         if (volume is None) == (duration is None):
-            raise InputError("pour: give either 'volume' or 'duration'", mend="keep one of them")
+            raise InputError("pour: give either 'volume' or 'duration'", hint="keep one of them")
         if volume is not None:
             length = number("pour volume", volume, low=1e-12) / (math.pi * radius**2)
         else:
             length = speed * number("pour duration", duration, low=1e-9)
         if length == 0.0:
-            raise InputError("pour: nothing flows at speed 0", mend="give 'volume' or a speed")
+            raise InputError("pour: nothing flows at speed 0", hint="give 'volume' or a speed")
         back = scaled(-0.5 * length, way)
         body = Body(
             name=self._name(None, "liquid"),
@@ -296,7 +296,7 @@ class Events(RigidThings):
         for key in needed:
             if key not in rest:
                 raise InputError(
-                    f"event {kind!r}: {key!r} is missing", mend=f"required: {', '.join(needed)}"
+                    f"event {kind!r}: {key!r} is missing", hint=f"required: {', '.join(needed)}"
                 )
         method(**{keys[key]: value for key, value in rest.items()})
 

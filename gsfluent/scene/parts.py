@@ -70,7 +70,7 @@ class Part:
         if not isinstance(where, Mapping) or not where:
             raise InputError(
                 f"part {name!r}: 'where' must name at least one condition, got {where!r}",
-                mend=f"give one of: {', '.join(_WHERE_KEYS)}",
+                hint=f"give one of: {', '.join(_WHERE_KEYS)}",
             )
         for key in where:
             known_key(f"part {name!r}, where", key, _WHERE_KEYS)
@@ -78,7 +78,7 @@ class Part:
         if len(sources) > 1:
             raise InputError(
                 f"part {name!r}: 'where' has both {sources[0]} and {sources[1]}",
-                mend="keep one of them, or make two parts",
+                hint="keep one of them, or make two parts",
             )
         for key in rest:
             known_key(
@@ -264,16 +264,16 @@ def known_key(where: str, key: Any, known: Any) -> None:
     if key not in known:
         close = difflib.get_close_matches(str(key), list(known), n=1, cutoff=0.4)
         hint = f"did you mean {close[0]!r}? " if close else ""
-        raise InputError(f"{where}: unknown {key!r}", mend=f"{hint}known: {', '.join(known)}")
+        raise InputError(f"{where}: unknown {key!r}", hint=f"{hint}known: {', '.join(known)}")
 
 
 def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
     """Read a finite number in a range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} must be a finite number, got {value!r}", mend="give one number")
+        raise InputError(f"{name} must be a finite number, got {value!r}", hint="give one number")
     if not low <= value <= high:
         raise InputError(
-            f"{name} must lie in [{low:g}, {high:g}], got {value:g}", mend="mend the number"
+            f"{name} must lie in [{low:g}, {high:g}], got {value:g}", hint="mend the number"
         )
     return float(value)
 
@@ -282,7 +282,7 @@ def vector(name: str, value: Any) -> Vector:
     """Read three numbers."""
     values = value.tolist() if isinstance(value, Tensor) else value
     if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != 3:
-        raise InputError(f"{name} must have three components, got {value!r}", mend="give [x, y, z]")
+        raise InputError(f"{name} must have three components, got {value!r}", hint="give [x, y, z]")
     x, y, z = (number(name, part) for part in values)
     return x, y, z
 
@@ -292,7 +292,7 @@ def unit(name: str, value: Any) -> Vector:
     given = vector(name, value)
     length = math.hypot(*given)
     if length == 0.0:
-        raise InputError(f"{name} must not be zero", mend="give a direction [x, y, z]")
+        raise InputError(f"{name} must not be zero", hint="give a direction [x, y, z]")
     x, y, z = (part / length for part in given)
     return x, y, z
 

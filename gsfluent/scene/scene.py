@@ -85,7 +85,7 @@ class Scene(Events):
         """
         if not bool(solid.occupancy.any()):
             raise InputError(
-                "scene.add: the solid holds no matter", mend="fill it first (gsfluent fill)"
+                "scene.add: the solid holds no matter", hint="fill it first (gsfluent fill)"
             )
         chosen = materials.get(material) if isinstance(material, str) else material
         regions = tuple(Part.parse(part) for part in (chosen.parts if parts is None else parts))

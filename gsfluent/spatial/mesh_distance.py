@@ -65,7 +65,7 @@ def mesh_body(path: str | Path, scale: float, spacing: float) -> MeshBody:
     if not mesh.is_watertight or abs(mesh.volume) <= 0.0:
         raise InputError(
             f"collider: the surface of {path} is not closed, so it has no inside",
-            mend="close its holes (a mesh editor's 'make manifold'), or use a box or a sphere",
+            hint="close its holes (a mesh editor's 'make manifold'), or use a box or a sphere",
         )
     if mesh.volume < 0.0:
         mesh.invert()
@@ -134,10 +134,10 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     except Exception as error:  # readers of many formats, each with errors of its own
         raise InputError(
             f"collider: {path} cannot be read as a mesh ({error})",
-            mend="give a file that trimesh reads: obj, ply, stl, glb",
+            hint="give a file that trimesh reads: obj, ply, stl, glb",
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"collider: {path} holds no triangles", mend="give a triangle mesh")
+        raise InputError(f"collider: {path} holds no triangles", hint="give a triangle mesh")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures are no openings
     return mesh
 

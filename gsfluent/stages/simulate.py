@@ -169,7 +169,7 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
             local = torch.tensor(report["middle"]) - field.origin
             report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
         if report["warning"]:
-            _log.warning("%s: %s; mend: %s", body.name, report["warning"], report["mend"])
+            _log.warning("%s: %s; hint: %s", body.name, report["warning"], report["hint"])
         found[body.name] = report
     return found
 

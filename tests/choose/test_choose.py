@@ -338,4 +338,4 @@ def test_a_run_whose_error_cannot_be_met_is_refused_with_what_can(
     with pytest.raises(InputError, match="cannot be met") as caught:
         choose_shot.choose_stage(context)
     least = true_error(0.6, 3.0, 1 / 128)
-    assert f"least that can be promised is solve.error: {least:.1%}" in caught.value.mend
+    assert f"least that can be promised is solve.error: {least:.1%}" in caught.value.hint

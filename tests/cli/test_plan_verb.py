@@ -71,8 +71,8 @@ def test_the_tables_say_what_binds_and_what_to_mend(
     for line in ("passes", "bounds of dx: ", "stages", "warnings", "in all"):
         assert f"\n{line}" in text or f"\n  {line}" in text, line
     assert "  +  damage variable" in text and "  -  blades" in text
-    assert "breaks from about" in text and "mend: raise the drop" in text
-    assert "mend: a finer solve.quality, or solve.cells: " in text
+    assert "breaks from about" in text and "hint: raise the drop" in text
+    assert "hint: a finer solve.quality, or solve.cells: " in text
 
 
 def test_wrong_words_and_shots_measure_nothing(

@@ -228,7 +228,7 @@ def test_render_refuses_what_it_cannot(
     finished: Path, extra: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["render", str(finished), *extra]) == 2
-    assert "mend:" in capsys.readouterr().err
+    assert "hint:" in capsys.readouterr().err
 
 
 def test_export_vtk_holds_the_particles(finished: Path) -> None:

@@ -156,7 +156,7 @@ def test_validated_names_the_bad_row(field: str, value: float, message: str) -> 
     broken.reshape(20, -1)[7, 0] = value
     with pytest.raises(InputError, match=message) as caught:
         gaussians.replace(**{field: broken}).validated()
-    assert caught.value.mend
+    assert caught.value.hint
 
 
 def test_validated_refuses_no_gaussians_and_returns_good_ones() -> None:

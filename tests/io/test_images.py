@@ -88,7 +88,7 @@ def test_truncated_image_names_the_file(tmp_path: Path, cameras: list[Camera]) -
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"1\.png: the image is damaged") as caught:
         capture.image(1)
-    assert caught.value.mend
+    assert caught.value.hint
     path.write_bytes(b"not an image")
     with pytest.raises(InputError, match="not an image that Pillow can read"):
         capture.image(1)

@@ -219,7 +219,7 @@ def test_truncation_anywhere_is_an_input_error(tmp_path: Path, share: float) -> 
     path.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(InputError) as caught:
         load_splats(path)
-    assert str(path) in str(caught.value) and caught.value.mend
+    assert str(path) in str(caught.value) and caught.value.hint
 
 
 @settings(
@@ -332,7 +332,7 @@ def test_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(RunError, match="No space left on device") as caught:
         save_splats(make_gaussians(9, 3), path)
-    assert caught.value.mend and path.read_bytes() == before
+    assert caught.value.hint and path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["a.ply"]
 
 

@@ -110,7 +110,7 @@ def test_a_parameter_that_the_law_does_not_read_is_refused_by_name(law: str) -> 
 def test_viscosity_on_an_elastic_body_names_the_fluid() -> None:
     with pytest.raises(InputError, match="viscosity does nothing under law 'elastic'") as caught:
         materials.jelly.override(viscosity=1.0)
-    assert "fluid" in caught.value.mend
+    assert "fluid" in caught.value.hint
 
 
 def test_scatter_of_strength_is_refused_where_nothing_breaks() -> None:

@@ -111,7 +111,7 @@ def test_what_is_not_a_run_is_refused(tmp_path: Path, folder: str) -> None:
     (tmp_path / "out" / folder).mkdir(parents=True)
     with pytest.raises(InputError, match="OUT: ") as error:
         RunSource(tmp_path / "out")
-    assert error.value.mend
+    assert error.value.hint
 
 
 def test_a_redone_simulation_replaces_the_old_frames(tmp_path: Path) -> None:

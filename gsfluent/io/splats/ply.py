@@ -112,7 +112,7 @@ def write_ply(
 
 def _read_header(path: Path, stream: Any) -> tuple[str, list[_Element]]:
     """Parse up to ``end_header``; return the byte order and the elements."""
-    mend = "check that the file is a complete .ply"
+    hint = "check that the file is a complete .ply"
     if stream.readline(16).strip() != b"ply":
         raise InputError(
             f"{path}: not a PLY file (it does not begin with 'ply')", "pass a 3DGS .ply file"
@@ -121,7 +121,7 @@ def _read_header(path: Path, stream: Any) -> tuple[str, list[_Element]]:
     while True:
         raw = stream.readline(4096)
         if not raw or stream.tell() > _HEADER_LIMIT:
-            raise InputError(f"{path}: the PLY header has no end_header", mend)
+            raise InputError(f"{path}: the PLY header has no end_header", hint)
         words = raw.decode("ascii", errors="replace").split()
         if not words or words[0] in ("comment", "obj_info"):
             continue
@@ -143,14 +143,14 @@ def _read_header(path: Path, stream: Any) -> tuple[str, list[_Element]]:
         except (KeyError, IndexError, ValueError) as error:
             line = " ".join(words)[:80]
             raise InputError(
-                f"{path}: the PLY header line {line!r} is not understood", mend
+                f"{path}: the PLY header line {line!r} is not understood", hint
             ) from error
     if not order:
-        raise InputError(f"{path}: the PLY header names no format", mend)
+        raise InputError(f"{path}: the PLY header names no format", hint)
     for element in elements:
         names = [name for name, _, _ in element.properties]
         if len(set(names)) != len(names):
-            raise InputError(f"{path}: element {element.name} names a property twice", mend)
+            raise InputError(f"{path}: element {element.name} names a property twice", hint)
     return order, elements
 
 

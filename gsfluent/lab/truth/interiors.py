@@ -187,10 +187,10 @@ def known_interior(name: str, size: int = 64, seed: int = 0) -> KnownInterior:
     if name not in _CLASSES:
         raise InputError(
             f"known interior must be one of {', '.join(KNOWN_INTERIORS)}, got {name!r}",
-            mend="choose one of these",
+            hint="choose one of these",
         )
     if size < 24:
-        raise InputError(f"known interior: {size} voxels are too few", mend="use at least 24")
+        raise InputError(f"known interior: {size} voxels are too few", hint="use at least 24")
     from scipy import ndimage
 
     kind = _CLASSES[name]

@@ -67,7 +67,7 @@ class BladeSet:
         if len(self.blades) > MAX_BLADES:
             raise InputError(
                 f"simulate: {len(self.blades)} blades are more than {MAX_BLADES}",
-                mend="give one blade a longer path",
+                hint="give one blade a longer path",
             )
 
     def __len__(self) -> int:
@@ -167,7 +167,7 @@ class BladeSet:
             raise InputError(
                 f"simulate: {found.shape[0]} parts on different sides of blades are more than "
                 f"{MAX_FIELDS}",
-                mend="use fewer blades or bodies",
+                hint="use fewer blades or bodies",
             )
         parent, sides = (found >> 32).to(torch.int32), (found & 0xFFFFFFFF).to(torch.int32)
         return Fields(field.to(torch.int32), parent, sides, ops.merged_fields(parent, sides))

@@ -73,7 +73,7 @@ class Gaps:
         if carry.scene is None:
             raise InputError(
                 "repair: the binding knows no scene, so there is no colour for crack faces",
-                mend="bind with Carry.bind(scene, matter), or use Repair(method='mvee')",
+                hint="bind with Carry.bind(scene, matter), or use Repair(method='mvee')",
             )
         self.carry = carry
         self._sites: Sites | None = None

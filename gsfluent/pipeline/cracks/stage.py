@@ -76,7 +76,7 @@ class Repair(Stage):
         super().__init__(seed=seed)
         if method not in METHODS:
             raise InputError(
-                f"repair: unknown method {method!r}", mend=f"known: {', '.join(METHODS)}"
+                f"repair: unknown method {method!r}", hint=f"known: {', '.join(METHODS)}"
             )
         self.method = method
         self.radius = radius

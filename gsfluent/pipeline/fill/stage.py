@@ -98,26 +98,26 @@ class Fill(Stage):
         if not 8 <= int(resolution) <= 512:
             raise InputError(
                 f"fill: resolution must be in 8..512 voxels, got {resolution}",
-                mend="96 to 160 is usual",
+                hint="96 to 160 is usual",
             )
         if method not in _METHODS:
             raise InputError(
                 f"fill: method must be one of {', '.join(_METHODS)}, got {method!r}",
-                mend="leave it at auto",
+                hint="leave it at auto",
             )
         if rays not in (6, 26):
             raise InputError(
-                f"fill: rays must be 6 or 26, got {rays}", mend="26 keeps crevices open"
+                f"fill: rays must be 6 or 26, got {rays}", hint="26 keeps crevices open"
             )
         if not threshold > 0:
-            raise InputError(f"fill: threshold must be > 0, got {threshold}", mend="0.5 is usual")
+            raise InputError(f"fill: threshold must be > 0, got {threshold}", hint="0.5 is usual")
         if not 0.5 <= agreement <= 1.0:
             raise InputError(
-                f"fill: agreement must be in 0.5..1, got {agreement}", mend="0.7 is usual"
+                f"fill: agreement must be in 0.5..1, got {agreement}", hint="0.7 is usual"
             )
         if spacing is not None and not 0.5 <= spacing <= 16:
             raise InputError(
-                f"fill: spacing must be in 0.5..16 voxels, got {spacing}", mend="leave it out"
+                f"fill: spacing must be in 0.5..16 voxels, got {spacing}", hint="leave it out"
             )
         self.resolution = int(resolution)
         self.method = method
@@ -274,7 +274,7 @@ class Fill(Stage):
         if self.method == "hull" and not (capture is not None and capture.shows_masks()):
             raise InputError(
                 "fill: method 'hull' needs a capture with masks",
-                mend="add masks or use method: vote",
+                hint="add masks or use method: vote",
             )
         method = {"vote": "density"}.get(self.method, self.method)
         if gaussians is not None and (method == "hull" or self.solid_through):
@@ -310,7 +310,7 @@ class Fill(Stage):
         if self.hollow < voxel:
             raise InputError(
                 f"fill: hollow wall {self.hollow:g} is thinner than a voxel ({voxel:g})",
-                mend="use a thicker wall or a higher resolution",
+                hint="use a thicker wall or a higher resolution",
             )
         wall = solid & (depth <= self.hollow)
         removed = 1.0 - float(wall.sum()) / max(int(solid.sum()), 1)
@@ -327,11 +327,11 @@ def _parse_hollow(hollow: str | float) -> float | None:
         except ValueError:
             raise InputError(
                 f"fill: hollow must be auto, none or a wall thickness, got {hollow!r}",
-                mend="for a 4 mm wall of an object in metres write hollow: 0.004",
+                hint="for a 4 mm wall of an object in metres write hollow: 0.004",
             ) from None
     if not (np.isfinite(hollow) and hollow > 0):
         raise InputError(
-            f"fill: hollow wall thickness must be positive, got {hollow}", mend="use hollow: none"
+            f"fill: hollow wall thickness must be positive, got {hollow}", hint="use hollow: none"
         )
     return float(hollow)
 

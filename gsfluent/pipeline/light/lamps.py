@@ -160,8 +160,8 @@ class Lighting:
         for name, most in {**limits, "occlusion": 1.0, "delight": 1.0}.items():
             value = getattr(self, name)
             if value is not None and not (0.0 <= value <= most and value < math.inf):
-                mend = "of at least 0" if most == math.inf else "from 0 to 1"
-                raise InputError(f"light.{name}: {value}", f"give a number {mend}")
+                hint = "of at least 0" if most == math.inf else "from 0 to 1"
+                raise InputError(f"light.{name}: {value}", f"give a number {hint}")
         given = self.environment
         if given is not None:
             fine = len(given) == 9 and all(len(row) == 3 for row in given)

@@ -111,7 +111,7 @@ def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
     if result.shape[0] == 0:
         raise InputError(
             f"sampling: no material point falls inside the solid at spacing {spacing:.4g}",
-            mend="use a finer quality",
+            hint="use a finer quality",
         )
     return result
 
@@ -143,14 +143,14 @@ def build_matter(
     """
     if not scene.bodies:
         raise InputError(
-            "simulate: the scene is empty", mend="scene.add(solid, material=...) first"
+            "simulate: the scene is empty", hint="scene.add(solid, material=...) first"
         )
     for body in scene.bodies if scene.floor is not None else ():
         depth = (scene.floor or 0.0) - float(body.bounds()[0][2])
         if depth > dx:
             raise InputError(
                 f"simulate: {body.name!r} starts {depth:.3g} m below the floor",
-                mend="add a drop event, or give a frame that puts it on the floor",
+                hint="add a drop event, or give a frame that puts it on the floor",
             )
     step = dx / POINTS_PER_CELL ** (1 / 3)
     expected = sum(body.volume for body in scene.bodies) / step**3
@@ -158,7 +158,7 @@ def build_matter(
         raise InputError(
             f"simulate: about {expected:.3g} material points at dx = {dx:.3g} m, "
             f"more than {max_particles}",
-            mend="use a coarser quality or raise max_particles",
+            hint="use a coarser quality or raise max_particles",
         )
     tables: list[Tensor] = []
     laws: list[Tensor] = []
@@ -222,7 +222,7 @@ def grid_spacing(scene: Scene, cells: int) -> float:
         extents.append((body.solid is not None, float((high - low).max())))
     if not extents:
         raise InputError(
-            "simulate: the scene is empty", mend="scene.add(solid, material=...) first"
+            "simulate: the scene is empty", hint="scene.add(solid, material=...) first"
         )
     return max(extents)[1] / cells
 
@@ -281,7 +281,7 @@ def _parameters(body: Body, points: Tensor, seed: int) -> tuple[Tensor, Tensor, 
                     f"material {material.name!r}: a field must have the shape of the voxels "
                     f"{wanted}, "
                     f"got {list(value.shape)}",
-                    mend="sample the field on Solid.occupancy's grid",
+                    hint="sample the field on Solid.occupancy's grid",
                 )
             voxel, _ = solid.voxel_index(points[index])
             return value.to("cpu", torch.float64)[voxel[:, 0], voxel[:, 1], voxel[:, 2]]
@@ -330,7 +330,7 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
     solid = body.solid
     if solid is None:
         raise InputError(
-            f"part {part.name!r}: a ball has no parts", mend="give the parts to a solid"
+            f"part {part.name!r}: a ball has no parts", hint="give the parts to a solid"
         )
     where = part.where
     mask = torch.ones(points.shape[0], dtype=torch.bool)
@@ -344,7 +344,7 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
         if solid.color is None:
             raise InputError(
                 f"part {part.name!r}: 'color_near' needs a textured solid",
-                mend="run the texture stage first",
+                hint="run the texture stage first",
             )
         wanted = torch.tensor(where["color_near"], dtype=torch.float64)
         color = solid.color_at(on_device).cpu().to(torch.float64)
@@ -357,7 +357,7 @@ def select(part: Part, body: Body, points: Tensor) -> Tensor:
         if solid.regions is None:
             raise InputError(
                 f"part {part.name!r}: the solid has no regions",
-                mend="use depth_below or color_near",
+                hint="use depth_below or color_near",
             )
         voxel, _ = solid.voxel_index(on_device)
         mask &= (solid.regions[voxel[:, 0], voxel[:, 1], voxel[:, 2]] == int(where["region"])).cpu()

@@ -144,13 +144,13 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
     try:
         values = torch.load(path, map_location=matter.particles.device, weights_only=True)
     except FileNotFoundError:
-        raise InputError(f"resume: no file {path}", mend="start without resume") from None
+        raise InputError(f"resume: no file {path}", hint="start without resume") from None
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise InputError(
-            f"resume: {path} cannot be read ({error})", mend="start without resume"
+            f"resume: {path} cannot be read ({error})", hint="start without resume"
         ) from error
     if not isinstance(values, dict) or values.get("version") != VERSION:
-        raise InputError(f"resume: {path} is no state of this version", mend="start without resume")
+        raise InputError(f"resume: {path} is no state of this version", hint="start without resume")
     mine = _fingerprint(matter)
     theirs = values["fingerprint"]
     if len(theirs) != len(mine) or not all(
@@ -158,7 +158,7 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
     ):
         raise InputError(
             f"resume: {path} belongs to another scene, quality or seed",
-            mend="resume with the settings it was made with, or start without resume",
+            hint="resume with the settings it was made with, or start without resume",
         )
     tensors = values["tensors"]
     rounded = tensors["position"].to(matter.particles.dtype)

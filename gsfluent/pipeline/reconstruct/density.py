@@ -193,7 +193,7 @@ class Adc:
         if not bool(keep.any()):
             raise RunError(
                 f"reconstruct: no Gaussian survived step {done}",
-                mend="check that masks, poses and photographs belong together",
+                hint="check that masks, poses and photographs belong together",
             )
         model.keep(keep)
         self.gradient = self.visits = torch.empty(0)
@@ -321,7 +321,7 @@ class Mcmc:
         if bool(dead.all()):
             raise RunError(
                 f"reconstruct: no Gaussian survived step {done}",
-                mend="check that masks, poses and photographs belong together",
+                hint="check that masks, poses and photographs belong together",
             )
         generator = draws(self.seed, 3, done)
         if wanted.stop:

@@ -184,7 +184,7 @@ class Reconstruct(Stage):
         if gaussians.count == 0:
             raise RunError(
                 "reconstruct: every Gaussian faded away in training",
-                mend="check that the poses belong to the photographs (gsfluent inspect)",
+                hint="check that the poses belong to the photographs (gsfluent inspect)",
             )
         trained = _now(self.device) - trained
         labels = gaussians.labels
@@ -359,7 +359,7 @@ class _Run:
             kept = self.checkpoint.path
             if kept is None or not kept.is_file():
                 raise
-            raise RunError(error.what, f"the last checkpoint, {kept}", error.mend) from error
+            raise RunError(error.what, f"the last checkpoint, {kept}", error.hint) from error
         self.history += [
             (before + step, count, round(db, 2)) for step, count, db in trainer.history
         ]

@@ -200,7 +200,7 @@ class Trainer:
             if not math.isfinite(losses[step % _RECENT]):
                 raise RunError(
                     f"reconstruct: the loss became {losses[step % _RECENT]} at step {step}",
-                    mend="check the poses with `gsfluent inspect`, or change the seed",
+                    hint="check the poses with `gsfluent inspect`, or change the seed",
                 )
         steps = range(max(0, self.done - 30), self.done)
         return sum(errors[step % _RECENT] for step in steps) / max(1, len(steps))

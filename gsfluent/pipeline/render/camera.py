@@ -203,7 +203,7 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
     Raises:
         InputError: The file is missing, is not such JSON, or an eye sits on its target.
     """
-    mend = 'give {"fov": 32, "frames": [{"eye": [x, y, z], "target": [x, y, z]}, ...]} in metres'
+    hint = 'give {"fov": 32, "frames": [{"eye": [x, y, z], "target": [x, y, z]}, ...]} in metres'
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         keys = torch.tensor(
@@ -216,16 +216,16 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
             f"give {', '.join(PATHS)}, an index, or a file",
         ) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"output.camera: {path}: {error!r}", mend) from error
+        raise InputError(f"output.camera: {path}: {error!r}", hint) from error
     if (
         keys.ndim != 2
         or keys.shape[1] != 6
         or not keys.isfinite().all()
         or not 1.0 <= field <= 150.0
     ):
-        raise InputError(f"output.camera: {path}: fov {field}, frames {tuple(keys.shape)}", mend)
+        raise InputError(f"output.camera: {path}: fov {field}, frames {tuple(keys.shape)}", hint)
     if bool(((keys[:, :3] - keys[:, 3:]).norm(dim=-1) == 0).any()):
-        raise InputError(f"output.camera: {path}: an eye equals its target", mend)
+        raise InputError(f"output.camera: {path}: an eye equals its target", hint)
     time = torch.linspace(0, keys.shape[0] - 1, count, dtype=torch.float64)
     low = time.floor().long().clamp(max=max(0, keys.shape[0] - 2))
     high = (low + 1).clamp(max=keys.shape[0] - 1)

@@ -51,7 +51,7 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
         if body.solid is not None:
             raise InputError(
                 f"live: {body.name!r} cannot be added while the simulation runs",
-                mend="start a session with it in the scene",
+                hint="start a session with it in the scene",
             )
     matter = run.matter
     if fresh:

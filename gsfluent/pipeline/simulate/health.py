@@ -219,8 +219,8 @@ class Watch:
 
     def verdict(self, frame: int) -> str:
         """Words for giving up: frame, time, region, likely cause, what to change."""
-        cause, mend = CAUSES[self.kind]
-        return f"frame {frame}: {self.reasons[-1]}; likely cause: {cause}; mend: {mend}"
+        cause, hint = CAUSES[self.kind]
+        return f"frame {frame}: {self.reasons[-1]}; likely cause: {cause}; hint: {hint}"
 
     def twin(self) -> Watch:
         """A watch of its own that knows what this one knows."""

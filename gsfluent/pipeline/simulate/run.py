@@ -250,7 +250,7 @@ class Run:
         if extra["fps"] != self.fps:
             raise InputError(
                 f"resume: {path} was made at {extra['fps']} frames per second, not {self.fps}",
-                mend="use the same fps, or start without resume",
+                hint="use the same fps, or start without resume",
             )
         self.state = state
         self.stepper.resume(Counters(**extra["counters"]))

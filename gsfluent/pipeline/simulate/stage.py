@@ -82,7 +82,7 @@ class SimulationFrame:
 
     def _binding(self) -> Carry:
         if self._carry is None:
-            raise InputError("frame: this run carries no splats", mend="Simulate(splats=True)")
+            raise InputError("frame: this run carries no splats", hint="Simulate(splats=True)")
         return self._carry
 
     @property
@@ -121,7 +121,7 @@ class SimulationFrame:
         """Where each splat has gone."""
         carry = self._binding()
         if self._points is None:
-            raise InputError("frame: no deformation was tracked", mend="Simulate(splats=True)")
+            raise InputError("frame: no deformation was tracked", hint="Simulate(splats=True)")
         return carry.follow(self._points, self._rest)
 
     @functools.cached_property
@@ -203,12 +203,12 @@ class Simulate(Stage):
         super().__init__(seed=seed)
         if quality not in QUALITY:
             raise InputError(
-                f"simulate: unknown quality {quality!r}", mend=f"known: {', '.join(QUALITY)}"
+                f"simulate: unknown quality {quality!r}", hint=f"known: {', '.join(QUALITY)}"
             )
         if dx is not None and not (math.isfinite(dx) and dx > 0):
-            raise InputError(f"simulate: dx must be positive, got {dx}", mend="give metres")
+            raise InputError(f"simulate: dx must be positive, got {dx}", hint="give metres")
         if not 0.0 < cfl <= 1.0:
-            raise InputError(f"simulate: cfl must lie in (0, 1], got {cfl}", mend="use 0.5")
+            raise InputError(f"simulate: cfl must lie in (0, 1], got {cfl}", hint="use 0.5")
         self.quality, self.dx, self.device = quality, dx, torch.device(device)
         self.jitter, self.max_particles = jitter, max_particles
         self.max_rollbacks, self.step_hook = max_rollbacks, step_hook
@@ -275,7 +275,7 @@ class Simulate(Stage):
         if not (math.isfinite(fps) and fps > 0 and math.isfinite(seconds) and seconds >= 0):
             raise InputError(
                 f"simulate: fps and seconds must be positive, got {fps} and {seconds}",
-                mend="for example fps=30, seconds=2",
+                hint="for example fps=30, seconds=2",
             )
         count = max(1, round(fps * seconds))
         run = self.run_of(scene, fps)
@@ -311,7 +311,7 @@ class Simulate(Stage):
             InputError: Nothing has been simulated yet.
         """
         if self._run is None or self._run.next_frame == 0:
-            raise InputError("simulate: there is no frame to save", mend="take a frame first")
+            raise InputError("simulate: there is no frame to save", hint="take a frame first")
         self._run.save(path, self._repair.state())
 
     def report(self) -> dict[str, Any]:
@@ -321,7 +321,7 @@ class Simulate(Stage):
             InputError: Nothing has been simulated yet.
         """
         if self._run is None:
-            raise InputError("simulate: nothing has been simulated", mend="call the stage first")
+            raise InputError("simulate: nothing has been simulated", hint="call the stage first")
         return self._run.report()
 
 

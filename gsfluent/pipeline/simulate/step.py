@@ -204,7 +204,7 @@ class Stepper:
                     f"simulate: from t = {state.time:.4g} s on the scene needs operators whose "
                     "sums have no order on a GPU (a blade at work, or a free body lighter than "
                     "what it meets), but deterministic was asked for",
-                    mend="leave out solve.deterministic, or run on the CPU",
+                    hint="leave out solve.deterministic, or run on the CPU",
                 )
             if not isinstance(self._engine, make):
                 settings = self._settings._replace(dt_scale=self.dt_scale)

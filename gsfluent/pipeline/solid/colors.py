@@ -68,7 +68,7 @@ def surface_colors(
     else:
         rows = (gaussians.labels == SURFACE).nonzero()[:, 0].cpu().numpy()
     if len(rows) == 0:
-        raise InputError("no surface Gaussians: labels hold none", mend="run fill on a splat first")
+        raise InputError("no surface Gaussians: labels hold none", hint="run fill on a splat first")
     alpha = gaussians.opacities.detach().double().cpu().numpy()[rows]
     weight = alpha if weights is None else np.asarray(weights, dtype=np.float64)[rows]
     solid = weight > (_FAINT if weights is None else 0.0)

@@ -63,7 +63,7 @@ def closed_mesh(field: SignedDistance, gaussians: Gaussians | None = None) -> tr
     if not mesh.is_watertight:
         raise RunError(
             f"mesh: the surface has open edges at voxel {field.voxel:.3g}",
-            mend="try another resolution, and report it",
+            hint="try another resolution, and report it",
         )
     if gaussians is not None and gaussians.count:
         color = surface_colors(gaussians, np.asarray(mesh.vertices), field.voxel)

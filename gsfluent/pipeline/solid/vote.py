@@ -116,7 +116,7 @@ def vote_solid(
     if gaussians.count < _FEW:
         raise InputError(
             f"fill: needs at least {_FEW} Gaussians, got {gaussians.count}",
-            mend="check that isolation kept the object",
+            hint="check that isolation kept the object",
         )
     box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
     field = density_field(
@@ -127,7 +127,7 @@ def vote_solid(
     if not shell.any():
         raise InputError(
             f"fill: no voxel reaches density {options.threshold:g} (largest {density.max():.3g})",
-            mend="lower threshold or resolution: the splats are transparent or sparse",
+            hint="lower threshold or resolution: the splats are transparent or sparse",
         )
     down = options.down
     if down is None and capture is not None:
@@ -150,7 +150,7 @@ def vote_solid(
         if not loose.any():
             raise InputError(
                 "fill: masks and splats do not overlap",
-                mend="check that masks are white on the object and belong to these cameras",
+                hint="check that masks are white on the object and belong to these cameras",
             )
     loose, dropped = keep_components(loose)
     loose = ndimage.binary_fill_holes(loose)

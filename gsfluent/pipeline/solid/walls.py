@@ -103,7 +103,7 @@ def thin_shells(
         ``cell``, ``limit`` (two cells), ``share`` of the surface that is thinner, ``thinnest`` (the
         5 % quantile) and ``median`` (both None when thicker than eight cells), ``middle`` (of the
         thin surface, [3], or None), ``cells_needed`` (how many times finer a grid would carry the
-        thinnest), ``warning`` and ``mend`` (texts, or None).
+        thinnest), ``warning`` and ``hint`` (texts, or None).
 
     Raises:
         ValueError: ``cell`` is not positive.
@@ -123,7 +123,7 @@ def thin_shells(
         "middle": None,
         "cells_needed": 1.0,
         "warning": None,
-        "mend": None,
+        "hint": None,
     }
     if len(thickness) == 0:
         return report
@@ -143,12 +143,12 @@ def thin_shells(
         f"{100 * share:.0f} % of the surface stands on walls under two cells ({limit:.3g}{unit}); "
         f"5 % is thinner than {thinnest:.3g}{unit}"
     )
-    mend = f"a grid {report['cells_needed']:.1f} times finer (solve.quality)"
+    hint = f"a grid {report['cells_needed']:.1f} times finer (solve.quality)"
     if gaussian_size is not None and thinnest < 2.0 * gaussian_size:
-        mend += "; the splats are as large as the wall is thick: reconstruct at a larger image_size"
+        hint += "; the splats are as large as the wall is thick: reconstruct at a larger image_size"
     if field.voxel > 0.5 * thinnest:
-        mend += "; a finer fill.resolution would know the wall better"
-    report["mend"] = mend
+        hint += "; a finer fill.resolution would know the wall better"
+    report["hint"] = hint
     return report
 
 

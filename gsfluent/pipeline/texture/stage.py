@@ -144,12 +144,12 @@ class Texture(Stage):
         if method not in METHODS:
             raise InputError(
                 f"texture: method must be one of {', '.join(METHODS)}, got {method!r}",
-                mend="leave it at auto",
+                hint="leave it at auto",
             )
         if quality not in QUALITIES:
             raise InputError(
                 f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
-                mend="leave it at fast",
+                hint="leave it at fast",
             )
         if method == "auto":
             method = "exemplar" if exemplar is not None else "procedural" if preset else "profile"
@@ -162,21 +162,21 @@ class Texture(Stage):
         if method == "exemplar" and exemplar is None:
             raise InputError(
                 "texture: method 'exemplar' needs an exemplar photograph",
-                mend="add exemplar: cut.jpg, or use method: procedural with a preset",
+                hint="add exemplar: cut.jpg, or use method: procedural with a preset",
             )
         if method == "procedural":
             preset = preset or prompt
             if preset not in PRESETS:
                 raise InputError(
                     f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
-                    mend="choose one of these or give an exemplar photograph",
+                    hint="choose one of these or give an exemplar photograph",
                 )
         options = InpaintOptions.of(inpaint)
         slices = method in ("diffusion", "inpaint")
         if slices and "diffusers" in (options.backend, options.coarse) and model is None:
             raise InputError(
                 f"texture: method {method!r} needs a model",
-                mend="give a local folder or hub id, for example "
+                hint="give a local folder or hub id, for example "
                 "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
             )
         self.method = method
@@ -193,7 +193,7 @@ class Texture(Stage):
         if cut is not None and cut not in CUTS:
             raise InputError(
                 f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
-                mend="leave it out when the structure does not follow the object's axis",
+                hint="leave it out when the structure does not follow the object's axis",
             )
         self.cut = cut
         self.photo = PhotoOptions.of(photo)
@@ -240,7 +240,7 @@ class Texture(Stage):
                 opened, structure = take_apart(opened)
                 exemplars = load_exemplars(opened)
         if not domain.inside.any():
-            raise InputError("texture: the solid is empty", mend="run fill first")
+            raise InputError("texture: the solid is empty", hint="run fill first")
         texture = self._make(domain, exemplars, progress)
         if structure is not None:
             texture = with_structure(domain, texture, structure, self.cut or CUTS[0])

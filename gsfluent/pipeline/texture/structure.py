@@ -213,7 +213,7 @@ def take_apart(opened: Any) -> tuple[Any, Structure]:
         if not part.silhouette:
             raise InputError(
                 f"texture: cut needs a photograph with an outline ({part.note})",
-                mend="cut the object out (RGBA), or leave cut out",
+                hint="cut the object out (RGBA), or leave cut out",
             )
         plain, structure = split_structure(part)
         found.append(structure)
@@ -221,7 +221,7 @@ def take_apart(opened: Any) -> tuple[Any, Structure]:
 
     plain = material(opened)
     if not found:
-        raise InputError("texture: cut needs an exemplar", mend="give a photograph of the cut")
+        raise InputError("texture: cut needs an exemplar", hint="give a photograph of the cut")
     return plain, found[0]
 
 

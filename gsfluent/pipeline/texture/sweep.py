@@ -58,7 +58,7 @@ class Sweep:
         if cut not in CUTS:
             raise InputError(
                 f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
-                mend="across: the photograph was cut across the axis; along: through it",
+                hint="across: the photograph was cut across the axis; along: through it",
             )
         self.cut, self.inside = cut, inside
         index = np.argwhere(inside)

@@ -84,7 +84,7 @@ def test_what_has_a_line_is_not_done_again(tmp_path: Path) -> None:
         def work(repeat: int) -> Outcome:
             calls.append(name)
             if error > 1.0:
-                raise RunError("it diverged", mend="take smaller steps")
+                raise RunError("it diverged", hint="take smaller steps")
             return Outcome(error, [0.1] * repeat, 5, {}, band=0.02)
 
         return Job("case", name, {"a": 1}, work)

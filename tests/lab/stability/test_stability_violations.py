@@ -43,7 +43,7 @@ class Staged:
         self.step += steps
         self.advanced += steps
         if self.change.get("raises") and self.step >= self.at:
-            raise FloatingPointError("solver: a point moved further than a cell\n  mend: lower dt")
+            raise FloatingPointError("solver: a point moved further than a cell\n  hint: lower dt")
 
     def look(self) -> State:
         now = dataclasses.replace(REST, step=self.step, time=0.1 * self.step)

@@ -84,7 +84,7 @@ def test_a_run_that_cannot_be_healed_keeps_its_frames_and_says_what_to_change() 
     assert [f.index for f in frames] == [0, 1, 2]
     reason = report["reason"]
     assert reason.startswith("frame 3: t = ") and "'right'" in reason, reason
-    assert "likely cause: " in reason and "mend: " in reason and "step_hook" in reason
+    assert "likely cause: " in reason and "hint: " in reason and "step_hook" in reason
     for frame in frames:
         assert bool(torch.isfinite(frame.particles.position).all())
 

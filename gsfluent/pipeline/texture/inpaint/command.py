@@ -78,12 +78,12 @@ class CommandInpainter(MaskedInpainter):
         if "{folder}" not in command:
             raise InputError(
                 f"inpaint: the command names no {{folder}}: {command!r}",
-                mend='write it like "python infer.py --folder {folder}"',
+                hint='write it like "python infer.py --folder {folder}"',
             )
         if not 0 <= overlap < window:
             raise InputError(
                 f"inpaint: overlap must be from 0 to below window, got {overlap} and {window}",
-                mend="24 and 4 are usual",
+                hint="24 and 4 are usual",
             )
         self.command = command
         self.window = int(window)
@@ -193,7 +193,7 @@ class CommandInpainter(MaskedInpainter):
             except OSError as error:
                 raise InputError(
                     f"{folder}: slices cannot be written ({error})",
-                    mend="choose a writable folder",
+                    hint="choose a writable folder",
                 ) from error
             self._run(folder, prompt)
         made = _read_all(folder / "out", slices.shape)
@@ -211,24 +211,24 @@ class CommandInpainter(MaskedInpainter):
             )
         except FileNotFoundError as error:
             raise InputError(
-                f"inpaint: command not found: {words[0]}", mend="give the full path of the program"
+                f"inpaint: command not found: {words[0]}", hint="give the full path of the program"
             ) from error
         except PermissionError as error:
             raise InputError(
-                f"inpaint: command cannot be run: {words[0]}", mend="make it executable"
+                f"inpaint: command cannot be run: {words[0]}", hint="make it executable"
             ) from error
         except subprocess.TimeoutExpired as error:
             raise RunError(
                 f"inpaint: the command took longer than {self.timeout:g} s",
                 kept=f"windows finished before, in {folder.parent}",
-                mend="raise timeout, or use a smaller window",
+                hint="raise timeout, or use a smaller window",
             ) from error
         if done.returncode != 0:
             last = (done.stderr or done.stdout).strip().splitlines()[-3:]
             raise RunError(
                 f"inpaint: the command ended with status {done.returncode}: {' | '.join(last)}",
                 kept=f"windows finished before, in {folder.parent}",
-                mend=f"run it by hand: {shlex.join(words)}",
+                hint=f"run it by hand: {shlex.join(words)}",
             )
 
 
@@ -250,7 +250,7 @@ def _read_all(folder: Path, shape: Sequence[int]) -> np.ndarray:
         raise RunError(
             f"{folder}: {len(found)} pictures for {count} slices"
             + (f"; {missing[0]} is missing" if missing else f"; {found[-1]} is one too many"),
-            mend="the command must write out/0000.png, 0001.png, ... one per slice",
+            hint="the command must write out/0000.png, 0001.png, ... one per slice",
         )
     frames = np.empty((count, height, width, 3), np.float32)
     for k, name in enumerate(wanted):
@@ -263,7 +263,7 @@ def _read_all(folder: Path, shape: Sequence[int]) -> np.ndarray:
             raise RunError(
                 f"{folder / name}: {pixels.shape[1]} x {pixels.shape[0]} pixels for a slice of "
                 f"{width} x {height}",
-                mend="the command must give the size back that it was given",
+                hint="the command must give the size back that it was given",
             )
         frames[k] = pixels.astype(np.float32) / 255.0
     return frames

@@ -68,7 +68,7 @@ class DiffusersInpainter(MaskedInpainter):
         if self.device.type == "cpu" and count > _CPU_PARAMETERS and not options.allow_slow:
             raise InputError(
                 f"texture: {count / 1e6:.0f} million parameters on a CPU would take hours to days",
-                mend="use a GPU, or set inpaint allow_slow to run anyway",
+                hint="use a GPU, or set inpaint allow_slow to run anyway",
             )
         if "strength" not in self.accepts:
             logger.warning("%s takes no strength: every pass repaints fully", self.name)
@@ -120,7 +120,7 @@ class DiffusersInpainter(MaskedInpainter):
                     raise RunError(
                         f"{self.name}: out of GPU memory with one picture of {self.size} pixels "
                         f"in memory mode {self.memory}",
-                        mend="use a smaller inpaint size or model, or free the GPU",
+                        hint="use a smaller inpaint size or model, or free the GPU",
                     ) from error
                 self.memory = lower
                 logger.warning("%s: out of memory, memory mode is now %s", self.name, lower)
@@ -170,13 +170,13 @@ class DiffusersInpainter(MaskedInpainter):
             raise RunError(
                 f"{self.name}: its safety checker blanked {sum(map(bool, flagged))} of {count} "
                 "slices",
-                mend="leave inpaint safety_checker off: it knows photographs, not slices",
+                hint="leave inpaint safety_checker off: it knows photographs, not slices",
             )
         pictures = np.asarray(output.images, dtype=np.float32)
         if not np.isfinite(pictures).all() or bool((pictures.std((1, 2, 3)) < 1e-5).any()):
             raise RunError(
                 f"{self.name}: the model returned NaN or a constant picture",
-                mend="this is how a float16 VAE overflows: use inpaint dtype float32 or bfloat16, "
+                hint="this is how a float16 VAE overflows: use inpaint dtype float32 or bfloat16, "
                 "or a model with the fp16-fixed VAE",
             )
         return frame.back(pictures)
@@ -190,7 +190,7 @@ class DiffusersInpainter(MaskedInpainter):
             if exemplar is None:
                 raise InputError(
                     "texture: ip_adapter needs an exemplar photograph to show to the model",
-                    mend="add exemplar: cut.jpg, or leave ip_adapter out",
+                    hint="add exemplar: cut.jpg, or leave ip_adapter out",
                 )
             result["ip_adapter_image"] = [_pil(exemplar)]
         elif exemplar is not None and "image_reference" in self.accepts:
@@ -199,7 +199,7 @@ class DiffusersInpainter(MaskedInpainter):
             depth = context.guide
             if depth is None:
                 raise InputError(
-                    "texture: controlnet needs the depth of the slices", mend="leave it out"
+                    "texture: controlnet needs the depth of the slices", hint="leave it out"
                 )
             near = 1.0 - depth / max(context.max_depth, float(depth.max()), 1e-6)
             if context.inside is not None:  # depth maps are bright near and black far away
@@ -258,7 +258,7 @@ class _Frame:
             raise RunError(
                 f"the model returned {pictures.shape[2]} x {pictures.shape[1]} pixels for a "
                 f"canvas of {self.width} x {self.height}",
-                mend="name a size the model knows (inpaint size)",
+                hint="name a size the model knows (inpaint size)",
             )
         size = (self.shape[1], self.shape[0])
         method = cv2.INTER_AREA if self.power >= 0 else cv2.INTER_LINEAR

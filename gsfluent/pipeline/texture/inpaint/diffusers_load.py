@@ -30,12 +30,12 @@ def pick_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError("texture: inpaint device is cuda, but no GPU is there", mend="use auto")
+        raise InputError("texture: inpaint device is cuda, but no GPU is there", hint="use auto")
     try:
         return torch.device(name)
     except RuntimeError as error:
         raise InputError(
-            f"texture: no device is called {name!r}", mend="use auto, cpu or cuda"
+            f"texture: no device is called {name!r}", hint="use auto, cpu or cuda"
         ) from error
 
 
@@ -97,18 +97,18 @@ def _packages(options: InpaintOptions) -> Any:
     except ImportError as error:
         raise InputError(
             "texture: method 'diffusion' needs the package diffusers, which is not installed",
-            mend="pip install diffusers transformers accelerate",
+            hint="pip install diffusers transformers accelerate",
         ) from error
     if not is_transformers_available():
         raise InputError(
             "texture: method 'diffusion' needs the package transformers, which is not installed",
-            mend="pip install transformers accelerate",
+            hint="pip install transformers accelerate",
         )
     if options.memory != "high" and not is_accelerate_available():
         raise InputError(
             f"texture: inpaint memory {options.memory} needs the package accelerate, which is not "
             "installed",
-            mend="pip install accelerate, or use memory: high",
+            hint="pip install accelerate, or use memory: high",
         )
     diffusers.utils.logging.set_verbosity_error()
     diffusers.utils.logging.disable_progress_bar()
@@ -122,7 +122,7 @@ def _is_local(model: str | Path) -> bool:
         if not (folder / "model_index.json").is_file():
             raise InputError(
                 f"{model}: not a diffusers model folder (no model_index.json)",
-                mend="give the folder that save_pretrained or a hub download made",
+                hint="give the folder that save_pretrained or a hub download made",
             )
         return True
     text = str(model)
@@ -132,7 +132,7 @@ def _is_local(model: str | Path) -> bool:
     if looks_local or text.count("/") != 1 or folder.parent.is_dir():
         raise InputError(
             f"{model}: model folder not found",
-            mend="give an existing folder or a hub id (owner/name)",
+            hint="give an existing folder or a hub id (owner/name)",
         )
     return False
 
@@ -163,13 +163,13 @@ def _load_error(
         where = f"the local cache, and {asked}, so the hub was not asked"
     else:
         where = "the hub"
-    mend = "check the name, download it beforehand, or give a local folder with .safetensors"
+    hint = "check the name, download it beforehand, or give a local folder with .safetensors"
     if options.variant is not None:
-        mend = f"leave variant ({options.variant}) out, or give the one that the files have"
+        hint = f"leave variant ({options.variant}) out, or give the one that the files have"
     elif "AutoPipeline can't find" in str(error):
-        mend = "use an inpainting model (SD-XL inpainting for example), or name pipeline_class"
+        hint = "use an inpainting model (SD-XL inpainting for example), or name pipeline_class"
     return InputError(
-        f"{model}: the inpainting model cannot be loaded from {where} ({first})", mend=mend
+        f"{model}: the inpainting model cannot be loaded from {where} ({first})", hint=hint
     )
 
 
@@ -179,7 +179,7 @@ def _pipeline_class(diffusers: Any, name: str, options: InpaintOptions) -> Any:
         if not hasattr(diffusers, options.pipeline_class):
             raise InputError(
                 f"texture: diffusers {diffusers.__version__} has no {options.pipeline_class}",
-                mend="leave pipeline_class out",
+                hint="leave pipeline_class out",
             )
         return getattr(diffusers, options.pipeline_class)
     if options.controlnet is not None:
@@ -208,7 +208,7 @@ def _controlnet(diffusers: Any, options: InpaintOptions, dtype: torch.dtype, off
     name = str(options.controlnet)
     local = Path(name).expanduser().is_dir()
     if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
-        raise InputError(f"{name}: ControlNet folder not found", mend="give a folder or a hub id")
+        raise InputError(f"{name}: ControlNet folder not found", hint="give a folder or a hub id")
     return diffusers.ControlNetModel.from_pretrained(
         name,
         local_files_only=local or offline,
@@ -223,12 +223,12 @@ def _ip_adapter(pipe: Any, options: InpaintOptions, offline: bool) -> None:
     if not hasattr(pipe, "load_ip_adapter"):
         raise InputError(
             f"texture: {type(pipe).__name__} takes no IP-adapter",
-            mend="leave ip_adapter out, or use an SD or SD-XL model",
+            hint="leave ip_adapter out, or use an SD or SD-XL model",
         )
     folder = Path(name).expanduser()
     local = folder.is_dir()
     if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
-        raise InputError(f"{name}: IP-adapter folder not found", mend="give a folder or a hub id")
+        raise InputError(f"{name}: IP-adapter folder not found", hint="give a folder or a hub id")
     own = None
     if getattr(pipe, "image_encoder", None) is None:
         # the encoder lies beside the weights or, as in h94/IP-Adapter, in models/image_encoder
@@ -244,7 +244,7 @@ def _ip_adapter(pipe: Any, options: InpaintOptions, offline: bool) -> None:
     if weights is None:
         raise InputError(
             f"{name}: which file holds the IP-adapter's weights is not clear",
-            mend="name it with ip_adapter_weights, for example ip-adapter_sdxl_vit-h.safetensors",
+            hint="name it with ip_adapter_weights, for example ip-adapter_sdxl_vit-h.safetensors",
         )
     try:
         pipe.load_ip_adapter(
@@ -258,12 +258,12 @@ def _ip_adapter(pipe: Any, options: InpaintOptions, offline: bool) -> None:
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(
             f"{name}: the IP-adapter cannot be used with {type(pipe).__name__} ({first})",
-            mend="take the adapter made for this family of models",
+            hint="take the adapter made for this family of models",
         ) from error
     if getattr(pipe, "image_encoder", None) is None:
         raise InputError(
             f"{name}: the pipeline has no image encoder, so an exemplar cannot be shown to it",
-            mend="put the encoder into image_encoder/ beside the adapter's weights",
+            hint="put the encoder into image_encoder/ beside the adapter's weights",
         )
     pipe.set_ip_adapter_scale(options.ip_adapter_scale)
 

@@ -143,7 +143,7 @@ class SliceStore:
                 os.replace(temporary, marker)
         except OSError as error:
             raise InputError(
-                f"{folder}: slices cannot be kept here ({error})", mend="choose a writable folder"
+                f"{folder}: slices cannot be kept here ({error})", hint="choose a writable folder"
             ) from error
 
     def get(self, number: int, axis: int, index: int, shape: tuple[int, ...]) -> np.ndarray | None:

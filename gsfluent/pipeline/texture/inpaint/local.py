@@ -37,7 +37,7 @@ class TeleaInpainter(MaskedInpainter):
 
     def __init__(self, radius: float = 3.0, method: str = "telea") -> None:
         if method not in ("telea", "ns"):
-            raise InputError(f"inpaint: method must be telea or ns, got {method!r}", mend="telea")
+            raise InputError(f"inpaint: method must be telea or ns, got {method!r}", hint="telea")
         self.radius = float(radius)
         self.method = method
         self.name = method
@@ -169,7 +169,7 @@ class ExemplarInpainter(MaskedInpainter):
         if photo is None:
             raise InputError(
                 "inpaint: backend 'exemplar' needs an exemplar photograph",
-                mend="add exemplar: cut.jpg, or choose backend telea or color",
+                hint="add exemplar: cut.jpg, or choose backend telea or color",
             )
         made = np.empty_like(slices)
         for k in range(len(slices)):

@@ -170,7 +170,7 @@ def make_inpainter(
     if model is None:
         raise InputError(
             "texture: method 'diffusion' needs a model",
-            mend="give a local folder or hub id, for example "
+            hint="give a local folder or hub id, for example "
             "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
         )
     from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter

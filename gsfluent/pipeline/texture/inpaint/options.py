@@ -103,36 +103,36 @@ class InpaintOptions:
             if not 0.0 < value <= 1.0:
                 raise InputError(
                     f"texture: inpaint {name} must be in 0..1, got {value}",
-                    mend="0.99 for the first pass and 0.1 to 0.4 for the others are usual",
+                    hint="0.99 for the first pass and 0.1 to 0.4 for the others are usual",
                 )
         for name in ("slices", "steps", "batch", "window"):
             if getattr(self, name) < 1:
                 raise InputError(
                     f"texture: inpaint {name} must be at least 1, got {getattr(self, name)}",
-                    mend="leave it out",
+                    hint="leave it out",
                 )
         if self.tile not in (1, 2, 4):
             raise InputError(
-                f"texture: inpaint tile must be 1, 2 or 4, got {self.tile}", mend="leave it out"
+                f"texture: inpaint tile must be 1, 2 or 4, got {self.tile}", hint="leave it out"
             )
         if self.size is not None and self.size < 16:
             raise InputError(
                 f"texture: inpaint size must be at least 16, got {self.size}",
-                mend="leave it out: the model knows its own",
+                hint="leave it out: the model knows its own",
             )
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise InputError(
                     f"texture: inpaint {name} must be one of {', '.join(filter(None, allowed))}, "
                     f"got {getattr(self, name)!r}",
-                    mend="use balanced when the GPU runs out of memory"
+                    hint="use balanced when the GPU runs out of memory"
                     if name == "memory"
                     else "leave it out",
                 )
         if "command" in (self.backend, self.coarse) and not self.command:
             raise InputError(
                 "texture: inpaint backend 'command' needs a command",
-                mend='add command: "python infer.py --folder {folder}"',
+                hint='add command: "python infer.py --folder {folder}"',
             )
 
     @staticmethod
@@ -151,7 +151,7 @@ class InpaintOptions:
         if wrong:
             raise InputError(
                 f"texture: inpaint knows no {', '.join(wrong)}",
-                mend=f"known are {', '.join(sorted(known))}",
+                hint=f"known are {', '.join(sorted(known))}",
             )
         given = dict(value)
         if "refine" in given:

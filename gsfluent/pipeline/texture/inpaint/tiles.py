@@ -31,7 +31,7 @@ class TiledInpainter:
 
     def __init__(self, inner: Inpainter, tile: int) -> None:
         if tile < 1:
-            raise InputError(f"inpaint: tile must be at least 1, got {tile}", mend="use 1, 2 or 4")
+            raise InputError(f"inpaint: tile must be at least 1, got {tile}", hint="use 1, 2 or 4")
         self.inner = inner
         self.tile = int(tile)
         self.name = f"{inner.name} ({tile}x{tile} tiles)"

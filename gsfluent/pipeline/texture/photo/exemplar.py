@@ -59,7 +59,7 @@ class PhotoOptions:
         if self.cutout not in CUTOUTS:
             raise InputError(
                 f"texture: cutout must be one of {', '.join(CUTOUTS)}, got {self.cutout!r}",
-                mend="leave it at auto",
+                hint="leave it at auto",
             )
         if self.white != "skin" if isinstance(self.white, str) else True:
             white_gains(self.white, np.zeros((4, 4, 3), np.float32), np.ones((4, 4), bool))
@@ -70,7 +70,7 @@ class PhotoOptions:
                 raise InputError(
                     f"texture: palette must be one of {', '.join(preset_names())}, "
                     f"got {self.palette!r}",
-                    mend="choose one of these, or leave it out",
+                    hint="choose one of these, or leave it out",
                 )
 
     @staticmethod
@@ -88,7 +88,7 @@ class PhotoOptions:
         for key in value:
             if key not in known:
                 raise InputError(
-                    f"texture: photo has no key {key!r}", mend=f"known: {', '.join(known)}"
+                    f"texture: photo has no key {key!r}", hint=f"known: {', '.join(known)}"
                 )
         return PhotoOptions(**value)
 
@@ -163,7 +163,7 @@ def load_exemplar(
         if mask.shape != image.shape[:2]:
             raise InputError(
                 f"{name}: the mask is {list(mask.shape)}, the exemplar {list(image.shape[:2])}",
-                mend="give a mask of the photograph's size",
+                hint="give a mask of the photograph's size",
             )
         chosen, silhouette, note = mask.astype(bool), True, "mask given"
     elif values.shape[2] == 4 and (values[..., 3] < 0.5).mean() > 0.005:
@@ -174,7 +174,7 @@ def load_exemplar(
     if chosen.mean() < 0.01:
         raise InputError(
             f"{name}: the mask leaves {100 * chosen.mean():.2f} % of the exemplar",
-            mend="give an image whose alpha channel is opaque on the cut face",
+            hint="give an image whose alpha channel is opaque on the cut face",
         )
     image, chosen, notes = _prepare(image, chosen, silhouette, options)
     note = "; ".join([note, *notes])

@@ -262,7 +262,7 @@ def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.
         if white != "auto":
             raise InputError(
                 f"texture: white must be auto, none, skin, kelvin or three numbers, got {white!r}",
-                mend="for example white: 3200 or white: [0.9, 0.85, 0.7]",
+                hint="for example white: 3200 or white: [0.9, 0.85, 0.7]",
             )
         return _ground_gains(image, mask)
     values = np.atleast_1d(np.asarray(white, dtype=float))
@@ -274,7 +274,7 @@ def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.
         return shade[1] / np.maximum(shade, 1e-3), "the reference given"
     raise InputError(
         f"texture: white must be 1000 to 25000 kelvin or three positive numbers, got {white!r}",
-        mend="for example white: 3200 or white: [0.9, 0.85, 0.7]",
+        hint="for example white: 3200 or white: [0.9, 0.85, 0.7]",
     )
 
 

@@ -41,7 +41,7 @@ def read_parts(source: object, photo: Exemplar) -> np.ndarray:
     else:
         raise InputError(
             f"texture: parts must be an image or a colour, got {type(source).__name__}",
-            mend="give a label image of the exemplar's size, or three values in 0..1",
+            hint="give a label image of the exemplar's size, or three values in 0..1",
         )
     if pixels.ndim == 3:
         pixels = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(2)
@@ -50,7 +50,7 @@ def read_parts(source: object, photo: Exemplar) -> np.ndarray:
         raise InputError(
             f"texture: parts are {pixels.shape[1]} x {pixels.shape[0]} pixels, the exemplar "
             f"{width} x {height}",
-            mend="label the exemplar itself, uncropped",
+            hint="label the exemplar itself, uncropped",
         )
     values = np.unique(pixels)
     labels = pixels > values[0] if len(values) <= 2 else pixels.astype(int)
@@ -68,7 +68,7 @@ def resized_parts(labels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 def _checked(labels: np.ndarray) -> np.ndarray:
     if not labels.any():
         raise InputError(
-            "texture: parts show nothing", mend="mark the inclusions, or leave parts away"
+            "texture: parts show nothing", hint="mark the inclusions, or leave parts away"
         )
     return labels
 
@@ -77,9 +77,9 @@ def _read(path: Path) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     if not path.is_file():
-        raise InputError(f"{path}: label image not found", mend="check the path")
+        raise InputError(f"{path}: label image not found", hint="check the path")
     try:
         with Image.open(path) as opened:
             return np.asarray(opened)
     except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise InputError(f"{path}: not an image ({error})", mend="use a PNG") from error
+        raise InputError(f"{path}: not an image ({error})", hint="use a PNG") from error

@@ -33,25 +33,25 @@ def read_pixels(source: str | Path | np.ndarray, name: str) -> np.ndarray:
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
         raise InputError(
             f"{name}: exemplar must be an RGB or RGBA image, got shape {list(pixels.shape)}",
-            mend="convert it to RGB",
+            hint="convert it to RGB",
         )
     if pixels.dtype.kind not in "uif":
         raise InputError(
-            f"{name}: exemplar holds {pixels.dtype} values", mend="give uint8, or float in 0..1"
+            f"{name}: exemplar holds {pixels.dtype} values", hint="give uint8, or float in 0..1"
         )
     top = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "ui" else 1.0
     values: np.ndarray = pixels.astype(np.float32) / top
     if not np.isfinite(values).all():
-        raise InputError(f"{name}: exemplar holds NaN or infinite values", mend="replace it")
+        raise InputError(f"{name}: exemplar holds NaN or infinite values", hint="replace it")
     if pixels.dtype.kind == "f" and values.size and values[..., :3].max() > 4.0:
         raise InputError(
             f"{name}: exemplar holds values up to {values.max():.0f}, float means 0..1",
-            mend="divide by 255, or give uint8",
+            hint="divide by 255, or give uint8",
         )
     if min(values.shape[:2]) < _SMALLEST:
         raise InputError(
             f"{name}: exemplar is {values.shape[1]} x {values.shape[0]} pixels",
-            mend=f"use a photograph of at least {_SMALLEST} x {_SMALLEST} pixels, better 300 x 300",
+            hint=f"use a photograph of at least {_SMALLEST} x {_SMALLEST} pixels, better 300 x 300",
         )
     longest = max(values.shape[:2])
     if longest > _LARGEST:
@@ -68,7 +68,7 @@ def _read(path: Path) -> np.ndarray:
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     if not path.is_file():
-        raise InputError(f"{path}: exemplar not found", mend="check the path")
+        raise InputError(f"{path}: exemplar not found", hint="check the path")
     try:
         with Image.open(path) as opened:
             picture: Image.Image = ImageOps.exif_transpose(opened)
@@ -88,5 +88,5 @@ def _read(path: Path) -> np.ndarray:
         Image.DecompressionBombError,
     ) as error:
         raise InputError(
-            f"{path}: exemplar cannot be read ({error})", mend="use a PNG or JPEG file"
+            f"{path}: exemplar cannot be read ({error})", hint="use a PNG or JPEG file"
         ) from error

@@ -49,7 +49,7 @@ def procedural_texture(domain: InteriorDomain, preset: str, seed: int) -> Interi
     if preset not in PRESETS:
         raise InputError(
             f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
-            mend="choose one of these or give an exemplar photograph",
+            hint="choose one of these or give an exemplar photograph",
         )
     index = np.argwhere(domain.inside)
     scale = max(domain.max_depth, 1.0)

@@ -60,7 +60,7 @@ def load_exemplars(source: object) -> dict[int, list[Exemplar]]:
         if not source or any(key not in _AXES for key in source):
             raise InputError(
                 f"texture: exemplar axes must be x, y, z, got {sorted(map(str, source))}",
-                mend="write exemplar: {x: a.jpg, z: b.jpg} or one file",
+                hint="write exemplar: {x: a.jpg, z: b.jpg} or one file",
             )
         return {_AXES[key]: _load_list(source[key]) for key in sorted(source)}
     one = _load_list(source)
@@ -70,14 +70,14 @@ def load_exemplars(source: object) -> dict[int, list[Exemplar]]:
 def _load_list(source: object) -> list[Exemplar]:
     if isinstance(source, Sequence) and not isinstance(source, str):
         if not source:
-            raise InputError("texture: the list of exemplars is empty", mend="name a photograph")
+            raise InputError("texture: the list of exemplars is empty", hint="name a photograph")
         return [item for part in source for item in _load_list(part)]
     if isinstance(source, Exemplar):
         return [source]
     if not isinstance(source, str | Path | np.ndarray):
         raise InputError(
             f"texture: exemplar must be a file, an array or a mapping, got {type(source).__name__}",
-            mend="give the path of a photograph",
+            hint="give the path of a photograph",
         )
     return [load_exemplar(source)]
 
@@ -143,7 +143,7 @@ def exemplar_texture(
         if value not in allowed:
             raise InputError(
                 f"texture: {name} must be one of {', '.join(allowed)}, got {value!r}",
-                mend=f"leave it at {allowed[0]}",
+                hint=f"leave it at {allowed[0]}",
             )
     began = time.process_time()
     where = _device(device)
@@ -153,7 +153,7 @@ def exemplar_texture(
     if isinstance(guide, str) and guide in ("axis", "height") and not outlined:
         raise InputError(
             f"texture: guide {guide!r} needs a photograph with an outline",
-            mend="cut the object out (RGBA) or use guide: none",
+            hint="cut the object out (RGBA) or use guide: none",
         )
     crop, back = _crop(domain)
     if isinstance(guide, np.ndarray):
@@ -161,7 +161,7 @@ def exemplar_texture(
             raise InputError(
                 f"texture: a guide array must be finite, of shape {list(domain.inside.shape)}, "
                 f"got {list(guide.shape)}",
-                mend="give one value per voxel of the solid",
+                hint="give one value per voxel of the solid",
             )
         guide = guide[back]
     shared = len({id(e) for e in everything}) == len(photos[min(photos)])
@@ -259,16 +259,16 @@ def _check(quality: str, scale: float, guide: str | np.ndarray, depth_scale: flo
     if quality not in QUALITIES:
         raise InputError(
             f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
-            mend="leave it at fast",
+            hint="leave it at fast",
         )
     if isinstance(guide, str) and guide not in GUIDES:
         raise InputError(
             f"texture: guide must be one of {', '.join(GUIDES)}, got {guide!r}",
-            mend="leave it at auto",
+            hint="leave it at auto",
         )
     for name, value in (("scale", scale), ("depth_scale", depth_scale)):
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"texture: {name} must be positive, got {value}", mend="1 is neutral")
+            raise InputError(f"texture: {name} must be positive, got {value}", hint="1 is neutral")
 
 
 def _device(device: str | torch.device) -> torch.device:
@@ -280,7 +280,7 @@ def _device(device: str | torch.device) -> torch.device:
 def _crop(domain: InteriorDomain) -> tuple[InteriorDomain, tuple[slice, ...]]:
     """The domain without its empty rim, and where it sits."""
     if not domain.inside.any():
-        raise InputError("texture: the solid is empty", mend="run fill first")
+        raise InputError("texture: the solid is empty", hint="run fill first")
     box = []
     for k in range(3):
         used = np.flatnonzero(domain.inside.any(tuple(i for i in range(3) if i != k)))
