@@ -28,7 +28,7 @@ if [ -z "${PYTHON:-}" ]; then
   . scripts/setup.sh
   prepare test || exit 1
 fi
-export PYTHONPATH="$PWD:$PWD/scripts${PYTHONPATH:+:$PYTHONPATH}" OMP_WAIT_POLICY=PASSIVE
+export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_WAIT_POLICY=PASSIVE
 mkdir -p "$out" || exit 1
 jobs=1
 [ "$device" = cpu ] && jobs=$(getconf _NPROCESSORS_ONLN)
@@ -54,14 +54,14 @@ brittle() {
   local which=()
   # on a GPU torch makes a thousand small calls a step; orders and debris are what a GPU can add
   [ "$device" = cuda ] && which=(--quick --parts order debris ejecta)
-  "$PYTHON" scripts/brittle_gpu.py -o "$out/brittle.jsonl" --device "$device" $quick "${which[@]}"
+  "$PYTHON" scripts/study/brittle/run.py -o "$out/brittle.jsonl" --device "$device" $quick "${which[@]}"
 }
 
 if [ -z "$enter" ]; then
-  part ops "$PYTHON" scripts/accuracy.py --device "$device" --json "$out/ops.json" $quick
+  part ops "$PYTHON" scripts/accuracy/ops.py --device "$device" --json "$out/ops.json" $quick
   battery_tier=(--tier all)
   [ -n "$quick" ] && battery_tier=(--only wave)
-  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" --known docs/accuracy.md "${battery_tier[@]}"
+  part battery "$PYTHON" scripts/accuracy/battery.py --device "$device" --json "$out/battery.json" --known docs/accuracy.md "${battery_tier[@]}"
   part bench bench
   part shatter "$PYTHON" scripts/fracturebench/shatter.py compare -o "$out/shatter.jsonl" --device "$device" $quick
   part chart "$PYTHON" -m gsfluent chart -o "$out/chart" --device "$device" $quick
@@ -76,19 +76,19 @@ have() { [ -s "$out/$1" ]; }
 keep() { have "$1" && mkdir -p docs/data && cp "$out/$1" "docs/data/$2"; }
 set -e
 if [ "$device" = cpu ]; then
-  if have ops.json; then "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null; fi
-  if have battery.json; then "$PYTHON" scripts/battery.py --json "$out/battery.json" --known docs/accuracy.md --markdown docs/accuracy.md > /dev/null; fi
+  if have ops.json; then "$PYTHON" scripts/accuracy/ops.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null; fi
+  if have battery.json; then "$PYTHON" scripts/accuracy/battery.py --json "$out/battery.json" --known docs/accuracy.md --markdown docs/accuracy.md > /dev/null; fi
   if keep shatter.jsonl shatter.jsonl; then "$PYTHON" scripts/fracturebench/shatter.py page; fi
 elif have ops.json; then
-  "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null
+  "$PYTHON" scripts/accuracy/ops.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null
 fi
 if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" docs/data/peers_*.jsonl > /dev/null; fi
-if keep chart/chart.jsonl "chart_$device.jsonl"; then "$PYTHON" scripts/chart_page.py; fi
+if keep chart/chart.jsonl "chart_$device.jsonl"; then "$PYTHON" scripts/pictures/chart.py; fi
 if keep stability/stability.jsonl "stability_$device.jsonl"; then
-  "$PYTHON" scripts/stability_page.py docs/data/stability_*.jsonl
+  "$PYTHON" scripts/pictures/stability.py docs/data/stability_*.jsonl
 fi
 if keep brittle.jsonl "brittle_$device.jsonl"; then
-  "$PYTHON" scripts/brittle_gpu.py -o docs/data/brittle_*.jsonl --only-tables \
+  "$PYTHON" scripts/study/brittle/run.py -o docs/data/brittle_*.jsonl --only-tables \
     --markdown docs/brittle_gpu.md --figure docs/images/brittle_gpu.png > /dev/null
 fi
 echo "entered what $out holds into docs/"

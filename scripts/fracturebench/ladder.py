@@ -15,10 +15,9 @@ import math
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))
 import numpy as np
-from page import enter
 
+from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench import registry
 from gsfluent.fracturebench.registry import Case, cases, find, judge
 from gsfluent.fracturebench.scene import SceneError

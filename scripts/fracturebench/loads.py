@@ -13,9 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from page import enter
-
+from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench.fracture_cantilever import cantilever
 from gsfluent.fracturebench.fracture_plane import notch
 from gsfluent.fracturebench.fracture_rock import experiment

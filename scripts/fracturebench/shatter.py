@@ -23,9 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from page import enter
-
+from gsfluent.figure.markdown import enter
 from gsfluent.figure.style import COLORS, OURS, new_figure, save_png
 from gsfluent.fracturebench.fracture_shatter import RADIUS, RECORD, SEEDS, reference
 from gsfluent.fracturebench.registry import find

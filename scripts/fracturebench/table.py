@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-sys.path.append(str(Path(__file__).resolve().parents[1]))
 import frozen
-from page import enter
 
 from gsfluent.charts.record import Record, of_run, read
 from gsfluent.errors import InputError
+from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench.registry import cases, find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError

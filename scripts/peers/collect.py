@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+sys.path.insert(0, str(ROOT))
 
 from gsfluent.charts.record import Record, append, machine, of_run, read  # noqa: E402
+from gsfluent.figure.markdown import enter  # noqa: E402
 from gsfluent.fracturebench.registry import find  # noqa: E402
 from gsfluent.fracturebench.run import Run  # noqa: E402
 from gsfluent.fracturebench.scene import Scene, SceneError  # noqa: E402
@@ -107,8 +108,6 @@ def reason(record: Record) -> str:
 
 def page(markdown: Path) -> None:
     """Enter the tables of the records that are there into a page."""
-    from page import enter
-
     text = markdown.read_text(encoding="utf-8")
     for device in ("cpu", "cuda"):
         data = DATA / f"peers_{device}.jsonl"

@@ -357,8 +357,8 @@ def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
 
 def enter_table(options: argparse.Namespace) -> int:
     """Print the tables of a file, or enter them into a page."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-    from page import enter
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    from gsfluent.figure.markdown import enter
 
     found = lines(options.out)
     for device in sorted({line["device"] for line in found}):

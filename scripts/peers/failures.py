@@ -323,8 +323,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         temporary.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         temporary.replace(options.out)
     if options.markdown is not None:
-        sys.path.insert(0, str(ROOT / "scripts"))
-        from page import enter
+        sys.path.insert(0, str(ROOT))
+        from gsfluent.figure.markdown import enter
 
         text = options.markdown.read_text(encoding="utf-8")
         part = table(json.loads(options.out.read_text(encoding="utf-8")))
