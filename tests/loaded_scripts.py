@@ -11,7 +11,7 @@ SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 
 def load_script(name: str) -> ModuleType:
-    """A new module from ``scripts/NAME.py``.
+    """A new module from a file below ``scripts/``.
 
     What it imports from beside it does not stay among the loaded modules: several folders have a
     ``cases.py``.

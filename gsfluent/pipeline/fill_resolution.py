@@ -9,8 +9,8 @@ from gsfluent.data import Gaussians
 __all__ = ["VOXELS_PER_CELL", "fill_resolution", "visible_extent"]
 
 VOXELS_PER_CELL = 2.0
-"""Measured (docs/interior.md): from two on, the mass that sampled points bring to the cells of a
-curved surface is limited by the points themselves (3 % of a cell), not by the voxels."""
+"""Measured (docs/measured/interior.md): from two on, the mass that sampled points bring to the
+cells of a curved surface is limited by the points themselves (3 % of a cell), not by the voxels."""
 _PICTURE = 96
 """Voxels along the largest object that its cut faces want, however coarse the simulation is."""
 _LEAST, _MOST = 32, 512

@@ -8,7 +8,7 @@ from gsfluent.pipeline.particles import POINTS_PER_CELL
 from gsfluent.scene import Scene
 
 BUDGET = {"cpu": 6_000, "cuda": 30_000}
-"""Material points of quality ``live`` by device: what docs/live.md measures as interactive."""
+"""Material points of quality ``live`` by device: interactive in docs/measured/live.md."""
 CELLS = (8, 64)
 """Fewest and most cells along the longest side of the largest solid."""
 

@@ -1,7 +1,7 @@
-"""Problems with known answers: run them all, and enter the table into docs/accuracy.md.
+"""Problems with known answers: run them all, and enter the table into docs/measured/accuracy.md.
 
     python scripts/accuracy/battery.py --tier fast         # a minute on one core
-    python scripts/accuracy/battery.py --json b.json --markdown docs/accuracy.md  # all
+    python scripts/accuracy/battery.py --json b.json --markdown docs/measured/accuracy.md  # all
     python scripts/accuracy/battery.py --device cuda --json g.json
 
 With --json the figures of every problem are kept as soon as it ends, and a second run computes only

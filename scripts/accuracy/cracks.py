@@ -1,4 +1,4 @@
-"""Judge the picture of a fracture against the true one, method by method; docs/crack_accuracy.md.
+"""Judge the picture of a fracture against the true one, method by method.
 
     python scripts/accuracy/cracks.py [--object melon ...] [--frames 15,18] [--only raw,default]
         [--size 400] [--cells 20] [--sheets FOLDER] [--lpips FOLDER] [--write]
@@ -40,7 +40,7 @@ from gsfluent.pipeline.render_figures import RawCarry
 from gsfluent.pipeline.render_holes import Holes, MatterView, small
 from gsfluent.pipeline.run_show import Film, light_of, shot_of
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "crack_accuracy.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "measured" / "crack_accuracy.md"
 VIEWS = ((-60.0, 20.0), (60.0, 20.0), (180.0, 20.0), (0.0, 55.0))
 """Azimuth and elevation of the cameras [degrees]."""
 FIELD = 32.0

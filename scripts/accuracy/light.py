@@ -1,6 +1,7 @@
 """Light against ray-traced truth: lit balls, shadows, occlusion, captured light divided out.
 
-    python scripts/accuracy/light.py [--page docs/light.md] [--json FILE] [--pictures FOLDER]
+    python scripts/accuracy/light.py [--page docs/measured/light.md]
+        [--json FILE] [--pictures FOLDER]
 
 Sphere: RMS of the difference of linear radiance over RMS of the truth, over the pixels whose
 surface faces the camera by at least 0.3 (away from the silhouette's rim). Shadow: where the share

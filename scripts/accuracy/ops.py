@@ -1,8 +1,8 @@
 """Errors of every op: the CPU against the float64 reference, CUDA against the CPU.
 
-    python scripts/accuracy/ops.py --markdown docs/accuracy.md      # refreshes the CPU part
+    python scripts/accuracy/ops.py --markdown docs/measured/accuracy.md    # the CPU part
     python scripts/accuracy/ops.py --device cuda --json a.json      # on a machine with a GPU
-    python scripts/accuracy/ops.py --table a.json --markdown docs/accuracy.md   # enters its figures
+    python scripts/accuracy/ops.py --table a.json --markdown docs/measured/accuracy.md
 
 Every precision gets the same float32 inputs. An error is the largest difference over the largest
 value. An entry beyond the bar is excused only where the op decides something (which splats pass the

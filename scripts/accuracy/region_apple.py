@@ -1,4 +1,4 @@
-"""Parts of the real apple, red and pale skin, told by a colour rule; enter docs/regions.md.
+"""Parts of the real apple, red and pale skin, told by a colour rule; docs/measured/regions.md.
 
     python scripts/accuracy/region_apple.py [--splats apple.ply] [--write]
 
@@ -30,7 +30,8 @@ from gsfluent.pipeline.regions import SkinLabels, project_labels
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data"))
-PAGE, PICTURE = ROOT / "docs" / "regions.md", ROOT / "docs" / "images" / "regions_apple.jpg"
+PAGE = ROOT / "docs" / "measured" / "regions.md"
+PICTURE = ROOT / "docs" / "images" / "regions_apple.jpg"
 SHEET = ROOT / "docs" / "images" / "regions_apple_masks.jpg"
 HUES = {"red": (330, 18), "pale": (18, 95)}  # degrees
 DIAMETER = 0.075  # of such an apple [m]; it was not measured

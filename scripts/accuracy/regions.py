@@ -1,4 +1,4 @@
-"""Measure projected labels against fruit whose patches are known; enter docs/regions.md.
+"""Measure projected labels against fruit whose patches are known; enter docs/measured/regions.md.
 
     python scripts/accuracy/regions.py [--resolution 96] [--only exact errors trained] [--write]
 
@@ -34,7 +34,7 @@ from gsfluent.pipeline import Fill, Reconstruct
 from gsfluent.pipeline.particles import sample_points
 from gsfluent.pipeline.regions import SkinLabels, project_labels
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "regions.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "measured" / "regions.md"
 NAMES = {1: "front", 2: "back", 3: "lid", 4: "spot"}
 VIEWS, SIZE = 42, 256
 LAYER = 0.015
@@ -278,7 +278,7 @@ def main() -> int:
     parser.add_argument("--resolution", type=int, default=96, help="voxels along the longest side")
     parser.add_argument("--only", nargs="*", default=["exact", "trained", "errors"])
     parser.add_argument(
-        "--write", action="store_true", help="enter the tables into docs/regions.md"
+        "--write", action="store_true", help="enter the tables into docs/measured/regions.md"
     )
     given = parser.parse_args()
     tables = {}

@@ -1,6 +1,6 @@
-"""How large a run gets in every format, and how long writing takes, as a table in docs/export.md.
+"""How large a run gets in every format, and how long writing takes: docs/measured/export.md.
 
-python scripts/bench/export_sizes.py demo_out --page docs/export.md
+python scripts/bench/export_sizes.py demo_out --page docs/measured/export.md
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python scripts/bench/light.py                    # 1080p, 1 M Gaussians, GPU if there is one
     python scripts/bench/light.py --device cpu --gaussians 100000 --size 640x360
-    python scripts/bench/light.py --read h100.out cpu.out --page docs/light.md
+    python scripts/bench/light.py --read h100.out cpu.out --page docs/measured/light.md
 
 A solid ball of matter breaks in four above a floor, under one soft key light. On the GPU times are
 medians of CUDA events around calls that run back to back; on the CPU they are the process's time.

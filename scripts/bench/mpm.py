@@ -1,8 +1,8 @@
 """Time a whole step of the resident solver on the falling-cube scenes of PhysGaussian's benchmark.
 
 python scripts/bench/mpm.py                                    # this machine's GPU, else its CPU
-python scripts/bench/mpm.py --device cpu --markdown docs/solver_cpu.md   # one core, process time
-python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/benchmarks.md
+python scripts/bench/mpm.py --device cpu --markdown docs/measured/benchmarks.md  # one core
+python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/benchmarks.md
 python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
 
 Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
@@ -207,7 +207,7 @@ def main() -> int:
     if options.markdown:
         page = options.markdown
         old = page.read_text() if page.exists() else ""
-        part = "bench_mpm" if gpu or options.threads == 1 else "bench_mpm threads"
+        part = "bench_mpm" if gpu else f"bench_mpm {'cpu' if options.threads == 1 else 'threads'}"
         page.write_text(enter(old, part, text.rstrip()))
     return 0
 

@@ -1,7 +1,7 @@
 """Time every op; print markdown, optionally write JSON. Errors: scripts/accuracy/ops.py.
 
 python scripts/bench/ops.py                         # this machine's CPU, and its GPU if any
-python scripts/bench/ops.py --device cuda --json bench.json --markdown docs/bench.md
+python scripts/bench/ops.py --device cuda --json bench.json --markdown bench.md
 python scripts/bench/ops.py --quick                 # a tenth of the size
 python scripts/bench/ops.py --compare before.json   # beside an earlier run
 """

@@ -2,7 +2,7 @@
 
 git clone https://github.com/XPandora/PhysGaussian && pip install warp-lang==0.10.1
 python scripts/bench/physgaussian.py PhysGaussian/mpm_solver_warp --json peer.json
-python scripts/bench/mpm.py --peer peer.json --markdown docs/benchmarks.md
+python scripts/bench/mpm.py --peer peer.json --markdown docs/measured/benchmarks.md
 
 Its code is imported from that folder, unchanged, and never copied: it has no licence. One substep
 is captured in a CUDA graph (`p2g2p` without its five synchronising timers, which is faster than as

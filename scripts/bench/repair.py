@@ -1,4 +1,4 @@
-"""Time the crack repair of a frame against the rendering of it; docs/cracks.md.
+"""Time the crack repair of a frame against the rendering of it; docs/measured/cracks.md.
 
     python scripts/bench/repair.py [--device cuda] [--splats 1000000] [--cells 40]
         [--size 1920x1080] [--frames 12] [--json FILE] [--write]
@@ -31,7 +31,7 @@ from gsfluent.pipeline.particles import build_matter
 from gsfluent.pipeline.repair import Repair
 from gsfluent.scene import Scene
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "cracks.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "measured" / "cracks.md"
 RADIUS = 0.1
 
 

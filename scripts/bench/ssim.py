@@ -4,7 +4,7 @@ Plain torch: SSIM by separable depthwise convolutions (half the time of one 11 x
 Adam by ``torch.optim.Adam(foreach=True)``.
 
 python scripts/bench/ssim.py                 # CPU, and the GPU when there is one
-python scripts/bench/ssim.py --device cuda
+python scripts/bench/ssim.py --device cuda --page docs/measured/losses.md
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
 from gsfluent import has_cuda, ops
+from gsfluent.figure.markdown import enter
 
 SIZES = ((200, 200), (800, 800), (1080, 1920))
 GAUSSIANS = {"cpu": 100_000, "cuda": 1_000_000}
@@ -124,18 +126,26 @@ def main() -> int:
     """Print the table; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"))
-    wanted = parser.parse_args().device
+    parser.add_argument("--page", type=Path, help="enter the tables into this page")
+    options = parser.parse_args()
+    wanted = options.device
     if wanted == "cuda" and not has_cuda():
         parser.error("no GPU, or gsfluent was built without CUDA")
     devices = [wanted] if wanted else ["cpu", *(["cuda"] if has_cuda() else [])]
     for device in devices:
         name = torch.cuda.get_device_name() if device == "cuda" else platform.machine()
         threads = "" if device == "cuda" else f", {torch.get_num_threads()} thread(s), process time"
-        print(f"\n{device}: {name}{threads}, torch {torch.__version__}, float32, median\n")
-        print("| what | ours [ms] | plain torch [ms] | ratio |\n| --- | --- | --- | --- |")
+        lines = [f"{device}: {name}{threads}, torch {torch.__version__}, float32, median", ""]
+        lines += ["| what | ours [ms] | plain torch [ms] | ratio |", "| --- | --- | --- | --- |"]
+        print("\n".join(["", *lines]))
         rows = [row for size in SIZES for row in loss_rows(device, size)]
         for what, ours, plain in [*rows, *adam_rows(device, GAUSSIANS[device])]:
-            print(f"| {what} | {ours:.3f} | {plain:.3f} | {plain / ours:.1f} |", flush=True)
+            lines.append(f"| {what} | {ours:.3f} | {plain:.3f} | {plain / ours:.1f} |")
+            print(lines[-1], flush=True)
+        if options.page is not None:
+            page = options.page.read_text(encoding="utf-8")
+            text = enter(page, f"ssim {device}", "\n".join(lines), f"## {device.upper()}")
+            options.page.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -27,7 +27,7 @@ from gsfluent.viewer.picture import PictureMaker
 from gsfluent.viewer.timeline import Timeline
 
 RADIUS, HEIGHT = 0.1, 0.13
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "viewer.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "measured" / "viewer.md"
 
 
 class Ball:
@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--splats", type=int, nargs="+", default=[50_000, 200_000, 1_000_000])
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--enter", metavar="NAME", help="enter into docs/viewer.md under this name")
+    parser.add_argument("--enter", metavar="NAME", help="enter into the page under this name")
     parser.add_argument("--read", type=Path, help="a table printed before, instead of measuring")
     arguments = parser.parse_args()
     if arguments.read is not None:

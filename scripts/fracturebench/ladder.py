@@ -4,7 +4,7 @@
 
 Every case of elastic bodies and of contact over its ladder of dx (float32, CFL 0.5, eight points
 per cell). The order is the slope of the error over the three finest; both tables are entered into
-docs/fracturebench.md. Half a minute on one quiet core.
+docs/measured/fracturebench.md. Half a minute on one quiet core.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases; default all of motion")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument(
-        "--page", type=Path, default=ROOT / "docs" / "fracturebench.md", metavar="FILE"
+        "--page", type=Path, default=ROOT / "docs" / "measured" / "fracturebench.md", metavar="FILE"
     )
     args = parser.parse_args()
     try:

@@ -22,7 +22,7 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.frozen import play
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "fracturebench_fracture.md"
+PAGE = ROOT / "docs" / "measured" / "fracturebench_fracture.md"
 
 
 def speeds(quick: bool) -> list[str]:

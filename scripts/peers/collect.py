@@ -1,7 +1,7 @@
 """Judge the runs of all.py and add them to a file of records, a JSON line each.
 
-python scripts/peers/collect.py out/peers -o docs/data/peers_cpu.jsonl [--machine NAME]
-python scripts/peers/collect.py --markdown docs/peers.md
+python scripts/peers/collect.py out/peers -o docs/measured/data/peers_cpu.jsonl [--machine NAME]
+python scripts/peers/collect.py --markdown docs/measured/peers.md
 
 Runs in gsfluent's environment. A run whose record is there is not added again. --machine names
 where the runs were made if that is not here.
@@ -25,7 +25,7 @@ from gsfluent.fracturebench.registry import find  # noqa: E402
 from gsfluent.fracturebench.run import Run  # noqa: E402
 from gsfluent.fracturebench.scene import Scene, SceneError  # noqa: E402
 
-DATA = ROOT / "docs" / "data"
+DATA = ROOT / "docs" / "measured" / "data"
 
 
 def record(folder: Path, path: Path, where: str | None) -> Record:
@@ -126,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, nargs="?", help="what all.py was given with -o")
     parser.add_argument("-o", "--out", type=Path, help="file of records, added to")
     parser.add_argument("--machine", help="where the runs were made; default: this machine")
-    parser.add_argument("--markdown", type=Path, help="enter docs/data/peers_*.jsonl into a page")
+    parser.add_argument("--markdown", type=Path, help="enter the recorded lines into this page")
     options = parser.parse_args(arguments)
     if options.markdown is None and (options.folder is None or options.out is None):
         parser.error("give a folder and -o, or --markdown")

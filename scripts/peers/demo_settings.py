@@ -2,7 +2,7 @@
 
 python scripts/peers/demo_settings.py peer PhysGaussian -o demo.jsonl [--device cuda]  # its env
 python scripts/peers/demo_settings.py ours PhysGaussian -o demo.jsonl [--device cuda]  # gsfluent's
-python scripts/peers/demo_settings.py table demo.jsonl --markdown docs/peers.md
+python scripts/peers/demo_settings.py table demo.jsonl --markdown docs/measured/peers.md
 
 PhysGaussian is the folder of a checkout. `peer` runs its solver at exactly each config's grid, step
 and matter on the stand-in of demo_scenes.py: error against the exact mode, and wall milliseconds

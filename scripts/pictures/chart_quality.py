@@ -1,6 +1,6 @@
-"""Enter recorded lines into docs/chart_quality.md and draw its pictures.
+"""Enter recorded lines into docs/measured/chart_quality.md and draw its pictures.
 
-    python scripts/pictures/chart_quality.py docs/data/chart_rendering_cpu.jsonl ...
+    python scripts/pictures/chart_quality.py docs/measured/data/chart_rendering_cpu.jsonl ...
 
 Each file holds lines of `gsfluent chart --of rendering|reconstruction|texturing`, of any device.
 """
@@ -16,7 +16,7 @@ from gsfluent.charts.record import read
 from gsfluent.figure.markdown import enter
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "chart_quality.md"
+PAGE = ROOT / "docs" / "measured" / "chart_quality.md"
 IMAGES = ROOT / "docs" / "images"
 
 
@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
                 (IMAGES / picture).write_bytes(Path(result["figure"]).read_bytes())
                 rows = [r for r in mine.values() if r.device.split(":")[0] == device]
                 parts.append(
-                    f"![{kind} on {rows[0].machine}](images/{picture})\n\n"
+                    f"![{kind} on {rows[0].machine}](../images/{picture})\n\n"
                     f"**{rows[0].machine}**\n\n{markdown(rows)}"
                 )
         text = enter(text, f"chart {kind}", "\n".join(parts))

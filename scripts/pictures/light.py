@@ -1,4 +1,4 @@
-"""Pictures of docs/light.md: a run under four lights, and a splat file whose capture is relit.
+"""Pictures of light: a run under four lights, and a splat file whose capture is relit.
 
 python scripts/pictures/light.py --run OUT --frame 11 -o docs/images/light_broken.jpg
 python scripts/pictures/light.py --splats apple.ply -o docs/images/light_apple.jpg

@@ -1,6 +1,6 @@
-"""Enter recorded stability maps into docs/stability.md and draw its pictures.
+"""Enter recorded stability maps into docs/measured/stability.md and draw its pictures.
 
-python scripts/pictures/stability.py docs/data/stability_cpu.jsonl [docs/data/stability_cuda.jsonl]
+python scripts/pictures/stability.py docs/measured/data/stability_*.jsonl
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ def main() -> int:
     """Draw and enter."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("lines", nargs="+", type=Path)
-    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "stability.md")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs" / "measured" / "stability.md")
     parser.add_argument("--images", type=Path, default=ROOT / "docs" / "images")
     parser.add_argument(
-        "--peers", type=Path, default=ROOT / "docs" / "data" / "peers_failures.json"
+        "--peers", type=Path, default=ROOT / "docs" / "measured" / "data" / "peers_failures.json"
     )
     given = parser.parse_args()
     programs = measured(given.peers) if given.peers.is_file() else []

@@ -1,6 +1,6 @@
 """Run the real captures and a real splat through `gsfluent run` at reduced settings; write a table.
 
-    python scripts/study/captures.py [-o captures_out] [--markdown docs/captures.md]
+    python scripts/study/captures.py [-o captures_out] [--markdown docs/measured/captures.md]
         [--only apple ...]
 
 Needs the data folder (GSFLUENT_DATA, or ../shared/data beside the checkout). Nothing is copied into
@@ -20,6 +20,7 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError
+from gsfluent.figure.markdown import enter
 from gsfluent.pipeline.run import run_shot
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -109,7 +110,7 @@ HEAD = (
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("captures_out"))
-    parser.add_argument("--markdown", type=Path, help="write the table here")
+    parser.add_argument("--markdown", type=Path, help="page to enter the table into")
     parser.add_argument("--only", nargs="*", choices=sorted(SHOTS), default=sorted(SHOTS))
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
@@ -128,7 +129,9 @@ def main() -> int:
     table = "\n".join(rows) + "\n"
     sys.stdout.write(table)
     if options.markdown:
-        options.markdown.write_text(table)
+        page = options.markdown
+        old = page.read_text(encoding="utf-8") if page.exists() else ""
+        page.write_text(enter(old, "captures", table.rstrip()), encoding="utf-8")
     return 1 if failed else 0
 
 

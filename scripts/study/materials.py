@@ -1,26 +1,23 @@
-"""Write the tables of presets into docs/materials.md, from the code.
+"""Write the tables of presets into docs/measured/materials.md, from the code.
 
 python scripts/study/materials.py
 """
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 
+from gsfluent.figure.markdown import enter
 from gsfluent.materials import table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "materials.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "measured" / "materials.md"
 
 
 def filled(text: str) -> str:
-    """Return the page with its generated blocks renewed."""
-    for block, made in (("numbers", table.numbers()), ("sources", table.sources())):
-        pattern = rf"(<!-- {block}: [^\n]*-->\n).*?(<!-- end -->)"
-        text, found = re.subn(pattern, lambda m, made=made: m[1] + made + m[2], text, flags=re.S)
-        if found != 1:
-            raise SystemExit(f"{PAGE.name} has {found} blocks called {block}, expected one")
+    """Return the page with its tables renewed."""
+    for name, made in (("numbers", table.numbers()), ("sources", table.sources())):
+        text = enter(text, name, made.rstrip(), f"## {name.capitalize()}")
     return text
 
 

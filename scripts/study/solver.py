@@ -1,6 +1,6 @@
-"""What the resident solver's fixed-point sums and its delayed time step cost; for docs/solver.md.
+"""What the resident solver's fixed-point sums and its delayed time step cost.
 
-python scripts/study/solver.py --markdown docs/solver.md    # two minutes on one core
+python scripts/study/solver.py --markdown docs/measured/solver.md    # two minutes on one core
 """
 
 from __future__ import annotations

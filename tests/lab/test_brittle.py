@@ -1,4 +1,4 @@
-"""What kills brittle MPM: the experiments of docs/brittle_gpu.md, in small."""
+"""What kills brittle MPM: the experiments of docs/measured/brittle_gpu.md, in small."""
 
 from __future__ import annotations
 

@@ -15,7 +15,9 @@ from gsfluent.cli import main
 from gsfluent.errors import InputError
 from gsfluent.figure.map import Cell, Plane, draw_planes, place_of
 
-RECORDED = Path(__file__).resolve().parents[2] / "docs" / "data" / "stability_cpu.jsonl"
+RECORDED = (
+    Path(__file__).resolve().parents[2] / "docs" / "measured" / "data" / "stability_cpu.jsonl"
+)
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,7 @@ def test_recorded_lines_become_a_figure_and_tables(
 
 
 def test_the_page_names_what_there_is() -> None:
-    text = (ROOT / "docs" / "chart.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "measured" / "chart.md").read_text(encoding="utf-8")
     tests = "".join(
         (ROOT / "tests" / "charts" / name).read_text(encoding="utf-8")
         for name in ("test_trades_nothing.py", "test_trades_nothing_cuda.py")

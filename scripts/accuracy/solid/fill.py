@@ -1,4 +1,4 @@
-"""Fill every mesh of the data folder after photographing and reconstructing it; docs/filling.md.
+"""Fill every mesh of the data folder, photographed and reconstructed; docs/measured/filling.md.
 
     python scripts/accuracy/solid/fill.py --cache out/fill [--only bowl] [--write] [--cuts]
 
@@ -26,7 +26,7 @@ from gsfluent.pipeline.fill import Fill
 from gsfluent.pipeline.fill_hollow import cavity_volume
 from gsfluent.pipeline.solid_field import SignedDistance
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "filling.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "measured" / "filling.md"
 SHEET = PAGE.parent / "images" / "filling_cuts.png"
 TRUTH = 200  # voxels along the longest side
 HOLLOW = 0.2  # a thing that holds over this share of its own volume in water is hollow

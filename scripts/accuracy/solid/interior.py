@@ -34,7 +34,7 @@ from gsfluent.pipeline.reconstruct_init import _quats_of
 from gsfluent.pipeline.texture.domain import InteriorTexture
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = ROOT / "docs" / "interior_gaussians.md"
+PAGE = ROOT / "docs" / "measured" / "interior_gaussians.md"
 SIZE = 512  # pixels of the cut
 SPLATS = 30_000  # on the skin of the known melon
 HELD = 8  # every eighth photograph is kept from training and from the refinement

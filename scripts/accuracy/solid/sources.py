@@ -1,4 +1,4 @@
-"""Measure every source of the solid against meshes whose inside is known; enter docs/solid.md.
+"""Measure sources of the solid against meshes whose inside is known; docs/measured/solid.md.
 
     python scripts/accuracy/solid/sources.py [--resolution 96] [--only torus skull] [--write]
 
@@ -36,7 +36,7 @@ DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data")) / 
 SIZE = 400  # pixels of the masks
 TRAINED = "watermelon, trained"
 METHODS = (("hull", True), ("density", False), ("tsdf", False), ("auto", True))
-PAGE = ROOT / "docs" / "solid.md"
+PAGE = ROOT / "docs" / "measured" / "solid.md"
 FILES = {
     "skull": "skull/skull_low_resolution.obj",
     "armadillo": "armadillo/armadillo.obj",
@@ -136,7 +136,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--resolution", type=int, default=96)
     parser.add_argument("--only", nargs="*", default=None)
-    parser.add_argument("--write", action="store_true", help="enter the table into docs/solid.md")
+    parser.add_argument("--write", action="store_true", help="enter the table into the page")
     given = parser.parse_args()
     names = [
         method + (" + masks" if masks and method != "hull" else "") for method, masks in METHODS

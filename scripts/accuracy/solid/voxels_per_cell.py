@@ -1,4 +1,4 @@
-"""How many voxels of a solid per cell of the simulation: enter the table of docs/interior.md.
+"""How many voxels of a solid per cell of the simulation: docs/measured/interior.md.
 
     python scripts/accuracy/solid/voxels_per_cell.py [--cells 40] [--write]
 
@@ -19,7 +19,7 @@ from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.figure.markdown import enter
 from gsfluent.pipeline.particles import sample_points
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "interior.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "measured" / "interior.md"
 AXES = (1.0, 1.3, 1.6)  # the radius is half the unit length over these
 PER_CELL = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 8.0)
 DRAWS = 6
@@ -80,7 +80,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--cells", type=int, default=40, help="grid cells along the object")
-    parser.add_argument("--write", action="store_true", help="enter the table in docs/interior.md")
+    parser.add_argument("--write", action="store_true", help="enter the table into the page")
     options = parser.parse_args()
     lines = [
         "| voxels per cell | mass of surface cells, error | volume, error |",

@@ -27,7 +27,7 @@ from gsfluent.pipeline.texture.inpaint import InpaintOptions, diffusion_texture
 from gsfluent.pipeline.texture.metrics import lab_histogram_distance, patch_distance
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = ROOT / "docs" / "inpainting.md"
+PAGE = ROOT / "docs" / "measured" / "inpainting.md"
 SHOWN = (2, 4, 7)  # planes of the sheet: across y, across z, oblique
 
 Maker = Callable[[KnownInterior], np.ndarray]

@@ -2,7 +2,8 @@
 
 The interior of a known watermelon is shown by Gaussians at twice the voxel spacing. Slices across
 all three axes are the targets; what counts are slices in between and at random angles, which no
-solver has seen. Times are process CPU seconds. With --write the tables go into docs/inpainting.md.
+solver has seen. Times are process CPU seconds. With --write the tables go
+into docs/measured/inpainting.md.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from gsfluent.pipeline.texture.fusion import (
     stack_planes,
 )
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "inpainting.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "measured" / "inpainting.md"
 SPACING = 2.0
 
 

@@ -1,11 +1,11 @@
-"""Judge texturing on six solids whose inside is known; enter docs/texture_accuracy.md.
+"""Judge texturing on six solids whose inside is known; enter docs/measured/texture_accuracy.md.
 
     python scripts/accuracy/texture/known.py [--size 128] [--only marble cake]
         [--methods default preview] [--device cuda] [--model FOLDER] [--seeds 0 1 2]
         [--draws 5] [--write] [--sheets]
 
-Every run leaves one JSON line in docs/data/texture_accuracy.jsonl (the latest per class, size,
-method, device and seed). ``--write`` enters the tables made of all lines, ``--sheets`` draws
+Every run leaves one JSON line in docs/measured/data/texture_accuracy.jsonl (the latest per class,
+size, method, device and seed). ``--write`` enters the tables made of all lines, ``--sheets`` draws
 held-out planes side by side. ``default`` is what a user gets who gives a photograph and no method.
 """
 
@@ -26,8 +26,8 @@ from gsfluent.lab.interiors import KNOWN_INTERIORS, known_interior
 from gsfluent.lab.interiors_judge import Judge, crossing_error
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = ROOT / "docs" / "texture_accuracy.md"
-LINES = ROOT / "docs" / "data" / "texture_accuracy.jsonl"
+PAGE = ROOT / "docs" / "measured" / "texture_accuracy.md"
+LINES = ROOT / "docs" / "measured" / "data" / "texture_accuracy.jsonl"
 METHODS = (
     "photograph",
     "color_copy",

@@ -6,8 +6,8 @@
 Needs the photographs of the data folder (GSFLUENT_DATA, or ../shared/data beside the checkout).
 One slice goes in; cuts through the solid are compared with photographs (or halves of photographs)
 that did not. The floor is the distance between two photographs of the class. Every run leaves one
-JSON line per class in docs/data/real_interiors.jsonl; ``--write`` enters the table of all lines,
-``--sheets`` draws what was compared.
+JSON line per class in docs/measured/data/real_interiors.jsonl; ``--write`` enters the table of
+all lines, ``--sheets`` draws what was compared.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from gsfluent.pipeline.texture.profile import depth_profile, profile_volume, sur
 from gsfluent.pipeline.texture.structure import take_apart, with_structure
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = ROOT / "docs" / "real_interiors.md"
-LINES = ROOT / "docs" / "data" / "real_interiors.jsonl"
+PAGE = ROOT / "docs" / "measured" / "real_interiors.md"
+LINES = ROOT / "docs" / "measured" / "data" / "real_interiors.jsonl"
 SHEET = ROOT / "docs" / "images" / "real_interiors.jpg"
 METHODS = ("color_copy", "profile", "photo_profile", "preview", "default")
 _RIM = 3  # voxels next to the outline where the surface's colour fades out
@@ -228,7 +228,7 @@ def table(lines: list[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--size", type=int, default=80, help="voxels along the cube (80)")
-    parser.add_argument("--only", nargs="*", help=f"classes: {', '.join(CASES)}")
+    parser.add_argument("--only", nargs="*", help=f"classes: {', '.join(CASES)}".replace("%", "%%"))
     parser.add_argument("--write", action="store_true", help="enter the table into the page")
     parser.add_argument("--sheets", action="store_true", help="draw docs/images/real_interiors.jpg")
     options = parser.parse_args()
@@ -240,7 +240,7 @@ def main() -> None:
     pictures = {}
     for name in options.only or CASES:
         if name not in CASES:
-            sys.exit(f"unknown class {name!r}; known: {', '.join(CASES)}")
+            sys.exit(f"unknown class {name!r}; known: {', '.join(CASES)}".replace("%", "%%"))
         record, pictures[name] = judge(CASES[name], options.size)
         known[name] = record
         ratio = record["default"]["patch"] / record["floor"]["patch"]

@@ -1,7 +1,7 @@
 """Reconstruct and gsplat's default trainer on the same photographs, side by side in one table.
 
 python scripts/bench/gsplat/compare.py --device cuda --jsonl out.jsonl \\
-    --markdown docs/reconstruction.md
+    --markdown docs/measured/reconstruction.md
 python scripts/bench/gsplat/compare.py --only fox demo:watermelon --ours mcmc:densify=mcmc
 
 Captures: every folder of GSFLUENT_DATA/captures (or ../shared/data beside the checkout) and the

@@ -1,6 +1,7 @@
 """Time gsfluent's rasterizer beside gsplat's, on the same Gaussians in one process.
 
-python scripts/bench/gsplat/rasterizer.py --garden test_garden.npz --markdown docs/benchmarks.md
+python scripts/bench/gsplat/rasterizer.py --garden test_garden.npz \\
+    --markdown docs/measured/benchmarks.md
 python scripts/bench/gsplat/rasterizer.py --device cpu --threads 1 2  # gsfluent alone, 100 k
 
 gsplat is imported when it is installed (its code is not part of gsfluent); without it gsfluent is

@@ -299,7 +299,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         import gsplat  # noqa: F401
     except ImportError:
-        parser.error("gsplat is not installed; docs/benchmarks.md says which version to build")
+        parser.error("gsplat is not installed; docs/measured/benchmarks.md names the version")
     device = torch.device(options.device)
     try:
         capture = gf.load_capture(options.capture)

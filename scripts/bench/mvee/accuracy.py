@@ -1,4 +1,4 @@
-"""Accuracy of ops.mvee_lens over families of pairs, entered into docs/mvee.md.
+"""Accuracy of ops.mvee_lens over families of pairs, entered into docs/measured/mvee.md.
 
 `outside`: how far the overlap reaches out of the result at worst, over 4000 rays and the points of
 a dense search, relative to the result's size (negative: inside). `volume`: smallest and largest

@@ -1,10 +1,10 @@
 """What kills brittle MPM on GPUs: the discontinuity, the order of sums, or a division by zero?
 
-python scripts/study/brittle/run.py -o brittle.jsonl --markdown docs/brittle_gpu.md \
+python scripts/study/brittle/run.py -o brittle.jsonl --markdown docs/measured/brittle_gpu.md \
     --figure docs/images/brittle_gpu.png
 python scripts/study/brittle/run.py -o brittle_gpu.jsonl --device cuda --parts order debris ejecta
 python scripts/study/brittle/run.py -o brittle.jsonl brittle_gpu.jsonl --only-tables \
-    --markdown docs/brittle_gpu.md
+    --markdown docs/measured/brittle_gpu.md
 
 One JSON line per run; what is in the file is not run again. Tables and the figure are drawn from
 the files.

@@ -238,7 +238,7 @@ def known_table(found: list[Record]) -> str:
 
 
 def tables(found: list[Record]) -> dict[str, str]:
-    """Markers of docs/brittle_gpu.md and what stands between them."""
+    """Markers of docs/measured/brittle_gpu.md and what stands between them."""
     made: dict[str, str] = {}
     for device in ("cpu", "cuda"):
         if any(r["part"] == "order" and r["device"] == device for r in found):

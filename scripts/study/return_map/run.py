@@ -1,6 +1,6 @@
-"""Which return mapping is the default, settled by measurement: the table of docs/return-mapping.md.
+"""Which return mapping is the default, settled by measurement.
 
-    python scripts/study/return_map/run.py --markdown docs/return-mapping.md
+    python scripts/study/return_map/run.py --markdown docs/measured/return-mapping.md
 
 Every variant (fixed centre; the paper's k = 2; algorithm D with its epsilon; explicit and implicit
 alpha) on: the two order-sensitivity tests of the specification (equations.md 7.6, solver.md 0.6),

@@ -1,7 +1,7 @@
-"""Choose settings by error on four shots, then see what the error is: docs/chart_shot.md.
+"""Choose settings by error on four shots, then see what the error is: docs/measured/chart_shot.md.
 
     python scripts/study/shots/choose.py [--device cuda] [-o choose_out] [--only orange_dropped ...]
-    python scripts/study/shots/choose.py --write docs/data/choose_cpu.jsonl [--no-times]  # the page
+    python scripts/study/shots/choose.py --write docs/measured/data/choose_cpu.jsonl [--no-times]
 
 Every shot is probed as `gsfluent chart SHOT.yaml --error` does; then the setting it chose is run
 over the whole shot with seeds that the probes have not seen, and a finer one with more seeds, whose
@@ -38,7 +38,7 @@ from gsfluent.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "examples"
-PAGE = ROOT / "docs" / "chart_shot.md"
+PAGE = ROOT / "docs" / "measured" / "chart_shot.md"
 FRESH = 1000  # first seed of the runs that judge
 Line = dict[str, Any]
 

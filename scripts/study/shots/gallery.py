@@ -1,4 +1,4 @@
-"""Run the shots of examples/, collect a picture and the times of each, and write docs/gallery.md.
+"""Run the shots of examples/, collect a picture and the times of each, and write the page.
 
     python scripts/study/shots/gallery.py            # all seven scenes, resumable
     python scripts/study/shots/gallery.py cake_cut milk_poured -o gallery_out --device cpu
@@ -38,8 +38,8 @@ from gsfluent.progress import LineReporter
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "examples"
-PAGE = ROOT / "docs" / "gallery.md"
-LINES = ROOT / "docs" / "data" / "gallery.jsonl"
+PAGE = ROOT / "docs" / "measured" / "gallery.md"
+LINES = ROOT / "docs" / "measured" / "data" / "gallery.jsonl"
 STRIP = (4, 320)  # pictures side by side, width of each [px]
 MOST_BYTES = 300_000
 
@@ -178,10 +178,10 @@ def table(lines: list[dict[str, Any]]) -> str:
         for device, line in both.items():
             if line is not None:
                 machines[device].add(line["machine"])
-        picture = f"![{scene.title}](images/gallery_{name}.jpg)"
+        picture = f"![{scene.title}](../images/gallery_{name}.jpg)"
         cells = [
             scene.title,
-            f"[{name}.yaml](../examples/{name}.yaml)",
+            f"[{name}.yaml](../../examples/{name}.yaml)",
             picture if (ROOT / "docs" / "images" / f"gallery_{name}.jpg").is_file() else "-",
             any_["verdict"] if any_ else "-",
             str(any_["pieces"]) if any_ else "-",
@@ -211,7 +211,7 @@ def main() -> int:
     parser.add_argument("--force", action="store_true", help="redo finished stages")
     parser.add_argument("--lines", type=Path, default=LINES, help="where a line per run is added")
     parser.add_argument("--images", action="store_true", help="write docs/images/gallery_NAME.jpg")
-    parser.add_argument("--page", action="store_true", help="write docs/gallery.md, run nothing")
+    parser.add_argument("--page", action="store_true", help="write the page, run nothing")
     options = parser.parse_args()
     unknown = set(options.names) - set(SCENES)
     if unknown:

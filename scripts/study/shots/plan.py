@@ -1,4 +1,4 @@
-"""Plan every shot of the gallery, run it, and put plan and fact side by side in docs/plan.md.
+"""Plan every shot of the gallery, run it, and put plan and fact side by side.
 
     python scripts/study/shots/plan.py                    # all shots, resumable, on the GPU if any
     python scripts/study/shots/plan.py bread_torn cake_cut --device cpu -o plan_out
@@ -35,8 +35,8 @@ from gsfluent.pipeline.plan_fact import actual_work
 from gsfluent.pipeline.plan_fit import Sample, fit
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = ROOT / "docs" / "plan.md"
-LINES = ROOT / "docs" / "data" / "plan.jsonl"
+PAGE = ROOT / "docs" / "measured" / "plan.md"
+LINES = ROOT / "docs" / "measured" / "data" / "plan.jsonl"
 BAR = 0.25
 
 
@@ -234,9 +234,9 @@ def main() -> int:
         "--quality", choices=("preview", "shot", "hero"), help="the shot's own if absent"
     )
     parser.add_argument("--lines", type=Path, help="where the lines are; default: -o/plan.jsonl")
-    parser.add_argument("--page", action="store_true", help="only write docs/plan.md")
+    parser.add_argument("--page", action="store_true", help="only write docs/measured/plan.md")
     parser.add_argument("--fit-memory", action="store_true", help="print fitted coefficients")
-    parser.add_argument("--keep", action="store_true", help="also add the lines to docs/data")
+    parser.add_argument("--keep", action="store_true", help="also record the lines in docs/")
     options = parser.parse_args()
     unknown = set(options.names) - set(SCENES)
     if unknown:
