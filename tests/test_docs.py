@@ -9,12 +9,15 @@ from pathlib import Path
 
 import pytest
 import yaml
+from loaded_scripts import load_script
 
 import gsfluent
 from gsfluent.cli.parse import VERBS, parse
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MEASURED = sorted((ROOT / "docs" / "measured").glob("*.md"))
+MARKED = re.compile(r"<!-- ([^\n]+): begin -->\n.*?<!-- \1: end -->", re.DOTALL)
 BLOCK = re.compile(r"```(\w+)\n(.*?)```", re.DOTALL)
 
 
@@ -80,3 +83,34 @@ def test_the_index_names_every_page() -> None:
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
     pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
     assert pages == set(re.findall(r"\]\((\w[\w-]*\.md)\)", index)) - {"index.md"}
+
+
+@pytest.mark.parametrize("page", MEASURED, ids=lambda p: p.name)
+def test_a_measured_page_names_the_command_that_writes_it(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    shell = "\n".join(found for kind, found in BLOCK.findall(text) if kind == "bash")
+    writes = False
+    for line in shell.replace("\\\n", " ").splitlines():
+        program, named, *_ = words = shlex.split(line, comments=True)
+        if program == "gsfluent":
+            assert named in VERBS
+            continue
+        assert program in ("python", "bash") and (ROOT / named).is_file(), line
+        source = (ROOT / named).read_text(encoding="utf-8")
+        options = [word for word in words if word.startswith("--")]
+        assert [word for word in options if not re.search(rf"{word}\b", source)] == []
+        writes |= f"docs/measured/{page.name}" in words or f'"{page.name}"' in source
+    assert writes, f"no command of {page.name} writes it"
+    assert MARKED.search(text) is not None
+
+
+@pytest.mark.parametrize("page", MEASURED, ids=lambda p: p.name)
+def test_no_table_of_a_measured_page_is_typed_in(page: Path) -> None:
+    typed = MARKED.sub("", page.read_text(encoding="utf-8"))
+    assert re.findall(r"^\|.*", typed, re.MULTILINE) == []
+
+
+def test_the_index_of_what_is_measured_is_made_from_the_pages() -> None:
+    folder = ROOT / "docs" / "measured"
+    made = load_script("pictures/measured_index").index(folder)
+    assert f"begin -->\n{made}\n<!--" in (folder / "README.md").read_text(encoding="utf-8")
