@@ -11,6 +11,9 @@ from pathlib import Path
 
 from gsfluent.errors import InputError
 from gsfluent.lab.charts.record import commit, machine, now
+
+# they register their maps
+from gsfluent.lab.stability import contact, matter, rounding, steps, transfer  # noqa: F401
 from gsfluent.lab.stability.maps import _MAPS, Map, Place, Point, Value, key_of, read
 
 

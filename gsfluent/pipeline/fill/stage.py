@@ -337,8 +337,8 @@ def _parse_hollow(hollow: str | float) -> float | None:
 
 
 VOXELS_PER_CELL = 2.0
-"""Measured (docs/interior.md): from two on, the mass that sampled points bring to the cells of a
-curved surface is limited by the points themselves (3 % of a cell), not by the voxels."""
+"""Measured (docs/measured/interior.md): from two on, the mass that sampled points bring to the
+cells of a curved surface is limited by the points themselves (3 % of a cell), not by the voxels."""
 
 
 _PICTURE = 96
