@@ -1,4 +1,4 @@
-"""The folder in which the commands of README and guide are run: small inputs under the names that the pages use."""
+"""Small inputs under the names that README and guide use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The documents do not drift: links lead somewhere, commands parse, examples are valid."""
+"""The documents do not drift: links, commands, examples and lengths of pages."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ import yaml
 import gsfluent
 from gsfluent.cli.parse import VERBS, parse
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SHELVES = ("guide", "theory", "measured")
+TABLES = {"shot-keys.md", "run-json.md", "physgaussian.md"}
+"""Pages of the guide that are looked things up in, not read."""
+GUIDE = [page for page in sorted((ROOT / "docs" / "guide").glob("*.md")) if page.name not in TABLES]
 BLOCK = re.compile(r"```(\w+)\n(.*?)```", re.DOTALL)
 
 
@@ -78,5 +82,37 @@ def test_the_smallest_shot_of_the_readme_is_a_shot(tmp_path: Path) -> None:
 
 def test_the_index_names_every_page() -> None:
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    assert pages == set(re.findall(r"\]\((\w[\w-]*\.md)\)", index)) - {"index.md"}
+    named = set(re.findall(r"\]\(([\w/-]+\.md)\)", index))
+    docs = ROOT / "docs"
+    pages = {str(p.relative_to(docs)) for shelf in SHELVES for p in (docs / shelf).rglob("*.md")}
+    assert pages - named == set()
+
+
+def test_every_page_stands_on_a_shelf() -> None:
+    docs = ROOT / "docs"
+    assert {page.name for page in docs.glob("*.md")} == {"index.md", "architecture.md"}
+    assert all((docs / shelf).is_dir() for shelf in SHELVES)
+
+
+def test_the_readme_is_short() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80
+    good = text.split("## What it is good at")[1].split("\n## ")[0]
+    lines = [line for line in good.splitlines() if line.startswith("* ")]
+    assert 1 <= len(lines) <= 8
+    assert all("](docs/measured/" in line for line in lines)  # every figure has its page
+    python = next(text for page, text in blocks("python") if page == "README.md")
+    assert len(python.splitlines()) <= 10
+
+
+def test_architecture_is_short() -> None:
+    assert len((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+@pytest.mark.parametrize("page", GUIDE, ids=lambda p: p.name)
+def test_a_page_of_the_guide_is_read_in_minutes(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    prose = BLOCK.sub("", text)
+    assert len(text.split()) <= 800
+    assert len(prose.split()) >= 300
+    assert BLOCK.search(text) is not None  # an example
