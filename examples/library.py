@@ -15,8 +15,8 @@ from pathlib import Path
 
 import gsfluent as gf
 from gsfluent.demo import make_capture
-from gsfluent.pipeline.light import Light
-from gsfluent.pipeline.render_floor import Studio
+from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.render.studio import Studio
 
 
 def main() -> int:
@@ -64,7 +64,7 @@ def main() -> int:
             f"t = {frame.time:.3f} s: {frame.stats['fragments']} pieces, "
             f"{frame.energy['kinetic']:.3f} J, {frame.gaussians.count} splats\n"
         )
-    frame.gaussians.save(options.out / "last.ply")  # opens in any splat viewer
+    gf.save(frame.gaussians, options.out / "last.ply")  # opens in any splat viewer
     sys.stdout.write(f"{report['psnr']:.1f} dB held out; {simulate.report()['verdict']}\n")
     return 0
 

@@ -14,15 +14,15 @@ class InputError(GsfluentError, ValueError):
 
     Args:
         what: What is wrong, naming the argument, key or file and what came.
-        mend: What the user can do about it (one sentence).
+        hint: What the user can do about it (one sentence).
     """
 
     exit_code = 2
 
-    def __init__(self, what: str, mend: str = "") -> None:
+    def __init__(self, what: str, hint: str = "") -> None:
         self.what = what
-        self.mend = mend
-        super().__init__(f"{what}\n  mend: {mend}" if mend else what)
+        self.hint = hint
+        super().__init__(f"{what}\n  hint: {hint}" if hint else what)
 
 
 class RunError(GsfluentError, RuntimeError):
@@ -31,18 +31,18 @@ class RunError(GsfluentError, RuntimeError):
     Args:
         what: What failed and where.
         kept: What was kept on disk.
-        mend: How to resume or what to change.
+        hint: How to resume or what to change.
     """
 
     exit_code = 1
 
-    def __init__(self, what: str, kept: str = "", mend: str = "") -> None:
+    def __init__(self, what: str, kept: str = "", hint: str = "") -> None:
         self.what = what
         self.kept = kept
-        self.mend = mend
+        self.hint = hint
         lines = [what]
         if kept:
             lines.append(f"  kept: {kept}")
-        if mend:
-            lines.append(f"  mend: {mend}")
+        if hint:
+            lines.append(f"  hint: {hint}")
         super().__init__("\n".join(lines))

@@ -10,11 +10,9 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
-
-from gsfluent.pipeline.stage import Progress
 
 _log = logging.getLogger(__name__)
 
@@ -119,3 +117,13 @@ def quiet_logs(name: str, level: int = logging.WARNING) -> Iterator[None]:
         yield
     finally:
         log.setLevel(before)
+
+
+Progress = Callable[[int, int, str], None]
+"""``progress(done, total, note)``: called by a stage as it goes; ``None`` means nobody listens."""
+
+
+def report_progress(progress: Progress | None, done: int, total: int, note: str = "") -> None:
+    """Call ``progress`` when there is one."""
+    if progress is not None:
+        progress(done, total, note)

@@ -26,9 +26,9 @@ import torch
 from page import enter
 
 from gsfluent import has_cuda
-from gsfluent.lab import registry
-from gsfluent.lab.driver import running_on
-from gsfluent.lab.registry import Problem, Result
+from gsfluent.lab.world import registry
+from gsfluent.lab.world.driver import running_on
+from gsfluent.lab.world.registry import Problem, Result
 
 HEADING = "## Problems with known answers"
 

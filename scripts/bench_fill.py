@@ -23,8 +23,9 @@ from typing import Any
 import torch
 
 from gsfluent.data import Camera, Capture, Gaussians
+from gsfluent.draw import draw
+from gsfluent.io.images import load_view
 from gsfluent.pipeline import Fill
-from gsfluent.pipeline.draw import draw
 
 AXES = (0.13, 0.11, 0.10)
 SIZE = 400  # pixels of the photographs
@@ -73,7 +74,9 @@ def photographs(gaussians: Gaussians, folder: Path, count: int) -> Capture:
         pixels = (rgba.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         Image.fromarray(pixels, "RGBA").save(path)
         cameras.append(camera)
-    return Capture(cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder)
+    return Capture(
+        cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder, load_view
+    )
 
 
 def timed(work: Any, device: torch.device, repeats: int) -> tuple[float, float, Any]:

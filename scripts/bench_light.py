@@ -25,11 +25,11 @@ from page import enter
 
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
-from gsfluent.pipeline.light import Lamp, Lighting, pack_lamps
-from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.render_normals import grid_for, splat_normals
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, pack_lamps
+from gsfluent.pipeline.light.normals import grid_for, splat_normals
+from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
 
 
 def scene(count: int, device: torch.device) -> Gaussians:

@@ -25,15 +25,15 @@ import torch
 from page import enter
 
 from gsfluent.data import INTERIOR, SURFACE, Camera, Gaussians, Solid
-from gsfluent.pipeline.live import LiveSession
-from gsfluent.pipeline.particles import POINTS_PER_CELL
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_camera import Action, orbit
-from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.render_normals import occupancy_cell
-from gsfluent.pipeline.run_simulate import saved
-from gsfluent.pipeline.simulate import frame_of
-from gsfluent.scene import Scene
+from gsfluent.live.session import LiveSession
+from gsfluent.pipeline.light.normals import occupancy_cell
+from gsfluent.pipeline.matter.points import POINTS_PER_CELL
+from gsfluent.pipeline.render.camera import Action, orbit
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
+from gsfluent.pipeline.simulate.stage import frame_of
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import saved
 
 RADII = (0.125, 0.105, 0.105)
 PARTS = ("simulate", "pieces and figures", "carry", "repair", "frame", "draw")

@@ -26,10 +26,10 @@ from torch import Tensor
 
 from gsfluent import geometry, materials, ops
 from gsfluent.data import INTERIOR, SURFACE, Gaussians, Solid
-from gsfluent.pipeline.carry import Carry, Points
-from gsfluent.pipeline.particles import build_matter
-from gsfluent.pipeline.repair import Repair
-from gsfluent.scene import Scene
+from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.matter.carry import Carry, Points
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.scene.scene import Scene
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "cracks.md"
 RADIUS = 0.1

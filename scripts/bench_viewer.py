@@ -18,13 +18,13 @@ import torch
 from page import enter
 
 from gsfluent.data import INTERIOR, SURFACE, Gaussians
-from gsfluent.pipeline.render_camera import look_at
-from gsfluent.pipeline.run_frames import SavedFrame
-from gsfluent.viewer.artist import BUDGETS
-from gsfluent.viewer.look import FRAGMENT, Look
-from gsfluent.viewer.pace import Pace
-from gsfluent.viewer.picture import PictureMaker
-from gsfluent.viewer.timeline import Timeline
+from gsfluent.pipeline.render.camera import look_at
+from gsfluent.results.frames import SavedFrame
+from gsfluent.viewer.draw.artist import BUDGETS
+from gsfluent.viewer.draw.picture import PictureMaker
+from gsfluent.viewer.model.look import FRAGMENT, Look
+from gsfluent.viewer.model.pace import Pace
+from gsfluent.viewer.model.timeline import Timeline
 
 RADIUS, HEIGHT = 0.1, 0.13
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "viewer.md"

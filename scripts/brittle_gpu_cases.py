@@ -13,12 +13,12 @@ import numpy as np
 import torch
 
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab import brittle
-from gsfluent.lab.driver import World
-from gsfluent.lab.frozen import rows
-from gsfluent.lab.peers_known import POINTS, find
-from gsfluent.lab.slab import SEPARATE, plane
-from gsfluent.lab.textbook import Variant
+from gsfluent.lab.frozen.answer import rows
+from gsfluent.lab.peers.known import POINTS, find
+from gsfluent.lab.problems.fracture import brittle
+from gsfluent.lab.problems.fracture.slab import SEPARATE, plane
+from gsfluent.lab.textbook.solver import Variant
+from gsfluent.lab.world.driver import World
 
 MAPS = (
     "fixed_explicit",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent.figure.style import COLORS, INK, OURS, new_figure, save_png
-from gsfluent.lab.peers_known import POINTS
+from gsfluent.lab.peers.known import POINTS
 
 Record = dict[str, Any]
 NAMES = {

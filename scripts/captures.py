@@ -19,7 +19,7 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.run import run_shot
+from gsfluent.run.shot import run_shot
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data"))

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from page import enter
 
-from gsfluent.charts.draw import Chart, gathered, of_records
 from gsfluent.errors import GsfluentError
 from gsfluent.io.atomic import atomic_path
+from gsfluent.lab.charts.draw import Chart, gathered, of_records
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "chart.md"

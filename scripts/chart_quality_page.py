@@ -13,8 +13,8 @@ from pathlib import Path
 
 from page import enter
 
-from gsfluent.charts.quality import KINDS, gathered, markdown
-from gsfluent.charts.record import read
+from gsfluent.lab.charts.quality import KINDS, gathered, markdown
+from gsfluent.lab.charts.record import read
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "chart_quality.md"

@@ -24,17 +24,17 @@ from typing import Any
 import numpy as np
 from page import enter
 
-from gsfluent.charts.record import commit, machine
+from gsfluent.choose.choose import Probing, choose_setting, run_probes, summary
+from gsfluent.choose.probe import Probe, distance, histories, probe
+from gsfluent.choose.seconds import cost_of
+from gsfluent.choose.shot import shot_scene
 from gsfluent.cli.common import choose_device
 from gsfluent.config import Shot, load_shot
 from gsfluent.config.yaml_file import read_yaml
-from gsfluent.pipeline.choose import Probing, choose_setting, run_probes, summary
-from gsfluent.pipeline.choose_probe import Probe, distance, histories, probe
-from gsfluent.pipeline.choose_seconds import cost_of
-from gsfluent.pipeline.choose_shot import shot_scene
-from gsfluent.pipeline.run_demo import SIZES, photograph_demo
-from gsfluent.pipeline.simulate_solver import CFL
-from gsfluent.scene import Scene
+from gsfluent.lab.charts.record import commit, machine
+from gsfluent.pipeline.simulate.engine import CFL
+from gsfluent.run.demo import SIZES, photograph_demo
+from gsfluent.scene.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"

@@ -5,7 +5,8 @@
 
 An object whose inside is known is filled with splats of the true colours and broken by the
 simulator; the truth is a dense cloud of voxels carried by the same material points
-(gsfluent.lab.fracture_pictures). Simulations and true pictures are kept in --cache, so a second
+(gsfluent.lab.truth.fracture_pictures). Simulations and true pictures are kept in --cache, so a
+second
 call scores in seconds. Colours are unlit, over white.
 """
 
@@ -28,17 +29,19 @@ from page import enter
 from torch import Tensor
 
 from gsfluent.data import Camera
+from gsfluent.draw import draw
+from gsfluent.inspect.compare_weights import Lpips
 from gsfluent.io import save_image
-from gsfluent.lab.fracture_pictures import PARTED, TrueCloud, TruePicture
+from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud, TruePicture
 from gsfluent.metrics import psnr, ssim
 from gsfluent.ops.raster import Rendered
-from gsfluent.pipeline.compare_weights import Lpips
-from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.flicker import Flow, flicker
-from gsfluent.pipeline.render_camera import Action, look_at
-from gsfluent.pipeline.render_figures import RawCarry
-from gsfluent.pipeline.render_holes import Holes, MatterView, small
-from gsfluent.pipeline.run_show import Film, light_of, shot_of
+from gsfluent.pipeline.render.camera import Action, look_at
+from gsfluent.pipeline.render.figures import RawCarry
+from gsfluent.pipeline.render.film import Film
+from gsfluent.pipeline.render.flicker import Flow, flicker
+from gsfluent.pipeline.render.holes import Holes, MatterView, small
+from gsfluent.results.record import shot_of
+from gsfluent.stages.show import light_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "crack_accuracy.md"
 VIEWS = ((-60.0, 20.0), (60.0, 20.0), (180.0, 20.0), (0.0, 55.0))

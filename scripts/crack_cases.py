@@ -15,15 +15,15 @@ from torch import Tensor
 from gsfluent import demo, geometry, materials, ops
 from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.demo.catalogue import OBJECTS
-from gsfluent.lab.fracture_pictures import PARTED, TrueCloud
-from gsfluent.lab.interiors import known_interior
-from gsfluent.pipeline.carry import Carry
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.particles import Matter, body_frame
-from gsfluent.pipeline.repair import Repair
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.pipeline.solid_field import SignedDistance
-from gsfluent.scene import Scene
+from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud
+from gsfluent.lab.truth.interiors import known_interior
+from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.matter.carry import Carry
+from gsfluent.pipeline.matter.points import Matter, body_frame
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.scene.scene import Scene
 
 VERSION = 1
 """Counts up when cached simulations are no longer what this file would make."""

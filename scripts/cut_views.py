@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from PIL import Image  # noqa: TID253
 
-from gsfluent.data import Solid
-from gsfluent.pipeline.fill_colors import skin_weights
-from gsfluent.pipeline.fill_view import cut_view
+from gsfluent.io.solid import load_solid
+from gsfluent.pipeline.render.cuts import cut_view
+from gsfluent.pipeline.solid.colors import skin_weights
 
 TILT = 25.0  # degrees that the viewer of the last cut stands above it
 
 
 def row(path: Path, up: np.ndarray, size: int) -> np.ndarray:
     """Across, from above, and aslant, [size, 3 * size, 3]."""
-    solid = Solid.load(path)
+    solid = load_solid(path)
     weights = skin_weights(solid)
     across = np.cross(up, [1.0, 0.0, 0.3])
     across /= np.linalg.norm(across)

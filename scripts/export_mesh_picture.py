@@ -23,7 +23,7 @@ from vtkmodules.vtkRenderingCore import (
 )
 from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLRenderer  # noqa: F401 - registers the drawing
 
-from gsfluent.pipeline.export import ExportOptions, export
+from gsfluent.export.write import ExportOptions, export
 
 
 def draw(path: Path, size: tuple[int, int]) -> np.ndarray:

@@ -17,8 +17,8 @@ from typing import Any
 import page
 import torch
 
-from gsfluent.pipeline.export import FORMATS, ExportOptions, export
-from gsfluent.pipeline.run_frames import count_frames, load_frame
+from gsfluent.export.write import FORMATS, ExportOptions, export
+from gsfluent.results.frames import count_frames, load_frame
 
 CASES: list[tuple[str, str, dict[str, Any]]] = [
     ("`ply-seq --sh 3`", "ply-seq", {"sh": 3}),

@@ -14,7 +14,7 @@ def main(model: str, out: str, exemplar: str | None = None) -> None:
     solid = gf.pipeline.Fill()(gf.load(model))
     method = {"method": "exemplar", "exemplar": exemplar} if exemplar else {}
     solid = gf.pipeline.Texture(**method)(solid)
-    solid.save(out)
+    gf.save(solid, out)
     sys.stdout.write(f"{solid.gaussians.count} Gaussians, {solid.report}: {out}\n")
 
 

@@ -22,9 +22,9 @@ from page import enter
 
 from gsfluent.data import Capture, Gaussians, Solid
 from gsfluent.pipeline import Reconstruct, find_solid
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.fill_hollow import cavity_volume
-from gsfluent.pipeline.solid_field import SignedDistance
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.hollow import cavity_volume
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "filling.md"
 SHEET = PAGE.parent / "images" / "filling_cuts.png"

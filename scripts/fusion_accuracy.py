@@ -18,16 +18,16 @@ import torch
 from page import enter
 from torch import Tensor
 
-from gsfluent.lab.interiors import known_interior
-from gsfluent.lab.interiors_judge import held_out_planes
-from gsfluent.pipeline.texture.domain import InteriorTexture
-from gsfluent.pipeline.texture.fusion import (
+from gsfluent.lab.truth.interiors import known_interior
+from gsfluent.lab.truth.interiors_judge import held_out_planes
+from gsfluent.pipeline.texture.polish import (
     SlabRenderer,
     SlicePlane,
     Steps,
     fuse_colors,
     stack_planes,
 )
+from gsfluent.pipeline.texture.volume.domain import InteriorTexture
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "inpainting.md"
 SPACING = 2.0

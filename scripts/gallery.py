@@ -32,9 +32,9 @@ from gsfluent.cli.common import choose_device
 from gsfluent.config import Shot, load_shot
 from gsfluent.errors import GsfluentError
 from gsfluent.hardware import processor
-from gsfluent.pipeline.run import run_shot
-from gsfluent.pipeline.run_demo import SIZES, photograph_demo
 from gsfluent.progress import LineReporter
+from gsfluent.run.demo import SIZES, photograph_demo
+from gsfluent.run.shot import run_shot
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from page import enter
 
-from gsfluent.lab.interiors import KnownInterior, known_interior
-from gsfluent.lab.interiors_judge import Judge
+from gsfluent.lab.truth.interiors import KnownInterior, known_interior
+from gsfluent.lab.truth.interiors_judge import Judge
 from gsfluent.pipeline.texture.baselines import color_copy, telea_slices
-from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
-from gsfluent.pipeline.texture.inpaint import InpaintOptions, diffusion_texture
-from gsfluent.pipeline.texture.metrics import lab_histogram_distance, patch_distance
+from gsfluent.pipeline.texture.inpaint.method import InpaintOptions, diffusion_texture
+from gsfluent.pipeline.texture.photo.metrics import lab_histogram_distance, patch_distance
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "inpainting.md"

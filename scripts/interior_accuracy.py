@@ -25,13 +25,13 @@ from torch import Tensor
 
 from gsfluent import demo
 from gsfluent.data import INTERIOR, Camera, Capture, Gaussians
-from gsfluent.io import load_capture, load_splats
+from gsfluent.draw import draw
+from gsfluent.io import load_capture, load_splats, save_splats
 from gsfluent.pipeline import Isolate, Reconstruct, Texture
-from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.fill import Fill
-from gsfluent.pipeline.fill_interior import INTERIOR_OPACITY, interior_gaussians
-from gsfluent.pipeline.reconstruct_init import _quats_of
-from gsfluent.pipeline.texture.domain import InteriorTexture
+from gsfluent.pipeline.fill.interior import INTERIOR_OPACITY, interior_gaussians
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.reconstruct.init import _quats_of
+from gsfluent.pipeline.texture.volume.domain import InteriorTexture
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "interior_gaussians.md"
@@ -206,7 +206,7 @@ def demos(cache: Path) -> Iterator[Case]:
         path = folder / "object.ply"
         if not path.is_file():
             whole, _ = Reconstruct(800, 30_000)(capture)
-            Isolate().split(whole, capture)[0].save(path)
+            save_splats(Isolate().split(whole, capture)[0], path)
         label = f"{name}, " + ("masks" if support == "none" else "on a table, no masks")
         texture = {"exemplar": str(folder / "cut.png"), "quality": "preview"}
         yield label, load_splats(path), capture, demo.make_object(name, 0).depth, texture
@@ -217,7 +217,7 @@ def meshes(cache: Path, names: list[str]) -> Iterator[Case]:
     from mesh_captures import capture_of, things
     from mesh_captures import load_splats as load_kept
 
-    from gsfluent.pipeline.solid_source import find_solid
+    from gsfluent.pipeline.solid.source import find_solid
 
     for thing in things(names):
         kept = cache / f"{thing.name.replace(' ', '_')}.npz"

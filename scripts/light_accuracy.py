@@ -22,16 +22,16 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.io import save_image
-from gsfluent.lab import light_truth as truth
-from gsfluent.pipeline import environment
-from gsfluent.pipeline.bake import bake_light
-from gsfluent.pipeline.delight import delight
-from gsfluent.pipeline.light import Lamp, Lighting, pack_lamps, to_display, to_linear
-from gsfluent.pipeline.light_maps import bulk, faces_of, shadow_maps
-from gsfluent.pipeline.occlusion import ambient_occlusion
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_normals import grid_for
-from gsfluent.pipeline.shade_shadow import transmittance
+from gsfluent.lab.truth import light as truth
+from gsfluent.pipeline.light import environment
+from gsfluent.pipeline.light.bake import bake_light
+from gsfluent.pipeline.light.delight import delight
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, pack_lamps, to_display, to_linear
+from gsfluent.pipeline.light.normals import grid_for
+from gsfluent.pipeline.light.occlusion import ambient_occlusion
+from gsfluent.pipeline.light.shadow import transmittance
+from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.render.stage import Render
 
 GREY = 0.5
 ALBEDO = float(to_linear(torch.tensor(GREY)))

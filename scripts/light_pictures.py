@@ -15,16 +15,17 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
-from gsfluent.io import load, save_image
-from gsfluent.lab import light_truth as truth
-from gsfluent.pipeline.delight import delight
-from gsfluent.pipeline.environment import sky_and_ground
-from gsfluent.pipeline.light import Lamp, Lighting
-from gsfluent.pipeline.light_maps import bulk
-from gsfluent.pipeline.light_shot import light_of
-from gsfluent.pipeline.render import Render
-from gsfluent.pipeline.render_floor import Studio
-from gsfluent.pipeline.run_show import Film, shot_of
+from gsfluent.io import load_splats, save_image
+from gsfluent.lab.truth import light as truth
+from gsfluent.pipeline.light.delight import delight
+from gsfluent.pipeline.light.environment import sky_and_ground
+from gsfluent.pipeline.light.from_shot import light_of
+from gsfluent.pipeline.light.lamps import Lamp, Lighting
+from gsfluent.pipeline.light.shadow_maps import bulk
+from gsfluent.pipeline.render.film import Film
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
+from gsfluent.results.record import shot_of
 
 WARM, COOL = (1.0, 0.82, 0.6), (0.55, 0.72, 1.0)
 
@@ -72,7 +73,7 @@ def run_pictures(out: Path, index: int, size: tuple[int, int]) -> Tensor:
 
 def splat_pictures(path: Path, up: Tensor, front: Tensor, size: tuple[int, int]) -> Tensor:
     """As captured, lit from left and right; below, with the captured light divided out."""
-    splats = load(path)
+    splats = load_splats(path)
     center, radius, _ = bulk(splats)
     above = up / up.norm()
     front = front - (front @ above) * above

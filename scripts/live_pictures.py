@@ -14,12 +14,12 @@ from pathlib import Path
 import torch
 from viewer_pictures import Page
 
-from gsfluent.pipeline.live import LiveSession
-from gsfluent.pipeline.live_player import LivePlayer
-from gsfluent.pipeline.live_scene import open_stage
+from gsfluent.live.player import LivePlayer
+from gsfluent.live.scene import open_stage
+from gsfluent.live.session import LiveSession
 from gsfluent.viewer.app import App
-from gsfluent.viewer.live_source import LiveSource
-from gsfluent.viewer.poke import PokePanel
+from gsfluent.viewer.model.live_source import LiveSource
+from gsfluent.viewer.panels.poke import PokePanel
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from gsfluent.data import Capture, Gaussians
-from gsfluent.lab.photograph import Mesh, around, marbled, photograph, textured
+from gsfluent.io.images import load_view
+from gsfluent.lab.truth.photograph import Mesh, around, marbled, photograph, textured
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data")) / "meshes"
@@ -155,7 +156,9 @@ def capture_of(
             picture = Image.fromarray((255.0 * pixels + 0.5).astype(np.uint8))
             picture.save(path, quality=90, method=2)  # its alpha is lossless
         cameras.append(camera.replace(image_path=path))
-    return Capture(cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder)
+    return Capture(
+        cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder, load_view
+    )
 
 
 def save_splats(gaussians: Gaussians, path: Path) -> None:

@@ -29,10 +29,10 @@ from page import enter
 
 from gsfluent.cli.common import choose_device
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.plan import cost_model, plan_shot
-from gsfluent.pipeline.plan_cost import Cost, CostModel
-from gsfluent.pipeline.plan_fact import actual_work
-from gsfluent.pipeline.plan_fit import Sample, fit
+from gsfluent.plan.cost import Cost, CostModel
+from gsfluent.plan.fact import actual_work
+from gsfluent.plan.fit import Sample, fit
+from gsfluent.plan.plan import cost_model, plan_shot
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "plan.md"
@@ -199,7 +199,7 @@ def stage_table(mine: list[dict[str, Any]]) -> str:
 
 def fit_memory(lines: list[dict[str, Any]]) -> dict[str, Any]:
     """Bytes per unit of work of every stage, from what runs have taken."""
-    from gsfluent.pipeline.plan_memory import BYTES
+    from gsfluent.plan.cost import BYTES
 
     found: dict[str, Any] = {}
     for device, stages in BYTES.items():

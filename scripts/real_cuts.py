@@ -20,8 +20,8 @@ import numpy as np
 from real_interiors_cases import data_folder
 
 import gsfluent as gf
-from gsfluent.pipeline.fill import cut_view
-from gsfluent.pipeline.orient import make_frame
+from gsfluent.pipeline.capture.orient import make_frame
+from gsfluent.pipeline.render.cuts import cut_view
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 VIEWS: tuple[Any, ...] = ("x", "y", "z", (0.55, 0.55, -0.63))

@@ -25,14 +25,14 @@ from page import enter
 from real_interiors_cases import CASES, Case, data_folder
 from scipy import ndimage  # noqa: TID253
 
-from gsfluent.lab.interiors_judge import Plane, sample_plane
-from gsfluent.pipeline.texture import metrics
+from gsfluent.lab.truth.interiors_judge import Plane, sample_plane
 from gsfluent.pipeline.texture.baselines import color_copy
-from gsfluent.pipeline.texture.domain import InteriorDomain, blend_skin
-from gsfluent.pipeline.texture.exemplar import exemplar_texture, load_exemplars
-from gsfluent.pipeline.texture.photo import Exemplar
-from gsfluent.pipeline.texture.profile import depth_profile, profile_volume, surface_profile
+from gsfluent.pipeline.texture.photo import metrics
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
+from gsfluent.pipeline.texture.photo.profile import depth_profile, profile_volume, surface_profile
 from gsfluent.pipeline.texture.structure import take_apart, with_structure
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, blend_skin
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "real_interiors.md"

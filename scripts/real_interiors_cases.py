@@ -12,8 +12,8 @@ import cv2  # noqa: TID253
 import numpy as np
 from scipy import ndimage  # noqa: TID253
 
-from gsfluent.pipeline.texture.domain import SHELL, InteriorDomain
-from gsfluent.pipeline.texture.photo import Exemplar, PhotoOptions, load_exemplar
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, PhotoOptions, load_exemplar
+from gsfluent.pipeline.texture.volume.domain import SHELL, InteriorDomain
 
 ROOT = Path(__file__).resolve().parents[1]
 Photographs = tuple[Exemplar, list[Exemplar], np.ndarray]

@@ -32,7 +32,7 @@ import gsfluent as gf
 from gsfluent import demo
 from gsfluent.data import Capture
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.reconstruct_report import write_report
+from gsfluent.pipeline.reconstruct.evaluate import write_report
 
 
 def opened(options: argparse.Namespace, scratch: str) -> tuple[str, Capture]:
@@ -125,7 +125,7 @@ def main(arguments: list[str]) -> int:
     if options.out is not None:
         if options.isolate:
             gaussians = gf.pipeline.Isolate()(gaussians, capture)
-        gaussians.save(options.out)
+        gf.save(gaussians, options.out)
     line: dict[str, Any] = {
         "capture": name,
         "trainer": f"gsfluent {report['recipe']} {report['densify']}",

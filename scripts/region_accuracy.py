@@ -29,10 +29,10 @@ from gsfluent.demo.capture import _FIELD_OF_VIEW, ring_cameras
 from gsfluent.demo.objects import DemoObject
 from gsfluent.demo.truth import grid_points
 from gsfluent.io import load_capture
-from gsfluent.io.segmentation import LabelView, Segmentation
+from gsfluent.io.segmentation.masks import LabelView, Segmentation
 from gsfluent.pipeline import Fill, Reconstruct
-from gsfluent.pipeline.particles import sample_points
-from gsfluent.pipeline.regions import SkinLabels, project_labels
+from gsfluent.pipeline.matter.points import sample_points
+from gsfluent.pipeline.regions.project import SkinLabels, project_labels
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "regions.md"
 NAMES = {1: "front", 2: "back", 3: "lid", 4: "spot"}

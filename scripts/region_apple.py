@@ -19,14 +19,14 @@ import torch
 from page import enter
 
 from gsfluent.data import Capture, Frame, Solid
-from gsfluent.io import load, load_capture
-from gsfluent.io.segmentation import LabelView, Segmentation, load_segmentation
+from gsfluent.draw import draw
+from gsfluent.inspect.parts import solid_regions
+from gsfluent.inspect.parts_picture import save_parts_picture
+from gsfluent.io import load_capture, load_splats
+from gsfluent.io.segmentation.masks import LabelView, Segmentation, load_segmentation
 from gsfluent.pipeline import Fill, Isolate, Reconstruct, label_regions
-from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.inspect_parts import solid_regions
-from gsfluent.pipeline.inspect_parts_picture import save_parts_picture
-from gsfluent.pipeline.orient import orient, upright_rotation
-from gsfluent.pipeline.regions import SkinLabels, project_labels
+from gsfluent.pipeline.capture.orient import orient, upright_rotation
+from gsfluent.pipeline.regions.project import SkinLabels, project_labels
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data"))
@@ -111,7 +111,7 @@ def apple(capture: Capture, path: Path | None) -> Solid:
     if path is None:
         splats, _ = Reconstruct(3000, 60_000, image_size=800)(capture)
     else:
-        splats = load(path)
+        splats = load_splats(path)
     return Fill(resolution=96)(Isolate()(splats, capture), capture)
 
 

@@ -9,10 +9,10 @@ import sys
 
 import gsfluent as gf
 from gsfluent.io import save_image
-from gsfluent.pipeline.light import Light
-from gsfluent.pipeline.orient import make_frame
-from gsfluent.pipeline.render_camera import look_at
-from gsfluent.pipeline.render_floor import Studio
+from gsfluent.pipeline.capture.orient import make_frame
+from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.render.camera import look_at
+from gsfluent.pipeline.render.studio import Studio
 
 
 def main(model: str, out: str, azimuth: str = "-60") -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 
 import gsfluent as gf
-from gsfluent.pipeline.orient import make_frame
+from gsfluent.pipeline.capture.orient import make_frame
 
 
 def main(
@@ -19,7 +19,7 @@ def main(
     height: str = "1.0",
     size: str = "0.25",
 ) -> None:
-    solid = gf.Solid.load(solid_file)
+    solid = gf.load(solid_file)
     frame = solid.frame or make_frame(solid.gaussians)
     low, high = solid.gaussians.bounds()
     if solid.frame is None:

@@ -24,12 +24,13 @@ from page import enter
 from gsfluent import demo
 from gsfluent.data import Capture, Gaussians
 from gsfluent.io import load_capture
+from gsfluent.io.images import load_view
 from gsfluent.pipeline import Reconstruct
-from gsfluent.pipeline.mesh_distance import load_mesh
-from gsfluent.pipeline.reconstruct_init import _quats_of
-from gsfluent.pipeline.solid_field import SignedDistance
-from gsfluent.pipeline.solid_source import find_solid
-from gsfluent.pipeline.solid_tsdf import ring_of_cameras
+from gsfluent.pipeline.reconstruct.init import _quats_of
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.source import find_solid
+from gsfluent.pipeline.solid.tsdf import ring_of_cameras
+from gsfluent.spatial.mesh_distance import load_mesh
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data")) / "meshes"
@@ -103,7 +104,9 @@ def masked_capture(mesh: Any, folder: Path) -> Capture:
         path = folder / f"{index:03d}.png"
         Image.fromarray(picture).save(path)
         cameras.append(camera.replace(image_path=path, name=path.name))
-    return Capture(cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder)
+    return Capture(
+        cameras, torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3), folder, load_view
+    )
 
 
 def trained() -> tuple[Gaussians, SignedDistance, Any]:

@@ -20,9 +20,9 @@ from typing import Any
 from page import enter
 from texture_sheets import draw_sheet
 
-from gsfluent.charts.texturing import texture
-from gsfluent.lab.interiors import KNOWN_INTERIORS, known_interior
-from gsfluent.lab.interiors_judge import Judge, crossing_error
+from gsfluent.lab.charts.texturing import texture
+from gsfluent.lab.truth.interiors import KNOWN_INTERIORS, known_interior
+from gsfluent.lab.truth.interiors_judge import Judge, crossing_error
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "texture_accuracy.md"

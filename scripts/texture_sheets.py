@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsfluent.lab.interiors_judge import Judge
-from gsfluent.pipeline.texture.metrics import Slice
+from gsfluent.lab.truth.interiors_judge import Judge
+from gsfluent.pipeline.texture.photo.metrics import Slice
 
 SHOWN = (0, 2, 4, 6, 8)  # one plane across each axis, two oblique ones
 COLUMNS = ("default", "full", "preview", "procedural", "color_copy", "telea", "diffusion")

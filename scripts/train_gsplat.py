@@ -17,7 +17,7 @@ capture with masks is trained and judged before white, and one without sparse po
 100,000 random points, is not measured here).
 
 The photographs, the held-out ones (every eighth) and the judging are gsfluent's own:
-``gsfluent.pipeline.reconstruct_evaluate.evaluate``; ``psnr_own`` is the same through gsplat's
+``gsfluent.pipeline.reconstruct.evaluate.evaluate``; ``psnr_own`` is the same through gsplat's
 renderer. ``seconds`` is training alone, ``total_seconds`` with reading and judging.
 """
 
@@ -38,10 +38,12 @@ from torch import Tensor
 import gsfluent as gf
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import GsfluentError, InputError
+from gsfluent.io import save_splats
 from gsfluent.metrics import psnr, ssim
-from gsfluent.pipeline.reconstruct_evaluate import HOLD_OUT, evaluate
-from gsfluent.pipeline.reconstruct_init import focus_point, hull_gaussians, visual_hull
-from gsfluent.pipeline.reconstruct_views import read_views
+from gsfluent.pipeline.capture.hull import focus_point, visual_hull
+from gsfluent.pipeline.capture.views import read_views
+from gsfluent.pipeline.reconstruct.evaluate import HOLD_OUT, evaluate
+from gsfluent.pipeline.reconstruct.init import hull_gaussians
 
 SH_C0 = 0.28209479177387814
 RATES = {
@@ -307,7 +309,7 @@ def main(arguments: list[str] | None = None) -> int:
             capture, options.iterations, options.image_size, device, options.seed
         )
         if options.out is not None:
-            gaussians.to("cpu").save(options.out)
+            save_splats(gaussians.to("cpu"), options.out)
     except GsfluentError as error:
         sys.stderr.write(f"error: {error}\n")
         return 1

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from gsfluent.viewer.app import App
-from gsfluent.viewer.source import RunSource
+from gsfluent.viewer.model.source import RunSource
 
 FLAGS = (
     "--headless",

@@ -17,7 +17,7 @@ import torch
 from page import enter
 
 from gsfluent.data import SURFACE, Gaussians, Solid
-from gsfluent.pipeline.particles import sample_points
+from gsfluent.pipeline.matter.points import sample_points
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "interior.md"
 AXES = (1.0, 1.3, 1.6)  # the radius is half the unit length over these

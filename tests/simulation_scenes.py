@@ -7,7 +7,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.data import Frame
-from gsfluent.scene import Scene
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 

@@ -10,8 +10,8 @@ from types import ModuleType
 
 import pytest
 
-from gsfluent.lab import registry
-from gsfluent.lab.registry import Problem, Result
+from gsfluent.lab.world import registry
+from gsfluent.lab.world.registry import Problem, Result
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

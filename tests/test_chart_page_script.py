@@ -10,8 +10,8 @@ from types import ModuleType
 
 import pytest
 
-from gsfluent.charts.ladder import CASES, KNOBS, OFF_GRID
-from gsfluent.charts.record import Record, append
+from gsfluent.lab.charts.ladder import CASES, KNOBS, OFF_GRID
+from gsfluent.lab.charts.record import Record, append
 
 ROOT = Path(__file__).parents[1]
 

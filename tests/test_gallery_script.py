@@ -64,7 +64,7 @@ def test_the_table_has_the_recorded_times_and_the_machine() -> None:
 def test_a_strip_shows_the_moments_of_a_video(tmp_path: Path) -> None:
     from PIL import Image
 
-    from gsfluent.pipeline.video import write_video
+    from gsfluent.pipeline.render.video import write_video
 
     shades = [np.full((48, 64, 3), 20 * i, np.uint8) for i in range(11)]
     write_video(tmp_path / "video.mp4", shades, fps=10, size=(64, 48))

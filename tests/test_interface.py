@@ -9,7 +9,8 @@ import torch
 
 import gsfluent as gf
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import Light
+from gsfluent.io import save_splats
+from gsfluent.pipeline.light.lamps import Light
 
 
 def shell(radius: float = 0.1, count: int = 4000) -> gf.Gaussians:
@@ -31,7 +32,7 @@ def shell(radius: float = 0.1, count: int = 4000) -> gf.Gaussians:
 
 
 def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
-    shell().save(tmp_path / "melon.ply")
+    save_splats(shell(), tmp_path / "melon.ply")
 
     gaussians = gf.load(tmp_path / "melon.ply")
     solid = gf.pipeline.Fill(resolution=32)(gaussians)

@@ -1,5 +1,5 @@
 // One pixel of a lit picture: from what the rasterizer blended to display values. The model, with
-// every formula, is shade_image() in gsfluent/pipeline/shade.py; a test holds the two together.
+// every formula, is shade_image() in gsfluent/pipeline/light/shade.py; a test holds the two together.
 #pragma once
 
 #include "core/shadow.h"
@@ -11,7 +11,7 @@ constexpr double kOpaque = 0.999;  // what is behind such a pixel is not worked 
 constexpr double kFaded = 1e-6;    // share below which the floor is left out
 constexpr double kDisplayGamma = 2.2;
 // Occlusion cones: levels, looks in cells of a level, own blur, filling, weight of the middle cone,
-// tilt of the other four. Fitted, see gsfluent/pipeline/occlusion.py.
+// tilt of the other four. Fitted, see gsfluent/pipeline/light/occlusion.py.
 constexpr int kConeFirst = 1, kConeLast = 4;
 constexpr double kConeReach = 2.16;
 constexpr double kConeFlat = 0.02;

@@ -1,5 +1,5 @@
 // Arguments of the shading of a picture: plain pointers and sizes, the same for CPU and CUDA. How
-// lamps, cameras of shadow maps and studio are packed: gsfluent/pipeline/shade.py.
+// lamps, cameras of shadow maps and studio are packed: gsfluent/pipeline/light/shade.py.
 #pragma once
 
 #include "core/vec.h"

@@ -1,6 +1,6 @@
 // Percentage-closer soft shadows of one point (Fernando 2005): blockers on a disc of the map give a
 // mean depth, that and the lamp's size the penumbra, and blocking is averaged over it. Constants
-// and rules are those of gsfluent/pipeline/shade_shadow.py, the model; a test holds the two
+// and rules are those of gsfluent/pipeline/light/shadow.py, the model; a test holds the two
 // together.
 #pragma once
 

@@ -92,7 +92,7 @@ def _execute(command: Verb, as_json: bool) -> int:
     except Exception as error:
         _show_traceback()
         text = f"unexpected {type(error).__name__}: {error}"
-        text += "\n  mend: GSFLUENT_DEBUG=1 shows the traceback; please report it"
+        text += "\n  hint: GSFLUENT_DEBUG=1 shows the traceback; please report it"
         return _fail(as_json, type(error).__name__, text, 1)
     if as_json:
         _print_json(result)
@@ -109,7 +109,7 @@ def _execute(command: Verb, as_json: bool) -> int:
 
 
 def _fields(error: GsfluentError) -> dict[str, str]:
-    names = ("what", "kept", "mend")
+    names = ("what", "kept", "hint")
     return {name: getattr(error, name) for name in names if getattr(error, name, "")}
 
 
@@ -117,11 +117,11 @@ def _explain_os_error(error: OSError) -> tuple[str, int]:
     """Message and exit code for a failed system call."""
     where = f" ({error.filename})" if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        mend = "free some space and run the same command again; finished stages are kept"
-        return f"the disk is full{where}: {error.strerror}\n  mend: {mend}", 1
+        hint = "free some space and run the same command again; finished stages are kept"
+        return f"the disk is full{where}: {error.strerror}\n  hint: {hint}", 1
     if error.errno in _USER_ERRNO:
-        return f"{error.strerror}{where}\n  mend: check the path and its permissions", 2
-    return f"{error}\n  mend: run the same command again; finished stages are kept", 1
+        return f"{error.strerror}{where}\n  hint: check the path and its permissions", 2
+    return f"{error}\n  hint: run the same command again; finished stages are kept", 1
 
 
 def _fail(

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.stage import Progress
+from gsfluent.progress import Progress
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
@@ -77,8 +77,8 @@ def choose_device(name: str, *, seed: int = 0) -> Any:
                 f"--device {name}: this torch has no CUDA", "install a CUDA torch, or use cpu"
             )
         if not HAS_CUDA_KERNELS:
-            mend = "reinstall with GSFLUENT_CUDA=1, or use cpu"
-            raise InputError(f"--device {name}: gsfluent was built without its CUDA kernels", mend)
+            hint = "reinstall with GSFLUENT_CUDA=1, or use cpu"
+            raise InputError(f"--device {name}: gsfluent was built without its CUDA kernels", hint)
         count = torch.cuda.device_count()
         if count == 0 or (device.index or 0) >= count:
             raise InputError(f"--device {name}: torch sees {count} GPUs", "use auto or cpu")

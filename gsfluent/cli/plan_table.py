@@ -12,7 +12,7 @@ def plan_text(plan: Mapping[str, Any]) -> str:
     """The plan as lines of text.
 
     Args:
-        plan: From :func:`gsfluent.pipeline.plan.plan_shot`.
+        plan: From :func:`gsfluent.plan.plan.plan_shot`.
     """
     calibrated = plan["calibrated"]
     size = " x ".join(f"{100 * side:.3g}" for side in plan["size_m"])

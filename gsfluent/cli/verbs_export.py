@@ -89,7 +89,7 @@ class Export(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Export."""
-        from gsfluent.pipeline.export import ExportOptions, export
+        from gsfluent.export.write import ExportOptions, export
 
         existing(self.out, "OUT")
         if self.fps is not None and not 0.1 <= self.fps <= 1000.0:

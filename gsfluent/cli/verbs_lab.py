@@ -57,7 +57,7 @@ class Chart(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Run what is missing and draw all of it."""
-        from gsfluent.charts.draw import gathered, of_records
+        from gsfluent.lab.charts.draw import gathered, of_records
 
         if self.shot is not None or self.error is not None:
             return self._shot()
@@ -89,10 +89,10 @@ class Chart(Verb):
 
     def _shot(self) -> dict[str, Any]:
         """Choose the cheapest setting of a shot."""
+        from gsfluent.choose.choose import QUICK
+        from gsfluent.choose.shot import chart_shot, readable
         from gsfluent.config import load_shot
         from gsfluent.config.settings_solve import read_error
-        from gsfluent.pipeline.choose import QUICK
-        from gsfluent.pipeline.choose_shot import chart_shot, readable
         from gsfluent.progress import reporter
 
         if self.shot is None or self.error is None:
@@ -113,7 +113,7 @@ class Chart(Verb):
 
     def _quality(self) -> dict[str, Any]:
         """Chart rendering, reconstruction or texturing."""
-        from gsfluent.charts.quality import chart_quality, gathered
+        from gsfluent.lab.charts.quality import chart_quality, gathered
 
         if self.cases or self.only:
             raise InputError("--cases and --only belong to --of simulation", "leave them out")
@@ -127,8 +127,8 @@ class Chart(Verb):
             )  # fmt: skip
 
     def _run(self, result: dict[str, Any]) -> Any:
-        from gsfluent.charts.chart import run
-        from gsfluent.charts.ladder import ladder
+        from gsfluent.lab.charts.chart import run
+        from gsfluent.lab.charts.ladder import ladder
 
         device = self.torch_device()
         place = str(device)
@@ -178,16 +178,17 @@ class Stability(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Run what is missing and draw all of it."""
-        from gsfluent.charts import stability
-        from gsfluent.charts.stability_peers import marks, measured
-        from gsfluent.charts.stability_report import verdict, write_all
+        from gsfluent.lab.stability.maps import read
+        from gsfluent.lab.stability.peers import marks, measured
+        from gsfluent.lab.stability.report import verdict, write_all
+        from gsfluent.lab.stability.run import chosen, run_maps
 
         programs = measured(existing(self.peers, "--peers", folder=False)) if self.peers else []
         maps = [m for name in self.maps for m in name.split(",") if m]
         if self.draw:
-            wanted = stability.chosen(maps)
+            wanted = chosen(maps)
             files = [existing(path, "--draw", folder=False) for path in self.draw]
-            points = [p for path in files for p in stability.read(path)]
+            points = [p for path in files for p in read(path)]
             known = {m.name for m in wanted}
             points = [p for p in points if p.map in known]
             if not points:
@@ -196,11 +197,11 @@ class Stability(Verb):
                 )
         else:
             device = self.torch_device()
-            wanted = stability.chosen(maps, gpu=device.type == "cuda")
+            wanted = chosen(maps, gpu=device.type == "cuda")
             if device.type == "cuda" and self.jobs > 1:
                 raise InputError("--jobs with a GPU", "leave it out: one process feeds it")
             with self.progress("stability") as progress:
-                points = stability.run_maps(
+                points = run_maps(
                     wanted, self.out / "stability.jsonl", device=device.type, quick=self.quick,
                     jobs=self.jobs, progress=progress,
                 )  # fmt: skip

@@ -10,6 +10,7 @@ import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
 from gsfluent.errors import InputError
+from gsfluent.io.solid import load_solid
 
 
 @dataclass(kw_only=True)
@@ -24,7 +25,7 @@ class Doctor(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Examine the machine."""
-        from gsfluent.pipeline.doctor import examine
+        from gsfluent.inspect.doctor import examine
 
         return examine(self.torch_device(), every_device=self.device == "auto")
 
@@ -56,7 +57,7 @@ class Inspect(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Inspect the input and draw the picture."""
-        from gsfluent.pipeline.inspect import inspect
+        from gsfluent.inspect.capture import inspect
 
         existing(self.input, "INPUT")
         suffix = self.input.suffix.lower()
@@ -71,7 +72,7 @@ class Inspect(Verb):
     def _shot(self) -> dict[str, Any]:
         """Show the parts of a shot."""
         from gsfluent.config import load_shot
-        from gsfluent.pipeline.inspect_shot import inspect_shot
+        from gsfluent.inspect.shot import inspect_shot
         from gsfluent.progress import reporter
 
         if self.run is None:
@@ -94,11 +95,10 @@ class Inspect(Verb):
 
 def _regions(path: Path, out: Path) -> dict[str, Any] | None:
     """The regions of a solid; None for a splat, or a solid without any."""
-    from gsfluent.data import Solid
-    from gsfluent.data.solid import volume_path
-    from gsfluent.pipeline.inspect_shot import inspect_solid
+    from gsfluent.inspect.shot import inspect_solid
+    from gsfluent.io.solid import volume_path
 
-    if not volume_path(path).is_file() or Solid.load(path).regions is None:
+    if not volume_path(path).is_file() or load_solid(path).regions is None:
         return None
     return inspect_solid(path, out)
 
@@ -127,8 +127,8 @@ class Plan(Verb):
     def execute(self) -> dict[str, Any]:
         """Plan the shot."""
         from gsfluent.config import load_shot
-        from gsfluent.pipeline.plan import cost_model, plan_shot
-        from gsfluent.pipeline.plan_cost import CostModel
+        from gsfluent.plan.cost import CostModel
+        from gsfluent.plan.plan import cost_model, plan_shot
 
         if self.recalibrate and not self.probe:
             raise InputError("--recalibrate measures, --no-probe forbids it", "drop one of them")
@@ -180,7 +180,7 @@ class Metrics(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Compare the two sides."""
-        from gsfluent.pipeline.compare import compare
+        from gsfluent.inspect.compare import compare
 
         existing(self.judged, "A")
         existing(self.reference, "B")

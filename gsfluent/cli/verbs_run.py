@@ -43,15 +43,15 @@ class Run(Verb):
     def execute(self) -> dict[str, Any]:
         """Run the shot."""
         from gsfluent.config import load_shot
-        from gsfluent.pipeline.run import run_shot
         from gsfluent.progress import reporter
+        from gsfluent.run.shot import run_shot
 
         if self.config is None:
             if self.write_shot:
                 raise InputError("--write-shot does nothing without --config", "drop it")
             path, facts = existing(self.shot, "SHOT.yaml", folder=False), None
         else:
-            from gsfluent.config.physgaussian import convert
+            from gsfluent.config.physgaussian.read import convert
 
             folder = self.out / "physgaussian"
             made = convert(existing(self.shot, "MODEL", folder=True), self.config, folder)
@@ -94,8 +94,8 @@ class Demo(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Run the demo."""
-        from gsfluent.pipeline.run_demo import SIZES, photograph_demo, run_demo
         from gsfluent.progress import reporter
+        from gsfluent.run.demo import SIZES, photograph_demo, run_demo
 
         if self.photographs is not None:
             scale, seed = SIZES[self.size], self.seed
@@ -166,7 +166,7 @@ class Render(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Render."""
-        from gsfluent.pipeline.run_show import render_again
+        from gsfluent.stages.show import render_again
 
         existing(self.out, "OUT", folder=True)
         with self.progress("render") as progress:
@@ -208,7 +208,7 @@ class Report(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Write the page."""
-        from gsfluent.pipeline.report import read_run, write_report
+        from gsfluent.run.report import read_run, write_report
 
         existing(self.out, "OUT", folder=True)
         values = read_run(self.out)

@@ -63,7 +63,7 @@ class Reconstruct(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Reconstruct and write."""
-        from gsfluent.pipeline.run_single import reconstruct_to
+        from gsfluent.run.single import reconstruct_to
 
         existing(self.capture, "CAPTURE", folder=True)
         given = {
@@ -123,7 +123,7 @@ class Fill(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Fill and write."""
-        from gsfluent.pipeline.run_single import fill_to
+        from gsfluent.run.single import fill_to
 
         existing(self.model, "INPUT")
         given = {"resolution": self.resolution, "method": self.method, "hollow": self.hollow}
@@ -189,7 +189,7 @@ class Texture(Verb):
     def execute(self) -> dict[str, Any]:
         """Texture and write."""
         from gsfluent.config.settings_inpaint import read_inpaint
-        from gsfluent.pipeline.run_single import texture_to
+        from gsfluent.run.single import texture_to
 
         existing(self.solid, "solid.ply", folder=False)
         method = self.method or ("exemplar" if self.exemplar else None)
@@ -249,7 +249,7 @@ class Mesh(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Find the solid and write its surface."""
-        from gsfluent.pipeline.solid_mesh import mesh_to
+        from gsfluent.pipeline.solid.mesh import mesh_to
 
         existing(self.input, "INPUT")
         return mesh_to(

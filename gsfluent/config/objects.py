@@ -328,10 +328,10 @@ def _parameters(
     try:
         preset = materials.get(material).override(**dict(base or {}))
     except InputError as error:
-        raise InputError(f"{place.inside('material').path}: {error.what}", error.mend) from error
+        raise InputError(f"{place.inside('material').path}: {error.what}", error.hint) from error
     try:
         preset.override(**read)  # together: a law is chosen with the parameters that it needs
     except InputError as error:
         blamed = next((name for name in read if f": {name} " in error.what), "law")
-        raise InputError(f"{place.inside(blamed).path}: {error.what}", error.mend) from error
+        raise InputError(f"{place.inside(blamed).path}: {error.what}", error.hint) from error
     return read

@@ -26,10 +26,10 @@ class Place:
         """Return the place of a key of this section."""
         return Place(f"{self.path}.{key}" if self.path else key, self.folder)
 
-    def error(self, wanted: str, got: Any, mend: str = "") -> InputError:
+    def error(self, wanted: str, got: Any, hint: str = "") -> InputError:
         """Make the error ``{path} must {wanted}, got {got}``."""
         return InputError(
-            f"{self.path} must {wanted}, got {got!r}", mend or "correct the shot file"
+            f"{self.path} must {wanted}, got {got!r}", hint or "correct the shot file"
         )
 
 
@@ -94,8 +94,8 @@ def section(cls: type[_Section], value: Any, place: Place) -> _Section:
         if name in given:
             values[field.name] = field.metadata["read"](given[name], place.inside(name))
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            mend = f"add it, for example {name}: {field.metadata['example']}"
-            raise InputError(f"{place.inside(name).path} is missing", mend)
+            hint = f"add it, for example {name}: {field.metadata['example']}"
+            raise InputError(f"{place.inside(name).path} is missing", hint)
     return cls(**values)
 
 
@@ -248,7 +248,7 @@ def preset(value: Any, place: Place) -> str:
     try:
         materials.get(name)
     except InputError as error:
-        raise InputError(f"{place.path}: {error.what}", error.mend) from None
+        raise InputError(f"{place.path}: {error.what}", error.hint) from None
     return name
 
 

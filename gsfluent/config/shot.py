@@ -247,4 +247,4 @@ def load_shot(path: str | Path) -> Shot:
     try:
         return Shot.from_dict(values, path.resolve().parent)
     except InputError as error:
-        raise InputError(f"{path}: {error.what}", error.mend) from error
+        raise InputError(f"{path}: {error.what}", error.hint) from error

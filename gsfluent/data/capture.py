@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,12 +43,15 @@ class Capture:
         points: Sparse points [P, 3], float64, world units; P may be 0.
         point_colors: Their colours [P, 3], float32 in 0..1.
         root: Folder the capture was read from.
+        reader: ``reader(camera, max_size)`` reads the photograph of a camera; None:
+            they are not to be read; of files, :func:`gsfluent.io.images.load_view`.
     """
 
     cameras: list[Camera]
     points: Tensor
     point_colors: Tensor
     root: Path
+    reader: Callable[[Camera, int | None], View] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes."""
@@ -96,10 +101,14 @@ class Capture:
 
         Raises:
             InputError: The file is missing, truncated, or not an image.
+            ValueError: The capture was made without a reader.
         """
-        from gsfluent.io.images import load_view
-
-        return load_view(self.cameras[index], max_size)
+        if self.reader is None:
+            raise ValueError(
+                "Capture.view: the capture has no reader; make it with gf.load_capture or pass"
+                " reader=gsfluent.io.images.load_view"
+            )
+        return self.reader(self.cameras[index], max_size)
 
     def views(self, indices: Iterable[int], max_size: int | None = None) -> list[View]:
         """Read several photographs as :meth:`view` does, by as many threads as there are cores.
@@ -107,9 +116,6 @@ class Capture:
         Raises:
             InputError: As :meth:`view`.
         """
-        import os
-        from concurrent.futures import ThreadPoolExecutor
-
         with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
             return list(pool.map(lambda index: self.view(index, max_size), indices))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -207,17 +206,17 @@ class Gaussians(TensorContainer):
                 f"{source}: there must be at least one Gaussian, got 0",
                 "check the file or selection",
             )
-        mend = "remove these rows or export the splat again"
+        hint = "remove these rows or export the splat again"
         for name in ("means", "quats", "scales", "opacities", "sh"):
             value = getattr(self, name)
             bad = ~torch.isfinite(value).reshape(self.count, -1).all(dim=1)
-            _refuse(source, f"{name} must be finite", "NaN or infinite", bad, mend)
+            _refuse(source, f"{name} must be finite", "NaN or infinite", bad, hint)
         _refuse(
             source,
             "scales must be positive",
             "zero or negative",
             (self.scales <= 0).any(dim=1),
-            mend,
+            hint,
         )
         outside = (self.opacities < 0) | (self.opacities > 1)
         _refuse(
@@ -229,12 +228,6 @@ class Gaussians(TensorContainer):
         )
         return self
 
-    def save(self, path: str | Path) -> None:
-        """Write an INRIA-layout 3DGS ``.ply`` (see :func:`gsfluent.io.save_splats`)."""
-        from gsfluent.io.splats import save_splats
-
-        save_splats(self, path)
-
 
 def _filled(labels: Tensor | None, means: Tensor, value: int) -> Tensor:
     """Return the labels, or a constant column where there are none."""
@@ -243,10 +236,10 @@ def _filled(labels: Tensor | None, means: Tensor, value: int) -> Tensor:
     return torch.full((means.shape[0],), value, dtype=torch.int32, device=means.device)
 
 
-def _refuse(source: str, wanted: str, got: str, bad: Tensor, mend: str) -> None:
+def _refuse(source: str, wanted: str, got: str, bad: Tensor, hint: str) -> None:
     """Raise for the rows where ``bad`` holds, naming their number and the first."""
     total = int(bad.sum())
     if total:
         first = int(bad.nonzero()[0])
         where = f"{total} of {bad.numel()} rows, first row {first}"
-        raise InputError(f"{source}: {wanted}, got {got} in {where}", mend)
+        raise InputError(f"{source}: {wanted}, got {got} in {where}", hint)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -14,7 +12,6 @@ from torch import Tensor
 from gsfluent.data._fields import TensorContainer, shape
 from gsfluent.data.frame import Frame
 from gsfluent.data.gaussians import Gaussians
-from gsfluent.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,83 +104,6 @@ class Solid(TensorContainer):
     def transformed(self, frame: Frame) -> Solid:
         """Return the solid placed by ``frame`` after its present frame; tensors stay."""
         return self.replace(frame=frame if self.frame is None else frame.compose(self.frame))
-
-    def save(self, path: str | Path) -> None:
-        """Write the splats to ``path`` (.ply) and the volume to ``<name>.volume.npz`` beside it."""
-        import numpy as np
-
-        from gsfluent.io.atomic import atomic_path
-
-        path = Path(path)
-        arrays: dict[str, Any] = {
-            "occupancy": np.packbits(self.occupancy.cpu().numpy()),
-            "shape": np.array(self.occupancy.shape, dtype=np.int64),
-            "depth": self.depth.cpu().numpy(),
-            "origin": self.origin.cpu().numpy(),
-            "voxel": np.float64(self.voxel),
-            "report": np.array(json.dumps(self.report)),
-            "frame": np.array(json.dumps(None if self.frame is None else self.frame.to_dict())),
-        }
-        if self.color is not None:
-            arrays["color"] = self.color.cpu().numpy()
-        if self.regions is not None:
-            arrays["regions"] = self.regions.cpu().numpy()
-        self.gaussians.save(path)
-        with atomic_path(volume_path(path)) as temporary, open(temporary, "wb") as stream:
-            np.savez_compressed(stream, **arrays)
-
-    @staticmethod
-    def load(path: str | Path) -> Solid:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            InputError: The splats or the volume are missing or damaged.
-        """
-        import zipfile
-
-        import numpy as np
-
-        from gsfluent.io.splats import load_splats
-
-        path = Path(path)
-        gaussians = load_splats(path)
-        beside = volume_path(path)
-        if not beside.is_file():
-            raise InputError(
-                f"{path}: a solid needs {beside.name} beside it, got none",
-                "make both with `gsfluent fill`",
-            )
-        try:
-            with np.load(beside, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files}
-            size = tuple(int(count) for count in arrays["shape"])
-            bits = np.unpackbits(arrays["occupancy"], count=math.prod(size))
-            frame = json.loads(str(arrays["frame"]))
-            if gaussians.labels is None:
-                gaussians = gaussians.replace(
-                    labels=torch.zeros(gaussians.count, dtype=torch.int32)
-                )
-            return Solid(
-                gaussians,
-                torch.from_numpy(bits.reshape(size).astype(bool)),
-                torch.from_numpy(arrays["depth"]),
-                torch.from_numpy(arrays["origin"]),
-                float(arrays["voxel"]),
-                torch.from_numpy(arrays["color"]) if "color" in arrays else None,
-                torch.from_numpy(arrays["regions"]) if "regions" in arrays else None,
-                json.loads(str(arrays["report"])),
-                None if frame is None else Frame.from_dict(frame),
-            )
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(
-                f"{beside}: the volume file is damaged ({error})",
-                "make it again with `gsfluent fill`",
-            ) from error
-
-
-def volume_path(path: str | Path) -> Path:
-    """Name of the volume file that belongs to a solid ``.ply``."""
-    return Path(path).with_suffix(".volume.npz")
 
 
 def _trilinear(grid: Tensor, position: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from gsfluent.demo.objects import DemoObject
 from gsfluent.demo.truth import save_truth
 from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
-from gsfluent.pipeline.stage import Progress, report_progress
+from gsfluent.progress import Progress, report_progress
 
 _KEY_LIGHT = (0.45, -0.35, 0.82)
 _RINGS = ((38.0, 0.40), (6.0, 0.35), (-32.0, 0.25))  # elevation [deg], share of the views

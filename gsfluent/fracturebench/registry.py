@@ -15,13 +15,13 @@ MODULES = (
     "contact",
     "elastic",
     "flow",
-    "fracture_bars",
-    "fracture_cantilever",
-    "fracture_plane",
-    "fracture_rock",
-    "fracture_shatter",
+    "bars",
+    "cantilever",
+    "plane",
+    "rock",
+    "shatter",
 )
-"""Modules of this package that register cases."""
+"""Modules of ``scenes`` that register cases."""
 
 Build = Callable[[float, int], Scene]
 Judge = Callable[[Scene, Run], Iterable[Measure]]
@@ -76,7 +76,7 @@ def case(
 def cases(kind: str | None = None) -> list[Case]:
     """Return all cases, or those of a kind, by name."""
     for module in MODULES:
-        importlib.import_module(f".{module}", __package__)
+        importlib.import_module(f".scenes.{module}", __package__)
     chosen = (c for c in _CASES.values() if kind is None or c.kind == kind)
     return sorted(chosen, key=lambda c: c.name)
 

@@ -2,12 +2,11 @@
 
 from gsfluent.io.atomic import atomic_path, write_json
 from gsfluent.io.capture import load_capture
-from gsfluent.io.delta import DeltaReader
 from gsfluent.io.images import load_image, save_image
-from gsfluent.io.ply import read_ply, write_ply
-from gsfluent.io.splats import load_splats, save_splats
-
-load = load_splats
+from gsfluent.io.solid import load, load_solid, save, save_solid
+from gsfluent.io.splats.delta import DeltaReader
+from gsfluent.io.splats.load import load_splats, save_splats
+from gsfluent.io.splats.ply import read_ply, write_ply
 
 __all__ = [
     "DeltaReader",
@@ -15,9 +14,12 @@ __all__ = [
     "load",
     "load_capture",
     "load_image",
+    "load_solid",
     "load_splats",
     "read_ply",
+    "save",
     "save_image",
+    "save_solid",
     "save_splats",
     "write_json",
     "write_ply",

@@ -19,7 +19,7 @@ from gsfluent import geometry
 from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
-from gsfluent.io.images import IMAGE_SUFFIXES
+from gsfluent.io.images import IMAGE_SUFFIXES, load_view
 
 # name -> (COLMAP id, parameter count, places of fx fy cx cy, of the OpenCV coefficients or None)
 _Lens = tuple[int, int, torch.Tensor, tuple[float, ...]]  # width, height, K, OpenCV coefficients
@@ -148,6 +148,7 @@ def read_model(model: Path, root: Path, *, photographs: bool = True) -> Capture:
         torch.from_numpy(np.ascontiguousarray(points[good])),
         torch.from_numpy((colors[good] / 255.0).astype(np.float32)),
         root,
+        load_view,
     )
 
 

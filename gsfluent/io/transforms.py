@@ -19,8 +19,8 @@ from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
 from gsfluent.io.colmap import find_mask
-from gsfluent.io.images import IMAGE_SUFFIXES, image_size
-from gsfluent.io.ply import read_ply
+from gsfluent.io.images import IMAGE_SUFFIXES, image_size, load_view
+from gsfluent.io.splats.ply import read_ply
 
 _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _RIGID_TOLERANCE = 1e-3
@@ -50,7 +50,7 @@ def read_transforms(path: Path) -> Capture:
             "restore the images, or delete these frames from the file",
         )
     points, colors = _points(path, data)
-    return Capture(cameras, points, colors, path.parent)
+    return Capture(cameras, points, colors, path.parent, load_view)
 
 
 def read_poses(path: Path) -> list[Camera]:

@@ -78,4 +78,4 @@ def get(name: str) -> Material:
     short = {key.split(".")[-1]: value for key, value in _PRESETS.items()}
     if name in short:
         return short[name]
-    raise InputError(f"unknown material {name!r}", mend=nearest(name, _PRESETS))
+    raise InputError(f"unknown material {name!r}", hint=nearest(name, _PRESETS))

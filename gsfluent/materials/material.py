@@ -101,7 +101,7 @@ class Material:
         """Fill in defaults; check the law and every number."""
         if self.law not in LAWS:
             raise InputError(
-                f"material {self.name!r}: unknown law {self.law!r}", mend=nearest(self.law, LAWS)
+                f"material {self.name!r}: unknown law {self.law!r}", hint=nearest(self.law, LAWS)
             )
         reads, defaults = READS[self.law], DEFAULTS.get(self.law, {})
         for field, (low, high, unit) in RANGES.items():
@@ -109,13 +109,13 @@ class Material:
             if value is not None and field not in reads:
                 raise InputError(
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
-                    mend=f"remove it, or use law {_readers(field)}",
+                    hint=f"remove it, or use law {_readers(field)}",
                 )
             if value is None and field in defaults:
                 object.__setattr__(self, field, defaults[field])
             elif value is None and field in reads:
                 raise InputError(
-                    f"material {self.name!r}: law {self.law!r} needs {field}", mend=f"give {unit}"
+                    f"material {self.name!r}: law {self.law!r} needs {field}", hint=f"give {unit}"
                 )
             if value is not None:
                 _check_number(self.name, field, value, low, high, unit)
@@ -127,7 +127,7 @@ class Material:
         if self.variation > 0.0 and self.law != "nacc":
             raise InputError(
                 f"material {self.name!r}: variation does nothing under law {self.law!r}",
-                mend="remove it, or use law nacc",
+                hint="remove it, or use law nacc",
             )
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
@@ -149,7 +149,7 @@ class Material:
         for key in changes:
             if key not in known:
                 raise InputError(
-                    f"material {self.name!r}: unknown parameter {key!r}", mend=nearest(key, known)
+                    f"material {self.name!r}: unknown parameter {key!r}", hint=nearest(key, known)
                 )
         law = changes.get("law", self.law)
         if law != self.law and law in LAWS:
@@ -165,7 +165,7 @@ class Material:
         if field not in (*PARAMETERS, *SCATTER, *LOOKS):
             raise InputError(
                 f"material {self.name!r}: unknown parameter {field!r}",
-                mend=nearest(field, PARAMETERS),
+                hint=nearest(field, PARAMETERS),
             )
         return self.sources.get(field, "chosen by eye")
 
@@ -217,14 +217,14 @@ def _check_number(name: str, field: str, value: Any, low: float, high: float, un
     where = f"material {name!r}: {field}"
     if isinstance(value, bool) or not isinstance(value, int | float | Tensor):
         raise InputError(
-            f"{where} must be a number or a tensor, got {type(value).__name__}", mend=f"give {unit}"
+            f"{where} must be a number or a tensor, got {type(value).__name__}", hint=f"give {unit}"
         )
     data = _tensor(value)
     if data.ndim not in (0, 3):
         raise InputError(
             f"{where} must be one number or a grid [X, Y, Z] over the solid's voxels, "
             f"got shape {list(data.shape)}",
-            mend="sample the field on the solid's occupancy grid",
+            hint="sample the field on the solid's occupancy grid",
         )
     inside = torch.isfinite(data) & (data >= low) & (data <= high)
     if field in POSITIVE:
@@ -234,7 +234,7 @@ def _check_number(name: str, field: str, value: Any, low: float, high: float, un
         edge = "above" if field in POSITIVE else "at least"
         raise InputError(
             f"{where} must be {edge} {low:g} and at most {high:g} ({unit}), got {worst:g}",
-            mend="mend the number",
+            hint="mend the number",
         )
 
 

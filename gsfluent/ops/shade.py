@@ -35,7 +35,8 @@ def shade(
     Blinn-Phong by any number of lamps with percentage-closer soft shadows (Fernando 2005), light
     from everywhere as spherical harmonics of degree 2 (Ramamoorthi and Hanrahan 2001) less what
     matter hides, a floor and a backdrop. Pixels more opaque than 0.999 do not ask what is behind.
-    The formulas and how the tables are packed: :mod:`gsfluent.pipeline.shade`; the whole picture
+    The formulas and how the tables are packed: :mod:`gsfluent.pipeline.light.shade`; the
+    whole picture
     in plain PyTorch, which the kernels are tested against: ``tests/ops/shade_model.py``.
 
     Args:

@@ -68,9 +68,9 @@ class SolverError(GsfluentError, RuntimeError):
     """
 
     def __init__(self, reason: int, time: float, step: int) -> None:
-        what, mend = _REASONS.get(reason, (f"reason {reason}", "report this"))
+        what, hint = _REASONS.get(reason, (f"reason {reason}", "report this"))
         self.reason, self.time, self.step = reason, time, step
-        super().__init__(f"solver: t = {time:.6g} s, step {step}: {what}\n  mend: {mend}")
+        super().__init__(f"solver: t = {time:.6g} s, step {step}: {what}\n  hint: {hint}")
 
 
 class Solver(SolverState):

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from torch import nn
-
-Progress = Callable[[int, int, str], None]
-"""``progress(done, total, note)``: called by a stage as it goes; ``None`` means nobody listens."""
 
 
 class Stage(nn.Module):
@@ -25,9 +20,3 @@ class Stage(nn.Module):
     def __init__(self, *, seed: int = 0) -> None:
         super().__init__()
         self.seed = int(seed)
-
-
-def report_progress(progress: Progress | None, done: int, total: int, note: str = "") -> None:
-    """Call ``progress`` when there is one."""
-    if progress is not None:
-        progress(done, total, note)

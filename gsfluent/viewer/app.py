@@ -18,26 +18,27 @@ import torch
 
 from gsfluent.data import Camera
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.run_show import poster_frame
-from gsfluent.viewer.artist import Artist
-from gsfluent.viewer.look import Look
-from gsfluent.viewer.look_panel import LookPanel
-from gsfluent.viewer.pace import Pace
-from gsfluent.viewer.picture import PictureMaker, browser_camera
-from gsfluent.viewer.playback import Playback
-from gsfluent.viewer.plot_panel import PlotPanel
+from gsfluent.pipeline.render.film import poster_frame
+from gsfluent.viewer.draw.artist import Artist
+from gsfluent.viewer.draw.picture import PictureMaker, browser_camera
+from gsfluent.viewer.draw.splats import BrowserSplats
+from gsfluent.viewer.model.look import Look
+from gsfluent.viewer.model.pace import Pace
+from gsfluent.viewer.model.playback import Playback
+from gsfluent.viewer.model.source import Source
+from gsfluent.viewer.model.timeline import Timeline
+from gsfluent.viewer.page import Page
+from gsfluent.viewer.panels.look import LookPanel
+from gsfluent.viewer.panels.plot import PlotPanel
+from gsfluent.viewer.panels.time import TimePanel
 from gsfluent.viewer.server import start_server, stop_server
-from gsfluent.viewer.source import Source
-from gsfluent.viewer.splats import BrowserSplats
-from gsfluent.viewer.time_panel import TimePanel
-from gsfluent.viewer.timeline import Timeline
 
 if TYPE_CHECKING:
     import viser
 
 _log = logging.getLogger(__name__)
 
-AddPanel = Callable[["viser.ViserServer", "App"], None]
+AddPanel = Callable[["viser.ViserServer", Page], None]
 """Adds controls of its own to the page, for example to throw and shoot at a live object."""
 
 _TICK = 1.0 / 60.0

@@ -13,7 +13,7 @@ import torch
 
 from gsfluent.io import save_image
 from gsfluent.viewer.app import App
-from gsfluent.viewer.source import RunSource
+from gsfluent.viewer.model.source import RunSource
 
 _log = logging.getLogger(__name__)
 _CHECK_SIZE = (960, 720)

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from gsfluent.pipeline.live import CRACKS, LiveSession
-from gsfluent.pipeline.live_player import LivePlayer
-from gsfluent.pipeline.live_scene import open_stage
+from gsfluent.live.player import LivePlayer
+from gsfluent.live.scene import open_stage
+from gsfluent.live.session import CRACKS, LiveSession
 from gsfluent.viewer.app import App
-from gsfluent.viewer.live_source import LiveSource
-from gsfluent.viewer.poke import PokePanel
+from gsfluent.viewer.model.live_source import LiveSource
+from gsfluent.viewer.panels.poke import PokePanel
 from gsfluent.viewer.serve import stay
 
 _log = logging.getLogger(__name__)

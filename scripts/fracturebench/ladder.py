@@ -22,10 +22,10 @@ from page import enter
 from gsfluent.fracturebench import registry
 from gsfluent.fracturebench.registry import Case, cases, find, judge
 from gsfluent.fracturebench.scene import SceneError
-from gsfluent.lab.frozen import play
+from gsfluent.lab.frozen.answer import play
 
 ROOT = Path(__file__).resolve().parents[2]
-REFERENCES = Path(registry.__file__).with_name("references.json")
+REFERENCES = Path(registry.__file__).parent / "data" / "references.json"
 ROUNDING = 1e-5
 """An error below it is that of float32, and has no order."""
 

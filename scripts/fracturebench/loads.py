@@ -16,12 +16,12 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from page import enter
 
-from gsfluent.fracturebench.fracture_cantilever import cantilever
-from gsfluent.fracturebench.fracture_plane import notch
-from gsfluent.fracturebench.fracture_rock import experiment
 from gsfluent.fracturebench.registry import find, judge
+from gsfluent.fracturebench.scenes.cantilever import cantilever
+from gsfluent.fracturebench.scenes.plane import notch
+from gsfluent.fracturebench.scenes.rock import experiment
 from gsfluent.io.atomic import atomic_path
-from gsfluent.lab.frozen import play
+from gsfluent.lab.frozen.answer import play
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "fracturebench_fracture.md"

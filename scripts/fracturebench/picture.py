@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from gsfluent.figure.style import COLORS, INK, OURS, new_figure, save_png
-from gsfluent.fracturebench.contact import height_history, momentum_history
-from gsfluent.fracturebench.elastic import growth_history
-from gsfluent.fracturebench.flow import wave_history
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen import play
+from gsfluent.fracturebench.scenes.contact import height_history, momentum_history
+from gsfluent.fracturebench.scenes.elastic import growth_history
+from gsfluent.fracturebench.scenes.flow import wave_history
+from gsfluent.lab.frozen.answer import play
 
 ROOT = Path(__file__).resolve().parents[2]
 History = Callable[[Scene, Run], tuple[np.ndarray, np.ndarray, np.ndarray]]

@@ -23,7 +23,7 @@ import numpy as np
 
 Law = Callable[[np.ndarray, float, float], np.ndarray]
 ROOT = Path(__file__).resolve().parents[2]
-OUT = ROOT / "gsfluent" / "fracturebench" / "references.json"
+OUT = ROOT / "gsfluent" / "fracturebench" / "data" / "references.json"
 
 
 def moduli(poisson: float) -> tuple[float, float]:

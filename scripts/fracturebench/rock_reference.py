@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.fracturebench.fracture_rock import EXPERIMENT, rosin_rammler
+from gsfluent.fracturebench.scenes.rock import EXPERIMENT, rosin_rammler
 from gsfluent.io.atomic import write_json
 
 ROCKS = {"sandstone": "SeeSst__Sheet1", "quartzite": "TaQu__TaQu", "limestone": "SaLi__SaLi"}

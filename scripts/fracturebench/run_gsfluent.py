@@ -21,12 +21,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import frozen
 import torch
 
-from gsfluent.charts.record import commit, machine
 from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import SceneError
-from gsfluent.lab.frozen import clock, play
+from gsfluent.lab.charts.record import commit, machine
+from gsfluent.lab.frozen.answer import clock, play
 
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")
 

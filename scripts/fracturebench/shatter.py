@@ -27,13 +27,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from page import enter
 
 from gsfluent.figure.style import COLORS, OURS, new_figure, save_png
-from gsfluent.fracturebench.fracture_shatter import RADIUS, RECORD, SEEDS, reference
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
+from gsfluent.fracturebench.scenes.shatter import RADIUS, RECORD, SEEDS, reference
 from gsfluent.fracturebench.statistics import MEASURES, Figures, distance, ensemble
 from gsfluent.io.atomic import atomic_path
-from gsfluent.lab.frozen import play
+from gsfluent.lab.frozen.answer import play
 
 ROOT = Path(__file__).resolve().parents[2]
 CELLS, CFL = 10, 0.3

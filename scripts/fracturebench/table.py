@@ -23,11 +23,11 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import frozen
 from page import enter
 
-from gsfluent.charts.record import Record, of_run, read
 from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import cases, find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
+from gsfluent.lab.charts.record import Record, of_run, read
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS = ROOT / "docs" / "data" / "fracturebench.jsonl"

@@ -19,10 +19,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
-from gsfluent.charts.record import Record, append, machine, of_run, read  # noqa: E402
 from gsfluent.fracturebench.registry import find  # noqa: E402
 from gsfluent.fracturebench.run import Run  # noqa: E402
 from gsfluent.fracturebench.scene import Scene, SceneError  # noqa: E402
+from gsfluent.lab.charts.record import Record, append, machine, of_run, read  # noqa: E402
 
 DATA = ROOT / "docs" / "data"
 

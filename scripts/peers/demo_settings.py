@@ -83,7 +83,7 @@ def record(
     steps: int, walls: Sequence[float], per_simulated: float, error: float, timed: int = 0,
     failed: str = "", commit: str = "", **more: Any,
 ) -> dict[str, Any]:  # fmt: skip
-    """A line in the form of gsfluent.charts.record; ``timed`` steps took the walls, or all did."""
+    """A line as gsfluent.lab.charts.record has them; ``timed`` steps took the walls, or all did."""
     bad = failed or not math.isfinite(error)
     return {
         "case": f"demo_{setting.name}", "kind": "elastic", "method": method, "variant": matter,
@@ -241,7 +241,7 @@ class Search:
         """Error of a run."""
         import torch
 
-        from gsfluent.lab.frozen import play
+        from gsfluent.lab.frozen.answer import play
 
         if choice not in self.made:
             scene = self.scene(choice)
@@ -263,7 +263,7 @@ class Search:
 
     def clock(self, choice: Choice) -> list[float]:
         """Wall seconds of whole runs."""
-        from gsfluent.lab.frozen import clock
+        from gsfluent.lab.frozen.answer import clock
 
         repeat = 3 if self.made[choice][2] < 2.0 else 1
         return clock(self.scene(choice), repeat=repeat, device=self.device, cfl=choice[0])
@@ -271,7 +271,7 @@ class Search:
 
 def ours(options: argparse.Namespace, chosen: Iterable[Setting]) -> int:
     """Find gsfluent's cheapest setting whose error is at most PhysGaussian's."""
-    from gsfluent.charts.record import commit, machine
+    from gsfluent.lab.charts.record import commit, machine
 
     version, name = commit(), machine(options.device)
     for setting in chosen:

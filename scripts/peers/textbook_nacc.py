@@ -2,7 +2,8 @@
 
 python scripts/peers/textbook_nacc.py --scene S.npz --out R.npz
 
-The reference that stands for what others ship (gsfluent.lab.textbook, in gsfluent's environment):
+The reference that stands for what others ship (gsfluent.lab.textbook.solver, in gsfluent's
+environment):
 APIC on quadratic B-splines, absolute float32 positions, deformation gradients, the return map of
 CD-MPM with its lagging hardening. It is plain torch, so its times say nothing about its makers'.
 """
@@ -51,8 +52,8 @@ class Textbook:
     variant: Any = None
 
     def load(self, folder: Path | None) -> str:
-        from gsfluent.charts.record import commit
-        from gsfluent.lab import textbook
+        from gsfluent.lab.charts.record import commit
+        from gsfluent.lab.textbook import solver as textbook
 
         self.solver, self.variant = textbook.Textbook, textbook.Variant
         return f"gsfluent {commit()}"

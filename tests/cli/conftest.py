@@ -10,6 +10,7 @@ import torch
 from ball_shot import write_shot
 
 from gsfluent.data import SURFACE, Gaussians
+from gsfluent.io import save_splats
 
 AXES = (1.0, 0.45, 0.45)  # slender, so that the fixed number of cells along it holds few points
 
@@ -31,7 +32,7 @@ def shell(count: int = 1500) -> Gaussians:
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shell as a .ply file."""
     path = tmp_path_factory.mktemp("splat") / "ball.ply"
-    shell().save(path)
+    save_splats(shell(), path)
     return path
 
 

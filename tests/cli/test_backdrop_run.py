@@ -13,7 +13,8 @@ from PIL import Image
 
 from gsfluent.cli import main
 from gsfluent.data import BACKGROUND, Gaussians
-from gsfluent.io import load
+from gsfluent.io import load_splats
+from gsfluent.io.splats.load import save_splats
 
 OUTPUT = {"fps": 20, "seconds": 0.2, "size": [96, 64]}
 
@@ -27,10 +28,9 @@ def ball_on_table(ball: Path, tmp_path: Path) -> Path:
     means = means[means[:, :2].norm(dim=1) > 0.4]
     scales = torch.tensor([0.08, 0.08, 0.01]).repeat(len(means), 1)
     red = torch.tensor([0.9, 0.05, 0.05]).repeat(len(means), 1)
-    whole = Gaussians.cat([
-        load(ball), Gaussians.from_colors(means, scales, red, opacities=0.95, label=BACKGROUND)
-    ])  # fmt: skip
-    whole.save(tmp_path / "scene.ply")
+    behind = Gaussians.from_colors(means, scales, red, opacities=0.95, label=BACKGROUND)
+    whole = Gaussians.cat([load_splats(ball), behind])
+    save_splats(whole, tmp_path / "scene.ply")
     return tmp_path / "scene.ply"
 
 

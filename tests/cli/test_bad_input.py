@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(120)
 def refused(words: list[str], capsys: pytest.CaptureFixture[str], code: int = 2) -> str:
     assert main(words) == code
     text = capsys.readouterr().err
-    assert "mend:" in text
+    assert "hint:" in text
     assert "Traceback" not in text
     return text
 

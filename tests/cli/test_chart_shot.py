@@ -12,7 +12,7 @@ from ball_shot import write_shot
 
 from gsfluent.cli import main
 from gsfluent.config import load_shot
-from gsfluent.pipeline.plan import plan_shot
+from gsfluent.plan.plan import plan_shot
 
 SOFT = {
     "objects": {"ball": {"material": "rubber", "young_modulus": 2e4}},

@@ -29,7 +29,7 @@ def test_a_shot_shows_its_parts_and_the_run_goes_on(
     out = tmp_path / "parts.png"
     words = ["inspect", str(shot), "-o", str(out), "--json"]
     assert main(words) == 2  # where?
-    assert "--run" in json.loads(capsys.readouterr().out)["error"]["mend"]
+    assert "--run" in json.loads(capsys.readouterr().out)["error"]["hint"]
     assert main([*words, "--run", str(tmp_path / "run")]) == 0
     report = json.loads(capsys.readouterr().out)["objects"]["ball"]
     rest, right, crust = report["parts"]

@@ -11,7 +11,7 @@ from physgaussian_model import CENTER, config, write_model
 
 from gsfluent.cli import main
 from gsfluent.data import Frame
-from gsfluent.pipeline.run_frames import load_frame
+from gsfluent.results.frames import load_frame
 
 
 @pytest.fixture(scope="module")

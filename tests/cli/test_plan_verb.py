@@ -11,8 +11,9 @@ import torch
 
 from gsfluent.cli import main
 from gsfluent.data import Gaussians
-from gsfluent.pipeline import plan_probe
-from gsfluent.pipeline.plan_cost import CostModel, machine_key
+from gsfluent.io.splats.load import save_splats
+from gsfluent.plan import probe as plan_probe
+from gsfluent.plan.cost import CostModel, machine_key
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     splats = Gaussians.from_colors(
         means, torch.full((len(means), 3), 0.006), torch.full((len(means), 3), 0.5), opacities=0.95
     )
-    splats.save(tmp_path / "slab.ply")
+    save_splats(splats, tmp_path / "slab.ply")
     path = tmp_path / "shot.yaml"
     path.write_text(
         "splats: slab.ply\nscale: 1.0\nup: +z\nobjects: {slab: {material: fruit.watermelon}}\n"
@@ -70,8 +71,8 @@ def test_the_tables_say_what_binds_and_what_to_mend(
     for line in ("passes", "bounds of dx: ", "stages", "warnings", "in all"):
         assert f"\n{line}" in text or f"\n  {line}" in text, line
     assert "  +  damage variable" in text and "  -  blades" in text
-    assert "breaks from about" in text and "mend: raise the drop" in text
-    assert "mend: a finer solve.quality, or solve.cells: " in text
+    assert "breaks from about" in text and "hint: raise the drop" in text
+    assert "hint: a finer solve.quality, or solve.cells: " in text
 
 
 def test_wrong_words_and_shots_measure_nothing(

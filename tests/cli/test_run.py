@@ -18,8 +18,8 @@ import torch
 from ball_shot import write_shot
 
 from gsfluent.cli import main
-from gsfluent.io import load
-from gsfluent.pipeline.run_show import poster_frame
+from gsfluent.io import load_splats
+from gsfluent.pipeline.render.film import poster_frame
 
 FRAMES = 10
 KEYS = {
@@ -102,7 +102,7 @@ def test_the_pictures_show_something(finished: Path) -> None:
 def test_the_ply_sequence_is_standard_and_falls(finished: Path) -> None:
     files = sorted((finished / "frames").glob("frame_*.ply"))
     assert [f.name for f in files] == [f"frame_{i:04d}.ply" for i in range(1, FRAMES + 1)]
-    first, later = load(files[0]), load(files[4])
+    first, later = load_splats(files[0]), load_splats(files[4])
     assert float(first.means[:, 2].mean() - later.means[:, 2].mean()) > 0.1
     header = files[0].read_bytes().split(b"end_header")[0]
     for name in (b"f_dc_0", b"opacity", b"scale_0", b"rot_0"):
@@ -197,13 +197,13 @@ def test_full_disk_during_the_simulation_keeps_what_is_done(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         save(stream, **arrays)
 
-    monkeypatch.setattr("gsfluent.pipeline.run_frames.np.savez", filling)
+    monkeypatch.setattr("gsfluent.results.frames.np.savez", filling)
     assert main(["run", str(shot), "-o", str(out)]) == 1
     said = capsys.readouterr().err
     assert os.strerror(errno.ENOSPC) in said
     assert not list(out.rglob("*partial*"))
     assert read(out)["verdict"] == "failed"
-    monkeypatch.setattr("gsfluent.pipeline.run_frames.np.savez", save)
+    monkeypatch.setattr("gsfluent.results.frames.np.savez", save)
     assert main(["run", str(shot), "-o", str(out)]) == 0
     assert read(out)["verdict"] == "clean"
 
@@ -228,7 +228,7 @@ def test_render_refuses_what_it_cannot(
     finished: Path, extra: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["render", str(finished), *extra]) == 2
-    assert "mend:" in capsys.readouterr().err
+    assert "hint:" in capsys.readouterr().err
 
 
 def test_export_vtk_holds_the_particles(finished: Path) -> None:
@@ -253,8 +253,8 @@ def test_export_hands_a_real_run_on(
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 3
     assert main(["export", str(tmp_path / "splats.gsd"), "--to", "ply-seq"]) == 0
     for number in (1, 2, 3):
-        unpacked = load(tmp_path / "splats" / "frames" / f"frame_{number:04d}.ply")
-        straight = load(tmp_path / "frames" / f"frame_{4 * number - 3:04d}.ply")
+        unpacked = load_splats(tmp_path / "splats" / "frames" / f"frame_{number:04d}.ply")
+        straight = load_splats(tmp_path / "frames" / f"frame_{4 * number - 3:04d}.ply")
         assert unpacked.count == straight.count
         gap = unpacked.means[::50, None].double() - straight.means
         off = gap.norm(dim=2).amin(dim=1)
@@ -286,7 +286,7 @@ def test_the_poster_follows_the_largest_break(fragments: list[int], expected: in
 
 def test_a_bullet_can_be_seen(finished: Path, ball: Path, tmp_path: Path) -> None:
     from gsfluent.data import TRANSITION
-    from gsfluent.pipeline.run_frames import load_frame
+    from gsfluent.results.frames import load_frame
 
     out = tmp_path / "out"
     shutil.copytree(finished, out)

@@ -46,7 +46,7 @@ def test_fill_and_simulate_scripts(
 ) -> None:
     solid = tmp_path / "solid.ply"
     script("fill").main(str(ball), str(solid))
-    assert gf.Solid.load(solid).color is not None
+    assert gf.load(solid).color is not None
     script("simulate").main(str(solid), "bread", "0.3", "2.0")
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("t = ") for line in lines) == 30

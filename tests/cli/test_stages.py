@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from gsfluent.cli import main
-from gsfluent.data import INTERIOR, Solid
+from gsfluent.data import INTERIOR
 from gsfluent.demo import make_capture
-from gsfluent.io import load
+from gsfluent.io import load_splats
+from gsfluent.io.solid import load_solid
 
 
 def done(words: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
@@ -41,18 +42,18 @@ def test_reconstruct_writes_a_splat_and_its_figures(
     words = ["reconstruct", str(tmp_path / "capture"), "-o", str(out), "--iterations", "20"]
     report = done([*words, "--max-gaussians", "900"], capsys)
     assert report["images"] == 9 and report["held_out"] == 1
-    assert load(out).count == report["gaussians_saved"] <= 900
+    assert load_splats(out).count == report["gaussians_saved"] <= 900
     assert json.loads((out.parent / "reconstruct.json").read_text()) == report
 
 
 def test_fill_then_texture(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     solid, textured = tmp_path / "solid.ply", tmp_path / "textured.ply"
     filled = done(["fill", str(ball), "-o", str(solid), "--resolution", "24"], capsys)
-    assert filled["interior_gaussians"] == int((load(solid).labels == INTERIOR).sum()) > 100
+    assert filled["interior_gaussians"] == int((load_splats(solid).labels == INTERIOR).sum()) > 100
     words = ["texture", str(solid), "-o", str(textured), "--method", "color_copy"]
     report = done(words, capsys)
     assert report["method"] == "color_copy"
-    color = Solid.load(textured).color
+    color = load_solid(textured).color
     assert color is not None and float(color.std()) > 0.05
     width, height = Image.open(report["cuts"]).size
     assert width > 2 * height > 0
@@ -61,7 +62,7 @@ def test_fill_then_texture(ball: Path, tmp_path: Path, capsys: pytest.CaptureFix
 def test_demo_small_tells_the_truth_about_its_inside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gsfluent.pipeline import run_demo
+    from gsfluent.run import demo as run_demo
 
     tiny = run_demo.DemoSize(9, 64, 40, 1500, 24, "preview", (64, 48), 0.3, 10.0)
     monkeypatch.setitem(run_demo.SIZES, "preview", tiny)

@@ -84,7 +84,7 @@ def test_wrong_device_exits_2_with_a_mend(device: str, capsys: pytest.CaptureFix
     assert main(["doctor", "--device", device]) == 2
     text = capsys.readouterr().err
     assert f"--device {device}" in text
-    assert "mend:" in text
+    assert "hint:" in text
 
 
 def test_json_errors_are_one_object(capsys: pytest.CaptureFixture[str]) -> None:
@@ -93,7 +93,7 @@ def test_json_errors_are_one_object(capsys: pytest.CaptureFixture[str]) -> None:
     value = json.loads(captured.out)
     assert value["exit_code"] == 2
     assert "missing.yaml" in value["error"]["message"]
-    assert value["error"]["mend"]
+    assert value["error"]["hint"]
     assert "missing.yaml" in captured.err
     assert not Path("x").exists()
 
@@ -109,7 +109,7 @@ def test_unexpected_failure_exits_1_without_traceback(
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("boom")
 
-    monkeypatch.setattr("gsfluent.pipeline.doctor.examine", fail)
+    monkeypatch.setattr("gsfluent.inspect.doctor.examine", fail)
     monkeypatch.delenv("GSFLUENT_DEBUG", raising=False)
     assert main(["doctor"]) == 1
     text = capsys.readouterr().err

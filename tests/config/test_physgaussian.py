@@ -16,13 +16,14 @@ import pytest
 import torch
 from physgaussian_model import CENTER, RADIUS, config, write_model
 
-from gsfluent.config import load_shot, physgaussian_page
-from gsfluent.config.physgaussian import Conversion, convert
-from gsfluent.config.physgaussian_keys import FILLING, KEYS, MATERIALS
+from gsfluent.config import load_shot
+from gsfluent.config.physgaussian import page as physgaussian_page
+from gsfluent.config.physgaussian.keys import FILLING, KEYS, MATERIALS
+from gsfluent.config.physgaussian.read import Conversion, convert
 from gsfluent.errors import InputError
-from gsfluent.io import load
-from gsfluent.pipeline.run_simulate import build_scene
-from gsfluent.scene import Scene
+from gsfluent.io import load_splats
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import build_scene
 
 SCALE = 1.0 / (2.0 * RADIUS)
 
@@ -47,14 +48,14 @@ def status(conversion: Conversion, key: str) -> str:
 def test_the_box_is_the_scene_and_the_model_lies_in_it(model: Path, tmp_path: Path) -> None:
     turns = {"rotation_degree": [90.0, 30.0], "rotation_axis": [0, 2], "scale": 0.6}
     conversion = made(model, tmp_path, **turns)
-    splats = load(tmp_path / "made" / "model.ply")
+    splats = load_splats(tmp_path / "made" / "model.ply")
     # a turned point of the model: about x, then about z, then into the box around (1, 1, 1)
     point = np.array([RADIUS, 0.0, 0.0])
     c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
     about_x = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     turned = about_z @ about_x @ point
-    means = load(model / "point_cloud/iteration_30/point_cloud.ply").means.numpy()
+    means = load_splats(model / "point_cloud/iteration_30/point_cloud.ply").means.numpy()
     whole = about_z @ about_x @ (means - np.array(CENTER)).T
     extent = float(np.ptp(whole, axis=1).max())
     middle = 0.5 * (whole.max(axis=1) + whole.min(axis=1))
@@ -187,7 +188,7 @@ def test_a_cylinder_that_turns_turns_the_same_way(model: Path, tmp_path: Path) -
     theirs = 0.05 * 1.9 * (-math.sin(0.7) * h1 + math.cos(0.7) * h2) + 0.5 * n
     ours = np.cross(found["spin"], offset) + np.array(found["velocity"])
     assert ours == pytest.approx(theirs, abs=1e-9)
-    from gsfluent.scene_parts import quaternion, turned
+    from gsfluent.scene.parts import quaternion, turned
 
     axis = turned(quaternion("turn", found["turn"]), (0.0, 0.0, 1.0))
     assert np.abs(axis) == pytest.approx(np.abs(n), abs=1e-9)
@@ -214,7 +215,7 @@ def test_an_impulse_is_a_throw_of_the_same_momentum(model: Path, tmp_path: Path)
     push = {"type": "particle_impulse", "force": [-0.18, 0, 0.09], "num_dt": 2, "start_time": 0}
     conversion = made(model, tmp_path, boundary_conditions=[push])
     (event,) = conversion.shot["events"]
-    means = load(model / "point_cloud/iteration_30/point_cloud.ply").means.double().numpy()
+    means = load_splats(model / "point_cloud/iteration_30/point_cloud.ply").means.double().numpy()
     place = SCALE * (means - np.array(CENTER)) + 1.0
     cells = np.unique(np.floor(place / 0.05).astype(int), axis=0)
     mass = 200.0 * 0.05**3 * len(cells)  # Gaussians of a cell share its volume
@@ -228,7 +229,7 @@ def test_an_impulse_is_a_throw_of_the_same_momentum(model: Path, tmp_path: Path)
 def test_what_lies_outside_sim_area_becomes_the_backdrop(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "model", far=True)
     conversion = made(folder, tmp_path, sim_area=[-3, 3, -3, 3, -3, 3])
-    splats = load(tmp_path / "made" / "model.ply")
+    splats = load_splats(tmp_path / "made" / "model.ply")
     assert splats.labels is not None
     assert int((splats.labels < 0).sum() + (splats.labels > 0).sum()) >= 50
     assert splats.count == 1550  # twenty are fainter than opacity_threshold

@@ -111,7 +111,7 @@ OBJECT = "objects.melon"
 
 
 @pytest.mark.parametrize(
-    ("keys", "path", "mend"),
+    ("keys", "path", "hint"),
     [
         ({"splat": "melon.ply"}, "splat: unknown key", "did you mean 'splats'"),
         (
@@ -145,11 +145,11 @@ OBJECT = "objects.melon"
     ],
 )
 def test_unknown_keys_name_their_path_and_the_nearest(
-    folder: Path, keys: dict[str, Any], path: str, mend: str
+    folder: Path, keys: dict[str, Any], path: str, hint: str
 ) -> None:
     with pytest.raises(InputError, match=path) as caught:
         read(folder, **keys)
-    assert mend in caught.value.mend
+    assert hint in caught.value.hint
 
 
 @pytest.mark.parametrize("other", [{"quality": "hero"}, {"cells": 30}, {"error": "3%"}])
@@ -157,7 +157,7 @@ def test_a_time_budget_stands_alone(folder: Path, other: dict[str, Any]) -> None
     assert read(folder, solve={"seconds_per_frame": 0.5}).solve.seconds_per_frame == 0.5
     with pytest.raises(InputError, match=next(iter(other))) as caught:
         read(folder, solve={"seconds_per_frame": 0.5} | other)
-    assert "remove" in caught.value.mend
+    assert "remove" in caught.value.hint
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_a_time_budget_stands_alone(folder: Path, other: dict[str, Any]) -> None
 def test_bad_values_name_their_path(folder: Path, keys: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         read(folder, **keys)
-    assert caught.value.mend
+    assert caught.value.hint
 
 
 def test_neither_input_is_an_error(folder: Path) -> None:

@@ -12,7 +12,7 @@ from simulation_shapes import ellipsoid
 from gsfluent.config import COLLIDERS, EVENTS, Shot, collider_dict, event_dict
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
-from gsfluent.pipeline.run_simulate import build_scene
+from gsfluent.stages.simulate import build_scene
 
 OBJECTS = {"a": {"material": "bread"}, "b": {"material": "jelly"}}
 SHOTS: list[dict[str, Any]] = [

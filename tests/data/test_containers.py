@@ -10,6 +10,7 @@ import torch
 from gsfluent import geometry
 from gsfluent.data import INTERIOR, SURFACE, Camera, Capture, Frame, Gaussians, Particles, Solid
 from gsfluent.errors import InputError
+from gsfluent.io.solid import load_solid, save_solid
 
 
 def make_gaussians(count: int = 20, degree: int = 3, **extra: object) -> Gaussians:
@@ -155,7 +156,7 @@ def test_validated_names_the_bad_row(field: str, value: float, message: str) -> 
     broken.reshape(20, -1)[7, 0] = value
     with pytest.raises(InputError, match=message) as caught:
         gaussians.replace(**{field: broken}).validated()
-    assert caught.value.mend
+    assert caught.value.hint
 
 
 def test_validated_refuses_no_gaussians_and_returns_good_ones() -> None:
@@ -293,9 +294,9 @@ def test_particles_validated_names_the_field() -> None:
 
 def test_solid_survives_saving(tmp_path: Path) -> None:
     solid = make_solid()
-    solid.save(tmp_path / "melon.ply")
+    save_solid(solid, tmp_path / "melon.ply")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["melon.ply", "melon.volume.npz"]
-    again = Solid.load(tmp_path / "melon.ply")
+    again = load_solid(tmp_path / "melon.ply")
     for name in ("occupancy", "depth", "origin", "color", "regions"):
         assert torch.equal(getattr(again, name), getattr(solid, name)), name
     assert again.report == solid.report and again.voxel == solid.voxel
@@ -340,12 +341,12 @@ def test_solid_refuses_missing_labels_and_bad_voxel() -> None:
 
 
 def test_solid_load_says_what_is_missing_or_damaged(tmp_path: Path) -> None:
-    make_solid().save(tmp_path / "melon.ply")
+    save_solid(make_solid(), tmp_path / "melon.ply")
     volume = tmp_path / "melon.volume.npz"
     whole = volume.read_bytes()
     volume.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="volume file is damaged"):
-        Solid.load(tmp_path / "melon.ply")
+        load_solid(tmp_path / "melon.ply")
     volume.unlink()
     with pytest.raises(InputError, match=r"needs melon\.volume\.npz beside it"):
-        Solid.load(tmp_path / "melon.ply")
+        load_solid(tmp_path / "melon.ply")

@@ -120,7 +120,7 @@ def test_two_melons_are_two_and_their_exemplar_is_one() -> None:
 
 
 def test_photographs_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsfluent.pipeline import run_demo
+    from gsfluent.run import demo as run_demo
 
     small = run_demo.DemoSize(3, 32, 1, 1, 1, "preview", (32, 32), 1.0, 1.0)
     monkeypatch.setitem(run_demo.SIZES, "preview", small)

@@ -11,8 +11,8 @@ import torch
 from gsfluent import geometry
 from gsfluent.config import Shot
 from gsfluent.data import TRANSITION, Camera, Gaussians
-from gsfluent.pipeline.draw import draw
-from gsfluent.pipeline.run_frames import SavedFrame, save_frame
+from gsfluent.draw import draw
+from gsfluent.results.frames import SavedFrame, save_frame
 
 FRAMES, CARRIED, POINTS = 4, 400, 600
 FPS = 25.0

@@ -16,15 +16,16 @@ from export_run import FPS, FRAMES, make_run, picture
 from gsfluent import geometry
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import axes, delta, delta_write
+from gsfluent.export.delta import delta_frame
+from gsfluent.export.frames import Reel
+from gsfluent.export.write import ExportOptions, export
+from gsfluent.io import axes
 from gsfluent.io.axes import nearest_axes
-from gsfluent.io.delta import DeltaFrame, DeltaReader, unpack_arrays
-from gsfluent.io.delta_write import Roster, bounds, pack_arrays, steps, write_delta
+from gsfluent.io.splats import delta, delta_write
+from gsfluent.io.splats.delta import DeltaFrame, DeltaReader, unpack_arrays
+from gsfluent.io.splats.delta_write import Roster, bounds, pack_arrays, steps, write_delta
 from gsfluent.metrics import psnr
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.export_delta import delta_frame
-from gsfluent.pipeline.export_frames import Reel
-from gsfluent.pipeline.run_frames import load_frame
+from gsfluent.results.frames import load_frame
 
 CPU = torch.device("cpu")
 
@@ -177,9 +178,9 @@ def test_a_run_goes_there_and_back(tmp_path: Path) -> None:
     for place, moment in enumerate(Reel(run)):
         check(reader.frame(place), delta_frame(moment, place), reader.header["error"])
     export(tmp_path / "splats.gsd", ["ply-seq"], device=CPU)
-    from gsfluent.io import load
+    from gsfluent.io import load_splats
 
-    back = load(tmp_path / "splats" / "frames" / f"frame_{FRAMES:04d}.ply")
+    back = load_splats(tmp_path / "splats" / "frames" / f"frame_{FRAMES:04d}.ply")
     truth = load_frame(run / "stages" / "simulate", FRAMES - 1).gaussians
     assert psnr(picture(back), picture(truth)) > 42.0
     assert back.count == truth.count

@@ -13,10 +13,10 @@ import trimesh
 from export_run import FRAMES, make_run, points_of_a_cube
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.export_frames import Reel
-from gsfluent.pipeline.export_meshes import Piece, fragment_meshes, surface
-from gsfluent.pipeline.rubble import clinging
+from gsfluent.export.frames import Reel
+from gsfluent.export.meshes import Piece, fragment_meshes, surface
+from gsfluent.export.write import ExportOptions, export
+from gsfluent.pipeline.matter.rubble import clinging
 
 pytest.importorskip("skimage")
 CPU = torch.device("cpu")

@@ -14,11 +14,11 @@ from PIL import Image
 
 from gsfluent.data import Camera
 from gsfluent.errors import InputError
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.export_pictures import straight
-from gsfluent.pipeline.render_camera import Action, cameras_for, orbit
-from gsfluent.pipeline.render_path import freeze
-from gsfluent.pipeline.video import write_animation
+from gsfluent.export.pictures import straight
+from gsfluent.export.write import ExportOptions, export
+from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
+from gsfluent.pipeline.render.path import freeze
+from gsfluent.pipeline.render.video import write_animation
 
 CPU = torch.device("cpu")
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 from export_run import FPS, FRAMES, make_run
 
+from gsfluent.export.write import ExportOptions, export
 from gsfluent.io.vtk import save_vti
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.run_frames import SavedFrame, load_frame
+from gsfluent.results.frames import SavedFrame, load_frame
 
 CPU = torch.device("cpu")
 

@@ -12,15 +12,15 @@ from export_run import add_record, make_run
 from gsfluent.config import Shot
 from gsfluent.data import SURFACE, Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import load
+from gsfluent.export.write import ExportOptions, export
+from gsfluent.io import load_splats
 from gsfluent.metrics import psnr
 from gsfluent.pipeline import Render
-from gsfluent.pipeline.export import ExportOptions, export
-from gsfluent.pipeline.light import Lighting
-from gsfluent.pipeline.light_shot import light_of
-from gsfluent.pipeline.render_normals import occupancy_cell
-from gsfluent.pipeline.run_frames import load_frame, save_frame
-from gsfluent.pipeline.run_show import shot_of
+from gsfluent.pipeline.light.from_shot import light_of
+from gsfluent.pipeline.light.lamps import Lighting
+from gsfluent.pipeline.light.normals import occupancy_cell
+from gsfluent.results.frames import load_frame, save_frame
+from gsfluent.results.record import shot_of
 
 CPU = torch.device("cpu")
 
@@ -56,7 +56,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_baked_light_looks_like_the_lit_picture(run: Path, tmp_path: Path) -> None:
     options = ExportOptions(relit=True, frames="0", light="-1,-0.5,1")
     export(run, ["ply-seq"], device=CPU, to=tmp_path, options=options)
-    baked = load(tmp_path / "frames" / "frame_0001.ply")
+    baked = load_splats(tmp_path / "frames" / "frame_0001.ply")
     plain = ball()
     camera = Camera.look_at((0.6, -0.5, 0.6), (0, 0, 0.4), width=120, height=120, fov=18.0)
     shot: Shot = shot_of(run)

@@ -17,10 +17,10 @@ from export_run import CARRIED, FPS, FRAMES, LIVING, make_run, picture
 from gsfluent import geometry
 from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.export.frames import upright
+from gsfluent.export.write import FORMATS, ExportOptions, export
 from gsfluent.metrics import psnr
-from gsfluent.pipeline.export import FORMATS, ExportOptions, export
-from gsfluent.pipeline.export_frames import upright
-from gsfluent.pipeline.run_frames import frame_path, load_frame
+from gsfluent.results.frames import frame_path, load_frame
 
 CPU = torch.device("cpu")
 LAST = FRAMES - 1

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from gsfluent.fracturebench.registry import find, judge
-from gsfluent.lab.frozen import clock, play
+from gsfluent.lab.frozen.answer import clock, play
 
 pytestmark = pytest.mark.cuda
 

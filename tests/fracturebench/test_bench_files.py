@@ -23,7 +23,7 @@ from gsfluent.fracturebench.__main__ import main
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError, quantised
-from gsfluent.lab.frozen import clock, play
+from gsfluent.lab.frozen.answer import clock, play
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "scripts" / "fracturebench"

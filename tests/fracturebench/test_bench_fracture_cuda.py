@@ -9,7 +9,7 @@ import torch
 from gsfluent.fracturebench.registry import find, judge
 from gsfluent.fracturebench.shapes import box, elastic, free
 from gsfluent.fracturebench.statistics import distance, ensemble
-from gsfluent.lab.frozen import play
+from gsfluent.lab.frozen.answer import play
 
 pytestmark = pytest.mark.cuda
 

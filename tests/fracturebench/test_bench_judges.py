@@ -14,11 +14,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gsfluent.fracturebench import contact, elastic, flow, ritz, shapes
+from gsfluent.fracturebench import ritz, shapes
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
-from gsfluent.lab.frozen import play
+from gsfluent.fracturebench.scenes import contact, elastic, flow
+from gsfluent.lab.frozen.answer import play
 
 Answer = tuple[np.ndarray, np.ndarray]
 

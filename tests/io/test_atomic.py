@@ -36,7 +36,7 @@ def test_full_or_forbidden_disk_is_a_run_error(tmp_path: Path, code: int) -> Non
     path = tmp_path / "a.txt"
     with pytest.raises(RunError, match=r"a\.txt: cannot be written") as caught, atomic_path(path):
         raise OSError(code, "no")
-    assert caught.value.mend and caught.value.kept and list(tmp_path.iterdir()) == []
+    assert caught.value.hint and caught.value.kept and list(tmp_path.iterdir()) == []
 
 
 def test_other_os_errors_pass(tmp_path: Path) -> None:

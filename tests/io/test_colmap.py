@@ -83,7 +83,7 @@ def test_fisheye_names_the_supported_models(tmp_path: Path, cameras: list[Camera
     )
     with pytest.raises(InputError, match="camera model OPENCV_FISHEYE is not supported") as caught:
         load_capture(tmp_path)
-    assert "SIMPLE_RADIAL" in caught.value.mend and "cameras.bin" in caught.value.what
+    assert "SIMPLE_RADIAL" in caught.value.hint and "cameras.bin" in caught.value.what
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])

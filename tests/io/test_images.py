@@ -11,7 +11,7 @@ import torch
 from gsfluent.data import Camera, Capture
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture, save_image
-from gsfluent.io.images import image_size, load_image, undistorted
+from gsfluent.io.images import image_size, load_image, load_view, undistorted
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_truncated_image_names_the_file(tmp_path: Path, cameras: list[Camera]) -
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"1\.png: the image is damaged") as caught:
         capture.image(1)
-    assert caught.value.mend
+    assert caught.value.hint
     path.write_bytes(b"not an image")
     with pytest.raises(InputError, match="not an image that Pillow can read"):
         capture.image(1)
@@ -150,7 +150,7 @@ def test_undistortion_puts_features_where_the_pinhole_says(tmp_path: Path, k1: f
     for column, row in pixels:
         image += torch.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * 2.0**2)).float()
     save_image(image.clamp(0, 1), tmp_path / "a.png")
-    capture = Capture([camera], torch.zeros(0, 3), torch.zeros(0, 3), tmp_path)
+    capture = Capture([camera], torch.zeros(0, 3), torch.zeros(0, 3), tmp_path, load_view)
     view = capture.view(0)
     assert view.valid is None and view.camera.distortion == ()
     expected, _ = view.camera.project(points)

@@ -14,8 +14,8 @@ from PIL import Image
 
 from gsfluent.data import Camera, Capture
 from gsfluent.errors import InputError
-from gsfluent.io.segmentation import load_masks, load_segmentation
-from gsfluent.io.segmentation_sam import decode_rle, encode_rle
+from gsfluent.io.segmentation.masks import load_masks, load_segmentation
+from gsfluent.io.segmentation.sam import decode_rle, encode_rle
 
 H, W = 12, 16
 

@@ -142,7 +142,7 @@ def test_bad_transforms_are_named(
     path.write_text(json.dumps(data))
     with pytest.raises(InputError, match=message) as caught:
         load_capture(tmp_path)
-    assert caught.value.mend and str(tmp_path) in caught.value.what
+    assert caught.value.hint and str(tmp_path) in caught.value.what
 
 
 def test_json_that_is_none_is_said(tmp_path: Path) -> None:
@@ -167,4 +167,4 @@ def test_folders_without_poses_say_what_they_hold(tmp_path: Path, cameras: list[
     files.write_images(tmp_path / "images", cameras)
     with pytest.raises(InputError, match="4 images but no poses") as caught:
         load_capture(tmp_path)
-    assert "colmap" in caught.value.mend
+    assert "colmap" in caught.value.hint

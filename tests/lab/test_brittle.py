@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.lab import brittle
-from gsfluent.lab.textbook import Textbook, Variant
+from gsfluent.lab.problems.fracture import brittle
+from gsfluent.lab.textbook.solver import Textbook, Variant
 
 ROOT = Path(__file__).resolve().parents[2]
 SINGLE, DOUBLE = torch.float32, torch.float64

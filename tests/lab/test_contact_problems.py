@@ -1,12 +1,12 @@
-"""Contact problems with known answers (gsfluent.lab.contact, gsfluent.lab.friction), fast sizes."""
+"""Contact problems with known answers (gsfluent.lab.problems.contact), fast sizes."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from gsfluent.lab import contact, friction
-from gsfluent.lab.registry import Result
+from gsfluent.lab.problems.contact import contact, friction
+from gsfluent.lab.world.registry import Result
 
 
 def holds(result: Result) -> None:

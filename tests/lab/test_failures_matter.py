@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.lab import softening
-from gsfluent.lab.driver import World
-from gsfluent.lab.shapes import ball, box, parameters
-from gsfluent.lab.slab import SEPARATE, between_planes, nacc, plane, wave_speed
+from gsfluent.lab.problems.fracture import softening
+from gsfluent.lab.problems.fracture.slab import SEPARATE, between_planes, nacc, plane, wave_speed
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.shapes import ball, box, parameters
 
 DX = 0.1
 POINT = (0.5 * DX) ** 3

@@ -11,8 +11,8 @@ import torch
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials, ops
-from gsfluent.pipeline.simulate import Simulate
-from gsfluent.scene import Scene
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
 

@@ -13,16 +13,19 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent import crack_band
-from gsfluent.fracturebench import fracture_bars, fracture_cantilever, fracture_plane, fracture_rock
-from gsfluent.fracturebench.fracture_rows import levels, moduli, shape_noise
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
+from gsfluent.fracturebench.scenes import bars as fracture_bars
+from gsfluent.fracturebench.scenes import cantilever as fracture_cantilever
+from gsfluent.fracturebench.scenes import plane as fracture_plane
+from gsfluent.fracturebench.scenes import rock as fracture_rock
+from gsfluent.fracturebench.scenes.rows import levels, moduli, shape_noise
 from gsfluent.fracturebench.shapes import box, elastic, free, wave_speed
-from gsfluent.lab.frozen import play
-from gsfluent.lab.slab import nacc
-from gsfluent.lab.spall import spall_strength
+from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.problems.fracture import crack_band
+from gsfluent.lab.problems.fracture.slab import nacc
+from gsfluent.lab.problems.fracture.spall import spall_strength
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {

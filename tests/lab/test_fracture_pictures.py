@@ -9,8 +9,8 @@ import torch
 
 from gsfluent import geometry
 from gsfluent.data import Camera
-from gsfluent.lab.fracture_pictures import TrueCloud
-from gsfluent.zbuffer import nearest_points
+from gsfluent.lab.truth.fracture_pictures import TrueCloud
+from gsfluent.spatial.zbuffer import nearest_points
 
 EDGE = 0.2
 STEP = 0.02

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsfluent import crack_band
-from gsfluent.lab import granular, liquid, notch, registry, spall
-from gsfluent.lab.paths import breaking_step
-from gsfluent.lab.slab import nacc
+from gsfluent.lab.problems.elastic.paths import breaking_step
+from gsfluent.lab.problems.flow import granular, liquid
+from gsfluent.lab.problems.fracture import crack_band, notch, spall
+from gsfluent.lab.problems.fracture.slab import nacc
+from gsfluent.lab.world import registry
 
 FAST = (
     "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",

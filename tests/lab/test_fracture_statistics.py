@@ -12,12 +12,12 @@ from scipy.spatial import cKDTree
 from scipy.stats import ks_2samp
 
 from gsfluent.fracturebench import pieces, statistics
-from gsfluent.fracturebench.fracture_shatter import RADIUS, SEEDS, lattice_ball, reference
 from gsfluent.fracturebench.registry import find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
+from gsfluent.fracturebench.scenes.shatter import RADIUS, SEEDS, lattice_ball, reference
 from gsfluent.fracturebench.shapes import box, elastic, free
-from gsfluent.lab.frozen import play
+from gsfluent.lab.frozen.answer import play
 
 DX = 0.1
 TIMES = np.linspace(0.0, 1.0, 21)[1:]

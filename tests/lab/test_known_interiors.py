@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError
-from gsfluent.lab.interiors import KNOWN_INTERIORS, KnownInterior, known_interior, upright
-from gsfluent.lab.interiors_judge import Judge, held_out_planes, judge, sample_plane
+from gsfluent.lab.truth.interiors import KNOWN_INTERIORS, KnownInterior, known_interior, upright
+from gsfluent.lab.truth.interiors_judge import Judge, held_out_planes, judge, sample_plane
 from gsfluent.pipeline.texture import load_exemplar
 from gsfluent.pipeline.texture.baselines import color_copy
 
@@ -141,7 +141,7 @@ def test_judge_takes_one_other_or_several() -> None:
 
 
 def test_wood_runs_along_z_and_cake_lies_in_layers() -> None:
-    from gsfluent.pipeline.texture.metrics import neighbour_change
+    from gsfluent.pipeline.texture.photo.metrics import neighbour_change
 
     wood, cake = (_known(n) for n in ("wood", "cake"))
     along = neighbour_change(wood.rgb, wood.domain.inside)

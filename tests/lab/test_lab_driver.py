@@ -7,10 +7,10 @@ import types
 import pytest
 import torch
 
-from gsfluent.lab import registry
-from gsfluent.lab.driver import World, running_on
-from gsfluent.lab.registry import Result, compare
-from gsfluent.lab.shapes import ball, box, parameters, rotation
+from gsfluent.lab.world import registry
+from gsfluent.lab.world.driver import World, running_on
+from gsfluent.lab.world.registry import Result, compare
+from gsfluent.lab.world.shapes import ball, box, parameters, rotation
 
 STEEL = parameters(1e5, 0.3, 1000.0)
 

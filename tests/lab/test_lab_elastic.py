@@ -7,9 +7,11 @@ import math
 import pytest
 import torch
 
-from gsfluent.lab import axes, beams, discs, registry, statics, transfer, vortex, waves
-from gsfluent.lab.driver import World, running_on
-from gsfluent.lab.shapes import ball, parameters
+from gsfluent.lab.problems.contact import discs
+from gsfluent.lab.problems.elastic import axes, beams, statics, transfer, vortex, waves
+from gsfluent.lab.world import registry
+from gsfluent.lab.world.driver import World, running_on
+from gsfluent.lab.world.shapes import ball, parameters
 
 FAST = [
     p.name

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from gsfluent.lab.peers_known import POINTS, Known, courant, find
+from gsfluent.lab.peers.known import POINTS, Known, courant, find
 
 
 @pytest.mark.parametrize("point", POINTS, ids=lambda p: p.name)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from gsfluent.lab.transfer import Spin
+from gsfluent.lab.problems.elastic.transfer import Spin
 
 STEPS_OF_CFL = (0.5, 0.6, 0.7, 0.8)
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsfluent.pipeline.occlusion import Occupancy, ambient_occlusion
-from gsfluent.pipeline.shade import (
+from gsfluent.pipeline.light.occlusion import Occupancy, ambient_occlusion
+from gsfluent.pipeline.light.shade import (
     ALPHA_FLOOR,
     arriving,
     shade_points,
@@ -15,7 +15,7 @@ from gsfluent.pipeline.shade import (
     to_display,
     to_linear,
 )
-from gsfluent.pipeline.shade_shadow import ShadowMaps
+from gsfluent.pipeline.light.shadow import ShadowMaps
 
 OPAQUE = 0.999  # what is behind such a pixel is not worked out
 FADED = 1e-6  # share of the floor below which it is left out

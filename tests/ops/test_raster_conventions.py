@@ -146,7 +146,7 @@ def test_random_scenes_equal_the_published_formulas(
 )
 def test_real_splats_equal_the_published_formulas(name: str, device: str, data_root: Path) -> None:
     """Every sixteenth splat, scaled to the unit ball."""
-    from gsfluent.io.splats import load_splats
+    from gsfluent.io.splats.load import load_splats
 
     path = data_root / "splats" / name
     if not path.is_file():

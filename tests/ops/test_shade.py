@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gsfluent import geometry
 from gsfluent.ops import shade
-from gsfluent.pipeline.occlusion import Occupancy
-from gsfluent.pipeline.shade_shadow import ShadowMaps
+from gsfluent.pipeline.light.occlusion import Occupancy
+from gsfluent.pipeline.light.shadow import ShadowMaps
 
 HEIGHT, WIDTH, TEXELS, NODES = 37, 53, 48, 32
 CUDA = pytest.param("cuda", marks=pytest.mark.cuda)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsfluent import ops
-from gsfluent.lab.shapes import ball, parameters
+from gsfluent.lab.world.shapes import ball, parameters
 
 E, RADIUS, SPEED = torch.float64, 3.0, 0.05
 

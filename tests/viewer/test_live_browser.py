@@ -11,6 +11,8 @@ import pytest
 import torch
 from live_ball import ball
 
+from gsfluent.io import save_solid
+
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 pytest.importorskip("selenium", reason="no selenium to drive a browser with")
 
@@ -19,12 +21,12 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from test_viewer_browser import FLAGS, greens, reds, until
 
-from gsfluent.pipeline.live import LiveSession
-from gsfluent.pipeline.live_player import AT_REST, RUNNING, LivePlayer
-from gsfluent.pipeline.live_scene import open_stage
+from gsfluent.live.player import AT_REST, RUNNING, LivePlayer
+from gsfluent.live.scene import open_stage
+from gsfluent.live.session import LiveSession
 from gsfluent.viewer.app import App
-from gsfluent.viewer.live_source import LiveSource
-from gsfluent.viewer.poke import PokePanel
+from gsfluent.viewer.model.live_source import LiveSource
+from gsfluent.viewer.panels.poke import PokePanel
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LivePlayer,
     if browser is None or driver is None:
         pytest.skip("no chromium and chromedriver on this machine")
     home = tmp_path_factory.mktemp("live")
-    ball().save(home / "ball.ply")
+    save_solid(ball(), home / "ball.ply")
     stage = open_stage(home / "ball.ply", material="fruit.watermelon")
     session = LiveSession(stage.scene, dx=0.025, slow=4.0)
     player = LivePlayer(session, stage.shot)

@@ -16,13 +16,13 @@ from viewer_scene import FRAMES, frame, write_run
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light import Lamp, Lighting
-from gsfluent.pipeline.run_frames import SavedFrame, save_frame
-from gsfluent.viewer import splats
+from gsfluent.pipeline.light.lamps import Lamp, Lighting
+from gsfluent.results.frames import SavedFrame, save_frame
 from gsfluent.viewer.app import App
-from gsfluent.viewer.light_panel import Handles
-from gsfluent.viewer.look import BODY, Cut, Look
-from gsfluent.viewer.source import RunSource
+from gsfluent.viewer.draw import splats
+from gsfluent.viewer.model.look import BODY, Cut, Look
+from gsfluent.viewer.model.source import RunSource
+from gsfluent.viewer.panels.light import Handles
 
 CPU = torch.device("cpu")
 

@@ -21,9 +21,9 @@ from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
-from gsfluent.pipeline.run_frames import frame_path  # noqa: E402
+from gsfluent.results.frames import frame_path  # noqa: E402
 from gsfluent.viewer.app import App  # noqa: E402
-from gsfluent.viewer.source import RunSource  # noqa: E402
+from gsfluent.viewer.model.source import RunSource  # noqa: E402
 
 FLAGS = (
     "--headless",

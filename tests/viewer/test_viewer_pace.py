@@ -8,11 +8,11 @@ import time
 import numpy as np
 import pytest
 
-from gsfluent.viewer.artist import BUDGETS, Artist
-from gsfluent.viewer.pace import Pace
-from gsfluent.viewer.playback import Playback
-from gsfluent.viewer.plots import plots_of
-from gsfluent.viewer.time_panel import first_speed
+from gsfluent.viewer.draw.artist import BUDGETS, Artist
+from gsfluent.viewer.model.pace import Pace
+from gsfluent.viewer.model.playback import Playback
+from gsfluent.viewer.model.plots import plots_of
+from gsfluent.viewer.panels.time import first_speed
 
 
 class Clock:

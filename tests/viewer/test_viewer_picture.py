@@ -11,14 +11,14 @@ from viewer_scene import FRAMES, HEIGHT, RADIUS, SIGMA, SPEED, frame, write_run
 
 from gsfluent import geometry
 from gsfluent.data import Camera
-from gsfluent.pipeline.light import Light
-from gsfluent.viewer import look
-from gsfluent.viewer.color import distinct, splat_colors
-from gsfluent.viewer.look import COLOR_BY, Cut, Look, angles, direction
-from gsfluent.viewer.picture import PictureMaker, browser_camera, hidden
-from gsfluent.viewer.source import RunSource
-from gsfluent.viewer.splats import unit_size
-from gsfluent.viewer.timeline import Timeline
+from gsfluent.pipeline.light.lamps import Light
+from gsfluent.viewer.draw.picture import PictureMaker, browser_camera, hidden
+from gsfluent.viewer.draw.splats import unit_size
+from gsfluent.viewer.model import look
+from gsfluent.viewer.model.color import distinct, splat_colors
+from gsfluent.viewer.model.look import COLOR_BY, Cut, Look, angles, direction
+from gsfluent.viewer.model.source import RunSource
+from gsfluent.viewer.model.timeline import Timeline
 
 LAST = FRAMES - 1
 

@@ -17,12 +17,13 @@ import gsfluent as gf
 from gsfluent.cli import main
 from gsfluent.data import SURFACE
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.run_frames import frame_path, save_frame
-from gsfluent.viewer.color import splat_colors
-from gsfluent.viewer.look import BODY
+from gsfluent.io.solid import save_solid
+from gsfluent.results.frames import frame_path, save_frame
+from gsfluent.viewer.model.color import splat_colors
+from gsfluent.viewer.model.look import BODY
+from gsfluent.viewer.model.source import RunSource
+from gsfluent.viewer.model.timeline import Timeline
 from gsfluent.viewer.server import free_port
-from gsfluent.viewer.source import RunSource
-from gsfluent.viewer.timeline import Timeline
 
 CPU = torch.device("cpu")
 
@@ -86,7 +87,7 @@ def test_a_filled_solid_is_shown_until_frames_come(tmp_path: Path) -> None:
     solid = gf.pipeline.Fill(resolution=20)(skin)
     out = tmp_path / "ball"
     (out / "stages" / "fill").mkdir(parents=True)
-    solid.save(out / "stages" / "fill" / "ball.ply")
+    save_solid(solid, out / "stages" / "fill" / "ball.ply")
     (out / "stages" / "fill" / "stage.json").write_text('{"complete": true}')
     source = RunSource(out)
     timeline = Timeline(source, CPU)
@@ -110,7 +111,7 @@ def test_what_is_not_a_run_is_refused(tmp_path: Path, folder: str) -> None:
     (tmp_path / "out" / folder).mkdir(parents=True)
     with pytest.raises(InputError, match="OUT: ") as error:
         RunSource(tmp_path / "out")
-    assert error.value.mend
+    assert error.value.hint
 
 
 def test_a_redone_simulation_replaces_the_old_frames(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import INTERIOR, SURFACE, Gaussians
-from gsfluent.pipeline.run_frames import SavedFrame, save_frame
+from gsfluent.results.frames import SavedFrame, save_frame
 
 RADIUS = 0.1
 SIGMA = 0.007  # of the splats of the skin

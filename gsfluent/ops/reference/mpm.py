@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsfluent.ops.blocks import Blocks
 from gsfluent.ops.collider import pad_colliders
-from gsfluent.ops.mpm import Blocks
 from gsfluent.ops.reference.collider import acting_mass, collide
 from gsfluent.ops.reference.contact import STEPS, contact, groups, merge
 

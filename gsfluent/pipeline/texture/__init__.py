@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .domain import InteriorDomain, InteriorTexture
-from .photo import Exemplar, load_exemplar
-from .procedural import preset_names
-from .stage import METHODS, Texture
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
+from gsfluent.pipeline.texture.presets.procedural import preset_names
+from gsfluent.pipeline.texture.stage import METHODS, Texture
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
 __all__ = [
     "METHODS",

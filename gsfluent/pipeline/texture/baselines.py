@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .domain import InteriorDomain, InteriorTexture
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
 __all__ = ["color_copy", "telea_slices"]
 

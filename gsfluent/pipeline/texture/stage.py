@@ -12,27 +12,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from gsfluent.data.regions import with_inclusions
 from gsfluent.errors import InputError
-
-from ..regions_table import with_inclusions
-from ..stage import Progress, Stage, report_progress
-from .baselines import color_copy, telea_slices
-from .domain import InteriorDomain, InteriorTexture, blend_skin
-from .exemplar import QUALITIES, exemplar_texture, load_exemplars
-from .inpaint_options import InpaintOptions
-from .metrics import (
+from gsfluent.pipeline.stage import Stage
+from gsfluent.pipeline.texture.baselines import color_copy, telea_slices
+from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
+from gsfluent.pipeline.texture.photo.exemplar import (
+    Exemplar,
+    PhotoOptions,
+    open_exemplars,
+    with_skin,
+)
+from gsfluent.pipeline.texture.photo.metrics import (
     depth_profile_error,
     lab_histogram_distance,
     neighbour_slice_ratio,
     patch_distance,
     volume_slices,
 )
-from .photo import Exemplar, PhotoOptions, open_exemplars, with_skin
-from .procedural import PRESETS, preset_names, procedural_texture
-from .profile import surface_profile
-from .structure import take_apart, with_structure
-from .sweep import CUTS
-from .unseen_skin import mend_unseen_skin
+from gsfluent.pipeline.texture.photo.profile import surface_profile
+from gsfluent.pipeline.texture.presets.procedural import PRESETS, preset_names, procedural_texture
+from gsfluent.pipeline.texture.structure import take_apart, with_structure
+from gsfluent.pipeline.texture.sweep import CUTS
+from gsfluent.pipeline.texture.synthesis.method import QUALITIES, exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.unseen_skin import mend_unseen_skin
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, blend_skin
+from gsfluent.progress import Progress, report_progress
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
@@ -139,12 +144,12 @@ class Texture(Stage):
         if method not in METHODS:
             raise InputError(
                 f"texture: method must be one of {', '.join(METHODS)}, got {method!r}",
-                mend="leave it at auto",
+                hint="leave it at auto",
             )
         if quality not in QUALITIES:
             raise InputError(
                 f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
-                mend="leave it at fast",
+                hint="leave it at fast",
             )
         if method == "auto":
             method = "exemplar" if exemplar is not None else "procedural" if preset else "profile"
@@ -157,21 +162,21 @@ class Texture(Stage):
         if method == "exemplar" and exemplar is None:
             raise InputError(
                 "texture: method 'exemplar' needs an exemplar photograph",
-                mend="add exemplar: cut.jpg, or use method: procedural with a preset",
+                hint="add exemplar: cut.jpg, or use method: procedural with a preset",
             )
         if method == "procedural":
             preset = preset or prompt
             if preset not in PRESETS:
                 raise InputError(
                     f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
-                    mend="choose one of these or give an exemplar photograph",
+                    hint="choose one of these or give an exemplar photograph",
                 )
         options = InpaintOptions.of(inpaint)
         slices = method in ("diffusion", "inpaint")
         if slices and "diffusers" in (options.backend, options.coarse) and model is None:
             raise InputError(
                 f"texture: method {method!r} needs a model",
-                mend="give a local folder or hub id, for example "
+                hint="give a local folder or hub id, for example "
                 "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
             )
         self.method = method
@@ -188,7 +193,7 @@ class Texture(Stage):
         if cut is not None and cut not in CUTS:
             raise InputError(
                 f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
-                mend="leave it out when the structure does not follow the object's axis",
+                hint="leave it out when the structure does not follow the object's axis",
             )
         self.cut = cut
         self.photo = PhotoOptions.of(photo)
@@ -235,14 +240,14 @@ class Texture(Stage):
                 opened, structure = take_apart(opened)
                 exemplars = load_exemplars(opened)
         if not domain.inside.any():
-            raise InputError("texture: the solid is empty", mend="run fill first")
+            raise InputError("texture: the solid is empty", hint="run fill first")
         texture = self._make(domain, exemplars, progress)
         if structure is not None:
             texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
         colored, polished = _color_interior(solid, replace(texture, rgb=rgb), domain, self.polish)
         # brings the compiled renderer with it, which texturing itself does without
-        from ..fill_colors import keep_skin
+        from gsfluent.pipeline.solid.colors import keep_skin
 
         colored = keep_skin(solid, colored)
         report = self._report(domain, texture, shown) | polished
@@ -290,7 +295,7 @@ class Texture(Stage):
         if self.method == "telea":
             return telea_slices(domain)
         if self.method in ("diffusion", "inpaint"):
-            from .inpaint import diffusion_texture
+            from gsfluent.pipeline.texture.inpaint.method import diffusion_texture
 
             return diffusion_texture(
                 domain,
@@ -364,7 +369,7 @@ def _color_interior(
     color = texture.sample(place, domain.inside)
     report: dict[str, Any] = {}
     if polish:
-        from .polish import polish_colors
+        from gsfluent.pipeline.texture.polish import polish_colors
 
         color, figures = polish_colors(
             domain, texture.rgb, place, color, device=solid.occupancy.device

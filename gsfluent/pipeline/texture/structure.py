@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from gsfluent.errors import InputError
-
-from .domain import InteriorDomain, InteriorTexture, smoothstep
-from .photo import Exemplar, rgb_to_lab
-from .sweep import Sweep, outline
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.pipeline.texture.sweep import Sweep, outline
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, smoothstep
 
 __all__ = ["Structure", "impose_structure", "split_structure", "take_apart", "with_structure"]
 
@@ -127,7 +126,7 @@ def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float
     """The photograph with ``hole`` painted in given Lab colours and the grain from beside it."""
     from scipy import ndimage
 
-    from .photo_color import lab_to_rgb
+    from gsfluent.pipeline.texture.volume.color import lab_to_rgb
 
     if not hole.any():
         return photo
@@ -214,7 +213,7 @@ def take_apart(opened: Any) -> tuple[Any, Structure]:
         if not part.silhouette:
             raise InputError(
                 f"texture: cut needs a photograph with an outline ({part.note})",
-                mend="cut the object out (RGBA), or leave cut out",
+                hint="cut the object out (RGBA), or leave cut out",
             )
         plain, structure = split_structure(part)
         found.append(structure)
@@ -222,7 +221,7 @@ def take_apart(opened: Any) -> tuple[Any, Structure]:
 
     plain = material(opened)
     if not found:
-        raise InputError("texture: cut needs an exemplar", mend="give a photograph of the cut")
+        raise InputError("texture: cut needs an exemplar", hint="give a photograph of the cut")
     return plain, found[0]
 
 

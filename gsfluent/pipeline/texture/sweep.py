@@ -17,9 +17,8 @@ from __future__ import annotations
 import numpy as np
 
 from gsfluent.errors import InputError
-
-from .domain import axis_frame
-from .noise import value_noise
+from gsfluent.pipeline.texture.volume.domain import axis_frame
+from gsfluent.pipeline.texture.volume.noise import value_noise
 
 __all__ = ["CUTS", "Sweep", "outline"]
 
@@ -59,7 +58,7 @@ class Sweep:
         if cut not in CUTS:
             raise InputError(
                 f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
-                mend="across: the photograph was cut across the axis; along: through it",
+                hint="across: the photograph was cut across the axis; along: through it",
             )
         self.cut, self.inside = cut, inside
         index = np.argwhere(inside)

@@ -1,0 +1,1 @@
+"""PhysGaussian's model folders and JSON configs."""

@@ -1,0 +1,1 @@
+"""A finished simulation in other programs' formats."""

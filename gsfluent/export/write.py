@@ -1,0 +1,170 @@
+"""A finished simulation in other programs' formats; docs/export.md says which reads what."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.config.read import nearest
+from gsfluent.errors import InputError
+from gsfluent.export.frames import DeltaReel, Reel
+from gsfluent.export.job import ExportOptions, Job
+from gsfluent.export.relit import relight_of
+from gsfluent.progress import Progress
+
+
+@dataclass(frozen=True)
+class Format:
+    """One thing that can be written.
+
+    Attributes:
+        what: Files and who reads them, in one line.
+        module: Module of the writer, beside this one.
+        function: The writer: takes a :class:`Job`, returns what was written.
+        pictures: Rendered; needs the shot's camera and light.
+        splats_only: Needs splats and nothing else, so it can be made of a ``.gsd`` file.
+        key: Name in the report.
+    """
+
+    what: str
+    module: str
+    function: str
+    pictures: bool = False
+    splats_only: bool = False
+    key: str = ""
+
+
+FORMATS: dict[str, Format] = {
+    "mp4": Format("H.264 video", "pictures", "mp4", pictures=True, key="video"),
+    "gif": Format("animated GIF", "pictures", "gif", pictures=True),
+    "webp": Format("animated WebP, also with alpha", "pictures", "webp", pictures=True),
+    "png": Format("PNG sequence, also with alpha", "pictures", "png", pictures=True),
+    "ply-seq": Format(
+        "3DGS .ply per frame: SuperSplat, Blender, Houdini, Unity",
+        "splats",
+        "ply_sequence",
+        splats_only=True,
+    ),
+    "spz": Format(
+        ".spz per frame: phones, web viewers", "splats", "spz_sequence", splats_only=True
+    ),
+    "splat": Format(
+        ".splat per frame: the first web viewers",
+        "splats",
+        "splat_sequence",
+        splats_only=True,
+    ),
+    "glb": Format(
+        "glTF with KHR_gaussian_splatting per frame",
+        "splats",
+        "glb_sequence",
+        splats_only=True,
+    ),
+    "delta": Format(
+        "one small .gsd file: gsfluent.io.DeltaReader, gsfluent export",
+        "delta",
+        "delta",
+        splats_only=True,
+    ),
+    "usd": Format("one USD file with time samples: Houdini, usdview", "splats", "usd"),
+    "vtk": Format("material points per frame: ParaView, VisIt", "points", "vtk"),
+    "points": Format("material points as .ply: Houdini, Blender", "points", "points"),
+    "meshes": Format("a closed surface per fragment: Houdini, Blender, games", "meshes", "meshes"),
+    "vti": Format("density and damage volume per frame: ParaView", "points", "vti"),
+}
+
+
+_OTHERS: dict[tuple[str, ...], str] = {
+    ("vdb", "nvdb", "openvdb"): "there is no library for it on PyPI; vti is the same volume",
+    ("abc", "alembic", "fbx"): "use usd, or meshes and points",
+    ("obj", "stl"): "use meshes, with --mesh-ending obj",
+    ("ksplat", "sog", "sogs"): "write ply-seq and convert it with splat-transform (npm)",
+    ("gltf",): "use glb",
+    ("ply",): "use ply-seq for splats, points for material points, meshes for fragments",
+    ("avi", "mov", "mkv", "video"): "use mp4",
+    ("jpg", "jpeg", "pictures", "frames"): "use png",
+}
+
+
+def export(
+    out: Path,
+    kinds: list[str],
+    *,
+    device: torch.device,
+    to: Path | None = None,
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write a finished simulation in some formats.
+
+    Args:
+        out: Folder of the run, or a ``.gsd`` file of one.
+        kinds: Some of :data:`FORMATS`.
+        device: Where pictures are rendered and light is baked.
+        to: Folder to write to; by default ``out``, or one named like the file.
+        options: How.
+        progress: Called per frame.
+
+    Returns:
+        Format to what was written, relative to ``to``.
+
+    Raises:
+        InputError: An unknown format or option, an extra that is not installed, or no frames.
+        RunError: The disk is full.
+    """
+    options = options or ExportOptions()
+    kinds = [kind.strip() for kind in kinds if kind.strip()]
+    for kind in kinds:
+        if kind not in FORMATS:
+            raise InputError(f"--to {kind}: gsfluent cannot write that", _instead(kind))
+    if not kinds:
+        raise InputError("--to names no format", f"choose from {', '.join(FORMATS)}")
+    reel: Reel
+    if out.is_file():
+        reel = DeltaReel(out, frames=options.frames, sh=options.sh, up=options.up)
+        for kind in kinds:
+            if options.relit or not FORMATS[kind].splats_only:
+                what = "--relit" if options.relit else f"--to {kind}"
+                raise InputError(f"{what}: {out} holds splats only", "export from the run")
+        to = to or out.with_suffix("")
+    else:
+        reel = Reel(
+            out,
+            frames=options.frames,
+            sh=options.sh,
+            relight=relight_of(out, options) if options.relit else None,
+            up=options.up,
+            device=device if options.relit else None,
+        )
+    job = Job(out, to or out, reel, options, options.fps or reel.rate(), device, progress)
+    return _write(job, kinds)
+
+
+def write_exports(
+    out: Path, kinds: list[str], *, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Write the formats that need no rendering, with the usual options; see :func:`export`."""
+    reel = Reel(out)
+    rate, cpu = reel.rate(), torch.device("cpu")
+    return _write(Job(out, out, reel, ExportOptions(), rate, cpu, progress), kinds)
+
+
+def _instead(kind: str) -> str:
+    """What to ask for in place of a format there is not."""
+    for names, hint in _OTHERS.items():
+        if kind.lower() in names:
+            return hint
+    return nearest(kind, FORMATS)
+
+
+def _write(job: Job, kinds: list[str]) -> dict[str, Any]:
+    job.folder.mkdir(parents=True, exist_ok=True)
+    written: dict[str, Any] = {}
+    for kind in kinds:
+        module = importlib.import_module(f"gsfluent.export.{FORMATS[kind].module}")
+        written[FORMATS[kind].key or kind] = getattr(module, FORMATS[kind].function)(job)
+    return written

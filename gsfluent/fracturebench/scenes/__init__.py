@@ -1,0 +1,1 @@
+"""The scenes: loads, materials, judges."""

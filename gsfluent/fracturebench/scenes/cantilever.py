@@ -1,0 +1,119 @@
+"""Double cantilever: the energy that a crack takes per area."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..registry import case
+from ..run import Measure, Run
+from ..scene import Floats, Scene, SceneError
+from ..scenes.rows import BROKEN, brittle, damage_of
+from ..scenes.slabs import heavy, sheet, slab_volume, walls
+from ..shapes import elastic, free, wave_speed
+from ..statistics import stored_energy
+
+__all__ = ["cantilever", "crack_tip", "double_cantilever", "energy_beyond"]
+
+_HEIGHT, _NOTCH = 0.375, 0.25
+_SECTION = (0.125, 0.1875)
+_PLAIN = elastic(1e9, 0.2, 1000.0)
+
+
+def energy_beyond(scene: Scene, run: Run, low: float, high: float) -> tuple[Floats, Floats]:
+    """Energy that went through a section towards larger x, and what of it is there [J], [T] each.
+
+    The section is a column of points ``low <= x < high`` in matter that does not break: power
+    ``-(1 / width) sum V sigma_x . v``, summed over the samples. What is there is kinetic and stored
+    energy of small strains; the column itself counts in proportion.
+
+    Raises:
+        SceneError: The run handed in no stresses.
+    """
+    if run.stress is None:
+        raise SceneError(f"{run.method}, {scene.name}: hand in `stress`; this case is judged by it")
+    x, volume = scene.x[:, 0], scene.volume
+    column = (x >= low) & (x < high)
+    pull = run.stress[:, column][..., [0, 3, 4]]
+    power = -np.einsum("n,tni,tni->t", volume[column], pull, run.v[:, column]) / (high - low)
+    times, power = np.append(0.0, scene.times), np.append(0.0, power)
+    passed = np.cumsum(0.5 * (power[1:] + power[:-1]) * np.diff(times))
+    share = np.clip((x - low) / (high - low), 0.0, 1.0)
+    motion = 0.5 * (run.v**2).sum(axis=2) @ (scene.mass * share)
+    return passed, motion + stored_energy(scene, run.stress) @ share
+
+
+def crack_tip(scene: Scene, damage: Floats, line: float, width: float) -> Floats:
+    """Place along x of the furthest broken point within ``width`` of a line in y [m], [T]."""
+    near = np.abs(scene.x[:, 1] - line) < width
+    x = scene.x[near, 0]
+    broken = damage[:, near] >= BROKEN
+    return np.where(broken.any(axis=1), np.where(broken, x, -np.inf).max(axis=1), _NOTCH)
+
+
+def _judge(scene: Scene, run: Run) -> Iterator[Measure]:
+    tip = crack_tip(scene, damage_of(scene, run), 0.5 * _HEIGHT, 0.0625)
+    passed, there = energy_beyond(scene, run, *_SECTION)
+    gone = passed - there
+    low, high = 0.3125, 0.5
+    on = (tip >= low) & (tip <= high)
+    value, row = math.nan, scene.materials[1]
+    if on.sum() > 2 and tip[-1] > high:
+        # slope of the energy that is gone over the length of the crack
+        away = tip[on] - tip[on].mean()
+        value = float((away * gone[on]).sum() / (away * away).sum()) / scene.dx
+    wanted = float(row["fracture_energy"])
+    error = abs(value / wanted - 1.0)
+    yield Measure(
+        "energy gone per area of the crack", value, wanted, error, 0.3, "J/m^2",
+        "energy through a section of the arms less what is there; fracture energy of the row",
+    )  # fmt: skip
+
+
+def cantilever(dx: float, per_cell: int, speed: float, seconds: float) -> Scene:
+    """The scene of :func:`double_cantilever` at any speed.
+
+    Args:
+        dx: Node spacing [m].
+        per_cell: Points per cell.
+        speed: Of each arm over that of a pressure wave.
+        seconds: Duration in travel times along the slab.
+    """
+    row = brittle(
+        1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, strength=0.02, softening=0.01,
+        energy=0.0817, dx=dx, reference=1.0 / 32.0,
+    )  # fmt: skip
+    c = wave_speed(_PLAIN)
+    points = sheet([0.0, 0.0], [1.0, _HEIGHT], dx, per_cell)
+    middle = points[:, 1] - 0.5 * _HEIGHT
+    keep = (points[:, 0] > _NOTCH) | (np.abs(middle) > 1.01 * dx)
+    points, middle = points[keep], middle[keep]
+    end, edge = points[:, 0] < 0.0626, 0.5 * _HEIGHT - 0.0626
+    held = end & (np.abs(middle) > edge)
+    times = np.linspace(0.0, seconds / c, 141)[1:]
+    return free(
+        "double_cantilever", points, [0.0, 0.0, 0.0], dx, per_cell, times,
+        (_PLAIN, row, heavy(_PLAIN)),
+        material=np.where(held, 2, np.abs(middle) < 0.0625).astype(np.int32),
+        volume=np.full(middle.size, slab_volume(dx, per_cell)), colliders=walls(dx),
+        drives=tuple(
+            {
+                "points": np.flatnonzero(end & (sign * middle > edge)).tolist(),
+                "velocity": [None, sign * speed * c, None], "ramp": 1.0 / c,
+            }
+            for sign in (1.0, -1.0)
+        ),
+        asks=("damage", "stress"),
+    )  # fmt: skip
+
+
+@case(kind="fracture", dx=1 / 32, ladder=(1 / 32, 1 / 48, 1 / 64), judge=_judge)
+def double_cantilever(dx: float, per_cell: int) -> Scene:
+    """Double cantilever: a crack takes the energy per area that its material says, at every dx.
+
+    Arms of a notched slab are wedged apart at 0.001 c each after a ramp. A layer of an eighth of a
+    metre around the middle can break, the rest is elastic.
+    """
+    return cantilever(dx, per_cell, 0.001, 14.0)

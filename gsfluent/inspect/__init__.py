@@ -1,0 +1,1 @@
+"""Looking without computing: captures, parts, comparisons, doctor."""

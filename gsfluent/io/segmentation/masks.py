@@ -1,0 +1,384 @@
+"""Segmentations: which part every pixel of the photographs shows, from any segmenter's files.
+
+What is read (docs/regions.md): a label image per photograph; a folder of masks per label; Segment
+Anything's folders and JSON; NumPy maps. Everything becomes a label map in the pinhole view that the
+photograph itself is resampled to (:func:`gsfluent.io.images.load_view`), nearest neighbour.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsfluent.data.camera import Camera
+from gsfluent.data.capture import Capture
+from gsfluent.errors import InputError
+from gsfluent.io.images import IMAGE_SUFFIXES, pinhole_map
+from gsfluent.io.segmentation import sam
+from gsfluent.io.segmentation.files import (
+    ARRAY_SUFFIXES,
+    LABEL_SUFFIXES,
+    numbered,
+    read_binary,
+    read_raw,
+    whole_labels,
+)
+from gsfluent.io.segmentation.match import ViewNames
+
+__all__ = ["LabelView", "Segmentation", "load_masks", "load_segmentation"]
+
+_NAMES_FILE = "labels.json"
+_ASPECT = 0.01
+_MASK_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelView:
+    """The labels of one photograph.
+
+    Attributes:
+        camera: Pinhole camera of the map.
+        labels: Label per pixel, int32 [H, W]: 0 for none, -1 where the photograph says nothing.
+    """
+
+    camera: Camera
+    labels: NDArray[np.int32]
+
+
+@dataclasses.dataclass(frozen=True)
+class Segmentation:
+    """Label maps of some of a capture's photographs.
+
+    Attributes:
+        source: Where they are from, for messages.
+        views: Maps, in the order of the capture's cameras.
+        names: Name of every label number above 0.
+        linked: A number means the same part in all views. When False the numbers are instances of
+            one view (Segment Anything), and 0 means unknown, not "no part".
+        notes: What was noticed while reading.
+    """
+
+    source: str
+    views: tuple[LabelView, ...]
+    names: dict[int, str]
+    linked: bool = True
+    notes: tuple[str, ...] = ()
+
+    def number(self, label: str | int) -> int:
+        """Return the number of a label given by name or number.
+
+        Raises:
+            InputError: There is no such label.
+        """
+        found = [n for n, name in self.names.items() if label in (name, n) or str(label) == str(n)]
+        if not found:
+            known = ", ".join(f"{name}" for name in list(self.names.values())[:20])
+            raise InputError(f"{self.source}: no label {label!r}", f"labels here: {known}")
+        by_name = [n for n in found if self.names[n] == str(label)]
+        return (by_name or found)[0]
+
+
+def load_segmentation(
+    path: str | Path, capture: Capture, *, max_size: int | None = 640, least: float = 0.0
+) -> Segmentation:
+    """Read the segmentation of a capture's photographs.
+
+    Args:
+        path: A folder of label images; of folders of masks, one per label; of Segment Anything's
+            folders or JSON files, one per photograph; or one ``.json``, ``.npz`` (a map per
+            photograph's name) or ``.npy`` ([views, H, W]).
+        capture: The photographs that the files are named after; some may have none.
+        max_size: Longest side of the maps [pixels]; None keeps the files' size.
+        least: Lowest ``predicted_iou`` and ``stability_score`` of Segment Anything's masks.
+
+    Returns:
+        The maps. A folder may hold ``labels.json``, names for numbers or colours:
+        ``{"1": "rind", "#ff0000": "leaf"}``.
+
+    Raises:
+        InputError: Nothing fits the photographs' names, or a file is damaged, of another shape than
+            its photograph, or no segmentation.
+    """
+    path, names = Path(path), ViewNames(capture)
+    if not path.exists():
+        raise InputError(f"{path}: no such segmentation", "check the path")
+    if path.is_file():
+        return _of_file(path, capture, names, max_size, least)
+    entries = sorted(path.iterdir())
+    if not entries:
+        raise InputError(f"{path}: the folder is empty", "put one label image per photograph there")
+    folders = [entry for entry in entries if entry.is_dir()]
+    tables = [e for e in entries if e.suffix.lower() == ".json" and e.name != _NAMES_FILE]
+    if folders and any((f / "metadata.csv").is_file() for f in folders):
+        return _sam_folders(path, folders, capture, names, max_size, least)
+    if folders and not any(e.suffix.lower() in LABEL_SUFFIXES for e in entries if e.is_file()):
+        per_image = [f for f in folders if names.find(f.name) is not None]
+        if per_image and not any(
+            names.find(x.name) is not None for f in per_image for x in f.iterdir()
+        ):
+            return _sam_folders(path, folders, capture, names, max_size, least)
+        if not _mirrors(path, folders, names):
+            return _label_folders(path, folders, capture, names, max_size)
+    if tables:
+        items: dict[str, Any] = {}
+        for table in tables:
+            items |= sam.read_json(table)
+        return _sam_items(str(path), items, capture, names, max_size, least)
+    return _label_images(path, capture, names, max_size)
+
+
+def load_masks(path: str | Path, capture: Capture, *, max_size: int | None = 640) -> Segmentation:
+    """Read one part's masks, one per photograph: white is the part, black is not.
+
+    Args:
+        path: Folder of masks named like the photographs.
+        capture: The photographs.
+        max_size: Longest side of the maps [pixels].
+
+    Returns:
+        A segmentation with the one label 1, named after the folder.
+
+    Raises:
+        InputError: As :func:`load_segmentation`.
+    """
+    path, names = Path(path), ViewNames(capture)
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder of masks", "name a folder, one mask per photo")
+    files = [f for f in sorted(path.rglob("*")) if f.suffix.lower() in _MASK_SUFFIXES]
+    found = _matched(path, files, names)
+    maps = {index: read_binary(file).astype(np.int64) for index, file in found.items()}
+    notes = _leftover(files, found, path)
+    return _finished(str(path), maps, capture, {1: path.name}, True, notes, max_size)
+
+
+def _label_images(
+    path: Path, capture: Capture, names: ViewNames, max_size: int | None
+) -> Segmentation:
+    files = [
+        f
+        for f in sorted(path.rglob("*"))
+        if f.suffix.lower() in (*LABEL_SUFFIXES, ".jpg", ".jpeg") and f.is_file()
+    ]
+    found = _matched(path, files, names)
+    maps, labels, notes = numbered([read_raw(file) for file in found.values()])
+    notes = [*notes, *_leftover(files, found, path)]
+    labels = _renamed(path / _NAMES_FILE, labels)
+    return _finished(
+        str(path), dict(zip(found, maps, strict=True)), capture, labels, True, notes, max_size
+    )
+
+
+def _label_folders(
+    path: Path, folders: list[Path], capture: Capture, names: ViewNames, max_size: int | None
+) -> Segmentation:
+    """A folder per label, named after it; a pixel that several masks claim shows none of them."""
+    maps: dict[int, NDArray[np.int64]] = {}
+    claims: dict[int, NDArray[np.int64]] = {}
+    labels, notes, files = {}, [], []
+    for number, folder in enumerate(folders, 1):
+        labels[number] = folder.name
+        inside = [f for f in sorted(folder.rglob("*")) if f.suffix.lower() in _MASK_SUFFIXES]
+        files += [f"{folder.name}/{f.name}" for f in inside]
+        for file in inside:
+            index = names.find(file.relative_to(folder).as_posix())
+            if index is None:
+                continue
+            mask = read_binary(file)
+            if index in maps and maps[index].shape != mask.shape:
+                raise InputError(
+                    f"{file}: the mask is {mask.shape[1]} x {mask.shape[0]}, another label's is "
+                    f"{maps[index].shape[1]} x {maps[index].shape[0]}",
+                    "export all masks of a photograph at one size",
+                )
+            maps.setdefault(index, np.zeros(mask.shape, np.int64))[mask] = number
+            claims.setdefault(index, np.zeros(mask.shape, np.int64))[mask] += 1
+    if not maps:
+        raise names.no_match(str(path), files)
+    twice = sum(int((count > 1).sum()) for count in claims.values())
+    if twice:
+        share = twice / max(sum(int((count > 0).sum()) for count in claims.values()), 1)
+        notes.append(f"{100 * share:.1f} % of the masked pixels belong to several labels: no vote")
+        for index, count in claims.items():
+            maps[index][count > 1] = -1
+    return _finished(str(path), maps, capture, labels, True, notes, max_size)
+
+
+def _sam_folders(
+    path: Path,
+    folders: list[Path],
+    capture: Capture,
+    names: ViewNames,
+    max_size: int | None,
+    least: float,
+) -> Segmentation:
+    found = {names.find(folder.name): folder for folder in folders}
+    found.pop(None, None)
+    if not found:
+        raise names.no_match(str(path), [folder.name for folder in folders])
+    maps = {i: sam.read_mask_folder(f, least) for i, f in found.items() if i is not None}
+    return _finished(str(path), maps, capture, {}, False, [], max_size)
+
+
+def _sam_items(
+    source: str,
+    items: dict[str, Any],
+    capture: Capture,
+    names: ViewNames,
+    max_size: int | None,
+    least: float,
+) -> Segmentation:
+    maps, kinds = {}, {}
+    for name, found in items.items():
+        index = names.find(name)
+        if index is None:
+            continue
+        masks, labels = sam.json_masks(found, f"{source}: {name}", least)
+        if masks:
+            maps[index] = sam.painted(masks, f"{source}: {name}")
+            kinds[index] = labels
+    if not maps:
+        raise names.no_match(source, items)
+    known = sorted({label for labels in kinds.values() for label in labels if label is not None})
+    if known and all(None not in labels for labels in kinds.values()):
+        # every mask says what it shows (COCO's categories): the same number in all photographs
+        number = {label: k for k, label in enumerate(known, 1)}
+        for index, labels in kinds.items():
+            maps[index] = np.array([0, *(number[str(label)] for label in labels)])[maps[index]]
+        names_of = {k: label for label, k in number.items()}
+        return _finished(source, maps, capture, names_of, True, [], max_size)
+    return _finished(source, maps, capture, {}, False, [], max_size)
+
+
+def _of_file(
+    path: Path, capture: Capture, names: ViewNames, max_size: int | None, least: float
+) -> Segmentation:
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return _sam_items(str(path), sam.read_json(path), capture, names, max_size, least)
+    if suffix not in (".npy", ".npz"):
+        raise InputError(
+            f"{path}: a segmentation must be a folder, .json, .npy or .npz", "see docs/regions.md"
+        )
+    import zipfile
+
+    try:
+        with open(path, "rb") as stream:
+            loaded = np.load(stream, allow_pickle=False)
+            arrays = {k: loaded[k] for k in loaded.files} if suffix == ".npz" else {"": loaded}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: the NumPy file is damaged ({error})", "save it again with numpy.save"
+        ) from error
+    maps: dict[int, NDArray[np.int64]] = {}
+    if suffix == ".npy":
+        stack = arrays[""]
+        if stack.ndim != 3 or stack.shape[0] != len(capture):
+            raise InputError(
+                f"{path}: label maps must be [{len(capture)} views, H, W], got {list(stack.shape)}",
+                "use an .npz with one map per photograph's name for some of the views",
+            )
+        maps = {index: whole_labels(stack[index], path) for index in range(len(capture))}
+    else:
+        for name, value in arrays.items():
+            index = names.find(name)
+            if index is None:
+                continue
+            if value.ndim != 2 or value.size == 0:
+                raise InputError(
+                    f"{path}: {name} must be [H, W], got {list(value.shape)}", "save label maps"
+                )
+            maps[index] = whole_labels(value, f"{path}: {name}")
+        if not maps:
+            raise names.no_match(str(path), arrays)
+    present = sorted({int(n) for value in maps.values() for n in np.unique(value)} - {0})
+    labels = _renamed(path.with_suffix(".labels.json"), {n: str(n) for n in present})
+    return _finished(str(path), maps, capture, labels, True, [], max_size)
+
+
+def _mirrors(path: Path, folders: list[Path], names: ViewNames) -> bool:
+    """Whether sub-folders repeat those of the photographs (camera folders), not labels."""
+    files = [f for folder in folders for f in folder.rglob("*") if f.suffix in LABEL_SUFFIXES]
+    relative = [f.relative_to(path).as_posix() for f in files]
+    ours = {name.rsplit(".", 1)[0] for name in names.names}
+    return any(r.rsplit(".", 1)[0] in ours for r in relative)
+
+
+def _matched(path: Path, files: list[Path], names: ViewNames) -> dict[int, Path]:
+    """Files by view; two files for one view are refused."""
+    found: dict[int, Path] = {}
+    for file in files:
+        index = names.find(file.relative_to(path).as_posix())
+        if index is None:
+            continue
+        if index in found:
+            raise InputError(
+                f"{file} and {found[index]} both mean the photograph {names.names[index]}",
+                "keep one label file per photograph",
+            )
+        found[index] = file
+    if not found:
+        raise names.no_match(str(path), [file.name for file in files])
+    return found
+
+
+def _leftover(files: list[Path], found: dict[int, Path], path: Path) -> list[str]:
+    spare = len(files) - len(found)
+    return [f"{spare} files of {path.name} belong to no photograph"] if spare else []
+
+
+def _renamed(table: Path, labels: dict[int, str]) -> dict[int, str]:
+    """Names out of ``labels.json``: number, colour or present name -> name."""
+    if not table.is_file():
+        return labels
+    try:
+        given = json.loads(table.read_text(encoding="utf-8"))
+        if not isinstance(given, dict):
+            raise ValueError("no mapping")
+        new = {str(key).lower(): str(value) for key, value in given.items()}
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise InputError(
+            f'{table}: names must be a mapping like {{"1": "rind"}} ({error})', "mend the file"
+        ) from error
+    return {n: new.get(name.lower(), new.get(str(n), name)) for n, name in labels.items()}
+
+
+def _finished(
+    source: str,
+    maps: dict[int, NDArray[np.int64]],
+    capture: Capture,
+    labels: dict[int, str],
+    linked: bool,
+    notes: list[str],
+    max_size: int | None,
+) -> Segmentation:
+    """Bring the maps to the photographs' pinhole views."""
+    if linked and not any((value > 0).any() for value in maps.values()):
+        raise InputError(
+            f"{source}: nothing is labelled in any of {len(maps)} files",
+            "0 and black mean nothing; give the parts other values",
+        )
+    views, resized = [], 0
+    for index in sorted(maps):
+        camera, value = capture.cameras[index], maps[index].astype(np.int32)
+        height, width = value.shape
+        if (width, height) != (camera.width, camera.height):
+            if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT:
+                raise InputError(
+                    f"{source}: the labels of {camera.name} are {width} x {height}, the photograph "
+                    f"is {camera.width} x {camera.height}",
+                    "segment the photographs that were posed, uncropped and not turned",
+                )
+            resized += 1
+        pinhole, moved = pinhole_map(camera, value, max_size)
+        views.append(LabelView(pinhole, moved))
+    if resized:
+        notes = [*notes, f"{resized} maps have another size than their photograph: resized"]
+    without = len(capture) - len(views)
+    if without:
+        notes = [*notes, f"{without} of {len(capture)} photographs have no labels"]
+    return Segmentation(source, tuple(views), labels, linked, tuple(notes))

@@ -1,0 +1,120 @@
+"""Solids in files: the splats as a ``.ply``, the volume beside it; ``gf.load`` and ``gf.save``."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsfluent.data.frame import Frame
+from gsfluent.data.gaussians import Gaussians
+from gsfluent.data.solid import Solid
+from gsfluent.errors import InputError
+from gsfluent.io.atomic import atomic_path
+from gsfluent.io.splats.load import load_splats, save_splats
+
+
+def load(path: str | Path) -> Gaussians | Solid:
+    """Read what :func:`save` wrote: a solid where its volume lies beside the ``.ply``, else splats.
+
+    Raises:
+        InputError: As :func:`gsfluent.io.load_splats` and :func:`load_solid`.
+    """
+    return load_solid(path) if volume_path(path).is_file() else load_splats(path)
+
+
+def save(thing: Gaussians | Solid, path: str | Path) -> None:
+    """Write Gaussians or a solid to ``path`` (.ply), so that :func:`load` gives it back.
+
+    A solid's volume goes beside it. One that is left from an earlier solid of that name is
+    removed when Gaussians take its place.
+
+    Args:
+        thing: What to write.
+        path: The ``.ply``.
+
+    Raises:
+        InputError: Neither of the two, or values that no stage can work with.
+        RunError: The disk is full or the folder cannot be written.
+    """
+    if isinstance(thing, Solid):
+        save_solid(thing, path)
+    elif isinstance(thing, Gaussians):
+        save_splats(thing, path)
+        volume_path(path).unlink(missing_ok=True)
+    else:
+        raise InputError(
+            f"gf.save: got {type(thing).__name__}",
+            "give Gaussians or a Solid; for others see gf.io",
+        )
+
+
+def save_solid(solid: Solid, path: str | Path) -> None:
+    """Write the splats to ``path`` (.ply) and the volume to ``<name>.volume.npz`` beside it."""
+    path = Path(path)
+    arrays: dict[str, Any] = {
+        "occupancy": np.packbits(solid.occupancy.cpu().numpy()),
+        "shape": np.array(solid.occupancy.shape, dtype=np.int64),
+        "depth": solid.depth.cpu().numpy(),
+        "origin": solid.origin.cpu().numpy(),
+        "voxel": np.float64(solid.voxel),
+        "report": np.array(json.dumps(solid.report)),
+        "frame": np.array(json.dumps(None if solid.frame is None else solid.frame.to_dict())),
+    }
+    if solid.color is not None:
+        arrays["color"] = solid.color.cpu().numpy()
+    if solid.regions is not None:
+        arrays["regions"] = solid.regions.cpu().numpy()
+    save_splats(solid.gaussians, path)
+    with atomic_path(volume_path(path)) as temporary, open(temporary, "wb") as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def load_solid(path: str | Path) -> Solid:
+    """Read what :func:`save_solid` wrote.
+
+    Raises:
+        InputError: The splats or the volume are missing or damaged.
+    """
+    path = Path(path)
+    gaussians = load_splats(path)
+    beside = volume_path(path)
+    if not beside.is_file():
+        raise InputError(
+            f"{path}: a solid needs {beside.name} beside it, got none",
+            "make both with `gsfluent fill`",
+        )
+    try:
+        with np.load(beside, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        size = tuple(int(count) for count in arrays["shape"])
+        bits = np.unpackbits(arrays["occupancy"], count=math.prod(size))
+        frame = json.loads(str(arrays["frame"]))
+        if gaussians.labels is None:
+            gaussians = gaussians.replace(labels=torch.zeros(gaussians.count, dtype=torch.int32))
+        return Solid(
+            gaussians,
+            torch.from_numpy(bits.reshape(size).astype(bool)),
+            torch.from_numpy(arrays["depth"]),
+            torch.from_numpy(arrays["origin"]),
+            float(arrays["voxel"]),
+            torch.from_numpy(arrays["color"]) if "color" in arrays else None,
+            torch.from_numpy(arrays["regions"]) if "regions" in arrays else None,
+            json.loads(str(arrays["report"])),
+            None if frame is None else Frame.from_dict(frame),
+        )
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{beside}: the volume file is damaged ({error})",
+            "make it again with `gsfluent fill`",
+        ) from error
+
+
+def volume_path(path: str | Path) -> Path:
+    """Name of the volume file that belongs to a solid ``.ply``."""
+    return Path(path).with_suffix(".volume.npz")

@@ -1,0 +1,1 @@
+"""Splats in files: PLY, compressed PLY, .splat, SPZ, delta sequences."""

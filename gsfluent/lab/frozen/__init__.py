@@ -1,0 +1,1 @@
+"""gsfluent's answers to FractureBench."""

@@ -1,0 +1,176 @@
+"""gsfluent's answer to a scene of FractureBench."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from gsfluent.fracturebench.run import Run
+from gsfluent.fracturebench.scene import Scene
+from gsfluent.lab.frozen.fracture import Drives, damage
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.shapes import parameters
+from gsfluent.ops.collider import collider_row
+from gsfluent.ops.plasticity import LAWS
+
+__all__ = ["clock", "play", "rows"]
+
+
+def rows(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Laws int32 [M], parameters float64 [M, 8] and alpha at the start [N] of a scene."""
+    laws, params, alpha = [], [], []
+    for m in scene.materials:
+        nacc = m["law"] == "nacc"
+        laws.append(LAWS[str(m["law"])])
+        columns = (
+            {
+                "c2": float(m["friction"]), "c3": float(m["cohesion"]),
+                "c4": float(m["hardening"]), "c5": float(m.get("shear_damage", 0.0)),
+            }
+            if nacc
+            else {}
+        )  # fmt: skip
+        params.append(
+            parameters(
+                float(m["young_modulus"]), float(m["poisson_ratio"]), float(m["density"]), **columns
+            )
+        )
+        alpha.append(float(m.get("alpha", 0.0)) if nacc else 0.0)
+    start = torch.tensor(alpha, dtype=torch.float64)[torch.from_numpy(scene.material).long()]
+    return torch.tensor(laws, dtype=torch.int32), torch.stack(params), start
+
+
+def _colliders(scene: Scene) -> torch.Tensor | None:
+    made = [
+        collider_row(
+            "plane", point=item["point"], normal=item["normal"], mode=str(item["kind"]),
+            friction=float(item.get("friction", 0.0)),
+        )
+        for item in scene.colliders
+    ]  # fmt: skip
+    return torch.stack(made) if made else None
+
+
+def _handed(name: str, world: World, alpha: torch.Tensor, drives: Drives | None) -> torch.Tensor:
+    """What a scene asks for beside positions and velocities."""
+    if name == "damage":
+        return damage(world, alpha)
+    if name == "impulse" and drives is not None:
+        return torch.cat([world.impulse, drives.impulse])
+    value: torch.Tensor = getattr(world, name)
+    return value
+
+
+def _padded(values: list[np.ndarray], count: int) -> np.ndarray | None:
+    """The samples with NaN for those that a run which broke off does not have, [count, ...]."""
+    if not values:
+        return None
+    missing = [np.full_like(values[0], math.nan)] * (count - len(values))
+    return np.stack(values + missing)
+
+
+def play(
+    scene: Scene,
+    *,
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float32,
+    cfl: float = 0.5,
+    dt: float | None = None,
+    engine: Literal["solver", "ops"] | None = None,
+    fields: bool = True,
+    method: str = "gsfluent",
+    watch: Callable[[World, int], None] | None = None,
+    **options: Any,
+) -> Run:
+    """Run a scene by gsfluent's solver.
+
+    Args:
+        scene: The scene.
+        device: Where.
+        dtype: Precision of the state.
+        cfl: Courant number of the automatic time step.
+        dt: Fixed time step [s] instead.
+        engine: As in :class:`gsfluent.lab.world.driver.World`.
+        fields: A velocity field per body; False puts all into one.
+        method: Name in the record.
+        watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
+        **options: Further arguments of World (``k``, ``epsilon``, ``implicit``, ...).
+
+    Returns:
+        The run; one that broke off says why in ``failed``.
+
+    Raises:
+        ValueError: An argument of World is wrong.
+    """
+    law, params, alpha = rows(scene)
+    several = fields and int(scene.body.max()) > 0
+    drives = Drives(scene, dtype, device) if scene.drives else None
+    world = World(
+        torch.from_numpy(scene.x), torch.from_numpy(scene.v), mass=torch.from_numpy(scene.mass),
+        volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
+        material=torch.from_numpy(scene.material), alpha=alpha,
+        body=torch.from_numpy(scene.body) if several else None,
+        affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
+        friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
+        force=drives,
+        deformation=bool(options.pop("deformation", False)) or "deformation" in scene.asks,
+        **options,
+    )  # fmt: skip
+    count = scene.times.shape[0]
+    shape = (count, scene.count, 3)
+    x, v = np.full(shape, math.nan), np.full(shape, math.nan)
+    asked: dict[str, list[np.ndarray]] = {name: [] for name in scene.asks}
+    wall, failed = 0.0, ""
+    cuda = torch.device(device).type == "cuda"
+    for i, end in enumerate(scene.times):
+        start = time.perf_counter()
+        try:
+            world.run(seconds=float(end) - world.time)
+        except (FloatingPointError, ValueError) as error:
+            failed = str(error).splitlines()[0]
+            break
+        if cuda:
+            torch.cuda.synchronize()
+        wall += time.perf_counter() - start
+        x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
+        for name, values in asked.items():
+            values.append(_handed(name, world, alpha, drives).double().cpu().numpy())
+        if watch is not None:
+            watch(world, i)
+    settings = {
+        "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
+        "engine": world.engine, "fields": several, **options,
+    }  # fmt: skip
+    return Run(
+        scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed,
+        **{name: _padded(values, count) for name, values in asked.items()},
+    )  # fmt: skip
+
+
+def clock(scene: Scene, repeat: int = 3, **options: Any) -> list[float]:
+    """Time a scene from its start to its last time without a stop.
+
+    Stops at the times that a judge asks for cost a launch each; here there are none.
+
+    Args:
+        scene: The scene.
+        repeat: Runs that count; one more goes before them to warm up.
+        **options: Of :func:`play`.
+
+    Returns:
+        Seconds that the steps of each run took; infinite for one that broke off.
+
+    Raises:
+        ValueError: ``repeat`` below 1, or an argument of World is wrong.
+    """
+    if repeat < 1:
+        raise ValueError(f"clock: repeat must be at least 1, got {repeat}")
+    straight = dataclasses.replace(scene, times=scene.times[-1:])
+    runs = [play(straight, **options) for _ in range(repeat + 1)]
+    return [math.inf if run.failed else run.wall_seconds for run in runs[1:]]

@@ -1,0 +1,1 @@
+"""Contact problems with known answers."""

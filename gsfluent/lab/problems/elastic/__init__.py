@@ -1,0 +1,1 @@
+"""Elastic problems with known answers."""

@@ -1,0 +1,1 @@
+"""Liquids, sand and metal with known answers."""

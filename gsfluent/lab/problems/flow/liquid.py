@@ -1,0 +1,195 @@
+"""Liquid: the collapse of a water column, and a tank that comes to rest."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsfluent.lab.problems.fracture.slab import SLIP, STICKY, between_planes, plane, sheet
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.registry import Result, problem
+
+__all__ = ["dam_break", "dam_front", "liquid_at_rest", "water"]
+
+FLUID = 4
+GRAVITY = 9.81
+
+
+def water(sound: float, density: float = 1000.0, exponent: float = 7.0) -> Tensor:
+    """Row of an inviscid liquid whose speed of sound at rest is ``sound`` [m/s], [8]."""
+    row = torch.zeros(8, dtype=torch.float64)
+    row[1], row[6], row[7] = density * sound**2, density, exponent
+    return row
+
+
+def hydrostatic(depth: Tensor, row: Tensor) -> Tensor:
+    """Strain of a liquid under ``depth`` [m] of itself, [N, 6]."""
+    bulk, density, gamma = float(row[1]), float(row[6]), float(row[7])
+    ratio = (1.0 + gamma * density * GRAVITY * depth / bulk) ** (-1.0 / gamma)
+    strain = torch.zeros(depth.shape[0], 6, dtype=torch.float64)
+    strain[:, :3] = (ratio ** (2.0 / 3.0) - 1.0)[:, None]
+    return strain
+
+
+def dam_front(
+    cells: int, *, until: float, bed: float, dtype: torch.dtype = torch.float32
+) -> list[tuple[float, float]]:
+    """Front of a water column twice as high as wide after the gate is gone.
+
+    Args:
+        cells: Cells along the base a.
+        until: End, as ``t sqrt(2 g / a)``.
+        bed: Mode of the bed: sticky (no slip, as in the experiment) or slip.
+        dtype: Precision.
+
+    Returns:
+        Pairs of ``t sqrt(2 g / a)`` and ``z / a``, one per step; the front is where the last two
+        square cells of liquid begin, so that a splash of few points is none.
+    """
+    base = 1.0
+    dx = base / cells
+    points = sheet([0.0, 0.0], [base, 2.0 * base], dx)
+    row = water(10.0 * math.sqrt(2.0 * GRAVITY * base))
+    volume = 0.25 * dx**3
+    walls = torch.cat([
+        between_planes(dx),
+        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], mode=SLIP)[None],
+        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0], mode=bed)[None],
+    ])  # fmt: skip
+    world = World(
+        points, [0.0, 0.0, 0.0], mass=float(row[6]) * volume, volume=volume, dx=dx, law=FLUID,
+        params=row, colliders=walls, gravity=(0.0, -GRAVITY, 0.0), dtype=dtype,
+        strain=hydrostatic(2.0 * base - points[:, 1], row),
+    )  # fmt: skip
+    scale = math.sqrt(2.0 * GRAVITY / base)
+    trace: list[tuple[float, float]] = []
+
+    def watch(w: World) -> None:
+        front = float(torch.topk(w.position[:, 0], 8).values[-1])
+        trace.append((w.time * scale, front / base))
+
+    world.run(seconds=until / scale, each=watch)
+    return trace
+
+
+def martin_moyce(data: Path) -> list[tuple[float, float]]:
+    """Measured fronts for n^2 = 2, both widths: pairs of ``t sqrt(2 g / a)`` and ``z / a``."""
+    rows: list[tuple[float, float]] = []
+    for path in sorted((data / "reference" / "dam_break").glob("martin_moyce_*n2_2*.csv")):
+        with path.open(newline="", encoding="utf-8") as file:
+            rows.extend((float(t), float(z)) for t, z in list(csv.reader(file))[1:])
+    return sorted(rows)
+
+
+@problem(tier="fast")
+def dam_break(
+    cells: int = 12,
+    until: float = 3.4,
+    data: Path | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> list[Result]:
+    """Dam break: front of a collapsing column against Martin and Moyce 1952.
+
+    Args:
+        cells: Cells along the base.
+        until: Last ``t sqrt(2 g / a)`` that is compared.
+        data: Folder with ``reference/dam_break``; default is the environment's GSFLUENT_DATA,
+            else ``shared/data`` beside the checkout.
+        dtype: Precision.
+
+    Raises:
+        FileNotFoundError: The measured fronts are not there.
+    """
+    beside = Path(__file__).resolve().parents[5] / "shared" / "data"
+    root = data or Path(os.environ.get("GSFLUENT_DATA", beside))
+    measured = [pair for pair in martin_moyce(root) if pair[0] <= until]
+    if not measured:
+        raise FileNotFoundError(
+            f"dam_break: no measured fronts under {root}; set GSFLUENT_DATA to the data folder"
+        )
+    source = "Martin and Moyce 1952, fig. 3, n^2 = 2, a = 1.125 and 2.25 in"
+    results = []
+    for bed, kind in ((STICKY, "no-slip bed"), (SLIP, "slip bed")):
+        trace = dam_front(cells, until=until, bed=bed, dtype=dtype)
+        errors = []
+        for time, place in measured:
+            front = next((z for t, z in trace if t >= time), math.nan)
+            errors.append(front / place - 1.0)
+        worst = max(errors, key=abs)
+        results.append(
+            Result(
+                "dam_break", f"front, {kind}: largest relative error", worst, 0.0, abs(worst),
+                0.1, "", source, note=f"mean {sum(errors) / len(errors):+.3f}",
+            )
+        )  # fmt: skip
+    return results
+
+
+@problem(tier="fast")
+def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[Result]:
+    """Tank at rest: a step of water comes to a level surface with hydrostatic pressure under it.
+
+    Half of a tank 1 m wide is filled to 0.625 m, half to 0.375 m; four seconds with damping, then
+    means over 0.7 s without.
+
+    Args:
+        cells: Cells along the tank.
+        dtype: Precision.
+    """
+    dx, depth = 1.0 / cells, 0.5
+    points = torch.cat([sheet([0.0, 0.0], [0.5, 0.625], dx), sheet([0.5, 0.0], [0.5, 0.375], dx)])
+    row = water(8.0 * math.sqrt(GRAVITY * depth))
+    volume = 0.25 * dx**3
+    walls = torch.cat([
+        between_planes(dx),
+        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])[None],
+        plane([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])[None],
+        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0])[None],
+    ])  # fmt: skip
+    damping = [2.0]
+
+    def damp(world: World, dt: float) -> None:
+        world.velocity = world.velocity * (1.0 - damping[0] * dt)
+
+    world = World(
+        points, [0.0, 0.0, 0.0], mass=float(row[6]) * volume, volume=volume, dx=dx, law=FLUID,
+        params=row, colliders=walls, gravity=(0.0, -GRAVITY, 0.0), dtype=dtype, force=damp,
+    )  # fmt: skip
+    world.run(seconds=4.0)
+    damping[0] = 0.0
+    layers = int(depth / dx) - 1
+    tops: list[Tensor] = []
+    pressures: list[Tensor] = []
+
+    def watch(w: World) -> None:
+        x, y = w.position[:, 0].double().cpu(), w.position[:, 1].double().cpu()
+        pressure = -w.stress[:, :3].double().mean(dim=1).cpu()
+        column = (x / dx).long().clamp(0, cells - 1)
+        layer = (y / dx).long().clamp(0, layers)
+        tops.append(torch.zeros(cells, dtype=torch.float64).scatter_reduce(0, column, y, "amax"))
+        total = torch.zeros(layers + 1, dtype=torch.float64).index_add(0, layer, pressure)
+        pressures.append(total / torch.bincount(layer, minlength=layers + 1))
+
+    world.run(seconds=0.7, each=watch)
+    top = torch.stack(tops).mean(dim=0)
+    height = (torch.arange(layers, dtype=torch.float64) + 0.5) * dx
+    scale = float(row[6]) * GRAVITY * depth
+    off = torch.stack(pressures).mean(dim=0)[:layers] / scale - (depth - height) / depth
+    level = float((top - top.mean()).abs().max()) / dx
+    inside, wall = float(off[2:].abs().max()), float(off[:2].abs().max())
+    surface = float(top.mean()) + 0.25 * dx
+    name, source = "liquid_at_rest", "hydrostatics"
+    return [
+        Result(name, "unevenness of the surface", level, 0.0, level, 1.0, "dx", source),
+        Result(
+            name, "height of the surface", surface, depth, abs(surface - depth) / depth, 0.02, "m",
+            "volume is kept",
+        ),
+        Result(name, "pressure over rho g H, two cells up", inside, 0.0, inside, 0.05, "", source),
+        Result(name, "pressure over rho g H at the floor", wall, 0.0, wall, 0.1, "", source),
+    ]  # fmt: skip

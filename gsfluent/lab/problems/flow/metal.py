@@ -1,0 +1,68 @@
+"""Taylor bar: a copper cylinder that hits a rigid wall."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from gsfluent.lab.problems.fracture.slab import SEPARATE, plane
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.registry import Result, compare, problem
+from gsfluent.lab.world.shapes import box, parameters
+
+__all__ = ["taylor_bar"]
+
+VON_MISES = 3
+
+
+@problem(tier="fast")
+def taylor_bar(cells: int = 4, dtype: torch.dtype = torch.float32) -> list[Result]:
+    """Taylor bar: final length and foot of a copper cylinder at 227 m/s after 80 microseconds.
+
+    32.4 mm x 6.4 mm; E 117 GPa, nu 0.35, 8930 kg/m^3, yield stress 400 MPa, linear hardening 100
+    MPa; a quarter between two planes of symmetry, frictionless wall. The end of a point's cell is
+    its position plus its stretched half spacing.
+
+    Args:
+        cells: Cells along the radius.
+        dtype: Precision.
+    """
+    radius, length, density = 3.2e-3, 32.4e-3, 8930.0
+    dx = radius / cells
+    step = 0.5 * dx
+    size = [radius + step, radius + step, round(length / step) * step]
+    points = box([0.0, 0.0, 0.0], size, step)
+    points = points[points[:, :2].norm(dim=1) <= radius]
+    start = float(points[:, 2].max()) + 0.5 * step
+    volume = 0.25 * math.pi * radius**2 * start / points.shape[0]
+    walls = torch.stack([
+        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
+        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
+        plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE),
+    ])  # fmt: skip
+    world = World(
+        points, [0.0, 0.0, -227.0], mass=density * volume, volume=volume, dx=dx, law=VON_MISES,
+        params=parameters(117e9, 0.35, density, c2=400e6, c4=100e6), colliders=walls,
+        deformation=True, dtype=dtype,
+    )  # fmt: skip
+    world.run(seconds=80e-6)
+    assert world.deformation is not None
+    position, stretch = world.position.double().cpu(), world.deformation.double().cpu()
+    top = int(position[:, 2].argmax())
+    end = float(position[top, 2] + 0.5 * step * stretch[top, 2, 2])
+    distance = position[:, :2].norm(dim=1)
+    rim = int(distance.argmax())
+    outward = points[rim, :2] / points[rim, :2].norm()
+    foot = float(distance[rim] + 0.5 * step * (stretch[rim, :2, :2] @ outward).norm())
+    source = "solver.md 3 row 14: 21.4 mm, 7.0 to 7.2 mm; Wilkins and Guinan 1973"
+    return [
+        compare(
+            "taylor_bar", "final length", end * 1e3, 21.4 * start / length, tolerance=0.03,
+            unit="mm", source=source, note=f"{points.shape[0]} points in a quarter",
+        ),
+        compare(
+            "taylor_bar", "radius of the foot", foot * 1e3, 7.1, tolerance=0.07, unit="mm",
+            source=source,
+        ),
+    ]  # fmt: skip

@@ -1,0 +1,1 @@
+"""Fracture problems with known answers."""

@@ -1,0 +1,1 @@
+"""Maps of where a run first breaks a law."""

@@ -1,0 +1,136 @@
+"""The list of all maps, and running what is missing of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from gsfluent.errors import InputError
+from gsfluent.lab.charts.record import commit, machine, now
+from gsfluent.lab.stability.maps import _MAPS, Map, Place, Point, Value, key_of, read
+
+
+def all_maps() -> dict[str, Map]:
+    """All maps by name, in the order of the page."""
+    return dict(_MAPS)
+
+
+def chosen(names: Sequence[str] | None = None, *, gpu: bool = False) -> list[Map]:
+    """The maps of these names; default: all, or with ``gpu`` those of the GPU's subset.
+
+    Raises:
+        InputError: A name that no map has.
+    """
+    known = all_maps()
+    for name in names or ():
+        if name not in known:
+            raise InputError(f"--maps {name}: no such map", f"take of {', '.join(known)}")
+    if names:
+        return [known[name] for name in dict.fromkeys(names)]
+    return [m for m in known.values() if m.gpu or not gpu]
+
+
+def points(wanted: Sequence[Map], *, quick: bool = False) -> list[tuple[str, str, Value, Value]]:
+    """All (map, variant, x, y) to run; ``quick``: three by three of each map."""
+    todo: list[tuple[str, str, Value, Value]] = []
+    for m in wanted:
+        xs = m.x.coarse() if quick else m.x.values
+        ys = m.y.coarse() if quick else m.y.values
+        todo += [(m.name, variant, x, y) for variant in m.variants for y in ys for x in xs]
+    return todo
+
+
+def run_point(task: tuple[str, str, Value, Value, str]) -> Point:
+    """Run one point of a map (also in a worker process)."""
+    name, variant, x, y, device = task
+    m = all_maps()[name]
+    begin = time.perf_counter()
+    outcome = m.run(x, y, variant, Place(device))
+    seconds = time.perf_counter() - begin
+    bad = outcome.violation
+    value = bad.value if bad is not None and math.isfinite(bad.value) else None
+    return Point(
+        map=name, variant=variant, x=x, y=y, limit=outcome.steps,
+        step=None if bad is None else bad.step, kind="" if bad is None else bad.kind, value=value,
+        note="" if bad is None else bad.note, points=outcome.points, seconds=round(seconds, 4),
+        device=device, machine=machine(device), commit="",
+        date=now(),
+    )  # fmt: skip
+
+
+def run_maps(
+    wanted: Sequence[Map],
+    path: str | Path,
+    *,
+    device: str = "cpu",
+    quick: bool = False,
+    jobs: int = 1,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[Point]:
+    """Run what is missing of these maps; every point is written as soon as it is done.
+
+    Args:
+        wanted: The maps.
+        path: The file of lines; points that it has (of this device) are not run again.
+        device: ``cpu`` or ``cuda``.
+        quick: Three by three points of each map.
+        jobs: Processes.
+        progress: Called with (done, all, what).
+
+    Returns:
+        The points of these maps, those of the file included.
+
+    Raises:
+        InputError: The file holds something else, or jobs is not positive.
+    """
+    if jobs < 1:
+        raise InputError(f"--jobs {jobs}", "give at least 1")
+    path = Path(path)
+    have = {p.key: p for p in read(path)} if path.is_file() else {}
+    tasks = [(*p, device) for p in points(wanted, quick=quick)]
+    keys = [key_of(*task) for task in tasks]
+    todo = [task for task, key in zip(tasks, keys, strict=True) if key not in have]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    version, done = commit(), len(tasks) - len(todo)
+    with path.open("a", encoding="utf-8") as file:
+        if path.stat().st_size and not path.read_bytes().endswith(b"\n"):
+            file.write("\n")  # what a stopped run left: the half line is skipped when read
+        for point in _each(todo, jobs):
+            point = dataclasses.replace(point, commit=version)
+            file.write(point.line())
+            file.flush()
+            have[point.key] = point
+            done += 1
+            if progress is not None:
+                progress(done, len(tasks), point.map)
+    return [have[key] for key in keys]
+
+
+def _each(todo: Sequence[tuple[str, str, Value, Value, str]], jobs: int) -> Iterator[Point]:
+    if jobs == 1 or len(todo) < 2:
+        yield from map(run_point, todo)
+        return
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+
+    context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the workers: read when they start
+    with ProcessPoolExecutor(jobs, context, _alone) as pool:
+        futures = [pool.submit(run_point, task) for task in todo]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _alone() -> None:
+    """One thread per worker."""
+    import torch
+
+    torch.set_num_threads(1)

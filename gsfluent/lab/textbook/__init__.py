@@ -1,0 +1,1 @@
+"""The textbook solver: MPM as papers print it, with its variants."""

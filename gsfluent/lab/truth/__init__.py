@@ -1,0 +1,1 @@
+"""Objects whose inside, light and pictures are known."""

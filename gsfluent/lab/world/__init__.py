@@ -1,0 +1,1 @@
+"""What every problem runs in: bodies, engine, driver, registry."""

@@ -1,0 +1,147 @@
+"""A :class:`gsfluent.lab.world.driver.World` on the resident :class:`gsfluent.ops.Solver`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.lab.world.stepper import Scene
+
+__all__ = ["Resident", "why_not"]
+
+
+def why_not(scene: Scene, forced: bool) -> str:
+    """Say why the resident solver cannot run a scene; empty if it can."""
+    if forced:
+        return "a force changes velocities between steps"
+    if any(scene.period):
+        return "it has no periodic axes"
+    if scene.cfl > 1.0:
+        return "its cfl is at most 1"
+    return ""
+
+
+class Resident:
+    """State that lives in the solver; read in the order it was given.
+
+    Position and strain keep the digits they have there: positions are float64 whatever the
+    precision of the rest, since the solver keeps them relative to their cell.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        position: Tensor,
+        velocity: Tensor,
+        affine: Tensor,
+        strain: Tensor,
+        alpha: Tensor,
+        deformation: Tensor | None,
+    ):
+        self.scene = scene
+        self.solver = ops.Solver(
+            position, velocity, scene.mass, scene.volume, dx=scene.dx, law=scene.law,
+            params=scene.params, material=scene.material, strain=strain, alpha=alpha,
+            affine=affine, deformation=deformation, body=scene.body, gravity=scene.gravity,
+            colliders=scene.colliders, friction=scene.friction, restitution=scene.restitution,
+            contact_gap=scene.contact_gap, cfl=scene.cfl, dt=scene.fixed_dt,
+            irreversible=scene.irreversible, **scene.return_map,
+        )  # fmt: skip
+        rows = 0 if scene.colliders is None else scene.colliders.shape[0]
+        self._none = torch.zeros(rows, 3, dtype=torch.float64, device=velocity.device)
+
+    def run(
+        self, end: float | None, steps: int | None, each: Callable[[float], None] | None
+    ) -> None:
+        """Advance to a time or by steps; ``each`` gets the length of every step.
+
+        Raises:
+            FloatingPointError: What the solver stopped for.
+        """
+        try:
+            if each is None:
+                self.solver.advance(end, steps=steps)
+                return
+            left = math.inf if steps is None else steps
+            if self.scene.fixed_dt is not None and end is not None:
+                left = max(0, round((end - self.solver.time) / self.scene.fixed_dt))
+            while left > 0 and (steps is not None or end is None or self.solver.time < end):
+                before = self.solver.steps
+                self.solver.advance(None if self.scene.fixed_dt else end, steps=1)
+                if self.solver.steps == before:
+                    return
+                each(self.solver.dt)
+                left -= 1
+        except ops.SolverError as error:
+            raise FloatingPointError(str(error)) from error
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.solver.time
+
+    @property
+    def steps(self) -> int:
+        """Steps taken."""
+        return self.solver.steps
+
+    @property
+    def position(self) -> Tensor:
+        """Positions [m], float64 [N, 3]."""
+        return self.solver.position
+
+    @property
+    def velocity(self) -> Tensor:
+        """Velocities [m/s], [N, 3]."""
+        return self.solver.velocity
+
+    @property
+    def affine(self) -> Tensor:
+        """APIC matrices C [1/s], [N, 3, 3]."""
+        return self.solver.affine
+
+    @property
+    def strain(self) -> Tensor:
+        """Elastic strain e = b - I, [N, 6]."""
+        return self.solver.strain
+
+    @property
+    def alpha(self) -> Tensor:
+        """Scalar state of the law, [N]."""
+        return self.solver.alpha
+
+    @property
+    def peak(self) -> Tensor:
+        """Largest alpha so far, [N]."""
+        return self.solver.peak
+
+    @property
+    def stress(self) -> Tensor:
+        """Kirchhoff stress of the strain [Pa], without viscosity, [N, 6]."""
+        scene, strain = self.scene, self.solver.strain
+        result = ops.return_mapping(
+            strain, self.solver.alpha, strain.new_zeros(strain.shape[0], 3, 3), law=scene.law,
+            params=scene.params, material=scene.material, dt=1.0, **scene.return_map,
+        )  # fmt: skip
+        return result[2]
+
+    @property
+    def deformation(self) -> Tensor | None:
+        """Deformation gradient since the start, [N, 3, 3]."""
+        return self.solver.deformation
+
+    @property
+    def impulse(self) -> Tensor:
+        """Given to the bodies by each collider so far [N s], float64 [K, 3]."""
+        return self.solver.impulse if self._none.shape[0] else self._none
+
+    @property
+    def info(self) -> Tensor:
+        """Sums over the steps: plastic, guarded, inverted, invalid points, int64 [4]."""
+        now = self.solver.counters()
+        names = ("plastic", "guarded", "inverted", "invalid")
+        return torch.tensor([int(now[name]) for name in names])

@@ -1,0 +1,217 @@
+"""One MPM step of a :class:`gsfluent.lab.world.driver.World` on the composable ops.
+
+p2g, grid update, g2p and return map, as in docs/mpm.md. A periodic axis is made of images: points
+within reach of one face appear again behind the other, give mass and momentum there, and are
+forgotten before the points move. That is exact, since every node near a face receives all it would
+receive on a torus.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.ops.plasticity import weakened
+
+__all__ = ["Scene", "Stepper", "automatic_dt", "wave_speed"]
+
+REACH = 3.0
+"""Width of the layer that is repeated behind a periodic face [dx]: a point reads nodes up to 1.5
+away, and those receive from points up to 1.5 further."""
+GRADIENT_LIMIT = 0.3
+"""Largest ``dt |grad v|`` of one automatic step."""
+LAW_FLUID = 4
+
+
+@dataclasses.dataclass
+class Scene:
+    """What does not change while a world runs (see :class:`gsfluent.lab.world.driver.World`)."""
+
+    mass: Tensor
+    volume: Tensor
+    dx: float
+    law: Tensor
+    params: Tensor
+    material: Tensor
+    body: Tensor | None
+    fields: int
+    gravity: tuple[float, float, float]
+    colliders: Tensor | None
+    friction: float
+    restitution: float
+    contact_gap: float
+    cfl: float
+    fixed_dt: float | None
+    period: tuple[float | None, float | None, float | None]
+    irreversible: bool
+    return_map: dict[str, Any]
+
+
+def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
+    """Fastest wave in the strained material [m/s], [N].
+
+    Solids: acoustic modulus of the neo-Hookean law in a uniaxial state (equations.md 2.1),
+    ``kappa (1 + J^2) / 2 + (2 mu / 9) (J^(4/3) + 5 J^(-2/3))``; fluids: ``K J^(-gamma-1)``, at
+    least its value at rest.
+
+    Args:
+        strain: e = b - I, [N, 6].
+        law: int32 [N].
+        params: [N, 8].
+    """
+    xx, yy, zz, xy, xz, yz = strain.unbind(-1)
+    xx, yy, zz = xx + 1.0, yy + 1.0, zz + 1.0
+    squared = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    squared = squared.clamp(min=1e-4)  # J^2
+    third = squared ** (1.0 / 3.0)
+    mu, kappa, density = params[:, 0], params[:, 1], params[:, 6]
+    solid = 0.5 * kappa * (1.0 + squared) + 2.0 / 9.0 * mu * (third * third + 5.0 / third)
+    gamma = torch.where(params[:, 7] > 0, params[:, 7], 7.0)
+    fluid = kappa * (squared ** (-0.5 * (gamma + 1.0))).clamp(min=1.0)
+    return torch.sqrt(torch.where(law == LAW_FLUID, fluid, solid) / density)
+
+
+def automatic_dt(scene: Scene, strain: Tensor, velocity: Tensor, affine: Tensor) -> float:
+    """Time step [s] of a scene in a state: the fixed one, or cfl * dx / (wave speed + speed).
+
+    Raises:
+        FloatingPointError: The state allows none.
+    """
+    if scene.fixed_dt is not None:
+        return scene.fixed_dt
+    rows = scene.material.long()
+    speed = wave_speed(strain, scene.law[rows], scene.params[rows]).max()
+    fastest = float(speed + velocity.norm(dim=1).max())
+    dt = scene.cfl * scene.dx / fastest if fastest > 0 else float("inf")
+    steepest = float(torch.linalg.matrix_norm(affine).max())
+    if steepest > 0:
+        dt = max(min(dt, GRADIENT_LIMIT / steepest), 0.25 * dt)
+    if not 0.0 < dt < float("inf"):
+        raise FloatingPointError(
+            f"no time step: fastest wave and point {fastest:.3g} m/s, "
+            f"velocity gradient {steepest:.3g} 1/s"
+        )
+    return dt
+
+
+class Stepper:
+    """State of the points and the step that advances it; precision is that of the tensors."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        position: Tensor,
+        velocity: Tensor,
+        affine: Tensor,
+        strain: Tensor,
+        alpha: Tensor,
+        deformation: Tensor | None,
+    ):
+        self.scene = scene
+        self.position, self.velocity, self.affine = position, velocity, affine
+        self.strain, self.alpha, self.deformation = strain, alpha, deformation
+        self.peak = alpha
+        rows = 0 if scene.colliders is None else scene.colliders.shape[0]
+        self.impulse = torch.zeros(rows, 3, dtype=torch.float64, device=position.device)
+        self.time, self.steps = 0.0, 0
+        self.info = torch.zeros(4, dtype=torch.int64, device=position.device)
+        self._blocks: ops.Blocks | None = None
+        self._travelled = 0.0
+        # the stress of the first step belongs to the strain given: a step without motion, of a
+        # length that only viscosity reads
+        self.stress = self._map(torch.zeros_like(affine), 1.0)[2]
+
+    def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        scene = self.scene
+        if scene.irreversible and bool((self.peak > 0).any()):
+            return *weakened(scene.law, scene.params, scene.material, self.peak), None
+        return scene.law, scene.params, scene.material
+
+    def _map(self, increment: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        law, params, material = self._rows()
+        return ops.return_mapping(
+            self.strain, self.alpha, increment,
+            law=law, params=params, material=material, dt=dt, **self.scene.return_map,
+        )  # fmt: skip
+
+    def limit(self) -> float:
+        """Time step [s]: the fixed one, or the automatic one of the current state."""
+        return automatic_dt(self.scene, self.strain, self.velocity, self.affine)
+
+    def advance(self, dt: float) -> None:
+        """Advance by one step of ``dt`` seconds."""
+        scene, count = self.scene, self.position.shape[0]
+        rows, place = self._images()
+        take = (lambda t: t) if rows is None else (lambda t: t[rows])
+        body = None if scene.body is None else take(scene.body)
+        blocks = self._find_blocks(place, dt, fresh=rows is not None)
+        contact = scene.fields > 1
+        grid, moments = ops.p2g(
+            place, take(self.velocity), take(self.affine), take(scene.mass),
+            dx=scene.dx, blocks=blocks, dt=dt, stress=take(self.stress),
+            volume=take(scene.volume), body=body, fields=scene.fields, contact=contact,
+        )  # fmt: skip
+        grid_velocity, impulse, _ = ops.grid_update(
+            grid, dx=scene.dx, dt=dt, blocks=blocks, gravity=scene.gravity,
+            colliders=scene.colliders, moments=moments, friction=scene.friction,
+            restitution=scene.restitution, contact_gap=scene.contact_gap,
+        )  # fmt: skip
+        deformation = None if self.deformation is None else take(self.deformation)
+        x, v, c, f, skipped = ops.g2p(
+            grid_velocity, place, dx=scene.dx, dt=dt, blocks=blocks, body=body,
+            deformation=deformation, velocity=take(self.velocity), return_skipped=True,
+        )  # fmt: skip
+        if int(skipped):
+            raise FloatingPointError(
+                f"{int(skipped)} points are not finite or left the grid after {self.steps} steps"
+            )
+        self.position, self.velocity, self.affine = x[:count], v[:count], c[:count]
+        self.deformation = None if f is None else f[:count]
+        self.strain, self.alpha, self.stress, info = self._map(dt * self.affine, dt)
+        self.info += info
+        self.peak = torch.maximum(self.peak, self.alpha)
+        self.impulse += impulse
+        self.time += dt
+        self.steps += 1
+
+    def _find_blocks(self, place: Tensor, dt: float, *, fresh: bool) -> ops.Blocks:
+        speed = float(self.velocity.abs().max())
+        reach = 1.25 * speed * dt + 10.0 * dt * dt
+        blocks = self._blocks
+        if fresh or blocks is None or blocks.expired(self._travelled + reach, self.scene.dx):
+            blocks, self._travelled = ops.build_blocks(place, self.scene.dx), 0.0
+        self._blocks, self._travelled = blocks, self._travelled + reach
+        return blocks
+
+    def _images(self) -> tuple[Tensor | None, Tensor]:
+        """Rows of the points and their images, and where they are; None without periods."""
+        period: Sequence[float | None] = self.scene.period
+        if not any(period):
+            return None, self.position
+        place, rows = self.position.clone(), torch.arange(self.position.shape[0])
+        rows = rows.to(place.device)
+        for axis, length in enumerate(period):
+            if length is None:
+                continue
+            place[:, axis] = torch.remainder(place[:, axis], length)
+        self.position = place
+        for axis, length in enumerate(period):
+            if length is None:
+                continue
+            layer = REACH * self.scene.dx
+            copies, sources = [place], [rows]
+            for near, shift in (
+                (place[:, axis] < layer, length),
+                (place[:, axis] > length - layer, -length),
+            ):
+                moved = place[near].clone()
+                moved[:, axis] += shift
+                copies.append(moved)
+                sources.append(rows[near])
+            place, rows = torch.cat(copies), torch.cat(sources)
+        return rows, place

@@ -1,0 +1,1 @@
+"""A session that one can poke while it runs."""

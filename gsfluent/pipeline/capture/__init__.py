@@ -1,0 +1,1 @@
+"""What a capture says before anything is learned: views, hull, which way is up."""

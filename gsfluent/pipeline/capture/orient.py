@@ -1,0 +1,272 @@
+"""Which way is up, where the floor is, how large a unit is: from the world to scene metres."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsfluent import geometry
+from gsfluent.data import Camera, Capture, Frame, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.spatial.shape import cluster, robust_box
+
+if TYPE_CHECKING:
+    from gsfluent.config import Shot
+
+Array = NDArray[np.float64]
+
+DEFAULT_SIZE = 0.2
+"""Largest extent [m] assumed for an object of unknown size: what fits in two hands."""
+
+_SPLAT_UP = (0.0, -1.0, 0.0)
+"""Up of a splat without cameras: trainers keep COLMAP's axes, where y points down."""
+
+_LEVEL = 0.05
+"""Mean squared sine of the cameras' roll below which they count as held level."""
+
+_TILT = np.cos(np.radians(30.0))
+"""A support plane may lean this far from what the cameras say is up."""
+
+_OPAQUE = 0.1
+"""Splats fainter than this do not count for an object's extent."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Orientation:
+    """How an input stands in its own coordinates.
+
+    Attributes:
+        up: Unit up axis [3], world.
+        up_from: What it was taken from: ``given``, ``support plane``, ``cameras`` or
+            ``convention``.
+        floor: Coordinate of the floor along ``up``, world units.
+        floor_from: ``given``, ``support plane`` or ``lowest point``.
+        focus: Point that the cameras look at [3], or the centre of the splats.
+    """
+
+    up: Array
+    up_from: str
+    floor: float
+    floor_from: str
+    focus: Array
+
+
+def orient(
+    gaussians: Gaussians | None, capture: Capture | None = None, up: Any = "auto"
+) -> Orientation:
+    """Find the up axis and the floor.
+
+    Up: as given; else the normal of the plane that carries the object, if the sparse points show
+    one near what the cameras suggest; else the axis that level cameras turn about; else, for a bare
+    splat, -y. Floor: that plane, else the lowest point of the object.
+
+    Args:
+        gaussians: The object's splats, or None when there is only a capture.
+        capture: The photographs it comes from, or None.
+        up: ``"auto"`` or three numbers.
+
+    Raises:
+        InputError: Neither splats nor a capture with points are given.
+    """
+    points = _object_points(gaussians, capture)
+    focus = points.mean(axis=0) if capture is None else look_at_point(capture.cameras)
+    plane = None
+    if not isinstance(up, str):
+        axis, source = np.asarray(up, dtype=np.float64), "given"
+        axis = axis / np.linalg.norm(axis)
+    elif capture is None:
+        axis, source = np.array(_SPLAT_UP), "convention"
+    else:
+        axis, source = camera_up(capture.cameras), "cameras"
+    if capture is not None and len(capture.points) >= 100:
+        plane = support_plane(capture, axis, focus)
+    if plane is not None:
+        if source != "given":
+            axis, source = plane[0], "support plane"
+        elif plane[0] @ axis < np.cos(np.radians(5.0)):
+            plane = None  # a slanted surface is no floor for the up axis the user gave
+    if plane is not None:
+        return Orientation(axis, source, float(plane[1]), "support plane", focus)
+    return Orientation(
+        axis, source, float(np.quantile(points @ axis, 0.002)), "lowest point", focus
+    )
+
+
+def make_frame(
+    gaussians: Gaussians, capture: Capture | None = None, shot: Shot | None = None
+) -> Frame:
+    """Return the transform from world coordinates to scene metres.
+
+    The scene has +z up. The object's centre stands on the z axis; its lowest point lies at z = 0,
+    unless the shot gives a floor height, or asks for the support plane, which then becomes z = 0.
+
+    Args:
+        gaussians: The object's splats (background removed), world coordinates.
+        capture: The photographs, used for the up axis.
+        shot: Settings ``up``, ``floor``, ``origin``, ``scale`` and ``size``; automatic without.
+
+    Raises:
+        InputError: No splats, or all in one point; or no support plane where one is asked for.
+    """
+    gaussians.validated("make_frame")
+    stance = orient(gaussians, capture, "auto" if shot is None else shot.up)
+    rotation = upright_rotation(stance.up, None if capture is None else capture.cameras)
+    points = _object_points(gaussians, None)
+    points = points[~cluster(points).floaters] @ rotation.T
+    low, high = robust_box(points)
+    extent = float((high - low).max())
+    if not extent > 0:
+        raise InputError(
+            "make_frame: all splats lie in one point", "check the splat file or the selection"
+        )
+    scale = DEFAULT_SIZE / extent
+    if shot is not None and shot.scale is not None:
+        scale = shot.scale
+    elif shot is not None and shot.size is not None:
+        scale = shot.size / extent
+    ground = low[2]
+    if shot is not None and not isinstance(shot.floor, str):
+        ground = shot.floor / scale
+    elif shot is not None and shot.floor == "plane":
+        if stance.floor_from != "support plane":
+            raise InputError(
+                "floor: plane: the capture shows no plane that the object stands on",
+                "use floor: auto, or give its height",
+            )
+        ground = stance.floor
+    base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, ground])
+    if shot is not None and shot.origin == "input":
+        base = np.array([0.0, 0.0, 0.0 if shot.floor == "none" else ground])
+    return Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
+
+
+def upright_rotation(up: Array, cameras: list[Camera] | None = None) -> Array:
+    """Rotation [3, 3] that carries ``up`` onto +z and faces the first camera (if any) along +y.
+
+    So the front view of a scene is the view of the first photograph.
+    """
+    rotation = geometry.rotation_between(
+        torch.from_numpy(up), torch.tensor([0.0, 0.0, 1.0])
+    ).numpy()
+    if cameras:
+        ahead = rotation @ cameras[0].forward().numpy()
+        length = float(np.hypot(ahead[0], ahead[1]))
+        if length > 0.1:  # a camera that looks straight down has no front
+            x, y = ahead[0] / length, ahead[1] / length
+            rotation = np.array([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]) @ rotation
+    return np.asarray(rotation)
+
+
+def camera_up(cameras: list[Camera]) -> Array:
+    """Up axis from cameras: perpendicular to all their horizontal axes, if they were held level.
+
+    With level cameras from several sides that axis is sharp: the eigenvector of sum(x x^T) with the
+    smallest eigenvalue. Otherwise the mean of the image-up directions is taken.
+    """
+    mean = torch.stack([camera.up() for camera in cameras]).to(torch.float64).mean(dim=0).numpy()
+    across = torch.stack([camera.viewmat[0, :3] for camera in cameras]).to(torch.float64).numpy()
+    values, vectors = np.linalg.eigh(across.T @ across / len(across))
+    if values[0] < _LEVEL and values[1] > 2 * _LEVEL:
+        axis = vectors[:, 0]
+        if abs(axis @ mean) > 0.1:
+            return np.asarray(axis * np.sign(axis @ mean))
+    length = float(np.linalg.norm(mean))
+    if length < 1e-3:
+        return np.array(_SPLAT_UP)
+    return np.asarray(mean / length)
+
+
+def look_at_point(cameras: list[Camera]) -> Array:
+    """Point nearest to all optical axes, least squares [3]; one unit ahead for parallel cameras."""
+    matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for camera in cameras:
+        axis = camera.forward().to(torch.float64).numpy()
+        projector = np.eye(3) - np.outer(axis, axis)
+        matrix += projector
+        right += projector @ camera.center().to(torch.float64).numpy()
+    if np.linalg.cond(matrix) > 1e6:
+        return np.asarray((cameras[0].center() + cameras[0].forward()).to(torch.float64).numpy())
+    return np.asarray(np.linalg.solve(matrix, right))
+
+
+def support_plane(capture: Capture, up: Array, focus: Array) -> tuple[Array, float] | None:
+    """Find the plane the object stands on: (unit normal [3], offset along it), or None.
+
+    RANSAC over triples of points near the object. A plane counts when its normal is within 30
+    degrees of ``up``, at least 15 % of the points lie on it, hardly any below it, and the cameras
+    are above it.
+    """
+    centers = capture.centers().numpy()
+    reach = float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    points = near_points(capture, focus)
+    if len(points) < 100:
+        return None
+    rng = np.random.default_rng(0)
+    sample = points if len(points) <= 4000 else points[rng.choice(len(points), 4000, replace=False)]
+    band = 0.01 * reach
+    normals, offsets = _candidate_planes(sample, up, rng)
+    best: tuple[float, Array, float] | None = None
+    for normal, offset in zip(normals, offsets, strict=True):
+        height = sample @ normal - offset
+        on, below = np.abs(height) < band, height < -3 * band
+        score = float(on.mean() - 3.0 * below.mean())
+        if (best is None or score > best[0]) and np.mean(centers @ normal > offset) > 0.9:
+            best = (score, normal, float(offset))
+    if best is None:
+        return None
+    _, normal, offset = best
+    for _ in range(5):  # least squares on the inliers
+        near = points[np.abs(points @ normal - offset) < band]
+        if len(near) < 3:
+            return None
+        middle = near.mean(axis=0)
+        axis = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+        normal = axis * np.sign(axis @ up)
+        offset = float(normal @ middle)
+    height = points @ normal - offset
+    on, below = np.mean(np.abs(height) < band), np.mean(height < -3 * band)
+    if on < 0.15 or below > 0.1 or normal @ up < _TILT:
+        return None
+    return np.asarray(normal), offset
+
+
+def near_points(capture: Capture, focus: Array) -> Array:
+    """Sparse points nearer to ``focus`` than half the cameras' distance [M, 3]."""
+    points = np.asarray(capture.points.to(torch.float64).numpy())
+    distance = np.linalg.norm(points - focus, axis=1)
+    reach = float(np.median(np.linalg.norm(capture.centers().numpy() - focus, axis=1)))
+    near = points[distance < 0.5 * reach]
+    return near if len(near) >= 100 else points[distance <= max(reach, float(np.median(distance)))]
+
+
+def _candidate_planes(points: Array, up: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Planes through random triples whose normal is near ``up``: normals [M, 3], offsets [M]."""
+    triples = points[rng.integers(0, len(points), size=(4000, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    keep = length > 1e-12
+    normals, triples = normals[keep] / length[keep, None], triples[keep]
+    normals *= np.where(normals @ up < 0, -1.0, 1.0)[:, None]
+    near = normals @ up > _TILT
+    normals, triples = normals[near][:1000], triples[near][:1000]
+    return normals, (normals * triples[:, 0]).sum(axis=1)
+
+
+def _object_points(gaussians: Gaussians | None, capture: Capture | None) -> Array:
+    """Centres of the opaque splats, or the sparse points [N, 3]."""
+    if gaussians is not None:
+        opaque: Tensor = gaussians.means[gaussians.opacities > _OPAQUE]
+        if len(opaque) < 10:
+            opaque = gaussians.means
+        return np.asarray(opaque.detach().to("cpu", torch.float64).numpy())
+    if capture is None or len(capture.points) == 0:
+        raise InputError(
+            "orient: neither splats nor sparse points are there",
+            "give splats, or a capture with points3D",
+        )
+    return near_points(capture, look_at_point(capture.cameras))

@@ -1,0 +1,1 @@
+"""Rigid things and blades while they move."""

@@ -1,0 +1,121 @@
+"""Splats for what has no photographs: bullets, poured liquids, rigid things."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import SURFACE, Gaussians, Particles
+from gsfluent.geometry import matrix_to_quaternion
+from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.scene.scene import Scene
+
+# Splats of this many standard deviations per spacing close a packing of particles.
+_SIGMA_IN_SPACINGS = 0.6
+_STEEL = (0.25, 0.25, 0.25)
+_BLADE = (0.55, 0.57, 0.60)
+_PLATE_POINTS = 100
+_PLATE_HEIGHT = 0.16
+"""Of the plate that stands for a blade, in widths."""
+_PAINT = {
+    "water": (0.45, 0.60, 0.68),
+    "milk": (0.93, 0.91, 0.85),
+    "honey": (0.75, 0.45, 0.08),
+    "oil": (0.70, 0.60, 0.15),
+}
+_LIQUID = (0.45, 0.60, 0.68)
+
+
+def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
+    """Splats for bodies that have matter but no photographs, or None without any.
+
+    Bullets are steel grey; liquids have the colour of their name, or that of water.
+    """
+    groups = []
+    for number, body in enumerate(scene.bodies):
+        if body.solid is not None:
+            continue
+        rows = particles.body == number
+        position, volume = particles.position[rows], particles.volume[rows]
+        plain = _LIQUID if body.material.law == "fluid" else _STEEL
+        paint = _PAINT.get(body.material.name.split(".")[-1], plain)
+        groups.append(_splats(position, _SIGMA_IN_SPACINGS * volume.pow(1.0 / 3.0), paint))
+    return Gaussians.cat(groups) if groups else None
+
+
+def bare_points(particles: Particles, scene: Scene) -> Tensor:
+    """Material point of each splat of :func:`bare_splats`, int64."""
+    rows = [
+        (particles.body == number).nonzero()[:, 0]
+        for number, body in enumerate(scene.bodies)
+        if body.solid is None
+    ]
+    return torch.cat(rows) if rows else particles.body.new_empty(0, dtype=torch.int64)
+
+
+def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
+    """Steel-grey splats on the surfaces of the rigid things but endless planes, or None.
+
+    Args:
+        rigid: The colliders.
+        rows: Their rows now, [M, 32].
+    """
+    points, normals, spacing = rigid.surfaces(rows)
+    if points.shape[0] == 0:
+        return None
+    sizes = torch.full_like(points[:, 0], _SIGMA_IN_SPACINGS * spacing)
+    made = _splats(points.float(), sizes.float(), _STEEL)
+    return made.replace(normals=normals.float())
+
+
+def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") -> Gaussians | None:
+    """Splats of the blades: a plate behind each edge, or None without blades.
+
+    An edge waits where its path begins, moves along it, is drawn back the way it came, and is gone.
+
+    Args:
+        scene: The scene.
+        time: Time [s].
+        device: Where they are made.
+    """
+    made = []
+    for blade in scene.blades:
+        path = torch.tensor(blade.path, dtype=torch.float64)
+        legs = path[1:] - path[:-1]
+        lengths = legs.norm(dim=1)
+        whole = float(lengths.sum())
+        along = max(blade.speed * (time - blade.start), 0.0)
+        if along > 2.0 * whole:
+            continue
+        along = along if along <= whole else 2.0 * whole - along
+        leg = 0
+        while leg + 1 < len(lengths) and along > float(lengths[leg]):
+            along -= float(lengths[leg])
+            leg += 1
+        way = legs[leg] / lengths[leg]
+        edge = torch.tensor(blade.edge, dtype=torch.float64)
+        step = blade.width / _PLATE_POINTS
+        across = torch.arange(_PLATE_POINTS + 1, dtype=torch.float64) * step - 0.5 * blade.width
+        back = torch.arange(round(_PLATE_HEIGHT * _PLATE_POINTS) + 1, dtype=torch.float64) * step
+        a, b = (part.reshape(-1, 1) for part in torch.meshgrid(across, back, indexing="ij"))
+        points = (path[leg] + along * way + a * edge - b * way).float().to(device)
+        normal = torch.linalg.cross(edge, way)
+        normal = (normal / normal.norm()).float()
+        # as thin as a blade: seen along its plane it must not be a row of balls
+        sizes = torch.full((points.shape[0], 3), _SIGMA_IN_SPACINGS * step, device=device)
+        sizes[:, 2] = 0.1 * sizes[:, 0]
+        turn = torch.stack([edge.float(), torch.linalg.cross(normal, edge.float()), normal], dim=1)
+        quat = matrix_to_quaternion(turn.double()).float().to(device)
+        splats = _splats(points, sizes, _BLADE)
+        made.append(
+            splats.replace(
+                quats=quat.expand(points.shape[0], 4).contiguous(),
+                normals=normal.to(device).expand_as(points).contiguous(),
+            )
+        )
+    return Gaussians.cat(made) if made else None
+
+
+def _splats(position: Tensor, sizes: Tensor, paint: tuple[float, float, float]) -> Gaussians:
+    colors = position.new_tensor(paint).expand_as(position).contiguous()
+    return Gaussians.from_colors(position, sizes, colors, opacities=0.95, label=SURFACE)

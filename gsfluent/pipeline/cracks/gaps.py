@@ -1,0 +1,184 @@
+"""The cracks of a running simulation: what has parted, which splats it cuts, which faces it opens.
+
+What is remembered from frame to frame is which neighbouring points have parted
+(:mod:`gsfluent.pipeline.matter.links`); everything else follows from it and is kept only because
+little of it changes from one frame to the next. It is part of a saved run (:meth:`Gaps.state`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent import geometry, ops
+from gsfluent.data import TRANSITION, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.pipeline.cracks.cuts import cut_splats
+from gsfluent.pipeline.cracks.faces import CRUMB, PIECE, Elements, Fit, find_elements
+from gsfluent.pipeline.cracks.sites import Sites
+from gsfluent.pipeline.matter.carry import Carry, Points
+from gsfluent.pipeline.matter.links import BACK, FULL, OPEN, Hanging
+
+OPACITY = 0.98
+"""Opacity of a face element where the gap is wide."""
+SLACK = 0.1
+"""Standard deviations by which the cuts of splats stay outside of a crack: what is left must still
+cover."""
+CHUNK = 100_000
+"""Sites and splats that are looked at at once; bounds memory."""
+
+
+class Births(NamedTuple):
+    """Splats born on crack faces, at one moment.
+
+    Attributes:
+        gaussians: Label TRANSITION, with normals, [T].
+        ids: Number of each, the same as long as it lives and when it comes back, int64 [T].
+        anchor: Material point that each follows, int64 [T].
+    """
+
+    gaussians: Gaussians
+    ids: Tensor
+    anchor: Tensor
+
+
+class Cracks(NamedTuple):
+    """The cracks of one moment.
+
+    Attributes:
+        points: The material points, with how they hang together.
+        rest: The splats at rest, those that lie across a crack cut.
+        births: Splats on open faces; None where there is none.
+    """
+
+    points: Points
+    rest: Gaussians
+    births: Births | None
+
+
+class Gaps:
+    """Follows the cracks of one run.
+
+    Args:
+        carry: The binding of the splats; it must know its scene (:meth:`Carry.bind`).
+
+    Raises:
+        InputError: It does not.
+    """
+
+    def __init__(self, carry: Carry) -> None:
+        if carry.scene is None:
+            raise InputError(
+                "repair: the binding knows no scene, so there is no colour for crack faces",
+                hint="bind with Carry.bind(scene, matter), or use Repair(method='mvee')",
+            )
+        self.carry = carry
+        self._sites: Sites | None = None
+        self.restore({})
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state` of another run of the same scene; from nothing when empty."""
+        self._before: Hanging | None = self.carry.links.restored(state) if state else None
+        self._opened = torch.zeros_like(self.carry.links.near, dtype=torch.bool)
+        self._crumb = torch.zeros_like(self._opened[:, 0])
+        self._elements: Elements | None = None
+        self._rest = self.carry.gaussians
+
+    def state(self) -> dict[str, Any]:
+        """What a later run needs to go on from here."""
+        return {} if self._before is None else self._before.state()
+
+    def step(self, points: Points) -> Cracks:
+        """Go on to the next frame.
+
+        Args:
+            points: Where the material points are now; points that joined the run later, to which no
+                splat is bound, come last.
+        """
+        hanging = self.carry.links.look(points.position, points.fragments, self._before)
+        self._before = hanging
+        points = points._replace(hanging=hanging)
+        crumb = points.fragments[: hanging.opened.shape[0]] < 0
+        changed = (hanging.opened != self._opened).any(dim=1)
+        changed |= (crumb != self._crumb) & hanging.opened.any(dim=1)
+        if bool(changed.any()):
+            self._opened, self._crumb = hanging.opened, crumb
+            self._cut(changed)
+            self._open(changed)
+        if self._elements is None or self._elements.count == 0:
+            return Cracks(points, self._rest, None)
+        return Cracks(points, self._rest, _births(self._elements, self.carry, points))
+
+    def _cut(self, changed: Tensor) -> None:
+        """Cut the splats of points [N] anew."""
+        carry, links = self.carry, self.carry.links
+        whole, rest = carry.gaussians, self._rest
+        stale = changed[carry.owner].nonzero()[:, 0]
+        means, quats, scales = rest.means.clone(), rest.quats.clone(), rest.scales.clone()
+        for rows in stale.split(CHUNK):
+            shape = whole.means[rows], whole.quats[rows], whole.scales[rows]
+            cut, *now = cut_splats(
+                *shape, owner=carry.owner[rows], near=links.near, opened=self._opened,
+                rest=links.rest, slack=SLACK,
+            )  # fmt: skip
+            for value, before, after in zip((means, quats, scales), shape, now, strict=True):
+                value[rows] = before.index_copy(0, cut, after)
+        self._rest = rest.replace(means=means, quats=quats, scales=scales)
+
+    def _open(self, changed: Tensor) -> None:
+        """Find the face elements of the sites of points [N] anew."""
+        carry = self.carry
+        if self._sites is None:
+            assert carry.scene is not None  # __init__ checks it
+            self._sites = Sites.of(carry.scene, carry.matter)
+        stale = changed[self._sites.owner]
+        old = self._elements
+        parts = [] if old is None else [old.select(~stale[old.site])]
+        crumb = self._crumb[self._sites.owner]
+        for fit, which in ((PIECE, ~crumb), (CRUMB, crumb)):
+            for rows in (stale & which).nonzero()[:, 0].split(CHUNK):
+                parts.append(self._found(rows, fit))
+        self._elements = Elements.sorted(parts) if parts else None
+
+    def _found(self, rows: Tensor, fit: Fit) -> Elements:
+        """Face elements of some sites, cut where other faces begin."""
+        links = self.carry.links
+        assert self._sites is not None  # _open sees to it
+        found = find_elements(self._sites, rows, links.rest, links.near, self._opened, fit)
+        cut, means, quats, scales = cut_splats(
+            found.means, found.quats, found.scales, owner=found.owner, near=links.near,
+            opened=self._opened, rest=links.rest, slack=fit.slack,
+        )  # fmt: skip
+        return dataclasses.replace(
+            found,
+            means=found.means.index_copy(0, cut, means),
+            quats=found.quats.index_copy(0, cut, quats),
+            scales=found.scales.index_copy(0, cut, scales),
+        )
+
+
+def _births(elements: Elements, carry: Carry, points: Points) -> Births:
+    """Elements as splats, where their points are now."""
+    assert points.hanging is not None  # step puts it there
+    ratio = points.hanging.ratio.view(-1)[elements.pair]
+    least = BACK * OPEN
+    opacity = OPACITY * ((ratio - least) / (FULL - least)).clamp(0.0, 1.0)
+    cell, slot = elements.cell, elements.slot
+    center, gradient, rotation = carry.cells(cell, points)
+    arm = elements.means - carry.matter.rest[elements.owner]
+    means = center[slot] + (gradient[slot] * arm[:, None]).sum(dim=2)
+    turn = rotation[slot]
+    quats, scales = ops.carry_axes(elements.quats, elements.scales, turn, turn, rigid=0.0)
+    gaussians = Gaussians(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacity,
+        sh=geometry.rgb_to_sh0(elements.color)[:, None],
+        labels=torch.full_like(elements.owner, TRANSITION, dtype=torch.int32),
+        normals=(turn * elements.normals[:, None]).sum(dim=2),
+    )
+    return Births(gaussians, carry.gaussians.count + elements.key, elements.owner)

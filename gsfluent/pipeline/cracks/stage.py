@@ -1,0 +1,178 @@
+"""Repair of cracks: splats that give both sides of a crack a face.
+
+Two ways, see docs/cracks.md:
+
+* ``gap`` (the default) puts fine, flat splats with the colour of the matter on the faces that open
+  (:mod:`gsfluent.pipeline.cracks.faces`);
+* ``mvee`` adds transition splats shaped as the overlap of broken splats and their unbroken
+  neighbours, as the Fracture-GS notes describe it (:mod:`gsfluent.pipeline.cracks.mvee`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import Gaussians
+from gsfluent.errors import InputError
+from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
+from gsfluent.pipeline.cracks.mvee import CROSS_RADIUS, NEIGHBOUR_RADIUS, CrackGraph, transitions
+from gsfluent.pipeline.matter.carry import Carry, Motion, Points
+from gsfluent.pipeline.stage import Stage
+
+METHODS = ("gap", "mvee", "none")
+
+
+class Repaired(NamedTuple):
+    """Splats with transition splats at the end.
+
+    Attributes:
+        gaussians: The carried splats, then the transition splats.
+        groups: Sibling group of each splat, int32 [M + T]; -1 for splats without siblings.
+        added: Number T of transition splats.
+        ids: Number of each splat that it keeps as long as it lives, int64 [M + T]: the row of a
+            carried splat, M and more for transition splats.
+        anchor: Material point each splat follows, int64 [M + T].
+    """
+
+    gaussians: Gaussians
+    groups: Tensor
+    added: int
+    ids: Tensor
+    anchor: Tensor
+
+    @classmethod
+    def none(cls, carried: Gaussians, anchor: Tensor) -> Repaired:
+        """Carried splats to which nothing was added."""
+        rows = torch.arange(carried.count, device=carried.device)
+        return cls(carried, torch.full_like(rows, -1, dtype=torch.int32), 0, rows, anchor)
+
+
+class Repair(Stage):
+    """Adds splats along cracks.
+
+    Args:
+        method: ``gap``, ``mvee`` or ``none``.
+        radius: Size of the ellipsoids that are intersected, in standard deviations (``mvee``).
+        neighbour_radius: Largest distance of neighbours, in mean splat spacings (``mvee``).
+        seed: Not used; repair is deterministic.
+
+    Raises:
+        InputError: An unknown method.
+    """
+
+    name = "repair"
+
+    def __init__(
+        self,
+        method: str = "gap",
+        *,
+        radius: float = CROSS_RADIUS,
+        neighbour_radius: float = NEIGHBOUR_RADIUS,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(seed=seed)
+        if method not in METHODS:
+            raise InputError(
+                f"repair: unknown method {method!r}", hint=f"known: {', '.join(METHODS)}"
+            )
+        self.method = method
+        self.radius = radius
+        self.neighbour_radius = neighbour_radius
+        self._graph: CrackGraph | None = None
+        self._gaps: Gaps | None = None
+        self._resumed: dict[str, Any] | None = None
+
+    def step(self, carry: Carry, points: Points) -> Cracks | None:
+        """Go on to the next frame (method ``gap``): call once per frame, in their order.
+
+        What was open before decides with what is open now, so that nothing flickers.
+
+        Args:
+            carry: The binding of the splats; another one than last time starts a new run.
+            points: Where the material points are.
+
+        Returns:
+            The cracks; None with the other methods.
+
+        Raises:
+            InputError: The binding knows no scene.
+        """
+        if self.method != "gap":
+            return None
+        if self._gaps is None or self._gaps.carry is not carry:
+            self._gaps = Gaps(carry)
+        if self._resumed is not None:
+            self._gaps.restore(self._resumed)
+            self._resumed = None
+        return self._gaps.step(points)
+
+    def forward(
+        self,
+        carry: Carry,
+        motion: Motion,
+        carried: Gaussians | None = None,
+        *,
+        cracks: Cracks | None = None,
+    ) -> Repaired:
+        """Repair the splats of one moment.
+
+        Args:
+            carry: The binding of the splats.
+            motion: Their motion.
+            carried: The carried splats, when they are at hand (method ``gap``: the cut ones).
+            cracks: What :meth:`step` returned for this moment; without it the step is made here.
+
+        Returns:
+            All splats, sibling groups, and how many were added.
+
+        Raises:
+            InputError: As :meth:`step`.
+        """
+        if cracks is None and self.method == "gap":
+            cracks, carried = self.step(carry, motion.points), None
+            assert cracks is not None  # method gap
+            motion = carry.follow(cracks.points, cracks.rest)
+        if cracks is not None:
+            moved = carry.apply(motion, cracks.rest) if carried is None else carried
+            return _with_births(moved, motion, cracks.births)
+        moved = carry.apply(motion) if carried is None else carried
+        if self.method == "none":
+            return Repaired.none(moved, motion.anchor)
+        if self._graph is None or self._graph.carry is not carry:
+            self._graph = CrackGraph(carry, self.radius, self.neighbour_radius)
+        made = transitions(self._graph, motion, moved)
+        if made is None:
+            return Repaired.none(moved, motion.anchor)
+        added, parent, side = made
+        groups = torch.full((moved.count,), -1, dtype=torch.int32, device=moved.device)
+        groups[parent] = parent.to(torch.int32)
+        groups = torch.cat([groups, parent.to(torch.int32)])
+        # a pair of splats names its transition splat for good, in whatever order they are born
+        ids = torch.arange(moved.count, device=moved.device)
+        ids = torch.cat([ids, moved.count * (parent + 1) + side])
+        anchor = torch.cat([motion.anchor, motion.anchor[side]])
+        return Repaired(Gaussians.cat([moved, added]), groups, parent.numel(), ids, anchor)
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs besides the points: plain tensors."""
+        return {} if self._gaps is None else self._gaps.state()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state` at the next :meth:`step`; from nothing for an empty one."""
+        self._resumed = state
+
+
+def _with_births(moved: Gaussians, motion: Motion, births: Births | None) -> Repaired:
+    if births is None:
+        return Repaired.none(moved, motion.anchor)
+    rows = torch.arange(moved.count + births.ids.numel(), device=moved.device)
+    return Repaired(
+        Gaussians.cat([moved, births.gaussians]),
+        torch.full_like(rows, -1, dtype=torch.int32),
+        births.ids.numel(),
+        torch.cat([rows[: moved.count], births.ids]),
+        torch.cat([motion.anchor, births.anchor]),
+    )

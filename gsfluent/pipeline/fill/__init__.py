@@ -1,0 +1,1 @@
+"""Gaussians inside a solid; the Fill stage."""

@@ -1,0 +1,1 @@
+"""Lamps, shadow maps, shading, occlusion, baking."""

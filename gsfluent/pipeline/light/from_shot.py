@@ -1,0 +1,198 @@
+"""The light that a shot, a light file or the command line asks for."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gsfluent import materials
+from gsfluent.config.read import Place, given
+from gsfluent.config.settings_light import EnvironmentSettings, LightSettings, read_light
+from gsfluent.config.yaml_file import read_yaml
+from gsfluent.errors import InputError
+from gsfluent.pipeline.light import environment
+from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lamp, Lighting
+
+if TYPE_CHECKING:
+    from gsfluent.config import ObjectSettings, Shot
+    from gsfluent.results.frames import SavedFrame
+
+__all__ = ["changed", "gloss_of", "light_of", "lighting_from", "looks_of"]
+
+_SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
+
+
+def light_of(shot: Shot) -> Lighting:
+    """The shot's light; what it leaves out keeps the default.
+
+    Raises:
+        InputError: A number out of range, or an environment picture that cannot be read.
+    """
+    return lighting_from(shot.light)
+
+
+def lighting_from(settings: LightSettings) -> Lighting:
+    """As :func:`light_of`, from a ``light:`` section."""
+    lamps = [Lamp(**given(settings.key))]
+    lamps += [Lamp(**given(lamp)) for lamp in settings.lights]
+    shared = {name: value for name, value in given(settings).items() if name in _SHARED}
+    around = None if settings.environment is None else _environment(settings.environment)
+    return Lighting(
+        lamps=tuple(lamps),
+        environment=around,
+        **shared,
+    )
+
+
+def changed(
+    lighting: Lighting,
+    *,
+    light: str | None = None,
+    lamps: tuple[str, ...] = (),
+    surroundings: str | None = None,
+    intensity: float | None = None,
+    lamp_size: float | None = None,
+    spin: float | None = None,
+    **shared: float | None,
+) -> Lighting:
+    """The lighting with what the command line changes.
+
+    Args:
+        lighting: What the shot says.
+        light: ``x,y,z`` or ``key=x,y,z``: toward the key light; or a YAML file with a ``light:``
+            section, which replaces all.
+        lamps: More lamps: ``point=x,y,z``, ``sun=x,y,z``, each with ``;name=value`` for what else
+            a lamp has, such as ``point=0.3,0,0.5;intensity=2;color=1,0.8,0.6``.
+        surroundings: An equirectangular picture, ``sky``, or ``none``.
+        intensity: Of the key light.
+        lamp_size: Of the key light.
+        spin: Of the key light [degrees per second].
+        shared: ``ambient``, ``specular``, ``shininess``, ``occlusion``, ``delight``.
+
+    Raises:
+        InputError: What was given cannot be read.
+    """
+    direction = None
+    if light is not None:
+        text = light.removeprefix("key=")
+        if Path(text).suffix.lower() in (".yaml", ".yml"):
+            lighting = lighting_from(
+                read_light(read_yaml(Path(text)), Place("", Path(text).parent))
+            )
+        else:
+            direction = _numbers(text, "--light")
+    key = {"direction": direction, "intensity": intensity, "size": lamp_size, "spin": spin}
+    key = {name: value for name, value in key.items() if value is not None}
+    if key:
+        first = lighting.lamps[0] if lighting.lamps else Lamp()
+        if direction is not None:
+            key["position"] = None
+        lighting = replace(
+            lighting,
+            lamps=(replace(first, **key), *lighting.lamps[1:]),  # type: ignore[arg-type]
+        )
+    if lamps:
+        more = tuple(_lamp(text) for text in lamps)
+        lighting = replace(lighting, lamps=(*lighting.lamps, *more))
+    if surroundings is not None:
+        lighting = replace(lighting, environment=_surroundings(surroundings))
+    return replace(lighting, **{k: v for k, v in shared.items() if v is not None})  # type: ignore[arg-type]
+
+
+def looks_of(shot: Shot) -> dict[str, tuple[float, float]]:
+    """k_s and n_s of every object of a shot; a picture hangs on them, its simulation does not."""
+    return {name: _shine(settings) for name, settings in shot.objects.items()}
+
+
+def _shine(settings: ObjectSettings) -> tuple[float, float]:
+    made_of = materials.get(settings.material).override(**dict(settings.overrides))
+    return made_of.specular, made_of.shininess
+
+
+def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
+    """k_s and n_s of every splat, [N, 2], from the material of the body that it follows.
+
+    None for frames that do not say which body is what (written by an older gsfluent). Splats of
+    rigid things are steel.
+    """
+    names = frame.facts.get("bodies")
+    if not names:
+        return None
+    rows, looks = [], looks_of(shot)
+    for name, preset in names:
+        row = looks.get(name, (SPECULAR, SHININESS))
+        if name not in looks and preset in materials.names():
+            made_of = materials.get(preset)
+            row = (made_of.specular, made_of.shininess)
+        rows.append(row)
+    steel = materials.get("steel")
+    rows.append((steel.specular, steel.shininess))
+    table = torch.tensor(rows).to(frame.gaussians.means)
+    anchor = frame.anchor.long()
+    body = frame.body[anchor.clamp(min=0)].long()
+    return table[torch.where(anchor >= 0, body, len(rows) - 1)]
+
+
+def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:
+    if settings.coefficients is not None:
+        found = settings.coefficients
+    elif settings.image is not None:
+        found = environment.of_file(settings.image)
+    else:
+        assert settings.sky is not None and settings.ground is not None  # the reader's rule
+        found = environment.sky_and_ground(settings.sky, settings.ground)
+    if settings.turn:
+        found = environment.turned(found, settings.turn)
+    return environment.summed([(found, (settings.intensity,) * 3)])
+
+
+def _surroundings(text: str) -> environment.Coefficients | None:
+    if text == "none":
+        return None
+    if text == "sky":
+        return environment.sky_and_ground((0.45, 0.55, 0.75), (0.25, 0.22, 0.18))
+    if not Path(text).is_file():
+        raise InputError(f"--environment {text}: no such file", "give a picture, sky or none")
+    return environment.of_file(Path(text))
+
+
+def _lamp(text: str) -> Lamp:
+    """Read ``point=x,y,z;name=value...``."""
+    values: dict[str, Any] = {}
+    for part in text.split(";"):
+        name, _, value = part.strip().partition("=")
+        numbers = _numbers(value, f"--lamp {name}", count=None)
+        if name in ("point", "sun"):
+            values["position" if name == "point" else "direction"] = _three(numbers, part)
+        elif name == "color":
+            values[name] = _three(numbers, part)
+        elif name in {f.name for f in fields(Lamp)} and len(numbers) == 1:
+            values[name] = int(numbers[0]) if name == "samples" else numbers[0]
+        else:
+            raise InputError(
+                f"--lamp {text}: {part!r} is not understood",
+                "such as point=0.3,0,0.5;intensity=2;color=1,0.8,0.6 or sun=-1,1,1;size=10",
+            )
+    if ("position" in values) == ("direction" in values):
+        raise InputError(f"--lamp {text}: no place", "begin with point=x,y,z or sun=x,y,z")
+    return Lamp(**values)
+
+
+def _numbers(text: str, what: str, count: int | None = 3) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if not numbers or (count is not None and len(numbers) != count):
+        raise InputError(f"{what} {text!r}", "give numbers such as 1,-1,2")
+    return numbers
+
+
+def _three(numbers: tuple[float, ...], text: str) -> tuple[float, ...]:
+    if len(numbers) != 3:
+        raise InputError(f"--lamp: {text!r}", "give three numbers such as 0.3,0,0.5")
+    return numbers

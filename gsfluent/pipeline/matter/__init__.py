@@ -1,0 +1,1 @@
+"""Material points, their state, fields and fragments; the splats they carry."""

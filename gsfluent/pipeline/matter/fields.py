@@ -1,0 +1,134 @@
+"""Velocity fields of the pieces of broken bodies.
+
+Points that share a velocity field are welded wherever they share a node. So every piece of a broken
+body has its own field, and pieces feel each other by contact only, like bodies; powder moves with
+the piece it lies on. A block of the grid holds a few fields at most: where more meet, the smallest
+pieces share one.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsfluent.ops.solver_buffers import SITE_FIELDS
+from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments
+from gsfluent.pipeline.matter.points import Matter
+
+_HOPS = 8
+"""How many links powder may lie from the piece it moves with."""
+MOST = 1024
+"""Fields of a scene at most."""
+
+
+def breakable(matter: Matter) -> Tensor:
+    """Bodies that can break: those with brittle matter, bool [bodies]. Liquids run together."""
+    return torch.stack([matter.brittle[a:b].any() for a, b in matter.ranges])
+
+
+def cut_bodies(matter: Matter, cut: Tensor) -> Tensor:
+    """Bodies that a blade has touched, bool [bodies]; liquids run together again."""
+    mark = (cut != 0) & ~matter.of_law("fluid")
+    return torch.stack([mark[a:b].any() for a, b in matter.ranges])
+
+
+def units(matter: Matter, links: Tensor, pieces: Fragments, may_break: Tensor) -> Tensor:
+    """What each point hangs together with: int64 [N], the first row of a body or piece.
+
+    Args:
+        matter: The points.
+        links: Links at rest whose ends are neighbours still, int64 [L, 2].
+        pieces: The pieces now.
+        may_break: From :func:`breakable`.
+    """
+    body = matter.particles.body.long()
+    starts = torch.tensor([a for a, _ in matter.ranges], device=body.device)
+    whole = starts[body]
+    ids = pieces.ids.to(body.device)
+    per_body = torch.bincount(body[ids], minlength=starts.shape[0])
+    split = (may_break & (per_body > 1))[body]
+    if not bool(split.any()):
+        return whole
+    label = torch.where(split, pieces.labels.long(), whole)
+    return torch.where(label == DEBRIS, _with_neighbours(label, links.to(body.device)), label)
+
+
+def _with_neighbours(label: Tensor, links: Tensor) -> Tensor:
+    """Labels spread along links at rest to points that have none; powder far from any keeps -1.
+
+    The largest of the labels at hand is taken, so that the result does not depend on any order.
+    """
+    # Only links with an open end spread anything, and no end opens again.
+    links = links[(label[links] < 0).any(dim=1)]
+    a, b = links.unbind(dim=1)
+    for _ in range(_HOPS):
+        open_a, open_b = label[a] < 0, label[b] < 0
+        if not bool((open_a ^ open_b).any()):
+            break
+        spread = label.clone()
+        spread.scatter_reduce_(0, a[open_a], label[b[open_a]], "amax")
+        spread.scatter_reduce_(0, b[open_b], label[a[open_b]], "amax")
+        label = spread
+    return label
+
+
+def number_fields(
+    unit: Tensor,
+    position: Tensor,
+    mass: Tensor,
+    on_grid: Tensor,
+    dx: float,
+    limit: int,
+    most: int,
+) -> Tensor:
+    """Number the units as velocity fields, heaviest first, so that no block has too many.
+
+    Args:
+        unit: From :func:`units`, [N]; -1 is a unit like any other.
+        position: Positions [m], [N, 3].
+        mass: Masses [kg], [N].
+        on_grid: Points that matter for the room in blocks, bool [N].
+        dx: Grid spacing [m].
+        limit: Fields that may meet in a block.
+        most: Fields in all.
+
+    Returns:
+        Fields from 0, int32 [N].
+    """
+    ids, index = torch.unique(unit, return_inverse=True)
+    if ids.shape[0] == 1:
+        return torch.zeros_like(index, dtype=torch.int32)
+    weight = torch.zeros(ids.shape[0], dtype=torch.float64, device=mass.device)
+    weight.index_add_(0, index, mass.double())
+    rank = torch.empty_like(ids)
+    order = torch.argsort(weight, descending=True, stable=True)
+    rank[order] = torch.arange(ids.shape[0], device=ids.device)
+    crumbs = limit - 1
+    crowded = rank >= most - 1
+    block = torch.floor(position[on_grid] / (4.0 * dx) - 0.125).long()
+    block = block - block.amin(dim=0) + 1
+    key = (block[:, 0] << 20 | block[:, 1]) << 20 | block[:, 2]
+    # Pairs of block and rank as one number each: sorting rows costs ten times as much.
+    count = ids.shape[0]
+    blocks, home = torch.unique(key, return_inverse=True)
+    pair = torch.unique(home * count + rank[index[on_grid]])
+    step = torch.tensor([-1, 0, 1], device=key.device)
+    star = ((step[:, None, None] * 2**20 + step[:, None]) * 2**20 + step).flatten()
+    around = (blocks[pair // count][:, None] + star).flatten()
+    _, site = torch.unique(around, return_inverse=True)
+    reached = torch.unique(site * count + (pair % count).repeat_interleave(27))
+    _, place, counts = torch.unique_consecutive(
+        reached // count, return_inverse=True, return_counts=True
+    )
+    first = torch.cumsum(counts, 0) - counts
+    behind = torch.arange(reached.shape[0], device=key.device) - first[place] >= crumbs
+    is_crowded = torch.zeros_like(crowded)
+    is_crowded[reached[behind] % count] = True
+    crowded = crowded | is_crowded[rank]
+    # The crumbs share the number of the heaviest of them.
+    rank = torch.where(crowded, rank[crowded].min() if bool(crowded.any()) else rank, rank)
+    return torch.unique(rank[index], return_inverse=True)[1].to(torch.int32)
+
+
+LIMIT = SITE_FIELDS
+"""Fields that may meet in a block of the resident solver."""

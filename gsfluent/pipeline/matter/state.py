@@ -1,0 +1,181 @@
+"""The state of a simulation; saving it at a frame and taking it up again."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import Particles
+from gsfluent.errors import InputError
+from gsfluent.io.atomic import atomic_path
+from gsfluent.ops.solver_state import UNBROKEN
+from gsfluent.pipeline.matter.points import Matter
+
+VERSION = 7
+_MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
+_POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit")
+_WHOLE = ("impulse", "colliders", "work", "dissipated")
+
+
+def at_rows(values: Tensor, rows: Tensor | None) -> Tensor:
+    """The values of some points, int64 [M]; of all for None."""
+    return values if rows is None else values[rows]
+
+
+class State(NamedTuple):
+    """Everything that changes in a simulation. Tensors are never written in place.
+
+    Attributes:
+        particles: All points as of ``time``; positions rounded to their dtype.
+        position: Positions [m], float64 [N, 3]: what the next step starts from.
+        peak: Largest alpha each brittle point ever had, [N]; breaking cannot be undone.
+            :data:`gsfluent.ops.solver_state.UNBROKEN` for points of other laws.
+        time: Simulated time [s].
+        step: Grid steps so far.
+        landed: Which bodies have ended their first flight.
+        impulse: Sum of collider impulses on the bodies [N s], float64 [3].
+        colliders: Rows of the rigid colliders as of ``time``, float64 [M, 32].
+        work: Most energy that colliders can have given to the bodies [J], float64 [].
+        stray: Crumbs that left the grid for good, bool [N] (see
+            :mod:`gsfluent.pipeline.simulate.strays`).
+        field: Velocity field of each point, int32 [N]: its body, or its piece of a broken one.
+        cut: Sides of blades each point lies on, int32 [N] (:func:`gsfluent.ops.blade_sides`).
+        group: First row of the group that moves without the grid and holds the point, int32 [N];
+            -1 for points on the grid and for bodies in their first flight.
+        asleep: Whether that group rests (else it flies), bool [N].
+        calm: Frames in a row during which the point hardly moved, int16 [N].
+        dissipated: Kinetic energy of vibration and of creep that went when groups left the grid
+            [J], float64 [].
+        unit: What each point hung together with when that was last looked at, int64 [N]: the first
+            row of its body or piece, -1 for powder.
+        kicked: How many of the scene's kicks have been given.
+    """
+
+    particles: Particles
+    position: Tensor
+    peak: Tensor
+    time: float
+    step: int
+    landed: tuple[bool, ...]
+    impulse: Tensor
+    colliders: Tensor
+    work: Tensor
+    stray: Tensor
+    field: Tensor
+    cut: Tensor
+    group: Tensor
+    asleep: Tensor
+    calm: Tensor
+    dissipated: Tensor
+    unit: Tensor
+    kicked: int = 0
+
+    @staticmethod
+    def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...]) -> State:
+        """The state at time 0."""
+        p = matter.particles
+        none = torch.zeros(p.count, dtype=torch.bool, device=p.device)
+        zero = torch.zeros((), dtype=torch.float64, device=p.device)
+        return State(
+            particles=p,
+            position=p.position.to(torch.float64),
+            peak=torch.where(matter.brittle, p.alpha, UNBROKEN),
+            time=0.0,
+            step=0,
+            landed=landed,
+            impulse=torch.zeros(3, dtype=torch.float64, device=p.device),
+            colliders=colliders,
+            work=zero,
+            stray=none,
+            field=p.body,
+            cut=torch.zeros_like(p.body),
+            group=torch.full_like(p.body, -1),
+            asleep=none,
+            calm=torch.zeros(p.count, dtype=torch.int16, device=p.device),
+            dissipated=zero,
+            unit=torch.tensor([a for a, _ in matter.ranges], device=p.device)[p.body.long()],
+        )
+
+    def adopting(self, before: State) -> State:
+        """Follow positions that somebody changed in ``particles`` since ``before``."""
+        now, then = self.particles.position, before.particles.position
+        if now is then or self.position is not before.position:
+            return self
+        changed = (now != then).any(dim=1, keepdim=True)
+        return self._replace(position=torch.where(changed, now.to(self.position), self.position))
+
+
+def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, Any]) -> None:
+    """Write a state atomically: tensors, numbers and strings only.
+
+    Args:
+        path: File to write.
+        state: State at a frame.
+        matter: The points, of which a fingerprint is stored.
+        extra: Counters and records, of plain types.
+    """
+    moving = {name: getattr(state.particles, name) for name in _MOVING}
+    values: dict[str, Any] = {
+        "version": VERSION,
+        "fingerprint": _fingerprint(matter),
+        "particles": {name: v if v is None else v.cpu() for name, v in moving.items()},
+        "tensors": {name: getattr(state, name).cpu() for name in _POINTS + _WHOLE},
+        "time": state.time,
+        "step": state.step,
+        "landed": list(state.landed),
+        "kicked": state.kicked,
+        "extra": extra,
+    }
+    with atomic_path(path) as temporary:
+        torch.save(values, temporary)
+
+
+def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]:
+    """Read what :func:`save_state` wrote.
+
+    Raises:
+        InputError: No such file, a damaged one, or one of another scene.
+    """
+    try:
+        values = torch.load(path, map_location=matter.particles.device, weights_only=True)
+    except FileNotFoundError:
+        raise InputError(f"resume: no file {path}", hint="start without resume") from None
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise InputError(
+            f"resume: {path} cannot be read ({error})", hint="start without resume"
+        ) from error
+    if not isinstance(values, dict) or values.get("version") != VERSION:
+        raise InputError(f"resume: {path} is no state of this version", hint="start without resume")
+    mine = _fingerprint(matter)
+    theirs = values["fingerprint"]
+    if len(theirs) != len(mine) or not all(
+        math.isclose(a, b, rel_tol=1e-9) for a, b in zip(theirs, mine, strict=True)
+    ):
+        raise InputError(
+            f"resume: {path} belongs to another scene, quality or seed",
+            hint="resume with the settings it was made with, or start without resume",
+        )
+    tensors = values["tensors"]
+    rounded = tensors["position"].to(matter.particles.dtype)
+    state = State(
+        particles=matter.particles.replace(position=rounded, **values["particles"]),
+        time=float(values["time"]),
+        step=int(values["step"]),
+        landed=tuple(bool(v) for v in values["landed"]),
+        kicked=int(values["kicked"]),
+        **tensors,
+    )
+    return state, values["extra"]
+
+
+def _fingerprint(matter: Matter) -> list[float]:
+    """Numbers that differ between scenes, qualities and seeds."""
+    p = matter.particles
+    parts = [p.position, p.velocity, p.alpha, p.mass, p.volume, matter.params]
+    sums = [float(v.cpu().double().sum()) for v in parts]
+    return [float(p.count), matter.dx, *sums]

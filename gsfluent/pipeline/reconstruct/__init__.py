@@ -1,0 +1,1 @@
+"""Photographs -> Gaussians; the object apart from its background."""

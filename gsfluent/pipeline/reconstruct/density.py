@@ -1,0 +1,415 @@
+"""How many Gaussians, and where: adaptive density control, or MCMC with a budget.
+
+Both look at the model every hundred steps. Adaptive density control (Kerbl et al. 2023) clones and
+splits what the photographs pull at and prunes what is transparent; with ``absgrad`` the pull is the
+sum of absolute per-pixel gradients (Ye et al. 2024, AbsGS). MCMC (Kheradmand et al. 2024) moves
+transparent Gaussians onto opaque ones, grows by 5 % towards its budget and shakes the centres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.errors import RunError
+from gsfluent.geometry import normalize_quaternions, quaternion_to_matrix
+from gsfluent.pipeline.capture.hull import Hull
+from gsfluent.pipeline.capture.views import TrainView
+from gsfluent.pipeline.reconstruct.model import SplatModel
+from gsfluent.pipeline.reconstruct.recipe import Recipe
+
+_SPLIT_FACTOR = 1.6  # a split Gaussian's parts are this much smaller (Kerbl et al. 2023)
+_SPLIT_ABOVE = 0.01  # of the extent: larger is split, smaller cloned
+_RESET_OPACITY = 0.01
+_GROWTH = 1.05  # of the count, each time (MCMC)
+_DEAD = 0.005  # opacity below which MCMC relocates
+_NOISE = 80.0  # strength of the noise: 5e5 times a step of 1.6e-4, in units of the extent
+_NOISE_END = 0.01  # of it, at the end of the run
+_NOISE_EVERY = 5  # steps; five times the variance, a fifth of the work
+_UNTIL = 0.85  # of the run: the end of relocation and growth (MCMC)
+_SHARPNESS = 100.0  # of the switch that spares opaque Gaussians from noise
+_MOST_COPIES = 50  # one Gaussian is split among at most so many
+_MCMC_OPACITY = 0.01  # weight of the mean opacity in the loss
+_MCMC_SCALE = 0.01  # weight of the mean scale, in units of the extent
+
+
+def draws(seed: int, purpose: int, step: int) -> torch.Generator:
+    """A CPU generator for one purpose at one step; a resumed run draws what the whole run drew."""
+    return torch.Generator().manual_seed((seed * 1_000_003 + step) * 8 + purpose)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where Gaussians may be.
+
+    Attributes:
+        hull: Visual hull of the object; None for a whole scene.
+        eyes: Camera positions [V, 3].
+    """
+
+    hull: Hull | None
+    eyes: Tensor
+
+    @torch.no_grad()
+    def misplaced(self, model: SplatModel) -> Tensor:
+        """Gaussians that are huge, not finite, outside the hull or right before a lens, [N]."""
+        means, largest = model.parameters["means"].detach(), model.scales().amax(1)
+        wrong = ~torch.isfinite(means).all(1)
+        if self.hull is not None:
+            wrong |= largest >= 0.3 * model.extent
+            wrong |= ~self.hull.contains(means, slack=4)
+        else:
+            # Matter right before a lens explains one photograph and spoils all others.
+            for eye in self.eyes:
+                wrong |= (means - eye).square().sum(1) < (0.3 * model.extent) ** 2
+            wrong |= largest >= model.extent
+        return wrong
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the image error asks of the next change of the count.
+
+    Attributes:
+        grow: Gaussians that may be multiplied, bool [N]; None for all.
+        drop: Gaussians that the images do not need, bool [N]; None for none.
+        stop: Add none at all.
+    """
+
+    grow: Tensor | None = None
+    drop: Tensor | None = None
+    stop: bool = False
+
+
+class Density(Protocol):
+    """What the training loop asks of a density control."""
+
+    absgrad: bool
+
+    def probe(self, model: SplatModel) -> Tensor | None:
+        """Zeros [N, 2] that shall receive the screen-space gradient, or None."""
+
+    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
+        """Take note of one view after its backward pass."""
+
+    def penalty(self, model: SplatModel) -> Tensor | None:
+        """A term of the loss."""
+
+    def after_step(self, model: SplatModel, done: int) -> None:
+        """Called after every optimiser step."""
+
+    def control(self, model: SplatModel, done: int, wanted: Wanted) -> None:
+        """Change the Gaussians; called every ``densify_every`` steps."""
+
+    def state(self) -> dict[str, Tensor]:
+        """What must be saved."""
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over what :meth:`state` returned."""
+
+
+class Adc:
+    """Adaptive density control.
+
+    Args:
+        recipe: Schedule.
+        iterations: Length of the run.
+        limit: Cap on the count.
+        threshold: Mean screen-space gradient above which a Gaussian is cloned or split.
+        place: Where Gaussians may be.
+        absgrad: Whether the probe receives absolute gradients.
+        seed: Seed of the places of split parts.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        iterations: int,
+        limit: int,
+        threshold: float,
+        place: Place,
+        *,
+        absgrad: bool,
+        seed: int,
+    ) -> None:
+        self.recipe, self.iterations, self.limit = recipe, iterations, limit
+        self.threshold, self.place, self.absgrad, self.seed = threshold, place, absgrad, seed
+        self.gradient = self.visits = torch.empty(0)
+
+    def probe(self, model: SplatModel) -> Tensor | None:
+        """Zeros that receive the gradient, while the count may grow."""
+        if model.steps >= self.recipe.densify_until * self.iterations:
+            return None
+        return torch.zeros(model.count, 2, device=model.device, requires_grad=True)
+
+    @torch.no_grad()
+    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
+        """Add one view's screen-space gradient, in units of half the image width."""
+        if probe is None or probe.grad is None:
+            return
+        if len(self.gradient) != len(probe):
+            self.gradient = torch.zeros(len(probe), device=probe.device)
+            self.visits = torch.zeros_like(self.gradient)
+        self.gradient += probe.grad.norm(dim=1) * (0.5 * view.full_width)  # 0 where not seen
+        self.visits += rendered.radii > 0
+
+    def penalty(self, model: SplatModel) -> Tensor | None:
+        """Pull on opacities, as the recipe has it, while the count may grow."""
+        recipe = self.recipe
+        if recipe.opacity_pull == 0 or model.steps >= recipe.densify_until * self.iterations:
+            return None
+        return recipe.opacity_pull * model.opacities().mean()
+
+    def after_step(self, model: SplatModel, done: int) -> None:
+        """Reset opacities when it is time."""
+        recipe = self.recipe
+        growing = done < recipe.densify_until * self.iterations
+        if recipe.reset_every and done % recipe.reset_every == 0 and growing:
+            reset_opacities(model)
+
+    @torch.no_grad()
+    def control(self, model: SplatModel, done: int, wanted: Wanted) -> None:
+        """Clone and split, then prune what is transparent or misplaced.
+
+        Raises:
+            RunError: Nothing is left.
+        """
+        recipe = self.recipe
+        if recipe.densify_from <= done <= recipe.densify_until * self.iterations:
+            if not wanted.stop and len(self.gradient) == model.count:
+                mean = self.gradient / self.visits.clamp_min(1.0)
+                if wanted.grow is not None:
+                    mean = mean * wanted.grow
+                densify(model, mean, self.threshold, self.limit, draws(self.seed, 1, done))
+        keep = ~self.place.misplaced(model)
+        keep &= model.opacities() > recipe.prune_opacity
+        if wanted.drop is not None:
+            keep[: len(wanted.drop)] &= ~wanted.drop
+        if not bool(keep.any()):
+            raise RunError(
+                f"reconstruct: no Gaussian survived step {done}",
+                hint="check that masks, poses and photographs belong together",
+            )
+        model.keep(keep)
+        self.gradient = self.visits = torch.empty(0)
+
+    def state(self) -> dict[str, Tensor]:
+        """The sums since the last control."""
+        return {"gradient": self.gradient, "visits": self.visits}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over what :meth:`state` returned."""
+        device = self.place.eyes.device
+        self.gradient, self.visits = state["gradient"].to(device), state["visits"].to(device)
+
+
+@torch.no_grad()
+def reset_opacities(model: SplatModel) -> None:
+    """Cut opacities to 0.01, so that only what the photographs need comes back."""
+    ceiling = math.log(_RESET_OPACITY / (1.0 - _RESET_OPACITY))
+    model.parameters["opacities"].detach().clamp_(max=ceiling)
+    model.first["opacities"].zero_()
+    model.second["opacities"].zero_()
+
+
+@torch.no_grad()
+def densify(
+    model: SplatModel, score: Tensor, threshold: float, limit: int, generator: torch.Generator
+) -> int:
+    """Clone small and split large Gaussians whose score is above the threshold, best first.
+
+    Args:
+        model: What is changed.
+        score: Pull of the photographs on each Gaussian, [N].
+        threshold: Least score.
+        limit: Cap on the count.
+        generator: Draws where the parts of a split lie (CPU).
+
+    Returns:
+        How many were added.
+    """
+    room = min(limit - model.count, int((score > threshold).sum()))
+    if room <= 0:
+        return 0
+    chosen = score.topk(room).indices.sort().values
+    scales = model.scales()[chosen]
+    large = scales.amax(1) > _SPLIT_ABOVE * model.extent
+    draw = torch.randn(room, 3, generator=generator).to(scales)
+    quats = normalize_quaternions(model.parameters["quats"].detach()[chosen])
+    shift = (quaternion_to_matrix(quats) @ (draw * scales)[..., None])[..., 0] * large[:, None]
+    smaller = math.log(_SPLIT_FACTOR) * large[:, None]
+    new = model.rows(chosen)
+    new["means"] += shift
+    new["scales"] -= smaller
+    model.parameters["scales"].detach()[chosen] -= smaller
+    model.parameters["means"].detach()[chosen] -= shift
+    model.append(new)
+    return room
+
+
+class Mcmc:
+    """Relocation, growth to a budget, and noise on the centres.
+
+    Args:
+        recipe: Schedule; relocation and growth go on until 85 % of the run, though.
+        iterations: Length of the run.
+        limit: The budget.
+        place: Where Gaussians may be; what is elsewhere counts as dead.
+        seed: Seed of draws and noise.
+    """
+
+    def __init__(
+        self, recipe: Recipe, iterations: int, limit: int, place: Place, *, seed: int
+    ) -> None:
+        self.recipe, self.iterations, self.limit = recipe, iterations, limit
+        self.place, self.seed = place, seed
+        self.absgrad = False
+        self.generator: torch.Generator | None = None
+
+    def probe(self, model: SplatModel) -> Tensor | None:
+        """None: no gradient is looked at."""
+        return None
+
+    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
+        """Nothing to note."""
+
+    def penalty(self, model: SplatModel) -> Tensor | None:
+        """Pull on opacities and scales, so that Gaussians that are not needed die."""
+        size = model.scales().mean() / model.extent
+        return _MCMC_OPACITY * model.opacities().mean() + _MCMC_SCALE * size
+
+    @torch.no_grad()
+    def after_step(self, model: SplatModel, done: int) -> None:
+        """Shake the centres along each Gaussian, the transparent ones most."""
+        if done % _NOISE_EVERY != 0:
+            return
+        if self.generator is None:
+            self.generator = torch.Generator(device=model.device)
+        generator = self.generator
+        generator.manual_seed((self.seed * 1_000_003 + done) * 8 + 2)
+        means = model.parameters["means"].detach()
+        draw = torch.randn(means.shape, generator=generator, device=means.device)
+        # sigmoid(-k (o - 0.005)): 1/2 at the opacity that is dead, none from 0.05 on
+        weight = torch.sigmoid(-_SHARPNESS * (model.opacities() - _DEAD))
+        # covariances over the extent: the original lets the scene have the size 1
+        rate = _NOISE * _NOISE_END ** (done / self.iterations) / model.extent
+        rate *= math.sqrt(_NOISE_EVERY)
+        turn = quaternion_to_matrix(normalize_quaternions(model.parameters["quats"].detach()))
+        variance = model.scales().square()
+        local = (turn.transpose(1, 2) @ draw[..., None])[..., 0] * variance
+        means += (turn @ local[..., None])[..., 0] * (weight * rate)[:, None]
+
+    @torch.no_grad()
+    def control(self, model: SplatModel, done: int, wanted: Wanted) -> None:
+        """Relocate the dead, and grow.
+
+        Raises:
+            RunError: All are dead.
+        """
+        if not self.recipe.densify_from <= done <= _UNTIL * self.iterations:
+            if wanted.drop is not None:
+                model.keep(~wanted.drop)
+            return
+        dead = self.place.misplaced(model) | (model.opacities() <= _DEAD)
+        if wanted.drop is not None:
+            dead |= wanted.drop
+        if bool(dead.all()):
+            raise RunError(
+                f"reconstruct: no Gaussian survived step {done}",
+                hint="check that masks, poses and photographs belong together",
+            )
+        generator = draws(self.seed, 3, done)
+        if wanted.stop:
+            model.keep(~dead)
+            return
+        weight = model.opacities() * ~dead
+        if wanted.grow is not None and bool((weight * wanted.grow).any()):
+            weight = weight * wanted.grow
+        relocate(model, dead, weight, generator)
+        added = min(self.limit, int(_GROWTH * model.count)) - model.count
+        if added > 0:
+            grow(model, added, model.opacities() if wanted.grow is None else weight, generator)
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing beside the model."""
+        return {}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Nothing beside the model."""
+
+
+def shared_out(opacity: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity and scales of ``copies`` Gaussians that together look like one.
+
+    Kheradmand et al. 2024, equation 9: ``o' = 1 - (1 - o)^(1/n)`` keeps the transmittance through
+    the centre, and ``s' = s o / sum_{i=1..n} sum_{k<i} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1)``
+    keeps the integral across it.
+
+    Args:
+        opacity: Opacity of the one, [M].
+        scales: Its standard deviations, [M, 3].
+        copies: How many replace it, [M] integers, at least 1 (at most 50 are counted).
+
+    Returns:
+        Opacity [M] and scales [M, 3] of each.
+    """
+    opacity = opacity.double()
+    copies = copies.clamp(1, _MOST_COPIES)
+    each = -torch.expm1(torch.log1p(-opacity) / copies)
+    total = torch.zeros_like(each)
+    # sum_i sum_k C(i-1, k) (-1)^k x^(k+1) / sqrt(k+1); the inner alternating sums lose digits for
+    # large i only where x is near 1, and x = each falls with the number of copies.
+    for i in range(1, int(copies.max()) + 1):
+        k = torch.arange(i, dtype=torch.float64, device=opacity.device)
+        choose = torch.exp(
+            torch.lgamma(k.new_tensor(i)) - torch.lgamma(k + 1) - torch.lgamma(i - k)
+        )
+        term = choose * (-1.0) ** k / (k + 1).sqrt()
+        inner = (term * each[:, None] ** (k + 1)).sum(1)
+        total += torch.where(copies >= i, inner, torch.zeros_like(inner))
+    factor = opacity / total.clamp_min(1e-12)
+    return each.to(scales), scales * factor.to(scales)[:, None]
+
+
+@torch.no_grad()
+def relocate(model: SplatModel, dead: Tensor, weight: Tensor, generator: torch.Generator) -> None:
+    """Move dead Gaussians onto living ones, drawn by ``weight`` [N]; the picture stays."""
+    gone = dead.nonzero()[:, 0]
+    if len(gone) == 0:
+        return
+    source = _draw(weight, len(gone), generator)
+    _share(model, source)
+    for name, value in model.rows(source).items():
+        model.parameters[name].detach()[gone] = value
+    model.forget(gone)
+
+
+@torch.no_grad()
+def grow(model: SplatModel, count: int, weight: Tensor, generator: torch.Generator) -> None:
+    """Add ``count`` Gaussians by sharing out those drawn by ``weight`` [N]; the picture stays."""
+    source = _draw(weight, count, generator)
+    _share(model, source)
+    model.append(model.rows(source))
+
+
+def _draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Rows drawn with replacement in proportion to ``weight``, by inversion (no 2^24 limit)."""
+    edges = weight.double().cumsum(0)
+    at = torch.rand(count, generator=generator, dtype=torch.float64).to(edges.device) * edges[-1]
+    return torch.searchsorted(edges, at, right=True).clamp_max(len(weight) - 1)
+
+
+def _share(model: SplatModel, source: Tensor) -> None:
+    """Share each Gaussian named in ``source`` among itself and its copies."""
+    named, counts = source.unique(return_counts=True)
+    opacity, scales = shared_out(model.opacities()[named], model.scales()[named], counts + 1)
+    raw = torch.logit(opacity.clamp(_DEAD, 1.0 - 1e-6))
+    model.parameters["opacities"].detach()[named] = raw
+    width = model.parameters["scales"].shape[1]
+    model.parameters["scales"].detach()[named] = scales[:, :width].log()
+    model.forget(named)

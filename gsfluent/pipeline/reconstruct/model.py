@@ -1,0 +1,289 @@
+"""The trained splats: raw parameters with their optimiser."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.data import Gaussians
+from gsfluent.geometry import normalize_quaternions
+from gsfluent.pipeline.capture.views import TrainView
+from gsfluent.pipeline.reconstruct.recipe import LearningRates
+
+_BETA1 = 0.9
+_EPSILON = 1e-15
+
+Rows = dict[str, Tensor]
+
+
+class SplatModel:
+    """Trainable Gaussians with per-parameter Adam moments that survive densification.
+
+    Args:
+        start: Gaussians to start from.
+        extent: Size of what is reconstructed [world units]: radius of the object, or distance of
+            the cameras from it.
+        isotropic: Keep one standard deviation per Gaussian.
+        rates: Learning rates.
+    """
+
+    def __init__(
+        self, start: Gaussians, extent: float, *, isotropic: bool, rates: LearningRates
+    ) -> None:
+        self.extent = extent
+        self.isotropic = isotropic
+        self.rates = rates
+        scales = start.scales.log()
+        if isotropic:
+            scales = scales.mean(1, keepdim=True)
+        self.parameters: Rows = {
+            "means": start.means,
+            "scales": scales,
+            "quats": normalize_quaternions(start.quats),
+            "opacities": torch.logit(start.opacities.clamp(0.005, 0.99)),
+            "sh0": start.sh[:, :1],
+            "sh_rest": start.sh[:, 1:],
+        }
+        self.parameters = {
+            name: value.detach().clone().contiguous().requires_grad_()
+            for name, value in self.parameters.items()
+        }
+        self.first = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
+        self.second = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
+        self.steps = 0
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return int(self.parameters["means"].shape[0])
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.parameters["means"].device
+
+    # -- rendering -------------------------------------------------------------------------------
+    def scales(self) -> Tensor:
+        """Standard deviations [N, 3]."""
+        return self.parameters["scales"].exp().expand(-1, 3)
+
+    def opacities(self) -> Tensor:
+        """Peak opacities [N]."""
+        return torch.sigmoid(self.parameters["opacities"])
+
+    def render(
+        self,
+        view: TrainView,
+        degree: int,
+        offset: Tensor | None = None,
+        *,
+        absgrad: bool = False,
+        features: Tensor | None = None,
+        contribution: bool = False,
+    ) -> ops.raster.Rendered:
+        """Render one view before black.
+
+        Args:
+            view: The camera.
+            degree: SH bands that are used.
+            offset: Zeros [N, 2] that receive the gradient of the projected centres.
+            absgrad: They receive the sum of its absolute values over the pixels.
+            features: Values [N, C] to blend instead of the colours.
+            contribution: Also sum each Gaussian's blend weights.
+        """
+        p = self.parameters
+        sh = None
+        if features is None:
+            sh = p["sh0"]
+            if degree > 0:
+                sh = torch.cat([sh, p["sh_rest"][:, : (degree + 1) ** 2 - 1]], dim=1)
+        width, height = view.size
+        return ops.rasterize(
+            p["means"],
+            self.opacities(),
+            view.viewmat,
+            view.K,
+            width,
+            height,
+            quats=p["quats"],
+            scales=self.scales().contiguous(),
+            sh=sh,
+            colors=features,
+            means2d_offset=None if absgrad else offset,
+            means2d_absgrad=offset if absgrad else None,
+            contribution=contribution,
+            depth=False,
+            near=0.01 * self.extent,
+        )
+
+    # -- optimisation ----------------------------------------------------------------------------
+    @torch.no_grad()
+    def step(self, progress: float) -> None:
+        """One Adam step, then clear the gradients; ``progress`` in [0, 1] sets the decay."""
+        self.steps += 1
+        names = [name for name, value in self.parameters.items() if value.numel() > 0]
+        ops.adam_step(
+            [self.parameters[name].detach() for name in names],
+            [self.parameters[name].grad for name in names],
+            [self.first[name] for name in names],
+            [self.second[name] for name in names],
+            lr=[
+                self.rates.at(name, progress) * (self.extent if name == "means" else 1.0)
+                for name in names
+            ],
+            step=self.steps,
+            betas=(_BETA1, self.rates.beta2),
+            eps=_EPSILON,
+        )
+        for parameter in self.parameters.values():
+            parameter.grad = None
+
+    # -- rows ------------------------------------------------------------------------------------
+    @torch.no_grad()
+    def rows(self, index: Tensor) -> Rows:
+        """Copies of rows ``index`` [M] of every parameter."""
+        return {name: p.detach()[index] for name, p in self.parameters.items()}
+
+    @torch.no_grad()
+    def append(self, rows: Rows) -> None:
+        """Add rows; their moments start at zero."""
+        zeros = {name: torch.zeros_like(value) for name, value in rows.items()}
+        self.parameters = {
+            name: torch.cat([p.detach(), rows[name]]).requires_grad_()
+            for name, p in self.parameters.items()
+        }
+        self.first = {name: torch.cat([m, zeros[name]]) for name, m in self.first.items()}
+        self.second = {name: torch.cat([m, zeros[name]]) for name, m in self.second.items()}
+
+    @torch.no_grad()
+    def put(self, index: Tensor, rows: Rows) -> None:
+        """Overwrite rows ``index`` [M] of every parameter and clear their moments."""
+        for name, value in rows.items():
+            self.parameters[name].detach()[index] = value
+        self.forget(index)
+
+    @torch.no_grad()
+    def forget(self, index: Tensor) -> None:
+        """Clear the moments of rows ``index`` [M]."""
+        for moments in (self.first, self.second):
+            for value in moments.values():
+                value[index] = 0.0
+
+    @torch.no_grad()
+    def keep(self, mask: Tensor) -> None:
+        """Drop the Gaussians outside ``mask``, bool [N]."""
+        if bool(mask.all()):
+            return
+        index = mask.nonzero()[:, 0]
+        self.parameters = {name: p[index].requires_grad_() for name, p in self._detached().items()}
+        self.first = {name: m[index] for name, m in self.first.items()}
+        self.second = {name: m[index] for name, m in self.second.items()}
+
+    def _detached(self) -> Rows:
+        return {name: value.detach() for name, value in self.parameters.items()}
+
+    # -- in and out ------------------------------------------------------------------------------
+    @torch.no_grad()
+    def gaussians(self, degree: int) -> Gaussians:
+        """The splats with activated values; rows with non-finite values are left out."""
+        p = self._detached()
+        sh = torch.cat([p["sh0"], p["sh_rest"][:, : (degree + 1) ** 2 - 1]], dim=1)
+        quats = normalize_quaternions(p["quats"])
+        result = Gaussians(p["means"], quats, self.scales().contiguous(), self.opacities(), sh)
+        finite = torch.ones(self.count, dtype=torch.bool, device=result.device)
+        for value in (result.means, result.quats, result.scales, result.sh.flatten(1)):
+            finite &= torch.isfinite(value).all(1)
+        return result.select(finite & torch.isfinite(result.opacities))
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything needed to go on, tensors only."""
+        groups = {"parameter": self.parameters, "first": self.first, "second": self.second}
+        flat = {
+            f"{group}.{name}": value.detach()
+            for group, values in groups.items()
+            for name, value in values.items()
+        }
+        return flat | {"steps": torch.tensor(self.steps)}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over what :meth:`state` returned.
+
+        Raises:
+            KeyError: Something is missing.
+        """
+        device = self.device
+        for name in self.parameters:
+            self.first[name] = state[f"first.{name}"].to(device)
+            self.second[name] = state[f"second.{name}"].to(device)
+            self.parameters[name] = state[f"parameter.{name}"].to(device).requires_grad_()
+        self.steps = int(state["steps"])
+
+
+_RATE = 1e-3
+
+
+_RATE_END = 0.02  # of the rate, at the end of the run
+
+
+_PULL = 1e-2  # weight of the squared distance from the identity
+
+
+_BETAS = (0.9, 0.99)
+
+
+class Exposure:
+    """``c' = (I + D_v) [c, 1]`` for photograph v, with D regularised and of mean zero.
+
+    The mean over the photographs stays the identity, or the splats would drift in colour and
+    photographs that were not trained on (which get no change) would be judged against the drift.
+
+    Args:
+        count: Photographs.
+        device: Where to keep them.
+    """
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        self.delta = torch.zeros(count, 3, 4, device=device)
+        self.first, self.second = torch.zeros_like(self.delta), torch.zeros_like(self.delta)
+        self._row: Tensor | None = None
+
+    def apply(self, image: Tensor, alpha: Tensor, index: int) -> Tensor:
+        """Change an image [H, W, 3] before black with opacity [H, W] as photograph ``index``."""
+        self._row = self.delta[index].clone().requires_grad_()
+        return image + image @ self._row[:, :3].T + alpha[..., None] * self._row[:, 3]
+
+    def penalty(self) -> Tensor:
+        """Distance from the identity of the photograph applied last."""
+        assert self._row is not None
+        return _PULL * self._row.square().sum()
+
+    @torch.no_grad()
+    def step(self, index: int, visits: int, progress: float) -> None:
+        """One Adam step of the photograph applied last; ``visits`` counts from 1."""
+        if self._row is None or self._row.grad is None:
+            return
+        gradient = self._row.grad
+        first, second = self.first[index], self.second[index]
+        first.lerp_(gradient, 1.0 - _BETAS[0])
+        second.mul_(_BETAS[1]).addcmul_(gradient, gradient, value=1.0 - _BETAS[1])
+        scale = (second / (1.0 - _BETAS[1] ** visits)).sqrt_().add_(1e-8)
+        rate = _RATE * _RATE_END**progress / (1.0 - _BETAS[0] ** visits)
+        self.delta[index].addcdiv_(first, scale, value=-rate)
+        self.delta -= self.delta.mean(0)
+        self._row = None
+
+    def state(self) -> dict[str, Tensor]:
+        """What must be saved."""
+        return {
+            "exposure.delta": self.delta,
+            "exposure.first": self.first,
+            "exposure.second": self.second,
+        }
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take over what :meth:`state` returned."""
+        device = self.delta.device
+        self.delta = state["exposure.delta"].to(device)
+        self.first = state["exposure.first"].to(device)
+        self.second = state["exposure.second"].to(device)

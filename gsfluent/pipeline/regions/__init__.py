@@ -1,0 +1,1 @@
+"""Labels of photographs -> parts of a solid."""

@@ -1,0 +1,1 @@
+"""Gaussians -> picture -> video; the Render stage."""

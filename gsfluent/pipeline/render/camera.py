@@ -1,0 +1,236 @@
+"""Cameras of a video: an orbit that follows the action, a photograph's pose, or a path."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsfluent.data import Camera, Capture, Frame
+from gsfluent.errors import InputError
+from gsfluent.pipeline.render.path import dolly, holds_poses, through, turntable
+
+PATHS = ("orbit", "turntable", "dolly")
+"""Camera paths that go by a name."""
+
+_FIELD_OF_VIEW = (
+    32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
+)
+_ELEVATION = 20.0
+_START = -60.0
+_SWEEP = (
+    70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
+)
+_SMOOTH_FRAMES = 5.0
+_ROOM = 1.3  # free space around the matter, as a factor on its radius
+
+
+@dataclass(frozen=True)
+class Action:
+    """Where the matter is over time, as far as a camera operator cares.
+
+    Attributes:
+        center: Robust centre of the matter per frame [m], shape [F, 3].
+        radius: Distance from the centre that holds nine tenths of it, per frame [m], shape [F].
+    """
+
+    center: Tensor
+    radius: Tensor
+
+    @classmethod
+    def of(cls, positions: Sequence[Tensor]) -> Action:
+        """Measure the action from positions [N, 3] of each frame."""
+        # the middle of what lies between the outer tenths: a median follows the largest heap only
+        tenths = torch.tensor([0.1, 0.9], dtype=torch.float64)
+        center = torch.stack(
+            [torch.quantile(_thin(p.double().cpu()), tenths, dim=0).mean(dim=0) for p in positions]
+        )
+        radius = [
+            torch.quantile(_thin((p.double().cpu() - c).norm(dim=-1)), 0.9)
+            for p, c in zip(positions, center, strict=True)
+        ]
+        return cls(center, torch.stack(radius))
+
+
+def _thin(values: Tensor) -> Tensor:
+    """Every n-th row: a quantile needs thousands (and torch.quantile refuses 2^24)."""
+    return values[:: max(1, values.shape[0] // 20_000)]
+
+
+def look_at(
+    target: Tensor, distance: float, azimuth: float, elevation: float, size: tuple[int, int]
+) -> Camera:
+    """A camera on a sphere around ``target`` [3] that looks at it; angles in degrees, +z up."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    outward = torch.tensor(
+        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)], dtype=torch.float64
+    )
+    eye = target.double() + distance * outward
+    return Camera.look_at(eye, target, width=size[0], height=size[1], fov=_vertical_fov(size))
+
+
+def _vertical_fov(size: tuple[int, int]) -> float:
+    """Vertical angle [degrees] at which the shorter side spans the field of view."""
+    width, height = size
+    half = math.tan(math.radians(_FIELD_OF_VIEW) / 2.0)
+    return math.degrees(2.0 * math.atan(half * height / min(width, height)))
+
+
+def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> list[Camera]:
+    """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
+
+    The distance shows nine tenths of the matter, but the whole object at least and 3.6 times the
+    object at most: a spray of crumbs must not shrink the subject to a dot.
+
+    Args:
+        action: Where the matter is.
+        size: (width, height) [px].
+        sweep: Degrees of azimuth from the first frame to the last.
+    """
+    count = action.center.shape[0]
+    shown = _shown(action)
+    distance = shown / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
+    centers = _follow(action, shown)
+    steps = [i / max(1, count - 1) for i in range(count)]
+    return [
+        look_at(centers[i], float(distance[i]), _START + sweep * step, _ELEVATION, size)
+        for i, step in enumerate(steps)
+    ]
+
+
+def _shown(action: Action) -> Tensor:
+    """Radius that is in the picture, per frame [m], shape [F]: it grows ahead of the burst."""
+    first = float(action.radius[0])
+    wanted = action.radius.clamp(min=1.35 * first, max=3.6 * first)
+    ahead = round(2.0 * _SMOOTH_FRAMES)
+    padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
+    widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values
+    return _ROOM * _smooth(widest[:, None], 1.5 * _SMOOTH_FRAMES)[:, 0]
+
+
+def _follow(action: Action, shown: Tensor) -> Tensor:
+    """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
+    smooth = _smooth(action.center, _SMOOTH_FRAMES)
+    lag = smooth - action.center
+    room = torch.maximum(shown - 1.5 * action.radius, 0.05 * shown)
+    length = lag.norm(dim=1).clamp(min=1e-12)
+    held = action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
+    return _smooth(held, 0.5)
+
+
+def _smooth(track: Tensor, sigma: float) -> Tensor:
+    """Gaussian smoothing over ``sigma`` frames with the ends held, shape [F, 3]."""
+    frames = torch.arange(track.shape[0], dtype=track.dtype)
+    weight = torch.exp(-0.5 * ((frames[:, None] - frames[None, :]) / sigma) ** 2)
+    return (weight @ track) / weight.sum(dim=1, keepdim=True)
+
+
+def framed(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The whole view of ``camera``, centred in a picture of another size and aspect."""
+    width, height = size
+    factor = min(width / camera.width, height / camera.height)
+    intrinsics = camera.K.clone()
+    intrinsics[:2] *= factor
+    intrinsics[0, 2] += (width - factor * camera.width) / 2.0
+    intrinsics[1, 2] += (height - factor * camera.height) / 2.0
+    return camera.replace(K=intrinsics, width=width, height=height)
+
+
+def cameras_for(
+    choice: str | int,
+    action: Action,
+    size: tuple[int, int],
+    *,
+    capture: Capture | None = None,
+    frame: Frame | None = None,
+) -> list[Camera]:
+    """One camera per frame for ``output.camera``.
+
+    Args:
+        choice: One of :data:`PATHS`, the index of a photograph, a JSON file (see
+            :func:`read_path`), or a ``transforms.json`` or COLMAP folder whose poses are followed.
+        action: Where the matter is; its length is the number of frames.
+        size: (width, height) [px].
+        capture: The photographs, needed for an index.
+        frame: World to scene, needed for an index and for poses.
+
+    Raises:
+        InputError: No such photograph, or an unreadable file.
+    """
+    count = action.center.shape[0]
+    if str(choice) in PATHS:
+        return _named_path(str(choice), action, size)
+    try:
+        index = int(str(choice))
+    except ValueError:
+        path = Path(str(choice))
+        if holds_poses(path):
+            return [framed(camera, size) for camera in through(path, count, frame)]
+        return read_path(path, count, size)
+    if capture is None or frame is None:
+        raise InputError(
+            f"output.camera: {index}",
+            "a photograph's index needs a `capture:`; use `orbit` or a file",
+        )
+    if not -len(capture.cameras) <= index < len(capture.cameras):
+        raise InputError(
+            f"output.camera: {index}",
+            f"the capture has photographs 0 to {len(capture.cameras) - 1}",
+        )
+    photograph = capture.view(index).camera  # undistorted
+    return [framed(photograph.transformed(frame), size)] * count
+
+
+def _named_path(name: str, action: Action, size: tuple[int, int]) -> list[Camera]:
+    if name == "orbit":
+        return orbit(action, size)
+    still = orbit(action, size, sweep=0.0)
+    centers = _follow(action, _shown(action))
+    return turntable(still, centers) if name == "turntable" else dolly(still, centers)
+
+
+def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
+    """Cameras from JSON: ``{"fov": 32, "frames": [{"eye": [x,y,z], "target": [x,y,z]}, ...]}``.
+
+    Scene frame, metres; ``fov`` is vertical, in degrees. One entry is a still camera; otherwise
+    eyes and targets are interpolated over the video.
+
+    Raises:
+        InputError: The file is missing, is not such JSON, or an eye sits on its target.
+    """
+    hint = 'give {"fov": 32, "frames": [{"eye": [x, y, z], "target": [x, y, z]}, ...]} in metres'
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        keys = torch.tensor(
+            [[*f["eye"], *f["target"]] for f in data["frames"]], dtype=torch.float64
+        )
+        field = float(data.get("fov", _FIELD_OF_VIEW))
+    except OSError as error:
+        raise InputError(
+            f"output.camera: {path}: {error.strerror}",
+            f"give {', '.join(PATHS)}, an index, or a file",
+        ) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"output.camera: {path}: {error!r}", hint) from error
+    if (
+        keys.ndim != 2
+        or keys.shape[1] != 6
+        or not keys.isfinite().all()
+        or not 1.0 <= field <= 150.0
+    ):
+        raise InputError(f"output.camera: {path}: fov {field}, frames {tuple(keys.shape)}", hint)
+    if bool(((keys[:, :3] - keys[:, 3:]).norm(dim=-1) == 0).any()):
+        raise InputError(f"output.camera: {path}: an eye equals its target", hint)
+    time = torch.linspace(0, keys.shape[0] - 1, count, dtype=torch.float64)
+    low = time.floor().long().clamp(max=max(0, keys.shape[0] - 2))
+    high = (low + 1).clamp(max=keys.shape[0] - 1)
+    part = (time - low)[:, None]
+    path_keys = keys[low] * (1.0 - part) + keys[high] * part
+    return [
+        Camera.look_at(k[:3], k[3:], width=size[0], height=size[1], fov=field) for k in path_keys
+    ]

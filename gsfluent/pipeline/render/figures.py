@@ -1,0 +1,214 @@
+"""Figures of a film: holes and flicker of what is drawn, beside the splats without any care.
+
+"Before" is what one gets by moving each splat rigidly with the material point that was nearest at
+the start, as the peers do: no binding to pieces, no repair. Holes in the film are counted in its
+own pictures, every frame. What needs pictures of its own (before, flicker, and the view of one of
+three cameras around the matter) is measured in two frames of every twelve in which something is
+broken, or it would cost as much as the film; without light, from the direction-independent colours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsfluent import geometry, ops
+from gsfluent.data import Camera, Gaussians
+from gsfluent.draw import draw
+from gsfluent.ops.raster import Rendered
+from gsfluent.pipeline.render.camera import Action, look_at
+from gsfluent.pipeline.render.flicker import Flow, flicker
+from gsfluent.pipeline.render.holes import Holes, MatterView, small
+from gsfluent.results.frames import SavedFrame
+
+AROUND = ((30.0, 15.0), (150.0, 15.0), (270.0, 15.0))
+"""Azimuth and elevation of the cameras around the matter [degrees]."""
+EVERY = 12
+_SIZE = (200, 150)
+_FIELD = 32.0  # degrees, of look_at
+_NEIGHBOURS = 8
+_FIGURES = ("hole_fraction", "see_through", "hole_fraction_around", "see_through_around", "flicker")
+
+
+class RawCarry:
+    """Splats that ride rigidly on the material point that was nearest to them at the start.
+
+    Args:
+        first: The first frame of the simulation.
+    """
+
+    def __init__(self, first: SavedFrame) -> None:
+        from scipy.spatial import cKDTree
+
+        # splats of solids have a number of their own; bullets, liquids, rigid things and repairs
+        # are drawn as they are
+        solids = (first.ids[: first.carried] >= 0).nonzero()[:, 0]
+        chosen = _plain(first.gaussians.select(solids))
+        quats = geometry.normalize_quaternions(chosen.quats)
+        self.gaussians = chosen.replace(quats=quats)
+        self._rest = first.positions
+        body = first.body.long()
+        splat_body = body[first.anchor[solids].long().clamp(min=0)]
+        nearest = torch.zeros(len(solids), dtype=torch.int64)
+        near = torch.zeros(len(body), _NEIGHBOURS, dtype=torch.int64)
+        points, means = first.positions.cpu().numpy(), self.gaussians.means.cpu().numpy()
+        for number in body.unique().tolist():
+            rows = (body == number).nonzero()[:, 0].cpu()
+            tree = cKDTree(points[rows.numpy()])
+            k = min(_NEIGHBOURS, len(rows))
+            found = tree.query(points[rows.numpy()], k=k)[1].reshape(-1, k)
+            found = found[:, np.arange(_NEIGHBOURS).clip(max=k - 1)]
+            near[rows] = rows[torch.from_numpy(found)]
+            mine = (splat_body == number).nonzero()[:, 0].cpu()
+            if len(mine):
+                nearest[mine] = rows[torch.from_numpy(tree.query(means[mine.numpy()])[1])]
+        device = first.positions.device
+        self._nearest, self._near = nearest.to(device), near.to(device)
+
+    def at(self, frame: SavedFrame) -> Gaussians:
+        """The splats at another moment; colours of degree 0."""
+        arm = self._rest[self._near] - self._rest[:, None]
+        now = frame.positions[self._near] - frame.positions[:, None]
+        # rotation of the best fit to how the neighbours have moved (Mueller et al. 2005)
+        turn, _ = ops.polar_clamped((now.mT @ arm / arm.square().mean()).contiguous(), 0.3, 2.0)
+        rest, point = self.gaussians, self._nearest
+        offset = rest.means - self._rest[point]
+        spin = geometry.matrix_to_quaternion(turn)[point]
+        raw = rest.replace(
+            means=frame.positions[point] + (turn[point] @ offset[..., None])[..., 0],
+            quats=geometry.quaternion_multiply(spin, rest.quats),
+        )
+        others = frame.ids < 0
+        if not bool(others.any()):
+            return raw
+        return Gaussians.cat([raw, _plain(frame.gaussians.select(others))])
+
+
+def _plain(gaussians: Gaussians) -> Gaussians:
+    return gaussians.replace(sh=gaussians.sh[:, :1].contiguous(), normals=None)
+
+
+class _Last(NamedTuple):
+    """What flicker needs of the frame before."""
+
+    number: int
+    matter: MatterView
+    camera: Camera
+    positions: Tensor
+    images: list[Tensor]
+
+
+class FilmFigures:
+    """Collects the figures of a film, frame by frame.
+
+    Args:
+        first: The first frame.
+        around: Cameras around the matter.
+        every: Of so many broken frames two are measured in full.
+    """
+
+    def __init__(
+        self, first: SavedFrame, around: Sequence[Camera] = (), *, every: int = EVERY
+    ) -> None:
+        self._raw, self._around, self._every = RawCarry(first), list(around), every
+        volume = first.volumes
+        self._spacing = float(volume.clamp(min=0.0).pow(1 / 3).median()) if len(volume) else 0.0
+        self._last: _Last | None = None
+        self._broken = 0
+        self._values: dict[str, list[float | int | None]] = {
+            name + end: [] for name in _FIGURES for end in ("_before", "")
+        }
+        self._values["transition_gaussians"] = []
+
+    @torch.no_grad()
+    def add(self, frame: SavedFrame, camera: Camera, alpha: Tensor, depth: Tensor) -> None:
+        """Measure a frame.
+
+        Args:
+            frame: The frame.
+            camera: The film's camera.
+            alpha: Opacity of the splats in the film's picture, [H, W].
+            depth: Their expected depth there [m], [H, W].
+        """
+        index = len(self._values["flicker"])
+        view = small(camera)
+        matter = MatterView.of(frame.positions, frame.volumes, view)
+        film = Holes.of(alpha, depth, matter)
+        for values in self._values.values():
+            values.append(None)
+        added = frame.gaussians.count - frame.carried
+        self._set("transition_gaussians", added)
+        if not added and not bool((frame.damage >= 1.0).any()):
+            self._enter("", [film, film])
+            return
+        turn, self._broken = self._broken % self._every, self._broken + 1
+        # the second and third broken frame, and so on: in the first nothing has parted yet
+        if turn not in (1 % self._every, 2 % self._every):
+            self._enter("", [None, film])
+            return
+        shown = [
+            (self._raw.at(frame), None),
+            (_plain(frame.gaussians), frame.groups if added else None),
+        ]
+        drawn = [_drawn(splats, view, groups) for splats, groups in shown]
+        self._enter("", [_holes(drawn[0], matter), film])
+        images = [picture.image for picture in drawn]
+        self._enter_flicker(_Last(index, matter, view, frame.positions, images))
+        if self._around:
+            view = self._around[index % len(self._around)]
+            matter = MatterView.of(frame.positions, frame.volumes, view)
+            drawn = [_drawn(splats, view, groups) for splats, groups in shown]
+            self._enter("_around", [_holes(picture, matter) for picture in drawn])
+
+    def _set(self, name: str, value: float | int | None) -> None:
+        self._values[name][-1] = round(value, 6) if isinstance(value, float) else value
+
+    def _enter(self, where: str, found: list[Holes | None]) -> None:
+        for end, holes in zip(("_before", ""), found, strict=True):
+            if holes is not None:
+                self._set(f"hole_fraction{where}{end}", holes.fraction)
+                self._set(f"see_through{where}{end}", holes.through)
+
+    def _enter_flicker(self, now: _Last) -> None:
+        last, self._last = self._last, now
+        if last is None or last.number != now.number - 1:
+            return
+        if last.positions.shape != now.positions.shape:
+            return
+        moved, views = (last.positions, now.positions), (last.camera, now.camera)
+        flow = Flow.of(last.matter, now.matter, moved, views, self._spacing)
+        for k, end in enumerate(("_before", "")):
+            self._set(f"flicker{end}", flicker(last.images[k], now.images[k], flow))
+
+    def report(self) -> dict[str, list[float | int | None]]:
+        """Lists with one entry a frame, None where not measured.
+
+        ``_around``: in a camera around the matter, another one each time.
+        """
+        return self._values
+
+
+def _drawn(gaussians: Gaussians, camera: Camera, groups: Tensor | None) -> Rendered:
+    white = gaussians.means.new_ones(3)
+    return draw(gaussians, camera, groups=groups, near=0.01, depth=True, background=white)
+
+
+def _holes(drawn: Rendered, matter: MatterView) -> Holes:
+    assert drawn.depth is not None  # asked for; narrows the type
+    return Holes.of(drawn.alpha, drawn.depth, matter)
+
+
+def cameras_around(positions: list[Tensor]) -> list[Camera]:
+    """Cameras that stand still and see nine tenths of the matter of all frames."""
+    action = Action.of(positions)
+    first = float(action.radius[0])
+    center = action.center[len(positions) // 2 :].mean(0)
+    away = (action.center - center).norm(dim=1) + action.radius
+    reach = min(float(away.amax()), 2.5 * first)
+    distance = reach / math.sin(math.radians(_FIELD / 2))
+    return [look_at(center, distance, azimuth, height, _SIZE) for azimuth, height in AROUND]

@@ -1,0 +1,1 @@
+"""Scene -> frames: stage, run, step, health; the engines; what is off the grid."""

@@ -1,0 +1,119 @@
+"""What an engine is: the time step seen from outside, its settings, points and counters."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+CFL = 0.5
+
+
+class Unhealthy(Exception):
+    """The state cannot be advanced.
+
+    Args:
+        reason: What is wrong.
+        wrong: Points at fault, bool [N], if they are known.
+        kind: ``numbers``, ``speed``, ``volume``, ``energy``, ``crowded``, ``far`` or ``step``.
+        time: When, if that is later than the state that was to be advanced [s].
+    """
+
+    def __init__(
+        self,
+        reason: str,
+        wrong: Tensor | None = None,
+        kind: str = "numbers",
+        time: float = -math.inf,
+    ) -> None:
+        super().__init__(reason)
+        self.reason, self.wrong, self.kind, self.time = reason, wrong, kind, time
+
+
+@dataclasses.dataclass
+class Counters:
+    """What the solver did and what it left out."""
+
+    steps: int = 0
+    particle_steps: int = 0
+    flight_seconds: float = 0.0
+    flight_body_steps: int = 0
+    composed_steps: int = 0
+    """Steps of the composed operators."""
+    law_kernel_steps: int = 0
+    """Steps of kernels made for the laws of the scene alone."""
+    undamaged_steps: int = 0
+    """Steps in which no point had a damage variable, because none can break."""
+    block_steps: int = 0
+    """Blocks that were stored, summed over steps."""
+    box_steps: int = 0
+    """Blocks of the bounding box of the points on the grid, likewise."""
+    contact_block_steps: int = 0
+    """Stored blocks that took part in the contact pass, likewise."""
+    contact_steps: int = 0
+    contact_nodes: int = 0
+    shared_sites: int = 0
+    """Most blocks in which several fields met, in any step looked at."""
+    block_builds: int = 0
+    blocks_max: int = 0
+    dt_min: float = float("inf")
+    dt_max: float = 0.0
+    plastic: int = 0
+    guarded: int = 0
+    inverted: int = 0
+    point_seconds: float = 0.0
+    """Simulated seconds of all points together."""
+    sleeping_point_seconds: float = 0.0
+    flying_point_seconds: float = 0.0
+    """Pieces and bodies that went back to flight; first flights are counted apart."""
+    naps: int = 0
+    wakes: int = 0
+    piece_flights: int = 0
+    fields_max: int = 1
+
+
+class Settings(NamedTuple):
+    """What an engine needs to know beside the points."""
+
+    cfl: float = CFL
+    irreversible: bool = True
+    return_map: dict[str, Any] | None = None
+    law_kernels: bool = True
+    contact_near: bool = True
+    dt_scale: float = 1.0
+
+
+class Points(NamedTuple):
+    """Moving part of the points of an engine; rows are those it was built with."""
+
+    position: Tensor
+    velocity: Tensor
+    affine: Tensor
+    strain: Tensor
+    alpha: Tensor
+    peak: Tensor
+    deformation: Tensor | None
+
+
+class Engine(Protocol):
+    """Points on the grid from a moment on.
+
+    Attributes:
+        time: Time reached [s].
+        colliders: Rows of the colliders as of ``time``, float64 [M, 32].
+        impulse: Impulse of all colliders on the points since the start [N s], float64 [3].
+        work: Most energy that colliders can have given since the start [J], float64 [].
+    """
+
+    time: float
+    colliders: Tensor
+    impulse: Tensor
+    work: Tensor
+
+    def advance(self, until: float, steps: int) -> int:
+        """Advance to a time, but by no more than so many steps; return how many were taken."""
+
+    def read(self) -> Points:
+        """The points now."""

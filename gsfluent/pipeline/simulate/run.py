@@ -1,0 +1,344 @@
+"""One run of a simulation: its state, frames, records and verdict."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import time as clock
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.ops.blade import cut_apart
+from gsfluent.pipeline.matter.carry import STRETCH
+from gsfluent.pipeline.matter.fields import breakable, cut_bodies, units
+from gsfluent.pipeline.matter.fragments import STRETCH_LIMIT, Fragments, find_fragments, rest_links
+from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
+from gsfluent.pipeline.matter.state import State, load_state, save_state
+from gsfluent.pipeline.simulate.engine import Counters, Unhealthy
+from gsfluent.pipeline.simulate.health import CHECK_EVERY, Figures, Ledger, Watch, figures_of
+from gsfluent.pipeline.simulate.kick import Kicks
+from gsfluent.pipeline.simulate.step import Stepper
+from gsfluent.scene.scene import Scene
+
+MOMENTUM_BAR = 1e-4
+"""Relative error of the momentum balance that a run should stay below."""
+REGROUP = 128
+"""Grid steps between two looks for new pieces within a frame."""
+LOOKS = 240.0
+"""Looks for new pieces, and for what may leave the grid, in a simulated second at most."""
+Hook = Callable[[State], State]
+
+
+class Run:
+    """Advances a scene from frame to frame.
+
+    Args:
+        scene: The scene.
+        matter: Its material points.
+        fps: Frames per second.
+        options: Arguments of :class:`Stepper`.
+        max_rollbacks: Roll-backs in a row before giving up.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        matter: Matter,
+        fps: float,
+        options: dict[str, Any],
+        max_rollbacks: int,
+    ) -> None:
+        self.fps, self._options = fps, options
+        self.stepper = Stepper(scene, matter, **options)
+        self._set(scene, matter)
+        self.state = self.stepper.initial()
+        self.figures = figures_of(matter, self.state, scene.gravity)
+        self.start = self.figures
+        self.watch = Watch(
+            matter, scene.gravity, self.start,
+            max_rollbacks=max_rollbacks, names=[body.name for body in scene.bodies],
+        )  # fmt: skip
+        held = [body.start if body.held else 0.0 for body in scene.bodies]
+        self.ledger = Ledger(matter, scene.gravity, self.start, held)
+        self.per_frame: list[dict[str, Any]] = []
+        self.seconds = 0.0
+        self.failure = ""
+        device = matter.particles.device
+        self.links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
+        self._pieces: tuple[State, Fragments] | None = None
+
+    def _set(self, scene: Scene, matter: Matter) -> None:
+        self.scene, self.matter = scene, matter
+        self.kicks = Kicks(scene, matter)
+        self._breakable = breakable(matter)
+        # What flows runs apart and together again: it has no pieces.
+        self._flowing = matter.of_law("fluid", "drucker_prager")
+
+    def fit(self, scene: Scene, matter: Matter) -> None:
+        """Go on with another scene and its matter; see :mod:`gsfluent.pipeline.simulate.grow`."""
+        before = self.stepper
+        self.stepper = Stepper(scene, matter, **self._options, flights=before.flights)
+        self.stepper.resume(before.counters)
+        self.stepper.field_limit, self.stepper.dt_scale = before.field_limit, before.dt_scale
+        self._set(scene, matter)
+        self._pieces = None
+        self.watch.matter, self.watch.names = matter, [body.name for body in scene.bodies]
+
+    def twin(self) -> Run:
+        """A run of its own that goes on from here."""
+        other = copy.copy(self)
+        other.per_frame = list(self.per_frame)
+        other.watch, other.ledger = self.watch.twin(), copy.copy(self.ledger)
+        other.ledger.held = list(self.ledger.held)
+        other.stepper = Stepper(
+            self.scene, self.matter, **self._options, flights=self.stepper.flights
+        )
+        other.stepper.resume(dataclasses.replace(self.stepper.counters))
+        other.stepper.field_limit = self.stepper.field_limit
+        other.stepper.dt_scale = self.stepper.dt_scale
+        return other
+
+    @property
+    def next_frame(self) -> int:
+        """Number of the first frame that has not been made."""
+        return len(self.per_frame)
+
+    def advance_to(self, frame: int, hook: Hook | None, time: float | None = None) -> bool:
+        """Advance to the time of a frame; return False when the run had to be given up.
+
+        Args:
+            frame: Its number.
+            hook: See :class:`gsfluent.pipeline.Simulate`.
+            time: Its time [s]; ``frame / fps`` when absent.
+        """
+        begun = clock.perf_counter()
+        state, stepper, watch = self.state, self.stepper, self.watch
+        until = frame / self.fps if time is None else time
+        # A frame is a clean start: what follows does not depend on what was cached before it, so a
+        # resumed run repeats the same numbers, and no roll-back goes behind a frame handed out.
+        stepper.reset()
+        # With many frames a second not each of them is worth a look.
+        ticks = [math.floor(LOOKS * t + 1e-6) for t in (state.time, until)]
+        if ticks[0] != ticks[1] or until <= state.time:
+            state = self._regroup(state)
+        state = bounded(state)
+        watch.keep(state, only=True)
+        checked = grouped = state.step
+        broken = self._broken(state)
+        while state.time < until:
+            trouble: Unhealthy | None = None
+            try:
+                left = CHECK_EVERY - (state.step - checked)
+                state = self.kicks.given(state)
+                stop = min(until, self.kicks.next_change(state))
+                now = stepper.advance(state, stop, 1 if hook is not None else left)
+                state = now if hook is None else hook(now).adopting(now)
+                if state.time >= until or state.step - checked >= CHECK_EVERY:
+                    state = bounded(state)
+                    trouble = watch.check(state, stepper)
+                    checked = state.step
+            except Unhealthy as error:
+                trouble = error
+            if trouble is not None:
+                back = watch.roll_back(trouble, state, stepper)
+                if back is None:
+                    self.failure = watch.verdict(frame)
+                    self.seconds += clock.perf_counter() - begun
+                    return False
+                state = back
+                checked = grouped = state.step
+            elif state.step - grouped >= REGROUP and checked == state.step:
+                grouped = state.step
+                if broken != (broken := self._broken(state)):
+                    state = self._regroup(state, at_frame=False)
+        self.state = state
+        self.seconds += clock.perf_counter() - begun
+        return True
+
+    def _broken(self, state: State) -> int:
+        return int((state.peak >= 0).sum())
+
+    def _fragments(self, state: State) -> Fragments:
+        """The pieces of a state; those of the last one asked for are kept."""
+        if self._pieces is None or self._pieces[0] is not state:
+            found = find_fragments(
+                self.links,
+                self.matter.rest,
+                state.particles.position,
+                (state.peak >= 0) | self._flowing,
+                self.matter.particles.mass,
+                cut=state.cut if self.scene.blades else None,
+            )
+            self._pieces = state, found
+        return self._pieces[1]
+
+    def _regroup(self, state: State, *, at_frame: bool = True) -> State:
+        """Let the stepper know what hangs together."""
+        may_break = self._breakable
+        if self.scene.blades:
+            may_break = may_break | cut_bodies(self.matter, state.cut)
+        unit = units(self.matter, self._holding(state), self._fragments(state), may_break)
+        return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
+
+    def _holding(self, state: State) -> Tensor:
+        """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
+        links = self.links
+        a, b = links.unbind(dim=1)
+        rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
+        near = now <= STRETCH_LIMIT * rest
+        if self.scene.blades:
+            near = near & ~cut_apart(state.cut[a], state.cut[b])
+        return links[near]
+
+    def record(
+        self, index: int, time: float | None = None
+    ) -> tuple[Figures, Fragments, dict[str, Any]]:
+        """Measure the present state and add it to the per-frame records (``time``: of it)."""
+        state = self.state
+        now = self.watch.figures(state)
+        self.figures = now
+        pieces = self._fragments(state)
+        stats = {
+            "time": index / self.fps if time is None else time,
+            "kinetic": now.kinetic,
+            "elastic": now.elastic,
+            "dissipated": self.start.total - now.total,
+            "gravity": now.gravity,
+            "momentum": list(now.momentum),
+            "angular_momentum": list(now.angular_momentum),
+            "damaged_fraction": now.damaged_fraction,
+            "fragments": pieces.count,
+            "largest_fragment": pieces.largest,
+            "fragments_over_3_percent": int((pieces.mass_fractions > 0.03).sum()),
+            "alpha_max": now.alpha_max,
+            "non_finite": now.non_finite,
+            "momentum_error": self.ledger.error(state, now),
+        }
+        self.per_frame.append(stats)
+        return now, pieces, stats
+
+    def save(self, path: str | Path, repair: dict[str, Any]) -> None:
+        """Write the state of the last frame, and that of the repair of cracks."""
+        counters = dataclasses.asdict(self.stepper.counters)
+        extra = {
+            "counters": counters,
+            "watch": self.watch.state(),
+            "ledger": {"worst": self.ledger.worst, "scale": self.ledger.scale},
+            "dt_scale": self.stepper.dt_scale,
+            "field_limit": self.stepper.field_limit,
+            "per_frame": self.per_frame,
+            "seconds": self.seconds,
+            "fps": self.fps,
+            "repair": repair,
+        }
+        save_state(path, self.state, self.matter, extra)
+
+    def resume(self, path: str | Path) -> dict[str, Any]:
+        """Take up a saved run; returns the state of the repair of cracks.
+
+        Raises:
+            InputError: The file is missing, damaged, or belongs to other settings.
+        """
+        from gsfluent.errors import InputError
+
+        state, extra = load_state(path, self.matter)
+        if extra["fps"] != self.fps:
+            raise InputError(
+                f"resume: {path} was made at {extra['fps']} frames per second, not {self.fps}",
+                hint="use the same fps, or start without resume",
+            )
+        self.state = state
+        self.stepper.resume(Counters(**extra["counters"]))
+        self.stepper.field_limit = int(extra["field_limit"])
+        self.stepper.dt_scale = float(extra["dt_scale"])
+        self.watch.restore(extra["watch"])
+        self.ledger.worst = float(extra["ledger"]["worst"])
+        self.ledger.scale = float(extra["ledger"]["scale"])
+        self.per_frame = list(extra["per_frame"])
+        self.seconds = float(extra["seconds"])
+        return dict(extra.get("repair", {}))
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures of run.json's section ``simulation``, with verdict and reason."""
+        c, matter = self.stepper.counters, self.matter
+        verdict = "failed" if self.failure else "healed" if self.watch.rollbacks else "clean"
+        reason = self.failure or "; ".join(self.watch.reasons)
+        keys = self.per_frame[0] if self.per_frame else {}
+        per_frame = {key: [frame[key] for frame in self.per_frame] for key in keys}
+        return {
+            "verdict": verdict,
+            "reason": reason,
+            "frames": len(self.per_frame),
+            "substeps": c.steps,
+            "composed_steps": c.composed_steps,
+            "dt_min": c.dt_min if c.steps else 0.0,
+            "dt_max": c.dt_max,
+            "dx": matter.dx,
+            "particles": matter.particles.count,
+            "particles_per_cell": POINTS_PER_CELL,
+            "active_blocks_max": c.blocks_max,
+            "active_blocks_mean": c.block_steps / max(c.steps, 1),
+            "grid_points_mean": c.particle_steps / max(c.steps, 1),
+            "seconds": self.seconds,
+            "particle_steps_per_second": c.particle_steps / self.seconds if self.seconds else 0.0,
+            "rollbacks": self.watch.rollbacks,
+            "momentum_error": self.ledger.worst,
+            "momentum_bar": MOMENTUM_BAR,
+            "guarded_points": c.guarded,
+            "inverted_points": c.inverted,
+            "contact_nodes": c.contact_nodes,
+            "shared_sites_max": c.shared_sites,
+            "fields_max": c.fields_max,
+            "pieces_flown": c.piece_flights,
+            "naps": c.naps,
+            "wakes": c.wakes,
+            "frozen_motion": float(self.state.dissipated),
+            "skipped": {
+                "free_flight_seconds": c.flight_seconds,
+                "free_flight_body_steps": c.flight_body_steps,
+                "piece_flight_fraction": c.flying_point_seconds / max(c.point_seconds, 1e-300),
+                "sleeping_fraction": c.sleeping_point_seconds / max(c.point_seconds, 1e-300),
+                "contact_steps": c.steps - c.contact_steps,
+                "contact_steps_done": c.contact_steps,
+                "contact_block_fraction": 1.0 - c.contact_block_steps / max(c.block_steps, 1),
+                "empty_block_fraction": 1.0 - c.block_steps / max(c.box_steps, 1),
+                "law_kernel_steps": c.law_kernel_steps,
+                "damage_steps": c.undamaged_steps,
+                "stray_points": int(self.state.stray.sum()),
+                "block_searches": max(c.steps - c.block_builds, 0),
+                "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),
+            },
+            "per_frame": per_frame,
+        }
+
+
+WILD = 1e6
+"""An entry of F at which the deformations of the state are bounded."""
+
+
+LARGE = 1e3
+"""Points with an entry from here on are bounded with it, so that it need not be done often."""
+
+
+def bounded(state: State) -> State:
+    """The state with what splats show of deformations that have run away; others stay as they are.
+
+    A deformation that is no number any more begins again from none.
+    """
+    deformation = state.particles.deformation
+    if deformation is None or bool((deformation.abs() < WILD).all()):
+        return state
+    return state._replace(particles=state.particles.replace(deformation=tamed(deformation)))
+
+
+def tamed(deformation: Tensor) -> Tensor:
+    """Deformations [N, 3, 3], large ones with their stretches clamped to what splats show."""
+    rows = (~(deformation.abs().amax(dim=(1, 2)) < LARGE)).nonzero()[:, 0]
+    # Squares of such entries are no float32.
+    _, clamped = ops.polar_clamped(deformation[rows].double(), *STRETCH)
+    return deformation.index_copy(0, rows, clamped.to(deformation))

@@ -1,0 +1,442 @@
+"""Advances the state of a simulation: matter on the grid, and what may be left out of it.
+
+The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many
+steps per
+call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and
+strays. A
+call ends when something may come close to a group, which then joins the grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsfluent.errors import InputError
+from gsfluent.pipeline.colliders.blades import BladeSet
+from gsfluent.pipeline.colliders.proximity import box_gaps, boxes, distance, time_to_meet
+from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.matter.fields import LIMIT, MOST, number_fields
+from gsfluent.pipeline.matter.points import Matter
+from gsfluent.pipeline.matter.state import State, at_rows
+from gsfluent.pipeline.simulate import strays as crumbs
+from gsfluent.pipeline.simulate.composed import FIELDS, Composed
+from gsfluent.pipeline.simulate.engine import CFL, Counters, Engine, Points, Settings, Unhealthy
+from gsfluent.pipeline.simulate.flight import Flight
+from gsfluent.pipeline.simulate.groups import (
+    LANDING,
+    Group,
+    Leaving,
+    count_calm,
+    grid_mask,
+    lay_down,
+)
+from gsfluent.pipeline.simulate.resident import Resident, resident_can
+from gsfluent.scene.scene import Scene
+
+__all__ = ["CFL", "Counters", "State", "Stepper", "Unhealthy"]
+
+FINE = 8.0
+"""Below this distance of their boxes [cells] the points of two things are compared themselves."""
+HASTE = 1.5
+"""How much faster than now matter on the grid may get before the next look."""
+
+
+class Stepper:
+    """Advances a :class:`State`.
+
+    Args:
+        scene: Floor, gravity and contact coefficients.
+        matter: Points and their parameters.
+        cfl: Courant number of the automatic time step.
+        free_flight: Whether bodies that touch nothing yet skip the grid.
+        piece_flight: Whether bodies and pieces that touch nothing any more leave it.
+        sleep: Whether what rests leaves it.
+        separate_fragments: Whether pieces of a body have velocity fields of their own.
+        resident: Whether the resident solver is used where it can be.
+        irreversible: Whether broken points stay without cohesion when they are pressed together.
+        law_kernels: Whether kernels made for fewer laws are used where these are all.
+        contact_near: Whether the contact pass is left out where no two fields are near; if not,
+            the composed operators take it in every step.
+        deterministic: Whether the composed operators are refused on a GPU.
+        return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
+            ``implicit``).
+        standing: Whether what stands still at time 0 sleeps from then on.
+        loose_crumbs: Whether broken points that are alone leave the grid for good.
+        flights: The first flights of the first bodies, when they are known.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        matter: Matter,
+        *,
+        cfl: float = CFL,
+        free_flight: bool = True,
+        piece_flight: bool = True,
+        sleep: bool = True,
+        separate_fragments: bool = True,
+        resident: bool = True,
+        irreversible: bool = True,
+        law_kernels: bool = True,
+        contact_near: bool = True,
+        deterministic: bool = False,
+        return_map: dict[str, Any] | None = None,
+        standing: bool = False,
+        loose_crumbs: bool = False,
+        flights: Sequence[Flight] = (),
+    ) -> None:
+        self.scene, self.matter = scene, matter
+        self.free_flight, self.separate_fragments = free_flight, separate_fragments
+        self._resident = resident and contact_near
+        self._ordered = deterministic and matter.particles.device.type == "cuda"
+        self._settings = Settings(cfl, irreversible, return_map, law_kernels, contact_near)
+        self.counters = Counters()
+        self.dt_scale = 1.0
+        self.field_limit = LIMIT
+        self._standing, self._loose = standing, loose_crumbs
+        self._reach = crumbs.reach_of(matter)
+        device = matter.particles.device
+        self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
+        self._pull = float(self._gravity.norm())
+        self.rigid = RigidSet(scene, matter.dx, device)
+        self.blades = BladeSet(scene, matter.dx)
+        self.leaving = Leaving(
+            matter, self.rigid, self._gravity, sleep=sleep, fly=piece_flight and free_flight
+        )
+        self.flights = list(flights)
+        known = len(self.flights)
+        for body, (a, b) in zip(scene.bodies[known:], matter.ranges[known:], strict=True):
+            points = matter.particles.select(torch.arange(a, b, device=device))
+            held = body.start if body.held else 0.0
+            self.flights.append(
+                Flight(points, points.position, self._gravity, 0.0, matter.dx, held=held)
+            )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was learned from the last state (at a frame, after a roll-back)."""
+        self._last: State | None = None
+        self._engine: Engine | None = None
+        self._groups: list[Group] = []
+        self._rows: Tensor | None = None
+        self._empty = False
+
+    def resume(self, counters: Counters) -> None:
+        """Go on counting from a saved run."""
+        self.counters = counters
+        self.leaving.naps, self.leaving.flights = counters.naps, counters.piece_flights
+        self.reset()
+
+    def initial(self) -> State:
+        """Return the state at time 0."""
+        landed = (not self.free_flight,) * len(self.flights)
+        state = State.start(self.matter, self.rigid.start, landed)
+        self._take(state)
+        state = self._land(state)[0]
+        if not self._standing:
+            return state
+        return lay_down(state, self.matter, self.rigid, self._gravity, state.unit)
+
+    def regroup(self, state: State, unit: Tensor, frame: float, *, at_frame: bool = True) -> State:
+        """Give units fields of their own and let what may leave the grid do so.
+
+        Args:
+            state: The state.
+            unit: What each point hangs together with, [N].
+            frame: Length of a frame [s].
+            at_frame: Whether a frame begins here; groups leave only then.
+        """
+        state = state._replace(unit=unit)
+        on_grid = grid_mask(state, self.matter)
+        state = self._renumber(state, on_grid)
+        if not at_frame:
+            return state
+        if self._loose:
+            state = self._let_go(
+                state, crumbs.find_lonely(state.position, state.peak, on_grid, self.matter.dx)
+            )
+            on_grid = grid_mask(state, self.matter)
+        state = count_calm(state, on_grid, self._gravity, self.matter.dx)
+        state = self.leaving(state, unit, frame)
+        self.counters.naps, self.counters.piece_flights = self.leaving.naps, self.leaving.flights
+        return state
+
+    def relieve(self, state: State) -> State:
+        """Let fewer fields meet in a block, after they were too many for it."""
+        self.field_limit = max(2, self.field_limit // 2)
+        return self._renumber(state, grid_mask(state, self.matter))
+
+    def _renumber(self, state: State, on_grid: Tensor) -> State:
+        if not self.separate_fragments or not bool(on_grid.any()):
+            return state
+        field = number_fields(
+            state.unit, state.position, self.matter.particles.mass, on_grid, self.matter.dx,
+            self.field_limit, MOST if self._resident_now(state) else FIELDS,
+        )  # fmt: skip
+        return state if torch.equal(field, state.field) else state._replace(field=field)
+
+    def advance(self, state: State, until: float, steps: int) -> State:
+        """Advance by one call of the engine, or by one stretch without the grid.
+
+        Args:
+            state: The state.
+            until: Time to reach at most [s].
+            steps: Grid steps at most.
+
+        Raises:
+            Unhealthy: A number is not finite or a point left the grid.
+        """
+        until = min(until, self.rigid.next_change(state.time), self.blades.next_change(state.time))
+        if state is not self._last:
+            self._take(state)
+        state, clear = self._land(state)
+        if self._empty:
+            state = self._without_grid(state, until)
+        else:
+            make = Resident if self._resident_now(state) else Composed
+            if make is Composed and self._ordered:
+                raise InputError(
+                    f"simulate: from t = {state.time:.4g} s on the scene needs operators whose "
+                    "sums have no order on a GPU (a blade at work, or a free body lighter than "
+                    "what it meets), but deterministic was asked for",
+                    hint="leave out solve.deterministic, or run on the CPU",
+                )
+            if not isinstance(self._engine, make):
+                settings = self._settings._replace(dt_scale=self.dt_scale)
+                self._engine = make(
+                    self.scene, self.matter, self.rigid, state, self._rows, settings, self.counters
+                )
+            state = self._on_grid(state, self._engine, min(until, clear), steps)
+        self._last = state
+        return state
+
+    def spread(self, wrong: Tensor, state: State) -> Tensor:
+        """Marks of the engine's points as marks of all points, bool [N]."""
+        if wrong.shape[0] == state.peak.shape[0] or self._rows is None:
+            return wrong
+        return torch.zeros_like(state.stray).index_copy(0, self._rows, wrong)
+
+    def _resident_now(self, state: State) -> bool:
+        """Whether the resident solver can go on from here: with no blade at work."""
+        if not (self._resident and resident_can(state.colliders, self.rigid, self.matter)):
+            return False
+        if len(self.blades) == 0:
+            return True
+        if self.blades.speed(state.time) > 0.0:
+            return False
+        # On powder a cut leaves nothing to hold; what shares a field has to lie on one side.
+        whole = state.unit if self.separate_fragments else state.field
+        held = state.unit >= 0
+        return self.blades.splits(whole[held], state.cut[held]).numel() == 0
+
+    def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:
+        pushed, worked = engine.impulse, engine.work
+        taken = engine.advance(until, steps)
+        self.counters.flight_body_steps += taken * sum(g.body is not None for g in self._groups)
+        state = self._moved(
+            state._replace(
+                step=state.step + taken,
+                colliders=engine.colliders,
+                impulse=state.impulse + (engine.impulse - pushed),
+                work=state.work + (engine.work - worked),
+            ),
+            engine.time,
+            engine.read(),
+        )
+        if isinstance(engine, Composed) and len(self.blades):
+            rows = self._rows
+            cut = engine.cut if rows is None else state.cut.index_copy(0, rows, engine.cut)
+            state = state._replace(cut=cut)
+        return self._retire(state)
+
+    def _without_grid(self, state: State, until: float) -> State:
+        """Move in closed form until a frame is due or something comes close to something."""
+        time, rows = state.time, state.colliders
+        while time < until:
+            _, clear = self._look_around(state, time, rows)
+            before, time = time, min(until, clear)
+            rows = self.rigid.advance(rows, before, time - before)
+            if self._look_around(state, time, rows)[0]:
+                break
+        if any(group.flight is not None for group in self._groups):
+            self.counters.flight_seconds += time - state.time
+        return self._moved(state._replace(colliders=rows), time, None)
+
+    # --- groups ---
+
+    def _take(self, state: State) -> None:
+        """Take over a state: its groups, and which rows are on the grid."""
+        self._engine = None
+        device = state.position.device
+        self._groups = []
+        for i, (flight, (a, b)) in enumerate(zip(self.flights, self.matter.ranges, strict=True)):
+            if not state.landed[i]:
+                rows = torch.arange(a, b, device=device)
+                self._groups.append(Group(rows, flight, i, state.position[a:b], flight.mass))
+        for number in torch.unique(state.group[state.group >= 0]).tolist():
+            rows = (state.group == number).nonzero()[:, 0]
+            self._groups.append(self._group(state, rows))
+        on_grid = grid_mask(state, self.matter)
+        self._empty = not bool(on_grid.any())
+        self._rows = None if bool(on_grid.all()) else on_grid.nonzero()[:, 0]
+
+    def _group(self, state: State, rows: Tensor) -> Group:
+        position = state.position[rows]
+        mass = float(state.particles.mass[rows].double().sum())
+        if bool(state.asleep[rows[0]]):
+            return Group(rows, None, None, position, mass)
+        flight = Flight(
+            state.particles.select(rows), position, self._gravity, state.time, self.matter.dx,
+            rigid=False,
+        )  # fmt: skip
+        return Group(rows, flight, None, position, mass)
+
+    def _land(self, state: State) -> tuple[State, float]:
+        """Put on the grid every group that something is close to; say how long the rest is clear.
+
+        Returns:
+            The state, and a time before which nothing else can come close.
+        """
+        while True:
+            touched, clear = self._look_around(state, state.time, state.colliders)
+            if not touched:
+                return state, clear
+            landed, group, asleep, calm = list(state.landed), state.group, state.asleep, state.calm
+            for i in touched:
+                found = self._groups[i]
+                if found.body is not None:
+                    landed[found.body] = True
+                    continue
+                self.counters.wakes += found.flight is None
+                group = group.index_fill(0, found.rows, -1)
+                asleep = asleep.index_fill(0, found.rows, False)
+                calm = calm.index_fill(0, found.rows, 0)
+            state = state._replace(landed=tuple(landed), group=group, asleep=asleep, calm=calm)
+            self._take(state)
+
+    def _look_around(self, state: State, time: float, colliders: Tensor) -> tuple[set[int], float]:
+        """Which groups something is close to, and until when nothing else can be."""
+        groups, dx, pad = self._groups, self.matter.dx, LANDING * self.matter.dx
+        touched: set[int] = set()
+        clear = math.inf
+        if not groups:
+            return touched, clear
+        bounds = [group.bounds(time) for group in groups]
+        low, high = (torch.stack([b[i] for b in bounds]) for i in (0, 1))
+        speed = [group.speed(time) for group in groups]
+        between = box_gaps(low, high, low, high)
+        grid = _OnGrid(state, self._rows) if not self._empty else None
+        to_grid = box_gaps(low, high, grid.low, grid.high) if grid is not None else None
+        driven = float(self.rigid.speed(colliders))
+        moving = self.rigid.moving(colliders)
+        to_any, to_moving = (self.rigid.gaps(rows, low, high) for rows in (colliders, moving))
+        for i, group in enumerate(groups):
+            if group.held(time):
+                clear = min(clear, group.flight.held if group.flight is not None else clear)
+                continue
+            sleeps = group.flight is None
+            # Gap to what is near, and how fast that is.
+            near: list[tuple[float, float]] = [(self.blades.gap(low[i], high[i], time), 0.0)]
+            near.append((to_moving[i] if sleeps else to_any[i], driven))
+            for j, other in enumerate(groups):
+                if j == i or (sleeps and other.flight is None):
+                    continue
+                gap = float(between[i, j])
+                if gap < FINE * dx:
+                    gap = max(gap, distance(group.points(time), other.points(time), dx))
+                near.append((gap, 0.0 if other.held(time) else speed[j]))
+            if grid is not None and to_grid is not None:
+                gap = float(to_grid[i].min())
+                if gap < FINE * dx:
+                    close = (to_grid[i] < FINE * dx).nonzero()[:, 0]
+                    gap = max(gap, distance(group.points(time), grid.points(close), dx))
+                near.append((gap, HASTE * grid.speed))
+            for gap, other_speed in near:
+                if gap < pad:
+                    touched.add(i)
+                # Half a cell more: a look costs something, and that much nearer is near enough.
+                wait = time_to_meet(
+                    max(gap - pad, 0.0) + 0.5 * dx, speed[i] + other_speed, self._pull
+                )
+                clear = min(clear, time + wait)
+        return touched, clear
+
+    # --- putting together ---
+
+    def _moved(self, state: State, time: float, points: Points | None) -> State:
+        """The state at a later time: points of the grid, groups and strays."""
+        span = time - state.time
+        p = state.particles
+        names = ("velocity", "affine", "strain", "alpha", "deformation")
+        if points is not None and self._rows is None:
+            position, peak = points.position, points.peak
+            values = {name: getattr(points, name) for name in names}
+        else:
+            position, peak = state.position.clone(), state.peak.clone()
+            values = {name: getattr(p, name) for name in names}
+            values = {name: v if v is None else v.clone() for name, v in values.items()}
+        if points is not None and self._rows is not None:
+            position[self._rows], peak[self._rows] = points.position, points.peak
+            for name, value in values.items():
+                if value is not None:
+                    value[self._rows] = getattr(points, name)
+        impulse = state.impulse
+        for group in self._groups:
+            seconds = span * group.rows.shape[0]
+            if group.flight is None:
+                # What lies still is held up against its weight.
+                impulse = impulse - span * group.mass * self._gravity.to(impulse)
+                self.counters.sleeping_point_seconds += seconds
+                continue
+            self.counters.flying_point_seconds += seconds if group.body is None else 0.0
+            moved, place = group.flight.state_at(time)
+            position[group.rows] = place
+            for name, value in values.items():
+                if value is not None:
+                    value[group.rows] = getattr(moved, name)
+        self.counters.point_seconds += span * p.count
+        strays = state.stray.nonzero()[:, 0]
+        if strays.numel():
+            push = crumbs.drift(
+                position, values["velocity"], p.mass, strays, span, self.scene.gravity,
+                self.scene.floor,
+            )  # fmt: skip
+            values["affine"][strays] = 0.0
+            impulse = impulse + push
+        particles = p.replace(position=position.to(p.dtype), **values)
+        return state._replace(
+            particles=particles, position=position, peak=peak, time=time, impulse=impulse
+        )
+
+    def _retire(self, state: State) -> State:
+        """Take broken points that are far away off the grid."""
+        candidate = grid_mask(state, self.matter)
+        return self._let_go(
+            state, crumbs.find_strays(state.position, state.peak, candidate, self._reach)
+        )
+
+    def _let_go(self, state: State, gone: Tensor) -> State:
+        if bool(gone.any()):
+            state = crumbs.let_go(state, gone)
+            self._take(state)
+        return state
+
+
+class _OnGrid:
+    """Boxes of the fields on the grid, and the points of some of them."""
+
+    def __init__(self, state: State, rows: Tensor | None) -> None:
+        self._position, self._field = at_rows(state.position, rows), at_rows(state.field, rows)
+        velocity = at_rows(state.particles.velocity, rows)
+        speed = float(velocity.norm(dim=1).max())
+        self.speed = speed if math.isfinite(speed) else 0.0
+        self.low, self.high = boxes(self._position, self._field, int(self._field.max()) + 1)
+
+    def points(self, fields: Tensor) -> Tensor:
+        """Positions of the points of some fields [m]."""
+        return self._position[torch.isin(self._field, fields.to(self._field))]

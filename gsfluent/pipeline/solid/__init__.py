@@ -1,0 +1,1 @@
+"""What is matter: signed distances from splats, masks, depths or a mesh."""

@@ -1,0 +1,197 @@
+"""Where an object's solid comes from: masks, the density of its splats, their depths, or a mesh."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from gsfluent.data import Capture, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.pipeline.capture.hull import visual_hull
+from gsfluent.pipeline.capture.views import read_views
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.inside import find_leaks, keep_components
+from gsfluent.pipeline.solid.inside import visual_hull as centre_hull
+from gsfluent.pipeline.solid.splats import solid_of_splats
+from gsfluent.pipeline.solid.vote import VoteOptions
+from gsfluent.spatial.density import GridBox
+from gsfluent.spatial.mesh_distance import load_mesh, oriented_samples, signed_distances
+from gsfluent.spatial.winding import winding_numbers
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["METHODS", "find_solid"]
+
+_log = logging.getLogger(__name__)
+
+METHODS = ("auto", "hull", "density", "tsdf", "mesh")
+_HULL_SIZE = 400  # pixels of the masks
+_HALF = 0.5  # winding number from which a place is inside an open mesh
+_BAND = 3.0  # voxels around a mesh with exact distances
+_FEW_VIEWS = 8  # cameras below which a hull is a cone
+
+
+def find_solid(
+    gaussians: Gaussians | None = None,
+    capture: Capture | None = None,
+    mesh: trimesh.Trimesh | str | Path | None = None,
+    *,
+    method: str = "auto",
+    resolution: int = 96,
+    options: VoteOptions | None = None,
+    match_masks: bool = True,
+    match_drawn: bool = True,
+    finer: bool = True,
+) -> SignedDistance:
+    """Signed distances to the surface of an object, from whatever there is.
+
+    Args:
+        gaussians: The object's splats (without background), or None.
+        capture: Its photographs, with masks for ``hull``; cameras for ``tsdf``.
+        mesh: A triangle mesh, or a file that trimesh reads.
+        method: ``hull`` (visual hull of the masks), ``density`` (opacity density and ray vote, cut
+            by the hull where there are masks), ``tsdf`` (fused depths of the splats), ``mesh``, or
+            ``auto``: the mesh when there is one, else what the splats enclose less what their
+            depths show to be free, else the hull.
+        resolution: Voxels along the longest side of the object.
+        options: Settings of the ray vote.
+        match_masks: Move the skin of splats to the outline that masks show.
+        match_drawn: Without masks, half of the way to the outline of the drawn splats: right for
+            trained ones, whose centres lie too deep, too far for large discs.
+        finer: Take smaller voxels where the walls found are thinner than five of them.
+
+    Returns:
+        The field; ``report["why"]`` says why this source was chosen.
+
+    Raises:
+        InputError: The method is unknown or needs what was not given, or there is no inside.
+    """
+    if method not in METHODS:
+        raise InputError(f"solid: method {method!r} is not known", f"choose {', '.join(METHODS)}")
+    if not 16 <= int(resolution) <= 512:
+        raise InputError(
+            f"solid: resolution must be in 16..512 voxels, got {resolution}", "96 to 160 is usual"
+        )
+    chosen, why = _choose(method, gaussians, capture, mesh)
+    began = time.perf_counter()
+    if chosen == "mesh":
+        assert mesh is not None
+        field = _of_mesh(mesh if not isinstance(mesh, str | Path) else load_mesh(mesh), resolution)
+    elif chosen == "hull":
+        assert capture is not None
+        field = _of_hull(capture, resolution)
+    else:
+        assert gaussians is not None
+        field, note = solid_of_splats(
+            gaussians,
+            capture,
+            resolution,
+            method="auto" if method == "auto" else chosen,
+            options=options,
+            match_masks=match_masks,
+            match_drawn=match_drawn,
+            finer=finer,
+        )
+        why += note
+    if chosen in ("hull", "density") and field.source in ("hull", "density"):
+        field = field.tidied()
+    if not bool(field.inside.any()):
+        raise InputError(
+            f"solid: {chosen} found no inside at {resolution} voxels",
+            "try another method or resolution, or check that the input is one closed object",
+        )
+    seconds = time.perf_counter() - began
+    _log.info("solid: %s (%s), volume %.4g", chosen, why, field.volume)
+    return field.replace(
+        report={"why": why, **field.report, "volume": field.volume, "seconds": seconds}
+    )
+
+
+def _choose(
+    method: str,
+    gaussians: Gaussians | None,
+    capture: Capture | None,
+    mesh: Any,
+) -> tuple[str, str]:
+    """Which source, and why."""
+    masks = capture is not None and capture.shows_masks()
+    needs = {"hull": masks, "density": gaussians is not None, "tsdf": gaussians is not None}
+    if method != "auto":
+        if not needs.get(method, mesh is not None):
+            what = {"hull": "a capture with masks", "mesh": "a mesh"}.get(method, "splats")
+            raise InputError(f"solid: method {method} needs {what}", "give it, or leave auto")
+        return method, "asked for"
+    if mesh is not None:
+        return "mesh", "a mesh is exact"
+    if gaussians is not None:
+        reason = "splats, and masks to cut them by" if masks else "splats, no masks"
+        return "density", reason
+    if masks:
+        return "hull", "masks and no splats"
+    raise InputError("solid: neither splats, nor masks, nor a mesh were given", "give one of them")
+
+
+def _of_hull(capture: Capture, resolution: int) -> SignedDistance:
+    """The conservative hull says where; voxel centres against the masks say exactly how far."""
+    views = read_views(capture, _HULL_SIZE, torch.device("cpu"), crop=True)
+    rough = visual_hull(views, resolution)
+    origin = rough.origin.double().cpu().numpy()
+    x, y, z = rough.occupancy.shape
+    box = GridBox((float(origin[0]), float(origin[1]), float(origin[2])), rough.voxel, (x, y, z))
+    grounds = []
+    for view in views:
+        assert view.mask is not None  # visual_hull has refused views without
+        ground = (view.mask < 0.5).cpu().numpy()
+        grounds.append((ground, view.viewmat.double().cpu().numpy(), view.K.double().cpu().numpy()))
+    body = rough.occupancy.cpu().numpy() & centre_hull(box, grounds)
+    body, dropped = keep_components(body)
+    notes = {
+        "views": len(views),
+        "leaks": 0,
+        "cone": len(views) < _FEW_VIEWS,
+        "components_dropped": dropped,
+    }
+    return SignedDistance.of_voxels(body, origin, rough.voxel, "hull", notes)
+
+
+def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
+    """Exact distances to a closed mesh; an open one is closed by its winding numbers."""
+    triangles = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    extent = float((high - low).max())
+    if not (np.isfinite(extent) and extent > 0):
+        raise InputError("solid: the mesh is empty or flat", "give a mesh with an inside")
+    voxel = extent / max(resolution - 1, 1)
+    size = np.ceil((high - low) / voxel).astype(int) + 7
+    origin = 0.5 * (low + high) - 0.5 * size * voxel
+    notes: dict[str, Any] = {"watertight": bool(mesh.is_watertight), "leaks": 0}
+    if mesh.is_watertight:
+        values = signed_distances(triangles, origin + 0.5 * voxel, voxel, size, _BAND)
+        start = torch.from_numpy(origin).float()
+        return SignedDistance(torch.from_numpy(values), start, voxel, "mesh", notes)
+    samples, areas = oriented_samples(triangles, 0.7 * voxel)
+    shell = np.zeros(size, dtype=bool)
+    shell[tuple(np.floor((samples - origin) / voxel).astype(int).T)] = True
+    axes = [torch.arange(int(n)) + 0.5 for n in size]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    winding = winding_numbers(
+        torch.from_numpy(origin).float() + grid * voxel,
+        torch.from_numpy(samples).float(),
+        torch.from_numpy(areas).float(),
+        soft=0.35 * voxel,
+    )
+    number = winding.reshape(tuple(size)).numpy()
+    if -float(number.min()) > float(number.max()):
+        number = -number  # wound inward
+    solid, dropped = keep_components(number > _HALF)
+    if not solid.any():  # a sheet encloses nothing: it is as thick as a voxel
+        solid, dropped = keep_components(shell)
+    notes |= find_leaks(shell, solid, origin, voxel) | {"components_dropped": dropped}
+    notes |= {"closed_side": None, "closed_by": "winding numbers"}
+    return SignedDistance.of_voxels(solid, origin, voxel, "mesh", notes)

@@ -1,0 +1,204 @@
+"""What a shell of splats encloses: density, ray vote and masks together, before any depths.
+
+This closes whatever is surrounded by surface; what cameras look into is taken out again in
+:mod:`gsfluent.pipeline.solid.splats`.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from gsfluent.errors import InputError
+from gsfluent.pipeline.capture.orient import orient
+from gsfluent.pipeline.solid.inside import (
+    cast_votes,
+    keep_components,
+    smooth_boundary,
+    trim_outer_flank,
+    visual_hull,
+)
+from gsfluent.spatial.density import GridBox, choose_grid, density_field
+from gsfluent.spatial.shape import robust_box
+from gsfluent.spatial.voxels import distance_transform
+
+if TYPE_CHECKING:
+    from gsfluent.data import Capture, Gaussians
+
+__all__ = ["Closed", "VoteOptions", "evidence", "vote_solid"]
+
+_log = logging.getLogger(__name__)
+
+_FEW = 16  # splats
+_HUGE = 0.5  # of the object's longest side: a standard deviation above it is no surface
+_MASK_SIZE = 400  # pixels
+_BURIED = 3.5  # voxels below the closed surface
+_SAMPLE = 100_000
+
+
+@dataclass(frozen=True)
+class VoteOptions:
+    """Arguments of :class:`gsfluent.pipeline.Fill` that concern the vote; see there."""
+
+    threshold: float = 0.5
+    agreement: float = 0.7
+    rays: int = 26
+    down: np.ndarray | None = None
+    close_underside: bool = True
+    masks: bool = True
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Result of :func:`vote_solid`; voxels bool [X, Y, Z].
+
+    Attributes:
+        box: The grid.
+        shell: Where the density is that of a surface.
+        loose: Shell and everything that it encloses.
+        solid: The same with the outer flank of the shell peeled off.
+        hull: What the masks allow, or None without masks.
+        notes: What was noticed.
+    """
+
+    box: GridBox
+    shell: np.ndarray
+    loose: np.ndarray
+    solid: np.ndarray
+    hull: np.ndarray | None
+    notes: dict[str, Any]
+
+
+def evidence(gaussians: Gaussians) -> tuple[Gaussians, int]:
+    """Splats that can be part of a surface, and how many of the visible ones cannot.
+
+    None without a size or a direction, none with a standard deviation above half of the object:
+    a single one would hide the object from every camera and blow up every box.
+    """
+    scales = gaussians.scales
+    finite = torch.isfinite(gaussians.means).all(1) & torch.isfinite(scales).all(1)
+    finite &= torch.isfinite(gaussians.quats).all(1)
+    fine = (scales > 0).all(1) & (gaussians.quats.norm(dim=1) > 1e-12)
+    seen = gaussians.opacities > 0.05
+    if int((fine & seen & finite).sum()) >= _FEW:
+        # quantiles of a hundred thousand points are those of all
+        points = gaussians.means[fine & seen & finite].detach()
+        low, high = robust_box(points[:: max(1, len(points) // _SAMPLE)].double().cpu().numpy())
+        fine &= scales.amax(1) <= _HUGE * float((high - low).max())
+    fine |= ~finite  # for validation to name
+    return gaussians.select(fine), int((seen & ~fine).sum())
+
+
+def vote_solid(
+    gaussians: Gaussians,
+    capture: Capture | None,
+    resolution: int,
+    options: VoteOptions,
+) -> Closed:
+    """Close a shell of splats.
+
+    Args:
+        gaussians: What :func:`evidence` left.
+        capture: Photographs; with masks, their visual hull is cut out of the result.
+        resolution: Voxels along the longest side of the object.
+        options: Settings of the vote.
+
+    Raises:
+        InputError: Too few splats, none reaches the density of a surface, or the masks do not
+            belong to the splats.
+    """
+    from scipy import ndimage
+
+    if gaussians.count < _FEW:
+        raise InputError(
+            f"fill: needs at least {_FEW} Gaussians, got {gaussians.count}",
+            hint="check that isolation kept the object",
+        )
+    box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
+    field = density_field(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
+    )
+    density = field.cpu().numpy()
+    shell = density >= options.threshold
+    if not shell.any():
+        raise InputError(
+            f"fill: no voxel reaches density {options.threshold:g} (largest {density.max():.3g})",
+            hint="lower threshold or resolution: the splats are transparent or sparse",
+        )
+    down = options.down
+    if down is None and capture is not None:
+        down = -np.asarray(orient(gaussians, capture).up, dtype=float)
+    vote = cast_votes(
+        shell,
+        rays=options.rays,
+        down=down,
+        close_open_side=options.close_underside,
+        device=gaussians.device,
+    )
+    loose = (vote.score >= options.agreement) | shell
+    hull = None
+    views = masked_views(capture) if options.masks else []
+    if views:
+        hull = visual_hull(box, views, gaussians.device)
+        # masks say what is not the object; rays cap the cone under objects seen only from above
+        # (just outside a convex surface about half of the rays hit it)
+        loose = hull & (shell | (vote.score >= 0.65))
+        if not loose.any():
+            raise InputError(
+                "fill: masks and splats do not overlap",
+                hint="check that masks are white on the object and belong to these cameras",
+            )
+    loose, dropped = keep_components(loose)
+    loose = ndimage.binary_fill_holes(loose)
+    trimmed = trim_outer_flank(loose, shell, density, gaussians.device)
+    solid, more = keep_components(smooth_boundary(trimmed))
+    # splats well below the surface hint at a cavity or an inner wall
+    deep = shell & (distance_transform(loose, gaussians.device) > _BURIED)
+    if vote.open_side is not None:
+        _log.info(
+            "fill: nothing seen from side %s; closed there (%.0f %% of inner voxels look out)",
+            vote.open_side,
+            100 * vote.open_fraction,
+        )
+    notes = {
+        "closed_by": "vote" if hull is None else "hull and vote",
+        "closed_side": None if vote.open_side is None else list(vote.open_side),
+        "closed_side_open_fraction": vote.open_fraction,
+        "components_dropped": dropped + more,
+        "buried_surface_fraction": float(deep.sum() / max(int(shell.sum()), 1)),
+        "stray_gaussians": strays,
+    }
+    return Closed(box, shell, loose, solid, hull, notes)
+
+
+def masked_views(
+    capture: Capture | None, size: int = _MASK_SIZE
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Background pixels and undistorted cameras of the views that have a mask."""
+    from scipy import ndimage
+
+    if capture is None:
+        return []
+    views = []
+    for view in capture.views(range(len(capture)), size):
+        if view.mask is None:
+            continue
+        ground = view.mask < 0.5
+        if view.valid is not None:
+            ground = ground & view.valid
+        # one pixel of tolerance: masks and poses are never better than that
+        ground_pixels = ndimage.binary_erosion(
+            ground.cpu().numpy(), np.ones((3, 3)), border_value=1
+        )
+        views.append(
+            (
+                ground_pixels,
+                view.camera.viewmat.double().cpu().numpy(),
+                view.camera.K.double().cpu().numpy(),
+            )
+        )
+    return views

@@ -1,0 +1,305 @@
+"""Inpainters without a network: Telea, colour diffusion, and guided patches of a photograph."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsfluent.errors import InputError
+from gsfluent.pipeline.texture.inpaint.inpainter import MaskedInpainter, SliceContext
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
+from gsfluent.pipeline.texture.synthesis.patches import Schedule, project_slice
+
+__all__ = ["ColorDiffusionInpainter", "ExemplarInpainter", "TeleaInpainter"]
+
+_REPAINT = 0.7  # strengths from here on start from nothing instead of from the slice
+
+
+def _without_ground(picture: np.ndarray, inside: np.ndarray | None) -> np.ndarray:
+    """The picture with the object's colours continued outward, so that no ground leaks in."""
+    from scipy import ndimage
+
+    if inside is None or inside.all() or not inside.any():
+        return picture
+    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    extended: np.ndarray = picture[tuple(nearest)]
+    return extended
+
+
+class TeleaInpainter(MaskedInpainter):
+    """``cv2.inpaint``: fast marching (Telea 2004) or Navier-Stokes (Bertalmio et al. 2001).
+
+    Args:
+        radius: Neighbourhood [pixels].
+        method: ``telea`` or ``ns``.
+    """
+
+    name = "telea"
+
+    def __init__(self, radius: float = 3.0, method: str = "telea") -> None:
+        if method not in ("telea", "ns"):
+            raise InputError(f"inpaint: method must be telea or ns, got {method!r}", hint="telea")
+        self.radius = float(radius)
+        self.method = method
+        self.name = method
+
+    def paint(
+        self,
+        slices: np.ndarray,
+        mask: np.ndarray,
+        prompt: str,
+        exemplar: Exemplar | None,
+        strength: float,
+        seeds: list[int],
+        context: SliceContext,
+    ) -> np.ndarray:
+        """Fill from the hole's edge inward."""
+        import cv2
+
+        kind = cv2.INPAINT_TELEA if self.method == "telea" else cv2.INPAINT_NS
+        made = np.empty_like(slices)
+        for k, (picture, hole) in enumerate(zip(slices, mask, strict=True)):
+            if hole.all():  # nothing known to start from
+                made[k] = picture
+                continue
+            inside = None if context.inside is None else context.inside[k]
+            extended = _without_ground(picture, inside)
+            pixels = (extended.clip(0, 1) * 255).round().astype(np.uint8)
+            filled = cv2.inpaint(pixels, hole.astype(np.uint8), self.radius, kind)
+            made[k] = filled.astype(np.float32) / 255.0
+        return slices + np.float32(strength) * (made - slices)
+
+
+class ColorDiffusionInpainter(MaskedInpainter):
+    """Harmonic fill: the membrane through the known colours at the hole's edge (Laplace)."""
+
+    name = "color"
+
+    def paint(
+        self,
+        slices: np.ndarray,
+        mask: np.ndarray,
+        prompt: str,
+        exemplar: Exemplar | None,
+        strength: float,
+        seeds: list[int],
+        context: SliceContext,
+    ) -> np.ndarray:
+        """Solve the discrete Laplace equation in every hole."""
+        made = slices.copy()
+        for k, hole in enumerate(mask):
+            if not hole.all():
+                made[k][hole] = _harmonic(slices[k], hole)
+        return slices + np.float32(strength) * (made - slices)
+
+
+def _harmonic(picture: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Colours [n, 3] of the hole's pixels: each the mean of its neighbours."""
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
+    count = int(hole.sum())
+    number = np.full(hole.shape, -1)
+    number[hole] = np.arange(count)
+    degree = np.zeros(count)
+    right = np.zeros((count, 3))
+    rows: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    for shift, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
+        at = number.take(range(1, hole.shape[axis]), axis)
+        other = number.take(range(hole.shape[axis] - 1), axis)
+        color = picture.take(range(hole.shape[axis] - 1), axis)
+        if shift < 0:
+            at, other = other, at
+            color = picture.take(range(1, hole.shape[axis]), axis)
+        here = at >= 0
+        degree += np.bincount(at[here], minlength=count)
+        known = here & (other < 0)
+        np.add.at(right, at[known], color[known])
+        both = here & (other >= 0)
+        rows.append(at[both])
+        columns.append(other[both])
+    i, j = np.concatenate(rows), np.concatenate(columns)
+    # a pixel cut off from all known ones keeps a solvable equation of its own
+    diagonal = degree + 1e-9
+    matrix = sparse.coo_matrix((-np.ones(len(i)), (i, j)), (count, count)).tocsc()
+    solved = splu(matrix + sparse.diags(diagonal).tocsc()).solve(right)
+    return np.asarray(solved, np.float32).clip(0.0, 1.0)
+
+
+class ExemplarInpainter(MaskedInpainter):
+    """Guided patch projection within each slice: patches of the photograph, matched by depth.
+
+    The engine of the exemplar method (:mod:`.synthesis`) confined to one slice. Every slice is
+    made by itself, which is what a 2-D model does too; so this is the offline stand-in for one.
+
+    Args:
+        exemplar: Photograph when a call brings none.
+        schedule: Work per slice; iterations are per pyramid level when repainting.
+        turns: Use the photograph turned and mirrored (off for grained materials).
+        scale: Size of the photograph's structure relative to the automatic choice.
+    """
+
+    name = "exemplar"
+
+    def __init__(
+        self,
+        exemplar: Exemplar | None = None,
+        schedule: Schedule | None = None,
+        turns: bool = True,
+        scale: float = 1.0,
+    ) -> None:
+        self.exemplar = exemplar
+        self.schedule = schedule or Schedule(iterations=(4, 3, 2), bank=1536, samples=400)
+        self.turns = turns
+        self.scale = float(scale)
+        self._fitted: dict[tuple[int, float, int], Exemplar] = {}
+
+    def paint(
+        self,
+        slices: np.ndarray,
+        mask: np.ndarray,
+        prompt: str,
+        exemplar: Exemplar | None,
+        strength: float,
+        seeds: list[int],
+        context: SliceContext,
+    ) -> np.ndarray:
+        """Project every slice onto the photograph's patches."""
+        photo = exemplar or self.exemplar
+        if photo is None:
+            raise InputError(
+                "inpaint: backend 'exemplar' needs an exemplar photograph",
+                hint="add exemplar: cut.jpg, or choose backend telea or color",
+            )
+        made = np.empty_like(slices)
+        for k in range(len(slices)):
+            inside = np.ones(mask.shape[1:], bool) if context.inside is None else context.inside[k]
+            depth = None if context.guide is None or not photo.silhouette else context.guide[k]
+            made[k] = self._slice(
+                slices[k], mask[k], inside | mask[k], depth, context.max_depth, photo, strength,
+                np.random.default_rng(seeds[k]),
+            )  # fmt: skip
+        return made
+
+    def _slice(
+        self,
+        picture: np.ndarray,
+        hole: np.ndarray,
+        inside: np.ndarray,
+        depth: np.ndarray | None,
+        max_depth: float,
+        photo: Exemplar,
+        strength: float,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        """One slice, coarse to fine when it is repainted."""
+        largest = max_depth if max_depth > 0 else max(hole.shape) / 2
+        if depth is not None:
+            factor = self.scale * largest / max(photo.max_depth, 1.0)
+        else:
+            factor = self.scale * max(hole.shape) / max(photo.mask.shape)
+        repaint = strength >= _REPAINT
+        factors = [f for f in (4, 2, 1) if min(hole.shape) // f >= 8] if repaint else [1]
+        iterations = self.schedule.iterations[-len(factors) :]
+        if not repaint:
+            iterations = (max(1, round(4 * strength)),)
+        rgb = picture
+        for step, (shrink, rounds) in enumerate(zip(factors, iterations, strict=True)):
+            fitted = self._photo(photo, factor, shrink)
+            small = _reduced(picture, hole, inside, depth, shrink)
+            image, open_, within, below = small
+            if step == 0 and repaint:
+                image = _start(image, open_, below, fitted, rng)
+            elif step > 0:
+                image = np.where(open_[..., None], _enlarged(rgb, open_.shape), image)
+            rgb = image
+            if open_.any():
+                shown = self._photo_guide(fitted, depth is not None)
+                rgb = project_slice(
+                    image, within, within & ~open_, 3.0 * _saturating(below, largest / shrink),
+                    (fitted.image, fitted.mask, 3.0 * shown), self.schedule, rounds,
+                    turns=self.turns, rng=rng,
+                )  # fmt: skip
+        return rgb
+
+    def _photo(self, photo: Exemplar, factor: float, shrink: int) -> Exemplar:
+        """The photograph at the pitch of a level; kept, since every slice wants the same."""
+        key = (id(photo), round(factor, 6), shrink)
+        if key not in self._fitted:
+            if len(self._fitted) > 16:
+                self._fitted.clear()
+            self._fitted[key] = photo.resized(factor / shrink)
+        return self._fitted[key]
+
+    @staticmethod
+    def _photo_guide(photo: Exemplar, guided: bool) -> np.ndarray:
+        if not guided:
+            return np.zeros(photo.mask.shape, np.float32)
+        return _saturating(photo.depth, photo.max_depth)
+
+
+def _saturating(depth: np.ndarray, largest: float) -> np.ndarray:
+    """Depth guide: steep near the skin, where layers are thin, flat in the core."""
+    result: np.ndarray = 1.0 - np.exp(-1.5 * depth / max(largest, 1e-6))
+    return result.astype(np.float32)
+
+
+def _start(
+    image: np.ndarray,
+    hole: np.ndarray,
+    depth: np.ndarray,
+    photo: Exemplar,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Photograph pixels of about the same depth in every hole pixel: right colours, no order."""
+    order = np.argsort(photo.depth[photo.mask], kind="stable")
+    sorted_depth = photo.depth[photo.mask][order]
+    colors = photo.image[photo.mask][order]
+    wanted = depth[hole]
+    if len(wanted) == 0:  # too small a hole for this level
+        return image
+    if float(np.ptp(wanted)) < 1e-6:
+        place = rng.integers(0, len(colors), len(wanted))
+    else:
+        middle = np.searchsorted(sorted_depth, wanted)
+        spread = max(1, len(colors) // 40)
+        place = middle + rng.integers(-spread, spread + 1, len(wanted))
+    made = image.copy()
+    made[hole] = colors[place.clip(0, len(colors) - 1)]
+    return made
+
+
+def _reduced(
+    picture: np.ndarray,
+    hole: np.ndarray,
+    inside: np.ndarray,
+    depth: np.ndarray | None,
+    factor: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Picture, hole, object and depth [coarse pixels] at 1/factor resolution."""
+    below = np.zeros(hole.shape, np.float32) if depth is None else depth
+    if factor == 1:
+        return picture, hole, inside, below
+    pad = [(0, -s % factor) for s in hole.shape]
+
+    def blocks(field: np.ndarray) -> np.ndarray:
+        padded = np.pad(field.astype(np.float32), pad + [(0, 0)] * (field.ndim - 2))
+        h, w = (s // factor for s in padded.shape[:2])
+        mean: np.ndarray = padded.reshape(h, factor, w, factor, *padded.shape[2:]).mean((1, 3))
+        return mean
+
+    share = blocks(inside)
+    within = share > 0.4
+    color = blocks(picture * inside[..., None]) / np.maximum(share, 1e-3)[..., None]
+    deep = blocks(below * inside) / np.maximum(share, 1e-3) / factor
+    open_ = within & (blocks(hole) > 0.5)
+    return color, open_, within, np.where(within, deep, 0.0).astype(np.float32)
+
+
+def _enlarged(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    import cv2
+
+    big = cv2.resize(picture, (2 * picture.shape[1], 2 * picture.shape[0]))
+    grown = [max(0, s - b) for s, b in zip(shape, big.shape[:2], strict=True)]
+    padded = np.pad(big, [(0, grown[0]), (0, grown[1]), (0, 0)], mode="edge")
+    return padded[: shape[0], : shape[1]]

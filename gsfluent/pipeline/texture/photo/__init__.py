@@ -1,0 +1,1 @@
+"""What a photograph of a cut says: exemplar, mask, light, stains, parts."""

@@ -1,0 +1,1 @@
+"""Insides that are drawn by rule."""

@@ -1,0 +1,1 @@
+"""A volume grown from patches of exemplars."""

@@ -1,0 +1,1 @@
+"""The voxels that get colours: domain, noise, colour spaces."""

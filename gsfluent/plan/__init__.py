@@ -1,0 +1,1 @@
+"""What a shot will cost, before anything runs."""

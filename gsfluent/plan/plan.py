@@ -1,0 +1,349 @@
+"""What a shot will cost, before it is paid: ``gsfluent plan``.
+
+Nothing is simulated. A stand-in solid (the splat coarsely filled, the hull that masks carve, or an
+ellipsoid in the box of sparse points) says how much matter there is; what happens to it is foreseen
+in closed form (:mod:`gsfluent.plan.motion`); a cost model measured on this machine
+(:mod:`gsfluent.plan.cost`) says what that takes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.config import Shot
+from gsfluent.pipeline.matter.points import MAX_PARTICLES, POINTS_PER_CELL, grid_spacing
+from gsfluent.pipeline.simulate.stage import QUALITY
+from gsfluent.plan.bounds import THIN_CELLS, bounds_of, budget_spacing, choose_cells, thickness
+from gsfluent.plan.cost import Cost, CostModel, memory_of
+from gsfluent.plan.fact import STAGES
+from gsfluent.plan.motion import Outlook, foresee
+from gsfluent.plan.stand_in import StandIn, stand_in
+from gsfluent.plan.work import (
+    NOT_PREDICTED,
+    born_splats,
+    export_work,
+    fill_work,
+    isolate_work,
+    laws_of,
+    passes_of,
+    reconstruct_work,
+    render_work,
+    simulate_work,
+    splat_count,
+    texture_method,
+    texture_work,
+)
+from gsfluent.progress import Progress
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import build_scene
+
+__all__ = ["cost_model", "plan_shot"]
+
+
+def cost_model(
+    device: torch.device | str,
+    *,
+    recalibrate: bool = False,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+) -> CostModel:
+    """The cost model of a device: the stored one, or a new one from the probe, which is stored.
+
+    Args:
+        device: Which.
+        recalibrate: Measure anew, and forget what runs have taught.
+        folder: Where models are stored; default: the user's cache.
+        progress: Told what is measured.
+
+    Raises:
+        RunError: The disk is full.
+    """
+    found = None if recalibrate else CostModel.load(device, folder)
+    if found is not None:
+        return found
+    from gsfluent.plan.probe import calibrate
+
+    model = calibrate(device, progress)
+    model.save(device, folder)
+    return model
+
+
+@dataclasses.dataclass(frozen=True)
+class Prospect:
+    """A shot with stand-ins: everything that does not hang on the size of the cells.
+
+    Attributes:
+        shot: The shot.
+        standing: Stand-ins of its objects.
+        scene: Its scene with them.
+        frames: Frames.
+        warnings: What was not known.
+    """
+
+    shot: Shot
+    standing: StandIn
+    scene: Scene
+    frames: int
+    warnings: tuple[str, ...]
+
+    @classmethod
+    def of(cls, shot: Shot) -> Prospect:
+        """Look at the input of a shot.
+
+        Raises:
+            InputError: The input cannot be read, or a material or event cannot be.
+        """
+        warnings: list[str] = []
+        standing = stand_in(shot, warnings)
+        scene = build_scene(shot, dict(standing.solids), standing.frame)
+        frames = max(1, round(shot.output.fps * shot.output.seconds))
+        return cls(shot, standing, scene, frames, tuple(warnings))
+
+    def counts(self, dx: float) -> list[int]:
+        """Material points of each body."""
+        return [max(1, round(b.volume * POINTS_PER_CELL / dx**3)) for b in self.scene.bodies]
+
+    def outlook(self, dx: float) -> Outlook:
+        """What happens on a grid of spacing ``dx``."""
+        # the run simulates until its last frame, not until the end
+        seconds = (self.frames - 1) / self.shot.output.fps
+        cfl = self.shot.solve.cfl
+        return foresee(self.scene, dx, seconds, self.frames, self.counts(dx), cfl=cfl)
+
+    def splats(self, cells: int) -> tuple[float, dict[str, float]]:
+        """Splats of the solids, and the features of filling them."""
+        fill, inside = fill_work(
+            self.shot, self.standing, splat_count(self.shot, self.standing), cells
+        )
+        return fill["splats"] + sum(inside.values()), fill
+
+    def simulation(self, dx: float, cells: int) -> tuple[Outlook, dict[str, float]]:
+        """What happens, and the features of simulating it."""
+        outlook = self.outlook(dx)
+        cracks = self.shot.output.cracks != "none"
+        return outlook, simulate_work(
+            outlook, self.scene, self.frames, self.splats(cells)[0], cracks,
+            points=float(sum(self.counts(dx))),
+        )  # fmt: skip
+
+    def frame_seconds(self, model: CostModel, cells: int) -> float:
+        """Seconds that simulating a frame takes with so many cells."""
+        dx = grid_spacing(self.scene, cells)
+        # the voxels of the solid, and so the splats, follow quality, not cells
+        work = self.simulation(dx, QUALITY[self.shot.solve.quality])[1]
+        return model.stage("simulate", work).seconds / self.frames
+
+
+def plan_shot(
+    shot: Shot,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    model: CostModel | None = None,
+) -> dict[str, Any]:
+    """Plan a shot.
+
+    Args:
+        shot: The shot.
+        device: Where it would run.
+        seed: Of the run; a plan has nothing random.
+        model: What work costs there; without one times are None.
+
+    Returns:
+        ``passes`` (name, needed, why), ``bounds``, ``binding`` and ``budget``, ``dx``, ``cells``,
+        ``dt``, ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and
+        memory_bytes by name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``,
+        ``size_m``, ``assumed``, ``warnings``, ``calibrated``, ``model`` (when it was measured,
+        corrections by runs), ``device`` and ``work`` (features by stage).
+
+    Raises:
+        InputError: The input cannot be read, or a material or event cannot be.
+    """
+    prospect = Prospect.of(shot)
+    chosen = cells_of(prospect, model)
+    dx = grid_spacing(prospect.scene, chosen)
+    quality = QUALITY[shot.solve.quality]
+    outlook, simulated = prospect.simulation(dx, quality)
+    work = _work(prospect, quality, simulated)
+    kind = torch.device(device).type
+    stages = {name: _costs(model, name, work[name], shot, kind) for name in STAGES if name in work}
+    seconds = [row["seconds"] for row in stages.values()]
+    total = sum(seconds) if all(value is not None for value in seconds) else None
+    counts = prospect.counts(dx)
+    least = None if shot.solve.seconds_per_frame is None or model is None else dx
+    bounds, binding = bounds_of(
+        prospect.scene.bodies, dx, strike=outlook.strike_speed, budget=least
+    )
+    warnings = [*prospect.warnings, *_warnings(prospect, outlook, dx, sum(counts))]
+    if texture_method(shot) in NOT_PREDICTED:
+        warnings.append(
+            f"texture: what {texture_method(shot)} costs hangs on the model you bring and is not "
+            "predicted; hint: texture.method: exemplar is"
+        )
+    first = next(body for body in prospect.scene.bodies if body.solid is not None)
+    low, high = first.bounds()
+    return {
+        "device": str(device),
+        "calibrated": model is not None,
+        "model": None if model is None else _about(model),
+        "passes": passes_of(shot, prospect.scene, outlook),
+        "size_m": (high - low).tolist(),
+        "assumed": prospect.standing.assumed,
+        "frames": prospect.frames,
+        "cells": chosen,
+        "dx": dx,
+        "bounds": [bound.row() for bound in bounds],
+        "binding": binding,
+        "budget": _budget(prospect, model),
+        "dt": outlook.dt,
+        "substeps": outlook.substeps,
+        "grid_from": outlook.grid_from,
+        "impact_speed": outlook.strike_speed,
+        "wave_speed": outlook.wave,
+        "particles": sum(counts),
+        "particles_per_cell": POINTS_PER_CELL,
+        "active_blocks": outlook.blocks,
+        "stages": stages,
+        "seconds": total,
+        "simulate_seconds": stages["simulate"]["seconds"],
+        "memory_bytes": max(row["memory_bytes"] for row in stages.values()),
+        "work": work,
+        "warnings": warnings,
+    }
+
+
+def cells_of(prospect: Prospect, model: CostModel | None) -> int:
+    """Cells along the largest body: the shot's, or as many as its time budget allows.
+
+    Raises:
+        InputError: The budget is too small for any grid.
+    """
+    solve = prospect.shot.solve
+    if solve.seconds_per_frame is None or model is None:
+        return solve.cells or QUALITY[solve.quality]
+    return choose_cells(lambda cells: prospect.frame_seconds(model, cells), solve.seconds_per_frame)
+
+
+def _budget(prospect: Prospect, model: CostModel | None) -> dict[str, float] | None:
+    """The time budget of a shot, and what the formula that counts points alone makes of it."""
+    seconds = prospect.shot.solve.seconds_per_frame
+    if seconds is None or model is None:
+        return None
+    return {
+        "seconds_per_frame": seconds,
+        "dx_by_formula": rough_spacing(prospect, model, seconds),
+    }
+
+
+def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:
+    """The textbook's answer: only points cost something (:func:`budget_spacing`) [m]."""
+    outlook = prospect.outlook(grid_spacing(prospect.scene, QUALITY["preview"]))
+    per_point = max(v for n, v in model.seconds["simulate"].items() if n.startswith("point_steps"))
+    return budget_spacing(
+        sum(body.volume for body in prospect.scene.bodies),
+        wave=outlook.wave + outlook.speed,
+        frame=1.0 / prospect.shot.output.fps,
+        seconds=budget,
+        per_point_step=per_point,
+    )
+
+
+def _about(model: CostModel) -> dict[str, Any]:
+    """When a model was measured, and what runs have taught it."""
+    return {
+        "measured": model.made,
+        "corrections": {name: model.correction(name) for name in model.ratios},
+        "runs": max((len(ratios) for ratios in model.ratios.values()), default=0),
+        "fit_errors": dict(model.errors),
+    }
+
+
+def _work(
+    prospect: Prospect, quality: int, simulated: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """Features of every stage that the shot has."""
+    shot, standing, frames = prospect.shot, prospect.standing, prospect.frames
+    splats, fill = prospect.splats(quality)
+    work = {}
+    if standing.photographs is not None:
+        work["reconstruct"] = reconstruct_work(standing.photographs, shot)
+    work["isolate"] = isolate_work(fill["splats"])
+    work["fill"] = fill
+    work["texture"] = texture_work(texture_method(shot), fill)
+    work["simulate"] = simulated
+    drawn = splats + born_splats(simulated)
+    work["render"] = render_work(shot, frames, drawn)
+    if any(kind != "mp4" for kind in shot.output.what):
+        work["export"] = export_work(shot, frames, drawn)
+    return work
+
+
+def _costs(
+    model: CostModel | None, name: str, features: dict[str, float], shot: Shot, kind: str
+) -> dict[str, Any]:
+    """Seconds and bytes of a stage; seconds are None where nobody can know them."""
+    if model is None:
+        return {"seconds": None, "memory_bytes": memory_of(name, features, kind)}
+    cost: Cost = model.stage(name, features)
+    unknown = name == "texture" and texture_method(shot) in NOT_PREDICTED
+    return {
+        "seconds": None if unknown else round(cost.seconds, 3),
+        "memory_bytes": cost.bytes,
+    }
+
+
+def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -> list[str]:
+    """What a user should mend before an hour is spent."""
+    shot, scene = prospect.shot, prospect.scene
+    found = []
+    if shot.solve.error is not None:
+        found.append(
+            "solve.error chooses the cells by probes when the shot is run, this plan has those of "
+            f"quality: {shot.solve.quality}; hint: gsfluent chart SHOT.yaml --error "
+            f"{shot.solve.error:.3g} chooses now"
+        )
+    if not shot.events and not shot.colliders:
+        found.append(
+            "the shot has no events: the object will only rest on the floor; hint: add an event"
+        )
+    if particles > MAX_PARTICLES:
+        found.append(
+            f"{particles} material points, more than the {MAX_PARTICLES} that a run takes; hint: "
+            "fewer solve.cells"
+        )
+    movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}
+    for number, body in enumerate(scene.bodies):
+        if body.solid is None:
+            continue
+        mover = movers[number]
+        limit = body.material.wave_speed * body.material.failure_strain
+        if math.isfinite(limit) and 0.0 < mover.speed < limit and not mover.driven:
+            found.append(
+                f"{body.name}: meets something at {mover.speed:.2g} m/s, but {body.material.name} "
+                f"breaks from about {limit:.2g} m/s; hint: raise the drop or lower cohesion"
+            )
+        thin = thickness(body)
+        if thin < THIN_CELLS * dx:
+            cells = math.ceil(QUALITY["preview"] * THIN_CELLS * dx / thin)
+            found.append(
+                f"{body.name}: {1000 * thin:.3g} mm at its thinnest, under {THIN_CELLS:g} cells of "
+                f"{1000 * dx:.3g} mm; hint: a finer solve.quality, or solve.cells: "
+                f"{math.ceil(cells * _cells(scene, dx) / QUALITY['preview'])}"
+            )
+    if outlook.grid_seconds <= 0.0:
+        found.append(
+            "nothing meets anything before the end; hint: a longer output.seconds, or another event"
+        )
+    if "nacc" not in laws_of(scene) and any(e.__class__.__name__ == "Bullet" for e in shot.events):
+        found.append("nothing is brittle, so the bullet breaks nothing; hint: another material")
+    return found
+
+
+def _cells(scene: Scene, dx: float) -> float:
+    """Cells along the largest body at a spacing."""
+    return grid_spacing(scene, 1) / dx

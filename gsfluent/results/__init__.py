@@ -1,0 +1,1 @@
+"""A result folder: finished stages, run.json, simulated frames."""

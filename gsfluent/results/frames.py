@@ -1,0 +1,186 @@
+"""Simulated frames on disk: what rendering and exporting need, without the solver's state.
+
+One uncompressed ``.npz`` per frame, about 50 bytes a Gaussian plus 6 a colour coefficient. Centres
+and sizes keep full precision, since pictures and exports hang on them; what only tints a picture is
+stored in half precision.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsfluent.data import Gaussians
+from gsfluent.errors import RunError
+from gsfluent.io import atomic_path
+
+_HALF = ("quats", "opacities", "sh", "damage", "velocity")
+_SPLATS = ("groups", "ids", "anchor")
+_POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "material")
+
+
+@dataclass(frozen=True, eq=False)
+class SavedFrame:
+    """One moment of a finished simulation.
+
+    Attributes:
+        index: Number of the frame, from 0.
+        time: Simulated time [s].
+        gaussians: Scene frame, repaired.
+        groups: Siblings for nearest-only compositing, int32 [N], -1 for none.
+        carried: How many of them came from the solids; the rest, at the end, are transition splats
+            of the repair.
+        ids: Number of each splat that it keeps from frame to frame as long as it lives, int64 [N]:
+            0 and up for those of the solids and the repair, negative for those of bullets, liquids
+            and rigid things.
+        anchor: Material point each splat follows, int32 [N], -1 for splats of rigid things.
+        positions: Material points [m], [P, 3].
+        volumes: Their volumes [m^3], [P].
+        damage: 0 intact to 1 broken, [P].
+        fragments: Fragment number per point, int32 [P].
+        velocity: Velocity of each point [m/s], [P, 3].
+        body: Number of each point's body in the scene, int32 [P].
+        material: Row of each point in the scene's table of materials, int32 [P].
+        facts: Plain figures of the frame (energies, counts).
+    """
+
+    index: int
+    time: float
+    gaussians: Gaussians
+    groups: Tensor
+    carried: int
+    ids: Tensor
+    anchor: Tensor
+    positions: Tensor
+    volumes: Tensor
+    damage: Tensor
+    fragments: Tensor
+    velocity: Tensor
+    body: Tensor
+    material: Tensor
+    facts: dict[str, Any]
+
+    def to(self, device: torch.device) -> SavedFrame:
+        """The same frame on another device."""
+        moved = {name: getattr(self, name).to(device) for name in (*_SPLATS, *_POINTS)}
+        return replace(self, gaussians=self.gaussians.to(device), **moved)
+
+
+def frame_path(folder: Path, index: int) -> Path:
+    """File of frame ``index``; numbers on disk start at 1 as in every frame sequence."""
+    return folder / f"frame_{index + 1:04d}.npz"
+
+
+def save_frame(folder: Path, frame: SavedFrame) -> Path:
+    """Write one frame atomically.
+
+    Raises:
+        RunError: The disk is full.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        arrays[name] = _packed(name, getattr(frame.gaussians, name))
+    if frame.gaussians.labels is not None:
+        arrays["labels"] = frame.gaussians.labels.cpu().numpy().astype(np.int8)
+    for name in (*_SPLATS, *_POINTS):
+        arrays[name] = _packed(name, getattr(frame, name))
+    head = {
+        "index": frame.index,
+        "time": frame.time,
+        "carried": frame.carried,
+        "facts": frame.facts,
+    }
+    arrays["head"] = np.array(json.dumps(head))
+    path = frame_path(folder, frame.index)
+    with atomic_path(path) as part, part.open("wb") as stream:
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
+    return path
+
+
+def load_frame(folder: Path, index: int) -> SavedFrame:
+    """Read one frame.
+
+    Raises:
+        RunError: It is missing or damaged.
+    """
+    path = frame_path(folder, index)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        head = json.loads(str(arrays["head"]))
+        return SavedFrame(
+            index=head["index"],
+            time=head["time"],
+            carried=head["carried"],
+            facts=head["facts"],
+            gaussians=_gaussians(arrays),
+            **{name: _tensor(arrays[name]) for name in (*_SPLATS, *_POINTS)},
+        )
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, error) from error
+
+
+def count_frames(folder: Path) -> int:
+    """Number of consecutive frames on disk, from the first."""
+    count = 0
+    while frame_path(folder, count).is_file():
+        count += 1
+    return count
+
+
+def frame_time(folder: Path, index: int) -> float:
+    """Simulated time [s] of a frame, without reading the rest of it.
+
+    Raises:
+        RunError: The frame is missing or damaged.
+    """
+    path = frame_path(folder, index)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return float(json.loads(str(data["head"]))["time"])
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, error) from error
+
+
+def frame_rate(folder: Path, default: float = 30.0) -> float:
+    """Frames per second of simulated time; ``default`` where there are not two frames."""
+    if count_frames(folder) < 2:
+        return default
+    step = frame_time(folder, 1) - frame_time(folder, 0)
+    return round(1.0 / step, 6) if step > 0 else default
+
+
+def _unreadable(path: Path, error: Exception) -> RunError:
+    hint = "run the shot again; only this stage is redone (use --force if it is not)"
+    return RunError(f"{path}: no readable frame ({error})", "the other frames", hint)
+
+
+def _packed(name: str, value: Tensor) -> np.ndarray:
+    array = value.detach().cpu().numpy()
+    if name in _HALF:
+        return array.astype(np.float16)
+    return array.astype(np.float32) if array.dtype == np.float64 else array
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    value = torch.from_numpy(array)
+    return value.float() if value.dtype == torch.float16 else value
+
+
+def _gaussians(arrays: dict[str, np.ndarray]) -> Gaussians:
+    labels = arrays.get("labels")
+    return Gaussians(
+        means=_tensor(arrays["means"]),
+        quats=_tensor(arrays["quats"]),
+        scales=_tensor(arrays["scales"]),
+        opacities=_tensor(arrays["opacities"]),
+        sh=_tensor(arrays["sh"]),
+        labels=None if labels is None else torch.from_numpy(labels.astype(np.int32)),
+    )

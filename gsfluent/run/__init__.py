@@ -1,0 +1,1 @@
+"""gsfluent run: the whole shot, the demo, single stages, the report."""

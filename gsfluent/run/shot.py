@@ -1,0 +1,138 @@
+"""Everything a shot asks for, in order, resumable: the orchestrator behind ``gsfluent run``.
+
+Each stage is looked up by the fingerprint of what goes into it and only done when that changed.
+Whatever happens, ``run.json`` says so: it is written when the run ends, when it fails, and when it
+is interrupted.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent.choose.shot import choose_stage
+from gsfluent.config import Shot
+from gsfluent.errors import GsfluentError, RunError
+from gsfluent.plan.in_run import foresee_run, judge_plan
+from gsfluent.progress import LineReporter, Reporter
+from gsfluent.results.record import RunRecord
+from gsfluent.results.store import StageResult, StageStore
+from gsfluent.run.report import REPORT, write_report
+from gsfluent.stages.chain import run_stages
+from gsfluent.stages.context import RunContext
+
+_log = logging.getLogger(__name__)
+
+AfterRun = Callable[[RunContext], dict[str, Any]]
+
+
+def run_shot(
+    shot: Shot,
+    out: Path,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    force: bool = False,
+    reporter: Reporter | None = None,
+    before: StageResult | None = None,
+    after: AfterRun | None = None,
+    facts: Mapping[str, Any] | None = None,
+    plan: bool = True,
+) -> dict[str, Any]:
+    """Run a shot into a folder.
+
+    Args:
+        shot: What to do, see :mod:`gsfluent.config`.
+        out: Folder for the results; made when missing.
+        device: Where the heavy work runs.
+        seed: Seed of everything random.
+        force: Redo finished stages.
+        reporter: Receives progress; log lines by default.
+        before: A stage done already, to stand first in ``run.json``.
+        after: Called when all stages are done; what it returns is added to ``run.json``.
+        facts: What is known before and belongs into ``run.json``.
+        plan: Plan the run first, and put plan and fact beside each other into ``run.json``.
+
+    Returns:
+        The content of ``run.json``.
+
+    Raises:
+        InputError: The shot or a file it names is wrong.
+        RunError: A stage failed; finished stages are kept.
+        KeyboardInterrupt: Interrupted; finished stages and frames are kept.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    device = torch.device(device)
+    store = StageStore(out / "stages", force=force)
+    if before is not None:
+        store.results.append(before)
+    record = RunRecord(out / "run.json", shot.resolved(), device, seed)
+    record.values.update(facts or {})
+    context = RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
+    start = time.perf_counter()
+
+    foreseen = None
+
+    def settle(context: RunContext) -> None:
+        nonlocal foreseen
+        if choose_stage(context):  # the plan was made with other cells
+            foreseen = foresee_run(context, plan=plan)
+
+    try:
+        foreseen = foresee_run(context, plan=plan)
+        run_stages(context, settle)
+        if after is not None:
+            record.values.update(after(context))
+        judge_plan(context, foreseen)
+    except BaseException as error:
+        _record_failure(record, error, store)
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt(_resume_text(error, out, store)) from error
+        if isinstance(error, GsfluentError | OSError) or not isinstance(error, Exception):
+            raise
+        at = store.results[-1].name if store.results else "start"
+        raise RunError(
+            f"{at}: {type(error).__name__}: {error}",
+            _kept(out, store),
+            "run the same command again to go on; GSFLUENT_DEBUG=1 shows the traceback",
+        ) from error
+    record.values["outputs"]["report"] = REPORT
+    values = record.finish(store.results)
+    write_report(out, values)
+    _log.info(
+        "%s in %.1f s: %s (%s)",
+        out,
+        time.perf_counter() - start,
+        values["verdict"],
+        values["reason"],
+    )
+    if values["verdict"] == "failed":
+        raise RunError(
+            values["reason"], _kept(out, store), "try solve.quality: hero, or softer material"
+        )
+    return values
+
+
+def _record_failure(record: RunRecord, error: BaseException, store: StageStore) -> None:
+    """Write run.json; where even that cannot be (full disk) the error still reaches the user."""
+    with suppress(RunError, OSError):
+        record.fail(error, store.results)
+
+
+def _kept(out: Path, store: StageStore) -> str:
+    done = [r.name for r in store.results if (r.folder / "stage.json").is_file()]
+    return f"{out}/stages with {', '.join(done)}" if done else "nothing yet"
+
+
+def _resume_text(error: KeyboardInterrupt, out: Path, store: StageStore) -> str:
+    cause = str(error) or "interrupted by Ctrl-C"
+    return (
+        f"{cause}\n  kept: {_kept(out, store)}\n  resume: run the same command again;"
+        " finished stages and simulated frames are not redone"
+    )

@@ -1,0 +1,1 @@
+"""What is simulated: bodies, things that move by themselves, events."""

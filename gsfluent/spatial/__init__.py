@@ -1,0 +1,1 @@
+"""Neighbours, voxels, densities, distances, winding numbers."""

@@ -1,0 +1,1 @@
+"""Stages of a run over files: fingerprint, work, record; resumable."""

@@ -1,0 +1,150 @@
+"""From simulated frames to pictures: render and export stages, and ``gsfluent render``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsfluent.errors import InputError
+from gsfluent.export.write import write_exports
+from gsfluent.io import save_image
+from gsfluent.pipeline.light.from_shot import changed, light_of, looks_of
+from gsfluent.pipeline.render.figures import FilmFigures
+from gsfluent.pipeline.render.film import Film, poster_frame
+from gsfluent.pipeline.render.video import to_bytes, write_video
+from gsfluent.progress import Progress, report_progress
+from gsfluent.results.record import shot_of
+from gsfluent.results.store import content_digest, fingerprint, publish
+from gsfluent.stages.context import RunContext
+
+
+def render_stage(context: RunContext) -> None:
+    """``video.mp4`` and ``poster.png``, and how many holes the repair closed."""
+    shot = context.shot
+    light = light_of(shot)
+    output = [list(shot.output.size), str(shot.output.camera), shot.output.fps]
+    output += [shot.output.slow, shot.output.backdrop]
+    path = shot.output.camera
+    camera_key = content_digest(path) if isinstance(path, Path) else None
+    looks = [repr(light), repr(looks_of(shot))]
+    key = fingerprint("render", context.key(context.source_key, looks, output, camera_key))
+
+    def work(folder: Path) -> dict[str, Any]:
+        film = Film.of(context.out, shot, light, context.device)
+        report: dict[str, Any] = {"frames": len(film)}
+        figures = FilmFigures(film.frame(0), film.around)
+        counts: list[int] = []
+        drawing = 0.0
+        progress = context.reporter.task("render")
+
+        def pictures() -> Iterator[np.ndarray]:
+            nonlocal drawing
+            for index in range(len(film)):
+                frame = film.frame(index)
+                start = time.perf_counter()
+                layers = film.layers(frame)
+                picture = to_bytes(layers.image)
+                drawing += time.perf_counter() - start
+                figures.add(frame, film.cameras[index], layers.alpha, layers.depth)
+                counts.append(int(frame.facts.get("fragments", 1)))
+                report_progress(progress, index + 1, len(film), "")
+                yield picture
+
+        write_video(
+            folder / "video.mp4", pictures(), fps=shot.output.video_fps, size=shot.output.size
+        )
+        report |= figures.report()
+        report["seconds_per_frame"] = drawing / len(film)
+        report["poster_frame"] = poster_frame(counts, shot.output.fps)
+        best = film.frame(report["poster_frame"])
+        save_image(film.picture(best).cpu(), folder / "poster.png")
+        return report
+
+    result = context.store.run("render", key, work)
+    for name in ("video.mp4", "poster.png"):
+        publish(result.folder / name, context.out / name)
+        context.record.values["outputs"][name.split(".")[0]] = name
+    context.record.values["render"] = dict(result.report)
+
+
+def export_stage(context: RunContext) -> None:
+    """What ``output.what`` asks for beside the video."""
+    wanted = [kind for kind in context.shot.output.what if kind != "mp4"]
+    if not wanted:
+        return
+    key = fingerprint("export", context.key(context.source_key, wanted))
+
+    def work(folder: Path) -> dict[str, Any]:
+        return write_exports(context.out, wanted, progress=context.reporter.task("export"))
+
+    result = context.store.run("export", key, work)
+    context.record.values["outputs"] |= result.report
+
+
+def render_again(
+    out: Path,
+    *,
+    device: torch.device,
+    to: Path | None = None,
+    camera: str | None = None,
+    size: tuple[int, int] | None = None,
+    frame: int | None = None,
+    progress: Progress | None = None,
+    **light: Any,
+) -> dict[str, Any]:
+    """Render a finished simulation with another camera, light or size.
+
+    Args:
+        out: Folder of the run.
+        device: Where to render.
+        to: Video (.mp4) or picture (.png); ``render.mp4`` or ``render.png`` in ``out`` by default.
+        camera: ``orbit``, a photograph's index, or a JSON file; the shot's own by default.
+        size: (width, height) [px].
+        frame: Only this frame.
+        progress: Called per frame.
+        light: Changes to the light, as :func:`gsfluent.pipeline.light.from_shot.changed`
+        takes them.
+
+    Returns:
+        ``output``, ``frames`` and ``seconds_per_frame``.
+
+    Raises:
+        InputError: Not a finished run, or an argument out of range.
+    """
+    shot = shot_of(out)
+    output = shot.output
+    if camera is not None:
+        index = camera.lstrip("-").isdigit()
+        output = replace(output, camera=int(camera) if index else camera)
+    if size is not None:
+        output = replace(output, size=size)
+    shot = replace(shot, output=output)
+    film = Film.of(out, shot, changed(light_of(shot), **light), device)
+    target = to or out / ("render.mp4" if frame is None else "render.png")
+    start = time.perf_counter()
+    if frame is not None:
+        if not 0 <= frame < len(film):
+            raise InputError(f"--frame {frame}", f"the run has frames 0 to {len(film) - 1}")
+        save_image(film.picture(film.frame(frame)).cpu(), target)
+        return {
+            "output": str(target),
+            "frames": 1,
+            "seconds_per_frame": time.perf_counter() - start,
+        }
+    if target.suffix.lower() != ".mp4":
+        raise InputError(f"-o {target}", "name a .mp4 file, or give --frame N for one .png")
+
+    def pictures() -> Iterator[np.ndarray]:
+        for index in range(len(film)):
+            yield to_bytes(film.picture(film.frame(index)))
+            report_progress(progress, index + 1, len(film), "")
+
+    count = write_video(target, pictures(), fps=shot.output.video_fps, size=shot.output.size)
+    seconds = (time.perf_counter() - start) / count
+    return {"output": str(target), "frames": count, "seconds_per_frame": seconds}

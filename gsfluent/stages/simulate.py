@@ -1,0 +1,238 @@
+"""The simulation stage of a run: one file per finished frame, taken up again where it stopped."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsfluent import materials
+from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
+from gsfluent.data import SURFACE, Frame, Gaussians, Solid
+from gsfluent.materials import Material
+from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
+from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.walls import thin_shells
+from gsfluent.results.frames import SavedFrame, count_frames, save_frame
+from gsfluent.results.store import content_digest, fingerprint
+from gsfluent.scene.scene import Body, Scene
+from gsfluent.stages.context import RunContext
+from gsfluent.stages.solids import load_solids
+
+_log = logging.getLogger(__name__)
+_STATE = "state.pt"
+_STEEL_ROWS = 2**40
+
+
+def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
+    """The scene of a shot: its solids with their materials, the floor, and the events.
+
+    Args:
+        shot: The shot.
+        solids: Solid of each object by name.
+        frame: World to scene.
+
+    Raises:
+        InputError: A material, part or event that cannot be.
+    """
+    scene = Scene(
+        floor=None if shot.floor == "none" else 0.0,
+        gravity=shot.gravity,
+        floor_mode=shot.floor_mode,
+        floor_friction=shot.floor_friction,
+    )
+    for name, settings in shot.objects.items():
+        parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
+        scene.add(solids[name], _material(settings), frame=frame, parts=parts, name=name)
+    if shot.floor == "auto":
+        _lift(scene)
+    for collider in shot.colliders:
+        keys = collider_dict(collider)
+        scene.add_collider(keys.pop("type"), **keys)
+    for event in shot.events:
+        scene.add_event(event_dict(event))
+    return scene
+
+
+def _lift(scene: Scene) -> None:
+    """Put objects on a floor that was found for them: a filled solid reaches below its splats."""
+    lowest = min(float(body.bounds()[0][2]) for body in scene.bodies)
+    if scene.floor is not None and lowest < scene.floor:
+        scene.lift(scene.floor - lowest)
+
+
+def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
+    """What a collider depends on: its settings, and the content of its mesh instead of its path."""
+    keys = collider_dict(collider)
+    if "mesh" in keys:
+        keys["mesh"] = content_digest(Path(keys["mesh"]))
+    return keys
+
+
+def _material(settings: ObjectSettings) -> Material:
+    return materials.get(settings.material).override(**dict(settings.overrides))
+
+
+def _moving(settings: ObjectSettings) -> dict[str, Any]:
+    """The settings of an object that a simulation hangs on: all but its highlights."""
+    return {k: v for k, v in settings.to_dict().items() if k not in materials.LOOKS}
+
+
+def moving_settings(shot: Shot) -> list[Any]:
+    """All of a shot that its motion hangs on, but for cells and step."""
+    objects = {
+        # the numbers of a preset, not its name: a retuned preset is another simulation
+        name: [_moving(settings), repr(_material(settings))]
+        for name, settings in shot.objects.items()
+    }
+    return [
+        objects,
+        [event_dict(event) for event in shot.events],
+        [_collider_key(collider) for collider in shot.colliders],
+        [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
+        [shot.solve.standing, shot.solve.loose_crumbs],
+        shot.output.fps,
+        shot.output.seconds,
+    ]
+
+
+def simulate_stage(context: RunContext) -> None:
+    """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
+    shot = context.shot
+    solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl]
+    settings = [moving_settings(shot), solve, shot.output.cracks]
+    key = fingerprint("simulate", context.key(context.source_key, settings))
+
+    def work(folder: Path) -> dict[str, Any]:
+        scene = build_scene(shot, load_solids(context), context.frame)
+        cells = shot.solve.cells
+        stage = Simulate(
+            quality=shot.solve.quality,
+            seed=context.seed,
+            device=context.device,
+            dx=None if cells is None else grid_spacing(scene, cells),
+            cfl=shot.solve.cfl,
+            standing=shot.solve.standing,
+            loose_crumbs=shot.solve.loose_crumbs,
+            deterministic=shot.solve.deterministic,
+            repair=shot.output.cracks,
+        )
+        state = folder / _STATE
+        resume = state if state.is_file() and count_frames(folder) > 0 else None
+        frames = stage(
+            scene,
+            fps=shot.output.fps,
+            seconds=shot.output.seconds,
+            progress=context.reporter.task("simulate"),
+            resume=resume,
+        )
+        for frame in frames:
+            save_frame(folder, saved(frame, scene))
+            # after the frame: a state on disk always has its picture
+            stage.save_state(state)
+        return stage.report() | {"thin": thin_walls(scene, stage.report()["dx"])}
+
+    result = context.store.run("simulate", key, work)
+    report = dict(result.report)
+    fill = context.record.values["fill"]
+    # the number of material points is known only once the grid is
+    for name in ("particles", "particles_per_cell"):
+        if name in report and name not in fill:
+            fill[name] = report[name]
+    context.record.values["simulation"] = report
+    context.source_key = result.fingerprint
+
+
+def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
+    """Walls that the grid cannot carry, by body, in scene metres; a warning for each with some."""
+    found = {}
+    for body in scene.bodies:
+        if body.solid is None:
+            continue
+        scale, splats = body.frame.scale, body.solid.gaussians
+        assert splats.labels is not None  # a solid has labels
+        skin = splats.select(splats.labels.eq(SURFACE))
+        field = SignedDistance.of_solid(body.solid)
+        report = thin_shells(
+            field.replace(values=field.values * scale, voxel=field.voxel * scale),
+            dx,
+            gaussian_size=scale * float(skin.scales.amax(1).median()) if skin.count else None,
+            unit=" m",
+        )
+        if report["middle"] is not None:
+            # measured from the corner of the grid, in metres
+            local = torch.tensor(report["middle"]) - field.origin
+            report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
+        if report["warning"]:
+            _log.warning("%s: %s; hint: %s", body.name, report["warning"], report["hint"])
+        found[body.name] = report
+    return found
+
+
+def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
+    """What of a simulated frame goes to disk.
+
+    Splats of the solids, then of bullets, liquids and rigid things, then transitions.
+    """
+    repaired = frame.repaired
+    gaussians, groups, ids = repaired.gaussians, repaired.groups, repaired.ids
+    anchor, carried = repaired.anchor, frame.carried.count
+    points = bare_points(frame.particles, scene)
+    bare = bare_splats(frame.particles, scene)
+    things = [rigid_splats(frame.rigid, frame.colliders)]
+    things.append(blade_splats(scene, frame.time, ids.device))
+    seen = [thing for thing in things if thing is not None]
+    steel = Gaussians.cat(seen) if seen else None
+    for extra, follows in ((bare, points), (steel, None)):
+        if extra is None:
+            continue
+        alone = torch.full((extra.count,), -1, dtype=torch.int64, device=ids.device)
+        # those of matter by its point, those of steel beyond all of them
+        numbers = torch.arange(extra.count, device=ids.device) + _STEEL_ROWS
+        numbers = -1 - (numbers if follows is None else follows)
+        first = torch.arange(gaussians.count, device=ids.device) < carried
+        gaussians = Gaussians.cat([gaussians.select(first), extra, gaussians.select(~first)])
+        groups = _insert(groups, carried, alone)
+        ids = _insert(ids, carried, numbers)
+        anchor = _insert(anchor, carried, alone if follows is None else follows)
+        carried += extra.count
+    particles = frame.particles
+    waiting = [n for n, body in enumerate(scene.bodies) if _waits(body, frame.time)]
+    if waiting:  # a bullet that has not been fired is not seen
+        them = torch.isin(particles.body, particles.body.new_tensor(waiting))
+        unseen = (anchor >= 0) & them[anchor.clamp(min=0).long()]
+        gaussians = gaussians.replace(opacities=gaussians.opacities.masked_fill(unseen, 0.0))
+    return SavedFrame(
+        index=frame.index,
+        time=frame.time,
+        gaussians=gaussians,
+        groups=groups,
+        carried=carried,
+        ids=ids,
+        anchor=anchor.to(torch.int32),
+        positions=particles.position,
+        volumes=particles.volume,
+        damage=frame.damage,
+        fragments=frame.fragments,
+        velocity=particles.velocity,
+        body=particles.body,
+        material=particles.material,
+        facts=dict(frame.stats)
+        | {
+            "energy": dict(frame.energy),
+            "bodies": [[body.name, body.material.name] for body in scene.bodies],
+        },
+    )
+
+
+def _waits(body: Body, time: float) -> bool:
+    return body.held and body.length == 0.0 and body.start > time + 1e-12
+
+
+def _insert(values: Tensor, row: int, more: Tensor) -> Tensor:
+    return torch.cat([values[:row], more.to(values), values[row:]])

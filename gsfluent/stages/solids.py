@@ -1,0 +1,317 @@
+"""The stages of a run that make solids: reconstruct, isolate, fill, texture."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsfluent.config import Shot
+from gsfluent.data import Frame, Solid
+from gsfluent.data.regions import source_key, source_paths
+from gsfluent.errors import InputError
+from gsfluent.io import atomic_path, load_capture, load_splats, write_json
+from gsfluent.io.solid import load_solid, save_solid
+from gsfluent.io.splats.load import save_splats
+from gsfluent.pipeline.capture.orient import Orientation, make_frame, orient
+from gsfluent.pipeline.fill.stage import Fill, fill_resolution, visible_extent
+from gsfluent.pipeline.reconstruct.evaluate import write_report
+from gsfluent.pipeline.reconstruct.isolate import Isolate
+from gsfluent.pipeline.reconstruct.stage import Reconstruct
+from gsfluent.pipeline.regions.project import label_regions
+from gsfluent.pipeline.render.backdrop import no_background
+from gsfluent.pipeline.render.cuts import save_cut_views
+from gsfluent.pipeline.simulate.stage import QUALITY
+from gsfluent.pipeline.texture import Texture
+from gsfluent.progress import LineReporter, Reporter
+from gsfluent.results.record import RunRecord, read_frame
+from gsfluent.results.store import StageStore, content_digest, fingerprint, publish
+from gsfluent.stages.context import RunContext
+from gsfluent.stages.select import select_mask
+
+_log = logging.getLogger(__name__)
+
+
+def reconstruct_stage(context: RunContext) -> None:
+    """Photographs to Gaussians: ``stages/reconstruct/model.ply``."""
+    shot = context.shot
+    if shot.capture is None:
+        return
+    context.capture = load_capture(shot.capture)
+    context.source_key = content_digest(shot.capture)
+    key = fingerprint("reconstruct", context.key(context.source_key, shot.reconstruct.given()))
+    capture = context.capture
+
+    def work(folder: Path) -> dict[str, Any]:
+        stage = Reconstruct(
+            **shot.reconstruct.given(),
+            checkpoint=folder / "training.pt",
+            device=context.device,
+            seed=context.seed,
+        )
+        gaussians, report = stage(capture, progress=context.reporter.task("reconstruct"))
+        save_splats(gaussians, folder / "model.ply")
+        write_report(folder, gaussians, capture, report)
+        return dict(report)
+
+    result = context.store.run("reconstruct", key, work)
+    context.record.values["reconstruction"] = result.report
+    context.source_key = result.fingerprint
+
+
+def isolate_stage(context: RunContext) -> None:
+    """The object apart from its background, and where it stands in the scene."""
+    shot = context.shot
+    if shot.splats is not None:
+        source = shot.splats
+        context.source_key = content_digest(source)
+    else:
+        source = context.store.root / "reconstruct" / "model.ply"
+    placing = {"scale": shot.scale, "size": shot.size, "up": shot.up, "floor": shot.floor}
+    placing["origin"] = shot.origin
+    captured = shot.output.backdrop == "captured"
+    key = fingerprint("isolate", context.key(context.source_key, placing))
+
+    def work(folder: Path) -> dict[str, Any]:
+        gaussians = load_splats(source).validated(source.name)
+        stage = Isolate(seed=context.seed)
+        whole, background = stage.split(gaussians, context.capture)
+        stance = orient(whole, context.capture, shot.up)
+        frame = make_frame(whole, context.capture, shot)
+        save_splats(whole, folder / "object.ply")
+        if background.count:
+            save_splats(background, folder / "background.ply")
+        elif captured:
+            raise no_background()
+        write_json(folder / "frame.json", frame.to_dict())
+        return dict(stage.report) | {
+            "gaussians_kept": whole.count,
+            "gaussians_removed": background.count,
+            "up": stance.up.tolist(),
+            "up_from": stance.up_from,
+            "floor_from": stance.floor_from,
+            "scale": frame.scale,
+            "support_plane": _support_plane(stance, frame),
+        }
+
+    result = context.store.run("isolate", key, work)
+    context.frame = read_frame(result.folder)
+    context.record.values["isolation"] = result.report
+    context.source_key = result.fingerprint
+
+
+def _support_plane(stance: Orientation, frame: Frame) -> dict[str, Any] | None:
+    """What the object stood on, ``normal @ x = offset``, in world units and in the scene [m]."""
+    if stance.floor_from != "support plane":
+        return None
+    normal = torch.from_numpy(stance.up).double()
+    turned = frame.apply_vector(normal[None])[0].double()
+    foot = frame.apply((stance.floor * normal)[None])[0].double()
+    return {
+        "world": {"normal": normal.tolist(), "offset": stance.floor},
+        "scene": {"normal": turned.tolist(), "offset": float(foot @ turned)},
+    }
+
+
+def fill_stage(context: RunContext) -> None:
+    """Shells to solids: ``stages/fill/<object>.ply`` for every object of the shot."""
+    shot, frame = context.shot, context.frame
+    selections = {name: repr(o.select) for name, o in shot.objects.items()}
+    labels = [content_digest(o.select.labels) for o in shot.objects.values() if o.select.labels]
+    options = shot.fill.given(frame.scale)
+    cells = QUALITY[shot.solve.quality]
+    # a finer simulation asks for another solid only where it asks for finer voxels
+    fine = options.get("resolution", fill_resolution(1.0, 1.0, cells))
+    key = fingerprint("fill", context.key(context.source_key, options, fine, selections, labels))
+
+    def work(folder: Path) -> dict[str, Any]:
+        everything = load_splats(context.store.root / "isolate" / "object.ply")
+        objects = {}
+        taken = torch.zeros(everything.count, dtype=torch.bool)
+        for name, settings in shot.objects.items():
+            mask = select_mask(everything, settings.select, frame) & ~taken
+            taken |= mask
+            objects[name] = everything.select(mask)
+        extents = {name: visible_extent(splats) for name, splats in objects.items()}
+        largest = max(extents.values())
+        down = tuple((-frame.rotation[2]).tolist())
+        reports = []
+        for name, splats in objects.items():
+            wanted = {"resolution": fill_resolution(extents[name], largest, cells)}
+            stage = Fill(**wanted | options, down=down, seed=context.seed)
+            solid = stage(
+                splats.to(context.device),
+                context.capture,
+                progress=context.reporter.task("fill"),
+            )
+            save_solid(solid.transformed(frame), folder / f"{name}.ply")
+            reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
+        return _merged(reports)
+
+    result = context.store.run("fill", key, work)
+    context.record.values["fill"] = dict(result.report)
+    context.source_key = result.fingerprint
+
+
+def texture_stage(context: RunContext) -> None:
+    """Colours for the inside: ``stages/texture/<object>.ply`` and ``OUT/interior.png``."""
+    shot = context.shot
+    options = shot.texture.given()
+    exemplar = content_digest(shot.texture.exemplar) if shot.texture.exemplar else None
+    key = fingerprint("texture", context.key(context.source_key, options, exemplar))
+
+    def work(folder: Path) -> dict[str, Any]:
+        reports = []
+        for name in shot.objects:
+            solid = load_solid(context.store.root / "fill" / f"{name}.ply")
+            # slices finished before a kill are found again: the folder outlives it
+            stage = Texture(
+                **options,
+                device=str(context.device),
+                resume=folder / f"{name}.slices",
+                seed=context.seed,
+            )
+            textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
+            save_solid(textured, folder / f"{name}.ply")
+            save_cut_views(textured, folder / f"{name}.png")
+            reports.append({k: v for k, v in textured.report.items() if k != "fill"})
+        return _merged(reports)
+
+    result = context.store.run("texture", key, work)
+    first = next(iter(shot.objects))
+    publish(result.folder / f"{first}.png", context.out / "interior.png")
+    context.record.values["texture"] = dict(result.report)
+    context.record.values["outputs"]["interior"] = "interior.png"
+    context.source_key = result.fingerprint
+
+
+def _merged(reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """One report: the object's own, or counts and volumes summed when there are more objects."""
+    if len(reports) == 1:
+        return reports[0]
+    total: dict[str, Any] = dict(reports[0])
+    for key in ("interior_gaussians", "volume", "volume_m3", "leaks", "slices"):
+        if all(isinstance(report.get(key), int | float) for report in reports):
+            total[key] = sum(report[key] for report in reports)
+    total["objects"] = reports
+    return total
+
+
+_KEYS = ("regions", "region_sources")
+
+
+def _sources(context: RunContext) -> dict[str, list[dict[str, Any]]]:
+    """Conditions that need labels, by object."""
+    found = {
+        name: [
+            where
+            for part in settings.parts or ()
+            if source_key(where := part.where.given()) is not None
+        ]
+        for name, settings in context.shot.objects.items()
+    }
+    return {name: sources for name, sources in found.items() if sources}
+
+
+def regions_stage(context: RunContext) -> None:
+    """Labels for the solids: ``stages/regions/<object>.npz`` and ``.json``, where parts ask."""
+    wanted = _sources(context)
+    if not wanted:
+        return
+    content = {
+        name: [
+            [source_key(where), [content_digest(file) for file in source_paths(where).values()]]
+            for where in sources
+        ]
+        for name, sources in wanted.items()
+    }
+    placing = context.frame.to_dict()  # label images are taken along the scene's axes
+    key = fingerprint("regions", context.key(context.source_key, content, placing))
+
+    def work(folder: Path) -> dict[str, Any]:
+        reports = {}
+        for name, sources in wanted.items():
+            solid = load_solid(context.store.root / "texture" / f"{name}.ply").to(context.device)
+            labelled = label_regions(
+                solid,
+                sources,
+                context.capture,
+                frame=context.frame,
+                progress=context.reporter.task("regions"),
+            )
+            assert labelled.regions is not None
+            with (
+                atomic_path(folder / f"{name}.npz") as temporary,
+                open(temporary, "wb") as stream,
+            ):
+                np.savez_compressed(stream, regions=labelled.regions.cpu().numpy())
+            write_json(folder / f"{name}.json", {k: labelled.report[k] for k in _KEYS})
+            reports[name] = labelled.report["region_sources"]
+        return reports
+
+    result = context.store.run("regions", key, work)
+    context.record.values["regions"] = dict(result.report)
+    context.source_key = result.fingerprint
+
+
+def load_solids(context: RunContext) -> dict[str, Solid]:
+    """The textured solids of the run's objects by name, with their labels where parts ask."""
+    root, labelled = context.store.root, _sources(context)
+    solids = {}
+    for name in context.shot.objects:
+        solid = load_solid(root / "texture" / f"{name}.ply")
+        if name in labelled:
+            solid = _with_labels(solid, root / "regions" / name)
+        solids[name] = solid
+    return solids
+
+
+def _with_labels(solid: Solid, path: Path) -> Solid:
+    import zipfile
+
+    try:
+        with np.load(path.with_name(path.name + ".npz"), allow_pickle=False) as data:
+            regions = torch.from_numpy(data["regions"])
+        table = json.loads(path.with_name(path.name + ".json").read_text(encoding="utf-8"))
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: the labels of the run are damaged ({error})",
+            "remove the folder; the next run makes them again",
+        ) from error
+    return solid.replace(regions=regions, report={**solid.report, **table})
+
+
+def context_of(
+    shot: Shot,
+    out: Path,
+    device: torch.device | str,
+    seed: int,
+    reporter: Reporter | None = None,
+) -> RunContext:
+    """What stages need to take up, or to begin, a run in a folder; nothing is done or written yet.
+
+    Args:
+        shot: The shot.
+        out: Folder of the run.
+        device: Where the stages compute.
+        seed: Seed of everything random.
+        reporter: Receives progress; log lines by default.
+    """
+    device = torch.device(device)
+    record = RunRecord(out / "run.json", shot.resolved(), device, seed)
+    store = StageStore(out / "stages")
+    return RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
+
+
+def make_solids(context: RunContext) -> None:
+    """Do the stages up to the solids and their regions, or find them done.
+
+    Raises:
+        InputError: The shot, or a file that it names, is wrong.
+    """
+    for stage in (reconstruct_stage, isolate_stage, fill_stage, texture_stage, regions_stage):
+        stage(context)

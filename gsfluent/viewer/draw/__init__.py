@@ -1,0 +1,1 @@
+"""How the viewer makes its pictures."""

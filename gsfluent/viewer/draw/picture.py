@@ -1,0 +1,200 @@
+"""One moment, one camera, one look: a picture. No browser is needed for any of this."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsfluent import geometry
+from gsfluent.data import Camera, Gaussians
+from gsfluent.errors import GsfluentError
+from gsfluent.pipeline.light.from_shot import gloss_of, light_of
+from gsfluent.pipeline.light.lamps import Lighting
+from gsfluent.pipeline.render.backdrop import Backdrop
+from gsfluent.pipeline.render.camera import Action, orbit
+from gsfluent.pipeline.render.film import captured_backdrop
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
+from gsfluent.results.frames import SavedFrame
+from gsfluent.viewer.model.color import Legend, splat_colors
+from gsfluent.viewer.model.look import Cut, Look
+from gsfluent.viewer.model.source import RunSource
+from gsfluent.viewer.model.timeline import Timeline
+
+_log = logging.getLogger(__name__)
+_BARE = (0.93, 0.93, 0.94)  # ground when there is no floor
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What of a frame is drawn.
+
+    Attributes:
+        gaussians: Splats, coloured and cut.
+        groups: Siblings, int32 [N].
+        gloss: Highlights of each splat, [N, 2], or None.
+        legend: What the colours mean, or None.
+    """
+
+    gaussians: Gaussians
+    groups: Tensor
+    gloss: Tensor | None
+    legend: Legend | None
+
+
+class PictureMaker:
+    """Draws moments of a timeline.
+
+    Args:
+        timeline: The frames.
+    """
+
+    def __init__(self, timeline: Timeline) -> None:
+        self.timeline = timeline
+        self.device = timeline.device
+        self.shot = timeline.source.shot
+        self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
+        self._backdrop = self._captured()
+        self._render: tuple[object, Render] | None = None
+
+    def first_light(self) -> Lighting:
+        """The shot's light, or the usual one."""
+        return light_of(self.shot) if self.shot is not None else Lighting()
+
+    def camera(self, index: int, width: int, height: int) -> Camera:
+        """The film's first camera, turned to frame ``index``.
+
+        Raises:
+            RunError: That frame cannot be read.
+        """
+        survey = self.timeline.survey(index)
+        radius = min(max(survey.radius, 1.35 * self.timeline.radius), 3.6 * self.timeline.radius)
+        action = Action(
+            torch.tensor([survey.center], dtype=torch.float64),
+            torch.tensor([radius], dtype=torch.float64),
+        )
+        return orbit(action, (width, height))[0]
+
+    def picture(self, index: int, camera: Camera, look: Look) -> np.ndarray:
+        """As :meth:`picture_and_legend`, the picture only."""
+        return self.picture_and_legend(index, camera, look)[0]
+
+    def picture_and_legend(
+        self, index: int, camera: Camera, look: Look
+    ) -> tuple[np.ndarray, Legend | None]:
+        """Draw frame ``index``.
+
+        Args:
+            index: Frame number from 0.
+            camera: In the scene frame.
+            look: Colours, light, cut.
+
+        Returns:
+            Display values, uint8 [H, W, 3], and what the colours mean, if they mean something.
+
+        Raises:
+            RunError: The frame is missing or damaged.
+        """
+        frame = self.timeline.frame(index)
+        drawn = self.splats(frame, look)
+        gaussians, groups, gloss = drawn.gaussians, drawn.groups, drawn.gloss
+        render = self._renderer(index, look)
+        if gaussians.count == 0:  # everything is cut away
+            image = self._empty(frame, camera, render)
+        else:
+            image = render(gaussians, camera, groups=groups, gloss=gloss, time=frame.time)
+        values = (image * 255.0).round().clamp(0, 255).to(torch.uint8)
+        return values.cpu().numpy(), drawn.legend
+
+    def _renderer(self, index: int, look: Look) -> Render:
+        """The render stage of a state of matter and light; it remembers how large matter is."""
+        key = (self.timeline.revision, index, look)
+        if self._render is None or self._render[0] != key:
+            render = Render(
+                light=look.light,
+                studio=self._studio() if look.floor else None,
+                backdrop=self._backdrop if look.floor else None,
+                background=_BARE,
+                normal_cell=self.timeline.normal_cell,
+            )
+            self._render = (key, render)
+        return self._render[1]
+
+    def splats(self, frame: SavedFrame, look: Look) -> Drawn:
+        """The splats of a frame as a look shows them."""
+        gaussians, groups = frame.gaussians, frame.groups
+        gloss = None if self.shot is None else gloss_of(self.shot, frame)
+        colors, legend = splat_colors(frame, self.timeline, look.color_by)
+        if colors is not None:
+            gaussians = gaussians.with_sh_degree(0).with_colors(colors)
+        if look.cut is not None:
+            kept = ~hidden(gaussians.means, look.cut, self.timeline.survey(frame.index).center)
+            gaussians, groups = gaussians.select(kept), groups[kept]
+            gloss = None if gloss is None else gloss[kept]
+        return Drawn(gaussians, groups, gloss, legend)
+
+    def _empty(self, frame: SavedFrame, camera: Camera, render: Render) -> Tensor:
+        """Floor and backdrop alone: one splat that nobody sees keeps to the renderer's path."""
+        speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
+        speck = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
+        return render(speck, camera)
+
+    def _studio(self) -> Studio | None:
+        if self.floor is None:
+            return None
+        timeline = self.timeline
+        return Studio(self.floor, timeline.middle(), timeline.radius, 1.3 * timeline.extent())
+
+    def _captured(self) -> Backdrop | None:
+        """The photographed surroundings where the shot asks for them and they are there."""
+        source, shot = self.timeline.source, self.shot
+        if shot is None or shot.output.backdrop != "captured" or not isinstance(source, RunSource):
+            return None
+        try:
+            return captured_backdrop(source.out / "stages", list(shot.objects), self.device)
+        except (GsfluentError, OSError) as error:
+            _log.warning("viewer: the captured backdrop is left out: %s", error)
+            return None
+
+
+def hidden(points: Tensor, cut: Cut, center: tuple[float, float, float]) -> Tensor:
+    """Which points [N, 3] lie in front of a cut plane through ``center`` + offset, bool [N]."""
+    normal = points.new_tensor(cut.normal)
+    normal = normal / normal.norm()
+    return (points - points.new_tensor(center)) @ normal > cut.offset
+
+
+def browser_camera(
+    wxyz: np.ndarray,
+    position: np.ndarray,
+    fov: float,
+    size: tuple[int, int],
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Camera:
+    """The camera that sees what the browser's sees (both look along +z with +y down).
+
+    Args:
+        wxyz: Orientation, camera to world [4].
+        position: Where it is [3].
+        fov: Vertical angle of view [radians].
+        size: (width, height) of the picture [px].
+        shift: From the browser's space to the scene [m], when the view follows the object.
+    """
+    turn = torch.as_tensor(np.asarray(wxyz, dtype=np.float64))
+    rotation = geometry.quaternion_to_matrix(turn[None])[0].T
+    eye = torch.as_tensor(np.asarray(position, dtype=np.float64)) + torch.tensor(
+        shift, dtype=torch.float64
+    )
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    width, height = size
+    focal = 0.5 * height / math.tan(0.5 * fov)
+    intrinsics = torch.tensor(
+        [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
+    return Camera(viewmat, intrinsics, width, height, name="browser")

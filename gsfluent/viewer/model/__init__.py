@@ -1,0 +1,1 @@
+"""What the viewer knows: sources of frames, the time line, what is looked at."""

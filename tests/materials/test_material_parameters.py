@@ -1,0 +1,177 @@
+"""Every parameter of every law changes a small simulation; what would not is refused by name."""
+
+from __future__ import annotations
+
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsfluent import materials, ops
+from gsfluent.errors import InputError
+from gsfluent.lab.world.driver import World
+from gsfluent.materials import LAWS, READS, Material, table
+
+DX = 0.05
+SOLID = {"young_modulus": 1e5, "poisson_ratio": 0.3, "density": 1000.0}
+BASE: dict[str, Material] = {
+    "elastic": Material("test", law="elastic", **SOLID),
+    "corotated": Material("test", law="corotated", **SOLID),
+    "nacc": Material(
+        "test", law="nacc", cohesion=0.2, hardening=3.0, friction_angle=40.0, alpha0=-0.02,
+        shear_damage=0.1, **SOLID,
+    ),
+    "drucker_prager": Material(
+        "test", law="drucker_prager", friction_angle=30.0, cohesion_pressure=200.0, **SOLID
+    ),
+    "von_mises": Material(
+        "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3, **SOLID
+    ),
+    "fluid": Material(
+        "test", law="fluid", density=1000.0, bulk_modulus=1e5, viscosity=2.0, tait_exponent=7.0
+    ),
+    "rigid": Material("test", law="rigid", density=1000.0),
+}  # fmt: skip
+CASES = [(law, field) for law, reads in READS.items() for field in reads]
+
+
+def fall(material: Material) -> Tensor:
+    """Positions [dx] of a 3 x 3 x 3 cell cube, thrown on its edge onto a slab on the floor.
+
+    The slab is elastic and stays the same: alone, a heavier body of the same wave speed would move
+    the same.
+    """
+    side = torch.arange(6, dtype=torch.float64) * (DX / 2.0) + 0.25 * DX
+    grid = torch.stack(torch.meshgrid(side, side, side, indexing="ij"), dim=-1).reshape(-1, 3)
+    turn = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]], dtype=torch.float64)
+    cube = (grid - 1.5 * DX) @ turn.T + torch.tensor([0.0, 0.0, 0.28], dtype=torch.float64)
+    slab = grid * torch.tensor([2.0, 2.0, 0.5], dtype=torch.float64)
+    slab = slab - torch.tensor([3.0 * DX, 3.0 * DX, -0.5 * DX], dtype=torch.float64)
+    rows = torch.stack([material.parameters(), materials.elastic.parameters()])
+    count = len(cube)
+    kind = torch.cat([torch.zeros(count), torch.ones(count)]).int()
+    volume = torch.cat([torch.full((count,), (DX / 2.0) ** 3), torch.full((count,), DX**3 / 4.0)])
+    velocity = torch.zeros(2 * count, 3, dtype=torch.float64)
+    velocity[:count] = torch.tensor([0.6, 0.0, -2.5], dtype=torch.float64)
+    alpha = torch.where(kind == 0, float(material.start_alpha), materials.UNBROKEN)
+    world = World(
+        torch.cat([cube, slab]),
+        velocity,
+        mass=rows[kind.long(), 6] * volume,
+        volume=volume,
+        dx=DX,
+        law=torch.tensor([LAWS[material.law], LAWS["elastic"]]),
+        params=rows,
+        material=kind,
+        alpha=alpha,
+        gravity=(0.0, 0.0, -9.81),
+        colliders=torch.tensor([[0, 2, 0.4, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]]).double(),
+        dt=4e-4,
+    )
+    world.run(steps=110)
+    return world.position[:count] / DX
+
+
+@functools.cache
+def base(law: str) -> Tensor:
+    return fall(BASE[law])
+
+
+@pytest.mark.parametrize(("law", "field"), CASES)
+def test_every_parameter_changes_the_outcome(law: str, field: str) -> None:
+    value = getattr(BASE[law], field)
+    changed = BASE[law].override(**{field: 1.2 * float(value)})
+    moved = (fall(changed) - base(law)).norm(dim=1).max()
+    assert moved > 1e-4, f"{field}: {float(moved):.2g} dx"
+    assert moved < 10.0
+
+
+def test_the_same_material_gives_the_same_outcome() -> None:
+    """What the test above measures is not chance."""
+    assert torch.equal(fall(BASE["nacc"].override(name="twin")), base("nacc"))
+
+
+@pytest.mark.parametrize("law", list(LAWS))
+def test_a_parameter_that_the_law_does_not_read_is_refused_by_name(law: str) -> None:
+    for field in materials.PARAMETERS:
+        if field in READS[law]:
+            continue
+        low, high, _ = materials.RANGES[field]
+        value = 1.0 if low <= 1.0 <= high else 0.5 * (low + high)
+        with pytest.raises(InputError, match=rf"{field} does nothing under law '{law}'") as caught:
+            BASE[law].override(**{field: value})
+        assert "use law" in str(caught.value)
+
+
+def test_viscosity_on_an_elastic_body_names_the_fluid() -> None:
+    with pytest.raises(InputError, match="viscosity does nothing under law 'elastic'") as caught:
+        materials.jelly.override(viscosity=1.0)
+    assert "fluid" in caught.value.hint
+
+
+def test_scatter_of_strength_is_refused_where_nothing_breaks() -> None:
+    with pytest.raises(InputError, match="variation does nothing under law 'fluid'"):
+        materials.water.override(variation=0.2)
+
+
+@pytest.mark.parametrize(
+    ("law", "missing", "given"),
+    [
+        ("von_mises", "yield_stress", dict(SOLID)),
+        ("fluid", "bulk_modulus", {"density": 1000.0}),
+        ("elastic", "poisson_ratio", {"young_modulus": 1e5, "density": 1000.0}),
+        ("rigid", "density", {}),
+    ],
+)
+def test_a_parameter_that_the_law_needs_is_asked_for(
+    law: str, missing: str, given: dict[str, Any]
+) -> None:
+    with pytest.raises(InputError, match=f"law '{law}' needs {missing}"):
+        Material("mine", law=law, **given)
+
+
+def test_a_change_of_law_drops_what_the_new_law_does_not_read() -> None:
+    calm = materials.fruit.watermelon.override(law="elastic")
+    assert calm.cohesion is None and calm.variation == 0.0 and calm.parts == ()
+    assert calm.young_modulus == materials.fruit.watermelon.young_modulus
+    metal = materials.glass.override(law="von_mises", yield_stress=1e5)
+    assert metal.hardening_modulus == 0.0
+    with pytest.raises(InputError, match="cohesion does nothing"):
+        materials.glass.override(law="elastic", cohesion=1.0)
+
+
+@pytest.mark.parametrize("name", materials.names())
+def test_rows_of_presets_are_accepted_by_the_op(name: str) -> None:
+    preset = materials.get(name)
+    law = torch.tensor([LAWS[preset.law]], dtype=torch.int32)
+    strain = torch.zeros(1, 6, dtype=torch.float64)
+    alpha = torch.full((1,), float(preset.start_alpha), dtype=torch.float64)
+    still = torch.zeros(1, 3, 3, dtype=torch.float64)
+    row = preset.parameters()[None]
+    out = ops.return_mapping(strain, alpha, still, law=law, params=row, dt=1e-3)
+    assert out[3].tolist() == [0, 0, 0, 0]
+    assert torch.equal(out[2], strain)
+    speed = float(ops.wave_speed(strain, law=law, params=row)[0])
+    assert speed == pytest.approx(preset.wave_speed, rel=1e-9)
+    # A frame of 1/30 s in cells of 1 cm is then at most about 1500 steps.
+    assert 0.0 < preset.wave_speed < 230.0
+
+
+def test_sand_slope_is_the_published_one() -> None:
+    """alpha_DP = sqrt(2/3) 2 sin / (3 - sin) (Klar et al. 2016)."""
+    row = materials.sand.override(friction_angle=30.0).parameters()
+    assert float(row[2]) == pytest.approx((2.0 / 3.0) ** 0.5 * 1.0 / 2.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("block", ["numbers", "sources"])
+def test_the_page_holds_what_the_presets_are(block: str) -> None:
+    """Renewed by scripts/material_tables.py."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "materials.md"
+    found = re.search(
+        rf"<!-- {block}: [^\n]*-->\n(.*?)<!-- end -->", page.read_text("utf-8"), re.DOTALL
+    )
+    assert found is not None and found.group(1) == getattr(table, block)()

@@ -1,0 +1,277 @@
+"""Render: light, shadow, floor, normals, holes, cameras, each on something of known look."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsfluent.data import Camera, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, pack_lamps, to_display, to_linear
+from gsfluent.pipeline.light.normals import estimate_normals, grid_for, splat_normals
+from gsfluent.pipeline.light.occlusion import ambient_occlusion
+from gsfluent.pipeline.light.shade import shade_points, surface_points
+from gsfluent.pipeline.light.shadow import transmittance
+from gsfluent.pipeline.light.shadow_maps import bulk, shadow_maps
+from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
+from gsfluent.pipeline.render.holes import hole_fraction
+from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
+
+SIZE = 96
+
+
+def ball(
+    radius: float = 0.1,
+    *,
+    center: tuple[float, float, float] = (0.0, 0.0, 0.1),
+    spacing: float = 0.008,
+) -> Gaussians:
+    """A solid grey ball of isotropic splats on a lattice."""
+    axis = torch.arange(-radius, radius + spacing, spacing)
+    points = torch.cartesian_prod(axis, axis, axis)
+    points = points[points.norm(dim=1) <= radius] + torch.tensor(center)
+    scales = torch.full((points.shape[0],), 0.6 * spacing)
+    return Gaussians.from_colors(points, scales, torch.full_like(points, 0.5), opacities=0.9)
+
+
+def front(distance: float = 1.0, height: float = 0.1) -> Camera:
+    return Camera.look_at(
+        (0.0, -distance, height), (0.0, 0.0, height), width=SIZE, height=SIZE, fov=20.0
+    )
+
+
+def brightness(image: Tensor, row: int, column: int) -> float:
+    return float(image[row - 2 : row + 3, column - 2 : column + 3].mean())
+
+
+def test_without_light_the_captured_colour_stays() -> None:
+    image = Render(front(), background=(0.0, 0.0, 0.0))(ball())
+    assert brightness(image, SIZE // 2, SIZE // 2) == pytest.approx(0.5, abs=0.01)
+
+
+def test_default_light_is_mild_where_it_falls() -> None:
+    light = Light(direction=(0.0, -1.0, 0.0), shadow=False)
+    image = Render(front(), light)(ball())
+    assert brightness(image, SIZE // 2, SIZE // 2) == pytest.approx(0.5, rel=0.12)
+
+
+def test_side_light_brightens_the_lit_side_only() -> None:
+    light = Light(direction=(1.0, 0.0, 0.0), ambient=0.3, intensity=0.8, shadow=False)
+    image = Render(front(), light)(ball())
+    offset = SIZE // 5
+    lit = brightness(image, SIZE // 2, SIZE // 2 + offset)
+    dark = brightness(image, SIZE // 2, SIZE // 2 - offset)
+    # the dark side sees ambient light alone: 0.5 * 0.3^(1/2.2)
+    assert dark == pytest.approx(0.5 * 0.3 ** (1 / 2.2), abs=0.03)
+    assert lit > dark + 0.1
+
+
+def test_blinn_phong_follows_its_equation() -> None:
+    lamp = Lamp(direction=(0.0, 0.0, 1.0), intensity=0.5, color=(1.0, 0.5, 0.0), shadow=False)
+    normal = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    albedo = torch.tensor([0.5, 0.25, 1.0]).expand(3, 3)
+    radiance = shade_points(
+        torch.zeros(3, 3),
+        normal,
+        torch.tensor([0.0, 0.0, 1.0]).expand(3, 3),
+        albedo,
+        torch.tensor([0.3, 4.0]),
+        pack_lamps((lamp,), (0,), normal),
+        Lighting(ambient=0.2).around(normal),
+    )
+    color = 0.5 * torch.tensor([1.0, 0.5, 0.0])
+    head_on = albedo[0] * (0.2 + color) + color * 0.3
+    aside = albedo[0] * 0.2
+    slanted = albedo[0] * (0.2 + color * 0.8) + color * 0.3 * 0.8**4
+    torch.testing.assert_close(radiance, torch.stack([head_on, aside, slanted]))
+
+
+def test_linear_and_display_values_are_inverse() -> None:
+    color = torch.linspace(0, 1, 11)
+    torch.testing.assert_close(to_display(to_linear(color)), color)
+
+
+def test_shadow_map_darkens_what_lies_behind() -> None:
+    lamps = (Lamp(direction=(0.0, 0.0, 1.0)),)
+    maps = shadow_maps(ball(), lamps, (1,), 256, bulk(ball()))
+    assert maps is not None
+    points = torch.tensor([[0.0, 0.0, -0.2], [0.25, 0.0, -0.2], [0.0, 0.0, 0.4]])
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(3, 3)
+    arrives = transmittance(points, up, pack_lamps(lamps, (1,), points)[0], maps)
+    assert float(arrives[0]) < 0.05  # under the ball
+    assert float(arrives[1]) == 1.0  # beside it
+    assert float(arrives[2]) == 1.0  # above it
+
+
+def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
+    light = Light(direction=(1.0, 0.0, 1.0), ambient=0.3, intensity=1.0)
+    studio = Studio(0.0, (0.0, 0.0), 0.2, 0.2)
+    camera = Camera.look_at((0.0, -0.01, 3.0), (0.0, 0.0, 0.0), width=SIZE, height=SIZE, fov=20.0)
+    high = ball(center=(0.0, 0.0, 0.3))
+    image = Render(camera, light, studio=studio)(high)
+    layers = Render(camera, light, studio=studio).layers(high)
+    # light from +x at 45 degrees: the shadow's centre lies 0.3 m to the -x side
+    ones = torch.ones(SIZE, SIZE)
+    _, rays = surface_points(ones, camera.viewmat.float(), camera.K.float())
+    eye = camera.center().float()
+    floor = eye + rays * (-eye[2] / rays[..., 2])[..., None]
+    inside = (floor[..., :2] - torch.tensor([-0.3, 0.0])).norm(dim=-1) < 0.04
+    outside = (floor[..., :2] - torch.tensor([0.3, 0.0])).norm(dim=-1) < 0.04
+    bare = layers.alpha < 0.01
+    shadow = image[inside & bare].mean()
+    open_floor = image[outside & bare].mean()
+    assert float(shadow) < 0.75 * float(open_floor)
+
+
+def test_contact_shadow_fades_with_height() -> None:
+    spot, up = torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+
+    def sky(height: float) -> float:
+        grey = ball(center=(0.0, 0.0, height))
+        return float(
+            ambient_occlusion(
+                spot, up, grid_for(grey, cell=0.012).of(grey.means, bulk(grey).center)
+            )
+        )
+
+    assert sky(0.1) < 0.6
+    assert sky(0.2) > sky(0.1) + 0.1
+    assert sky(0.5) > 0.95
+
+
+def test_normals_of_a_ball_point_outward() -> None:
+    grey = ball()
+    normals = torch.nn.functional.normalize(estimate_normals(grey), dim=1)
+    away = grey.means - torch.tensor([0.0, 0.0, 0.1])
+    skin = away.norm(dim=1) > 0.09
+    agreement = (normals[skin] * torch.nn.functional.normalize(away[skin], dim=1)).sum(1)
+    assert float(agreement.mean()) > 0.97
+    assert float(agreement.min()) > 0.7
+
+
+def test_debris_far_apart_does_not_need_a_huge_grid() -> None:
+    near, far = ball(), ball(center=(40.0, 0.0, 0.1))
+    spray = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * 100.0
+    crumbs = Gaussians.from_colors(spray, torch.full((400,), 0.005), torch.rand(400, 3))
+    normals = estimate_normals(Gaussians.cat([near, far, crumbs]), cell=0.012)
+    assert torch.isfinite(normals).all()
+    assert float(normals.norm(dim=1).max()) <= 1.0 + 1e-6
+
+
+def test_flat_splats_on_a_solid_add_their_axis_to_the_density() -> None:
+    grey = ball()
+    away = torch.nn.functional.normalize(grey.means - torch.tensor([0.0, 0.0, 0.1]), dim=1)
+    skin = (grey.means - torch.tensor([0.0, 0.0, 0.1])).norm(dim=1) > 0.09
+    slanted = skin & (away[:, 2] > 0.7) & (away[:, 2] < 0.95)
+    scales = grey.scales.clone()
+    scales[slanted, 2] *= 0.1  # flat in z, which is 18 to 45 degrees off the surface's normal
+    plain = torch.nn.functional.normalize(estimate_normals(grey)[slanted], dim=1)
+    normals = estimate_normals(grey.replace(scales=scales))[slanted]
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(len(normals)))
+    bent = (normals[:, 2] - plain[:, 2]).mean()
+    assert float(bent) > 0.05  # toward the axis
+    assert float((normals * plain).sum(1).min()) > 0.9  # the density leads
+
+
+def test_sheet_of_flat_splats_faces_the_eye() -> None:
+    axis = torch.arange(-0.1, 0.1, 0.004)
+    spots = torch.cartesian_prod(axis, axis)
+    means = torch.cat([spots, torch.zeros_like(spots[:, :1])], 1)
+    scales = torch.tensor([0.004, 0.004, 0.0002]).expand_as(means).contiguous()
+    sheet = Gaussians.from_colors(means, scales, torch.full_like(means, 0.5))
+    grid = grid_for(sheet).of(means, (0.0, 0.0, 0.0))
+    for height in (1.0, -1.0):
+        normals = splat_normals(sheet, grid, torch.tensor([0.1, 0.2, height]))
+        inner = spots.abs().amax(1) < 0.08
+        expected = torch.tensor([0.0, 0.0, height]).expand(int(inner.sum()), 3)
+        torch.testing.assert_close(normals[inner], expected, atol=1e-5, rtol=0)
+
+
+def test_hole_fraction_counts_what_shows_through() -> None:
+    grey = ball()
+    volume = torch.full((grey.count,), 0.008**3)
+    # the rasterizer leaves 1e-4 of the light, and a little more at the rim
+    assert hole_fraction(grey, grey.means, volume, front()) < 5e-4
+    # drill a square tunnel along the view: the particles stay, the splats go
+    tunnel = (grey.means[:, 0].abs() < 0.05) & ((grey.means[:, 2] - 0.1).abs() < 0.05)
+    holed = hole_fraction(grey.select(~tunnel), grey.means, volume, front())
+    expected = 0.1**2 / (math.pi * 0.1**2)
+    # perspective and the soft rims of the splats make the opening smaller, never larger
+    assert 0.5 * expected < holed < expected
+
+
+def test_orbit_keeps_the_action_in_frame() -> None:
+    falling = [ball(center=(0.0, 0.0, 1.0 - 0.1 * i)).means for i in range(6)]
+    cameras = orbit(Action.of(falling), (SIZE, SIZE))
+    assert len(cameras) == 6
+    for camera, points in zip(cameras, falling, strict=True):
+        pixels, depth = camera.project(points.double())
+        assert float(depth.min()) > 0
+        assert float(pixels.min()) > 0 and float(pixels.max()) < SIZE
+
+
+def test_camera_path_is_interpolated(tmp_path: Path) -> None:
+    path = tmp_path / "path.json"
+    keys = [{"eye": [x, -1.0, 0.5], "target": [0.0, 0.0, 0.0]} for x in (0.0, 1.0)]
+    path.write_text(json.dumps({"fov": 40, "frames": keys}))
+    action = Action.of([torch.zeros(4, 3)] * 3)
+    cameras = cameras_for(str(path), action, (64, 48))
+    centers = torch.stack([camera.center() for camera in cameras])
+    torch.testing.assert_close(centers[:, 0], torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "not json",
+        "{}",
+        '{"frames": [{"eye": [0, 0, 0], "target": [0, 0, 0]}]}',
+        '{"frames": [[1]]}',
+    ],
+)
+def test_bad_camera_path_is_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "path.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"output\.camera"):
+        cameras_for(str(path), Action.of([torch.zeros(4, 3)] * 3), (64, 48))
+
+
+def test_photograph_index_needs_a_capture() -> None:
+    with pytest.raises(InputError, match="needs a `capture:`"):
+        cameras_for("3", Action.of([torch.zeros(4, 3)]), (64, 48))
+
+
+def test_render_refuses_missing_camera_and_distortion() -> None:
+    with pytest.raises(InputError, match="no camera"):
+        Render()(ball())
+    bent = front().replace(distortion=(0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="distortion"):
+        Render(bent)(ball())
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (float("nan"), 0.0, 1.0)])
+def test_light_without_direction_is_refused(direction: tuple[float, float, float]) -> None:
+    with pytest.raises(InputError, match=r"light\.key\.direction"):
+        Light(direction=direction)
+
+
+def test_nearest_sibling_alone_shades_a_pixel() -> None:
+    means = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.05, 0.1]])
+    pair = Gaussians.from_colors(
+        means,
+        torch.full((2,), 0.05),
+        torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        opacities=0.5,
+    )
+    alone = Render(front())(pair.select(torch.tensor([0])))
+    grouped = Render(front())(pair, groups=torch.tensor([7, 7], dtype=torch.int32))
+    plain = Render(front())(pair)
+    middle = (SIZE // 2, SIZE // 2)
+    torch.testing.assert_close(grouped[middle], alone[middle])
+    assert not torch.allclose(plain[middle], alone[middle])

@@ -1,0 +1,186 @@
+"""A plan beside what came of it: bookkeeping, what a run stores, what a model learns."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from simulation_shapes import ellipsoid
+
+from gsfluent.config import Shot
+from gsfluent.errors import InputError
+from gsfluent.io.splats.load import save_splats
+from gsfluent.plan import probe as plan_probe
+from gsfluent.plan.cost import CostModel, machine_key
+from gsfluent.plan.fact import actual_work, compare, learn
+from gsfluent.plan.plan import cost_model, plan_shot
+from gsfluent.run.shot import run_shot
+
+
+def model() -> CostModel:
+    """Made-up costs of every stage, large enough to matter."""
+    return CostModel(
+        machine=machine_key("cpu"),
+        seconds={
+            "reconstruct": {"steps": 1e-3},
+            "isolate": {"splats": 1e-6},
+            "fill": {"voxels": 1e-6, "inner": 1e-6},
+            "texture": {"exemplar_objects": 1.0, "procedural_objects": 1.0},
+            "simulate": {"steps": 1e-4, "point_steps_elastic": 1e-7, "point_steps_nacc": 1e-7,
+                         "point_steps_general": 1e-7, "block_steps": 1e-7, "frames": 1e-2},
+            "render": {"frames": 1e-2, "frame_pixels": 1e-8},
+            "export": {"ply-seq_gaussians": 1e-6},
+        },
+        made="2026-01-01T00:00:00+00:00",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    folder = tmp_path_factory.mktemp("shot")
+    save_splats(ellipsoid((0.1, 0.1, 0.1), splats=1500).gaussians, folder / "ball.ply")
+    return Shot.from_dict(
+        {
+            "splats": str(folder / "ball.ply"),
+            "scale": 1.0,
+            "up": "+z",
+            "fill": {"resolution": 24},
+            "objects": {"ball": {"material": "rubber"}},
+            "events": [{"type": "drop", "height": 0.02}],
+            "solve": {"quality": "preview", "cells": 10},
+            "output": {"fps": 30, "seconds": 0.2, "size": [64, 48]},
+        }
+    )
+
+
+@pytest.fixture
+def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache with the made-up model in it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    model().save("cpu")
+    return tmp_path
+
+
+def test_a_plan_has_every_stage_and_their_sum(shot: Shot) -> None:
+    plan = plan_shot(shot, model=model())
+    assert list(plan["stages"]) == ["isolate", "fill", "texture", "simulate", "render"]
+    assert plan["seconds"] == pytest.approx(sum(s["seconds"] for s in plan["stages"].values()))
+    assert plan["memory_bytes"] == max(s["memory_bytes"] for s in plan["stages"].values())
+    assert plan["simulate_seconds"] == plan["stages"]["simulate"]["seconds"] > 0.0
+    assert plan["cells"] == 10 and plan["calibrated"]
+    blank = plan_shot(shot)
+    assert not blank["calibrated"] and blank["seconds"] is None
+    assert blank["particles"] == plan["particles"] and blank["memory_bytes"] > 1e8
+    json.dumps(plan)
+
+
+def test_a_run_says_what_was_planned_and_learns(shot: Shot, stored: Path) -> None:
+    values = run_shot(shot, stored / "out")
+    section = values["plan"]
+    assert section["calibrated"]
+    predicted, actual, ratio = (section[name] for name in ("predicted", "actual", "ratio"))
+    assert actual["particles"] == values["simulation"]["particles"]
+    assert actual["substeps"] == values["simulation"]["substeps"]
+    assert predicted["particles"] == pytest.approx(actual["particles"], rel=0.25)
+    assert predicted["substeps"] == pytest.approx(actual["substeps"], rel=0.25)
+    assert ratio["seconds"] == pytest.approx(actual["seconds"] / predicted["seconds"])
+    stages = {s["name"]: s for s in values["stages"]}
+    for name, row in actual["stages"].items():
+        assert row["seconds"] == stages[name]["seconds"]
+        assert row["memory_bytes"] == stages[name]["peak_memory_bytes"]
+    assert actual["seconds"] == pytest.approx(sum(r["seconds"] for r in actual["stages"].values()))
+    taught = CostModel.load("cpu")
+    assert taught is not None and set(taught.ratios) == set(actual["stages"])
+    # the same work again is planned closer to what it took
+    again = plan_shot(shot, model=taught)
+    off = [
+        abs(p["seconds"] / actual["seconds"] - 1.0) for p in (plan_shot(shot, model=model()), again)
+    ]
+    assert off[1] < off[0]
+    # nothing was done, so nothing is compared or learned
+    repeated = run_shot(shot, stored / "out")["plan"]
+    assert repeated["actual"]["stages"] == {} and repeated["actual"]["seconds"] is None
+    after = CostModel.load("cpu")
+    assert after is not None and after.ratios == taught.ratios
+
+
+def test_a_run_without_a_calibration_says_so_and_measures_nothing(
+    shot: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def never(*_: Any) -> CostModel:
+        raise AssertionError("a run must not measure the machine")
+
+    monkeypatch.setattr(plan_probe, "calibrate", never)
+    section = run_shot(shot, tmp_path / "out")["plan"]
+    assert section["calibrated"] is False
+    assert section["predicted"]["seconds"] is None and section["actual"]["seconds"] > 0.0
+    assert section["predicted"]["substeps"] > 0
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_damaged_calibration_is_measured_anew(
+    stored: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def measured(*_: Any) -> CostModel:
+        calls.append(1)
+        return model()
+
+    monkeypatch.setattr(plan_probe, "calibrate", measured)
+    assert cost_model("cpu") == model() and not calls
+    next(stored.rglob("cost_*.json")).write_text("{")
+    assert cost_model("cpu") == model() and len(calls) == 1
+    assert CostModel.load("cpu") == model()
+    cost_model("cpu", recalibrate=True)
+    assert len(calls) == 2
+
+
+def test_a_time_budget_becomes_cells_and_stays(shot: Shot, stored: Path) -> None:
+    def budget(seconds: float) -> Shot:
+        values = shot.resolved()
+        return Shot.from_dict(values | {"solve": {"seconds_per_frame": seconds}})
+
+    free, tight = (plan_shot(budget(s), model=model()) for s in (1.0, 0.1))
+    assert tight["cells"] < free["cells"]
+    for plan, seconds in ((free, 1.0), (tight, 0.1)):
+        assert plan["simulate_seconds"] / plan["frames"] <= seconds * 1.001
+        assert "time budget" in [row["bound"] for row in plan["bounds"]]
+        assert plan["budget"]["seconds_per_frame"] == seconds
+        assert plan["budget"]["dx_by_formula"] == pytest.approx(plan["dx"], rel=0.8)
+    with pytest.raises(InputError, match="seconds_per_frame 1e-05"):
+        plan_shot(budget(1e-5), model=model())
+    values = run_shot(budget(0.1), stored / "out")
+    chosen = values["plan"]["chosen"]
+    assert chosen["cells"] == tight["cells"]
+    assert values["simulation"]["dx"] == pytest.approx(chosen["dx"], rel=0.15)
+    # a model that has learned otherwise does not change a run that has begun
+    quick = CostModel.load("cpu")
+    assert quick is not None
+    quick.ratios["simulate"] = [4.0] * 8
+    quick.save("cpu")
+    again = run_shot(budget(0.1), stored / "out")
+    assert again["plan"]["chosen"]["cells"] == chosen["cells"]
+    assert all(stage["resumed"] for stage in again["stages"])
+
+
+def test_work_that_was_foreseen_wrongly_is_not_the_models_fault(shot: Shot, stored: Path) -> None:
+    plan = plan_shot(shot, model=model())
+    values = run_shot(shot, stored / "out", plan=False)
+    assert "plan" not in values
+    work = actual_work(plan["work"], values)
+    assert work["simulate"]["steps"] == values["simulation"]["substeps"]
+    made, stages = model(), {s["name"]: s for s in values["stages"]}
+    exact = made.stage("simulate", work["simulate"], corrected=False).seconds
+    made = learn(made, plan, values, "cpu", stored)
+    assert made == CostModel.load("cpu", stored)
+    assert made.ratios["simulate"][0] == pytest.approx(stages["simulate"]["seconds"] / exact)
+    section = compare(plan, values)
+    planned = plan["stages"]["simulate"]["seconds"]
+    assert section["ratio"]["stages"]["simulate"]["seconds"] == pytest.approx(
+        stages["simulate"]["seconds"] / planned
+    )

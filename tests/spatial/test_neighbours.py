@@ -1,0 +1,51 @@
+"""Nearest neighbours by cells are those of a tree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsfluent.spatial.neighbours import grid_search, nearest
+
+
+def _cloud(kind: str) -> tuple[torch.Tensor, np.ndarray]:
+    random = np.random.default_rng(4)
+    if kind == "shell":
+        points = random.standard_normal((3000, 3))
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+        queries = 1.02 * points[:400] + 0.01 * random.standard_normal((400, 3))
+    elif kind == "far":  # queries away from everything, points in two clumps
+        points = np.concatenate([random.random((500, 3)), 40.0 + random.random((500, 3))])
+        queries = 100.0 * random.random((60, 3)) - 30.0
+    else:  # all at one place
+        points = np.zeros((50, 3))
+        queries = random.random((20, 3))
+    return torch.from_numpy(points), queries
+
+
+@pytest.mark.parametrize("kind", ["shell", "far", "same"])
+@pytest.mark.parametrize("count", [1, 12, 50])
+@pytest.mark.parametrize("cell", [1e-3, 0.05, 10.0])
+def test_cells_find_what_a_tree_finds(kind: str, count: int, cell: float) -> None:
+    points, queries = _cloud(kind)
+    expected, _ = nearest(points, queries, count, cell)
+    distance, index = grid_search(points, torch.from_numpy(queries), count, cell)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=1e-9, atol=1e-12)
+    reached = (points[index] - torch.from_numpy(queries)[:, None]).norm(dim=2)
+    np.testing.assert_allclose(reached.numpy(), distance.numpy(), rtol=1e-9, atol=1e-12)
+    assert all(len(set(row.tolist())) == count for row in index)
+
+
+def test_nothing_asked_nothing_found() -> None:
+    points, _ = _cloud("shell")
+    distance, index = grid_search(points, torch.zeros(0, 3, dtype=torch.float64), 3, 0.1)
+    assert distance.shape == (0, 3)
+    assert index.shape == (0, 3)
+
+
+@pytest.mark.parametrize(("count", "cell"), [(0, 1.0), (4000, 1.0), (1, 0.0), (1, float("nan"))])
+def test_refusals(count: int, cell: float) -> None:
+    points, queries = _cloud("shell")
+    with pytest.raises(ValueError, match="nearest"):
+        nearest(points, queries, count, cell)
