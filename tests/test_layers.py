@@ -29,7 +29,7 @@ ORDER = (
     "pipeline/texture/volume pipeline/texture/presets pipeline/texture/photo "
     "pipeline/texture/synthesis pipeline/texture/inpaint pipeline/texture "
     "pipeline/render pipeline/cracks pipeline/simulate "
-    "export stages inspect live viewer/model viewer/draw viewer/panels viewer plan choose run "
+    "export stages inspection live viewer/model viewer/draw viewer/panels viewer plan choose run "
     "lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers lab/charts lab/stability "
     "lab cli __main__.py"
 ).split()

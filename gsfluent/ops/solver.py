@@ -53,8 +53,8 @@ def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
     if contact != 0.0 or bounces:
         raise ValueError(
             f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: given back "
-            "at nodes in every step of a lasting contact it makes energy (docs/theory/contact.md); how"
-            " far bodies bounce follows from their elasticity"
+            "at nodes in every step of a lasting contact it makes energy (docs/theory/contact.md);"
+            " how far bodies bounce follows from their elasticity"
         )
 
 

@@ -1,7 +1,8 @@
 """Compare pictures of insides: a picture, a folder of pictures or a textured solid on each side.
 
 Statistics that need no weights are always computed; CLIP score, LPIPS, FID and KID when the user
-gives the weights (:mod:`gsfluent.inspect.compare_weights`). They measure likeness to a reference,
+gives the weights (:mod:`gsfluent.inspection.compare_weights`). They measure likeness to a
+reference,
 not realism.
 """
 
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 
 from gsfluent.errors import InputError
-from gsfluent.inspect import compare_weights as weights
+from gsfluent.inspection import compare_weights as weights
 from gsfluent.io.images import IMAGE_SUFFIXES
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.texture.photo import metrics

@@ -14,8 +14,8 @@ from scipy import linalg, ndimage
 
 from gsfluent.cli import main
 from gsfluent.errors import InputError
-from gsfluent.inspect.compare import compare, load_pictures
-from gsfluent.inspect.compare_weights import (
+from gsfluent.inspection.compare import compare, load_pictures
+from gsfluent.inspection.compare_weights import (
     Lpips,
     clip_scores,
     frechet_distance,

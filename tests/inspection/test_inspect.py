@@ -14,7 +14,7 @@ from gsfluent import geometry
 from gsfluent.config import Select, Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.inspect.capture import inspect
+from gsfluent.inspection.capture import inspect
 from gsfluent.io import load_capture, load_image, load_splats, save_image, save_splats
 from gsfluent.pipeline.capture.orient import (
     camera_up,

@@ -10,8 +10,8 @@ import torch
 from gsfluent import materials
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
-from gsfluent.inspect.parts import PartMap, body_parts, solid_regions
-from gsfluent.inspect.parts_picture import save_parts_picture
+from gsfluent.inspection.parts import PartMap, body_parts, solid_regions
+from gsfluent.inspection.parts_picture import save_parts_picture
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY

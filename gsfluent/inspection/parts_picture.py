@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsfluent.data import SURFACE, Camera, Gaussians
 from gsfluent.draw import draw
-from gsfluent.inspect.parts import PartMap
+from gsfluent.inspection.parts import PartMap
 from gsfluent.io import save_image
 from gsfluent.pipeline.regions.vote import Skin, find_skin
 
