@@ -10,7 +10,7 @@ namespace gsf::cuda {
 namespace {
 
 // Threads of a CTA, and CTAs of a multiprocessor that registers must suffice for: measured on an
-// H100 (docs/benchmarks.md).
+// H100 (docs/measured/benchmarks.md).
 constexpr int kP2GThreads = 128, kP2GCtas = 8;
 constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared blocks need
 // Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.

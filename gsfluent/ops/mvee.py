@@ -115,8 +115,8 @@ def mvee_lens(
     Each Gaussian stands for ``(x - mean)^T cov^-1 (x - mean) <= radius^2``. Balls, and ellipsoids
     of equal shape, have a closed form; so has one inside the other. Other pairs are fitted: the
     result contains the overlap to 1e-5 of its size, and its volume is within 1e-3 of the smallest
-    (measured in docs/mvee.md). float32 covariances hold axis ratios up to about 100 to that
-    accuracy; more extreme ones are widened until they contain the overlap.
+    (docs/measured/mvee.md). float32 covariances hold axis ratios up to about 100 to that accuracy;
+    more extreme ones are widened until they contain the overlap.
 
     Args:
         mean_a: Centres [m], [B, 3], float32 or float64.

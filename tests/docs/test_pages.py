@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from loaded_scripts import load_script
 
 import gsfluent
 from gsfluent.cli.parse import VERBS, parse
@@ -19,6 +20,8 @@ SHELVES = ("guide", "theory", "measured")
 TABLES = {"shot-keys.md", "run-json.md", "physgaussian.md"}
 """Pages of the guide that are looked things up in, not read."""
 GUIDE = [page for page in sorted((ROOT / "docs" / "guide").glob("*.md")) if page.name not in TABLES]
+MEASURED = sorted((ROOT / "docs" / "measured").glob("*.md"))
+MARKED = re.compile(r"<!-- ([^\n]+): begin -->\n.*?<!-- \1: end -->", re.DOTALL)
 BLOCK = re.compile(r"```(\w+)\n(.*?)```", re.DOTALL)
 
 
@@ -81,11 +84,14 @@ def test_the_smallest_shot_of_the_readme_is_a_shot(tmp_path: Path) -> None:
 
 
 def test_the_index_names_every_page() -> None:
-    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"\]\(([\w/-]+\.md)\)", index))
     docs = ROOT / "docs"
-    pages = {str(p.relative_to(docs)) for shelf in SHELVES for p in (docs / shelf).rglob("*.md")}
-    assert pages - named == set()
+    lists = [docs / "index.md", docs / "theory" / "README.md", docs / "measured" / "README.md"]
+    named = {
+        (page.parent / target).resolve()
+        for page in lists
+        for target in re.findall(r"\]\(([\w/-]+\.md)\)", page.read_text(encoding="utf-8"))
+    }
+    assert {page.resolve() for shelf in SHELVES for page in (docs / shelf).glob("*.md")} <= named
 
 
 def test_every_page_stands_on_a_shelf() -> None:
@@ -116,3 +122,34 @@ def test_a_page_of_the_guide_is_read_in_minutes(page: Path) -> None:
     assert len(text.split()) <= 800
     assert len(prose.split()) >= 300
     assert BLOCK.search(text) is not None  # an example
+
+
+@pytest.mark.parametrize("page", MEASURED, ids=lambda p: p.name)
+def test_a_measured_page_names_the_command_that_writes_it(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    shell = "\n".join(found for kind, found in BLOCK.findall(text) if kind == "bash")
+    writes = False
+    for line in shell.replace("\\\n", " ").splitlines():
+        program, named, *_ = words = shlex.split(line, comments=True)
+        if program == "gsfluent":
+            assert named in VERBS
+            continue
+        assert program in ("python", "bash") and (ROOT / named).is_file(), line
+        source = (ROOT / named).read_text(encoding="utf-8")
+        options = [word for word in words if word.startswith("--")]
+        assert [word for word in options if not re.search(rf"{word}\b", source)] == []
+        writes |= f"docs/measured/{page.name}" in words or f'"{page.name}"' in source
+    assert writes, f"no command of {page.name} writes it"
+    assert MARKED.search(text) is not None
+
+
+@pytest.mark.parametrize("page", MEASURED, ids=lambda p: p.name)
+def test_no_table_of_a_measured_page_is_typed_in(page: Path) -> None:
+    typed = MARKED.sub("", page.read_text(encoding="utf-8"))
+    assert re.findall(r"^\|.*", typed, re.MULTILINE) == []
+
+
+def test_the_index_of_what_is_measured_is_made_from_the_pages() -> None:
+    folder = ROOT / "docs" / "measured"
+    made = load_script("pictures/measured_index").index(folder)
+    assert f"begin -->\n{made}\n<!--" in (folder / "README.md").read_text(encoding="utf-8")

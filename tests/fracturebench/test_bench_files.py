@@ -31,7 +31,7 @@ SCRIPTS = ROOT / "scripts" / "fracturebench"
 
 @pytest.fixture(scope="module")
 def scripts() -> Callable[[str], ModuleType]:
-    sys.path[:0] = [str(SCRIPTS), str(ROOT / "scripts")]
+    sys.path.insert(0, str(SCRIPTS))
 
     def load(name: str) -> ModuleType:
         return importlib.import_module(name)

@@ -2,7 +2,7 @@
 
 The definition of what p2g of ``csrc/cuda/solver_*`` adds up, and of what may lie
 between that and the exact sums. The units come from the clock of a :class:`gsfluent.ops.Solver`;
-docs/solver.md has the proof that nothing overflows. ``scripts/solver_study.py`` and a test use it.
+docs/solver.md has the proof that nothing overflows. ``scripts/study/solver.py`` and a test use it.
 """
 
 from __future__ import annotations
