@@ -24,7 +24,7 @@
 // tried: the outward direction of either body, from moments smoothed over the neighbours, and their
 // mean. The mean is best where both surfaces are smooth, so it wins ties; one body's own direction
 // is taken where it parts the bodies clearly better (at the edge of a footprint, where the other
-// body's direction leans). docs/contact.md compares this with other normals.
+// body's direction leans). docs/theory/contact.md compares this with other normals.
 // Source of the force: equations.md 11.3 (corrected Collision-MPM); Bardenhagen et al. 2001. Idea
 // of a separating plane: Nairn et al. 2020.
 #pragma once
@@ -46,7 +46,7 @@ GSF_HOST_DEVICE T mass_floor() {
 struct ContactLaw {
   double friction;  // Coulomb coefficient between bodies
   // 0: no approach velocity is left; 1: elastic. Makes energy in a contact of many steps: the
-  // resident solver has none (docs/contact.md).
+  // resident solver has none (docs/theory/contact.md).
   double restitution;
   double gap;  // s_c: centroid separation, in dx, up to which bodies touch
 };

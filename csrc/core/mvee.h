@@ -1,5 +1,5 @@
 // Minimum-volume enclosing ellipsoid of one point set, by the interior-point method of
-// mvee_barrier.h (docs/mvee.md).
+// mvee_barrier.h (docs/theory/mvee.md).
 #pragma once
 
 #include "core/mvee_barrier.h"

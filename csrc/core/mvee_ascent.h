@@ -1,6 +1,6 @@
 // Points of an overlap { max of two quadratics <= 0 }: fixed ones spread over its surface and its
 // rim, and moving ones that climb to where the overlap reaches furthest out of an ellipsoid
-// (docs/mvee.md).
+// (docs/theory/mvee.md).
 #pragma once
 
 #include "core/mvee_barrier.h"

@@ -1,5 +1,5 @@
 // Smallest ellipsoid around points by a primal-dual interior-point method on the lifted problem:
-// minimize -log det H subject to q_i^T H q_i <= 1, q = (y, 1), H symmetric 4x4 (docs/mvee.md).
+// minimize -log det H subject to q_i^T H q_i <= 1, q = (y, 1), H symmetric 4x4 (docs/theory/mvee.md).
 // Ten unknowns whatever the number of points; about ten steps whatever the accuracy.
 #pragma once
 

@@ -1,4 +1,4 @@
-// Smallest ellipsoid around the overlap of two ellipsoids (docs/mvee.md).
+// Smallest ellipsoid around the overlap of two ellipsoids (docs/theory/mvee.md).
 #pragma once
 
 #include "core/mvee_ascent.h"

@@ -1,4 +1,4 @@
-// Two ellipsoids brought to a frame made for their overlap (docs/mvee.md): tells the cases with a
+// Two ellipsoids brought to a frame made for their overlap (docs/theory/mvee.md): tells the cases with a
 // closed answer apart, and gives the others as two quadratics with coefficients of order one. In
 // double whatever the type of the data, because thin overlaps are differences of large terms.
 #pragma once

@@ -114,7 +114,7 @@ class Plan(Verb):
       gsfluent plan shot.yaml --no-probe    # do not measure; no times where nothing was measured
 
     The first plan on a machine measures for about ten seconds what work costs there and keeps it
-    in the user's cache; every run then corrects it. See docs/plan.md.
+    in the user's cache; every run then corrects it. See docs/theory/plan.md.
     """
 
     shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]

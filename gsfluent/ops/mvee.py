@@ -43,7 +43,8 @@ def mvee(
 
     Gradient: none.
     Source: primal-dual interior-point method on the lifted problem (Sun and Freund 2004 compare
-    such methods), ten unknowns per step; derivation in docs/mvee.md. Fracture-GS uses Khachiyan's.
+    such methods), ten unknowns per step; derivation in docs/theory/mvee.md. Fracture-GS uses
+    Khachiyan's.
     """
     check_tensor("mvee", "points", points, shape=("B", "N", 3))
     if points.shape[0] and not points.shape[1]:
@@ -139,7 +140,7 @@ def mvee_lens(
 
     Gradient: none.
     Source: Fracture-GS (transition Gaussians); closed form from John's conditions, and the fit of
-    unlike ellipsoids, derived in docs/mvee.md.
+    unlike ellipsoids, derived in docs/theory/mvee.md.
     """
     op = "mvee_lens"
     check_tensor(op, "mean_a", mean_a, shape=("B", 3))

@@ -7,7 +7,7 @@ decided on the device (``csrc/core/solver_clock.h``). The composable operators
 the reference it is tested against.
 
 Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Wang et al. 2020 and Fei et al. 2021
-(block-sorted GPU transfers); fixed-point sums: docs/solver.md.
+(block-sorted GPU transfers); fixed-point sums: docs/theory/solver-sums.md.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ _REASONS = {
 
 
 def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
-    """Refuse what would make energy: see docs/contact.md."""
+    """Refuse what would make energy: see docs/theory/contact.md."""
     rows = None if colliders is None else pad_colliders(colliders)
     bounces = rows is not None and bool((rows[:, RESTITUTION] > 0).any())
     if contact != 0.0 or bounces:
         raise ValueError(
             f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: given back "
-            "at nodes in every step of a lasting contact it makes energy (docs/contact.md); how "
-            "far bodies bounce follows from their elasticity"
+            "at nodes in every step of a lasting contact it makes energy (docs/theory/contact.md); how"
+            " far bodies bounce follows from their elasticity"
         )
 
 
@@ -100,7 +100,7 @@ class Solver(SolverState):
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
         friction: Coulomb friction between fields.
         restitution: 0. Given back at nodes in every step of a lasting contact, it makes energy
-            (docs/contact.md); bodies bounce by their elasticity. Likewise that of colliders.
+            (docs/theory/contact.md); bodies bounce by their elasticity. Likewise that of colliders.
         contact_gap: Distance of the centroids, in cells, up to which fields touch.
         cfl: Courant number of the automatic time step.
         gradient_limit: Largest ``dt |grad v|`` of unbroken matter.

@@ -215,7 +215,7 @@ def test_the_shot_of_the_page_is_a_shot(tmp_path: Path) -> None:
 
     import yaml
 
-    page = Path(__file__).resolve().parents[3] / "docs" / "regions.md"
+    page = Path(__file__).resolve().parents[3] / "docs" / "guide" / "regions.md"
     found = re.search(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     assert found is not None
     for name in ("captures/apple", "parts/stem", "segmentation"):
