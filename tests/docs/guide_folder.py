@@ -14,7 +14,7 @@ from PIL import Image
 
 from gsfluent.data import SURFACE, Gaussians
 from gsfluent.demo import make_capture
-from gsfluent.io import save_splats
+from gsfluent.io import save
 
 SHOT: dict[str, Any] = {
     "capture": "captures/apple",
@@ -73,13 +73,13 @@ def write_model(folder: Path) -> None:
     """A model folder as the INRIA trainer leaves it: the shell, one camera."""
     place = folder / "point_cloud" / "iteration_30"
     place.mkdir(parents=True)
-    save_splats(shell(800), place / "point_cloud.ply")
+    save(shell(800), place / "point_cloud.ply")
     (folder / "cameras.json").write_text(json.dumps([CAMERA]))
 
 
 def write_inputs(folder: Path) -> None:
     """Everything that a user brings."""
-    save_splats(shell(), folder / "melon.ply")
+    save(shell(), folder / "melon.ply")
     write_cut(folder / "cut.jpg")
     write_box(folder / "scan.obj")
     make_capture("orange", folder / "captures" / "apple", views=9, size=64)

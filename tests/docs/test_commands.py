@@ -21,7 +21,7 @@ import yaml
 
 from gsfluent.cli import main
 from gsfluent.config import Shot, load_shot
-from gsfluent.pipeline import run_demo
+from gsfluent.run import demo as run_demo
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/guide").glob("*.md"))]
