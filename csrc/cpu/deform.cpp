@@ -1,7 +1,7 @@
 // CPU kernels of the deformation ops.
 #include "host/deform.h"
 
-#include "core/carry.h"
+#include "core/deform/carry.h"
 
 namespace gsf {
 namespace {

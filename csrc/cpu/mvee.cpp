@@ -4,8 +4,8 @@
 #include <atomic>
 #include <vector>
 
-#include "core/mvee.h"
-#include "core/mvee_lens.h"
+#include "core/mvee/lens.h"
+#include "core/mvee/mvee.h"
 
 namespace gsf {
 namespace {

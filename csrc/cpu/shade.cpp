@@ -1,7 +1,7 @@
 // CPU kernel of the shading op.
 #include "host/shade.h"
 
-#include "core/shade.h"
+#include "core/shade/shade.h"
 
 namespace gsf {
 namespace {

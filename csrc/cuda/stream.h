@@ -1,5 +1,5 @@
 // The current CUDA stream of a tensor's device, through the stable C shim; device guard. Included
-// by *_ops.cpp only.
+// by ops.cpp only.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -3,7 +3,7 @@
 
 #include <cmath>
 
-#include "core/adam.h"
+#include "core/train/adam.h"
 #include "torch_api.h"
 
 namespace gsf {

@@ -1,7 +1,7 @@
 // Collider operators, once for both back ends: checks, allocation, dtype dispatch.
 #pragma once
 
-#include "core/collider_args.h"
+#include "core/collider/args.h"
 #include "torch_api.h"
 
 namespace gsf {

@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of the deformation ops, once for both back ends.
 #pragma once
 
-#include "core/material_args.h"
+#include "core/deform/args.h"
 #include "torch_api.h"
 
 namespace gsf {

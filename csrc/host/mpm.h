@@ -2,7 +2,7 @@
 // Backend::<kernel>(args, scope).
 #pragma once
 
-#include "core/mpm_args.h"
+#include "core/mpm/args.h"
 #include "torch_api.h"
 
 namespace gsf {

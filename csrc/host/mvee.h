@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of the enclosing-ellipsoid ops, once for both back ends.
 #pragma once
 
-#include "core/material_args.h"
+#include "core/mvee/args.h"
 #include "torch_api.h"
 
 namespace gsf {

@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of return_mapping, once for both back ends.
 #pragma once
 
-#include "core/return_mapping.h"
+#include "core/material/return_mapping.h"
 #include "torch_api.h"
 
 namespace gsf {

@@ -4,7 +4,7 @@
 // zeroing), `Plan<T>` (project, sort, count; then bin and blend) and `backward<T>`.
 #pragma once
 
-#include "core/raster.h"
+#include "core/raster/raster.h"
 #include "torch_api.h"
 
 namespace gsf {

@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of the shading op, once for both back ends.
 #pragma once
 
-#include "core/shade_args.h"
+#include "core/shade/args.h"
 #include "torch_api.h"
 
 namespace gsf {

@@ -2,7 +2,7 @@
 // ends.
 #pragma once
 
-#include "core/ssim.h"
+#include "core/train/ssim.h"
 #include "torch_api.h"
 
 namespace gsf {
