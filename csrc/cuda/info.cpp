@@ -9,6 +9,4 @@ std::string compiled_for(const Tensor&) { return "cuda runtime " + std::to_strin
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("compiled_for", TORCH_BOX(&gsf::compiled_for));
-}
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) { GSF_IMPL(gsf, compiled_for); }

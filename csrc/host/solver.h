@@ -241,9 +241,9 @@ struct SolverOps {
     });
   }
 
-  static void register_all(torch::stable::detail::StableLibrary& m) {
-    m.impl("solver_prime", TORCH_BOX(&SolverOps::solver_prime));
-    m.impl("solver_run", TORCH_BOX(&SolverOps::solver_run));
+  static void register_all(Library& m) {
+    GSF_IMPL(SolverOps, solver_prime);
+    GSF_IMPL(SolverOps, solver_run);
   }
 
  private:

@@ -42,11 +42,6 @@ enum ColliderType {
                   // the third half edge; it holds nothing beyond its rim: a blade's face
 };
 
-template <typename T>
-GSF_HOST_DEVICE Vec3<T> load_vec3(const T* p) {
-  return {p[0], p[1], p[2]};
-}
-
 // v turned by the quaternion q (any length but 0; the zero quaternion turns nothing), or back.
 template <typename T>
 GSF_HOST_DEVICE Vec3<T> turn(const T* q, const Vec3<T>& v, bool back = false) {

@@ -7,8 +7,9 @@ namespace gsf {
 namespace {
 
 struct PlasticityCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void return_mapping(const ReturnMappingArgs<T>& a, const Tensor&) {
+  static void return_mapping(const ReturnMappingArgs<T>& a, const Scope&) {
     parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
       int32_t counts[4] = {0, 0, 0, 0};
       for (int64_t i = begin; i < end; ++i) {
@@ -27,6 +28,4 @@ struct PlasticityCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("return_mapping", TORCH_BOX(&gsf::PlasticityOps<gsf::PlasticityCpu>::return_mapping));
-}
+GSF_REGISTER(CPU, gsf::PlasticityOps<gsf::PlasticityCpu>)

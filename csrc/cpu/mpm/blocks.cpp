@@ -160,6 +160,4 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> build_blocks(Tensor position,
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("build_blocks", TORCH_BOX(&gsf::build_blocks));
-}
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) { GSF_IMPL(gsf, build_blocks); }

@@ -318,9 +318,7 @@ void gather_all(const GatherArgs<T>& a) {
 }
 
 struct Cpu {
-  struct Scope {
-    explicit Scope(const Tensor&) {}
-  };
+  using Scope = CpuScope;
   template <typename T>
   static void p2g(const P2GArgs<T>& a, const Scope&) {
     cpu::p2g(a);
@@ -350,5 +348,5 @@ struct Cpu {
 STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
   gsf::MpmOps<gsf::cpu::Cpu>::register_all(m);
   // CUDA has this one in torch operations: gsfluent/ops/_mpm_grad.py.
-  m.impl("transfer_slope", TORCH_BOX(&gsf::MpmOps<gsf::cpu::Cpu>::transfer_slope));
+  GSF_IMPL(gsf::MpmOps<gsf::cpu::Cpu>, transfer_slope);
 }

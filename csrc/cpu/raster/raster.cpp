@@ -35,10 +35,7 @@ struct RasterCpu {
   static constexpr bool kSavesOrder = true;
   static constexpr bool kWritesGradients = true;
   static int stride(int features) { return row_stride(features); }
-
-  struct Scope {
-    explicit Scope(const Tensor&) {}
-  };
+  using Scope = CpuScope;
 
   template <typename T>
   class Plan {
@@ -118,8 +115,4 @@ struct RasterCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  using Ops = gsf::RasterOps<gsf::RasterCpu>;
-  m.impl("rasterize", TORCH_BOX(&Ops::forward));
-  m.impl("rasterize_backward", TORCH_BOX(&Ops::backward));
-}
+GSF_REGISTER(CPU, gsf::RasterOps<gsf::RasterCpu>)

@@ -74,9 +74,7 @@ void prime_particles(const SolverView<T>& s, bool measure) {
 }
 
 struct Cpu {
-  struct Scope {
-    explicit Scope(const Tensor&) {}
-  };
+  using Scope = CpuScope;
 
   template <typename T>
   static void prime(const SolverView<T>& s, int, const Scope&) {
@@ -109,4 +107,4 @@ struct Cpu {
 }  // namespace
 }  // namespace gsf::cpu
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) { gsf::SolverOps<gsf::cpu::Cpu>::register_all(m); }
+GSF_REGISTER(CPU, gsf::SolverOps<gsf::cpu::Cpu>)

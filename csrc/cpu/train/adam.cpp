@@ -105,8 +105,9 @@ void update_stretch(const AdamTensor<T>& t, const AdamVisible& visible, int64_t 
 }
 
 struct AdamCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void step(const AdamArgs<T>& args, const Tensor&) {
+  static void adam_step(const AdamArgs<T>& args, const Scope&) {
     for (int k = 0; k < args.count; ++k) {
       const AdamTensor<T>& t = args.tensors[k];
       const int64_t rows = std::max<int64_t>(kStretchValues / t.columns, 1);
@@ -122,6 +123,4 @@ struct AdamCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("adam_step", TORCH_BOX(&gsf::AdamOps<gsf::AdamCpu>::step));
-}
+GSF_REGISTER(CPU, gsf::AdamOps<gsf::AdamCpu>)

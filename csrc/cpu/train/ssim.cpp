@@ -15,8 +15,9 @@ constexpr int64_t kStripValues = 1536;
 constexpr int64_t kBandRows = 32;
 
 struct SsimCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void run(const SsimArgs<T>& a, const Tensor&) {
+  static void run(const SsimArgs<T>& a, const Scope&) {
     const int64_t columns = std::max<int64_t>(kStripValues / a.channels, 64);
     const int64_t strips = (a.width + columns - 1) / columns;
     // Sums per row and strip, added below in one order: bands may end anywhere.
@@ -39,8 +40,4 @@ struct SsimCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("ssim", TORCH_BOX(&gsf::SsimOps<gsf::SsimCpu>::map));
-  m.impl("ssim_backward", TORCH_BOX(&gsf::SsimOps<gsf::SsimCpu>::map_backward));
-  m.impl("photometric_loss", TORCH_BOX(&gsf::SsimOps<gsf::SsimCpu>::photometric));
-}
+GSF_REGISTER(CPU, gsf::SsimOps<gsf::SsimCpu>)

@@ -8,23 +8,12 @@ namespace {
 
 struct ColliderCuda {
   using Scope = CudaScope;
-  template <typename T>
-  static void distance(const ColliderDistanceArgs<T>& a, const Scope& scope) {
-    STD_CUDA_CHECK(cuda::collider_distance(a, scope.stream()));
-  }
-  template <typename T>
-  static void advance(const AdvanceCollidersArgs<T>& a, const Scope& scope) {
-    STD_CUDA_CHECK(cuda::advance_colliders(a, scope.stream()));
-  }
-  template <typename T>
-  static void blade_sides(const BladeSidesArgs<T>& a, const Scope& scope) {
-    STD_CUDA_CHECK(cuda::blade_sides(a, scope.stream()));
-  }
+  GSF_LAUNCH(collider_distance)
+  GSF_LAUNCH(advance_colliders)
+  GSF_LAUNCH(blade_sides)
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  gsf::ColliderOps<gsf::ColliderCuda>::register_all(m);
-}
+GSF_REGISTER(CUDA, gsf::ColliderOps<gsf::ColliderCuda>)

@@ -10,7 +10,7 @@ __global__ void polar_kernel(PolarArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i >= a.count) return;
   Mat3<T> rotation, clamped;
-  polar_clamped(load_mat3(a.deformation + 9 * i), a.lo, a.hi, rotation, clamped);
+  gsf::polar_clamped(load_mat3(a.deformation + 9 * i), a.lo, a.hi, rotation, clamped);
   store_mat3(a.rotation + 9 * i, rotation);
   store_mat3(a.clamped + 9 * i, clamped);
 }
@@ -45,7 +45,7 @@ cudaError_t launch(const Args& args, cudaStream_t stream, Kernel kernel) {
 }  // namespace
 
 template <typename T>
-cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream) {
+cudaError_t polar_clamped(const PolarArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, polar_kernel<T>);
 }
 template <typename T>
@@ -61,8 +61,8 @@ cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, carry_axes_kernel<T>);
 }
 
-template cudaError_t polar(const PolarArgs<float>&, cudaStream_t);
-template cudaError_t polar(const PolarArgs<double>&, cudaStream_t);
+template cudaError_t polar_clamped(const PolarArgs<float>&, cudaStream_t);
+template cudaError_t polar_clamped(const PolarArgs<double>&, cudaStream_t);
 template cudaError_t covariance_axes(const CovarianceAxesArgs<float>&, cudaStream_t);
 template cudaError_t covariance_axes(const CovarianceAxesArgs<double>&, cudaStream_t);
 template cudaError_t carry_place(const CarryPlaceArgs<float>&, cudaStream_t);

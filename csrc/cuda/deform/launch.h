@@ -8,7 +8,7 @@
 namespace gsf::cuda {
 
 template <typename T>
-cudaError_t polar(const PolarArgs<T>& args, cudaStream_t stream);
+cudaError_t polar_clamped(const PolarArgs<T>& args, cudaStream_t stream);
 
 template <typename T>
 cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stream);

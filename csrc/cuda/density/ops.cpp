@@ -7,28 +7,13 @@ namespace gsf {
 namespace {
 
 struct DensityCuda {
-  template <typename T>
-  static void occupancy(const DensityArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::occupancy(args, scope.stream()));
-  }
-  template <typename T>
-  static void bulk(const BulkArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::splat_bulk(args, scope.stream()));
-  }
-  template <typename T>
-  static void normals(const DensityNormalArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::density_normals(args, scope.stream()));
-  }
+  using Scope = CudaScope;
+  GSF_LAUNCH(occupancy)
+  GSF_LAUNCH(splat_bulk)
+  GSF_LAUNCH(density_normals)
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("occupancy", TORCH_BOX(&gsf::DensityOps<gsf::DensityCuda>::occupancy));
-  m.impl("splat_bulk", TORCH_BOX(&gsf::DensityOps<gsf::DensityCuda>::bulk));
-  m.impl("density_normals", TORCH_BOX(&gsf::DensityOps<gsf::DensityCuda>::normals));
-}
+GSF_REGISTER(CUDA, gsf::DensityOps<gsf::DensityCuda>)

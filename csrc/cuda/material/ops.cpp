@@ -7,16 +7,11 @@ namespace gsf {
 namespace {
 
 struct PlasticityCuda {
-  template <typename T>
-  static void return_mapping(const ReturnMappingArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::return_mapping(args, scope.stream()));
-  }
+  using Scope = CudaScope;
+  GSF_LAUNCH(return_mapping)
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("return_mapping", TORCH_BOX(&gsf::PlasticityOps<gsf::PlasticityCuda>::return_mapping));
-}
+GSF_REGISTER(CUDA, gsf::PlasticityOps<gsf::PlasticityCuda>)

@@ -7,31 +7,15 @@
 namespace gsf {
 namespace {
 
-void check(const char* op, cudaError_t error) {
-  STD_TORCH_CHECK(error == cudaSuccess, op, ": ", cudaGetErrorString(error));
-}
-
-struct Cuda {
+struct MpmCuda {
   using Scope = CudaScope;
-  template <typename T>
-  static void p2g(const P2GArgs<T>& a, const Scope& scope) {
-    check("p2g", cuda::p2g(a, scope.stream()));
-  }
-  template <typename T>
-  static void g2p(const GatherArgs<T>& a, const Scope& scope) {
-    check("g2p", cuda::g2p(a, scope.stream()));
-  }
-  template <typename T>
-  static void p2g_adjoint(const GatherArgs<T>& a, const Scope& scope) {
-    check("p2g_adjoint", cuda::p2g_adjoint(a, scope.stream()));
-  }
-  template <typename T>
-  static void grid_update(const GridUpdateArgs<T>& a, const Scope& scope) {
-    check("grid_update", cuda::grid_update(a, scope.stream()));
-  }
+  GSF_LAUNCH(p2g)
+  GSF_LAUNCH(g2p)
+  GSF_LAUNCH(p2g_adjoint)
+  GSF_LAUNCH(grid_update)
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) { gsf::MpmOps<gsf::Cuda>::register_all(m); }
+GSF_REGISTER(CUDA, gsf::MpmOps<gsf::MpmCuda>)

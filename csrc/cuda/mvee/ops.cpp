@@ -7,28 +7,25 @@ namespace gsf {
 namespace {
 
 struct MveeCuda {
+  using Scope = CudaScope;
   template <typename T>
-  static void mvee(const MveeArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
+  static void mvee(const MveeArgs<T>& args, const Scope& scope) {
     const int64_t size = cuda::mvee_scratch(args);
-    const Tensor scratch = gsf::new_empty(like, {size}, scalar_type_of<T>());
-    STD_CUDA_CHECK(cuda::mvee(args, size > 0 ? mptr<T>(scratch) : nullptr, size, scope.stream()));
+    const Tensor scratch = scope.scratch(size, scalar_type_of<T>());
+    check_cuda("mvee",
+               cuda::mvee(args, size > 0 ? mptr<T>(scratch) : nullptr, size, scope.stream()));
   }
   template <typename T>
-  static void mvee_lens(const MveeLensArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
+  static void mvee_lens(const MveeLensArgs<T>& args, const Scope& scope) {
     const int64_t chunk = args.batch < cuda::kLensChunk ? args.batch : cuda::kLensChunk;
-    const Tensor setups = gsf::new_empty(like, {cuda::kLensFields * chunk}, ScalarType::Double);
-    const Tensor rows = gsf::new_empty(like, {chunk + 1}, ScalarType::Int);
-    STD_CUDA_CHECK(cuda::mvee_lens(args, mptr<double>(setups), mptr<int32_t>(rows),
-                                   mptr<int32_t>(rows) + chunk, scope.stream()));
+    const Tensor setups = scope.scratch(cuda::kLensFields * chunk, ScalarType::Double);
+    const Tensor rows = scope.scratch(chunk + 1, ScalarType::Int);
+    check_cuda("mvee_lens", cuda::mvee_lens(args, mptr<double>(setups), mptr<int32_t>(rows),
+                                            mptr<int32_t>(rows) + chunk, scope.stream()));
   }
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("mvee", TORCH_BOX(&gsf::MveeOps<gsf::MveeCuda>::mvee));
-  m.impl("mvee_lens", TORCH_BOX(&gsf::MveeOps<gsf::MveeCuda>::mvee_lens));
-}
+GSF_REGISTER(CUDA, gsf::MveeOps<gsf::MveeCuda>)

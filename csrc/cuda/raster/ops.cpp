@@ -6,10 +6,6 @@
 namespace gsf {
 namespace {
 
-void check_raster_launch(cudaError_t error) {
-  STD_TORCH_CHECK(error == cudaSuccess, kRasterOp, ": CUDA error: ", cudaGetErrorString(error));
-}
-
 struct RasterCuda {
   using Scope = CudaScope;
   static constexpr int kTile = cuda::kListTile;
@@ -34,14 +30,14 @@ struct RasterCuda {
       const size_t bytes = cuda::raster_order_scratch(a.splat_count());
       scratch_ = gsf::new_empty(like, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
       order_ = cuda::carve_raster_order(mptr<uint8_t>(scratch_), a.splat_count());
-      check_raster_launch(cuda::raster_project(a, order_, number_, scope.stream()));
+      check_cuda(kRasterOp, cuda::raster_project(a, order_, number_, scope.stream()));
       // Sorted while the host waits for the number of list entries, which projection knows.
-      check_raster_launch(cuda::raster_sort(order_, a.splat_count(), scope.stream()));
+      check_cuda(kRasterOp, cuda::raster_sort(order_, a.splat_count(), scope.stream()));
     }
 
     int64_t instance_count() const {
       int64_t count = 0;
-      check_raster_launch(cuda::await_count(number_, &count));
+      check_cuda(kRasterOp, cuda::await_count(number_, &count));
       return count;
     }
 
@@ -50,9 +46,9 @@ struct RasterCuda {
       const size_t bytes =
           a_.instance_count > 0 ? cuda::raster_bin_scratch(a_.instance_count, tiles) : 0;
       Tensor scratch = gsf::new_empty(like_, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
-      check_raster_launch(
-          cuda::raster_bin(a_, order_, mptr<uint8_t>(scratch), bytes, scope_.stream()));
-      check_raster_launch(cuda::raster_blend(a_, scope_.stream()));
+      check_cuda(kRasterOp,
+                 cuda::raster_bin(a_, order_, mptr<uint8_t>(scratch), bytes, scope_.stream()));
+      check_cuda(kRasterOp, cuda::raster_blend(a_, scope_.stream()));
     }
 
    private:
@@ -69,15 +65,11 @@ struct RasterCuda {
     check(b.forward);
     Tensor own = gsf::new_empty(like, {cuda::raster_sums_size(b)}, scalar_type_of<T>());
     const cuda::SplatSums<T> sums = cuda::raster_sums(b, own.numel() > 0 ? mptr<T>(own) : nullptr);
-    check_raster_launch(cuda::raster_backward(b, sums, scope.stream()));
+    check_cuda(kRasterOp, cuda::raster_backward(b, sums, scope.stream()));
   }
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  using Ops = gsf::RasterOps<gsf::RasterCuda>;
-  m.impl("rasterize", TORCH_BOX(&Ops::forward));
-  m.impl("rasterize_backward", TORCH_BOX(&Ops::backward));
-}
+GSF_REGISTER(CUDA, gsf::RasterOps<gsf::RasterCuda>)

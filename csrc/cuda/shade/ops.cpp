@@ -7,16 +7,11 @@ namespace gsf {
 namespace {
 
 struct ShadeCuda {
-  template <typename T>
-  static void shade(const ShadeArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::shade(args, scope.stream()));
-  }
+  using Scope = CudaScope;
+  GSF_LAUNCH(shade)
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("shade", TORCH_BOX(&gsf::ShadeOps<gsf::ShadeCuda>::shade));
-}
+GSF_REGISTER(CUDA, gsf::ShadeOps<gsf::ShadeCuda>)

@@ -10,10 +10,6 @@
 namespace gsf {
 namespace {
 
-void check(const char* op, cudaError_t error) {
-  STD_TORCH_CHECK(error == cudaSuccess, op, ": ", cudaGetErrorString(error));
-}
-
 // A round as a CUDA graph, launched again and again: one launch for two dozen kernels, and shorter
 // gaps between them. It is captured on a stream of its own, since the default stream cannot be, and
 // kept while the state stays where it is.
@@ -27,36 +23,36 @@ class Round {
     if (exec_ == nullptr || law_set != law_set_ || steps != steps_ ||
         std::memcmp(&s, &view_, sizeof view_) != 0)
       capture(s, law_set, steps);
-    check("solver_run", cudaEventRecord(event_, caller));
-    check("solver_run", cudaStreamWaitEvent(stream_, event_, 0));
-    for (int64_t r = 0; r < rounds; ++r) check("solver_run", cudaGraphLaunch(exec_, stream_));
-    check("solver_run", cudaEventRecord(event_, stream_));
-    check("solver_run", cudaStreamWaitEvent(caller, event_, 0));
+    check_cuda("solver_run", cudaEventRecord(event_, caller));
+    check_cuda("solver_run", cudaStreamWaitEvent(stream_, event_, 0));
+    for (int64_t r = 0; r < rounds; ++r) check_cuda("solver_run", cudaGraphLaunch(exec_, stream_));
+    check_cuda("solver_run", cudaEventRecord(event_, stream_));
+    check_cuda("solver_run", cudaStreamWaitEvent(caller, event_, 0));
   }
 
  private:
   void start(int device) {
     stream_ = nullptr;  // those of another device stay with it
     exec_ = nullptr;
-    check("solver_run", cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
-    check("solver_run", cudaEventCreateWithFlags(&event_, cudaEventDisableTiming));
+    check_cuda("solver_run", cudaStreamCreateWithFlags(&stream_, cudaStreamNonBlocking));
+    check_cuda("solver_run", cudaEventCreateWithFlags(&event_, cudaEventDisableTiming));
     device_ = device;
   }
 
   void capture(const SolverView<T>& s, int law_set, int64_t steps) {
-    if (exec_ != nullptr) check("solver_run", cudaGraphExecDestroy(exec_));
+    if (exec_ != nullptr) check_cuda("solver_run", cudaGraphExecDestroy(exec_));
     exec_ = nullptr;
-    check("solver_run", cudaStreamBeginCapture(stream_, cudaStreamCaptureModeThreadLocal));
+    check_cuda("solver_run", cudaStreamBeginCapture(stream_, cudaStreamCaptureModeThreadLocal));
     cudaError_t error = cuda::solver_build(s, stream_);
     for (int64_t i = 0; i < steps && error == cudaSuccess; ++i)
       error = cuda::solver_step(s, law_set, stream_);
     cudaGraph_t graph = nullptr;
     const cudaError_t ended = cudaStreamEndCapture(stream_, &graph);
-    check("solver_run", error);
-    check("solver_run", ended);
+    check_cuda("solver_run", error);
+    check_cuda("solver_run", ended);
     error = cudaGraphInstantiate(&exec_, graph, 0);
     cudaGraphDestroy(graph);
-    check("solver_run", error);
+    check_cuda("solver_run", error);
     std::memcpy(&view_, &s, sizeof view_);
     law_set_ = law_set;
     steps_ = steps;
@@ -71,11 +67,11 @@ class Round {
   int64_t steps_ = 0;
 };
 
-struct Cuda {
+struct SolverCuda {
   using Scope = CudaScope;
   template <typename T>
   static void prime(const SolverView<T>& s, int, const Scope& scope) {
-    check("solver_prime", cuda::solver_prime(s, scope.stream()));
+    check_cuda("solver_prime", cuda::solver_prime(s, scope.stream()));
   }
   template <typename T>
   static void run(const SolverView<T>& s, int law_set, int64_t rounds, int64_t steps,
@@ -88,4 +84,4 @@ struct Cuda {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) { gsf::SolverOps<gsf::Cuda>::register_all(m); }
+GSF_REGISTER(CUDA, gsf::SolverOps<gsf::SolverCuda>)

@@ -7,16 +7,11 @@ namespace gsf {
 namespace {
 
 struct AdamCuda {
-  template <typename T>
-  static void step(const AdamArgs<T>& args, const Tensor& like) {
-    const CudaScope scope(like);
-    STD_CUDA_CHECK(cuda::adam_step(args, scope.stream()));
-  }
+  using Scope = CudaScope;
+  GSF_LAUNCH(adam_step)
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("adam_step", TORCH_BOX(&gsf::AdamOps<gsf::AdamCuda>::step));
-}
+GSF_REGISTER(CUDA, gsf::AdamOps<gsf::AdamCuda>)

@@ -7,26 +7,21 @@ namespace gsf {
 namespace {
 
 struct SsimCuda {
+  using Scope = CudaScope;
   template <typename T>
-  static void run(const SsimArgs<T>& a, const Tensor& like) {
-    const CudaScope scope(like);
+  static void run(const SsimArgs<T>& a, const Scope& scope) {
     cuda::SsimPlan plan{};
-    STD_CUDA_CHECK(cuda::ssim_plan(a, scope.index(), plan));
+    check_cuda("ssim", cuda::ssim_plan(a, scope.index(), plan));
     const bool gradient = a.grad_image != nullptr;
-    const Tensor slopes =
-        gsf::new_empty(like, {gradient ? 3 * a.map_count() : 0}, scalar_type_of<T>());
-    const Tensor sums =
-        gsf::new_empty(like, {a.loss != nullptr ? plan.sums() : 0}, ScalarType::Double);
-    STD_CUDA_CHECK(cuda::ssim(a, plan, gradient ? mptr<T>(slopes) : nullptr,
-                              a.loss != nullptr ? mptr<double>(sums) : nullptr, scope.stream()));
+    const Tensor slopes = scope.scratch(gradient ? 3 * a.map_count() : 0, scalar_type_of<T>());
+    const Tensor sums = scope.scratch(a.loss != nullptr ? plan.sums() : 0, ScalarType::Double);
+    check_cuda("ssim",
+               cuda::ssim(a, plan, gradient ? mptr<T>(slopes) : nullptr,
+                          a.loss != nullptr ? mptr<double>(sums) : nullptr, scope.stream()));
   }
 };
 
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CUDA, m) {
-  m.impl("ssim", TORCH_BOX(&gsf::SsimOps<gsf::SsimCuda>::map));
-  m.impl("ssim_backward", TORCH_BOX(&gsf::SsimOps<gsf::SsimCuda>::map_backward));
-  m.impl("photometric_loss", TORCH_BOX(&gsf::SsimOps<gsf::SsimCuda>::photometric));
-}
+GSF_REGISTER(CUDA, gsf::SsimOps<gsf::SsimCuda>)
