@@ -15,6 +15,8 @@ struct Stencil {
   T f[3];
   T w[3][3];  // w[axis][node]
 
+  GSF_HOST_DEVICE T weight(int i, int j, int k) const { return w[0][i] * w[1][j] * w[2][k]; }
+
   // Derivative of w[axis][node] with respect to x_p, times dx.
   GSF_HOST_DEVICE T slope(int axis, int node) const {
     return node == 0 ? f[axis] - T(1.5) : (node == 1 ? T(-2) * (f[axis] - T(1)) : f[axis] - T(0.5));
@@ -31,7 +33,7 @@ struct NodeRange {
 // False, and nothing usable in `s`, when the position is not finite or its base lies outside
 // `range`. The comparison comes before the cast, so no value can overflow the integer.
 template <typename T>
-GSF_HOST_DEVICE bool make_stencil(const T* x, T inv_dx, const NodeRange& range, Stencil<T>& s) {
+GSF_INLINE bool make_stencil(const T* x, T inv_dx, const NodeRange& range, Stencil<T>& s) {
   for (int axis = 0; axis < 3; ++axis) {
     const T g = x[axis] * inv_dx;
     const T u = g - T(0.5);
@@ -47,6 +49,19 @@ GSF_HOST_DEVICE bool make_stencil(const T* x, T inv_dx, const NodeRange& range, 
     s.w[axis][2] = T(0.5) * c * c;
   }
   return true;
+}
+
+// f(i, j, k) for the 27 nodes of a stencil.
+template <typename F>
+GSF_INLINE void for_each_node(const F& f) {
+  // clang-format off
+  GSF_UNROLL
+  for (int i = 0; i < 3; ++i)
+    GSF_UNROLL
+    for (int j = 0; j < 3; ++j)
+      GSF_UNROLL
+      for (int k = 0; k < 3; ++k) f(i, j, k);
+  // clang-format on
 }
 
 }  // namespace gsf

@@ -85,6 +85,18 @@ struct StencilBlocks {
   }
 };
 
+// Field and stencil of particle p of a kernel's arguments, and the blocks under it; p is not looked
+// at unless it exists. False when it has no place, because it is in no field, or active blocks do
+// not cover its stencil: then it gives nothing and takes nothing.
+template <class Args, typename T>
+GSF_INLINE bool locate_particle(const Args& a, bool exists, int64_t p, int32_t& field,
+                                Stencil<T>& s, StencilBlocks& at) {
+  field = exists && a.body != nullptr ? a.body[p] : 0;
+  return exists && field >= 0 && field < a.fields &&
+         make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s) &&
+         at.find(a.blocks, s);
+}
+
 // Momentum one particle gives to stencil node o (o in {0, 1, 2}^3), before its weight: constant +
 // slope o. MLS-MPM: m (v + C d) - dt V0 (4 / dx^2) tau d with d = x_i - x_p = (o - f) dx.
 template <typename T>
@@ -95,22 +107,29 @@ struct ParticleMomentum {
 };
 
 template <typename T>
-GSF_HOST_DEVICE ParticleMomentum<T> particle_momentum(const Stencil<T>& s, T mass,
-                                                      const T* velocity, const T* affine,
-                                                      const T* stress, T volume, T dx, T dt) {
+GSF_HOST_DEVICE ParticleMomentum<T> momentum_given(const Stencil<T>& s, const T* velocity,
+                                                   const T* slope, T mass, T dx) {
   ParticleMomentum<T> q;
-  for (int i = 0; i < 9; ++i) q.slope.m[i] = mass * affine[i];
-  if (stress != nullptr) {
-    const T scale = -dt * volume * T(4) / (dx * dx);
-    const Mat3<T> tau = to_mat3(load_sym3(stress));
-    for (int i = 0; i < 9; ++i) q.slope.m[i] += scale * tau.m[i];
-  }
-  for (int i = 0; i < 9; ++i) q.slope.m[i] *= dx;
+  for (int i = 0; i < 9; ++i) q.slope.m[i] = slope[i] * dx;
   for (int i = 0; i < 3; ++i)
     q.constant[i] = mass * velocity[i] -
                     (q.slope(i, 0) * s.f[0] + q.slope(i, 1) * s.f[1] + q.slope(i, 2) * s.f[2]);
   q.mass = mass;
   return q;
+}
+
+template <typename T>
+GSF_HOST_DEVICE ParticleMomentum<T> particle_momentum(const Stencil<T>& s, T mass,
+                                                      const T* velocity, const T* affine,
+                                                      const T* stress, T volume, T dx, T dt) {
+  Mat3<T> slope;
+  for (int i = 0; i < 9; ++i) slope.m[i] = mass * affine[i];
+  if (stress != nullptr) {
+    const T scale = -dt * volume * T(4) / (dx * dx);
+    const Mat3<T> tau = to_mat3(load_sym3(stress));
+    for (int i = 0; i < 9; ++i) slope.m[i] += scale * tau.m[i];
+  }
+  return momentum_given(s, velocity, slope.m, mass, dx);
 }
 
 // What one particle gathers: value = sum w g (four channels) and first = sum w g (x_i - x_p)^T

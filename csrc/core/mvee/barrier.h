@@ -5,12 +5,6 @@
 
 #include "core/sym3.h"
 
-#ifdef __CUDACC__
-#define GSF_UNROLL _Pragma("unroll")
-#else
-#define GSF_UNROLL _Pragma("GCC unroll 64")
-#endif
-
 namespace gsf {
 
 // The team of one. A "team" of lanes shares the points; every lane ends with the same ellipsoid.

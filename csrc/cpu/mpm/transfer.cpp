@@ -55,23 +55,22 @@ ParticleMomentum<T> momentum_of(const P2GArgs<T>& a, const Stencil<T>& s, int64_
 // thread only.
 template <typename T>
 bool scatter_stray(const P2GArgs<T>& a, int64_t p) {
-  const int32_t field = a.body != nullptr ? a.body[p] : 0;
-  if (field < 0 || field >= a.fields) return false;
+  int32_t field;
   Stencil<T> s;
   StencilBlocks at;
-  if (!make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s)) return false;
-  if (!at.find(a.blocks, s)) return false;
+  if (!locate_particle(a, true, p, field, s, at)) return false;
   Lanes<T> tile[27] = {};
   Lanes<T> moment[27] = {};
   scatter_momentum(momentum_of(a, s, p), s, tile, 3);
   if (a.moments != nullptr) scatter_moments(s, a.mass[p], moment, 3);
   const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
-  for (int n = 0; n < 27; ++n) {
-    const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
+  for_each_node([&](int i, int j, int k) {
+    const int n = 9 * i + 3 * j + k;
+    const int64_t node = base + at.node(s, i, j, k);
     for (int c = 0; c < 4; ++c) a.grid[4 * node + c] += tile[n][c];
-    if (a.moments == nullptr) continue;
+    if (a.moments == nullptr) return;
     for (int c = 0; c < kContactMoments; ++c) a.moments[kContactMoments * node + c] += moment[n][c];
-  }
+  });
   return true;
 }
 
@@ -240,18 +239,16 @@ struct SlopeGather {
 
 template <typename T, typename Kind>
 bool gather_stray(const GatherArgs<T>& a, int64_t p) {
-  const int32_t field = a.body != nullptr ? a.body[p] : 0;
-  if (field < 0 || field >= a.fields) return false;
+  int32_t field;
   Stencil<T> s;
   StencilBlocks at;
-  if (!make_stencil(a.position + 3 * p, T(1) / a.dx, a.blocks.node_range(), s)) return false;
-  if (!at.find(a.blocks, s)) return false;
+  if (!locate_particle(a, true, p, field, s, at)) return false;
   Lanes<T> tile[27] = {};
   const int64_t base = int64_t(field) * a.blocks.count * kBlockNodes;
-  for (int n = 0; n < 27; ++n) {
-    const int64_t node = base + at.node(s, n / 9, n / 3 % 3, n % 3);
-    for (int c = 0; c < Kind::kChannels; ++c) tile[n][c] = a.grid[Kind::kChannels * node + c];
-  }
+  for_each_node([&](int i, int j, int k) {
+    const T* node = a.grid + Kind::kChannels * (base + at.node(s, i, j, k));
+    for (int c = 0; c < Kind::kChannels; ++c) tile[9 * i + 3 * j + k][c] = node[c];
+  });
   Kind::visit(a, p, s, tile, 3);
   return true;
 }

@@ -149,26 +149,21 @@ __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, i
     for (int i = 0; i < 9; ++i) q.slope.m[i] *= per_unit;
     const T weight_unit = mass * per_mass;
     const int base = window_base(given.meta);
+    for_each_node([&](int i, int j, int k) {
+      const T w = st.weight(i, j, k);
+      const int at = base + i * kStrideX + j * kStrideY + k;
 #pragma unroll
-    for (int i = 0; i < 3; ++i)
-#pragma unroll
-      for (int j = 0; j < 3; ++j)
-#pragma unroll
-        for (int k = 0; k < 3; ++k) {
-          const T w = st.w[0][i] * st.w[1][j] * st.w[2][k];
-          const int at = base + i * kStrideX + j * kStrideY + k;
-#pragma unroll
-          for (int c = 0; c < 3; ++c)
-            Fixed<T>::add(&tile[c][at],
-                          Fixed<T>::round(w * (q.constant[c] + q.slope(c, 0) * T(i) +
-                                               q.slope(c, 1) * T(j) + q.slope(c, 2) * T(k))));
-          Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
-          if constexpr (kMoments) {
-            const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
-            for (int c = 0; c < kContactMoments; ++c)
-              Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
-          }
-        }
+      for (int c = 0; c < 3; ++c)
+        Fixed<T>::add(&tile[c][at],
+                      Fixed<T>::round(w * (q.constant[c] + q.slope(c, 0) * T(i) +
+                                           q.slope(c, 1) * T(j) + q.slope(c, 2) * T(k))));
+      Fixed<T>::add(&tile[3][at], Fixed<T>::round(w * weight_unit));
+      if constexpr (kMoments) {
+        const Vec3<T> g = contact_moment(st, w * weight_unit, i, j, k);
+        for (int c = 0; c < kContactMoments; ++c)
+          Fixed<T>::add(&tile[4 + c][at], Fixed<T>::round(g[c]));
+      }
+    });
     r += stride;
     if (r < count) given.read(s, first + r);
   }
