@@ -71,7 +71,7 @@ def _mvee_no_gradient(ctx: Any, *grads: Tensor) -> None:
 torch.library.register_autograd("gsfluent::mvee", _mvee_no_gradient)
 
 _ORDER = (0, 4, 8, 1, 2, 5)
-# In the order of LensFault (csrc/core/mvee_lens.h), of the first Gaussian and of the second.
+# In the order of LensFault (csrc/core/mvee/lens.h), of the first Gaussian and of the second.
 _NOT_FINITE = "finite, got NaN or infinity in row {}"
 _FAULTS = [
     (f"{name}_{side}", what)

@@ -318,7 +318,7 @@ def wave_speed(
         ValueError: A shape, device, law, parameter or material row is wrong.
 
     Gradient: with respect to strain and params (plain PyTorch).
-    Source: csrc/core/wave_speed.h, which the solver's kernels use.
+    Source: csrc/core/material/wave_speed.h, which the solver's kernels use.
     """
     check_tensor("wave_speed", "strain", strain, shape=("N", 6))
     count = strain.shape[0]

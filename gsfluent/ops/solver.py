@@ -2,7 +2,7 @@
 
 :class:`Solver` advances many explicit MLS-MPM steps per call without a look from the host: the
 time step, the search for active blocks, the re-sorting of particles and the stopping time are
-decided on the device (``csrc/core/solver_clock.h``). The composable operators
+decided on the device (``csrc/core/solver/clock.h``). The composable operators
 (:func:`gsfluent.ops.p2g` and its siblings) are the differentiable face of the same mathematics and
 the reference it is tested against.
 
@@ -62,7 +62,7 @@ class SolverError(GsfluentError, RuntimeError):
     """The solver stopped before the time it was asked for.
 
     Args:
-        reason: Number in ``SolverReason`` (``csrc/core/solver_state.h``).
+        reason: Number in ``SolverReason`` (``csrc/core/solver/state.h``).
         time: Simulated time at which it stopped [s].
         step: Steps so far.
     """

@@ -79,7 +79,7 @@ def test_a_textured_solid_is_compared_by_its_slices(tmp_path: Path) -> None:
     save_solid(solid, tmp_path / "bare.ply")
     with pytest.raises(InputError, match="no colours inside"):
         load_pictures(tmp_path / "bare.ply")
-    replace(solid, color=torch.from_numpy(known.rgb)).save(tmp_path / "stone.ply")
+    save_solid(replace(solid, color=torch.from_numpy(known.rgb)), tmp_path / "stone.ply")
     cut = (known.exemplars()["x"] * 255).round().astype(np.uint8)
     Image.fromarray(cut).save(tmp_path / "cut.png")
     found = compare(tmp_path / "stone.ply", tmp_path / "cut.png")

@@ -20,7 +20,7 @@ from gsfluent.ops.reference import fixed_point as fixed
 from gsfluent.ops.solver_buffers import MAX_PARTICLES
 
 CUDA = Path(__file__).parents[2] / "csrc" / "cuda"
-KERNEL = "\n".join(p.read_text(encoding="utf-8") for p in sorted(CUDA.glob("solver_*")))
+KERNEL = "\n".join(p.read_text(encoding="utf-8") for p in sorted(CUDA.glob("solver/*")))
 WEIGHT = Fraction(3, 4) ** 3
 """Largest weight of a quadratic B-spline in three dimensions."""
 
@@ -59,7 +59,7 @@ def primed(given: dict[str, Any]) -> tuple[fixed.Transfer, dict[str, float]]:
 def test_the_constants_are_those_of_the_kernel() -> None:
     def found(pattern: str) -> float:
         match = re.search(pattern, KERNEL)
-        assert match, f"{pattern} is not in csrc/cuda/solver_*"
+        assert match, f"{pattern} is not in csrc/cuda/solver"
         return float(match.group(1))
 
     assert found(r"Fixed<float> \{[^}]*kBits = (\d+);") == fixed.WINDOW_BITS

@@ -1,6 +1,6 @@
 """Sums of the resident solver on a GPU, in whole numbers: 32 bits in a window, 64 between windows.
 
-The definition of what p2g of ``csrc/cuda/solver_*`` adds up, and of what may lie
+The definition of what p2g of ``csrc/cuda/solver`` adds up, and of what may lie
 between that and the exact sums. The units come from the clock of a :class:`gsfluent.ops.Solver`;
 docs/theory/solver-sums.md has the proof that nothing overflows. ``scripts/study/solver.py`` and a
 test use it.
