@@ -30,7 +30,7 @@ class Chart(Verb):
 
     Writes chart.jsonl (a line per run), chart.png, chart.html and chart.md.
     docs/measured/chart.md says how to read them. With a shot: chart.json and chart.png,
-    see docs/chart_shot.md.
+    see docs/guide/lab.md.
     """
 
     shot: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="SHOT.yaml")] = None

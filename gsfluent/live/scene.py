@@ -118,7 +118,7 @@ def _stood(scene: Scene) -> Scene:
 
 
 BUDGET = {"cpu": 6_000, "cuda": 30_000}
-"""Material points of quality ``live`` by device: interactive in docs/measured/live.md."""
+"""Material points of quality ``live`` by device (docs/measured/live.md)."""
 
 
 CELLS = (8, 64)

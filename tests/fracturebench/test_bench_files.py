@@ -137,7 +137,7 @@ def test_the_example_of_the_docs_is_a_submission(
     scene: Scene, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    page = (ROOT / "docs" / "fracturebench.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guide" / "fracturebench.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     scene.save("scenes/bar.npz")
