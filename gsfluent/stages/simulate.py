@@ -15,6 +15,7 @@ from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
 from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.walls import thin_shells
@@ -101,6 +102,17 @@ def moving_settings(shot: Shot) -> list[Any]:
     ]
 
 
+def solver_options(shot: Shot) -> SolverOptions:
+    """How the matter of a shot is moved."""
+    solve = shot.solve
+    return SolverOptions(
+        cfl=solve.cfl,
+        standing=solve.standing,
+        loose_crumbs=solve.loose_crumbs,
+        deterministic=solve.deterministic,
+    )
+
+
 def simulate_stage(context: RunContext) -> None:
     """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
     shot = context.shot
@@ -116,10 +128,7 @@ def simulate_stage(context: RunContext) -> None:
             seed=context.seed,
             device=context.device,
             dx=None if cells is None else grid_spacing(scene, cells),
-            cfl=shot.solve.cfl,
-            standing=shot.solve.standing,
-            loose_crumbs=shot.solve.loose_crumbs,
-            deterministic=shot.solve.deterministic,
+            options=solver_options(shot),
             repair=shot.output.cracks,
         )
         state = folder / _STATE

@@ -61,7 +61,7 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
         if matter.particles.deformation is None:
             more = dataclasses.replace(more, particles=more.particles.replace(deformation=None))
         matter = _joined(matter, more)
-        state = _joined_state(state, matter, len(fresh), landed=not run.stepper.free_flight)
+        state = _joined_state(state, matter, len(fresh), landed=not run.stepper.options.free_flight)
     _refit(run, scene, matter, state)
     run.state = run.state._replace(colliders=_colliders(run, old, state))
     if fresh:

@@ -34,7 +34,7 @@ from gsfluent.pipeline.matter.points import (
     grid_spacing,
 )
 from gsfluent.pipeline.matter.state import State
-from gsfluent.pipeline.simulate.engine import CFL
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
@@ -140,32 +140,15 @@ class Simulate(Stage):
         seed: Seed of point positions and weakness, in object space.
         device: Where to compute.
         jitter: Relative half-width of the noise on ``alpha0``.
-        cfl: Courant number of the automatic time step.
-        free_flight: Move bodies that touch nothing in closed form instead of on the grid.
-        piece_flight: Do so again with bodies and pieces that touch nothing any more.
-        sleep: Take off the grid what rests, until something comes near.
-        separate_fragments: Give the pieces of a broken body velocity fields of their own, so that
-            they do not weld again where they touch.
-        resident: Use the resident solver wherever it knows the colliders; otherwise the composed
-            operators, step by step.
-        irreversible: Broken points stay without cohesion when they are pressed together again.
-        law_kernels: Use kernels made for elastic and brittle matter where there is no other.
-        contact_near: Leave out contact where no two bodies or pieces are near each other; False
-            is for comparison: the composed operators then look for contact at every node.
-        deterministic: Refuse what cannot give the same bits from the same input on the same
-            device: the composed operators on a GPU, whose sums have no order.
-        standing: Let what stands still on the floor at time 0 sleep, without a strain, until
-            something comes near; else its weight begins to act then.
-        loose_crumbs: Take broken points with next to nothing around them off the grid for good:
-            they fall freely and stay where they meet the floor.
         repair: How ``frame.gaussians`` get splats along cracks: a method of
             :class:`gsfluent.pipeline.Repair`; True for its default, False for ``none``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
-        return_map: Options of :func:`gsfluent.ops.return_mapping`.
-        max_rollbacks: Roll-backs in a row before the run is given up.
         max_particles: Refuse scenes with more material points.
         step_hook: Called with the state after every grid step; what it returns goes on. For tests
             and for forces of one's own.
+        options: How the matter is moved.
+        changes: Fields of :class:`SolverOptions` that differ from ``options``, for example
+            ``cfl=0.3`` or ``sleep=False``.
 
     Raises:
         InputError: An unknown quality or a number outside its range.
@@ -181,24 +164,12 @@ class Simulate(Stage):
         seed: int = 0,
         device: torch.device | str = "cpu",
         jitter: float = ALPHA_JITTER,
-        cfl: float = CFL,
-        free_flight: bool = True,
-        piece_flight: bool = True,
-        sleep: bool = True,
-        separate_fragments: bool = True,
-        resident: bool = True,
-        irreversible: bool = True,
-        law_kernels: bool = True,
-        contact_near: bool = True,
-        deterministic: bool = False,
         repair: bool | str = True,
         splats: bool = True,
-        standing: bool = False,
-        loose_crumbs: bool = False,
-        return_map: dict[str, float | bool] | None = None,
-        max_rollbacks: int = 6,
         max_particles: int = MAX_PARTICLES,
         step_hook: Callable[[State], State] | None = None,
+        options: SolverOptions | None = None,
+        **changes: Any,
     ) -> None:
         super().__init__(seed=seed)
         if quality not in QUALITY:
@@ -207,30 +178,13 @@ class Simulate(Stage):
             )
         if dx is not None and not (math.isfinite(dx) and dx > 0):
             raise InputError(f"simulate: dx must be positive, got {dx}", hint="give metres")
-        if not 0.0 < cfl <= 1.0:
-            raise InputError(f"simulate: cfl must lie in (0, 1], got {cfl}", hint="use 0.5")
         self.quality, self.dx, self.device = quality, dx, torch.device(device)
         self.jitter, self.max_particles = jitter, max_particles
-        self.max_rollbacks, self.step_hook = max_rollbacks, step_hook
-        self.splats = splats
+        self.splats, self.step_hook = splats, step_hook
+        self.options = dataclasses.replace(options or SolverOptions(), **changes)
         self._repair = Repair(
             repair if isinstance(repair, str) else METHODS[0] if repair else "none"
         )
-        self._options = {
-            "cfl": cfl,
-            "free_flight": free_flight,
-            "piece_flight": piece_flight,
-            "sleep": sleep,
-            "separate_fragments": separate_fragments,
-            "resident": resident,
-            "irreversible": irreversible,
-            "law_kernels": law_kernels,
-            "contact_near": contact_near,
-            "deterministic": deterministic,
-            "standing": standing,
-            "loose_crumbs": loose_crumbs,
-            "return_map": return_map,
-        }
         self._run: Run | None = None
 
     def prepare(self, scene: Scene) -> Matter:
@@ -286,7 +240,7 @@ class Simulate(Stage):
 
     def run_of(self, scene: Scene, fps: float) -> Run:
         """A run of a scene at time 0, to be advanced by hand."""
-        return Run(scene, self.prepare(scene), fps, self._options, self.max_rollbacks)
+        return Run(scene, self.prepare(scene), fps, self.options)
 
     def _frames(
         self,

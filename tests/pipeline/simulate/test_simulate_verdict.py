@@ -119,7 +119,7 @@ def test_too_many_pieces_in_one_place_share_fields(monkeypatch: pytest.MonkeyPat
     """More fields than a block has room for are no reason to stop, nor for shorter steps."""
     simulate = Simulate(dx=0.04, splats=False)
     scene = two_balls()
-    run = Run(scene, simulate.prepare(scene), FPS, {}, 6)
+    run = Run(scene, simulate.prepare(scene), FPS)
     unit = torch.arange(run.matter.particles.count) // 10
     assert int(unit.max()) > 2 * SITE_FIELDS
     monkeypatch.setattr(simulate_run, "units", lambda *_: unit)
