@@ -112,20 +112,20 @@ def measure(given: argparse.Namespace, device: torch.device) -> dict[str, Any]:
             scales=splats.scales, sh=splats.sh, depth=False,
         ).image  # fmt: skip
 
-    repair = Repair()
+    history = Repair().begin(carry)
     rows = []
     with torch.no_grad():
         # the first opening also places the sites; it is a second run that is timed
-        repair.step(carry, moment(carry, 1.0))
-        repair.restore({})
+        history.step(moment(carry, 1.0))
+        history.restore({})
         for index in range(given.frames):
             share = min(1.0, index / (0.5 * given.frames))
             points = moment(carry, share)
             start = clock(device)
-            cracks = repair.step(carry, points)
+            cracks = history.step(points)
             first = 1e3 * (clock(device) - start)
             assert cracks is not None  # method gap
-            still, cracks = timed(device, lambda p=points: repair.step(carry, p), given.repeats)
+            still, cracks = timed(device, lambda p=points: history.step(p), given.repeats)
             move, motion = timed(
                 device, lambda c=cracks: carry.apply(carry.follow(c.points, c.rest), c.rest), 1
             )

@@ -112,9 +112,8 @@ class LiveSession:
         start = copy_of(scene)
         self._first = self._simulate.run_of(start, fps)
         self.solids = len(scene.bodies)
-        self._carry = Carry.bind(start, self._first.matter)
         self.cracks = cracks
-        self._repair = Repair(self.cracks)
+        self._history = Repair(cracks).begin(Carry.bind(start, self._first.matter))
         self._reach = reach_of(self._first.matter)
         self._prepared = self._first.twin(), 0, (0, 0.0)
         self.dropped = 0
@@ -125,7 +124,7 @@ class LiveSession:
     def _restart(self, index: int, run: Run, base: tuple[int, float]) -> None:
         self.index, self._base, self.failure = index, base, ""
         self.run = run.twin()
-        self._repair.restore({})
+        self._history.restore({})
         self.pokes: list[dict[str, Any]] = []
         self._frame: SavedFrame | None = None
         self._rest: tuple[State, bool] | None = None
@@ -241,7 +240,7 @@ class LiveSession:
         """This moment as a frame of a run."""
         if self._frame is None:
             with torch.no_grad():
-                whole = frame_of(self.run, self.index, self._carry, self._repair, self.time)
+                whole = frame_of(self.run, self.index, self._history, self.time)
                 self._frame = saved(whole, self.scene)
                 del self.run.per_frame[:]
         return self._frame

@@ -191,9 +191,9 @@ def _times(solid: Solid, material: str, device: torch.device) -> tuple[float, fl
     with tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name:
         for frame in frames:
             save_frame(Path(name), saved(frame, scene))
-            stage.save_state(Path(name) / "state.pt")
+            frames.save(Path(name) / "state.pt")
             points = float(frame.particles.count)
-    rest = time.perf_counter() - start - float(stage.report()["seconds"])
+    rest = time.perf_counter() - start - float(frames.report["seconds"])
     start = time.perf_counter()
     thin_walls(scene, side / _CELLS)
     return setup + time.perf_counter() - start, max(rest, 1e-4), points

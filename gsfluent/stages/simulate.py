@@ -143,8 +143,8 @@ def simulate_stage(context: RunContext) -> None:
         for frame in frames:
             save_frame(folder, saved(frame, scene))
             # after the frame: a state on disk always has its picture
-            stage.save_state(state)
-        return stage.report() | {"thin": thin_walls(scene, stage.report()["dx"])}
+            frames.save(state)
+        return frames.report | {"thin": thin_walls(scene, frames.run.matter.dx)}
 
     result = context.store.run("simulate", key, work)
     report = dict(result.report)

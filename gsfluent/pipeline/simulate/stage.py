@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from gsfluent.data import Gaussians, Particles
 from gsfluent.errors import InputError
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.cracks.gaps import Cracks
-from gsfluent.pipeline.cracks.stage import METHODS, Repair, Repaired
+from gsfluent.pipeline.cracks.stage import METHODS, CrackHistory, Repair, Repaired
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.matter.fragments import Fragments
 from gsfluent.pipeline.matter.points import (
@@ -33,14 +32,11 @@ from gsfluent.pipeline.matter.points import (
     build_matter,
     grid_spacing,
 )
-from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.simulate.engine import SolverOptions
-from gsfluent.pipeline.simulate.run import Run
+from gsfluent.pipeline.simulate.run import Hook, Run
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
-
-_log = logging.getLogger(__name__)
 
 QUALITY = {"preview": 20, "shot": 40, "hero": 64}
 """Cells along the longest side of the largest solid."""
@@ -75,15 +71,14 @@ class SimulationFrame:
     broken: Tensor
     rigid: RigidSet
     colliders: Tensor
-    _carry: Carry | None = None
-    _repair: Repair | None = None
+    _history: CrackHistory | None = None
     _points: Points | None = None
     _cracks: Cracks | None = None
 
-    def _binding(self) -> Carry:
-        if self._carry is None:
+    def _binding(self) -> CrackHistory:
+        if self._history is None:
             raise InputError("frame: this run carries no splats", hint="Simulate(splats=True)")
-        return self._carry
+        return self._history
 
     @property
     def _rest(self) -> Gaussians | None:
@@ -97,9 +92,10 @@ class SimulationFrame:
         Splats of all bodies follow each other in the order of the scene; transition splats come
         last.
         """
-        if self._repair is None:
-            return Repaired.none(self.carried, self.motion.anchor)
-        return self._repair(self._binding(), self.motion, self.carried, cracks=self._cracks)
+        history = self._binding()
+        return history.repair(
+            history.carry, self.motion, self.carried, history=history, cracks=self._cracks
+        )
 
     @property
     def gaussians(self) -> Gaussians:
@@ -114,31 +110,78 @@ class SimulationFrame:
     @functools.cached_property
     def carried(self) -> Gaussians:
         """The splats without repair: one for one those of the solids."""
-        return self._binding().apply(self.motion, self._rest)
+        return self._binding().carry.apply(self.motion, self._rest)
 
     @functools.cached_property
     def motion(self) -> Motion:
         """Where each splat has gone."""
-        carry = self._binding()
-        if self._points is None:
-            raise InputError("frame: no deformation was tracked", hint="Simulate(splats=True)")
+        carry = self._binding().carry
+        assert self._points is not None  # with the binding
         return carry.follow(self._points, self._rest)
 
-    @functools.cached_property
-    def splat_damage(self) -> Tensor:
-        """Damage of each splat of :attr:`gaussians`, 0 to 1; transition splats have 1."""
-        damage = self._binding().sample(self.damage)
-        return torch.cat([damage, damage.new_ones(self.repaired.added)])
+
+class Simulation(Iterator[SimulationFrame]):
+    """A scene that is being simulated; iterate over it for its frames.
+
+    When the run cannot be healed the iteration ends early; :attr:`report` has the verdict.
+
+    Args:
+        run: The run, at the frame to go on with.
+        count: Number of frames.
+        history: The splats and their cracks; None to carry none.
+        step_hook: See :class:`Simulate`.
+        progress: Told after each frame.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        count: int,
+        history: CrackHistory | None,
+        step_hook: Hook | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self.run, self.count, self.history = run, count, history
+        self._hook, self._progress = step_hook, progress
+
+    def __next__(self) -> SimulationFrame:
+        """Simulate up to the next frame."""
+        index = self.run.next_frame
+        with torch.no_grad():
+            if (
+                index >= self.count
+                or self.run.failure
+                or not self.run.advance_to(index, self._hook)
+            ):
+                raise StopIteration
+            frame = frame_of(self.run, index, self.history)
+        report_progress(self._progress, index + 1, self.count, f"t = {frame.time:.3f} s")
+        return frame
+
+    def save(self, path: str | Path) -> None:
+        """Write the state of the last frame, to be given to ``resume`` of :class:`Simulate`.
+
+        Raises:
+            InputError: Nothing has been simulated yet.
+        """
+        if self.run.next_frame == 0:
+            raise InputError("simulate: there is no frame to save", hint="take a frame first")
+        self.run.save(path, {} if self.history is None else self.history.state())
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The section ``simulation`` of run.json, plus ``verdict`` and ``reason``."""
+        return self.run.report()
 
 
 class Simulate(Stage):
-    """Simulates a scene; iterate over the call for its frames.
+    """Simulates a scene: the call gives a :class:`Simulation`, iterate over that for the frames.
 
     Args:
         quality: ``preview``, ``shot`` or ``hero``: 20, 40 or 64 cells along the largest solid.
         dx: Grid spacing [m]; overrides ``quality``.
         seed: Seed of point positions and weakness, in object space.
-        device: Where to compute.
+        device: Where to compute; where the first solid is when absent.
         jitter: Relative half-width of the noise on ``alpha0``.
         repair: How ``frame.gaussians`` get splats along cracks: a method of
             :class:`gsfluent.pipeline.Repair`; True for its default, False for ``none``.
@@ -162,12 +205,12 @@ class Simulate(Stage):
         *,
         dx: float | None = None,
         seed: int = 0,
-        device: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
         jitter: float = ALPHA_JITTER,
         repair: bool | str = True,
         splats: bool = True,
         max_particles: int = MAX_PARTICLES,
-        step_hook: Callable[[State], State] | None = None,
+        step_hook: Hook | None = None,
         options: SolverOptions | None = None,
         **changes: Any,
     ) -> None:
@@ -178,14 +221,13 @@ class Simulate(Stage):
             )
         if dx is not None and not (math.isfinite(dx) and dx > 0):
             raise InputError(f"simulate: dx must be positive, got {dx}", hint="give metres")
-        self.quality, self.dx, self.device = quality, dx, torch.device(device)
+        self.quality, self.dx, self.device = quality, dx, device
         self.jitter, self.max_particles = jitter, max_particles
         self.splats, self.step_hook = splats, step_hook
         self.options = dataclasses.replace(options or SolverOptions(), **changes)
-        self._repair = Repair(
+        self.repair = Repair(
             repair if isinstance(repair, str) else METHODS[0] if repair else "none"
         )
-        self._run: Run | None = None
 
     def prepare(self, scene: Scene) -> Matter:
         """Sample the material points of a scene without simulating it (for ``plan`` and tests)."""
@@ -195,7 +237,7 @@ class Simulate(Stage):
             dx,
             seed=self.seed,
             jitter=self.jitter,
-            device=self.device,
+            device=scene.device if self.device is None else self.device,
             max_particles=self.max_particles,
         )
         if not self.splats:
@@ -211,17 +253,15 @@ class Simulate(Stage):
         *,
         progress: Progress | None = None,
         resume: str | Path | None = None,
-    ) -> Iterator[SimulationFrame]:
+    ) -> Simulation:
         """Simulate ``round(fps * seconds)`` frames; frame k is at time ``k / fps``.
-
-        When the run cannot be healed the iteration ends early; :meth:`report` has the verdict.
 
         Args:
             scene: What to simulate.
             fps: Frames per second.
             seconds: Length.
             progress: Told after each frame.
-            resume: File of :meth:`save_state`; frames up to that one are not yielded again.
+            resume: File of :meth:`Simulation.save`; frames up to that one are not yielded again.
 
         Raises:
             InputError: An empty scene, bad numbers, or a resume file of another scene.
@@ -233,54 +273,20 @@ class Simulate(Stage):
             )
         count = max(1, round(fps * seconds))
         run = self.run_of(scene, fps)
-        self._repair.restore(run.resume(resume) if resume is not None else {})
-        self._run = run
-        carry = Carry.bind(scene, run.matter) if self.splats else None
-        return self._frames(run, count, carry, self._repair, progress)
+        saved = {} if resume is None else run.resume(resume)
+        history = None
+        if self.splats:
+            history = self.repair.begin(Carry.bind(scene, run.matter))
+            history.restore(saved)
+        return Simulation(run, count, history, self.step_hook, progress)
 
     def run_of(self, scene: Scene, fps: float) -> Run:
         """A run of a scene at time 0, to be advanced by hand."""
         return Run(scene, self.prepare(scene), fps, self.options)
 
-    def _frames(
-        self,
-        run: Run,
-        count: int,
-        carry: Carry | None,
-        repair: Repair,
-        progress: Progress | None,
-    ) -> Iterator[SimulationFrame]:
-        for index in range(run.next_frame, count):
-            with torch.no_grad():
-                if not run.advance_to(index, self.step_hook):
-                    return
-                frame = frame_of(run, index, carry, repair)
-            report_progress(progress, index + 1, count, f"t = {frame.time:.3f} s")
-            yield frame
-
-    def save_state(self, path: str | Path) -> None:
-        """Write the state of the last frame that was yielded, to be given to ``resume``.
-
-        Raises:
-            InputError: Nothing has been simulated yet.
-        """
-        if self._run is None or self._run.next_frame == 0:
-            raise InputError("simulate: there is no frame to save", hint="take a frame first")
-        self._run.save(path, self._repair.state())
-
-    def report(self) -> dict[str, Any]:
-        """Return the section ``simulation`` of run.json, plus ``verdict`` and ``reason``.
-
-        Raises:
-            InputError: Nothing has been simulated yet.
-        """
-        if self._run is None:
-            raise InputError("simulate: nothing has been simulated", hint="call the stage first")
-        return self._run.report()
-
 
 def frame_of(
-    run: Run, index: int, carry: Carry | None, repair: Repair | None, time: float | None = None
+    run: Run, index: int, history: CrackHistory | None, time: float | None = None
 ) -> SimulationFrame:
     """Measure the present state of a run and wrap it up as a frame (``time``: index / fps)."""
     time = index / run.fps if time is None else time
@@ -289,9 +295,9 @@ def frame_of(
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
     damage = torch.where(run.matter.brittle, damage, 0.0)
     particles, broken, points, cracks = run.state.particles, peak >= 0, None, None
-    if carry is not None and particles.deformation is not None:
+    if history is not None and particles.deformation is not None:
         points = Points.of(particles.position, particles.deformation, pieces.labels, broken)
-        cracks = None if repair is None else repair.step(carry, points)
+        cracks = history.step(points)
         points = points if cracks is None else cracks.points
     return SimulationFrame(
         index=index,
@@ -310,8 +316,7 @@ def frame_of(
         broken=broken,
         rigid=run.stepper.rigid,
         colliders=run.state.colliders,
-        _carry=carry,
-        _repair=repair,
+        _history=history,
         _points=points,
         _cracks=cracks,
     )

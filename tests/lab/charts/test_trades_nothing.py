@@ -241,9 +241,9 @@ DX = 0.02
 def _frames(
     scene: Scene, fps: float, seconds: float, **options: bool
 ) -> tuple[list[SimulationFrame], Any]:
-    simulate = Simulate(dx=DX, splats=False, **options)
-    frames = list(simulate(scene, fps=fps, seconds=seconds))
-    report = simulate.report()
+    simulation = Simulate(dx=DX, splats=False, **options)(scene, fps=fps, seconds=seconds)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "clean", report["reason"]
     return frames, report
 

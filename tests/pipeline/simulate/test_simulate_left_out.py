@@ -25,9 +25,9 @@ class Ran:
     def __init__(
         self, scene: Scene, *, fps: float, seconds: float, dx: float = DX, **options: Any
     ) -> None:
-        simulate = Simulate(dx=dx, splats=False, **options)
-        self.frames: list[SimulationFrame] = list(simulate(scene, fps=fps, seconds=seconds))
-        self.report = simulate.report()
+        simulation = Simulate(dx=dx, splats=False, **options)(scene, fps=fps, seconds=seconds)
+        self.frames: list[SimulationFrame] = list(simulation)
+        self.report = simulation.report
         self.skipped: dict[str, float] = self.report["skipped"]
         assert self.report["verdict"] == "clean", self.report["reason"]
         assert self.report["momentum_error"] < 1e-5
