@@ -96,7 +96,7 @@ def moving_settings(shot: Shot) -> list[Any]:
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.standing, shot.solve.loose_crumbs],
+        [shot.solve.standing, shot.solve.loose_debris],
         shot.output.fps,
         shot.output.seconds,
     ]
@@ -108,7 +108,7 @@ def solver_options(shot: Shot) -> SolverOptions:
     return SolverOptions(
         cfl=solve.cfl,
         standing=solve.standing,
-        loose_crumbs=solve.loose_crumbs,
+        loose_debris=solve.loose_debris,
         deterministic=solve.deterministic,
     )
 

@@ -63,18 +63,18 @@ def ball(splats: int, voxels: int) -> Solid:
 
 
 def moment(carry: Carry, share: float) -> Points:
-    """The points when the gap is ``share`` of its full width, 2 cm; a fifth of them is crumbs."""
+    """The points when the gap is ``share`` of its full width, 2 cm; a fifth of them is debris."""
     rest, spacing = carry.matter.rest, carry.matter.spacing[0]
     side = torch.sign(rest[:, :1])
     bottom = rest[:, 2] < -0.4 * RADIUS
     gap = torch.tensor([0.01, 0.0, 0.0], device=rest.device) * share * side
-    # crumbs spread from the middle of the bottom
+    # debris spreads from the middle of the bottom
     spread = (rest - rest.new_tensor([0.0, 0.0, -0.4 * RADIUS])) * (1.5 * share)
     position = rest + torch.where(bottom[:, None], spread, gap)
     eye = torch.eye(3, device=rest.device).expand(rest.shape[0], 3, 3).contiguous()
-    crumb = bottom & (share > 0.02 * spacing)
-    piece = torch.where(crumb, -1, (rest[:, 0] > 0).to(torch.int32)).to(torch.int32)
-    return Points(position, eye, eye, piece, crumb)
+    debris = bottom & (share > 0.02 * spacing)
+    piece = torch.where(debris, -1, (rest[:, 0] > 0).to(torch.int32)).to(torch.int32)
+    return Points(position, eye, eye, piece, debris)
 
 
 def clock(device: torch.device) -> float:

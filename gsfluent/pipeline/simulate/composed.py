@@ -15,7 +15,7 @@ from gsfluent import ops
 from gsfluent.data import Particles
 from gsfluent.ops.plasticity import weakened
 from gsfluent.pipeline.colliders.blades import BladeSet
-from gsfluent.pipeline.colliders.proximity import near_pairs
+from gsfluent.pipeline.colliders.proximity import proximity_pairs
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
@@ -62,7 +62,7 @@ class Composed:
         self._blocks: ops.Blocks | None = None
         self._travelled = self._speed = self._limit = 0.0
         self._refresh = 0
-        self._near = False
+        self._proximity = False
         self._lost: Tensor | int = 0
         self._info = torch.zeros(4, dtype=torch.int64, device=device)
         p = self.points
@@ -149,7 +149,7 @@ class Composed:
             blocks = self._build()
         self._travelled += reach
         rows = self._cut(dt)
-        several = self._near or self._merged is not None
+        several = self._proximity or self._merged is not None
         body = self._body if several else None
         grid, moments = ops.p2g(
             p.position, p.velocity, p.affine, p.mass,
@@ -206,9 +206,9 @@ class Composed:
         self.counters.block_builds += 1
         self.counters.blocks_max = max(self.counters.blocks_max, blocks.block_count)
         # Kernel reach of both (2 x 1.5) plus the slack of the blocks on both sides.
-        self._near = self._fields > 1 and (
-            not self.options.contact_near
-            or near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
+        self._proximity = self._fields > 1 and (
+            not self.options.contact_proximity
+            or proximity_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
         )
         return blocks
 

@@ -92,13 +92,13 @@ class SolverOptions:
             operators, step by step.
         irreversible: Broken points stay without cohesion when they are pressed together again.
         law_kernels: Use kernels made for elastic and brittle matter where there is no other.
-        contact_near: Leave out contact where no two bodies or pieces are near each other; False
-            is for comparison: the composed operators then look for contact at every node.
+        contact_proximity: Leave out contact where no two bodies or pieces are near each other;
+            False is for comparison: the composed operators then look for contact at every node.
         deterministic: Refuse what cannot give the same bits from the same input on the same
             device: the composed operators on a GPU, whose sums have no order.
         standing: Let what stands still on the floor at time 0 sleep, without a strain, until
             something comes near; else its weight begins to act then.
-        loose_crumbs: Take broken points with next to nothing around them off the grid for good:
+        loose_debris: Take broken points with next to nothing around them off the grid for good:
             they fall freely and stay where they meet the floor.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
@@ -116,10 +116,10 @@ class SolverOptions:
     resident: bool = True
     irreversible: bool = True
     law_kernels: bool = True
-    contact_near: bool = True
+    contact_proximity: bool = True
     deterministic: bool = False
     standing: bool = False
-    loose_crumbs: bool = False
+    loose_debris: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
     max_rollbacks: int = 6
 

@@ -21,7 +21,7 @@ from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State, load_state, save_state
 from gsfluent.pipeline.simulate.engine import Counters, SolverOptions, Unhealthy
 from gsfluent.pipeline.simulate.health import CHECK_EVERY, Figures, Ledger, Watch, figures_of
-from gsfluent.pipeline.simulate.kick import Kicks
+from gsfluent.pipeline.simulate.impulse import Impulses
 from gsfluent.pipeline.simulate.step import Stepper
 from gsfluent.scene.scene import Scene
 
@@ -73,7 +73,7 @@ class Run:
 
     def _set(self, scene: Scene, matter: Matter) -> None:
         self.scene, self.matter = scene, matter
-        self.kicks = Kicks(scene, matter)
+        self.impulses = Impulses(scene, matter)
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
@@ -126,8 +126,8 @@ class Run:
             trouble: Unhealthy | None = None
             try:
                 left = CHECK_EVERY - (state.step - checked)
-                state = self.kicks.given(state)
-                stop = min(until, self.kicks.next_change(state))
+                state = self.impulses.given(state)
+                stop = min(until, self.impulses.next_change(state))
                 now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
@@ -301,7 +301,7 @@ class Run:
                 "empty_block_fraction": 1.0 - c.block_steps / max(c.box_steps, 1),
                 "law_kernel_steps": c.law_kernel_steps,
                 "damage_steps": c.undamaged_steps,
-                "stray_points": int(self.state.stray.sum()),
+                "stray_points": int(self.state.loose.sum()),
                 "block_searches": max(c.steps - c.block_builds, 0),
                 "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),
             },

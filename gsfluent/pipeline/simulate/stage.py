@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,8 +39,12 @@ from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
 
+_log = logging.getLogger(__name__)
+
 QUALITY = {"preview": 20, "shot": 40, "hero": 64}
 """Cells along the longest side of the largest solid."""
+RENAMED = {"loose_crumbs": "loose_debris", "contact_near": "contact_proximity"}
+"""Options under their names of before, which :class:`Simulate` still takes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -224,6 +229,10 @@ class Simulate(Stage):
         self.quality, self.dx, self.device = quality, dx, device
         self.jitter, self.max_particles = jitter, max_particles
         self.splats, self.step_hook = splats, step_hook
+        for old, new in RENAMED.items():
+            if old in changes:
+                _log.warning("simulate: %s is called %s now; the old name still works", old, new)
+                changes[new] = changes.pop(old)
         self.options = dataclasses.replace(options or SolverOptions(), **changes)
         self.repair = Repair(
             repair if isinstance(repair, str) else METHODS[0] if repair else "none"

@@ -1,10 +1,9 @@
 """Advances the state of a simulation: matter on the grid, and what may be left out of it.
 
-The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many
-steps per
-call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and
-strays. A
-call ends when something may come close to a group, which then joins the grid.
+The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many steps
+per call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and loose
+debris.
+A call ends when something may come close to a group, which then joins the grid.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.fields import LIMIT, MOST, number_fields
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
-from gsfluent.pipeline.simulate import strays as crumbs
+from gsfluent.pipeline.simulate import debris
 from gsfluent.pipeline.simulate.composed import FIELDS, Composed
 from gsfluent.pipeline.simulate.engine import Counters, Engine, Points, SolverOptions
 from gsfluent.pipeline.simulate.flight import Flight
@@ -66,7 +65,7 @@ class Stepper:
         self.counters = Counters()
         self.dt_scale = 1.0
         self.field_limit = LIMIT
-        self._reach = crumbs.reach_of(matter)
+        self._reach = debris.reach_of(matter)
         device = matter.particles.device
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         self._pull = float(self._gravity.norm())
@@ -131,9 +130,9 @@ class Stepper:
         state = self._renumber(state, on_grid)
         if not at_frame:
             return state
-        if self.options.loose_crumbs:
+        if self.options.loose_debris:
             state = self._let_go(
-                state, crumbs.find_lonely(state.position, state.peak, on_grid, self.matter.dx)
+                state, debris.find_loose(state.position, state.peak, on_grid, self.matter.dx)
             )
             on_grid = grid_mask(state, self.matter)
         state = count_calm(state, on_grid, self._gravity, self.matter.dx)
@@ -194,11 +193,11 @@ class Stepper:
         """Marks of the engine's points as marks of all points, bool [N]."""
         if wrong.shape[0] == state.peak.shape[0] or self._rows is None:
             return wrong
-        return torch.zeros_like(state.stray).index_copy(0, self._rows, wrong)
+        return torch.zeros_like(state.loose).index_copy(0, self._rows, wrong)
 
     def _resident_now(self, state: State) -> bool:
         """Whether the resident solver can go on from here: with no blade at work."""
-        wanted = self.options.resident and self.options.contact_near
+        wanted = self.options.resident and self.options.contact_proximity
         if not (wanted and resident_can(state.colliders, self.rigid, self.matter)):
             return False
         if len(self.blades) == 0:
@@ -345,7 +344,7 @@ class Stepper:
     # --- putting together ---
 
     def _moved(self, state: State, time: float, points: Points | None) -> State:
-        """The state at a later time: points of the grid, groups and strays."""
+        """The state at a later time: points of the grid, groups and loose debris."""
         span = time - state.time
         p = state.particles
         names = ("velocity", "affine", "strain", "alpha", "deformation")
@@ -376,13 +375,13 @@ class Stepper:
                 if value is not None:
                     value[group.rows] = getattr(moved, name)
         self.counters.point_seconds += span * p.count
-        strays = state.stray.nonzero()[:, 0]
-        if strays.numel():
-            push = crumbs.drift(
-                position, values["velocity"], p.mass, strays, span, self.scene.gravity,
+        loose = state.loose.nonzero()[:, 0]
+        if loose.numel():
+            push = debris.drift(
+                position, values["velocity"], p.mass, loose, span, self.scene.gravity,
                 self.scene.floor,
             )  # fmt: skip
-            values["affine"][strays] = 0.0
+            values["affine"][loose] = 0.0
             impulse = impulse + push
         particles = p.replace(position=position.to(p.dtype), **values)
         return state._replace(
@@ -393,12 +392,12 @@ class Stepper:
         """Take broken points that are far away off the grid."""
         candidate = grid_mask(state, self.matter)
         return self._let_go(
-            state, crumbs.find_strays(state.position, state.peak, candidate, self._reach)
+            state, debris.find_far(state.position, state.peak, candidate, self._reach)
         )
 
     def _let_go(self, state: State, gone: Tensor) -> State:
         if bool(gone.any()):
-            state = crumbs.let_go(state, gone)
+            state = debris.let_go(state, gone)
             self._take(state)
         return state
 

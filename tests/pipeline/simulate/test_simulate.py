@@ -246,6 +246,31 @@ def test_options_are_given_by_name_or_as_one_record():
     assert Simulate(options=options, cfl=0.4).options == SolverOptions(cfl=0.4, sleep=False)
 
 
+def test_options_are_taken_under_their_old_names(caplog):
+    options = Simulate(loose_crumbs=True, contact_near=False).options
+    assert options == SolverOptions(loose_debris=True, contact_proximity=False)
+    assert "loose_crumbs is called loose_debris now" in caplog.text
+    assert "contact_near is called contact_proximity now" in caplog.text
+
+
+def test_names_in_a_saved_state_stay(tmp_path):
+    """What a version before wrote is read by this one, whatever its fields are called now."""
+    simulation = Simulate(dx=0.04)(ball_scene(), fps=20, seconds=0.1)
+    next(simulation)
+    simulation.save(tmp_path / "s.pt")
+    values = torch.load(tmp_path / "s.pt", weights_only=True)
+    assert sorted(values) == sorted(
+        ["version", "fingerprint", "particles", "tensors", "time", "step", "landed", "kicked"]
+        + ["extra"]
+    )
+    assert sorted(values["particles"]) == ["affine", "alpha", "deformation", "strain", "velocity"]
+    assert sorted(values["tensors"]) == sorted(
+        ["position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit"]
+        + ["impulse", "colliders", "work", "dissipated"]
+    )
+    assert set(values["extra"]) >= {"counters", "watch", "ledger", "per_frame", "repair"}
+
+
 def test_a_stage_keeps_nothing_of_the_scenes_it_was_given():
     """Two runs of one stage, taken by turns, are those it gives one after the other."""
     simulate = Simulate(dx=0.04)
@@ -327,7 +352,7 @@ def test_irreversible_breaking_changes_what_pressed_debris_can_hold():
     assert not torch.equal(shares[0], shares[1])
 
 
-def test_far_crumbs_leave_the_grid_and_still_balance_momentum():
+def test_far_debris_leaves_the_grid_and_still_balances_momentum():
     def throw(state):
         if state.step != 20:
             return state
@@ -348,8 +373,8 @@ def test_far_crumbs_leave_the_grid_and_still_balance_momentum():
     assert report["skipped"]["stray_points"] == 10
     assert report["active_blocks_max"] < 200
     assert report["momentum_error"] < 1e-5
-    crumbs = last.particles.position[:10]
-    assert float(crumbs[:, 2].abs().max()) < 1e-6 and float(crumbs[:, 0].min()) > 2.5
+    debris = last.particles.position[:10]
+    assert float(debris[:, 2].abs().max()) < 1e-6 and float(debris[:, 0].min()) > 2.5
     assert float(last.particles.velocity[:10].abs().max()) < 1e-6
 
 
