@@ -11,6 +11,13 @@ from pathlib import Path
 
 from gsfluent.errors import InputError
 from gsfluent.lab.charts.record import commit, machine, now
+from gsfluent.lab.stability import (  # noqa: F401  (they register their maps, in this order)
+    contact,
+    matter,
+    rounding,
+    steps,
+    transfer,
+)
 from gsfluent.lab.stability.maps import _MAPS, Map, Place, Point, Value, key_of, read
 
 

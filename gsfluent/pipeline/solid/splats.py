@@ -29,7 +29,7 @@ __all__ = ["solid_of_splats"]
 
 _log = logging.getLogger(__name__)
 
-_DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/solid.md)
+_DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/theory/solid.md)
 _INNER = 0.05  # share of the surface below the closed one that makes an inner wall
 _ENOUGH = 12  # photographs from which depths decide where the skin is
 _SKIN = 1.5  # voxels; density and depths may disagree by so much about where the skin is

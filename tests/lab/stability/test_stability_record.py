@@ -17,7 +17,9 @@ from gsfluent.lab.stability import run as running
 from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place, Point, Violation
 from gsfluent.lab.stability.peers import KNOWN, marks, measured
 
-RECORDED = Path(__file__).resolve().parents[3] / "docs" / "data" / "stability_cpu.jsonl"
+RECORDED = (
+    Path(__file__).resolve().parents[3] / "docs" / "measured" / "data" / "stability_cpu.jsonl"
+)
 
 
 @pytest.fixture(scope="module")
