@@ -12,12 +12,11 @@ import torch
 
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.capture.hull import visual_hull
+from gsfluent.pipeline.capture.hull import centre_hull, lattice, visual_hull
 from gsfluent.pipeline.capture.views import read_views
 from gsfluent.pipeline.solid.evidence import Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.inside import find_leaks, keep_components
-from gsfluent.pipeline.solid.inside import visual_hull as centre_hull
 from gsfluent.pipeline.solid.splats import solid_of_splats
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.mesh_distance import load_mesh, oriented_samples, signed_distances
@@ -123,9 +122,7 @@ def _of_hull(capture: Capture, resolution: int) -> SignedDistance:
     """The conservative hull says where; voxel centres against the masks say exactly how far."""
     views = read_views(capture, _HULL_SIZE, torch.device("cpu"), crop=True)
     rough = visual_hull(views, resolution)
-    origin = rough.origin.double().cpu().numpy()
-    x, y, z = rough.occupancy.shape
-    box = GridBox((float(origin[0]), float(origin[1]), float(origin[2])), rough.voxel, (x, y, z))
+    box = GridBox.of(rough.origin, rough.voxel, rough.occupancy.shape)
     grounds = []
     for view in views:
         assert view.mask is not None  # visual_hull has refused views without
@@ -139,7 +136,7 @@ def _of_hull(capture: Capture, resolution: int) -> SignedDistance:
         "cone": len(views) < _FEW_VIEWS,
         "components_dropped": dropped,
     }
-    return SignedDistance.of_voxels(body, origin, rough.voxel, "hull", notes)
+    return SignedDistance.of_voxels(body, np.array(box.origin), rough.voxel, "hull", notes)
 
 
 def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
@@ -160,10 +157,8 @@ def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
     samples, areas = oriented_samples(triangles, 0.7 * voxel)
     shell = np.zeros(size, dtype=bool)
     shell[tuple(np.floor((samples - origin) / voxel).astype(int).T)] = True
-    axes = [torch.arange(int(n)) + 0.5 for n in size]
-    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     winding = winding_numbers(
-        torch.from_numpy(origin).float() + grid * voxel,
+        torch.from_numpy(origin).float() + lattice(size.tolist()) * voxel,
         torch.from_numpy(samples).float(),
         torch.from_numpy(areas).float(),
         soft=0.35 * voxel,

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gsfluent.data import Camera
+from gsfluent.pipeline.capture.hull import lattice
 from gsfluent.pipeline.solid.evidence import MOST_CAMERAS, Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance, distances_of
 from gsfluent.pipeline.solid.hollow import hidden_cavity
@@ -23,7 +24,7 @@ from gsfluent.pipeline.solid.tsdf import Fused, depth_views, fuse, fuse_depths
 from gsfluent.pipeline.solid.vote import Closed, vote_solid
 from gsfluent.pipeline.solid.walls import wall_thickness
 from gsfluent.spatial.density import GridBox
-from gsfluent.spatial.voxels import distance_transform, grown
+from gsfluent.spatial.voxels import distance_transform, grown, surface
 
 __all__ = ["solid_of_splats"]
 
@@ -225,10 +226,7 @@ def _without_bubbles(body: np.ndarray) -> np.ndarray:
 
 def _unseen(field: SignedDistance, fused: Fused) -> float:
     """Share of the surface that no camera saw: there the boundary is a guess."""
-    from scipy import ndimage
-
-    body = field.inside.cpu().numpy()
-    skin = body & ~ndimage.binary_erosion(body)
+    skin = surface(field.inside.cpu().numpy())
     return float((skin & (fused.known == 0)).sum() / max(1, int(skin.sum())))
 
 
@@ -261,12 +259,7 @@ def _finer(
     voxel = coarse / factor
     shape = (size * factor).ceil().long().tolist()
     device = field.values.device
-    origin = field.origin.double().cpu().numpy()
-    box = GridBox(
-        (float(origin[0]), float(origin[1]), float(origin[2])),
-        voxel,
-        (int(shape[0]), int(shape[1]), int(shape[2])),
-    )
+    box = GridBox.of(field.origin, voxel, shape)
     near = (field.values.abs() < _BAND * coarse).cpu().numpy()
     if closed is not None and closed.shell.shape == near.shape:
         near |= ndimage.binary_dilation(closed.shell)
@@ -331,9 +324,8 @@ def _matched(
             closed.hull, np.array(known.box.origin), known.box.voxel, "hull",
             device=values.device,
         )  # fmt: skip
-        axes = [torch.arange(n, device=values.device) + 0.5 for n in field.values.shape]
-        grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        allowed = bound.at(field.origin + grid * field.voxel).reshape(values.shape)
+        places = field.origin + lattice(values.shape, values.device) * field.voxel
+        allowed = bound.at(places).reshape(values.shape)
         values = torch.maximum(values, torch.minimum(allowed, field.values))
     notes = {"skin_offset": offset, "skin_from": "masks"}
     return grown.replace(values=values, report=field.report | notes)

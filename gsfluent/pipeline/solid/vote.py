@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsfluent.errors import InputError
+from gsfluent.pipeline.capture.hull import Ground, centre_hull
 from gsfluent.pipeline.capture.orient import orient
 from gsfluent.pipeline.solid.evidence import FEW, Evidence, SolidOptions
 from gsfluent.pipeline.solid.inside import (
@@ -20,7 +21,6 @@ from gsfluent.pipeline.solid.inside import (
     keep_components,
     smooth_boundary,
     trim_outer_flank,
-    visual_hull,
 )
 from gsfluent.spatial.density import GridBox, density_field
 from gsfluent.spatial.voxels import distance_transform
@@ -97,7 +97,7 @@ def vote_solid(known: Evidence, options: SolidOptions) -> Closed:
     hull = None
     views = masked_views(capture) if options.masks else []
     if views:
-        hull = visual_hull(box, views, gaussians.device)
+        hull = centre_hull(box, views, gaussians.device)
         # masks say what is not the object; rays cap the cone under objects seen only from above
         # (just outside a convex surface about half of the rays hit it)
         loose = hull & (shell | (vote.score >= 0.65))
@@ -129,7 +129,7 @@ def vote_solid(known: Evidence, options: SolidOptions) -> Closed:
     return Closed(box, shell, loose, solid, hull, notes)
 
 
-def masked_views(capture: Capture | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def masked_views(capture: Capture | None) -> list[Ground]:
     """Background pixels and undistorted cameras of the views that have a mask."""
     from scipy import ndimage
 
