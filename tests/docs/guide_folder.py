@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -16,6 +17,7 @@ from gsfluent.data import SURFACE, Gaussians
 from gsfluent.demo import make_capture
 from gsfluent.io import save
 
+TESTS = Path(__file__).resolve().parents[1]
 SHOT: dict[str, Any] = {
     "capture": "captures/apple",
     "size": 0.16,
@@ -77,12 +79,39 @@ def write_model(folder: Path) -> None:
     (folder / "cameras.json").write_text(json.dumps([CAMERA]))
 
 
+def write_parts(folder: Path, capture: Path) -> None:
+    """A mask and a label image per photograph: the upper half of each is both."""
+    (folder / "parts" / "stem").mkdir(parents=True)
+    (folder / "segmentation").mkdir()
+    for photograph in sorted((capture / "images").iterdir()):
+        width, height = Image.open(photograph).size
+        half = np.zeros((height, width), dtype=np.uint8)
+        half[: height // 2] = 255
+        name = f"{photograph.stem}.png"
+        Image.fromarray(half).save(folder / "parts" / "stem" / name)
+        Image.fromarray(half // 255).save(folder / "segmentation" / name)
+    (folder / "segmentation" / "labels.json").write_text(json.dumps({"1": "leaf"}))
+
+
+def write_diffusion(folder: Path) -> None:
+    """An inpainting pipeline with random weights, as the tests of the texture stage make it."""
+    path = TESTS / "pipeline" / "texture" / "tiny_diffusers.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    tiny = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tiny)
+    tiny.save_sdxl(folder)
+
+
 def write_inputs(folder: Path) -> None:
     """Everything that a user brings."""
     save(shell(), folder / "melon.ply")
     write_cut(folder / "cut.jpg")
     write_box(folder / "scan.obj")
     make_capture("orange", folder / "captures" / "apple", views=9, size=64)
+    write_parts(folder, folder / "captures" / "apple")
+    if importlib.util.find_spec("transformers"):  # of the extra `inpaint`
+        write_diffusion(folder / "models" / "sdxl-inpainting")
     write_model(folder / "model")
     (folder / "phys.json").write_text(json.dumps(PHYSGAUSSIAN))
     (folder / "shot.yaml").write_text(yaml.safe_dump(SHOT, sort_keys=False))

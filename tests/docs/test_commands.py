@@ -9,6 +9,7 @@ import shlex
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 import tomllib
@@ -43,9 +44,13 @@ SMALLER_PYTHON = [
     (r"height=1\.0", "height=0.02"),
     (r"Fill\(\)", "Fill(resolution=24)"),
     (r"resolution=(96|48|32)", "resolution=24"),
+    (r'"tile": 2', '"tile": 2, "slices": 8, "steps": 4'),
     (r'exemplar="cut\.jpg"', 'exemplar="cut.jpg", quality="preview"'),
 ]
 """The same for the Python examples."""
+
+NEEDS = {"sdxl-inpainting": "transformers"}
+"""What an example names that only an extra can read."""
 
 LOOKS_ONLY = {"doctor", "plan", "metrics"}
 """Verbs that write no file."""
@@ -67,16 +72,28 @@ def lines() -> list[list[str]]:
     return [list(found) for found in dict.fromkeys(tuple(w) for w in words if w)]
 
 
+BENCH = ROOT / "docs" / "guide" / "fracturebench.md"
 COMMANDS = [words[1:] for words in lines() if words[0] == "gsfluent"]
-OTHERS = [words for words in lines() if words[0] != "gsfluent"]
+OTHERS = [
+    words for words in lines() if words[0] != "gsfluent" and "fracturebench" not in " ".join(words)
+]
 SERVES = [words for words in COMMANDS if words[0] == "view" and "--check" not in words]
 ENDS = [words for words in COMMANDS if words not in SERVES]
+
+
+def skip_without_extra(text: str) -> None:
+    for word, library in NEEDS.items():
+        if word in text:
+            pytest.importorskip(library)
 
 
 def smaller(words: list[str]) -> list[str]:
     more = [flag for flag in SMALLER.get(words[0], []) if flag[0] not in words]
     if words[0] == "texture" and "--exemplar" in words:
         more.append(["--quality", "preview"])
+    if "tile=2" in words:
+        at = words.index("tile=2")
+        words = [*words[:at], "slices=8", "steps=4", *words[at:]]
     return [*words, *(word for flag in more for word in flag)]
 
 
@@ -91,6 +108,7 @@ def test_command_does_what_it_says(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
+    skip_without_extra(" ".join(words))
     monkeypatch.chdir(place)
     monkeypatch.setitem(run_demo.SIZES, "preview", TINY_DEMO)
     before = files(place)
@@ -180,7 +198,10 @@ def test_install_line_names_what_is_there(words: list[str]) -> None:
         assert word in text if word.startswith("-") else (ROOT / word).exists()
 
 
-@pytest.mark.parametrize(("page", "text"), blocks("python"), ids=lambda x: getattr(x, "name", ""))
+PYTHON = [(page, text) for page, text in blocks("python") if page != BENCH]
+
+
+@pytest.mark.parametrize(("page", "text"), PYTHON, ids=lambda x: getattr(x, "name", ""))
 def test_python_runs(
     page: Path,
     text: str,
@@ -189,6 +210,7 @@ def test_python_runs(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(place)
+    skip_without_extra(text)
     for what, small in SMALLER_PYTHON:
         text = re.sub(what, small, text)
     before = files(place)
@@ -224,3 +246,35 @@ def test_help_of_every_verb_is_served(capsys: pytest.CaptureFixture[str]) -> Non
     for verb in sorted(verbs):
         assert main([verb, "--help"]) == 0
         assert "examples:" in capsys.readouterr().out.lower()
+
+
+def test_any_simulator_takes_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page of FractureBench in its order: scenes, an answer to one of them, scores."""
+    monkeypatch.chdir(tmp_path)
+    make, score = (
+        line
+        for page, text in blocks("bash")
+        for line in text.splitlines()
+        if page == BENCH and not line.startswith("#")
+    )
+    (text,) = (text for page, text in blocks("python") if page == BENCH)
+
+    def run(line: str) -> None:
+        """Run it here, with paths of the repository as they are from its root."""
+        words = shlex.split(line, comments=True)
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        if words[0].startswith("PYTHONPATH="):
+            environment["PYTHONPATH"] = str(ROOT / words.pop(0).split("=")[1])
+        assert words[0] == "python"
+        words = [str(ROOT / word) if word.startswith("scripts/") else word for word in words]
+        subprocess.run([sys.executable, *words[1:]], env=environment, check=True)
+
+    def simulate(x: Any, v: Any, volume: Any, materials: Any, times: Any) -> Any:
+        """A poor simulator: every point flies on."""
+        return x + v * times[:, None, None], v + 0 * times[:, None, None]
+
+    run(make)
+    exec(compile(text, BENCH.name, "exec"), {"simulate": simulate})
+    run(score)
+    found = json.loads((tmp_path / "scores.json").read_text())
+    assert "bar" in json.dumps(found) and "you" in (tmp_path / "scores.md").read_text()
