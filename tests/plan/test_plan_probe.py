@@ -11,7 +11,7 @@ from gsfluent import materials
 from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
-from gsfluent.pipeline.capture.coarse_hull import hull_grid, masked_views
+from gsfluent.pipeline.capture.hull import hull_grid, masked_views
 from gsfluent.pipeline.capture.orient import look_at_point
 from gsfluent.plan import probe as plan_probe
 from gsfluent.plan.fit import Sample
