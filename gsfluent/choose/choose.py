@@ -26,6 +26,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.simulate.engine import CFL
 from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import solver_options
 
 __all__ = [
     "LEVELS",
@@ -148,8 +149,8 @@ def run_probes(
     def go(cells: int, number: int, frames: int, cfl: float = CFL) -> Probe:
         nonlocal done
         found = probe(
-            scene, cells, fps=fps, frames=frames, cfl=cfl, seed=seed + number, device=device,
-            standing=shot.solve.standing, loose_crumbs=shot.solve.loose_crumbs,
+            scene, cells, fps=fps, frames=frames, seed=seed + number, device=device,
+            options=dataclasses.replace(solver_options(shot), cfl=cfl),
         )  # fmt: skip
         if found.failed:
             raise InputError(

@@ -22,7 +22,7 @@ from gsfluent.export.job import Job, span
 from gsfluent.export.points import deposit
 from gsfluent.io import atomic_path
 from gsfluent.io.gltf import to_linear
-from gsfluent.pipeline.matter.rubble import REACH, clinging
+from gsfluent.pipeline.matter.debris import REACH, clinging
 from gsfluent.pipeline.solid.colors import surface_colors
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ BLUR = 1.0
 """Point spacings over which the matter of fragments is blurred: below, the points show as bumps;
 above, edges go round."""
 
-_CRUMBS = 0.75  # share of it for debris, whose crumbs are a few points each and would melt together
+_DEBRIS_BLUR = 0.75  # share of it for debris: parts of a few points each would melt together
 _APART = 2.0  # point spacings between heaps whose surfaces do not meet
 _REACHES = 3.0  # blurs around the matter that are looked at
 _NEAR = 1e-4  # a grid value this near to the level would make triangles without area
@@ -107,7 +107,7 @@ def meshes(job: Job) -> str:
         save_pieces(path, list(pieces))
 
     if ending == "glb":
-        job = replace(job, reel=job.reel.turned("z"))
+        job = replace(job, sequence=job.sequence.turned("z"))
     return span("meshes", job.write_each("meshes", "meshes", f"frame_{{:04d}}.{ending}", write))
 
 
@@ -177,7 +177,7 @@ def fragment_meshes(moment: Moment, blur: float = BLUR) -> Iterator[Piece]:
     splats = np.where(anchor >= 0, piece[np.maximum(anchor, 0)], DEBRIS - 1)
     for number in np.unique(piece).tolist():
         mine = piece == number
-        width = blur * (_CRUMBS if number == DEBRIS else 1.0)
+        width = blur * (_DEBRIS_BLUR if number == DEBRIS else 1.0)
         vertices, faces = surface(where[mine], volumes[mine], spacing, width)
         rows = np.flatnonzero(splats == number)
         colors = _colors(moment.gaussians, rows, vertices, _CELL * spacing)
