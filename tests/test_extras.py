@@ -16,8 +16,8 @@ import torch
 from gsfluent.choose.shot import _write
 from gsfluent.cli import main
 from gsfluent.errors import EXTRAS, MissingPackage
-from gsfluent.inspect.compare_weights import clip_scores
-from gsfluent.inspect.doctor import examine
+from gsfluent.inspection.compare_weights import clip_scores
+from gsfluent.inspection.doctor import examine
 from gsfluent.io.usd import open_usd
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.mesh import closed_mesh

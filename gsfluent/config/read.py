@@ -90,14 +90,12 @@ def mapping(value: Any, place: Place) -> dict[str, Any]:
 def section(cls: type[_Section], value: Any, place: Place) -> _Section:
     """Read a mapping into the dataclass ``cls`` whose fields were declared with :func:`key`.
 
-    A class attribute ``LATER`` (key -> what it belongs to) names keys that a later issue brings.
-
     Raises:
-        InputError: An unknown, later or missing key, or a value that its reader refuses.
+        InputError: An unknown or missing key, or a value that its reader refuses.
     """
     fields = {key_name(field): field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     given = _renamed(mapping(value, place), fields, place)
-    refuse_unknown(given, fields, place, getattr(cls, "LATER", {}))
+    refuse_unknown(given, fields, place)
     values = {}
     for name, field in fields.items():
         if name in given:
@@ -127,15 +125,10 @@ def _renamed(
     return given
 
 
-def refuse_unknown(
-    given: Iterable[str], known: Iterable[str], place: Place, later: Mapping[str, str] | None = None
-) -> None:
-    """Raise for the first key that is not known, or that a later issue brings."""
+def refuse_unknown(given: Iterable[str], known: Iterable[str], place: Place) -> None:
+    """Raise for the first key that is not known."""
     known = list(known)
     for name in given:
-        if later and name in later:
-            where = place.inside(name).path
-            raise InputError(f"{where}: {later[name]} arrives with a later issue", "remove the key")
         if name not in known:
             raise InputError(f"{place.inside(name).path}: unknown key", nearest(name, known))
 
@@ -186,16 +179,12 @@ def flag(value: Any, place: Place) -> bool:
     return value
 
 
-def choice(*known: str, later: Iterable[str] = ()) -> Reader:
-    """Reader of one of ``known``; words in ``later`` are refused as coming with a later issue."""
+def choice(*known: str) -> Reader:
+    """Reader of one of ``known``."""
 
     def read(value: Any, place: Place) -> str:
         if value is None or value is False:
             value = "no" if value is False else "none"
-        if value in later:
-            raise InputError(
-                f"{place.path}: {value} arrives with a later issue", nearest("", known)
-            )
         if value not in known:
             raise place.error(f"be one of {', '.join(known)}", value, nearest(value, known))
         return str(value)

@@ -168,7 +168,7 @@ class Shot:
             folder: Where relative paths start.
 
         Raises:
-            InputError: An unknown, missing or later key, or a value out of range; the message names
+            InputError: An unknown or missing key, or a value out of range; the message names
                 its path.
         """
         shot = section(Shot, values, Place("", Path(folder)))

@@ -10,7 +10,7 @@ from gsfluent._lazy import lazy
 __getattr__, __dir__, __all__ = lazy(
     __name__,
     {
-        "gsfluent.progress": ("Stage",),
+        "gsfluent.pipeline.stage": ("Stage",),
         "gsfluent.pipeline.reconstruct.stage": ("Reconstruct",),
         "gsfluent.pipeline.reconstruct.isolate": ("Isolate",),
         "gsfluent.pipeline.fill.stage": ("Fill",),

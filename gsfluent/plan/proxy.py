@@ -1,7 +1,7 @@
 """Solids of about the right size, shape and place, before there is any reconstruction.
 
 Splats are filled coarsely. Photographs with masks are carved to their visual hull. Without masks
-the sparse points say how large the object is, and an ellipsoid stands in for it.
+the sparse points say how large the object is, and an ellipsoid is its proxy.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.config import Shot
-from gsfluent.data import INTERIOR, SURFACE, Capture, Frame, Gaussians, Solid, View
+from gsfluent.data import SURFACE, Capture, Frame, Gaussians, Solid, View
 from gsfluent.errors import InputError
 from gsfluent.inspection.capture import inspect
 from gsfluent.io import load_capture, load_splats
@@ -29,7 +29,7 @@ from gsfluent.stages.select import select_mask
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Photographs", "StandIn", "look_at_photographs", "stand_in"]
+__all__ = ["Photographs", "Proxy", "look_at_photographs", "proxy"]
 
 _VOXELS = 48
 _MARGIN = 8
@@ -59,8 +59,8 @@ class Photographs:
 
 
 @dataclasses.dataclass(frozen=True)
-class StandIn:
-    """What a shot is planned with.
+class Proxy:
+    """What a shot is planned with before there is any reconstruction.
 
     Attributes:
         solids: Solid of each object by name, in the coordinates of the input.
@@ -77,7 +77,7 @@ class StandIn:
     splats: int | None = None
 
 
-def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
+def proxy(shot: Shot, warnings: list[str]) -> Proxy:
     """Solids to plan a shot with.
 
     Args:
@@ -98,7 +98,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
             taken |= mask
             solids[name] = _grey(Fill(**options, refine_views=0)(gaussians.select(mask)))
         what = f"the splat, filled at {_VOXELS} voxels"
-        return StandIn(solids, frame, what, splats=gaussians.count)
+        return Proxy(solids, frame, what, splats=gaussians.count)
     if shot.capture is None:
         raise InputError("the shot has neither capture nor splats", "name one input")
     # what is wrong with a capture is an error; what is not in it is a warning
@@ -132,7 +132,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
                 "hint: add masks to the capture"
             )
     solids = dict.fromkeys(shot.objects, _ellipsoid(box, _SOLID_SHARE))
-    return StandIn(solids, Frame.identity(), what, photographs)
+    return Proxy(solids, Frame.identity(), what, photographs)
 
 
 def look_at_photographs(
@@ -185,8 +185,8 @@ def _carved(
     grid: np.ndarray,
     inside: np.ndarray,
     photographs: Photographs,
-) -> StandIn:
-    """Stand-ins from the voxels of a hull, selected as the splats of a run are."""
+) -> Proxy:
+    """Proxies from the voxels of a hull, selected as the splats of a run are."""
     occupied = torch.from_numpy(inside)
     points = torch.from_numpy(grid)[occupied].float()
     step = (grid[-1, -1, -1] - grid[0, 0, 0]) / (len(grid) - 1)
@@ -207,7 +207,7 @@ def _carved(
             )
         taken |= mask
         solids[name] = _solid_of(occupied, mask, grid, step)
-    return StandIn(solids, frame, "the visual hull of the photographs", photographs)
+    return Proxy(solids, frame, "the visual hull of the photographs", photographs)
 
 
 def _solid_of(occupied: Tensor, mask: Tensor, grid: np.ndarray, step: np.ndarray) -> Solid:
@@ -263,9 +263,3 @@ def _grey(solid: Solid) -> Solid:
     if solid.color is not None:
         return solid
     return dataclasses.replace(solid, color=torch.full((*solid.occupancy.shape, 3), 0.5))
-
-
-def visible_splats(solid: Solid) -> int:
-    """Splats of a solid that are not its inside."""
-    labels = solid.gaussians.labels
-    return solid.gaussians.count if labels is None else int((labels != INTERIOR).sum())
