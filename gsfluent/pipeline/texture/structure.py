@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.sweep import Sweep, outline
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, smoothstep
 
@@ -126,7 +127,7 @@ def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float
     """The photograph with ``hole`` painted in given Lab colours and the grain from beside it."""
     from scipy import ndimage
 
-    from gsfluent.pipeline.texture.volume.color import lab_to_rgb
+    from gsfluent.colors import lab_to_rgb
 
     if not hole.any():
         return photo

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsfluent.pipeline.texture.photo.exemplar import rgb_to_lab
+from gsfluent.colors import rgb_to_lab
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
 __all__ = ["mend_unseen_skin"]

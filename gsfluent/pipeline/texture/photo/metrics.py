@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.colors import rgb_to_lab
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
 __all__ = [

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 
 __all__ = ["read_parts", "resized_parts"]
 

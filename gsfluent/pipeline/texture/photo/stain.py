@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfluent.pipeline.texture.volume.color import lab_to_rgb, rgb_to_lab
+from gsfluent.colors import lab_to_rgb, rgb_to_lab
 from gsfluent.pipeline.texture.volume.domain import smoothstep
 
 __all__ = ["fill_holes", "grey_share", "remove_stain", "recolor"]

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.colors import rgb_to_lab100
 from gsfluent.pipeline.texture.synthesis.bank import LevelPhoto
 from gsfluent.pipeline.texture.synthesis.guides import DepthGuide, PlacedPhoto
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 from gsfluent.pipeline.texture.synthesis.sections import Section
-from gsfluent.pipeline.texture.volume.color import rgb_to_lab100
 
 __all__ = ["LevelGuides"]
 
