@@ -20,8 +20,6 @@ from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.sweep import Sweep, outline
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, smoothstep
 
-__all__ = ["Structure", "impose_structure", "split_structure", "take_apart", "with_structure"]
-
 _BINS = 32
 _NEAR = 16.0  # Lab distance within which the next depth of an inner half is the same material
 

@@ -23,8 +23,6 @@ from gsfluent.pipeline.texture.photo.mask import CUTOUTS, cut_out, strip_ground,
 from gsfluent.pipeline.texture.photo.read import read_pixels
 from gsfluent.pipeline.texture.photo.stain import fill_holes, grey_share, recolor, remove_stain
 
-__all__ = ["Exemplar", "PhotoOptions", "load_exemplar", "open_exemplars", "rgb_to_lab", "with_skin"]
-
 logger = logging.getLogger(__name__)
 
 

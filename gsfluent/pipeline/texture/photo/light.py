@@ -9,15 +9,6 @@ import numpy as np
 from gsfluent.colors import linear_to_srgb, rgb_to_lab, srgb_to_linear
 from gsfluent.errors import InputError
 
-__all__ = [
-    "match_skin",
-    "remove_glints",
-    "remove_shading",
-    "remove_tint",
-    "shading_field",
-    "white_gains",
-]
-
 _WORK = 160  # pixels along the longest side while the shading is fitted
 _LEAST_SHADING = 0.10  # range of log luminance below which shading is left alone
 _MOST_SHADING = 1.1  # three times the light on one side is no gradient but another object

@@ -6,8 +6,6 @@ import numpy as np
 
 from gsfluent.colors import rgb_to_lab
 
-__all__ = ["CUTOUTS", "cut_out", "largest_piece", "strip_ground", "trim_rim"]
-
 CUTOUTS = ("auto", "ground", "grabcut", "none")
 
 _GROUND = 14.0

@@ -11,8 +11,6 @@ from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 
-__all__ = ["read_parts", "resized_parts"]
-
 _LIKE = 25.0  # Lab distance up to which a pixel has the named colour
 
 

@@ -18,8 +18,6 @@ from gsfluent.pipeline.texture.photo.metrics import lab_histogram_distance
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient
 
-__all__ = ["surface_verdict"]
-
 _PATCH = 5
 _ALLOWED = 1.5  # times the distance between the halves of the photograph
 _EQUAL = 0.6  # Lab units that nobody sees

@@ -22,8 +22,6 @@ from gsfluent.colors import rgb_to_lab100
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 
-__all__ = ["GUIDES", "DepthGuide", "PlacedPhoto", "explained", "place_photo"]
-
 logger = logging.getLogger(__name__)
 
 GUIDES = ("auto", "depth", "axis", "height", "none")

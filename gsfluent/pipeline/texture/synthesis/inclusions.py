@@ -12,8 +12,6 @@ from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient
 
-__all__ = ["Inclusions", "find_inclusions", "paint_inclusions", "remove_inclusions"]
-
 logger = logging.getLogger(__name__)
 
 _RINGS = np.array([0.0, 0.4, 0.7, 0.95, 1.2, 1.4])  # normalised radii of the colour profile

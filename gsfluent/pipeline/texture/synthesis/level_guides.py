@@ -13,8 +13,6 @@ from gsfluent.pipeline.texture.synthesis.guides import DepthGuide, PlacedPhoto
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 from gsfluent.pipeline.texture.synthesis.sections import Section
 
-__all__ = ["LevelGuides"]
-
 _PER_VOXEL = 0.08  # guide weight of a cell of height or of distance to the axis
 _SECTION_WEIGHT = 3.0  # against the 75 values of a patch: structure leads, texture decides
 _OWN_WEIGHT = 4.5  # of a user's coordinate that runs from 0 to 1, like the depth's near the skin

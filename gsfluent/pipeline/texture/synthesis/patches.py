@@ -20,8 +20,6 @@ from gsfluent.pipeline.texture.synthesis.bank import Bank, LevelPhoto
 from gsfluent.pipeline.texture.synthesis.levels import hashed, nearest_inside
 from gsfluent.pipeline.texture.synthesis.transport import match_near, polish_patches
 
-__all__ = ["Schedule", "SynthesisLevel", "project_slice", "synthesize_level"]
-
 logger = logging.getLogger(__name__)
 
 _FALLOFF = 0.45  # vote window: standard deviation over half the patch width

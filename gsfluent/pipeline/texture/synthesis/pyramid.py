@@ -25,8 +25,6 @@ from gsfluent.pipeline.texture.synthesis.sections import Section
 from gsfluent.pipeline.texture.synthesis.transport import Cells
 from gsfluent.progress import Progress, report_progress
 
-__all__ = ["synthesize_pyramid", "to_grid"]
-
 _PARTS = 96  # parts of the guide's space over which the photographs' pixels are spread
 _PATCH = 7  # patches whose statistics are matched
 _FIBRE, _LINES = 2.0, 0.7  # voxels of smoothing along the axis: fibres; lines among cells
