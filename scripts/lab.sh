@@ -4,7 +4,7 @@
 #   bash scripts/lab.sh --device cuda -o out/gpu # on a GPU: a few minutes
 #   bash scripts/lab.sh --quick                  # a smoke subset, two minutes
 #   bash scripts/lab.sh --only chart,stability   # some parts
-#   bash scripts/lab.sh --enter                  # put what out/lab holds into docs/ (tables, records, pictures); runs nothing
+#   bash scripts/lab.sh --enter                  # put what out/lab holds into docs/measured (tables, records, pictures); runs nothing
 # Parts: ops battery bench shatter chart stability brittle. What is in the folder already is not run again.
 # PYTHON=... names an interpreter that has gsfluent already; else one is set up in .venv.
 set -uo pipefail
@@ -28,7 +28,7 @@ if [ -z "${PYTHON:-}" ]; then
   . scripts/setup.sh
   prepare test || exit 1
 fi
-export PYTHONPATH="$PWD:$PWD/scripts${PYTHONPATH:+:$PYTHONPATH}" OMP_WAIT_POLICY=PASSIVE
+export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_WAIT_POLICY=PASSIVE
 mkdir -p "$out" || exit 1
 jobs=1
 [ "$device" = cpu ] && jobs=$(getconf _NPROCESSORS_ONLN)
@@ -54,14 +54,14 @@ brittle() {
   local which=()
   # on a GPU torch makes a thousand small calls a step; orders and debris are what a GPU can add
   [ "$device" = cuda ] && which=(--quick --parts order debris ejecta)
-  "$PYTHON" scripts/brittle_gpu.py -o "$out/brittle.jsonl" --device "$device" $quick "${which[@]}"
+  "$PYTHON" scripts/study/brittle/run.py -o "$out/brittle.jsonl" --device "$device" $quick "${which[@]}"
 }
 
 if [ -z "$enter" ]; then
-  part ops "$PYTHON" scripts/accuracy.py --device "$device" --json "$out/ops.json" $quick
+  part ops "$PYTHON" scripts/accuracy/ops.py --device "$device" --json "$out/ops.json" $quick
   battery_tier=(--tier all)
   [ -n "$quick" ] && battery_tier=(--only wave)
-  part battery "$PYTHON" scripts/battery.py --device "$device" --json "$out/battery.json" --known docs/accuracy.md "${battery_tier[@]}"
+  part battery "$PYTHON" scripts/accuracy/battery.py --device "$device" --json "$out/battery.json" --known docs/measured/accuracy.md "${battery_tier[@]}"
   part bench bench
   part shatter "$PYTHON" scripts/fracturebench/shatter.py compare -o "$out/shatter.jsonl" --device "$device" $quick
   part chart "$PYTHON" -m gsfluent chart -o "$out/chart" --device "$device" $quick
@@ -71,24 +71,24 @@ if [ -z "$enter" ]; then
   exit $status
 fi
 
-# have FILE: whether the lab left it; what was not run stays as it was in docs/
+# have FILE: whether the lab left it; what was not run stays as it was in docs/measured
 have() { [ -s "$out/$1" ]; }
-keep() { have "$1" && mkdir -p docs/data && cp "$out/$1" "docs/data/$2"; }
+keep() { have "$1" && mkdir -p docs/measured/data && cp "$out/$1" "docs/measured/data/$2"; }
 set -e
 if [ "$device" = cpu ]; then
-  if have ops.json; then "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null; fi
-  if have battery.json; then "$PYTHON" scripts/battery.py --json "$out/battery.json" --known docs/accuracy.md --markdown docs/accuracy.md > /dev/null; fi
+  if have ops.json; then "$PYTHON" scripts/accuracy/ops.py --table "$out/ops.json" --markdown docs/measured/accuracy.md > /dev/null; fi
+  if have battery.json; then "$PYTHON" scripts/accuracy/battery.py --json "$out/battery.json" --known docs/measured/accuracy.md --markdown docs/measured/accuracy.md > /dev/null; fi
   if keep shatter.jsonl shatter.jsonl; then "$PYTHON" scripts/fracturebench/shatter.py page; fi
 elif have ops.json; then
-  "$PYTHON" scripts/accuracy.py --table "$out/ops.json" --markdown docs/accuracy.md > /dev/null
+  "$PYTHON" scripts/accuracy/ops.py --table "$out/ops.json" --markdown docs/measured/accuracy.md > /dev/null
 fi
-if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" docs/data/peers_*.jsonl > /dev/null; fi
-if keep chart/chart.jsonl "chart_$device.jsonl"; then "$PYTHON" scripts/chart_page.py; fi
+if have runs; then "$PYTHON" scripts/fracturebench/table.py "$out/runs" docs/measured/data/peers_*.jsonl > /dev/null; fi
+if keep chart/chart.jsonl "chart_$device.jsonl"; then "$PYTHON" scripts/pictures/chart.py; fi
 if keep stability/stability.jsonl "stability_$device.jsonl"; then
-  "$PYTHON" scripts/stability_page.py docs/data/stability_*.jsonl
+  "$PYTHON" scripts/pictures/stability.py docs/measured/data/stability_*.jsonl
 fi
 if keep brittle.jsonl "brittle_$device.jsonl"; then
-  "$PYTHON" scripts/brittle_gpu.py -o docs/data/brittle_*.jsonl --only-tables \
-    --markdown docs/brittle_gpu.md --figure docs/images/brittle_gpu.png > /dev/null
+  "$PYTHON" scripts/study/brittle/run.py -o docs/measured/data/brittle_*.jsonl --only-tables \
+    --markdown docs/measured/brittle_gpu.md --figure docs/images/brittle_gpu.png > /dev/null
 fi
-echo "entered what $out holds into docs/"
+echo "entered what $out holds into docs/measured"

@@ -283,7 +283,7 @@ def choose(
         progress: Told after every run.
 
     Returns:
-        ``chart.json``: see docs/chart_shot.md.
+        ``chart.json``: see docs/theory/plan.md.
 
     Raises:
         InputError: A probe broke off, or the scene is empty.
@@ -371,7 +371,7 @@ def loose_limit(poisson_ratio: float) -> float:
     All nodes are its own, so a step changes its velocity gradient by ``-4 dt / (rho dx^2) tau``: an
     oscillator of its volume with ``omega^2 = 12 K / (rho dx^2)``, which symplectic Euler keeps up
     to ``omega dt = 2``. Measured within 3 %, also on clusters of 2 to 8 points
-    (docs/stability.md).
+    (docs/theory/stability.md).
 
     Args:
         poisson_ratio: nu, above -1 and below 0.5.

@@ -51,7 +51,7 @@ def chart_shot(
         reporter: Receives progress; log lines by default.
 
     Returns:
-        The content of ``chart.json``; keys in docs/chart_shot.md.
+        The content of ``chart.json``; keys in docs/theory/plan.md.
 
     Raises:
         InputError: The shot is wrong, or a probe broke off.

@@ -28,8 +28,9 @@ class Chart(Verb):
       gsfluent chart shot.yaml --error 3%                 # the cheapest setting for your own shot
       gsfluent chart shot.yaml --error 3% -o out          # of the solids of the run in out
 
-    Writes chart.jsonl (a line per run), chart.png, chart.html and chart.md. docs/chart.md says how
-    to read them. With a shot: chart.json and chart.png, see docs/chart_shot.md.
+    Writes chart.jsonl (a line per run), chart.png, chart.html and chart.md.
+    docs/measured/chart.md says how to read them. With a shot: chart.json and chart.png,
+    see docs/guide/lab.md.
     """
 
     shot: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="SHOT.yaml")] = None
@@ -37,7 +38,7 @@ class Chart(Verb):
     error: str | None = None
     """Largest error the shot may have, such as 3%."""
     of: Literal["simulation", "rendering", "reconstruction", "texturing"] = "simulation"
-    """What is charted: docs/chart_quality.md says what the errors of the others are."""
+    """What is charted: docs/measured/chart_quality.md says what the errors of the others are."""
 
     out: Out = Path("chart")
     """Folder of the results; runs whose lines are there are not done again."""
@@ -159,8 +160,8 @@ class Stability(Verb):
       gsfluent stability --device cuda                   # those that are worth a GPU
       gsfluent stability --draw stability/stability.jsonl  # only draw what was recorded
 
-    Writes stability.jsonl (a line per point), a PNG per map and stability.html. docs/stability.md
-    says what they show.
+    Writes stability.jsonl (a line per point), a PNG per map and stability.html.
+    docs/measured/stability.md says what they show.
     """
 
     out: Out = Path("stability")

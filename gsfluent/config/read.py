@@ -43,7 +43,7 @@ def key(
 
     Args:
         read: Turns the YAML value into the field's value.
-        doc: One sentence for docs/shot.md, with the unit.
+        doc: One sentence for docs/guide/shot-keys.md, with the unit.
         example: A YAML value, read by the documentation's test.
         default: Value when the key is absent; without one the key is required.
         name: Key in the file when it is not a legal field name (``from``).

@@ -1,4 +1,4 @@
-"""A finished simulation in other programs' formats; docs/export.md says which reads what."""
+"""A finished simulation in other programs' formats; docs/guide/export.md says which reads what."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of presets for docs/materials.md."""
+"""Tables of presets for docs/measured/materials.md."""
 
 from __future__ import annotations
 

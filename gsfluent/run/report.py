@@ -254,5 +254,7 @@ def _left_out(page: Page, skipped: Values) -> None:
     """What the scene did not need and was not computed."""
     if skipped:
         page.heading("What was left out")
-        page.text("Counted while the run went on; docs/simulation.md says what each figure means.")
+        page.text(
+            "Counted while the run went on; docs/theory/simulation.md says what each figure means."
+        )
         page.table(["figure", "value"], [(k.replace("_", " "), v) for k, v in skipped.items()])

@@ -4,7 +4,7 @@
 
 Every case of elastic bodies and of contact over its ladder of dx (float32, CFL 0.5, eight points
 per cell). The order is the slope of the error over the three finest; both tables are entered into
-docs/fracturebench.md. Half a minute on one quiet core.
+docs/measured/fracturebench.md. Half a minute on one quiet core.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import math
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).resolve().parents[1]))
 import numpy as np
-from page import enter
 
+from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench import registry
 from gsfluent.fracturebench.registry import Case, cases, find, judge
 from gsfluent.fracturebench.scene import SceneError
@@ -79,7 +78,7 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="cases; default all of motion")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument(
-        "--page", type=Path, default=ROOT / "docs" / "fracturebench.md", metavar="FILE"
+        "--page", type=Path, default=ROOT / "docs" / "measured" / "fracturebench.md", metavar="FILE"
     )
     args = parser.parse_args()
     try:

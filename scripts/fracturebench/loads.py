@@ -13,9 +13,7 @@ import argparse
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from page import enter
-
+from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench.registry import find, judge
 from gsfluent.fracturebench.scenes.cantilever import cantilever
 from gsfluent.fracturebench.scenes.plane import notch
@@ -24,7 +22,7 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.frozen.answer import run_case
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "fracturebench_fracture.md"
+PAGE = ROOT / "docs" / "measured" / "fracturebench_fracture.md"
 
 
 def speeds(quick: bool) -> list[str]:

@@ -7,7 +7,7 @@
 ``record`` writes the figures of eight runs at dx = R / 10 in float64 (2 minutes on one core).
 ``compare`` runs ensembles over dx, CFL, precision and return map (4 minutes on one core): one line
 per setting, and what is there is not run again. ``page`` enters the table into
-docs/fracturebench_fracture.md and draws docs/images/shatter.png from those lines.
+docs/measured/fracturebench_fracture.md and draws docs/images/shatter.png from those lines.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from page import enter
-
+from gsfluent.figure.markdown import enter
 from gsfluent.figure.style import COLORS, OURS, new_figure, save_png
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
@@ -37,8 +35,8 @@ from gsfluent.lab.frozen.answer import run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 CELLS, CFL = 10, 0.3
-LINES = ROOT / "docs" / "data" / "shatter.jsonl"
-PAGE = ROOT / "docs" / "fracturebench_fracture.md"
+LINES = ROOT / "docs" / "measured" / "data" / "shatter.jsonl"
+PAGE = ROOT / "docs" / "measured" / "fracturebench_fracture.md"
 PICTURE = ROOT / "docs" / "images" / "shatter.png"
 SETTINGS: tuple[dict[str, Any], ...] = (
     *({"cells": n, "cfl": 0.5, "dtype": "float32"} for n in (4, 5, 6, 7, 8)),

@@ -3,10 +3,10 @@
     python scripts/fracturebench/table.py RUNS ... [--records FILE] [--page FILE]
 
 RUNS are folders of runs on the frozen scenes, by gsfluent or by anyone, or .jsonl files of records
-(such as the peers' docs/data/peers_cpu.jsonl), of which those at the frozen resolution count. A
-figure of the same case, method and device replaces the one recorded before; of several variants of
-a peer the one of least error is shown, of gsfluent that of the default settings. Without RUNS the
-table is drawn again from the records.
+(such as the peers' docs/measured/data/peers_cpu.jsonl), of which those at the frozen resolution
+count. A figure of the same case, method and device replaces the one recorded before; of several
+variants of a peer the one of least error is shown, of gsfluent that of the default settings.
+Without RUNS the table is drawn again from the records.
 """
 
 from __future__ import annotations
@@ -19,19 +19,18 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-sys.path.append(str(Path(__file__).resolve().parents[1]))
 import frozen
-from page import enter
 
 from gsfluent.errors import InputError
+from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench.registry import cases, find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
 from gsfluent.lab.charts.record import Record, of_run, read
 
 ROOT = Path(__file__).resolve().parents[2]
-RECORDS = ROOT / "docs" / "data" / "fracturebench.jsonl"
-PAGE = ROOT / "docs" / "fracturebench.md"
+RECORDS = ROOT / "docs" / "measured" / "data" / "fracturebench.jsonl"
+PAGE = ROOT / "docs" / "measured" / "fracturebench.md"
 
 
 def judge_all(folders: Sequence[Path]) -> tuple[list[Record], list[str]]:

@@ -2,7 +2,7 @@
 
 python scripts/peers/all.py -o out/peers --folder physgaussian=PhysGaussian/mpm_solver_warp \\
     --folder taichi_elements=taichi_elements [--peer newton] [--device cuda] [--quick]
-python scripts/peers/collect.py out/peers -o docs/data/peers_cpu.jsonl
+python scripts/peers/collect.py out/peers -o docs/measured/data/peers_cpu.jsonl
 
 Scenes are frozen to files, each peer is started once as a process of its own (--python gives it
 its own interpreter) and works off its list; a run that is there is not done again. What would

@@ -1,7 +1,7 @@
 """Judge the runs of all.py and add them to a file of records, a JSON line each.
 
-python scripts/peers/collect.py out/peers -o docs/data/peers_cpu.jsonl [--machine NAME]
-python scripts/peers/collect.py --markdown docs/peers.md
+python scripts/peers/collect.py out/peers -o docs/measured/data/peers_cpu.jsonl [--machine NAME]
+python scripts/peers/collect.py --markdown docs/measured/peers.md
 
 Runs in gsfluent's environment. A run whose record is there is not added again. --machine names
 where the runs were made if that is not here.
@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+sys.path.insert(0, str(ROOT))
 
+from gsfluent.figure.markdown import enter  # noqa: E402
 from gsfluent.fracturebench.registry import find  # noqa: E402
 from gsfluent.fracturebench.run import Run  # noqa: E402
 from gsfluent.fracturebench.scene import Scene, SceneError  # noqa: E402
 from gsfluent.lab.charts.record import Record, append, machine, of_run, read  # noqa: E402
 
-DATA = ROOT / "docs" / "data"
+DATA = ROOT / "docs" / "measured" / "data"
 
 
 def record(folder: Path, path: Path, where: str | None) -> Record:
@@ -107,8 +108,6 @@ def reason(record: Record) -> str:
 
 def page(markdown: Path) -> None:
     """Enter the tables of the records that are there into a page."""
-    from page import enter
-
     text = markdown.read_text(encoding="utf-8")
     for device in ("cpu", "cuda"):
         data = DATA / f"peers_{device}.jsonl"
@@ -127,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, nargs="?", help="what all.py was given with -o")
     parser.add_argument("-o", "--out", type=Path, help="file of records, added to")
     parser.add_argument("--machine", help="where the runs were made; default: this machine")
-    parser.add_argument("--markdown", type=Path, help="enter docs/data/peers_*.jsonl into a page")
+    parser.add_argument("--markdown", type=Path, help="enter the recorded lines into this page")
     options = parser.parse_args(arguments)
     if options.markdown is None and (options.folder is None or options.out is None):
         parser.error("give a folder and -o, or --markdown")

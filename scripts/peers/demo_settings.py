@@ -2,7 +2,7 @@
 
 python scripts/peers/demo_settings.py peer PhysGaussian -o demo.jsonl [--device cuda]  # its env
 python scripts/peers/demo_settings.py ours PhysGaussian -o demo.jsonl [--device cuda]  # gsfluent's
-python scripts/peers/demo_settings.py table demo.jsonl --markdown docs/peers.md
+python scripts/peers/demo_settings.py table demo.jsonl --markdown docs/measured/peers.md
 
 PhysGaussian is the folder of a checkout. `peer` runs its solver at exactly each config's grid, step
 and matter on the stand-in of demo_scenes.py: error against the exact mode, and wall milliseconds
@@ -357,8 +357,8 @@ def table(found: Sequence[Mapping[str, Any]], device: str) -> str:
 
 def enter_table(options: argparse.Namespace) -> int:
     """Print the tables of a file, or enter them into a page."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-    from page import enter
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    from gsfluent.figure.markdown import enter
 
     found = lines(options.out)
     for device in sorted({line["device"] for line in found}):

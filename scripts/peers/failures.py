@@ -1,7 +1,7 @@
 """Known failures of PhysGaussian's solver, reproduced from outside: named points for the maps.
 
-python scripts/peers/failures.py PhysGaussian/mpm_solver_warp -o docs/data/peers_failures.json
-python scripts/peers/failures.py --markdown docs/peers.md
+python scripts/peers/failures.py PhysGaussian/mpm_solver_warp
+python scripts/peers/failures.py --markdown docs/measured/peers.md
 
 Each is a small scene with an answer that needs no reference; each runs in a process of its own,
 because two of them may take it with them. `reproduced` says whether the failure was seen, so a
@@ -27,7 +27,7 @@ from peerlib import Floats, Placement, Scene
 from physgaussian import Engine, PhysGaussian
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = ROOT / "docs" / "data" / "peers_failures.json"
+DATA = ROOT / "docs" / "measured" / "data" / "peers_failures.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -323,8 +323,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         temporary.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         temporary.replace(options.out)
     if options.markdown is not None:
-        sys.path.insert(0, str(ROOT / "scripts"))
-        from page import enter
+        sys.path.insert(0, str(ROOT))
+        from gsfluent.figure.markdown import enter
 
         text = options.markdown.read_text(encoding="utf-8")
         part = table(json.loads(options.out.read_text(encoding="utf-8")))

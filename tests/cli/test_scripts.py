@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from loaded_scripts import load_script
 from PIL import Image
 
 import gsfluent as gf
 from gsfluent.demo import make_capture
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
-
-def script(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"scripts_{name}", SCRIPTS / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts" / "stages"
 
 
 @pytest.mark.parametrize("name", ["fill", "simulate", "render"])
@@ -34,7 +25,7 @@ def test_reconstruct_script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     model, report = tmp_path / "model.ply", tmp_path / "report"
     arguments = [str(tmp_path / "capture"), "-o", str(model), "--report", str(report)]
     arguments += ["--iterations", "10", "--start-gaussians", "500"]
-    assert script("reconstruct").main(arguments) == 0
+    assert load_script("bench/gsplat/reconstruct").main(arguments) == 0
     line = json.loads(capsys.readouterr().out)
     assert line["iterations"] == 10 and line["psnr"] > 5.0
     assert gf.load(model).count == line["gaussians"] > 100
@@ -45,14 +36,14 @@ def test_fill_and_simulate_scripts(
     ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     solid = tmp_path / "solid.ply"
-    script("fill").main(str(ball), str(solid))
+    load_script("stages/fill").main(str(ball), str(solid))
     assert gf.load(solid).color is not None
-    script("simulate").main(str(solid), "bread", "0.3", "2.0")
+    load_script("stages/simulate").main(str(solid), "bread", "0.3", "2.0")
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("t = ") for line in lines) == 30
 
 
 def test_render_script(ball: Path, tmp_path: Path) -> None:
-    script("render").main(str(ball), str(tmp_path / "ball.png"))
+    load_script("stages/render").main(str(ball), str(tmp_path / "ball.png"))
     low, high = Image.open(tmp_path / "ball.png").convert("L").getextrema()
     assert high - low > 50

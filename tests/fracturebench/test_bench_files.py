@@ -31,7 +31,7 @@ SCRIPTS = ROOT / "scripts" / "fracturebench"
 
 @pytest.fixture(scope="module")
 def scripts() -> Callable[[str], ModuleType]:
-    sys.path[:0] = [str(SCRIPTS), str(ROOT / "scripts")]
+    sys.path.insert(0, str(SCRIPTS))
 
     def load(name: str) -> ModuleType:
         return importlib.import_module(name)
@@ -137,7 +137,7 @@ def test_the_example_of_the_docs_is_a_submission(
     scene: Scene, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    page = (ROOT / "docs" / "fracturebench.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guide" / "fracturebench.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     scene.save("scenes/bar.npz")

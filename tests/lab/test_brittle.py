@@ -1,8 +1,7 @@
-"""What kills brittle MPM: the experiments of docs/brittle_gpu.md, in small."""
+"""What kills brittle MPM: the experiments of docs/measured/brittle_gpu.md, in small."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from loaded_scripts import load_script
 
 from gsfluent.lab.problems.fracture import brittle
 from gsfluent.lab.textbook.solver import Textbook, Variant
@@ -74,11 +74,10 @@ def test_damage_depends_on_the_step_least_with_the_implicit_dynamic_centre() -> 
 def test_the_script_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    script = importlib.import_module("brittle_gpu")
+    script = load_script("study/brittle/run")
     record = tmp_path / "brittle.jsonl"
     line = [
-        "brittle_gpu.py", "-o", str(record), "--quick", "--parts", "inversion", "--markdown",
+        "run.py", "-o", str(record), "--quick", "--parts", "inversion", "--markdown",
         str(tmp_path / "page.md"), "--figure", str(tmp_path / "page.png"),
     ]  # fmt: skip
     monkeypatch.setattr(sys, "argv", line)

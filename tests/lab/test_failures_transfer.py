@@ -1,6 +1,6 @@
 """Failure catalogue (solver.md section 4), rows of the transfer: 1, 2, 4, 5, 16, 17, 18, 20 to 22.
 
-docs/failures.md has the table: what fails in the peers, and the figures of these tests.
+docs/theory/failures.md has the table: what fails in the peers, and the figures of these tests.
 """
 
 from __future__ import annotations

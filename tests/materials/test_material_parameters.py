@@ -169,9 +169,9 @@ def test_sand_slope_is_the_published_one() -> None:
 
 @pytest.mark.parametrize("block", ["numbers", "sources"])
 def test_the_page_holds_what_the_presets_are(block: str) -> None:
-    """Renewed by scripts/material_tables.py."""
-    page = Path(__file__).resolve().parents[2] / "docs" / "materials.md"
+    """Renewed by scripts/study/materials.py."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "measured" / "materials.md"
     found = re.search(
-        rf"<!-- {block}: [^\n]*-->\n(.*?)<!-- end -->", page.read_text("utf-8"), re.DOTALL
+        rf"<!-- {block}: begin -->\n(.*?)<!-- {block}: end -->", page.read_text("utf-8"), re.DOTALL
     )
     assert found is not None and found.group(1) == getattr(table, block)()

@@ -2,7 +2,7 @@
 
 Only numpy and the standard library are used, and nothing else of gsfluent's is but its errors.
 
-Layout (little-endian; docs/export.md has the reasons)::
+Layout (little-endian; docs/guide/export.md has the reasons)::
 
     "GSFDELTA", version u32, size of header u32, header (JSON, UTF-8)
     block of the roster, then one block per frame in order, then the index

@@ -19,7 +19,7 @@ __all__ = ["BYTES", "Done", "bandwidth", "run"]
 
 BYTES = 208.0
 """What the two passes of the solver read and write of a float32 point in a step
-(docs/benchmarks.md); of a NACC point 224."""
+(docs/measured/benchmarks.md); of a NACC point 224."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -213,7 +213,7 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("ppc", "27 per cell", 27)
     yield turned("dt", f"fixed dt, c dt/dx {DEMO_COURANT}", courant=DEMO_COURANT)
     yield turned("engine", "composed operators", engine="ops")
-    if case.kind != "fracture":  # there carried splats part, which is their matter (docs/cracks.md)
+    if case.kind != "fracture":  # there splats part (docs/theory/cracks.md)
         yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, carried_by=8)
         yield turned("gaussians", f"{DENSE} per cell", DENSE)
     if device.startswith("cpu"):

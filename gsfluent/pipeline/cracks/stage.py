@@ -1,6 +1,6 @@
 """Repair of cracks: splats that give both sides of a crack a face.
 
-Two ways, see docs/cracks.md:
+Two ways, see docs/theory/cracks.md:
 
 * ``gap`` (the default) puts fine, flat splats with the colour of the matter on the faces that open
   (:mod:`gsfluent.pipeline.cracks.faces`);

@@ -48,7 +48,8 @@ class Fill(Stage):
 
     Args:
         resolution: Voxels along the longest side of the object.
-        method: Where the inside comes from (docs/filling.md): ``auto``; ``vote`` (rays among the
+        method: Where the inside comes from (docs/theory/solid.md): ``auto``; ``vote`` (rays among
+        the
             splats), ``hull`` (the same cut by the masks; masks alone without splats), ``density``
             (``hull`` where there are masks, else ``vote``) or ``tsdf`` (depths alone).
         hollow: ``auto`` (cavities that depths show stay empty; nothing is guessed of closed ones),
@@ -337,7 +338,8 @@ def _parse_hollow(hollow: str | float) -> float | None:
 
 
 VOXELS_PER_CELL = 2.0
-"""Measured (docs/interior.md): from two on, the mass that sampled points bring to the cells of a
+"""Measured (docs/measured/interior.md): from two on, the mass that sampled points bring to the
+cells of a
 curved surface is limited by the points themselves (3 % of a cell), not by the voxels."""
 
 

@@ -27,7 +27,7 @@ COARSEST = 2 ** (LEVELS - 1)
 # Ambient occlusion: levels of the pyramid that each cone steps through, how far out in cells of
 # that level, what is taken off for the surface's own blur, and how fast a cone fills. Fitted to
 # ray-traced truth in cracks of three widths, a corner, beside a ball and on open faces
-# (scripts/light_accuracy.py).
+# (scripts/accuracy/light.py).
 AO_LEVELS = (1, 2, 3, 4)
 AO_REACH = 2.16
 AO_FLAT = 0.02

@@ -251,7 +251,8 @@ def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
 def _cell_order(points: Tensor, edge: float) -> Tensor:
     """Order of points [N, 3] by block of 4^3 cells, then by cell: neighbours in memory as in space.
 
-    The transfers run several times faster on points that are stored in this order (docs/mpm.md).
+    The transfers run several times faster on points that are stored in this order
+    (docs/theory/mpm.md).
     """
     cell = torch.floor((points - points.amin(dim=0)) / edge).to(torch.int64)
     block, local = cell // 4, cell % 4

@@ -3,8 +3,8 @@
 When a body breaks, the Gaussians that rode on it part and what is behind shines through. What ought
 to be opaque comes from the matter itself: its material points as discs that just overlap at rest. A
 true gap between fragments is therefore no hole, a see-through fragment is, and so is an opening too
-narrow for the points to know of. Measured on true pictures of fractures (docs/crack_accuracy.md)
-this finds next to nothing.
+narrow for the points to know of. Measured on true pictures of fractures
+(docs/measured/crack_accuracy.md) this finds next to nothing.
 """
 
 from __future__ import annotations

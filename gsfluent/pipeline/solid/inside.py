@@ -1,7 +1,8 @@
 """Which voxels are inside: ray vote, visual hull, surface trimming, leak report.
 
 A bare flood fill from outside is never used to decide: one missing splat and the whole object is
-"outside" (measured IoU 0.13-0.38, against 0.75-0.85 for votes; docs/interior.md). It is used only
+"outside" (measured IoU 0.13-0.38, against 0.75-0.85 for votes; docs/theory/solid.md). It is used
+only
 to *report* leaks.
 """
 

@@ -37,7 +37,7 @@ __all__ = ["solid_of_splats"]
 _log = logging.getLogger(__name__)
 
 _FAINT = 0.05  # opacity below which a splat is no matter
-_DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/solid.md)
+_DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/theory/solid.md)
 _INNER = 0.05  # share of the surface below the closed one that makes an inner wall
 _ENOUGH = 12  # photographs from which depths decide where the skin is
 _MOST_CAMERAS = 48  # evenly chosen; more say the same again

@@ -15,7 +15,7 @@ import numpy as np
 from gsfluent.errors import GsfluentError
 from gsfluent.live.player import FAILED, PAUSED, RUNNING, LivePlayer, Status
 from gsfluent.viewer.model.live_source import factor
-from gsfluent.viewer.page import Page
+from gsfluent.viewer.panels.page import Page
 
 if TYPE_CHECKING:
     import viser

@@ -1,6 +1,7 @@
 """Measures that make a run cheaper and trade nothing: with and without each, the error is the same.
 
-What gsfluent leaves out, sorts or reuses (docs/solver.md, docs/solver_cpu.md, docs/simulation.md),
+What gsfluent leaves out, sorts or reuses (docs/theory/solver.md, docs/theory/solver.md,
+docs/theory/simulation.md),
 by name: a case with a known answer is run with the measure and without it, and the two errors may
 differ by at most 1 % of the case's tolerance (``solver.md`` section 6). Where the pages promise the
 same bits, the runs have the same bits. On a GPU: tests/lab/charts/test_trades_nothing_cuda.py.

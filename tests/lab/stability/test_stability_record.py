@@ -17,7 +17,9 @@ from gsfluent.lab.stability import run as running
 from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place, Point, Violation
 from gsfluent.lab.stability.peers import KNOWN, marks, measured
 
-RECORDED = Path(__file__).resolve().parents[3] / "docs" / "data" / "stability_cpu.jsonl"
+RECORDED = (
+    Path(__file__).resolve().parents[3] / "docs" / "measured" / "data" / "stability_cpu.jsonl"
+)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +115,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Map:
         "toy", "Toy", Axis("x", "x", (0.5, 1.0, 2.0, 3.0, 4.0), 1.0),
         Axis("y", "y", ("a", "b"), "a"), ("gsfluent",), slope, "test_toy",
     )  # fmt: skip
-    monkeypatch.setitem(stability._MAPS, "toy", m)
+    monkeypatch.setattr(running, "all_maps", lambda: {"toy": m})
     RUNS.clear()
     return m
 

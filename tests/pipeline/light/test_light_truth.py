@@ -1,27 +1,23 @@
-"""Light against ray-traced truth, by the functions of scripts/light_accuracy.py."""
+"""Light against ray-traced truth, by the functions of scripts/accuracy/light.py."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
+from loaded_scripts import load_script
 
-from gsfluent.data import Camera
+from gsfluent.data import Camera, Gaussians
 from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, to_linear
 from gsfluent.pipeline.render.stage import Render
 
-SCRIPTS = Path(__file__).parents[3] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
-import light_accuracy  # noqa: E402
+light_accuracy = load_script("accuracy/light")
 
 BAR = 0.02  # issue 6
 
 
 @pytest.fixture(scope="module")
-def skin() -> light_accuracy.Gaussians:
+def skin() -> Gaussians:
     ball = truth.Ball((0.0, 0.0, 0.0), light_accuracy.RADIUS)
     return truth.surface_splats(ball, 80_000, light_accuracy.GREY)
 
@@ -29,9 +25,7 @@ def skin() -> light_accuracy.Gaussians:
 @pytest.mark.parametrize(
     "name", ["directional", "point", "three lamps", "specular", "environment, evening sky"]
 )
-def test_lit_sphere_is_within_two_percent_of_truth(
-    skin: light_accuracy.Gaussians, name: str
-) -> None:
+def test_lit_sphere_is_within_two_percent_of_truth(skin: Gaussians, name: str) -> None:
     error, _ = light_accuracy.sphere(skin, name)
     assert error < BAR
 

@@ -1,4 +1,4 @@
-"""Exemplar synthesis: its laws; how it looks is measured by scripts/texture_accuracy.py."""
+"""Exemplar synthesis: its laws; how it looks is measured by scripts/accuracy/texture/known.py."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ def hertz_spheres(
         compare("hertz_spheres", "contact time / Hertz", (touching[-1] - touching[0]) / time, 1.0,
                 tolerance=0.1, source=source, note=note),
         compare("hertz_spheres", "restitution", after, 1.0, tolerance=0.05,
-                source="elastic impact", note="damping of the transfer, see docs/contact.md"),
+                source="elastic impact", note="damping of the transfer (docs/theory/contact.md)"),
     ]  # fmt: skip
 
 

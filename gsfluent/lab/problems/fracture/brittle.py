@@ -1,8 +1,9 @@
 """Scenes in which brittle MPM goes wrong, and how far apart two runs of them are.
 
 A ball that breaks on a floor (failures.md row 8), the same seeded half-way between nodes, and
-debris: points that fly alone. ``scripts/brittle_gpu.py`` and :mod:`gsfluent.lab.peers.known` run
-them with the variants of :mod:`gsfluent.lab.textbook.solver`.
+debris: points that fly alone. ``scripts/study/brittle/run.py`` and
+:mod:`gsfluent.lab.peers.known` run them with the variants of
+:mod:`gsfluent.lab.textbook.solver`.
 """
 
 from __future__ import annotations

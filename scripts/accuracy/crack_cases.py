@@ -1,0 +1,286 @@
+"""Objects of known inside that are broken for ``cracks.py``, and the ways to draw them."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsfluent import demo, geometry, materials, ops
+from gsfluent.data import SURFACE, Gaussians, Solid
+from gsfluent.demo.catalogue import OBJECTS
+from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud
+from gsfluent.lab.truth.interiors import known_interior
+from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.fill.stage import Fill
+from gsfluent.pipeline.matter.carry import Carry
+from gsfluent.pipeline.matter.points import Matter, body_frame
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.scene.scene import Scene
+
+VERSION = 1
+"""Counts up when cached simulations are no longer what this file would make."""
+FPS = 30.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One object and how it is broken.
+
+    Attributes:
+        known: Name of the demo object or the known interior.
+        material: Preset.
+        height: It falls from [m].
+        seconds: Length of the simulation [s].
+        isotropic: Every splat is a ball.
+        longest: Longest side [m] of known interiors.
+    """
+
+    known: str
+    material: str
+    height: float
+    seconds: float
+    isotropic: bool = False
+    longest: float = 0.25
+
+
+CASES = {
+    "melon": Case("watermelon", "fruit.watermelon", 1.0, 0.8),
+    "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.0, 0.8, isotropic=True),
+    "marble": Case("marble", "fruit.watermelon", 1.5, 0.8),
+    "bread": Case("bread", "fruit.watermelon", 1.2, 0.8),
+}
+
+
+@dataclass(frozen=True)
+class Inside:
+    """Shape and colours of an object, in metres."""
+
+    inside: Callable[[Tensor], Tensor]
+    colors: Callable[[Tensor], Tensor]
+    bounds: tuple[Tensor, Tensor]
+
+
+def known_inside(case: Case, seed: int = 0) -> Inside:
+    """The true object of a case."""
+    if case.known in OBJECTS:
+        fruit = demo.make_object(case.known, seed)
+        return Inside(fruit.inside, fruit.interior, fruit.bounds())
+    made = known_interior(case.known, 128, seed)
+    index = np.argwhere(made.domain.inside)
+    voxel = case.longest / float((index.max(0) - index.min(0) + 1).max())
+    origin = -voxel * np.array([64.0, 64.0, index.min(0)[2]])
+    field = SignedDistance.of_voxels(made.domain.inside, origin, voxel, "known")
+    from scipy import ndimage
+
+    fill = ndimage.distance_transform_edt(
+        ~made.domain.inside, return_distances=False, return_indices=True
+    )
+    volume = made.rgb[tuple(fill)]
+
+    def colors(points: Tensor) -> Tensor:
+        at = ((points.numpy() - origin) / voxel - 0.5).T
+        channels = [
+            ndimage.map_coordinates(volume[..., k], at, order=1, mode="nearest") for k in range(3)
+        ]
+        return torch.from_numpy(np.stack(channels, 1)).clamp(0.0, 1.0)
+
+    low = torch.from_numpy(origin + voxel * index.min(0))
+    high = torch.from_numpy(origin + voxel * (index.max(0) + 1))
+    return Inside(lambda p: field.at(p.float()) <= 0, colors, (low, high))
+
+
+def make_solid(case: Case, known: Inside, resolution: int) -> Solid:
+    """Fill the true shape and give every splat the true colour of its place."""
+    low, high = known.bounds
+    voxel = float((high - low).max()) / resolution
+    axes = [
+        torch.arange(float(low[k]) + 0.5 * voxel, float(high[k]) + voxel, voxel) for k in range(3)
+    ]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    matter = known.inside(grid.reshape(-1, 3).double()).reshape(grid.shape[:3])
+    field = SignedDistance.of_voxels(matter.numpy(), low.double().numpy(), voxel, "known")
+    solid = Fill(resolution=resolution)(None, None, solid=field)
+    splats = solid.gaussians
+    if case.isotropic:
+        skin = splats.labels == SURFACE
+        # a ball as large as a disc hides as much; its centre goes in by half its size
+        size = splats.scales.amax(1)
+        round_ = torch.where(skin, 0.8 * size, splats.scales.prod(1) ** (1 / 3))
+        inward = -geometry.quaternion_to_matrix(splats.quats)[..., 2] * 0.5 * round_[:, None]
+        means = torch.where(skin[:, None], splats.means + inward, splats.means)
+        splats = splats.replace(means=means, scales=round_[:, None].expand(-1, 3).contiguous())
+    colors = known.colors(splats.means.double()).float()
+    splats = splats.replace(sh=geometry.rgb_to_sh0(colors)[:, None])
+    return solid.replace(gaussians=splats)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The material points of one frame."""
+
+    position: Tensor
+    deformation: Tensor
+    strain: Tensor
+    fragments: Tensor
+    broken: Tensor
+    pieces: int
+
+    def motion(self, carry: Carry):
+        return carry.motion(self.position, self.deformation, self.fragments, self.broken)
+
+
+class Broken:
+    """A case, simulated once and kept in a folder.
+
+    Args:
+        name: One of :data:`CASES`.
+        cells: Grid cells along the object.
+        resolution: Voxels of the fill along the object.
+        cache: Folder.
+    """
+
+    def __init__(self, name: str, cells: int, resolution: int, cache: Path) -> None:
+        self.name, self.case = name, CASES[name]
+        self.known = known_inside(self.case)
+        key = repr((VERSION, self.case, cells, resolution, FPS))
+        self.folder = cache / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:10]}"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        stored = self.folder / "solid.pt"
+        if not stored.exists():
+            torch.save(make_solid(self.case, self.known, resolution), stored)
+        self.solid: Solid = torch.load(stored, weights_only=False)
+        self.scene = Scene(floor=0.0)
+        self.scene.add(self.solid, materials.get(self.case.material))
+        self.scene.drop(self.case.height)
+        longest = float((self.known.bounds[1] - self.known.bounds[0]).max())
+        self.stage = Simulate(dx=longest / cells)
+        self.matter: Matter = self.stage.prepare(self.scene)
+        self.carry = Carry.bind(self.scene, self.matter)
+        self.count = round(FPS * self.case.seconds)
+        if not self._file(self.count - 1).exists():
+            self._simulate()
+
+    def _file(self, index: int) -> Path:
+        return self.folder / f"moment_{index:03d}.npz"
+
+    def _simulate(self) -> None:
+        for frame in self.stage(self.scene, fps=FPS, seconds=self.case.seconds):
+            p = frame.particles
+            np.savez(
+                self._file(frame.index),
+                position=p.position,
+                deformation=p.deformation,
+                strain=p.strain,
+                fragments=frame.fragments,
+                broken=frame.broken,
+                pieces=frame.pieces.count,
+            )
+
+    def moment(self, index: int) -> Moment:
+        with np.load(self._file(index)) as data:
+            values = {k: torch.from_numpy(data[k]) for k in data.files}
+        return Moment(**values | {"pieces": int(values["pieces"])})
+
+    @functools.cache  # noqa: B019
+    def broken_frames(self) -> list[int]:
+        """Frames in which a hundredth of the matter or more is broken."""
+        parts = [float(self.moment(k).broken.float().mean()) for k in range(self.count)]
+        return [k for k, part in enumerate(parts) if part >= 0.01]
+
+    def cloud(self, voxels: int, parted: float = PARTED) -> TrueCloud:
+        """The dense true cloud with ``voxels`` voxels along the object, kept in the folder."""
+        stored = self.folder / f"cloud_{voxels}.pt"
+        shift = body_frame(self.scene.bodies[0], self.scene).translation
+        low, high = self.known.bounds
+        if stored.exists():
+            cloud: TrueCloud = torch.load(stored, weights_only=False)
+        else:
+            cloud = TrueCloud(
+                lambda p: self.known.inside(p - shift),
+                lambda p: self.known.colors(p - shift),
+                (low + shift, high + shift),
+                float((high - low).max()) / voxels,
+                self.matter.rest,
+                self.matter.spacing[0],
+            )
+            keep, cloud.colors = cloud.colors, None
+            torch.save(cloud, stored)
+            cloud.colors = keep
+        cloud.colors = lambda p: self.known.colors(p - shift)
+        cloud.parted = parted
+        return cloud
+
+
+Drawn = tuple[Gaussians, Tensor | None]
+
+
+def raw(broken: Broken, moment: Moment, *, total: bool = False) -> Drawn:
+    """As the peers: each splat by its nearest point's own deformation, whatever that is.
+
+    The codes show the elastic deformation (their return mapping has replaced F before anyone draws
+    it); ``total`` takes the deformation gradient of the paper's formula at its word.
+    """
+    carry, rest = broken.carry, broken.carry.gaussians
+    if total:
+        local = moment.deformation
+        rotation = ops.polar_clamped(local.contiguous(), 0.3, 2.0)[0]
+    else:
+        # F_e = V R with V^2 = b = I + strain
+        rotation = ops.polar_clamped(moment.deformation.contiguous(), 0.3, 2.0)[0]
+        b = geometry.unpack_symmetric(moment.strain) + torch.eye(3)
+        values, vectors = torch.linalg.eigh(b.double())
+        root = vectors * values.clamp(min=1e-6).sqrt()[:, None] @ vectors.mT
+        local = root.float() @ rotation
+    own = carry.owner
+    local, turn = local[own], rotation[own]
+    arm = rest.means - carry.matter.rest[own]
+    means = moment.position[own] + (local @ arm[..., None])[..., 0]
+    root = local @ geometry.quaternion_to_matrix(rest.quats) * rest.scales[:, None]
+    quats, scales = ops.covariance_axes(geometry.pack_symmetric(root @ root.mT))
+    sh = geometry.rotate_sh(rest.sh, turn)
+    return rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None), None
+
+
+def ideal(broken: Broken, moment: Moment, cloud: TrueCloud) -> Drawn:
+    """The splats moved exactly as the true matter: what a perfect binding would reach."""
+    rest = broken.carry.gaussians
+    owner = broken.carry.owner
+    means, local = cloud.follow(
+        rest.means, owner, moment.position, moment.deformation, moment.fragments
+    )
+    turn, local = ops.polar_clamped(local.contiguous(), 0.6, 1.5)
+    root = local @ geometry.quaternion_to_matrix(rest.quats) * rest.scales[:, None]
+    quats, scales = ops.covariance_axes(geometry.pack_symmetric(root @ root.mT))
+    sh = geometry.rotate_sh(rest.sh, turn)
+    return rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None), None
+
+
+def carried(broken: Broken, moment: Moment) -> Drawn:
+    """Our carry, no repair."""
+    return broken.carry.apply(moment.motion(broken.carry)), None
+
+
+def repaired(broken: Broken, moment: Moment, **options: str) -> Drawn:
+    """Our carry and a repair, which is kept from frame to frame as in a run."""
+    kept = _STAGES.setdefault((broken.name, *options.values()), Repair(**options))
+    made = kept(broken.carry, moment.motion(broken.carry))
+    return made.gaussians, made.groups
+
+
+_STAGES: dict[tuple[str, ...], Repair] = {}
+
+METHODS: dict[str, Callable[[Broken, Moment], Drawn]] = {
+    "raw": raw,
+    "raw-total": lambda b, m: raw(b, m, total=True),
+    "carried": carried,
+    "mvee": lambda b, m: repaired(b, m, method="mvee"),
+    "default": repaired,
+}

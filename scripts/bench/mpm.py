@@ -1,0 +1,216 @@
+"""Time a whole step of the resident solver on the falling-cube scenes of PhysGaussian's benchmark.
+
+python scripts/bench/mpm.py                                    # this machine's GPU, else its CPU
+python scripts/bench/mpm.py --device cpu --markdown docs/measured/benchmarks.md  # one core
+python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/benchmarks.md
+python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
+
+Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
+eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
+E = 1e5, nu = 0.3, dt = 1e-4, walls three cells inside the domain. 50 steps to warm up, then the
+median of five runs of 100 steps; the clock is read once per run. PhysGaussian's column is what
+--peer holds, else the figure of that table: CUDA graph, same scene, same kind of GPU. On the CPU:
+one thread, process time, the least of the five runs, and beside it the plain C++ solver of
+shared/spec/solver.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsfluent import has_cuda, ops
+from gsfluent.figure.markdown import enter
+
+PEER = {  # (grid, cells, order) -> ms per substep, warp-lang 0.10.1, CUDA graph, H100
+    (100, 24, "lattice"): 0.209, (100, 24, "random"): 0.275,
+    (200, 50, "lattice"): 1.508, (200, 50, "random"): 1.859,
+    (200, 80, "lattice"): 4.958, (200, 80, "random"): 6.416,
+    (300, 100, "lattice"): 10.272, (300, 100, "random"): 13.009,
+}  # fmt: skip
+BARS = {
+    (100, 24, "lattice"): 0.03, (100, 24, "random"): 0.03,
+    (200, 50, "lattice"): 0.15, (200, 50, "random"): 0.17,
+    (200, 80, "lattice"): 0.50, (200, 80, "random"): 0.58,
+    (300, 100, "lattice"): 1.0, (300, 100, "random"): 1.1,
+}  # fmt: skip
+CPU_PEER, CPU_BAR = {(100, 24): 47.5}, {(100, 24): 12.0}
+BYTES = {"elastic": 208, "nacc": 224}
+"""Bytes a point must move in a step: p2g reads 68, g2p reads 48 and writes 92 (NACC 16 more)."""
+
+
+def walls(n: int, dx: float, device: torch.device) -> Tensor:
+    rows = []
+    for axis in range(3):
+        for side in (1.0, -1.0):
+            normal = [side if a == axis else 0.0 for a in range(3)]
+            point = [3 * dx if side > 0 else 2.0 - 3 * dx] * 3
+            rows.append([0.0, 2.0, 0.0, *point, *normal] + [0.0] * 7)
+    return torch.tensor(rows, device=device)
+
+
+def points(n: int, cells: int, order: str, device: torch.device) -> tuple[Tensor, float]:
+    dx = 2.0 / n
+    generator = torch.Generator().manual_seed(0)
+    axis = torch.arange(cells)
+    cell = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 1, 3)
+    half = torch.stack(torch.meshgrid(*[torch.arange(2)] * 3, indexing="ij"), -1).reshape(1, 8, 3)
+    jitter = torch.rand(cell.shape[0], 8, 3, generator=generator)
+    low = torch.tensor([1.0 - 0.5 * cells * dx, 1.0 - 0.5 * cells * dx, 4 * dx])
+    x = low + (cell + 0.5 * (half + jitter)) * dx
+    x = x.reshape(-1, 3)
+    if order == "random":
+        x = x[torch.randperm(x.shape[0], generator=generator)]
+    return x.to(device), dx
+
+
+def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> ops.Solver:
+    x, dx = points(n, cells, order, device)
+    count = x.shape[0]
+    young, nu = 1e5, 0.3
+    row = [young / (2 * (1 + nu)), young / (3 * (1 - 2 * nu)), 1.85, 0.6, 3.0, 0.0, 1000.0, 0.0]
+    velocity = torch.zeros(count, 3, device=device)
+    velocity[:, 2] = -3.0
+    volume = torch.full((count,), dx**3 / 8, device=device)
+    body = None
+    if kind in ("two", "apart"):  # the upper half is another body; "apart": 0.3 m higher up
+        middle = 4 * dx + 0.5 * cells * dx
+        body = (x[:, 2] > middle).to(torch.int32)
+        if kind == "apart":
+            x[:, 2] += 4 * round(0.3 / (4 * dx)) * dx * body  # whole blocks
+    law = 1 if kind == "nacc" else 0
+    return ops.Solver(
+        x, velocity, 1000.0 * volume, volume, dx=dx, dt=1e-4, gravity=(0.0, 0.0, -9.8),
+        law=torch.tensor([law], dtype=torch.int32, device=device), body=body,
+        params=torch.tensor([row], device=device), colliders=walls(n, dx, device),
+        alpha=torch.full((count,), -0.4, device=device) if law else None,
+    )  # fmt: skip
+
+
+def seconds_per_step(solver: ops.Solver, steps: int, runs: int) -> list[float]:
+    def wait() -> None:
+        if solver.device.type == "cuda":
+            torch.cuda.synchronize()
+
+    alone = solver.device.type == "cpu" and torch.get_num_threads() == 1
+    clock = time.process_time if alone else time.perf_counter
+    times = []
+    for _ in range(runs):
+        wait()
+        start = clock()
+        solver.advance(steps=steps)
+        wait()
+        times.append((clock() - start) / steps)
+    return sorted(times)
+
+
+def measure(n: int, cells: int, order: str, kind: str, device: torch.device) -> dict[str, Any]:
+    solver = build(n, cells, order, kind, device)
+    solver.advance(steps=50)
+    times = seconds_per_step(solver, 100, 5)
+    # Others work on the machine too: the least is what the code needs of a core.
+    middle = times[len(times) // 2] if device.type == "cuda" else times[0]
+    counters = solver.counters()
+    need = BYTES["nacc" if kind == "nacc" else "elastic"] * solver.count
+    height = float(solver.position[:, 2].mean())
+    return {
+        "grid": n, "cells": cells, "order": order, "kind": kind, "particles": solver.count,
+        "ms": 1e3 * middle, "ms_best": 1e3 * times[0],
+        "ns_per_particle": 1e9 * middle / solver.count,
+        "gb_per_second": need / middle / 1e9, "memory_mib": solver.memory() / 2**20,
+        "builds_per_step": counters["builds"] / counters["step"], "mean_height": height,
+        "slots": counters["slots"], "homes": counters["homes"],
+    }  # fmt: skip
+
+
+def bar_and_peer(row: dict[str, Any], gpu: bool) -> tuple[float | None, float | None]:
+    if row["kind"] != "elastic":
+        return None, None
+    key = (row["grid"], row["cells"])
+    if not gpu:
+        return CPU_BAR.get(key), CPU_PEER.get(key)
+    return BARS.get((*key, row["order"])), PEER.get((*key, row["order"]))
+
+
+def markdown(name: str, rows: list[dict[str, Any]], gpu: bool) -> str:
+    other = "PhysGaussian" if gpu else "plain C++"
+    lines = [
+        f"Device: {name}; torch {torch.__version__}. Times are of whole steps, builds included.",
+        "",
+        "| scene | points | order | ms | ns/point | GB/s needed | memory MiB | bar ms | "
+        f"{other} ms | ratio |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for r in rows:
+        bar, peer = bar_and_peer(r, gpu)
+        ratio = f"{peer / r['ms']:.1f}" if peer else ""
+        lines.append(
+            f"| {r['kind']}, {r['grid']}^3 | {r['particles']:,} | {r['order']} | {r['ms']:.4f} | "
+            f"{r['ns_per_particle']:.3f} | {r['gb_per_second']:.0f} | {r['memory_mib']:.0f} | "
+            f"{bar or ''} | {peer or ''} | {ratio} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+    parser.add_argument("--threads", type=int, default=1, help="CPU; with several: wall time")
+    parser.add_argument("--rows", nargs="*", help="grid:cells, for example 200:50")
+    parser.add_argument("--kinds", nargs="*", default=["elastic", "nacc", "two", "apart"])
+    parser.add_argument("--orders", nargs="*", default=["lattice", "random"])
+    parser.add_argument("--peer", type=Path, help="what physgaussian.py wrote")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path)
+    options = parser.parse_args()
+    if options.peer:
+        for row in json.loads(options.peer.read_text())["rows"]:
+            PEER[row["grid"], row["cells"], row["order"]] = round(row["ms"], 3)
+    if options.device == "cuda" and not has_cuda():
+        parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
+    gpu = options.device == "cuda" or (options.device == "auto" and has_cuda())
+    device = torch.device("cuda" if gpu else "cpu")
+    if not gpu:
+        torch.set_num_threads(options.threads)
+    default = ["100:24", "200:50", "200:80", "300:100"] if gpu else ["100:24"]
+    rows = []
+    for text in options.rows or default:
+        n, cells = (int(part) for part in text.split(":"))
+        for kind in options.kinds:
+            for order in options.orders:
+                row = measure(n, cells, order, kind, device)
+                rows.append(row)
+                sys.stderr.write(
+                    f"{kind} {n}^3 {row['particles']:,} {order}: {row['ms']:.4f} ms, "
+                    f"{row['ns_per_particle']:.3f} ns, {row['memory_mib']:.0f} MiB, "
+                    f"builds/step {row['builds_per_step']:.3f}, height {row['mean_height']:.4f}\n"
+                )
+    name = torch.cuda.get_device_name() if gpu else f"{platform.processor() or platform.machine()}"
+    if not gpu:
+        kind = "process" if options.threads == 1 else "wall"
+        name += f", {options.threads} thread(s), {kind} time, load {os.getloadavg()[0]:.1f}"
+    text = markdown(name, rows, gpu)
+    sys.stdout.write(text)
+    if options.json:
+        options.json.write_text(json.dumps({"device": name, "rows": rows}, indent=1) + "\n")
+    if options.markdown:
+        page = options.markdown
+        old = page.read_text() if page.exists() else ""
+        part = "bench_mpm" if gpu else f"bench_mpm {'cpu' if options.threads == 1 else 'threads'}"
+        page.write_text(enter(old, part, text.rstrip()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""scripts/study/shots/gallery.py: its shots are shots, its table says only what was recorded."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loaded_scripts import load_script
+
+from gsfluent.config import load_shot
+from gsfluent.demo.catalogue import OBJECTS
+
+ROOT = Path(__file__).resolve().parents[2]
+gallery = load_script("study/shots/gallery")
+
+
+def line(**keys: Any) -> dict[str, Any]:
+    made = {
+        "scene": "cake_cut", "machine": "Some CPU, 2 cores", "device": "cpu", "quality": "preview",
+        "verdict": "clean", "pieces": 2, "stages": {"fill": 3.4, "simulate": 20.2, "export": 0.2},
+    }  # fmt: skip
+    return made | keys
+
+
+@pytest.mark.parametrize("name", gallery.SCENES)
+def test_every_scene_has_a_shot_that_reads(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (ROOT / "examples" / f"{name}.yaml").read_text(encoding="utf-8")
+    drawn = gallery.SCENES[name].drawn
+    assert not drawn or drawn in OBJECTS
+    assert f"gsfluent run examples/{name}.yaml" in text
+    assert not drawn or f"gsfluent demo {drawn} --photographs examples/data/{drawn}" in text
+    # files that the shot names need not be there for it to be read
+    monkeypatch.setenv("GSFLUENT_DATA", str(tmp_path))
+    for word in text.replace(",", " ").replace("}", " ").split():
+        path = word.removeprefix("$GSFLUENT_DATA/")
+        if "/" in path and path.startswith(("data/", "captures/", "exemplars/", "cameras/")):
+            (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / path).touch()
+    (tmp_path / "shot.yaml").write_text(text, encoding="utf-8")
+    shot = load_shot(tmp_path / "shot.yaml")
+    assert 1.0 <= shot.output.seconds * shot.output.slow <= 4.0  # what one watches
+
+
+def test_the_table_has_the_recorded_times_and_the_machine() -> None:
+    later = line(stages={"fill": 1.0, "simulate": 5.0})
+    gpu = line(device="cuda", machine="Some GPU", quality="shot", pieces=7, verdict="healed")
+    text = gallery.table([line(), later, gpu])
+    row = next(r for r in text.splitlines() if "cake_cut.yaml" in r)
+    assert "6 s (fill 1, simulate 5; preview)" in row  # the last line counts
+    assert "24 s (fill 3, simulate 20; shot)" in row
+    assert "| healed | 7 |" in row
+    assert "2 cores: Some CPU, 2 cores." in text and "H100: Some GPU." in text
+    empty = next(r for r in text.splitlines() if "milk_poured.yaml" in r)
+    assert empty.endswith("| - | - | - | - |")
+
+
+def test_a_strip_shows_the_moments_of_a_video(tmp_path: Path) -> None:
+    from PIL import Image
+
+    from gsfluent.pipeline.render.video import write_video
+
+    shades = [np.full((48, 64, 3), 20 * i, np.uint8) for i in range(11)]
+    write_video(tmp_path / "video.mp4", shades, fps=10, size=(64, 48))
+    gallery.strip(tmp_path / "video.mp4", (0.0, 0.5, 1.0), tmp_path / "strip.jpg")
+    picture = np.asarray(Image.open(tmp_path / "strip.jpg")).astype(float)
+    assert picture.shape == (240, 960, 3)
+    means = [picture[:, 320 * k : 320 * (k + 1)].mean() for k in range(3)]
+    assert means == pytest.approx([0, 100, 200], abs=6)
+
+
+def test_the_page_is_written_from_the_lines_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, lines = tmp_path / "gallery.md", tmp_path / "gallery.jsonl"
+    page.write_text("# Gallery\n\n<!-- gallery: begin -->\nold\n<!-- gallery: end -->\n")
+    lines.write_text(json.dumps(line()) + "\n")
+    monkeypatch.setattr(gallery, "PAGE", page)
+    monkeypatch.setattr(sys, "argv", ["gallery.py", "--page", "--lines", str(lines)])
+    assert gallery.main() == 0
+    text = page.read_text()
+    assert "old" not in text and "24 s (fill 3, simulate 20; preview)" in text
