@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gsfluent.inspection.compare_weights import clip_scores
-from gsfluent.inspection.doctor import examine
 
 from gsfluent.choose.shot import _write
 from gsfluent.cli import main
 from gsfluent.errors import EXTRAS, MissingPackage
+from gsfluent.inspection.compare_weights import clip_scores
+from gsfluent.inspection.doctor import examine
 from gsfluent.io.usd import open_usd
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.mesh import closed_mesh
