@@ -59,7 +59,7 @@ def main() -> int:
     for frame in simulation:
         if frame.index < fall:
             continue
-        image = render(frame.gaussians, groups=frame.groups)  # [H, W, 3], on the device
+        image = render(frame.gaussians, groups=frame.groups).image  # [H, W, 3], on the device
         gf.io.save_image(image.cpu(), options.out / f"frame_{frame.index:03d}.png")
         sys.stdout.write(
             f"t = {frame.time:.3f} s: {frame.stats['fragments']} pieces, "

@@ -44,7 +44,7 @@ def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
     render = gf.pipeline.Render(camera, Light())
     simulation = gf.pipeline.Simulate(dx=0.025)(scene, fps=30, seconds=2 / 30)
     for frame in simulation:
-        image = render(frame.gaussians)
+        image = render(frame.gaussians).image
         assert image.shape == (48, 64, 3) and bool(image.isfinite().all())
         # the green ball is in the picture, before a white ground
         assert float((image[..., 1] - image[..., 0]).max()) > 0.1

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsfluent.colors import srgb_to_linear
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError, need
 from gsfluent.export.frames import Moment, upright
 from gsfluent.export.job import Job, span
 from gsfluent.export.points import deposit
 from gsfluent.io import atomic_path
-from gsfluent.io.gltf import to_linear
 from gsfluent.pipeline.matter.debris import REACH, clinging
 from gsfluent.pipeline.solid.colors import surface_colors
 
@@ -73,7 +73,7 @@ class Piece:
         import trimesh
 
         rgba = np.full((len(self.vertices), 4), 255, np.uint8)
-        rgba[:, :3] = np.round((to_linear(self.colors) if linear else self.colors) * 255.0)
+        rgba[:, :3] = np.round((srgb_to_linear(self.colors) if linear else self.colors) * 255.0)
         number = np.full(len(self.vertices), self.fragment, np.int32)
         return trimesh.Trimesh(
             self.vertices,

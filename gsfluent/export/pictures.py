@@ -12,7 +12,6 @@ from torch import Tensor
 from gsfluent.errors import InputError
 from gsfluent.export.job import Job, span
 from gsfluent.export.relit import lighting_for
-from gsfluent.pipeline.light.from_shot import gloss_of
 from gsfluent.pipeline.render.camera import Action
 from gsfluent.pipeline.render.film import Film, poster_frame
 from gsfluent.pipeline.render.path import FREEZE_SECONDS, Cut, freeze
@@ -89,9 +88,9 @@ class _Pictures:
             output = replace(output, size=options.size)
         self.size = output.size
         shot = replace(shot, output=output)
-        self.film = Film.of(job.out, shot, lighting_for(shot, options), job.device)
+        self.film = Film(job.out, shot, lighting_for(shot, options), job.device)
         if options.alpha:
-            self.film.render.studio = self.film.render.backdrop = None
+            self.film.render.studio = self.film.backdrop = None
             self.film.render.background = (0.0, 0.0, 0.0)
         cuts = [Cut(index, camera) for index, camera in enumerate(self.film.cameras)]
         if frozen:
@@ -117,14 +116,8 @@ class _Pictures:
         for done, cut in enumerate(self.cuts, start=1):
             if loaded is None or loaded.index != cut.frame:
                 loaded = self.film.frame(cut.frame)
-            layers = self.film.render.layers(
-                loaded.gaussians,
-                cut.camera,
-                groups=loaded.groups,
-                gloss=gloss_of(self.film.shot, loaded),
-                time=loaded.time,
-            )
-            image = straight(layers.image, layers.alpha) if self.job.options.alpha else layers.image
+            made = self.film.drawn(loaded.gaussians, loaded, cut.camera)
+            image = straight(made.image, made.alpha) if self.job.options.alpha else made.image
             yield to_bytes(image)
             self.job.report(done, len(self.cuts), kind)
 

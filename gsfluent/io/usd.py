@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 
 from gsfluent import geometry
+from gsfluent.colors import srgb_to_linear
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError, need
 from gsfluent.io.atomic import atomic_path
-from gsfluent.io.gltf import to_linear
 
 _THREE_SIGMA = 3.0
 
@@ -204,7 +204,7 @@ class UsdWriter:
         corners = np.ascontiguousarray(faces.reshape(-1), np.int32)
         prim.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(corners), time)
         # display colours of a stage are linear light
-        prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(to_linear(colors)), time)
+        prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(srgb_to_linear(colors)), time)
         prim.CreateExtentAttr().Set(_box(where, 0.0), time)
         self._seen[name].add(time)
 

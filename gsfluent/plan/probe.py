@@ -233,7 +233,7 @@ def figures_sample(out: Path, device: torch.device) -> Sample:
 
     shot = shot_of(out)
     start = time.perf_counter()
-    film = Film.of(out, shot, light_of(shot), device)
+    film = Film(out, shot, light_of(shot), device)
     first = film.frame(0)
     FilmFigures(first, film.around)
     if device.type == "cuda":

@@ -128,7 +128,7 @@ def measured(points: int, frames: int, slow: float, device: torch.device) -> dic
         frame = watch.timed("frame", lambda whole=whole: saved(whole, session.scene))
         watch.timed(
             "draw",
-            lambda frame=frame: render(frame.gaussians, camera, groups=frame.groups).cpu(),
+            lambda frame=frame: render(frame.gaussians, camera, groups=frame.groups).image.cpu(),
         )
         pieces = frame.facts["fragments"]
     wall = watch.now() - begun

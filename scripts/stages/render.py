@@ -22,7 +22,7 @@ def main(model: str, out: str, azimuth: str = "-60") -> None:
     radius = 0.5 * float((high - low).norm())
     camera = look_at((low + high) / 2, 4.0 * radius, float(azimuth), 20.0, (800, 600))
     studio = Studio(0.0, (0.0, 0.0), radius, radius)
-    save_image(gf.pipeline.Render(camera, Light(), studio=studio)(gaussians), out)
+    save_image(gf.pipeline.Render(camera, Light(), studio=studio)(gaussians).image, out)
 
 
 if __name__ == "__main__":

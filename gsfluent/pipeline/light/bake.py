@@ -19,8 +19,6 @@ from gsfluent.pipeline.light.occlusion import ambient_occlusion
 from gsfluent.pipeline.light.shade import shade_points, to_display, to_linear
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
 
-__all__ = ["bake_light"]
-
 _RESOLUTION = 1024
 # Splats deeper than this below the skin, in cells, look at the lamps from the skin above them.
 _LIFT = 1.0

@@ -18,8 +18,6 @@ from torch import Tensor
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light.shade import harmonics, to_linear
 
-__all__ = ["Coefficients", "of_file", "of_radiance", "sky_and_ground", "summed", "turned"]
-
 Coefficients = tuple[tuple[float, float, float], ...]
 
 # Share of each band that the cosine of Lambert's law keeps, over pi.

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from gsfluent.config import ObjectSettings, Shot
     from gsfluent.results.frames import SavedFrame
 
-__all__ = ["changed", "gloss_of", "light_of", "lighting_from", "looks_of"]
-
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
 

@@ -15,10 +15,8 @@ import torch
 from torch import Tensor
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.shade import DIRECTIONAL, LAMP, POINT, to_display, to_linear
+from gsfluent.pipeline.light.shade import DIRECTIONAL, LAMP, POINT
 from gsfluent.pipeline.light.shadow import disc
-
-__all__ = ["Lamp", "Light", "Lighting", "lighting_of", "to_display", "to_linear"]
 
 Vector = tuple[float, float, float]
 AMBIENT, INTENSITY, SPECULAR, SHININESS = 0.6, 0.55, 0.03, 24.0
@@ -142,7 +140,7 @@ class Lighting:
         shininess: n_s of Blinn-Phong on everything; None takes each material's own.
         resolution: Texels along the side of a shadow map; from the picture's size when None.
         delight: Share of the captured shading that is divided out first, 0 to 1
-            (:mod:`gsfluent.pipeline.light.delight`).
+            (:mod:`gsfluent.pipeline.light.albedo`).
     """
 
     lamps: tuple[Lamp, ...] = (Lamp(),)

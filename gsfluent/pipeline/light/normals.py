@@ -17,8 +17,6 @@ from gsfluent import ops
 from gsfluent.data import INTERIOR, Gaussians
 from gsfluent.pipeline.light.occlusion import COARSEST, PER_CELL, Occupancy, occupancy
 
-__all__ = ["Grid", "estimate_normals", "grid_for", "occupancy_cell", "splat_normals"]
-
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
 _MOST_NODES = 256

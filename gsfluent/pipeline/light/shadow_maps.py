@@ -28,8 +28,6 @@ from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shade import MAP
 from gsfluent.pipeline.light.shadow import ShadowMaps
 
-__all__ = ["Bulk", "bulk", "faces_of", "shadow_maps"]
-
 # Distance of a directional lamp's camera in scene radii.
 _FAR = 500.0
 # Free border of a map, as a share of the scene's radius.

@@ -23,8 +23,6 @@ from gsfluent.pipeline.light.shade import arriving, surface_points, to_display, 
 if TYPE_CHECKING:
     from gsfluent.pipeline.light.shadow_maps import Lit
 
-__all__ = ["Backdrop", "Behind", "covered_floor"]
-
 _NEAREST = 24  # splats that colour a covered spot
 _COLUMN = 0.9  # of the object's half width: the column whose inside nobody saw
 _PATCH = 40  # spots along the diameter of the covered disc

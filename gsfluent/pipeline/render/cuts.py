@@ -21,8 +21,6 @@ from gsfluent.pipeline.solid.colors import skin_colors, skin_weights
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
-__all__ = ["cut_view"]
-
 _GREY = 0.55  # of matter without colour
 _SMOOTH = 3.0  # voxels; whole voxels seen at their own size are stairs and terraces
 _MOST = 1.0  # voxels by which smoothing may move the outline

@@ -6,8 +6,6 @@ import numpy as np
 
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
-__all__ = ["color_copy", "telea_slices"]
-
 
 def color_copy(domain: InteriorDomain) -> InteriorTexture:
     """Colour of the nearest surface, as PhysGaussian gives its filled particles."""

@@ -13,8 +13,6 @@ from torch import Tensor
 
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
-__all__ = ["polish_colors"]
-
 _COARSE = 1.15  # voxels; Gaussians closer than this show the volume already when sampled
 
 

@@ -42,8 +42,6 @@ from gsfluent.progress import Progress, report_progress
 if TYPE_CHECKING:
     from gsfluent.data import Capture, Solid
 
-__all__ = ["METHODS", "Texture"]
-
 logger = logging.getLogger(__name__)
 
 METHODS = (

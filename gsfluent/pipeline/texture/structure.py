@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.sweep import Sweep, outline
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, smoothstep
-
-__all__ = ["Structure", "impose_structure", "split_structure", "take_apart", "with_structure"]
 
 _BINS = 32
 _NEAR = 16.0  # Lab distance within which the next depth of an inner half is the same material
@@ -126,7 +125,7 @@ def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float
     """The photograph with ``hole`` painted in given Lab colours and the grain from beside it."""
     from scipy import ndimage
 
-    from gsfluent.pipeline.texture.volume.color import lab_to_rgb
+    from gsfluent.colors import lab_to_rgb
 
     if not hole.any():
         return photo

@@ -20,8 +20,6 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.texture.volume.domain import axis_frame
 from gsfluent.pipeline.texture.volume.noise import value_noise
 
-__all__ = ["CUTS", "Sweep", "outline"]
-
 CUTS = ("across", "along")
 """How a photograph was cut, relative to the object's axis."""
 

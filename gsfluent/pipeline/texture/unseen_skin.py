@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsfluent.pipeline.texture.photo.exemplar import rgb_to_lab
+from gsfluent.colors import rgb_to_lab
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
-
-__all__ = ["mend_unseen_skin"]
 
 _DARK = 0.5  # lightness over that of the rest of the skin, below which an unseen place is shadow
 _FACING = 0.3  # cosine between outward normal and the closed side

@@ -115,7 +115,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Map:
         "toy", "Toy", Axis("x", "x", (0.5, 1.0, 2.0, 3.0, 4.0), 1.0),
         Axis("y", "y", ("a", "b"), "a"), ("gsfluent",), slope, "test_toy",
     )  # fmt: skip
-    monkeypatch.setitem(stability._MAPS, "toy", m)
+    monkeypatch.setattr(running, "all_maps", lambda: {"toy": m})
     RUNS.clear()
     return m
 

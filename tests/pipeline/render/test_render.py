@@ -12,10 +12,10 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, pack_lamps, to_display, to_linear
+from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import estimate_normals, grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import ambient_occlusion
-from gsfluent.pipeline.light.shade import shade_points, surface_points
+from gsfluent.pipeline.light.shade import shade_points, surface_points, to_display, to_linear
 from gsfluent.pipeline.light.shadow import transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, shadow_maps
 from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
@@ -51,19 +51,19 @@ def brightness(image: Tensor, row: int, column: int) -> float:
 
 
 def test_without_light_the_captured_colour_stays() -> None:
-    image = Render(front(), background=(0.0, 0.0, 0.0))(ball())
+    image = Render(front(), background=(0.0, 0.0, 0.0))(ball()).image
     assert brightness(image, SIZE // 2, SIZE // 2) == pytest.approx(0.5, abs=0.01)
 
 
 def test_default_light_is_mild_where_it_falls() -> None:
     light = Light(direction=(0.0, -1.0, 0.0), shadow=False)
-    image = Render(front(), light)(ball())
+    image = Render(front(), light)(ball()).image
     assert brightness(image, SIZE // 2, SIZE // 2) == pytest.approx(0.5, rel=0.12)
 
 
 def test_side_light_brightens_the_lit_side_only() -> None:
     light = Light(direction=(1.0, 0.0, 0.0), ambient=0.3, intensity=0.8, shadow=False)
-    image = Render(front(), light)(ball())
+    image = Render(front(), light)(ball()).image
     offset = SIZE // 5
     lit = brightness(image, SIZE // 2, SIZE // 2 + offset)
     dark = brightness(image, SIZE // 2, SIZE // 2 - offset)
@@ -114,8 +114,8 @@ def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
     studio = Studio(0.0, (0.0, 0.0), 0.2, 0.2)
     camera = Camera.look_at((0.0, -0.01, 3.0), (0.0, 0.0, 0.0), width=SIZE, height=SIZE, fov=20.0)
     high = ball(center=(0.0, 0.0, 0.3))
-    image = Render(camera, light, studio=studio)(high)
-    layers = Render(camera, light, studio=studio).layers(high)
+    layers = Render(camera, light, studio=studio)(high)
+    image = layers.image
     # light from +x at 45 degrees: the shadow's centre lies 0.3 m to the -x side
     ones = torch.ones(SIZE, SIZE)
     _, rays = surface_points(ones, camera.viewmat.float(), camera.K.float())
@@ -269,9 +269,9 @@ def test_nearest_sibling_alone_shades_a_pixel() -> None:
         torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
         opacities=0.5,
     )
-    alone = Render(front())(pair.select(torch.tensor([0])))
-    grouped = Render(front())(pair, groups=torch.tensor([7, 7], dtype=torch.int32))
-    plain = Render(front())(pair)
+    alone = Render(front())(pair.select(torch.tensor([0]))).image
+    grouped = Render(front())(pair, groups=torch.tensor([7, 7], dtype=torch.int32)).image
+    plain = Render(front())(pair).image
     middle = (SIZE // 2, SIZE // 2)
     torch.testing.assert_close(grouped[middle], alone[middle])
     assert not torch.allclose(plain[middle], alone[middle])

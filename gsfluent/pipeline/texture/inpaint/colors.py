@@ -15,8 +15,6 @@ from gsfluent.pipeline.texture.photo.profile import (
 )
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
-__all__ = ["initial_volume", "match_slices", "to_photo"]
-
 
 def match_slices(
     images: np.ndarray,

@@ -16,8 +16,6 @@ import torch
 from gsfluent.errors import InputError, need
 from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
 
-__all__ = ["lower_memory", "load_pipeline", "pick_device"]
-
 logger = logging.getLogger(__name__)
 
 

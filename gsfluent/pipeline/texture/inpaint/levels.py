@@ -12,8 +12,6 @@ import numpy as np
 from gsfluent.errors import InputError
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
-__all__ = ["coarse_domain", "enlarge", "fuse_stacks", "slice_positions"]
-
 
 def coarse_domain(domain: InteriorDomain, factor: int) -> InteriorDomain:
     """The domain at 1/factor of its resolution; depth in the new voxels."""

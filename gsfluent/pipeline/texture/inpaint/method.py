@@ -42,16 +42,6 @@ from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 from gsfluent.progress import Progress, report_progress
 
-__all__ = [
-    "InpaintOptions",
-    "Inpainter",
-    "SliceStore",
-    "diffusion_texture",
-    "inpaint_plan",
-    "inpaint_volume",
-    "make_inpainter",
-]
-
 logger = logging.getLogger(__name__)
 
 Photographs = Exemplar | Mapping[int, Exemplar | Sequence[Exemplar]] | None

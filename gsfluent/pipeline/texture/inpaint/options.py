@@ -8,8 +8,6 @@ from typing import Any
 
 from gsfluent.errors import InputError
 
-__all__ = ["BACKENDS", "InpaintOptions"]
-
 BACKENDS = ("diffusers", "command", "exemplar", "telea", "color")
 _CHOICES = {
     "backend": BACKENDS,

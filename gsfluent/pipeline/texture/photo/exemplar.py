@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
 from gsfluent.pipeline.texture.photo.light import (
     match_skin,
@@ -21,9 +22,6 @@ from gsfluent.pipeline.texture.photo.light import (
 from gsfluent.pipeline.texture.photo.mask import CUTOUTS, cut_out, strip_ground, trim_rim
 from gsfluent.pipeline.texture.photo.read import read_pixels
 from gsfluent.pipeline.texture.photo.stain import fill_holes, grey_share, recolor, remove_stain
-from gsfluent.pipeline.texture.volume.color import rgb_to_lab
-
-__all__ = ["Exemplar", "PhotoOptions", "load_exemplar", "open_exemplars", "rgb_to_lab", "with_skin"]
 
 logger = logging.getLogger(__name__)
 

@@ -6,17 +6,8 @@ import itertools
 
 import numpy as np
 
+from gsfluent.colors import linear_to_srgb, rgb_to_lab, srgb_to_linear
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.volume.color import linear, rgb_to_lab, srgb
-
-__all__ = [
-    "match_skin",
-    "remove_glints",
-    "remove_shading",
-    "remove_tint",
-    "shading_field",
-    "white_gains",
-]
 
 _WORK = 160  # pixels along the longest side while the shading is fitted
 _LEAST_SHADING = 0.10  # range of log luminance below which shading is left alone
@@ -53,7 +44,7 @@ def shading_field(
     factor = min(1.0, _WORK / max(height, width))
     size = (max(8, round(width * factor)), max(8, round(height * factor)))
     share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    light = cv2.resize(linear(image) * mask[..., None], size, interpolation=cv2.INTER_AREA)
+    light = cv2.resize(srgb_to_linear(image) * mask[..., None], size, interpolation=cv2.INTER_AREA)
     small = share > 0.98
     blur = 1.5
     norm = ndimage.gaussian_filter(share, blur) + 1e-6
@@ -178,7 +169,7 @@ def remove_shading(
         return image, None
     if size > _MOST_SHADING:
         return image, f"shading: left alone, too strong for a gradient of light ({size:.1f})"
-    even = srgb(linear(image) * np.exp(-field)[..., None])
+    even = linear_to_srgb(srgb_to_linear(image) * np.exp(-field)[..., None])
     return even, f"shading: light that changes by {100 * np.expm1(size):.0f} % across it evened out"
 
 
@@ -270,7 +261,8 @@ def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.
         tint = _planck(float(values[0])) / _planck(6504.0)
         return tint[1] / tint, f"light of {values[0]:.0f} K"
     if values.shape == (3,) and np.isfinite(values).all() and (values > 0).all():
-        shade = linear(values / 255.0 if values.max() > 1.0 else values).astype(float)
+        seen = (values / 255.0 if values.max() > 1.0 else values).astype(np.float32)
+        shade = srgb_to_linear(seen).astype(float)
         return shade[1] / np.maximum(shade, 1e-3), "the reference given"
     raise InputError(
         f"texture: white must be 1000 to 25000 kelvin or three positive numbers, got {white!r}",
@@ -293,7 +285,7 @@ def _ground_gains(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str]
     # dark grounds say nothing, clipped ones hide their tint, strong hues are paint and not light
     if middle[0] < 45.0 or even < 0.6 or not 2.0 < tint < 16.0 or pixels.max(1).mean() > 0.995:
         return np.ones(3), ""
-    shade = linear(np.median(pixels, axis=0)).astype(float)
+    shade = srgb_to_linear(np.median(pixels, axis=0)).astype(float)
     return shade[1] / shade, "its ground, which is nearly neutral"
 
 
@@ -335,7 +327,8 @@ def remove_tint(
     if not source or float(np.abs(gains - 1.0).max()) < 0.01:
         return image, None
     shown = ", ".join(f"{g:.2f}" for g in gains)
-    return srgb(linear(image) * gains.astype(np.float32)), f"white balance from {source} ({shown})"
+    even = linear_to_srgb(srgb_to_linear(image) * gains.astype(np.float32))
+    return even, f"white balance from {source} ({shown})"
 
 
 def match_skin(
@@ -368,7 +361,8 @@ def match_skin(
             f"white: the photograph's rim is not the object's skin (chroma {chroma[0]:.0f} and "
             f"{chroma[1]:.0f}, hues {turn:.0f} degrees apart)"
         )
-    gains = linear(wanted) / np.maximum(linear(seen), 1e-3)
+    gains = srgb_to_linear(wanted) / np.maximum(srgb_to_linear(seen), 1e-3)
     gains = np.clip(gains / gains[1], 0.5, 2.0)
     shown = ", ".join(f"{g:.2f}" for g in gains)
-    return srgb(linear(image) * gains), f"white balance from the object's skin ({shown})"
+    even = linear_to_srgb(srgb_to_linear(image) * gains)
+    return even, f"white balance from the object's skin ({shown})"

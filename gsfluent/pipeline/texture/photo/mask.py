@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfluent.pipeline.texture.volume.color import rgb_to_lab
-
-__all__ = ["CUTOUTS", "cut_out", "largest_piece", "strip_ground", "trim_rim"]
+from gsfluent.colors import rgb_to_lab
 
 CUTOUTS = ("auto", "ground", "grabcut", "none")
 

@@ -11,23 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.colors import rgb_to_lab
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
-
-__all__ = [
-    "Slice",
-    "depth_profile_difference",
-    "depth_profile_error",
-    "half_size",
-    "lab_histogram_distance",
-    "neighbour_change",
-    "neighbour_slice_ratio",
-    "patch_distance",
-    "patch_neighbours",
-    "radial_ratio",
-    "sharpness",
-    "volume_slices",
-]
 
 Slice = tuple[np.ndarray, np.ndarray]
 """An image [H, W, 3] in 0..1 and its mask [H, W]."""

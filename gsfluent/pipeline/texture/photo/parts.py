@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
-
-__all__ = ["read_parts", "resized_parts"]
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 
 _LIKE = 25.0  # Lab distance up to which a pixel has the named colour
 

@@ -7,8 +7,6 @@ import numpy as np
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
-__all__ = ["depth_profile", "match_colors", "profile_volume", "surface_profile"]
-
 
 def depth_profile(exemplar: Exemplar, bins: int = 48) -> tuple[np.ndarray, np.ndarray]:
     """Mean colour per depth of a photograph.

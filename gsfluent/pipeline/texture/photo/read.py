@@ -8,8 +8,6 @@ import numpy as np
 
 from gsfluent.errors import InputError
 
-__all__ = ["read_pixels"]
-
 _LARGEST = 1024  # pixels; exemplars are reduced to voxel pitch anyway
 _SMALLEST = 16
 

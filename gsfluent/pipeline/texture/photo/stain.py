@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfluent.pipeline.texture.volume.color import lab_to_rgb, rgb_to_lab
+from gsfluent.colors import lab_to_rgb, rgb_to_lab
 from gsfluent.pipeline.texture.volume.domain import smoothstep
-
-__all__ = ["fill_holes", "grey_share", "remove_stain", "recolor"]
 
 _GREY = 8.0  # Lab chroma below which a pixel counts as grey
 _CAVITY = 0.65  # light at the bottom of a small cavity relative to its rim

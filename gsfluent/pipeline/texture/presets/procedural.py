@@ -15,8 +15,6 @@ from gsfluent.pipeline.texture.presets import matter as presets_matter
 from gsfluent.pipeline.texture.presets.tools import Preset
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, axis_frame
 
-__all__ = ["PRESETS", "preset_names", "procedural_texture"]
-
 _CHUNK = 32_000
 """Points evaluated at a time: their fifty numbers each should stay in the cache."""
 

@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["Preset", "layers", "mix", "paint"]
-
 Preset = Callable[[np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]]
 """``f(points [n, 3], depth [n], seed) -> (rgb [n, 3], key [n])``; key 0 is the matrix, any other
 number is that of one inclusion (equal for all its points, whatever else is asked)."""

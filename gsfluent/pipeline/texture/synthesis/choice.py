@@ -13,12 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent.pipeline.texture.photo.exemplar import rgb_to_lab
+from gsfluent.colors import rgb_to_lab
 from gsfluent.pipeline.texture.photo.metrics import lab_histogram_distance
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient
-
-__all__ = ["surface_verdict"]
 
 _PATCH = 5
 _ALLOWED = 1.5  # times the distance between the halves of the photograph

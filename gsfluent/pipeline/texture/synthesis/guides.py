@@ -18,11 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsfluent.colors import rgb_to_lab100
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
-from gsfluent.pipeline.texture.volume.color import rgb_to_lab100
-
-__all__ = ["GUIDES", "DepthGuide", "PlacedPhoto", "explained", "place_photo"]
 
 logger = logging.getLogger(__name__)
 

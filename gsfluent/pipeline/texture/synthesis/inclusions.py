@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, rgb_to_lab
+from gsfluent.colors import rgb_to_lab
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient
-
-__all__ = ["Inclusions", "find_inclusions", "paint_inclusions", "remove_inclusions"]
 
 logger = logging.getLogger(__name__)
 

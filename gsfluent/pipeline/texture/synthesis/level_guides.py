@@ -7,13 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.colors import rgb_to_lab100
 from gsfluent.pipeline.texture.synthesis.bank import LevelPhoto
 from gsfluent.pipeline.texture.synthesis.guides import DepthGuide, PlacedPhoto
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 from gsfluent.pipeline.texture.synthesis.sections import Section
-from gsfluent.pipeline.texture.volume.color import rgb_to_lab100
-
-__all__ = ["LevelGuides"]
 
 _PER_VOXEL = 0.08  # guide weight of a cell of height or of distance to the axis
 _SECTION_WEIGHT = 3.0  # against the 75 values of a patch: structure leads, texture decides

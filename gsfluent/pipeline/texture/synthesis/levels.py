@@ -17,8 +17,6 @@ from torch.nn import functional
 
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, axis_frame
 
-__all__ = ["Lattice", "ObjectFields", "hashed", "hashed_noise", "nearest_inside", "pad_edges"]
-
 _COARSEST = 16.0  # voxels per object size (cube root of the volume) at the first level
 _SLAB = 1 << 21  # points sampled at once
 

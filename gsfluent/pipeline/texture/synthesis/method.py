@@ -29,8 +29,6 @@ from gsfluent.pipeline.texture.synthesis.pyramid import synthesize_pyramid, to_g
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 from gsfluent.progress import Progress
 
-__all__ = ["CORES", "QUALITIES", "SURFACES", "exemplar_texture", "load_exemplars"]
-
 logger = logging.getLogger(__name__)
 
 QUALITIES: dict[str, Schedule] = {

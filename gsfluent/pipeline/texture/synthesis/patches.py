@@ -15,12 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.colors import lab100_to_rgb, rgb_to_lab100
 from gsfluent.pipeline.texture.synthesis.bank import Bank, LevelPhoto
 from gsfluent.pipeline.texture.synthesis.levels import hashed, nearest_inside
 from gsfluent.pipeline.texture.synthesis.transport import match_near, polish_patches
-from gsfluent.pipeline.texture.volume.color import lab100_to_rgb, rgb_to_lab100
-
-__all__ = ["Schedule", "SynthesisLevel", "project_slice", "synthesize_level"]
 
 logger = logging.getLogger(__name__)
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.colors import lab100_to_rgb, rgb_to_lab100
 from gsfluent.pipeline.texture.synthesis.bank import Bank, LevelPhoto
 from gsfluent.pipeline.texture.synthesis.guides import DepthGuide, PlacedPhoto
 from gsfluent.pipeline.texture.synthesis.level_guides import LevelGuides
@@ -22,10 +23,7 @@ from gsfluent.pipeline.texture.synthesis.levels import (
 from gsfluent.pipeline.texture.synthesis.patches import Schedule, SynthesisLevel, synthesize_level
 from gsfluent.pipeline.texture.synthesis.sections import Section
 from gsfluent.pipeline.texture.synthesis.transport import Cells
-from gsfluent.pipeline.texture.volume.color import lab100_to_rgb, rgb_to_lab100
 from gsfluent.progress import Progress, report_progress
-
-__all__ = ["synthesize_pyramid", "to_grid"]
 
 _PARTS = 96  # parts of the guide's space over which the photographs' pixels are spread
 _PATCH = 7  # patches whose statistics are matched

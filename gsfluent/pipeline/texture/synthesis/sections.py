@@ -16,8 +16,6 @@ from torch.nn import functional
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto, explained
 from gsfluent.pipeline.texture.synthesis.levels import trilinear
 
-__all__ = ["Section"]
-
 _TURNS, _RADII, _DEPTHS, _STEPS = 180, 64, 48, 160  # of the lookup
 _FINE_TURNS, _FINE_STEPS = 1080, 256  # of pictures
 

@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["Cells", "match_near", "polish_patches"]
-
 _KNOTS = 65
 _LEAST = 96  # samples a part of the guide's space must hold on both sides
 

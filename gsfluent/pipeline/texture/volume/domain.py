@@ -10,15 +10,6 @@ import numpy as np
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
-__all__ = [
-    "InteriorDomain",
-    "InteriorTexture",
-    "axis_frame",
-    "blend_skin",
-    "gradient",
-    "smoothstep",
-]
-
 SHELL = 1.6
 """Depth [voxels] down to which the colour is that of the surface splats."""
 BLEND = 3.0

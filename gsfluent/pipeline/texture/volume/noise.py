@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["Cells", "cells", "fractal", "gradient_noise", "value_noise"]
-
 
 def _hash(x: np.ndarray, y: np.ndarray, z: np.ndarray, seed: int) -> np.ndarray:
     """Well mixed uint32 of integer coordinates (multiply, fold, multiply)."""

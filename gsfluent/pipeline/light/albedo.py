@@ -30,8 +30,6 @@ from gsfluent.pipeline.light.shade import harmonics, to_display, to_linear
 if TYPE_CHECKING:
     from gsfluent.results.frames import SavedFrame
 
-__all__ = ["Delighting", "Delit", "delight", "estimate_shading"]
-
 _SAMPLES = 3000  # splats that the light is estimated from
 _PARTNERS = 40  # pairs per splat
 # Spread of chromaticities that are one paint: coloured light tints paint, so not too narrow.
@@ -44,7 +42,7 @@ _FEWEST = 100  # splats that light can be estimated from
 _SEED = 0
 
 
-class Delighting(NamedTuple):
+class Shading(NamedTuple):
     """The light of a capture.
 
     Attributes:
@@ -60,7 +58,7 @@ class Delighting(NamedTuple):
 
 
 @torch.no_grad()
-def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> Delighting:
+def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> Shading:
     """Estimate the light that the colours were captured in.
 
     Args:
@@ -78,7 +76,7 @@ def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> 
     even = torch.zeros(9, dtype=torch.float64, device=grey.device)
     even[0] = 1.0 / 0.28209479177387814
     if index.numel() < _FEWEST:
-        return Delighting(even[:, None].expand(9, 3), 0.0, (0.0, 0.0))
+        return Shading(even[:, None].expand(9, 3), 0.0, (0.0, 0.0))
     generator = torch.Generator().manual_seed(_SEED)
     picked = torch.randperm(index.numel(), generator=generator)[:_SAMPLES].to(index.device)
     index = index[picked]
@@ -97,12 +95,12 @@ def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> 
     rest = target - light.log()[first] + light.log()[second]
     sure = alike > 0.5
     before, after = (values[sure].abs().median() for values in (target, rest))
-    return Delighting(found, float(light.mean(-1).std()), (float(before), float(after)))
+    return Shading(found, float(light.mean(-1).std()), (float(before), float(after)))
 
 
-def delight(
+def to_albedo(
     gaussians: Gaussians,
-    shading: Delighting | None = None,
+    shading: Shading | None = None,
     *,
     strength: float = 1.0,
     normals: Tensor | None = None,
@@ -154,7 +152,7 @@ def _solve(
     return found
 
 
-class Delit:
+class Albedo:
     """The captured light of a film's objects, found in its first frame, while they are whole.
 
     Each body has a light of its own, because events turn bodies before they move. Splats that the
@@ -179,7 +177,7 @@ class Delit:
                 continue
             mine = (body == number).nonzero()[:, 0]
             part = gaussians.select(mine)
-            after = delight(part, strength=strength, normals=normals[mine]).colors()
+            after = to_albedo(part, strength=strength, normals=normals[mine]).colors()
             factor[mine] = after / before[mine].clamp(min=1.0 / 255.0)
         # by number of the splat, and by point for splats that come later
         known = (first.ids >= 0) & (body >= 0)
