@@ -40,9 +40,9 @@ Reader = Callable[[Any, Place], Any]
 
 def key(
     read: Reader,
-    *,
     doc: str,
     example: str,
+    *,
     default: Any = dataclasses.MISSING,
     name: str = "",
     old: str = "",
@@ -61,6 +61,11 @@ def key(
     if default is not dataclasses.MISSING and default.__class__.__hash__ is None:
         return dataclasses.field(default_factory=lambda: dict(default), metadata=facts)
     return dataclasses.field(default=default, metadata=facts)
+
+
+def optional(read: Reader, doc: str, example: str, *, name: str = "") -> Any:
+    """Declare a setting that is None when its key is absent."""
+    return key(read, doc, example, default=None, name=name)
 
 
 def key_name(field: dataclasses.Field[Any]) -> str:
@@ -246,14 +251,21 @@ def typed(value: Any, place: Place, known: Mapping[str, type[Any]], noun: str) -
     return tuple(found)
 
 
-def either_of(settings: Any, names: tuple[str, str], place: Place) -> None:
+def typed_dict(settings: Any, known: Mapping[str, type[Any]]) -> dict[str, Any]:
+    """Turn a section that :func:`typed` has read back into what the shot file has."""
+    kind = next(name for name, cls in known.items() if type(settings) is cls)
+    return without_none({"type": kind, **plain(settings)})
+
+
+def either_of(
+    settings: Any, names: tuple[str, str], place: Place, hint: str = "keep one of them"
+) -> None:
     """Refuse a section that has both or neither of two keys."""
     first, second = (getattr(settings, name) is not None for name in names)
     if first == second:
         got = "both" if first else "neither"
         raise InputError(
-            f"{place.path} must have either {names[0]!r} or {names[1]!r}, got {got}",
-            "keep one of them",
+            f"{place.path} must have either {names[0]!r} or {names[1]!r}, got {got}", hint
         )
 
 
@@ -318,10 +330,14 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def given(settings: Any) -> dict[str, Any]:
-    """Return the fields of a section that are set (not None), by field name."""
-    pairs = ((field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings))
-    return {name: value for name, value in pairs if value is not None}
+class Section:
+    """Base of sections whose settings are passed on as far as they are set."""
+
+    def given(self) -> dict[str, Any]:
+        """Return the fields that are set (not None), by field name."""
+        names = (field.name for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        pairs = ((name, getattr(self, name)) for name in names)
+        return {name: value for name, value in pairs if value is not None}
 
 
 def without_none(value: Any) -> Any:
