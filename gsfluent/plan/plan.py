@@ -75,21 +75,13 @@ def cost_model(
 
 @dataclasses.dataclass(frozen=True)
 class Prospect:
-    """A shot with a proxy of its solids: everything that does not hang on the size of the cells.
+    """A shot with a proxy of its solids: everything that does not hang on the size of the cells."""
 
-    Attributes:
-        shot: The shot.
-        proxy: Proxies of its objects.
-        scene: Its scene with them.
-        frames: Frames.
-        warnings: What was not known.
-    """
-
-    shot: Shot
-    proxy: Proxy
-    scene: Scene
-    frames: int
-    warnings: tuple[str, ...]
+    shot: Shot  # The shot
+    proxy: Proxy  # Proxies of its objects
+    scene: Scene  # Its scene with them
+    frames: int  # Frames
+    warnings: tuple[str, ...]  # What was not known
 
     @classmethod
     def of(cls, shot: Shot) -> Prospect:

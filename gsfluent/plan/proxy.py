@@ -41,40 +41,24 @@ over the two of the gallery without masks (apple 0.81, skull 0.70)."""
 
 @dataclasses.dataclass(frozen=True)
 class Photographs:
-    """What training will look at.
+    """What training will look at."""
 
-    Attributes:
-        images: How many photographs.
-        source_pixels: Pixels of all their files.
-        pixels: Pixels of one at the size of training, mean.
-        object_pixels: Those of the part that shows the object, mean.
-        masked: Whether there are masks.
-    """
-
-    images: int
-    source_pixels: float
-    pixels: float
-    object_pixels: float
-    masked: bool
+    images: int  # How many photographs
+    source_pixels: float  # Pixels of all their files
+    pixels: float  # Pixels of one at the size of training, mean
+    object_pixels: float  # Those of the part that shows the object, mean
+    masked: bool  # Whether there are masks
 
 
 @dataclasses.dataclass(frozen=True)
 class Proxy:
-    """What a shot is planned with before there is any reconstruction.
+    """What a shot is planned with before there is any reconstruction."""
 
-    Attributes:
-        solids: Solid of each object by name, in the coordinates of the input.
-        frame: From there to the scene.
-        assumed: Where they come from, in words.
-        photographs: None when the shot starts from splats.
-        splats: Splats of the object, when they are known.
-    """
-
-    solids: Mapping[str, Solid]
-    frame: Frame
-    assumed: str
-    photographs: Photographs | None = None
-    splats: int | None = None
+    solids: Mapping[str, Solid]  # Solid of each object by name, in the coordinates of the input
+    frame: Frame  # From there to the scene
+    assumed: str  # Where they come from, in words
+    photographs: Photographs | None = None  # None when the shot starts from splats
+    splats: int | None = None  # Splats of the object, when they are known
 
 
 def proxy(shot: Shot, warnings: list[str]) -> Proxy:
