@@ -28,17 +28,6 @@ from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import solver_options
 
-__all__ = [
-    "LEVELS",
-    "Growth",
-    "Probing",
-    "Probes",
-    "choose",
-    "choose_setting",
-    "run_probes",
-    "summary",
-]
-
 _log = logging.getLogger(__name__)
 
 LEVELS = (10, 14, 20)

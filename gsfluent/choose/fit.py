@@ -17,8 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ORDERS", "Fit", "History", "fit_histories", "fit_history"]
-
 Array = NDArray[np.float64]
 
 ORDERS = (0.5, 2.0)

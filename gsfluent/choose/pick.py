@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from gsfluent.choose.fit import Fit
 
-__all__ = ["CELLS", "SURE", "Choice", "Setting", "pick", "ranked"]
-
 Array = NDArray[np.float64]
 
 CELLS = (8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 128)

@@ -42,8 +42,6 @@ from gsfluent.progress import Progress
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import build_scene
 
-__all__ = ["cost_model", "plan_shot"]
-
 
 def cost_model(
     device: torch.device | str,

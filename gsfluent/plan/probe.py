@@ -36,8 +36,6 @@ from gsfluent.progress import Progress, quiet_logs, report_progress
 from gsfluent.stages.chain import run_stages
 from gsfluent.stages.solids import context_of
 
-__all__ = ["FEATURES", "calibrate"]
-
 _log = logging.getLogger(__name__)
 
 FEATURES: dict[str, tuple[str, ...]] = {

@@ -29,8 +29,6 @@ from gsfluent.stages.select import select_mask
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Photographs", "Proxy", "look_at_photographs", "proxy"]
-
 _VOXELS = 48
 _MARGIN = 8
 """Pixels that training keeps around a mask."""
