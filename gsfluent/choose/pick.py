@@ -125,10 +125,7 @@ def _band(fit: Fit, size: float, spread: Mapping[str, float]) -> float:
 
 
 def _mean(
-    fit: Fit,
-    size: float,
-    growth: Mapping[str, float],
-    added: Mapping[str, tuple[float, float]],
+    fit: Fit, size: float, growth: Mapping[str, float], added: Mapping[str, tuple[float, float]]
 ) -> Array:
     """Drawn errors of the mean of many runs at a setting, over the whole shot, [D]."""
     more, at = added.get(fit.name, (0.0, size))

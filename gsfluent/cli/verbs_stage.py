@@ -235,7 +235,5 @@ class Mesh(Verb):
 
         existing(self.input, "INPUT")
         return mesh_to(
-            self.input,
-            self.out,
-            **self.given("capture", "method", "resolution", "scale"),
+            self.input, self.out, **self.given("capture", "method", "resolution", "scale")
         )

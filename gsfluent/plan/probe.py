@@ -186,15 +186,9 @@ def run_small(
                 "image_size": size.image_size,
             },
             "fill": {"resolution": size.resolution},
-            "texture": {
-                "method": "exemplar",
-                "exemplar": str(folder / "photographs" / "cut.png"),
-            },
+            "texture": {"method": "exemplar", "exemplar": str(folder / "photographs" / "cut.png")},
             "objects": {"melon": {"material": size.material}},
-            "events": [
-                {"type": "drop", "height": 0.01},
-                {"type": "throw", "velocity": [0, 0, -4]},
-            ],
+            "events": [{"type": "drop", "height": 0.01}, {"type": "throw", "velocity": [0, 0, -4]}],
             "solve": {"quality": "preview", "cells": size.cells},
             "output": {"fps": fps, "seconds": size.frames / fps, "size": list(size.picture)},
         }

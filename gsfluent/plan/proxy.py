@@ -162,11 +162,7 @@ def look_at_photographs(
 
 
 def _carved(
-    shot: Shot,
-    capture: Capture,
-    grid: np.ndarray,
-    inside: np.ndarray,
-    photographs: Photographs,
+    shot: Shot, capture: Capture, grid: np.ndarray, inside: np.ndarray, photographs: Photographs
 ) -> Proxy:
     """Proxies from the voxels of a hull, selected as the splats of a run are."""
     occupied = torch.from_numpy(inside)
