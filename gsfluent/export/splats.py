@@ -142,10 +142,6 @@ class Constant:
 
     Iterating gives :class:`Moment`; rows are sorted by id. Axes keep their names and quaternions
     their sign from frame to frame, so that a player may interpolate.
-
-    Args:
-        sequence: The chosen frames; read twice.
-        progress: Called per frame of the first reading.
     """
 
     def __init__(self, sequence: FrameSequence, progress: Progress | None = None) -> None:

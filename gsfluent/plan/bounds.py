@@ -170,11 +170,7 @@ def budget_spacing(
 
 
 def choose_cells(cost: Callable[[int], float], budget: float) -> int:
-    """Most cells along the largest body whose frames keep to a budget.
-
-    Args:
-        cost: Seconds of a frame at so many cells; grows with them.
-        budget: Seconds there are.
+    """Most cells along the largest body whose frames keep to a budget [s]; cost grows with them.
 
     Raises:
         InputError: Not even the coarsest grid keeps to it.

@@ -200,13 +200,6 @@ def learn(
 ) -> CostModel:
     """Correct the stored model of a device by a finished run.
 
-    Args:
-        model: The model that the plan was made with, taken where none is stored any more.
-        plan: The plan.
-        values: ``run.json``.
-        device: Where it ran.
-        folder: Where the model is stored, if not in the user's cache.
-
     Returns:
         The corrected model, which has been stored.
     """

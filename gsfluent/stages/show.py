@@ -100,16 +100,7 @@ def render_again(
 ) -> dict[str, Any]:
     """Render a finished simulation with another camera, light or size.
 
-    Args:
-        out: Folder of the run.
-        device: Where to render.
-        to: Video (.mp4) or picture (.png); ``render.mp4`` or ``render.png`` in ``out`` by default.
-        camera: ``orbit``, a photograph's index, or a JSON file; the shot's own by default.
-        size: (width, height) [px].
-        frame: Only this frame.
-        progress: Called per frame.
-        light: Changes to the light, as :func:`gsfluent.pipeline.light.from_shot.changed`
-        takes them.
+    Arguments as the options of ``gsfluent render`` (docs/guide/light-and-video.md).
 
     Returns:
         ``output``, ``frames`` and ``seconds_per_frame``.

@@ -33,11 +33,6 @@ _STEEL_ROWS = 2**40
 def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     """The scene of a shot: its solids with their materials, the floor, and the events.
 
-    Args:
-        shot: The shot.
-        solids: Solid of each object by name.
-        frame: World to scene.
-
     Raises:
         InputError: A material, part or event that cannot be.
     """

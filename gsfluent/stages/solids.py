@@ -283,15 +283,7 @@ def _with_labels(solid: Solid, path: Path) -> Solid:
 def context_of(
     shot: Shot, out: Path, device: torch.device | str, seed: int, reporter: Reporter | None = None
 ) -> RunContext:
-    """What stages need to take up, or to begin, a run in a folder; nothing is done or written yet.
-
-    Args:
-        shot: The shot.
-        out: Folder of the run.
-        device: Where the stages compute.
-        seed: Seed of everything random.
-        reporter: Receives progress; log lines by default.
-    """
+    """What stages need to take up, or to begin, a run in a folder; nothing is written yet."""
     device = torch.device(device)
     record = RunRecord(out / "run.json", shot.resolved(), device, seed)
     store = StageStore(out / "stages")
