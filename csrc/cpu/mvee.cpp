@@ -10,17 +10,6 @@
 namespace gsf {
 namespace {
 
-template <typename T>
-Vec3<T> load_point(const T* p) {
-  return {p[0], p[1], p[2]};
-}
-template <typename T>
-void store_point(T* p, const Vec3<T>& v) {
-  p[0] = v.x;
-  p[1] = v.y;
-  p[2] = v.z;
-}
-
 // The largest value reported so far.
 void report(int64_t* to, int64_t value) {
   const std::atomic_ref<int64_t> most(*to);
@@ -39,7 +28,7 @@ struct MveeCpu {
         const Ellipsoid<T> fit =
             mvee_fit(SerialTeam{}, a.points + 3 * a.count * i, static_cast<int>(a.count),
                      scratch.data(), a.tolerance, a.max_iterations);
-        store_point(a.center + 3 * i, fit.center);
+        store_vec3(a.center + 3 * i, fit.center);
         store_mat3(a.shape + 9 * i, to_mat3(fit.shape));
       }
     });
@@ -50,7 +39,7 @@ struct MveeCpu {
     parallel_for(a.batch, 16, [&](int64_t begin, int64_t end) {
       FitPoint<T> points[kLensPoints];
       for (int64_t i = begin; i < end; ++i) {
-        const Vec3<T> mean_a = load_point(a.mean_a + 3 * i), mean_b = load_point(a.mean_b + 3 * i);
+        const Vec3<T> mean_a = load_vec3(a.mean_a + 3 * i), mean_b = load_vec3(a.mean_b + 3 * i);
         const Sym3<T> cov_a = load_sym3(a.covariance_a + 6 * i);
         const Sym3<T> cov_b = load_sym3(a.covariance_b + 6 * i);
         const int fault_a = lens_fault(mean_a, cov_a), fault_b = lens_fault(mean_b, cov_b);
@@ -59,7 +48,7 @@ struct MveeCpu {
         if (fault_a != kSound || fault_b != kSound) continue;
         const LensResult<T> r =
             gsf::mvee_lens(mean_a, cov_a, mean_b, cov_b, a.radius, a.flat, points);
-        store_point(a.mean + 3 * i, r.mean);
+        store_vec3(a.mean + 3 * i, r.mean);
         store_sym3(a.covariance + 6 * i, r.covariance);
         a.overlap[i] = r.overlap;
       }

@@ -2,34 +2,18 @@
 // blend loop needs. GCC and clang compile it to AVX, NEON or scalar code.
 #pragma once
 
-#include <cmath>
-#include <cstdint>
-#include <cstring>
-
 #ifdef __AVX__
 #include <immintrin.h>
 #endif
 
+#include "cpu/pack.h"
+
 namespace gsf {
 
 template <typename T>
-struct PackOf;
-template <>
-struct PackOf<float> {
-  using Type = float __attribute__((vector_size(32)));
-  using Mask = int32_t __attribute__((vector_size(32)));
-  static constexpr int kLanes = 8;
-};
-template <>
-struct PackOf<double> {
-  using Type = double __attribute__((vector_size(32)));
-  using Mask = int64_t __attribute__((vector_size(32)));
-  static constexpr int kLanes = 4;
-};
+using Pack = typename cpu::PackTypes<T>::Raw;
 template <typename T>
-using Pack = typename PackOf<T>::Type;
-template <typename T>
-using PackMask = typename PackOf<T>::Mask;
+using PackMask = typename cpu::PackTypes<T>::Int;
 
 template <typename T>
 inline Pack<T> splat_pack(T x) {
@@ -49,25 +33,7 @@ inline void store_pack(T* p, const V& v) {
   std::memcpy(p, &v, sizeof v);
 }
 
-// Sign bit of every lane; for a comparison result, the lanes where it holds.
-inline unsigned lane_bits(PackMask<float> m) {
-#ifdef __AVX__
-  return static_cast<unsigned>(_mm256_movemask_ps(reinterpret_cast<__m256>(m)));
-#else
-  unsigned bits = 0;
-  for (int i = 0; i < 8; ++i) bits |= static_cast<unsigned>(m[i] < 0) << i;
-  return bits;
-#endif
-}
-inline unsigned lane_bits(PackMask<double> m) {
-#ifdef __AVX__
-  return static_cast<unsigned>(_mm256_movemask_pd(reinterpret_cast<__m256d>(m)));
-#else
-  unsigned bits = 0;
-  for (int i = 0; i < 4; ++i) bits |= static_cast<unsigned>(m[i] < 0) << i;
-  return bits;
-#endif
-}
+using cpu::mask_bits;
 
 template <typename T>
 inline Pack<T> pack_max(Pack<T> a, Pack<T> b) {
@@ -79,19 +45,8 @@ inline Pack<T> pack_min(Pack<T> a, Pack<T> b) {
 }
 template <typename T>
 inline Pack<T> pack_sqrt(Pack<T> a) {
-  for (int i = 0; i < PackOf<T>::kLanes; ++i) a[i] = std::sqrt(a[i]);
-  return a;
+  return cpu::sqrt(cpu::Pack<T>(a)).v;
 }
-#ifdef __AVX__
-template <>
-inline Pack<float> pack_sqrt<float>(Pack<float> a) {
-  return _mm256_sqrt_ps(a);
-}
-template <>
-inline Pack<double> pack_sqrt<double>(Pack<double> a) {
-  return _mm256_sqrt_pd(a);
-}
-#endif
 
 template <typename T>
 inline Pack<T> pack_abs(Pack<T> a) {
@@ -101,7 +56,7 @@ inline Pack<T> pack_abs(Pack<T> a) {
 template <typename T>
 inline T pack_sum(Pack<T> a) {
   T s = T(0);
-  for (int i = 0; i < PackOf<T>::kLanes; ++i) s += a[i];
+  for (int i = 0; i < cpu::Pack<T>::kLanes; ++i) s += a[i];
   return s;
 }
 template <>
@@ -114,7 +69,7 @@ inline float pack_sum<float>(Pack<float> a) {
 template <typename T>
 inline Pack<T> pack_sums(const Pack<T>* v) {
   Pack<T> sums{};
-  for (int k = 0; k < PackOf<T>::kLanes; ++k) sums[k] = pack_sum<T>(v[k]);
+  for (int k = 0; k < cpu::Pack<T>::kLanes; ++k) sums[k] = pack_sum<T>(v[k]);
   return sums;
 }
 #ifdef __AVX__

@@ -11,7 +11,7 @@
 namespace gsf::raster_cpu {
 
 template <typename T>
-inline constexpr int kLanes = PackOf<T>::kLanes;
+inline constexpr int kLanes = cpu::Pack<T>::kLanes;
 // Blocks of kLanes pixels in a row; block index = column * kTileEdge + row.
 template <typename T>
 inline constexpr int kColumns = kTileEdge / kLanes<T>;
@@ -52,7 +52,7 @@ struct SplatRows {
       for (int column = 0; column < kColumns<T>; ++column) {
         const T x0 = T(column * kLanes<T>) + T(0.5);
         const auto reached = (high >= x0) & (low <= x0 + T(kLanes<T> - 1)) & (rest > T(0));
-        bits |= static_cast<uint64_t>(lane_bits(reached)) << (column * kTileEdge + r);
+        bits |= static_cast<uint64_t>(mask_bits(reached)) << (column * kTileEdge + r);
       }
     }
     return bits;
@@ -122,7 +122,7 @@ struct BlockWalk {
     }
     PackMask<T> sign;
     std::memcpy(&sign, &next, sizeof sign);
-    if (lane_bits(sign) == (1u << kLanes<T>)-1) alive &= ~(uint64_t(1) << block);
+    if (mask_bits(sign) == (1u << kLanes<T>)-1) alive &= ~(uint64_t(1) << block);
     return r;
   }
 };
