@@ -20,59 +20,35 @@ Value = float | str
 
 @dataclass(frozen=True)
 class Cell:
-    """One point of a map.
+    """One point of a map."""
 
-    Attributes:
-        step: Steps to the first violation, None where it held.
-        letter: Of the kind of violation.
-    """
-
-    step: int | None
-    letter: str = ""
+    step: int | None  # steps to the first violation, None where it held
+    letter: str = ""  # of the kind of violation
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A named point, such as where another program stands.
+    """A named point, such as where another program stands."""
 
-    Attributes:
-        x: Value of the horizontal axis, a number between two of its values too.
-        y: Of the vertical one.
-        name: Its words.
-    """
-
-    x: Value
-    y: Value
-    name: str
+    x: Value  # value of the horizontal axis, a number between two of its values too
+    y: Value  # of the vertical one
+    name: str  # its words
 
 
 @dataclass(frozen=True)
 class Plane:
-    """One panel.
+    """One panel."""
 
-    Attributes:
-        title: Over it.
-        subtitle: Under the title: the variant.
-        x_label: Words of the horizontal axis.
-        y_label: Words of the vertical axis.
-        xs: Values along x, [X]: rising numbers, or words.
-        ys: Values along y, [Y].
-        cells: (column, row) -> cell; what is missing was not run.
-        limit: Steps that a run had at most.
-        star: Column and row of the default, or None.
-        marks: Named points.
-    """
-
-    title: str
-    subtitle: str
-    x_label: str
-    y_label: str
-    xs: Sequence[Value]
-    ys: Sequence[Value]
-    cells: Mapping[tuple[int, int], Cell]
-    limit: int
-    star: tuple[int, int] | None = None
-    marks: Sequence[Mark] = ()
+    title: str  # over it
+    subtitle: str  # under the title: the variant
+    x_label: str  # words of the horizontal axis
+    y_label: str  # words of the vertical axis
+    xs: Sequence[Value]  # values along x, [X]: rising numbers, or words
+    ys: Sequence[Value]  # values along y, [Y]
+    cells: Mapping[tuple[int, int], Cell]  # (column, row) -> cell; what is missing was not run
+    limit: int  # steps that a run had at most
+    star: tuple[int, int] | None = None  # column and row of the default, or None
+    marks: Sequence[Mark] = ()  # named points
 
 
 def place_of(values: Sequence[Value], value: Value) -> float | None:

@@ -15,23 +15,15 @@ Values = Sequence[float | int | None]
 
 @dataclass(frozen=True)
 class Panel:
-    """One set of axes.
+    """One set of axes."""
 
-    Attributes:
-        title: Over it.
-        unit: Along its vertical axis.
-        series: Name -> values over the common axis; None and NaN are gaps.
-        bar: A level to draw, such as a limit, or None.
-        whole: Whether values are counts: no fractions along the axis.
-        log: Logarithmic values; zeros are gaps then.
-    """
-
-    title: str
-    unit: str
+    title: str  # over it
+    unit: str  # along its vertical axis
+    # name -> values over the common axis; None and NaN are gaps
     series: Mapping[str, Values] = field(default_factory=dict)
-    bar: float | None = None
-    whole: bool = False
-    log: bool = False
+    bar: float | None = None  # A level to draw, such as a limit, or None
+    whole: bool = False  # whether values are counts: no fractions along the axis
+    log: bool = False  # logarithmic values; zeros are gaps then
 
 
 def _numbers(values: Values, log: bool) -> list[float]:

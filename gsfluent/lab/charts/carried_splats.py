@@ -22,8 +22,6 @@ from gsfluent.pipeline.matter.carry import BLEND
 from gsfluent.pipeline.matter.links import NEIGHBOURS
 from gsfluent.spatial.neighbours import nearest_rows
 
-__all__ = ["CarriedSplats"]
-
 
 class CarriedSplats:
     """The points of a dense scene on those of a sparse one.

@@ -15,8 +15,6 @@ from gsfluent.lab.charts.record import Record, append, commit, machine, now, rea
 from gsfluent.lab.charts.run_case import measure
 from gsfluent.progress import Progress, report_progress
 
-__all__ = ["BYTES", "Done", "bandwidth", "run"]
-
 BYTES = 208.0
 """What the two passes of the solver read and write of a float32 point in a step
 (docs/measured/benchmarks.md); of a NACC point 224."""
@@ -24,19 +22,13 @@ BYTES = 208.0
 
 @dataclasses.dataclass(frozen=True)
 class Done:
-    """What came of a ladder.
+    """What came of a ladder."""
 
-    Attributes:
-        records: Of all settings that have one, in the order of the ladder, and the machine's.
-        fresh: How many of them were run now.
-        left_out: Settings that did not fit into the budget.
-        seconds: What it took [s].
-    """
-
+    # of all settings that have one, in the order of the ladder, and the machine's
     records: list[Record]
-    fresh: int
-    left_out: list[Setting]
-    seconds: float
+    fresh: int  # how many of them were run now
+    left_out: list[Setting]  # settings that did not fit into the budget
+    seconds: float  # what it took [s]
 
 
 def bandwidth(device: str, mebibytes: int = 256, repeat: int = 5) -> Record:

@@ -17,8 +17,6 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.front import Verdict, cases, counted, front, methods, verdict
 from gsfluent.lab.charts.record import Record, read
 
-__all__ = ["Chart", "gathered", "of_records"]
-
 OURS = "gsfluent"
 _BASES = ("dx", "textbook", "adaptive")
 """Knobs whose runs are a method's base."""
@@ -27,17 +25,11 @@ _XLABEL = "wall ms per simulated ms"
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """Records of one device, ready to be drawn.
+    """Records of one device, ready to be drawn."""
 
-    Attributes:
-        records: All of them.
-        device: ``cpu`` or ``cuda``.
-        verdict: Our front against every peer's.
-    """
-
-    records: tuple[Record, ...]
-    device: str
-    verdict: Verdict
+    records: tuple[Record, ...]  # all of them
+    device: str  # cpu or cuda
+    verdict: Verdict  # our front against every peer's
 
     @property
     def machine(self) -> str:

@@ -22,8 +22,6 @@ from gsfluent.lab.charts.record import Record, commit, machine, now, of_run
 from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.world.driver import World
 
-__all__ = ["broken", "even_dt", "measure", "shuffled", "stepwise"]
-
 MASS = "mass over pieces, KS"
 _SEEDS = 3
 """Runs of a fracture case, moved on the grid; their median error counts."""

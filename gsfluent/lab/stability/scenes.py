@@ -15,11 +15,6 @@ from gsfluent.lab.world.resident import Resident
 from gsfluent.lab.world.shapes import ball, box, nacc, parameters, wave_speed
 from gsfluent.lab.world.walls import wall
 
-__all__ = [
-    "BRITTLE", "DENSITY", "DX", "FLOOR", "IMPACT", "SPACING", "STRENGTH", "YOUNG", "Courant",
-    "block", "brittle", "brittle_points", "clusters", "noise", "refused", "thrown", "watched",
-]  # fmt: skip
-
 DX = 0.1
 DENSITY = 1000.0
 YOUNG = 1e5

@@ -16,8 +16,6 @@ from gsfluent.lab.stability.scenes import DX
 from gsfluent.lab.textbook.solver import Textbook, Variant
 from gsfluent.lab.world.invariants import Limits, State, first_violation, observe
 
-__all__ = ["OfTextbook", "scene_of", "watched_textbook"]
-
 
 def scene_of(
     points: Tensor,

@@ -11,23 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Elastic", "advance", "clamped", "corotated", "measure", "neo_hookean", "with_stretch"]
-
 
 class Elastic(NamedTuple):
-    """What the laws read of a state.
+    """What the laws read of a state."""
 
-    Attributes:
-        e: b - I, [N, 3, 3].
-        j: Volume ratio, with its sign where F is stored, [N].
-        j2m1: J^2 - 1, [N].
-        log_j: ln J, [N].
-    """
-
-    e: Tensor
-    j: Tensor
-    j2m1: Tensor
-    log_j: Tensor
+    e: Tensor  # b - I, [N, 3, 3]
+    j: Tensor  # volume ratio, with its sign where F is stored, [N]
+    j2m1: Tensor  # J^2 - 1, [N]
+    log_j: Tensor  # ln J, [N]
 
 
 def trace(m: Tensor) -> Tensor:

@@ -34,8 +34,6 @@ from gsfluent.lab.textbook.nacc import Nacc, return_map
 from gsfluent.lab.textbook.variant import Birth, Variant
 from gsfluent.lab.world.drives import Drives, damage
 
-__all__ = ["Birth", "Textbook", "Variant", "run_textbook"]
-
 
 def six(m: Tensor) -> Tensor:
     """Entries xx, yy, zz, xy, xz, yz of symmetric matrices, [N, 6]."""

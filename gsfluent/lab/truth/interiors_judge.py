@@ -16,8 +16,6 @@ from gsfluent.lab.truth.interiors import KnownInterior
 from gsfluent.pipeline.texture.photo import metrics
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
-__all__ = ["Judge", "Plane", "crossing_error", "held_out_planes", "judge", "sample_plane"]
-
 Plane = tuple[np.ndarray, np.ndarray, np.ndarray]
 """A point on the plane and two unit vectors in it (columns, rows), voxel units."""
 

@@ -16,8 +16,6 @@ from torch.nn import functional
 
 from gsfluent.data import Camera
 
-__all__ = ["Mesh", "around", "marbled", "photograph", "textured", "visible_faces"]
-
 _TILE = 8  # pixels; a triangle is tested in the tiles of its box
 _PAIRS = 100_000  # tiles at a time
 _AMBIENT = 0.45
@@ -26,17 +24,11 @@ _LIGHT = (0.4, 0.75, 0.55)
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles to be photographed.
+    """Triangles to be photographed."""
 
-    Attributes:
-        corners: float32 [F, 3, 3].
-        normals: Unit normals at the corners, float32 [F, 3, 3].
-        color: Colour of surface points: (points [N, 3], face [N], weights [N, 3]) to [N, 3] in
-            0..1.
-    """
-
-    corners: Tensor
-    normals: Tensor
+    corners: Tensor  # float32 [F, 3, 3]
+    normals: Tensor  # unit normals at the corners, float32 [F, 3, 3]
+    # colour of surface points: (points [N, 3], face [N], weights [N, 3]) to [N, 3] in 0..1
     color: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 

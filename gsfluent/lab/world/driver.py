@@ -14,8 +14,6 @@ from gsfluent import ops
 from gsfluent.lab.world.resident import Resident, why_not
 from gsfluent.lab.world.stepper import Scene, Stepper, automatic_dt
 
-__all__ = ["World", "running_on"]
-
 Force = Callable[["World", float], None]
 
 _place: list[torch.device] = []

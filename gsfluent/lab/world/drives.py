@@ -12,8 +12,6 @@ from torch import Tensor
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.world.driver import World
 
-__all__ = ["Drives", "damage"]
-
 
 class _Drive:
     """One drive on a device (keys: :class:`gsfluent.fracturebench.scene.Scene`)."""

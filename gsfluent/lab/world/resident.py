@@ -11,8 +11,6 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.lab.world.stepper import Scene
 
-__all__ = ["Resident", "why_not"]
-
 
 def why_not(scene: Scene, forced: bool) -> str:
     """Say why the resident solver cannot run a scene; empty if it can."""

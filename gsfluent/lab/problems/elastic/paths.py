@@ -12,8 +12,6 @@ from gsfluent import ops
 from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import nacc
 
-__all__ = ["PATHS", "breaking_step", "return_map_paths"]
-
 STRAIN, STEPS = 0.6, 600
 SLOPE = 6.0 * math.sin(math.pi / 4) / (3.0 - math.sin(math.pi / 4))
 """Friction M of 45 degrees."""

@@ -12,8 +12,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import parameters, sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
-__all__ = ["run_out", "sand_column"]
-
 DRUCKER_PRAGER = 2
 FRICTION_ANGLE = 26.0
 """Of the triaxial fit [degrees]; in plane strain that is sin(phi) = M / sqrt(3), 36 degrees. The

@@ -15,8 +15,6 @@ from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
-__all__ = ["dam_break", "dam_front", "liquid_at_rest", "water"]
-
 FLUID = 4
 GRAVITY = 9.81
 

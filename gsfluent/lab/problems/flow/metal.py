@@ -11,8 +11,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
 from gsfluent.lab.world.walls import wall
 
-__all__ = ["taylor_bar"]
-
 VON_MISES = 3
 
 

@@ -12,8 +12,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["brazilian_disc", "loaded_disc"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 DIAMETER = 1.0
 

@@ -17,8 +17,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["BAND_CELLS", "brittle_spacing", "crack_band", "fracture_energy", "softening_energy"]
-
 BAND_CELLS = 2.0
 """Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
 the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""

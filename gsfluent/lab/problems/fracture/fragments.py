@@ -15,8 +15,6 @@ from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import box, nacc, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["expected_size", "fragment_size", "mean_size"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 ALPHA0, CELLS = -0.004, 240
 ROW = nacc(

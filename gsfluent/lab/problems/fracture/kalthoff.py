@@ -14,8 +14,6 @@ from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import nacc, parameters, sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
-__all__ = ["Crack", "kalthoff_winkler", "shear_notch"]
-
 YOUNG, POISSON, DENSITY = 190e9, 0.3, 8000.0
 SIDE, NOTCH, HEIGHT = 0.1, 0.05, 0.025
 

@@ -15,8 +15,6 @@ from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["Run", "rayleigh_speed", "run_crack", "single_edge_notch"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 WIDTH, HEIGHT, NOTCH = 1.0, 0.5, 0.2
 
@@ -28,17 +26,11 @@ def rayleigh_speed(shear_wave: float, poisson: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A crack on its way through a strip.
+    """A crack on its way through a strip."""
 
-    Attributes:
-        fastest: Largest speed over a tenth of the width, over the Rayleigh speed.
-        mean: Speed between 0.3 and 0.8 of the width, over the Rayleigh speed.
-        spread: Largest distance of a broken point from the line of the notch [dx].
-    """
-
-    fastest: float
-    mean: float
-    spread: float
+    fastest: float  # largest speed over a tenth of the width, over the Rayleigh speed
+    mean: float  # speed between 0.3 and 0.8 of the width, over the Rayleigh speed
+    spread: float  # largest distance of a broken point from the line of the notch [dx]
 
 
 def run_crack(

@@ -20,8 +20,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["Opening", "double_cantilever", "open_cantilever", "pull_bar", "slope", "softening_bar"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 
 

@@ -12,8 +12,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["plate_impact_spall", "spall_strength"]
-
 
 def spall_strength(row: Tensor, alpha: float) -> float:
     """Axial stress at which uniaxial straining in tension leaves the elastic range [Pa].
