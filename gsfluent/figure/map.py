@@ -85,7 +85,6 @@ def draw_planes(
     *,
     kinds: Mapping[str, str],
     columns: int = 2,
-    title: str = "",
     dpi: int = 110,
     cell: tuple[float, float] = (0.36, 0.24),
 ) -> Path:
@@ -99,7 +98,6 @@ def draw_planes(
         path: Of the PNG.
         kinds: Letter -> words, for the line below; those that occur are named.
         columns: Panels side by side.
-        title: Over all.
         dpi: Of the PNG.
         cell: Least width and height of a cell [inches].
 
@@ -116,7 +114,7 @@ def draw_planes(
     tall = max(len(p.ys) for p in drawn)
     width = min(1.7 + cell[0] * wide, 6.6)
     height = 1.35 + cell[1] * tall
-    with new_figure(width * columns, height * lines + 0.35 + 0.3 * bool(title)) as figure:
+    with new_figure(width * columns, height * lines + 0.35) as figure:
         grid = figure.subplots(lines, columns, squeeze=False).ravel()
         for axes, plane in zip(grid, planes, strict=False):
             if plane is None:
@@ -130,8 +128,6 @@ def draw_planes(
         if any(p.star for p in drawn):
             words.append("★ default")
         figure.supxlabel("   ".join(words), fontsize=7.5, color=INK)
-        if title:
-            figure.suptitle(title, fontsize=11, fontweight="bold", x=0.01, ha="left")
         return save_png(figure, path, dpi=dpi)
 
 

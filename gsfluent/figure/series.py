@@ -31,14 +31,13 @@ def _numbers(values: Values, log: bool) -> list[float]:
     return [v if not log or v > 0.0 else math.nan for v in plain]
 
 
-def curves(along: Sequence[float], label: str, panels: Sequence[Panel], *, columns: int = 2) -> str:
+def curves(along: Sequence[float], label: str, panels: Sequence[Panel]) -> str:
     """Draw panels below and beside each other.
 
     Args:
         along: Common horizontal axis, [N].
         label: Its name and unit.
         panels: What to draw; a panel without any number is left out.
-        columns: Panels side by side.
 
     Returns:
         An ``<svg>`` element; empty when nothing is left to draw.
@@ -46,6 +45,7 @@ def curves(along: Sequence[float], label: str, panels: Sequence[Panel], *, colum
     Raises:
         ValueError: A series has another length than ``along``.
     """
+    columns = 2
     for panel in panels:
         for name, values in panel.series.items():
             if len(values) != len(along):

@@ -31,18 +31,16 @@ class Done:
     seconds: float  # what it took [s]
 
 
-def bandwidth(device: str, mebibytes: int = 256, repeat: int = 5) -> Record:
+def bandwidth(device: str) -> Record:
     """Measure what a plain copy moves, and the floor it sets for a point and a step.
 
     Args:
         device: Where.
-        mebibytes: Size of the array, far beyond the caches.
-        repeat: The best of so many copies counts: a floor is what nothing goes under.
     """
-    source = torch.ones(mebibytes << 18, dtype=torch.float32, device=device)
+    source = torch.ones(256 << 18, dtype=torch.float32, device=device)
     target = torch.empty_like(source)
     seconds = []
-    for _ in range(repeat + 1):
+    for _ in range(6):  # the first one warms up
         start = time.perf_counter()
         target.copy_(source)
         if device.startswith("cuda"):

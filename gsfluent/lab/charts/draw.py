@@ -44,10 +44,10 @@ class Chart:
         """All machines, ours first; more than one and times cannot be compared."""
         return list(dict.fromkeys([self.machine, *(r.machine for r in self.records)]))
 
-    def figure(self, path: Path, *, dpi: int = 110) -> Path:
+    def figure(self, path: Path) -> Path:
         """Write the PNG."""
         with draw(self._panels(), self._rates(), title=self.title, xlabel=_XLABEL) as figure:
-            return save_png(figure, path, dpi=dpi)
+            return save_png(figure, path)
 
     @property
     def title(self) -> str:

@@ -385,9 +385,7 @@ def run_textbook(
     *,
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
-    cfl: float = 0.5,
     dt: float | None = None,
-    method: str = "textbook",
     **options: Any,
 ) -> Run:
     """Run a scene by the textbook solver.
@@ -396,9 +394,7 @@ def run_textbook(
         scene: The scene.
         device: Where.
         dtype: Precision.
-        cfl: Courant number of the automatic time step.
         dt: Fixed time step [s] instead.
-        method: Name in the record.
         **options: Fields of :class:`Variant`.
 
     Returns:
@@ -409,7 +405,7 @@ def run_textbook(
         TypeError: An option that there is not.
     """
     variant = Variant(**options)
-    solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt, cfl=cfl)
+    solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt, cfl=0.5)
     count = scene.times.shape[0]
     x, v = np.full((count, scene.count, 3), math.nan), np.full((count, scene.count, 3), math.nan)
     intact = solver.alpha
@@ -436,10 +432,10 @@ def run_textbook(
         if solver.deformation is not None:
             kept["deformation"][i] = solver.deformation.double().cpu().numpy()
     settings = {
-        "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
+        "dx": scene.dx, "cfl": 0.5, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         **dataclasses.asdict(variant),
     }  # fmt: skip
     return Run(
-        scene.name, method, scene.times, x, v, wall, solver.steps, settings, str(device), failed,
-        **kept,
+        scene.name, "textbook", scene.times, x, v, wall, solver.steps, settings, str(device),
+        failed, **kept,
     )  # fmt: skip

@@ -153,7 +153,6 @@ def first_violation(
     *,
     limits: Limits | None = None,
     every: int = 8,
-    start: State | None = None,
     seen: Callable[[State], None] | None = None,
 ) -> Violation | None:
     """Run on until a law is broken, or for a number of steps.
@@ -167,7 +166,6 @@ def first_violation(
         steps: Steps to go at most.
         limits: What is allowed.
         every: Steps between two looks.
-        start: State that it is judged against; default: the present one.
         seen: Called with the state at every good look, those of the halving included.
 
     Returns:
@@ -176,7 +174,7 @@ def first_violation(
     Raises:
         ValueError: ``every`` is not positive.
     """
-    first = start or moving.look()
+    first = moving.look()
 
     def judge() -> Violation | None:
         now = moving.look()

@@ -43,13 +43,12 @@ def expected_size(rate: float) -> float:
     return 0.5 * (low + high)
 
 
-def mean_size(rate: float, seed: int = 0, dtype: torch.dtype = torch.float32) -> float:
+def mean_size(rate: float, seed: int = 0) -> float:
     """Mean piece of a free bar of one metre whose strength scatters by a tenth [m].
 
     Args:
         rate: Strain rate [1/s].
         seed: Of the scatter.
-        dtype: Precision.
     """
     dx, c = 1.0 / CELLS, wave_speed(ROW)
     points = box([0.0, 0.0, 0.0], [1.0, dx, dx], 0.5 * dx)
@@ -64,7 +63,7 @@ def mean_size(rate: float, seed: int = 0, dtype: torch.dtype = torch.float32) ->
     world = World(
         points, velocity, volume=volume, dx=dx, law=1, params=ROW,
         alpha=ALPHA0 * strength[cell], colliders=between_planes(dx, (1, 2)), affine=affine,
-        dtype=dtype,
+        dtype=torch.float32,
     )  # fmt: skip
     limit = spall_strength(ROW, ALPHA0) / (DENSITY * c * c)
     # to the elastic limit, and on until waves have crossed the longest pieces
