@@ -11,8 +11,6 @@ from typing import Any
 
 from gsfluent.figure.style import INK, new_figure, save_png
 
-__all__ = ["Cell", "Mark", "Plane", "draw_planes", "place_of"]
-
 HOLDS = "#cfe9dc"
 NOT_RUN = "#f4f4f4"
 Value = float | str

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Dot", "Panel", "Rates", "colors_of", "draw"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Dot:

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 
 from gsfluent.figure.style import COLORS, FAILED, INK, OURS, new_figure, to_svg
 
-__all__ = ["Panel", "curves"]
-
 Values = Sequence[float | int | None]
 
 

@@ -20,8 +20,6 @@ from numpy.polynomial import legendre
 
 from .scene import Floats
 
-__all__ = ["Modes", "ball_rule", "box_rule", "modes"]
-
 Rule = tuple[Floats, Floats]
 
 

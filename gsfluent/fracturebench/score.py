@@ -13,8 +13,6 @@ from .registry import judge
 from .run import Measure, Run
 from .scene import Scene, SceneError
 
-__all__ = ["Score", "markdown", "plain", "read_scenes", "score"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Score:

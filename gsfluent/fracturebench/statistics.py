@@ -21,21 +21,6 @@ from .registry import Case
 from .run import Run
 from .scene import Floats, Scene, SceneError
 
-__all__ = [
-    "MEASURES",
-    "Distance",
-    "Figures",
-    "Member",
-    "distance",
-    "ensemble",
-    "figures",
-    "jitter",
-    "lost_energy",
-    "mass_ks",
-    "spacing",
-    "stored_energy",
-]
-
 MEASURES = (
     "momentum history",
     "dissipated energy",

@@ -32,11 +32,7 @@ class Done:
 
 
 def bandwidth(device: str) -> Record:
-    """Measure what a plain copy moves, and the floor it sets for a point and a step.
-
-    Args:
-        device: Where.
-    """
+    """Measure what a plain copy moves, and the floor it sets for a point and a step."""
     source = torch.ones(256 << 18, dtype=torch.float32, device=device)
     target = torch.empty_like(source)
     seconds = []

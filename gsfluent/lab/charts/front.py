@@ -113,11 +113,6 @@ def cheapest(records: Iterable[Record], error: float) -> Record | None:
 def compare(records: Sequence[Record], ours: str, peer: str) -> dict[str, list[Versus]]:
     """At every error level that a peer reaches: our cheapest time, and the ratio.
 
-    Args:
-        records: Runs of both, on one device.
-        ours: Name of our method.
-        peer: Name of the other.
-
     Returns:
         By case that both ran; an empty list where the peer reaches no level.
     """

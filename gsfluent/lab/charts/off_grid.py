@@ -33,11 +33,6 @@ _FPS = 20.0
 def measure_off_grid(setting: Setting, device: str, repeat: int) -> Record:
     """Run ``flight`` or ``rest``; the time is that of all frames, with checks and figures.
 
-    Args:
-        setting: Of :data:`gsfluent.lab.charts.ladder.OFF_GRID`; its options go to Simulate.
-        device: Where.
-        repeat: Timed runs.
-
     Returns:
         The record; a run that raises is one that failed.
 

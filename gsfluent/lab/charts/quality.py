@@ -90,14 +90,6 @@ def run_jobs(
 ) -> list[Record]:
     """Do what has no line yet, in order.
 
-    Args:
-        kind: One of :data:`KINDS`.
-        jobs: The settings.
-        lines: File of records; each is on disk when the next one starts.
-        device: Where to compute.
-        repeat: Timed repeats.
-        progress: Told after every job.
-
     Returns:
         The records of these jobs.
     """

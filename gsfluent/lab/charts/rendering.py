@@ -167,15 +167,7 @@ def _views(size: int, count: int, distance: float) -> list[View]:
 
 
 class _Case:
-    """Views, truth and splats of one distance; the truth is made when first asked for.
-
-    Args:
-        grid: See :func:`glossy_melon`.
-        size: Pixels along an edge.
-        distance: Of the camera, in radii of the melon.
-        fine: Pixels of the truth per pixel, each way.
-        device: Where to render.
-    """
+    """Views, truth and splats of one distance; the truth is made when first asked for."""
 
     def __init__(
         self, grid: int, size: int, distance: float, fine: int, device: torch.device

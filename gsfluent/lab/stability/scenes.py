@@ -102,16 +102,7 @@ def brittle(
     place: Place,
     **options: Any,
 ) -> World:
-    """A NACC ball that breaks on a floor (equations.md, the drop of row 8), at a fixed step.
-
-    Args:
-        hardening: xi.
-        courant: (c + v) dt / dx.
-        mach: Speed over wave speed.
-        order: Seed of another numbering of its points.
-        place: Where.
-        **options: Of World.
-    """
+    """A NACC ball that breaks on a floor (equations.md, the drop of row 8), at a fixed step."""
     row = nacc(
         BRITTLE["young_modulus"], BRITTLE["poisson_ratio"], BRITTLE["density"],
         friction=BRITTLE["friction"], cohesion=BRITTLE["cohesion"], hardening=hardening,

@@ -128,14 +128,7 @@ def scatter(node: Tensor, values: Tensor, size: int, sums: str, order: Tensor | 
 
 
 def collide(velocity: Tensor, x: Tensor, planes: Sequence[Mapping[str, Any]], dx: float) -> Tensor:
-    """Velocities of nodes after planes (a node at or behind one is in it): equations.md 8.
-
-    Args:
-        velocity: [m/s], [G, 3].
-        x: Positions of the nodes [m], [G, 3].
-        planes: ``point``, ``normal``, ``kind`` (sticky, slip, separate) and ``friction``.
-        dx: Node spacing [m].
-    """
+    """Velocities of nodes after planes (a node at or behind one is in it): equations.md 8."""
     for plane in planes:
         n = torch.tensor([float(c) for c in plane["normal"]], dtype=x.dtype, device=x.device)
         n = n / n.norm()

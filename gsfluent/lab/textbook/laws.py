@@ -41,13 +41,7 @@ def _one(m: Tensor) -> Tensor:
 
 
 def advance(state: Tensor, increment: Tensor, storage: str) -> Tensor:
-    """Push F or e = b - I forward by I + A.
-
-    Args:
-        state: [N, 3, 3].
-        increment: A = dt grad v, [N, 3, 3].
-        storage: ``F`` or ``strain``.
-    """
+    """Push F or e = b - I forward by I + A."""
     if storage == "F":
         return (_one(increment) + increment) @ state  # as codes write it
     h = increment + increment @ state
@@ -78,15 +72,7 @@ def _svd(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def clamped(state: Tensor, storage: str, low: float, high: float, inverted: Tensor) -> Tensor:
-    """State with its volume ratio in [low, high], by an even stretch; what is turned gets ``low``.
-
-    Args:
-        state: F or e, [N, 3, 3].
-        storage: ``F`` or ``strain``.
-        low: Smallest volume ratio.
-        high: Largest.
-        inverted: Points that the step turned inside out, [N]; F knows by itself.
-    """
+    """State with J in [low, high], by an even stretch; what is inverted gets ``low``."""
     m = measure(state, storage)
     turned = inverted | ~(m.j > 0)
     outside = turned | (m.j < low) | (m.j > high)

@@ -43,14 +43,6 @@ def six(m: Tensor) -> Tensor:
 class Textbook:
     """A scene run by a variant.
 
-    Args:
-        scene: Points, materials (``elastic``, ``nacc``), planes, drives.
-        variant: What to do.
-        device: Where.
-        dtype: Precision of everything.
-        dt: Fixed time step [s]; None: ``cfl dx / (c + |v|)`` with the wave speed c at rest.
-        cfl: Courant number of the automatic step.
-
     Raises:
         ValueError: A law or drive that this solver does not have.
     """
@@ -389,13 +381,6 @@ def run_textbook(
     **options: Any,
 ) -> Run:
     """Run a scene by the textbook solver.
-
-    Args:
-        scene: The scene.
-        device: Where.
-        dtype: Precision.
-        dt: Fixed time step [s] instead.
-        **options: Fields of :class:`Variant`.
 
     Returns:
         The run; one that broke off says why in ``failed``. Impulses are not kept.

@@ -29,12 +29,7 @@ _KEEP_OFF = 3.0
 
 
 def held_out_planes(known: KnownInterior, seed: int = 0) -> list[Plane]:
-    """Twelve planes: two off-centre ones across each axis, and six at random angles.
-
-    Args:
-        known: The solid; its photographed slices are avoided.
-        seed: Seed of the random angles.
-    """
+    """Twelve planes: two off-centre ones across each axis, and six at random angles."""
     index = np.argwhere(known.domain.inside)
     low, high = index.min(0), index.max(0) + 1.0
     middle, extent = 0.5 * (low + high), high - low
@@ -86,12 +81,7 @@ def sample_plane(domain: InteriorDomain, rgb: np.ndarray, plane: Plane) -> metri
 
 
 class Judge:
-    """Figures of textures of one known interior, each beside the floor.
-
-    Args:
-        known: The solid with its truth.
-        others: Other draws of the class; the floor is their mean.
-    """
+    """Figures of textures of one known interior, each beside the floor."""
 
     def __init__(self, known: KnownInterior, others: Sequence[KnownInterior]) -> None:
         self.known = known

@@ -163,12 +163,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 @torch.no_grad()
 def photograph(mesh: Mesh, camera: Camera) -> Tensor:
-    """One photograph with Lambert shading, RGBA float32 [H, W, 4], straight alpha.
-
-    Args:
-        mesh: What is photographed.
-        camera: A pinhole camera.
-    """
+    """One photograph with Lambert shading, RGBA float32 [H, W, 4], straight alpha."""
     supersample = 3
     fine = camera.resized(camera.width * supersample, camera.height * supersample)
     face, weight, _ = visible_faces(mesh.corners, fine)

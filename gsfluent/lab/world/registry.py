@@ -86,10 +86,6 @@ def discover() -> None:
 def problems(tier: str = "all", only: str | None = None) -> list[Problem]:
     """Return registered problems in the order of their names.
 
-    Args:
-        tier: ``"fast"``, ``"slow"`` or ``"all"``.
-        only: Keep problems whose name contains this.
-
     Raises:
         ValueError: An unknown tier.
     """

@@ -127,13 +127,7 @@ TURNS = (None, ((1.0, 2.0, 3.0), 0.7), ((-2.0, 1.0, 0.5), 1.9))
 def oblique_spheres(
     radius: float = 7.0, one_field: bool = False, turns: int = 3
 ) -> Iterator[Result]:
-    """Frictionless balls that meet at 45 degrees leave without spin.
-
-    Args:
-        radius: [dx], a multiple of half a cell.
-        one_field: Both in one velocity field, for comparison.
-        turns: In how many directions through the grid.
-    """
+    """Frictionless balls that meet at 45 degrees leave without spin."""
     speed = 0.05
     for number, turn in enumerate(TURNS[:turns]):
         q = torch.eye(3, dtype=torch.float64) if turn is None else rotation(*turn)
@@ -151,12 +145,7 @@ def oblique_spheres(
 
 @problem(tier="slow")
 def hertz_spheres(radius: float = 7.0, one_field: bool = False) -> list[Result]:
-    """Head-on elastic balls: largest force, time of contact and restitution.
-
-    Args:
-        radius: [dx], a multiple of half a cell.
-        one_field: Both in one velocity field: what the transfer alone loses.
-    """
+    """Head-on elastic balls: largest force, time of contact and restitution."""
     speed = 0.025
     chosen = TURNS[1]
     q = torch.eye(3, dtype=torch.float64) if chosen is None else rotation(*chosen)

@@ -52,13 +52,7 @@ def _block() -> Tensor:
 
 
 def slide(friction: float, angle: float = 45.0, dtype: torch.dtype = torch.float64) -> Result:
-    """Coefficient of friction seen in the acceleration of a sliding block.
-
-    Args:
-        friction: Below tan(angle). With 0 the acceleration itself is compared.
-        angle: Of the incline [degrees].
-        dtype: Precision.
-    """
+    """Coefficient of friction seen in the acceleration of a sliding block."""
     world, block = _on_slab(_block(), 22.0, 10.0, angle, friction, dtype=dtype)
     # Friction starts from nothing and a shear wave runs through the block: measured after that.
     world.run(40.0)

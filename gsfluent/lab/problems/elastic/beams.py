@@ -34,10 +34,6 @@ def swing(cells: int, periods: float) -> tuple[float, float, float, int]:
 
     It is held behind x = 0 by the grid; the face it is clamped at lies :data:`FACE` behind.
 
-    Args:
-        cells: Cells across its height.
-        periods: Time to run for, in periods of the reference.
-
     Returns:
         Frequency [Hz], its reference [Hz], damping ratio, steps.
     """
@@ -111,10 +107,6 @@ def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
     integrals); one of finite slenderness also shears and stretches (Reissner 1972; nu = 0, shear
     factor 5/6).
 
-    Args:
-        load: P L^2 / (E I).
-        slenderness: Length over height.
-
     Returns:
         Deflection across and shortening along, over the length.
     """
@@ -146,9 +138,6 @@ def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
 
 def bend(load: float) -> tuple[float, float, int]:
     """Bend a slab (nu = 0, plane) by a dead load on its end and let it come to rest.
-
-    Args:
-        load: P L^2 / (E I).
 
     Returns:
         Deflection across and shortening along over the length, and the steps taken.

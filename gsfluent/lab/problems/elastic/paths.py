@@ -55,12 +55,6 @@ def breaking_step(
 ) -> tuple[int | None, float, float]:
     """Walk a point of watermelon flesh along a path in 600 steps of 0.001.
 
-    Args:
-        path: One of :data:`PATHS` or ``"uniaxial compression"``.
-        cohesion: beta.
-        shear_damage: eta.
-        return_map: Options of :func:`gsfluent.ops.return_mapping`.
-
     Returns:
         Number (from 0) of the step in which alpha reaches 0, or None; alpha at the end; and
         ``q / mu`` at the end.

@@ -20,12 +20,7 @@ the grains."""
 
 
 def run_out(aspect: float, cells: int = 16) -> float:
-    """Run-out of a column of base 1 m beside a wall, over its base.
-
-    Args:
-        aspect: Height over base.
-        cells: Cells along the base.
-    """
+    """Run-out of a column of base 1 m beside a wall, over its base."""
     dx = 1.0 / cells
     sine = math.sin(math.radians(FRICTION_ANGLE))
     alpha_dp = math.sqrt(2.0 / 3.0) * 2.0 * sine / (3.0 - sine)
@@ -48,12 +43,7 @@ def law(aspect: float) -> float:
 
 @problem(tier="slow")
 def sand_column(aspects: Sequence[float] = (1.0, 2.0, 4.0), cells: int = 16) -> list[Result]:
-    """Sand column: run-out of a plane column follows 1.2 a, then 1.9 a^(2/3).
-
-    Args:
-        aspects: Heights over base.
-        cells: Cells along the base.
-    """
+    """Sand column: run-out of a plane column follows 1.2 a, then 1.9 a^(2/3)."""
     return [
         compare(
             "sand_column", f"run-out over base, aspect {a:g}", run_out(a, cells),

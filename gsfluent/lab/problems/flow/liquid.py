@@ -38,11 +38,6 @@ def hydrostatic(depth: Tensor, row: Tensor) -> Tensor:
 def dam_front(cells: int, *, until: float, bed: str) -> list[tuple[float, float]]:
     """Front of a water column twice as high as wide after the gate is gone.
 
-    Args:
-        cells: Cells along the base a.
-        until: End, as ``t sqrt(2 g / a)``.
-        bed: Mode of the bed: ``sticky`` (no slip, as in the experiment) or ``slip``.
-
     Returns:
         Pairs of ``t sqrt(2 g / a)`` and ``z / a``, one per step; the front is where the last two
         square cells of liquid begin, so that a splash of few points is none.

@@ -76,13 +76,7 @@ def drop(
 
 
 def debris(edge: int = 12, *, away: float = 32.0, seed: int = 0) -> Scene:
-    """Broken points in free flight, none of which shares a node with another.
-
-    Args:
-        edge: Points along each axis.
-        away: Distance from the origin [dx].
-        seed: Of their places.
-    """
+    """Broken points in free flight, none of which shares a node with another."""
     random = np.random.default_rng(seed)
     points = box([away * DX] * 3, [4.0 * edge * DX] * 3, 4.0 * DX).numpy()
     points = points + DX * random.random(points.shape)

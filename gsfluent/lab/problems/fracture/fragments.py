@@ -29,9 +29,6 @@ def expected_size(rate: float) -> float:
 
     ``rho rate^2 s^3 / 24 + sigma^2 s / (2 M) = G`` (Glenn and Chudnovsky 1986; without the stored
     energy it is Grady's ``(24 G / (rho rate^2))^(1/3)``), solved by bisection.
-
-    Args:
-        rate: Strain rate [1/s].
     """
     energy = WIDE * fracture_energy(ROW, ALPHA0, dx=1.0 / CELLS)
     stored = spall_strength(ROW, ALPHA0) ** 2 / (2.0 * DENSITY * wave_speed(ROW) ** 2)
@@ -44,12 +41,7 @@ def expected_size(rate: float) -> float:
 
 
 def mean_size(rate: float, seed: int = 0) -> float:
-    """Mean piece of a free bar of one metre whose strength scatters by a tenth [m].
-
-    Args:
-        rate: Strain rate [1/s].
-        seed: Of the scatter.
-    """
+    """Mean piece of a free bar of one metre whose strength scatters by a tenth [m]."""
     dx, c = 1.0 / CELLS, wave_speed(ROW)
     points = box([0.0, 0.0, 0.0], [1.0, dx, dx], 0.5 * dx)
     cell = (points[:, 0] / dx).long()
@@ -81,9 +73,6 @@ def fragment_size(shares: Sequence[float] = (0.005, 0.01, 0.02, 0.05)) -> list[R
 
     A trend, not a law: strength scatters, and cracks that start at the same time do not share their
     energy evenly.
-
-    Args:
-        shares: Strain rates, as the speed of the ends over that of a pressure wave.
     """
     name, source = "fragment_size", "Glenn and Chudnovsky 1986; solver.md 3 row 24"
     results, sizes = [], []

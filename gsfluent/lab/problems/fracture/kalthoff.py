@@ -32,10 +32,6 @@ def shear_notch(cells: int) -> Crack:
     steel, 50 mm long, gives the edge half its speed. Fracture energy 22 kJ/m^2 (18Ni1900). The
     tensile strength is 0.5 GPa, half of the real one: ``E G / sigma^2``, the length a crack needs
     to soften, is then 16 mm and 8 to 10 cells, where the real 4 mm would be two.
-
-    Args:
-        cells: Cells along the plate; softening follows
-        :func:`gsfluent.lab.problems.fracture.crack_band.crack_band`.
     """
     dx, softening = SIDE / cells, 0.0172
     row = nacc(

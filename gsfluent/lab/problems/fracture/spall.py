@@ -35,9 +35,6 @@ def plate_impact_spall(over: float = 1.25) -> list[Result]:
     ``2 over spall_strength / (rho c)``. The release waves from the two free faces meet one flyer
     thickness inside the target; the free face slows by ``2 sigma_sp / (rho c)`` and is then pushed
     by the wave from the new surface. The impact is smoothed over 4 cells: a sharper one rings.
-
-    Args:
-        over: Impact stress over spall strength.
     """
     flyer = 20
     dx, alpha0 = 0.4 / flyer, -0.01
