@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials
-from gsfluent.config.read import Place, given
+from gsfluent.config.read import Place
 from gsfluent.config.settings_light import EnvironmentSettings, LightSettings, read_light
 from gsfluent.config.yaml_file import read_yaml
 from gsfluent.errors import InputError
@@ -35,9 +35,9 @@ def light_of(shot: Shot) -> Lighting:
 
 def lighting_from(settings: LightSettings) -> Lighting:
     """As :func:`light_of`, from a ``light:`` section."""
-    lamps = [Lamp(**given(settings.key))]
-    lamps += [Lamp(**given(lamp)) for lamp in settings.lights]
-    shared = {name: value for name, value in given(settings).items() if name in _SHARED}
+    lamps = [Lamp(**settings.key.given())]
+    lamps += [Lamp(**lamp.given()) for lamp in settings.lights]
+    shared = {name: value for name, value in settings.given().items() if name in _SHARED}
     around = None if settings.environment is None else _environment(settings.environment)
     return Lighting(
         lamps=tuple(lamps),
