@@ -9,11 +9,12 @@ import importlib
 from typing import Any
 
 _PUBLIC: dict[str, str] = {
-    "Stage": "gsfluent.progress",
+    "Stage": "gsfluent.pipeline.stage",
     "Reconstruct": "gsfluent.pipeline.reconstruct.stage",
     "Isolate": "gsfluent.pipeline.reconstruct.isolate",
     "Fill": "gsfluent.pipeline.fill.stage",
     "Texture": "gsfluent.pipeline.texture",
+    "Regions": "gsfluent.pipeline.regions.stage",
     "label_regions": "gsfluent.pipeline.regions.project",
     "Simulate": "gsfluent.pipeline.simulate.stage",
     "Repair": "gsfluent.pipeline.cracks.stage",
