@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class GsfluentError(Exception):
     """Base class of gsfluent's own errors."""
@@ -23,6 +25,14 @@ class InputError(GsfluentError, ValueError):
         self.what = what
         self.hint = hint
         super().__init__(f"{what}\n  hint: {hint}" if hint else what)
+
+
+def check_choice(what: str, value: object, allowed: Iterable[object], hint: str = "") -> None:
+    """Raise :class:`InputError` unless ``value`` is one of ``allowed``; ``what`` names it."""
+    names = list(allowed)
+    if value not in names:
+        listed = ", ".join(str(name) for name in names if name != "")
+        raise InputError(f"{what} must be one of {listed}, got {value!r}", hint)
 
 
 class RunError(GsfluentError, RuntimeError):

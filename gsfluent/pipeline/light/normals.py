@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import INTERIOR, Gaussians
-from gsfluent.pipeline.light.occlusion import COARSEST, PER_CELL, Occupancy, occupancy
+from gsfluent.pipeline.light.occlusion import COARSEST, FULL, PER_CELL, Occupancy, box_frame
 
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
@@ -62,8 +62,10 @@ class Grid(NamedTuple):
     per_cell: float
 
     def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
-        """Occupancy of centres [N, 3] around ``center`` [m]."""
-        return occupancy(means, center, self.cell, self.nodes, per_cell=self.per_cell)
+        """Occupancy of centres [N, 3] around ``center`` [m]; those off the grid are left out."""
+        frame = means.new_tensor(box_frame(center, self.cell, self.nodes))
+        values = ops.occupancy(means, frame, self.nodes, full=FULL * self.per_cell)
+        return Occupancy(values, frame, self.nodes)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:

@@ -22,7 +22,6 @@ def polish_colors(
     means: np.ndarray,
     colors: np.ndarray,
     *,
-    iterations: int = 4,
     device: torch.device | None = None,
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Fit colours so that cuts through the Gaussians show the slices of the volume.
@@ -36,7 +35,6 @@ def polish_colors(
         rgb: Its colours, float32 [X, Y, Z, 3].
         means: Centres of the Gaussians in voxel units [N, 3].
         colors: Sampled colours [N, 3], kept where no slice shows a Gaussian.
-        iterations: Conjugate-gradient steps.
         device: Where to compute.
 
     Returns:
@@ -68,21 +66,14 @@ def polish_colors(
         spacing=spacing,
         masks=masks,
         initial=torch.from_numpy(colors),
-        steps=Steps(iterations),
         slab=0.5 * step,
     )
     return fitted.cpu().numpy(), {"polished": True, "spacing": spacing, **report}
 
 
 _SIGMA = 0.55  # standard deviation of a footprint over the spacing of the Gaussians
-
-
 _CUT = 2.5  # standard deviations
-
-
 _LEAST = 0.35  # weight below which a pixel shows too little to count
-
-
 _STORED = 40_000_000  # matrix entries kept (about 0.6 GB); beyond they are made anew each time
 
 
@@ -110,12 +101,8 @@ def stack_planes(
 ) -> list[SlicePlane]:
     """Planes through the voxel centres of slices of a volume; rows of a picture come first.
 
-    Args:
-        axis: Axis that the slices lie across.
-        offsets: Slice indices.
-        shape: Shape of the volume [3].
-        origin: Corner of voxel (0, 0, 0), world units [3].
-        voxel: Edge of a voxel, world units.
+    Slices ``offsets`` lie across ``axis``; ``origin`` is the corner of voxel (0, 0, 0), world
+    units.
     """
     down_axis, right_axis = (i for i in range(3) if i != axis)
     unit = torch.eye(3, dtype=origin.dtype, device=origin.device)

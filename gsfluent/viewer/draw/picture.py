@@ -101,8 +101,8 @@ class PictureMaker:
         """
         frame = self.timeline.frame(index)
         drawn = self.splats(frame, look)
-        gaussians, groups, gloss = drawn.gaussians, drawn.groups, drawn.gloss
-        time = frame.time
+        gaussians, gloss, time = drawn.gaussians, drawn.gloss, frame.time
+        groups: Tensor | None = drawn.groups
         if gaussians.count == 0:  # everything is cut away: one splat that nobody sees
             speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
             gaussians = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))

@@ -38,12 +38,7 @@ def pick_device(name: str) -> torch.device:
 
 
 def load_pipeline(model: str | Path, options: InpaintOptions, device: torch.device) -> Any:
-    """Find the pipeline class, load the weights, set the switches.
-
-    Args:
-        model: Local folder (``save_pretrained``), or hub id.
-        options: Settings.
-        device: Where to run.
+    """Find the pipeline class of a model folder or hub id, load the weights, set the switches.
 
     Raises:
         InputError: A package is missing, the weights are not there, no inpainting pipeline belongs
@@ -95,18 +90,18 @@ def _packages(options: InpaintOptions) -> Any:
     except ImportError as error:
         raise InputError(
             "texture: method 'diffusion' needs the package diffusers, which is not installed",
-            hint="pip install diffusers transformers accelerate",
+            hint="pip install 'gsfluent[inpaint]'",
         ) from error
     if not is_transformers_available():
         raise InputError(
             "texture: method 'diffusion' needs the package transformers, which is not installed",
-            hint="pip install transformers accelerate",
+            hint="pip install 'gsfluent[inpaint]'",
         )
     if options.memory != "high" and not is_accelerate_available():
         raise InputError(
             f"texture: inpaint memory {options.memory} needs the package accelerate, which is not "
             "installed",
-            hint="pip install accelerate, or use memory: high",
+            hint="pip install 'gsfluent[inpaint]', or use memory: high",
         )
     diffusers.utils.logging.set_verbosity_error()
     diffusers.utils.logging.disable_progress_bar()

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.colors import rgb_to_lab100
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 
@@ -65,8 +66,6 @@ class PlacedPhoto:
 
     def at(self, pitch: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Image, mask, depth and place with pixels of ``pitch`` voxels of the solid."""
-        import cv2
-
         factor = self.pitch / pitch
         image, mask, depth, local = self.image, self.mask, self.depth, self.local
         if abs(factor - 1.0) < 2e-2:
@@ -113,7 +112,6 @@ def place_photo(
     photo: Exemplar,
     fields: ObjectFields,
     axis: int,
-    *,
     guided: bool,
     scale: float,
     depth_scale: float | None,
@@ -223,11 +221,11 @@ class DepthGuide:
         return values[right - 1] + share * (values[right] - values[right - 1])
 
 
-def explained(value: np.ndarray, color: np.ndarray, bins: int = 24) -> float:
+def explained(value: np.ndarray, color: np.ndarray) -> float:
     """Share of the colours' variance [n, 3] that a coordinate [n] explains (correlation ratio)."""
     if len(value) == 0 or float(np.ptp(value)) <= 0:
         return 0.0
     order = np.argsort(value, kind="stable")
     total = float(((color - color.mean(0)) ** 2).sum())
-    within = sum(float(((c - c.mean(0)) ** 2).sum()) for c in np.array_split(color[order], bins))
+    within = sum(float(((c - c.mean(0)) ** 2).sum()) for c in np.array_split(color[order], 24))
     return 1.0 - within / max(total, 1e-9)
