@@ -59,7 +59,7 @@ def cxx_flags() -> list[str]:
 def cpu_extension() -> cpp_extension.CppExtension:
     return cpp_extension.CppExtension(
         "gsfluent._C",
-        sources("csrc/library.cpp", "csrc/cpu/*.cpp"),
+        sources("csrc/library.cpp", "csrc/cpu/**/*.cpp"),
         include_dirs=[str(ROOT / "csrc")],
         depends=sources("csrc/**/*.h"),
         extra_compile_args={"cxx": [TORCH_TARGET, *cxx_flags()]},
@@ -87,7 +87,7 @@ def cuda_extension() -> list:
     return [
         cpp_extension.CppExtension(
             "gsfluent._C_cuda",
-            sources("csrc/cuda/*.cu", "csrc/cuda/*.cpp"),
+            sources("csrc/cuda/**/*.cu", "csrc/cuda/**/*.cpp"),
             include_dirs=[str(ROOT / "csrc"), f"{home}/include"],
             library_dirs=[f"{home}/lib64"],
             libraries=["cudart"],
@@ -124,7 +124,7 @@ def core_extension() -> list:
             "gsfluent._core",
             ["csrc/bindings.cpp"],
             include_dirs=[pybind11.get_include(), str(ROOT / "csrc")],
-            depends=sources("csrc/core/*.h"),
+            depends=sources("csrc/core/**/*.h"),
             extra_compile_args=cxx_flags(),
             language="c++",
         )

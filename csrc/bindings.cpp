@@ -8,9 +8,9 @@
 #include <string>
 #include <vector>
 
-#include "core/mvee.h"
-#include "core/mvee_lens.h"
-#include "core/return_mapping.h"
+#include "core/material/return_mapping.h"
+#include "core/mvee/lens.h"
+#include "core/mvee/mvee.h"
 
 namespace py = pybind11;
 
@@ -84,21 +84,21 @@ py::dict one_particle(const Array<T>& strain, T alpha, const Array<T>& increment
 template <typename T>
 void bind(py::module_ m) {
   using py::arg;
-  py::class_<MaterialRow<T>>(m, "Material", "One row of params (core/laws.h).")
+  py::class_<MaterialRow<T>>(m, "Material", "One row of params (core/material/laws.h).")
       .def(py::init(&material<T>), arg("mu"), arg("kappa"), arg("strength") = T(0),
            arg("cohesion") = T(0), arg("hardening") = T(0), arg("damage") = T(0),
            arg("density") = T(1), arg("exponent") = T(0));
   m.def("return_mapping", &one_particle<T>, arg("strain"), arg("alpha"), arg("increment"),
         arg("law"), arg("material"), arg("k") = T(2), arg("epsilon") = T(0.1),
         arg("implicit") = true, arg("dt") = T(0),
-        "One constitutive step of one particle (core/return_mapping.h).");
+        "One constitutive step of one particle (core/material/return_mapping.h).");
   m.def(
       "wave_speed_squared",
       [](const Array<T>& strain, int law, const MaterialRow<T>& material) {
         return wave_speed_squared(law, material, load_sym3(expect(strain, "strain", {6})));
       },
       arg("strain"), arg("law"), arg("material"),
-      "Square of the fastest wave speed of one particle [m^2/s^2] (core/wave_speed.h).");
+      "Square of the fastest wave speed of one particle [m^2/s^2] (core/material/wave_speed.h).");
   m.def(
       "elastic_energy",
       [](const Array<T>& strain, T mu, T kappa) {
@@ -106,7 +106,7 @@ void bind(py::module_ m) {
         return elastic_energy(mu, kappa, elastic_state(e, false));
       },
       arg("strain"), arg("mu"), arg("kappa"),
-      "Stored energy per initial volume of one particle [J/m^3] (core/elastic.h).");
+      "Stored energy per initial volume of one particle [J/m^3] (core/material/elastic.h).");
   m.def(
       "yield_surface",
       [](const MaterialRow<T>& r, T alpha) {
@@ -134,7 +134,7 @@ void bind(py::module_ m) {
         return py::make_tuple(to_array(e.center), to_array(to_mat3(e.shape)));
       },
       arg("points"), arg("tolerance") = 5e-4, arg("max_iterations") = 100,
-      "(centre, shape) of the ellipsoid around one point set (core/mvee.h).");
+      "(centre, shape) of the ellipsoid around one point set (core/mvee/mvee.h).");
   m.def(
       "ball_lens",
       [](T r1, T r2, T distance) {
@@ -142,7 +142,7 @@ void bind(py::module_ m) {
         return py::make_tuple(b.center, b.axial, b.radial, b.overlap);
       },
       arg("r1"), arg("r2"), arg("distance"),
-      "(centre on the axis, axial, radial semi-axis, overlap) of two balls (core/mvee_pair.h).");
+      "(centre on the axis, axial, radial semi-axis, overlap) of two balls (core/mvee/pair.h).");
   m.def(
       "mvee_lens",
       [](const Array<T>& mean_a, const Array<T>& cov_a, const Array<T>& mean_b,
@@ -155,7 +155,7 @@ void bind(py::module_ m) {
       },
       arg("mean_a"), arg("cov_a"), arg("mean_b"), arg("cov_b"), arg("radius") = 2.0,
       arg("flat") = 0.0,
-      "(mean, covariance, overlap) around one pair of Gaussians (core/mvee_lens.h).");
+      "(mean, covariance, overlap) around one pair of Gaussians (core/mvee/lens.h).");
 }
 
 }  // namespace

@@ -1,5 +1,5 @@
-// Every operator schema, in reading order. Kernels are registered in csrc/cpu/*.cpp and
-// csrc/cuda/*_ops.cpp.
+// Every operator schema, in reading order. Kernels are registered in the .cpp files of csrc/cpu and
+// in the ops.cpp of each family in csrc/cuda.
 #include "torch_api.h"
 
 STABLE_TORCH_LIBRARY(gsfluent, m) {
@@ -115,8 +115,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- ssim: structural similarity, the photometric loss of training ---
   m.def("ssim(Tensor image, Tensor target, bool inside) -> Tensor");
   m.def("ssim_backward(Tensor grad, Tensor image, Tensor target, bool inside) -> Tensor");
-  // Returns the loss, its figures (similarity, |miss|, miss^2, |excess|: csrc/core/ssim.h), and the
-  // gradients of image and alpha.
+  // Returns the loss, its figures (similarity, |miss|, miss^2, |excess|: csrc/core/train/ssim.h),
+  // and the gradients of image and alpha.
   m.def(
       "photometric_loss(Tensor image, Tensor target, Tensor? valid, Tensor? alpha, Tensor? mask, "
       "Tensor? backdrop, float constant, float l1, float ssim, float excess, bool inside, "

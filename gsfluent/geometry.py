@@ -211,6 +211,22 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     return torch.cat(parts, dim=-2)
 
 
+def trilinear(grid: Tensor, place: Tensor) -> Tensor:
+    """Values [N] of a grid [X, Y, Z] between its points, at places [N, 3] in steps; 0 outside."""
+    size = torch.tensor(grid.shape, device=place.device)
+    base = place.floor()
+    fraction, base = place - base, base.to(torch.int64)
+    total = grid.new_zeros(len(place))
+    for corner in range(8):
+        step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=place.device)
+        index = base + step
+        inside = ((index >= 0) & (index < size)).all(dim=1)
+        weight = torch.where(step.bool(), fraction, 1 - fraction).prod(dim=1) * inside
+        index = torch.minimum(index.clamp_min(0), size - 1)
+        total += weight.to(grid) * grid[index[:, 0], index[:, 1], index[:, 2]]
+    return total
+
+
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """World-to-camera matrix [4, 4] (OpenCV axes) of a camera at ``eye`` facing ``target``, [3].
 

@@ -41,15 +41,15 @@ def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
     scene.add(solid, material=gf.materials.fruit.watermelon)
     camera = gf.Camera.look_at((0.5, -0.5, 0.3), (0.0, 0.0, 0.1), width=64, height=48)
     render = gf.pipeline.Render(camera, key_light())
-    simulate = gf.pipeline.Simulate(dx=0.025)
-    for frame in simulate(scene, fps=30, seconds=2 / 30):
+    simulation = gf.pipeline.Simulate(dx=0.025)(scene, fps=30, seconds=2 / 30)
+    for frame in simulation:
         image = render(frame.gaussians).image
         assert image.shape == (48, 64, 3) and bool(image.isfinite().all())
         # the green ball is in the picture, before a white ground
         assert float((image[..., 1] - image[..., 0]).max()) > 0.1
         assert frame.damage.shape == frame.fragments.shape
         assert frame.energy["kinetic"] >= 0.0
-    assert simulate.report()["verdict"] == "clean"
+    assert simulation.report["verdict"] == "clean"
     # a solid without a frame stands on the floor, not in the ground
     assert abs(float(frame.particles.position[:, 2].min())) < 0.03
 

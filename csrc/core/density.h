@@ -3,7 +3,7 @@
 // Cells are numbered z, y, x; values stand at cell centres and are zero outside the grid.
 #pragma once
 
-#include "core/splat.h"
+#include "core/raster/splat.h"
 
 namespace gsf {
 

@@ -74,6 +74,16 @@ GSF_HOST_DEVICE Mat3<T> identity3() {
   return {{T(1), T(0), T(0), T(0), T(1), T(0), T(0), T(0), T(1)}};
 }
 template <typename T>
+GSF_HOST_DEVICE Vec3<T> load_vec3(const T* p) {
+  return {p[0], p[1], p[2]};
+}
+template <typename T>
+GSF_HOST_DEVICE void store_vec3(T* p, const Vec3<T>& v) {
+  p[0] = v.x;
+  p[1] = v.y;
+  p[2] = v.z;
+}
+template <typename T>
 GSF_HOST_DEVICE Mat3<T> load_mat3(const T* p) {
   Mat3<T> r;
   for (int i = 0; i < 9; ++i) r.m[i] = p[i];

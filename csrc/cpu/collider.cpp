@@ -4,18 +4,16 @@
 namespace gsf {
 namespace {
 
-struct Cpu {
-  struct Scope {
-    explicit Scope(const Tensor&) {}
-  };
+struct ColliderCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void distance(const ColliderDistanceArgs<T>& a, const Scope&) {
+  static void collider_distance(const ColliderDistanceArgs<T>& a, const Scope&) {
     parallel_for(a.points * a.rows, 256, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) a.compute(i);
     });
   }
   template <typename T>
-  static void advance(const AdvanceCollidersArgs<T>& a, const Scope&) {
+  static void advance_colliders(const AdvanceCollidersArgs<T>& a, const Scope&) {
     for (int64_t c = 0; c < a.rows; ++c) a.compute(c);
   }
   template <typename T>
@@ -29,4 +27,4 @@ struct Cpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) { gsf::ColliderOps<gsf::Cpu>::register_all(m); }
+GSF_REGISTER(CPU, gsf::ColliderOps<gsf::ColliderCpu>)

@@ -9,8 +9,9 @@ namespace gsf {
 namespace {
 
 struct DensityCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void occupancy(const DensityArgs<T>& a, const Tensor&) {
+  static void occupancy(const DensityArgs<T>& a, const Scope&) {
     const int64_t n = a.nodes, layer = n * n;
     parallel_for(n, (n + 15) / 16, [&](int64_t begin, int64_t end) {
       for (int64_t i = 0; i < a.count; ++i) {
@@ -45,7 +46,7 @@ struct DensityCpu {
   }
 
   template <typename T>
-  static void bulk(const BulkArgs<T>& a, const Tensor&) {
+  static void splat_bulk(const BulkArgs<T>& a, const Scope&) {
     // Pieces of fixed size, added up in order: the same for any number of threads.
     constexpr int64_t kPiece = 65536;
     const int64_t pieces = (a.count + kPiece - 1) / kPiece;
@@ -98,7 +99,7 @@ struct DensityCpu {
   }
 
   template <typename T>
-  static void normals(const DensityNormalArgs<T>& a, const Tensor&) {
+  static void density_normals(const DensityNormalArgs<T>& a, const Scope&) {
     smooth<T, kDensityPasses>(a.values, a.fine, a.spare, a.nodes);
     smooth<T, 1>(a.values + density_level(a.nodes, kDensityWide), a.wide, a.spare,
                  a.nodes >> kDensityWide);
@@ -111,8 +112,4 @@ struct DensityCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("occupancy", TORCH_BOX(&gsf::DensityOps<gsf::DensityCpu>::occupancy));
-  m.impl("splat_bulk", TORCH_BOX(&gsf::DensityOps<gsf::DensityCpu>::bulk));
-  m.impl("density_normals", TORCH_BOX(&gsf::DensityOps<gsf::DensityCpu>::normals));
-}
+GSF_REGISTER(CPU, gsf::DensityOps<gsf::DensityCpu>)

@@ -7,6 +7,4 @@ std::string compiled_for(const Tensor&) { return std::string("cpu ") + __VERSION
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("compiled_for", TORCH_BOX(&gsf::compiled_for));
-}
+STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) { GSF_IMPL(gsf, compiled_for); }

@@ -4,22 +4,11 @@
 #include <atomic>
 #include <vector>
 
-#include "core/mvee.h"
-#include "core/mvee_lens.h"
+#include "core/mvee/lens.h"
+#include "core/mvee/mvee.h"
 
 namespace gsf {
 namespace {
-
-template <typename T>
-Vec3<T> load_vec3(const T* p) {
-  return {p[0], p[1], p[2]};
-}
-template <typename T>
-void store_vec3(T* p, const Vec3<T>& v) {
-  p[0] = v.x;
-  p[1] = v.y;
-  p[2] = v.z;
-}
 
 // The largest value reported so far.
 void report(int64_t* to, int64_t value) {
@@ -30,8 +19,9 @@ void report(int64_t* to, int64_t value) {
 }
 
 struct MveeCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void mvee(const MveeArgs<T>& a, const Tensor&) {
+  static void mvee(const MveeArgs<T>& a, const Scope&) {
     parallel_for(a.batch, 1, [&](int64_t begin, int64_t end) {
       std::vector<FitPoint<T>> scratch(a.count);
       for (int64_t i = begin; i < end; ++i) {
@@ -45,7 +35,7 @@ struct MveeCpu {
   }
 
   template <typename T>
-  static void mvee_lens(const MveeLensArgs<T>& a, const Tensor&) {
+  static void mvee_lens(const MveeLensArgs<T>& a, const Scope&) {
     parallel_for(a.batch, 16, [&](int64_t begin, int64_t end) {
       FitPoint<T> points[kLensPoints];
       for (int64_t i = begin; i < end; ++i) {
@@ -69,7 +59,4 @@ struct MveeCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("mvee", TORCH_BOX(&gsf::MveeOps<gsf::MveeCpu>::mvee));
-  m.impl("mvee_lens", TORCH_BOX(&gsf::MveeOps<gsf::MveeCpu>::mvee_lens));
-}
+GSF_REGISTER(CPU, gsf::MveeOps<gsf::MveeCpu>)

@@ -115,14 +115,14 @@ typename Pack<T>::Int int_pack_of(const F& f) {
     return Int{f(0), f(1), f(2), f(3)};
 }
 
-// Bit per lane of a mask.
+// Sign bit of every lane; for a mask, the lanes where it holds.
 inline uint32_t mask_bits(PackTypes<float>::Int mask) {
 #ifdef __AVX__
   return static_cast<uint32_t>(
       __builtin_ia32_movmskps256(reinterpret_cast<PackTypes<float>::Raw>(mask)));
 #else
   uint32_t bits = 0;
-  for (int lane = 0; lane < 8; ++lane) bits |= mask[lane] != 0 ? 1u << lane : 0u;
+  for (int lane = 0; lane < 8; ++lane) bits |= mask[lane] < 0 ? 1u << lane : 0u;
   return bits;
 #endif
 }
@@ -132,7 +132,7 @@ inline uint32_t mask_bits(PackTypes<double>::Int mask) {
       __builtin_ia32_movmskpd256(reinterpret_cast<PackTypes<double>::Raw>(mask)));
 #else
   uint32_t bits = 0;
-  for (int lane = 0; lane < 4; ++lane) bits |= mask[lane] != 0 ? 1u << lane : 0u;
+  for (int lane = 0; lane < 4; ++lane) bits |= mask[lane] < 0 ? 1u << lane : 0u;
   return bits;
 #endif
 }

@@ -1,14 +1,15 @@
 // CPU kernel of the shading op.
 #include "host/shade.h"
 
-#include "core/shade.h"
+#include "core/shade/shade.h"
 
 namespace gsf {
 namespace {
 
 struct ShadeCpu {
+  using Scope = CpuScope;
   template <typename T>
-  static void shade(const ShadeArgs<T>& a, const Tensor&) {
+  static void shade(const ShadeArgs<T>& a, const Scope&) {
     // Short pieces: lit and shadowed rows cost many times what the backdrop does.
     parallel_for(a.height, 8, [&](int64_t begin, int64_t end) {
       for (int64_t line = begin; line < end; ++line)
@@ -20,6 +21,4 @@ struct ShadeCpu {
 }  // namespace
 }  // namespace gsf
 
-STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
-  m.impl("shade", TORCH_BOX(&gsf::ShadeOps<gsf::ShadeCpu>::shade));
-}
+GSF_REGISTER(CPU, gsf::ShadeOps<gsf::ShadeCpu>)

@@ -3,7 +3,7 @@
 
 #include <cmath>
 
-#include "core/adam.h"
+#include "core/train/adam.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -26,9 +26,9 @@ struct AdamOps {
     STD_TORCH_CHECK(t.is_contiguous(), op, ": ", name, " must be contiguous");
   }
 
-  static void step(const Tensors& parameters, const Tensors& gradients, const Tensors& first,
-                   const Tensors& second, const std::vector<double>& rates, double beta1,
-                   double beta2, double epsilon, int64_t step, const OptTensor& visible) {
+  static void adam_step(const Tensors& parameters, const Tensors& gradients, const Tensors& first,
+                        const Tensors& second, const std::vector<double>& rates, double beta1,
+                        double beta2, double epsilon, int64_t step, const OptTensor& visible) {
     const char* op = "adam_step";
     const size_t count = parameters.size();
     STD_TORCH_CHECK(gradients.size() == count && first.size() == count && second.size() == count &&
@@ -51,11 +51,12 @@ struct AdamOps {
     const AdamVisible seen = visible_rows(visible, parameters);
     const double correction1 = 1.0 - std::pow(beta1, double(step));
     const double root = 1.0 / std::sqrt(1.0 - std::pow(beta2, double(step)));
+    const typename Backend::Scope scope(like);
     dispatch_floating(op, like, [&]<typename T>() {
       AdamArgs<T> args{};
       args.visible = seen;
       const auto flush = [&] {
-        if (args.count > 0) Backend::step(args, like);
+        if (args.count > 0) Backend::adam_step(args, scope);
         args.count = 0;
       };
       for (size_t i = 0; i < count; ++i) {
@@ -87,6 +88,8 @@ struct AdamOps {
                     ": visible must be bool or int32");
     return {nullptr, cptr<uint8_t>(*visible)};
   }
+
+  static void register_all(Library& m) { GSF_IMPL(AdamOps, adam_step); }
 };
 
 }  // namespace gsf

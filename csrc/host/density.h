@@ -15,67 +15,52 @@ template <class Backend>
 struct DensityOps {
   static Tensor occupancy(Tensor means, Tensor frame, int64_t nodes, double full) {
     const char* op = "occupancy";
-    check_shape(op, "means", means, {-1, 3});
-    check_shape(op, "frame", frame, {4});
-    check_dtype(op, "frame", frame, means.scalar_type());
-    check_same_device(op, "frame", frame, means);
+    means = ready(op, "means", means, means, {-1, 3});
+    frame = ready(op, "frame", frame, means, {4});
     check_density_nodes(op, nodes);
     STD_TORCH_CHECK(full > 0, op, ": full must be positive, got ", full);
-    means = gsf::contiguous(means);
-    frame = gsf::contiguous(frame);
     const int side = static_cast<int>(nodes);
     Tensor values =
         gsf::new_zeros(means, {density_level(side, kDensityLevels)}, means.scalar_type());
+    const typename Backend::Scope scope(means);
     dispatch_floating(op, means, [&]<typename T>() {
       const DensityArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(frame),
                                 side,          T(full),        mptr<T>(values)};
-      Backend::occupancy(args, means);
+      Backend::occupancy(args, scope);
     });
     return values;
   }
 
-  static Tensor bulk(Tensor means, Tensor scales) {
+  static Tensor splat_bulk(Tensor means, Tensor scales) {
     const char* op = "splat_bulk";
-    check_shape(op, "means", means, {-1, 3});
-    check_shape(op, "scales", scales, {means.size(0), 3});
-    check_dtype(op, "scales", scales, means.scalar_type());
-    check_same_device(op, "scales", scales, means);
-    means = gsf::contiguous(means);
-    scales = gsf::contiguous(scales);
+    means = ready(op, "means", means, means, {-1, 3});
+    scales = ready(op, "scales", scales, means, {means.size(0), 3});
     Tensor out = gsf::new_zeros(means, {kBulkSize}, ScalarType::Double);
+    const typename Backend::Scope scope(means);
     dispatch_floating(op, means, [&]<typename T>() {
       const BulkArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(scales), mptr<double>(out)};
-      Backend::bulk(args, means);
+      Backend::splat_bulk(args, scope);
     });
     return out;
   }
 
-  static Tensor normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame,
-                        int64_t nodes, OptTensor eye) {
+  static Tensor density_normals(Tensor means, Tensor quats, Tensor scales, Tensor values,
+                                Tensor frame, int64_t nodes, OptTensor eye) {
     const char* op = "density_normals";
-    check_shape(op, "means", means, {-1, 3});
+    means = ready(op, "means", means, means, {-1, 3});
     const int64_t n = means.size(0);
-    check_shape(op, "quats", quats, {n, 4});
-    check_shape(op, "scales", scales, {n, 3});
+    quats = ready(op, "quats", quats, means, {n, 4});
+    scales = ready(op, "scales", scales, means, {n, 3});
     check_density_nodes(op, nodes);
     const int side = static_cast<int>(nodes), wide = side >> kDensityWide;
-    check_shape(op, "values", values, {density_level(side, kDensityLevels)});
-    check_shape(op, "frame", frame, {4});
-    for (Tensor* t : {&means, &quats, &scales, &values, &frame}) {
-      check_dtype(op, "every tensor", *t, means.scalar_type());
-      check_same_device(op, "every tensor", *t, means);
-      *t = gsf::contiguous(*t);
-    }
-    if (eye) {
-      check_shape(op, "eye", *eye, {3});
-      check_dtype(op, "eye", *eye, means.scalar_type());
-      check_same_device(op, "eye", *eye, means);
-      eye = gsf::contiguous(*eye);
-    }
+    values = ready(op, "values", values, means, {density_level(side, kDensityLevels)});
+    frame = ready(op, "frame", frame, means, {4});
+    eye = ready(op, "eye", eye, means, {3});
     const auto real = means.scalar_type();
     const int64_t cells = int64_t(side) * side * side, coarse = int64_t(wide) * wide * wide;
     Tensor out = gsf::new_empty(means, {n, 3}, real);
     Tensor smooth = gsf::new_empty(means, {2 * cells + coarse}, real);
+    const typename Backend::Scope scope(means);
     dispatch_floating(op, means, [&]<typename T>() {
       if (n == 0) return;
       T* room = mptr<T>(smooth);
@@ -85,15 +70,21 @@ struct DensityOps {
                                       cptr<T>(scales),
                                       cptr<T>(values),
                                       cptr<T>(frame),
-                                      eye ? cptr<T>(*eye) : nullptr,
+                                      cptr<T>(eye),
                                       side,
                                       room,
                                       room + 2 * cells,
                                       room + cells,
                                       mptr<T>(out)};
-      Backend::normals(args, means);
+      Backend::density_normals(args, scope);
     });
     return out;
+  }
+
+  static void register_all(Library& m) {
+    GSF_IMPL(DensityOps, occupancy);
+    GSF_IMPL(DensityOps, splat_bulk);
+    GSF_IMPL(DensityOps, density_normals);
   }
 };
 

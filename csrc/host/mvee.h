@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of the enclosing-ellipsoid ops, once for both back ends.
 #pragma once
 
-#include "core/material_args.h"
+#include "core/mvee/args.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -20,6 +20,7 @@ struct MveeOps {
     const ScalarType dtype = x.scalar_type();
     Tensor center = gsf::new_empty(x, {batch, 3}, dtype);
     Tensor shape = gsf::new_empty(x, {batch, 3, 3}, dtype);
+    const typename Backend::Scope scope(x);
     dispatch_floating(op, x, [&]<typename T>() {
       if (batch == 0) return;
       const MveeArgs<T> args{.batch = batch,
@@ -29,7 +30,7 @@ struct MveeOps {
                              .max_iterations = static_cast<int>(max_iterations),
                              .center = mptr<T>(center),
                              .shape = mptr<T>(shape)};
-      Backend::mvee(args, x);
+      Backend::mvee(args, scope);
     });
     return {center, shape};
   }
@@ -59,6 +60,7 @@ struct MveeOps {
     Tensor overlap = gsf::new_empty(ma, {batch}, ScalarType::Bool);
     // Reported and not checked here, so that the caller decides when to wait for the device.
     Tensor faults = gsf::new_zeros(ma, {6}, ScalarType::Long);
+    const typename Backend::Scope scope(ma);
     dispatch_floating(op, ma, [&]<typename T>() {
       if (batch == 0) return;
       const MveeLensArgs<T> args{.batch = batch,
@@ -72,9 +74,14 @@ struct MveeOps {
                                  .covariance = mptr<T>(covariance),
                                  .overlap = mptr<bool>(overlap),
                                  .faults = mptr<int64_t>(faults)};
-      Backend::mvee_lens(args, ma);
+      Backend::mvee_lens(args, scope);
     });
     return {mean, covariance, overlap, faults};
+  }
+
+  static void register_all(Library& m) {
+    GSF_IMPL(MveeOps, mvee);
+    GSF_IMPL(MveeOps, mvee_lens);
   }
 };
 

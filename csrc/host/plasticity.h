@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of return_mapping, once for both back ends.
 #pragma once
 
-#include "core/return_mapping.h"
+#include "core/material/return_mapping.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -45,6 +45,7 @@ struct PlasticityOps {
     Tensor alpha_out = gsf::new_empty(e, {n}, dtype);
     Tensor stress_out = gsf::new_empty(e, {n, 6}, dtype);
     Tensor info = gsf::new_zeros(e, {4}, ScalarType::Int);
+    const typename Backend::Scope scope(e);
     dispatch_floating(op, e, [&]<typename T>() {
       if (n == 0) return;
       const ReturnMappingArgs<T> args{.count = n,
@@ -63,10 +64,12 @@ struct PlasticityOps {
                                       .alpha_out = mptr<T>(alpha_out),
                                       .stress_out = mptr<T>(stress_out),
                                       .info = mptr<int32_t>(info)};
-      Backend::return_mapping(args, e);
+      Backend::return_mapping(args, scope);
     });
     return {strain_out, alpha_out, stress_out, info};
   }
+
+  static void register_all(Library& m) { GSF_IMPL(PlasticityOps, return_mapping); }
 };
 
 }  // namespace gsf

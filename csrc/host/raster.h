@@ -4,7 +4,7 @@
 // zeroing), `Plan<T>` (project, sort, count; then bin and blend) and `backward<T>`.
 #pragma once
 
-#include "core/raster.h"
+#include "core/raster/raster.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -138,12 +138,12 @@ struct RasterOps {
   using Backward = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                               Tensor, Tensor, Tensor>;
 
-  static Forward forward(Tensor means, Tensor opacities, Tensor viewmat, Tensor intrinsics,
-                         OptTensor quats, OptTensor scales, OptTensor covars, OptTensor sh,
-                         OptTensor colors, OptTensor background, OptTensor normals,
-                         OptTensor groups, OptTensor offset, OptTensor absolute, int64_t width,
-                         int64_t height, bool antialiased, bool contribution, bool depth,
-                         bool median_depth, double near, double far) {
+  static Forward rasterize(Tensor means, Tensor opacities, Tensor viewmat, Tensor intrinsics,
+                           OptTensor quats, OptTensor scales, OptTensor covars, OptTensor sh,
+                           OptTensor colors, OptTensor background, OptTensor normals,
+                           OptTensor groups, OptTensor offset, OptTensor absolute, int64_t width,
+                           int64_t height, bool antialiased, bool contribution, bool depth,
+                           bool median_depth, double near, double far) {
     RasterInputs in{means, opacities, viewmat,    intrinsics, quats,  scales, covars,
                     sh,    colors,    background, normals,    groups, offset, absolute};
     prepare_raster_inputs(in);
@@ -195,15 +195,14 @@ struct RasterOps {
   }
 
   // Absent inputs get an empty gradient.
-  static Backward backward(OptTensor grad_image, OptTensor grad_alpha, OptTensor grad_depth,
-                           OptTensor grad_normal, Tensor image, Tensor alpha, Tensor depth,
-                           Tensor normal, Tensor splats, Tensor order, Tensor tile_start,
-                           Tensor instances, Tensor means, Tensor opacities, Tensor viewmat,
-                           Tensor intrinsics, OptTensor quats, OptTensor scales, OptTensor covars,
-                           OptTensor sh, OptTensor colors, OptTensor background, OptTensor normals,
-                           OptTensor groups, OptTensor offset, OptTensor absolute, int64_t width,
-                           int64_t height, bool antialiased, bool has_depth, double near,
-                           double far) {
+  static Backward rasterize_backward(
+      OptTensor grad_image, OptTensor grad_alpha, OptTensor grad_depth, OptTensor grad_normal,
+      Tensor image, Tensor alpha, Tensor depth, Tensor normal, Tensor splats, Tensor order,
+      Tensor tile_start, Tensor instances, Tensor means, Tensor opacities, Tensor viewmat,
+      Tensor intrinsics, OptTensor quats, OptTensor scales, OptTensor covars, OptTensor sh,
+      OptTensor colors, OptTensor background, OptTensor normals, OptTensor groups, OptTensor offset,
+      OptTensor absolute, int64_t width, int64_t height, bool antialiased, bool has_depth,
+      double near, double far) {
     RasterInputs in{means, opacities, viewmat,    intrinsics, quats,  scales, covars,
                     sh,    colors,    background, normals,    groups, offset, absolute};
     prepare_raster_inputs(in);
@@ -285,6 +284,11 @@ struct RasterOps {
       Backend::template backward<T>(b, like, scope);
       return out;
     });
+  }
+
+  static void register_all(Library& m) {
+    GSF_IMPL(RasterOps, rasterize);
+    GSF_IMPL(RasterOps, rasterize_backward);
   }
 };
 

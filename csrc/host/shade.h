@@ -1,7 +1,7 @@
 // Checks, allocation and dtype dispatch of the shading op, once for both back ends.
 #pragma once
 
-#include "core/shade_args.h"
+#include "core/shade/args.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -61,8 +61,8 @@ struct ShadeOps {
          {&gloss, &map_depth, &map_alpha, &map_cameras, &occupancy, &grid_frame, &studio})
       if (*t) prepare(op, **t, image);
     Tensor out = gsf::new_empty(image, {h, w, 3}, image.scalar_type());
+    const typename Backend::Scope scope(image);
     dispatch_floating(op, image, [&]<typename T>() {
-      const auto pointer = [](const OptTensor& t) { return t ? cptr<T>(*t) : nullptr; };
       if (h == 0 || w == 0) return;
       const ShadeArgs<T> args{w,
                               h,
@@ -71,28 +71,30 @@ struct ShadeOps {
                               cptr<T>(depth),
                               cptr<T>(normal),
                               static_cast<int>(normal.size(2)),
-                              pointer(gloss),
+                              cptr<T>(gloss),
                               cptr<T>(viewmat),
                               cptr<T>(intrinsics),
                               cptr<T>(lamps),
                               cptr<T>(environment),
                               cptr<T>(background),
                               static_cast<int>(lamps.size(0)),
-                              pointer(map_depth),
-                              pointer(map_alpha),
-                              pointer(map_cameras),
+                              cptr<T>(map_depth),
+                              cptr<T>(map_alpha),
+                              cptr<T>(map_cameras),
                               shadows ? static_cast<int>(map_depth->size(0)) : 0,
                               shadows ? static_cast<int>(map_depth->size(1)) : 0,
-                              pointer(occupancy),
-                              pointer(grid_frame),
+                              cptr<T>(occupancy),
+                              cptr<T>(grid_frame),
                               static_cast<int>(nodes),
                               T(occlusion),
-                              pointer(studio),
+                              cptr<T>(studio),
                               mptr<T>(out)};
-      Backend::shade(args, image);
+      Backend::shade(args, scope);
     });
     return out;
   }
+
+  static void register_all(Library& m) { GSF_IMPL(ShadeOps, shade); }
 
  private:
   static void prepare(const char* op, Tensor& t, const Tensor& like) {

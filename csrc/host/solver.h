@@ -5,8 +5,8 @@
 
 #include <cstring>
 
-#include "core/collider.h"
-#include "core/solver_state.h"
+#include "core/collider/collider.h"
+#include "core/solver/state.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -107,7 +107,7 @@ struct SolverOps {
       bool optional;
     } wanted[kSolverBuffers] = {
         {"clock", 1, kClockWords, i64, false},
-        // core/solver_layout.h: on a device offset holds meta, and velocity the slope
+        // core/solver/layout.h: on a device offset holds meta, and velocity the slope
         {"offset", n, device ? 4 : 3, real, false},
         {"meta", device ? 0 : n, 1, i32, false},
         {"velocity", n, device ? 12 : 3, real, false},
@@ -241,9 +241,9 @@ struct SolverOps {
     });
   }
 
-  static void register_all(torch::stable::detail::StableLibrary& m) {
-    m.impl("solver_prime", TORCH_BOX(&SolverOps::solver_prime));
-    m.impl("solver_run", TORCH_BOX(&SolverOps::solver_run));
+  static void register_all(Library& m) {
+    GSF_IMPL(SolverOps, solver_prime);
+    GSF_IMPL(SolverOps, solver_run);
   }
 
  private:

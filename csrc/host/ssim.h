@@ -2,7 +2,7 @@
 // ends.
 #pragma once
 
-#include "core/ssim.h"
+#include "core/train/ssim.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -28,17 +28,6 @@ struct SsimOps {
     return inside ? kSsimRadius : 0;
   }
 
-  // An optional [H, W] or [C] tensor, made contiguous.
-  static OptTensor plane(const char* name, const OptTensor& t, const Tensor& image,
-                         std::initializer_list<int64_t> shape) {
-    if (!t.has_value()) return std::nullopt;
-    const char* op = "photometric_loss";
-    check_shape(op, name, *t, shape);
-    check_dtype(op, name, *t, image.scalar_type());
-    check_same_device(op, name, *t, image);
-    return gsf::contiguous(*t);
-  }
-
   template <typename T>
   static SsimArgs<T> images(const Tensor& image, const Tensor& target, int64_t inset) {
     SsimArgs<T> a{};
@@ -51,45 +40,45 @@ struct SsimOps {
     return a;
   }
 
-  static Tensor map(const Tensor& image_in, const Tensor& target_in, bool inside) {
+  static Tensor ssim(const Tensor& image_in, const Tensor& target_in, bool inside) {
     const char* op = "ssim";
     const int64_t inset = check_images(op, image_in, target_in, inside);
     const Tensor image = gsf::contiguous(image_in), target = gsf::contiguous(target_in);
     Tensor out =
         gsf::new_empty(image, {image.size(0) - 2 * inset, image.size(1) - 2 * inset, image.size(2)},
                        image.scalar_type());
+    const typename Backend::Scope scope(image);
     dispatch_floating(op, image, [&]<typename T>() {
       SsimArgs<T> a = images<T>(image, target, inset);
       a.map = mptr<T>(out);
-      Backend::run(a, image);
+      Backend::run(a, scope);
     });
     return out;
   }
 
   // Gradient with respect to `image` of the map's sum weighted by `grad`.
-  static Tensor map_backward(const Tensor& grad_in, const Tensor& image_in, const Tensor& target_in,
-                             bool inside) {
+  static Tensor ssim_backward(const Tensor& grad_in, const Tensor& image_in,
+                              const Tensor& target_in, bool inside) {
     const char* op = "ssim_backward";
     const int64_t inset = check_images(op, image_in, target_in, inside);
     const Tensor image = gsf::contiguous(image_in), target = gsf::contiguous(target_in);
-    check_shape(op, "grad", grad_in,
-                {image.size(0) - 2 * inset, image.size(1) - 2 * inset, image.size(2)});
-    check_dtype(op, "grad", grad_in, image.scalar_type());
-    check_same_device(op, "grad", grad_in, image);
-    const Tensor grad = gsf::contiguous(grad_in);
+    const Tensor grad =
+        ready(op, "grad", grad_in, image,
+              {image.size(0) - 2 * inset, image.size(1) - 2 * inset, image.size(2)});
     Tensor out =
         gsf::new_empty(image, {image.size(0), image.size(1), image.size(2)}, image.scalar_type());
+    const typename Backend::Scope scope(image);
     dispatch_floating(op, image, [&]<typename T>() {
       SsimArgs<T> a = images<T>(image, target, inset);
       a.map_slope = cptr<T>(grad);
       a.grad_image = mptr<T>(out);
-      Backend::run(a, image);
+      Backend::run(a, scope);
     });
     return out;
   }
 
   // Loss, its figures (similarity, |miss|, miss^2, |excess|), gradients of image and alpha.
-  static std::tuple<Tensor, Tensor, Tensor, Tensor> photometric(
+  static std::tuple<Tensor, Tensor, Tensor, Tensor> photometric_loss(
       const Tensor& image_in, const Tensor& target_in, const OptTensor& valid,
       const OptTensor& alpha, const OptTensor& mask, const OptTensor& backdrop, double constant,
       double l1, double similarity, double excess, bool inside, bool pixels, bool gradient) {
@@ -99,10 +88,10 @@ struct SsimOps {
     STD_TORCH_CHECK(!backdrop.has_value() || alpha.has_value(), op, ": backdrop needs alpha");
     const Tensor image = gsf::contiguous(image_in), target = gsf::contiguous(target_in);
     const int64_t h = image.size(0), w = image.size(1), channels = image.size(2);
-    const OptTensor valid_c = plane("valid", valid, image, {h, w});
-    const OptTensor alpha_c = plane("alpha", alpha, image, {h, w});
-    const OptTensor mask_c = plane("mask", mask, image, {h, w});
-    const OptTensor backdrop_c = plane("backdrop", backdrop, image, {channels});
+    const OptTensor valid_c = ready(op, "valid", valid, image, {h, w});
+    const OptTensor alpha_c = ready(op, "alpha", alpha, image, {h, w});
+    const OptTensor mask_c = ready(op, "mask", mask, image, {h, w});
+    const OptTensor backdrop_c = ready(op, "backdrop", backdrop, image, {channels});
     const auto dtype = image.scalar_type();
     Tensor loss = gsf::new_empty(image, {}, dtype);
     Tensor figures = gsf::new_empty(image, {kSsimSums}, dtype);
@@ -110,24 +99,28 @@ struct SsimOps {
     Tensor grad_image = gradient ? gsf::new_empty(image, {h, w, channels}, dtype)
                                  : gsf::new_empty(image, {0, w, channels}, dtype);
     Tensor grad_alpha = gsf::new_empty(image, {slopes_alpha ? h : 0, w}, dtype);
+    const typename Backend::Scope scope(image);
     dispatch_floating(op, image, [&]<typename T>() {
-      const auto optional = [](const OptTensor& t) {
-        return t.has_value() ? cptr<T>(*t) : nullptr;
-      };
       SsimArgs<T> a = images<T>(image, target, inset);
-      a.valid = optional(valid_c);
-      a.alpha = optional(alpha_c);
-      a.mask = optional(mask_c);
-      a.backdrop = optional(backdrop_c);
+      a.valid = cptr<T>(valid_c);
+      a.alpha = cptr<T>(alpha_c);
+      a.mask = cptr<T>(mask_c);
+      a.backdrop = cptr<T>(backdrop_c);
       a.weigh({constant, l1, similarity, excess});
       a.pixels = pixels;
       a.grad_image = gradient ? mptr<T>(grad_image) : nullptr;
       a.grad_alpha = slopes_alpha ? mptr<T>(grad_alpha) : nullptr;
       a.loss = mptr<T>(loss);
       a.figures = mptr<T>(figures);
-      Backend::run(a, image);
+      Backend::run(a, scope);
     });
     return {loss, figures, grad_image, grad_alpha};
+  }
+
+  static void register_all(Library& m) {
+    GSF_IMPL(SsimOps, ssim);
+    GSF_IMPL(SsimOps, ssim_backward);
+    GSF_IMPL(SsimOps, photometric_loss);
   }
 };
 

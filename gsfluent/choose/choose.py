@@ -26,6 +26,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.simulate.engine import CFL
 from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import solver_options
 
 __all__ = [
     "LEVELS",
@@ -148,8 +149,8 @@ def run_probes(
     def go(cells: int, number: int, frames: int, cfl: float = CFL) -> Probe:
         nonlocal done
         found = probe(
-            scene, cells, fps=fps, frames=frames, cfl=cfl, seed=seed + number, device=device,
-            standing=shot.solve.standing, loose_crumbs=shot.solve.loose_crumbs,
+            scene, cells, fps=fps, frames=frames, seed=seed + number, device=device,
+            options=dataclasses.replace(solver_options(shot), cfl=cfl),
         )  # fmt: skip
         if found.failed:
             raise InputError(
@@ -283,7 +284,7 @@ def choose(
         progress: Told after every run.
 
     Returns:
-        ``chart.json``: see docs/chart_shot.md.
+        ``chart.json``: see docs/theory/plan.md.
 
     Raises:
         InputError: A probe broke off, or the scene is empty.
@@ -371,7 +372,7 @@ def loose_limit(poisson_ratio: float) -> float:
     All nodes are its own, so a step changes its velocity gradient by ``-4 dt / (rho dx^2) tau``: an
     oscillator of its volume with ``omega^2 = 12 K / (rho dx^2)``, which symplectic Euler keeps up
     to ``omega dt = 2``. Measured within 3 %, also on clusters of 2 to 8 points
-    (docs/stability.md).
+    (docs/theory/stability.md).
 
     Args:
         poisson_ratio: nu, above -1 and below 0.5.

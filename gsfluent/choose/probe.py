@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gsfluent.choose.fit import History
 from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
@@ -103,11 +104,9 @@ def probe(
     *,
     fps: float,
     frames: int,
-    cfl: float,
+    options: SolverOptions,
     seed: int,
     device: torch.device | str = "cpu",
-    standing: bool = False,
-    loose_crumbs: bool = False,
     tick: Callable[[], None] | None = None,
 ) -> Probe:
     """Run a scene without its splats and watch it.
@@ -117,16 +116,14 @@ def probe(
         cells: Cells along the largest solid.
         fps: Frames per second.
         frames: How many, from time 0.
-        cfl: Courant number.
+        options: How the matter is moved.
         seed: Seed of point positions and weakness.
         device: Where to compute.
-        standing: See :class:`Simulate`.
-        loose_crumbs: See :class:`Simulate`.
         tick: Called after every frame.
     """
     stage = Simulate(
-        dx=grid_spacing(scene, cells), seed=seed, device=device, cfl=cfl, splats=False,
-        repair=False, standing=standing, loose_crumbs=loose_crumbs,
+        dx=grid_spacing(scene, cells), seed=seed, device=device, splats=False, repair=False,
+        options=options,
     )  # fmt: skip
     with torch.no_grad():
         run = stage.run_of(scene, fps)
@@ -155,7 +152,7 @@ def probe(
         mass=float(run.matter.particles.mass.sum()), length=length,
     )  # fmt: skip
     return Probe(
-        cells=cells, cfl=cfl, seed=seed, seen=seen, seconds=run.seconds,
+        cells=cells, cfl=options.cfl, seed=seed, seen=seen, seconds=run.seconds,
         points=run.matter.particles.count, point_steps=np.array(spent, dtype=np.float64),
         steps=counters.steps, blocks=counters.block_steps / max(counters.steps, 1),
         fields=counters.fields_max, composed=counters.composed_steps, failed=run.failure,

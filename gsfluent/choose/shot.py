@@ -12,7 +12,7 @@ import torch
 
 from gsfluent.choose.choose import Probing, choose
 from gsfluent.config import Shot
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, MissingPackage
 from gsfluent.io import write_json
 from gsfluent.plan.stand_in import stand_in
 from gsfluent.progress import LineReporter, Reporter
@@ -51,7 +51,7 @@ def chart_shot(
         reporter: Receives progress; log lines by default.
 
     Returns:
-        The content of ``chart.json``; keys in docs/chart_shot.md.
+        The content of ``chart.json``; keys in docs/theory/plan.md.
 
     Raises:
         InputError: The shot is wrong, or a probe broke off.
@@ -64,8 +64,10 @@ def chart_shot(
     )  # fmt: skip
     result["solid"] = solid
     out.mkdir(parents=True, exist_ok=True)
-    _write(result, out)
-    result["outputs"] = {"chart": str(out / FILE), "picture": str(out / PICTURE)}
+    drawn = _write(result, out)
+    result["outputs"] = {"chart": str(out / FILE)}
+    if drawn:
+        result["outputs"]["picture"] = str(out / PICTURE)
     return result
 
 
@@ -103,11 +105,17 @@ def shot_scene(
     return build_scene(shot, dict(standing.solids), standing.frame), standing.assumed
 
 
-def _write(result: dict[str, Any], folder: Path) -> None:
+def _write(result: dict[str, Any], folder: Path) -> bool:
+    """Write the choice and draw it; whether it could be drawn."""
     from gsfluent.figure.choice import draw_choice
 
     write_json(folder / FILE, result)
-    draw_choice(result, folder / PICTURE)
+    try:
+        draw_choice(result, folder / PICTURE)
+    except MissingPackage as missing:  # the choice is worth having without its picture
+        _log.warning("%s is not drawn: %s", PICTURE, missing)
+        return False
+    return True
 
 
 def readable(result: dict[str, Any]) -> dict[str, Any]:
@@ -200,11 +208,12 @@ def choose_stage(context: RunContext) -> bool:
         return result
 
     result = context.store.run("choose", key, work)
-    publish(result.folder / PICTURE, context.out / PICTURE)
     publish(result.folder / FILE, context.out / FILE)
+    if (result.folder / PICTURE).is_file():
+        publish(result.folder / PICTURE, context.out / PICTURE)
+        context.record.values["outputs"]["chart"] = PICTURE
     found = result.report
     context.record.values["choice"] = {k: v for k, v in found.items() if k != "settings"}
-    context.record.values["outputs"]["chart"] = PICTURE
     chosen = found["chosen"]
     if chosen is None and found["floor"] > bound:
         chosen = found["enough"]

@@ -29,7 +29,7 @@ class Export(Verb):
       gsfluent export out --to mp4 --camera freeze           # time stands still, once around
       gsfluent export out --to webp --alpha --size 480x270   # to lay over a web page
 
-    Formats (docs/export.md says who reads what, and how large it gets):
+    Formats (docs/guide/export.md says who reads what, and how large it gets):
       ply-seq  3DGS .ply per frame     spz, splat, glb  the same as smaller or newer files
       delta    all frames in one small file, read by gsfluent.io.DeltaReader
       usd      all frames in one file: splats, particles with velocity and damage

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 
 Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")]
 
@@ -30,7 +30,7 @@ class Chart(Verb):
 
     Writes chart.jsonl (a line per run), chart.png, chart.html and chart.md.
     docs/measured/chart.md says how to read them. With a shot: chart.json and chart.png,
-    see docs/chart_shot.md.
+    see docs/guide/lab.md.
     """
 
     shot: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="SHOT.yaml")] = None
@@ -62,6 +62,7 @@ class Chart(Verb):
 
         if self.shot is not None or self.error is not None:
             return self._shot()
+        need("matplotlib", "figures", "chart")  # missing is better said before the runs
         if self.repeat < 1:
             raise InputError(f"--repeat {self.repeat}", "give at least 1")
         if self.budget is not None and self.budget < 0:
@@ -184,6 +185,7 @@ class Stability(Verb):
         from gsfluent.lab.stability.report import verdict, write_all
         from gsfluent.lab.stability.run import chosen, run_maps
 
+        need("matplotlib", "figures", "stability")  # missing is better said before the runs
         programs = measured(existing(self.peers, "--peers", folder=False)) if self.peers else []
         maps = [m for name in self.maps for m in name.split(",") if m]
         if self.draw:

@@ -25,7 +25,7 @@ class Doctor(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Examine the machine."""
-        from gsfluent.inspect.doctor import examine
+        from gsfluent.inspection.doctor import examine
 
         return examine(self.torch_device(), every_device=self.device == "auto")
 
@@ -57,7 +57,7 @@ class Inspect(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Inspect the input and draw the picture."""
-        from gsfluent.inspect.capture import inspect
+        from gsfluent.inspection.capture import inspect
 
         existing(self.input, "INPUT")
         suffix = self.input.suffix.lower()
@@ -72,7 +72,7 @@ class Inspect(Verb):
     def _shot(self) -> dict[str, Any]:
         """Show the parts of a shot."""
         from gsfluent.config import load_shot
-        from gsfluent.inspect.shot import inspect_shot
+        from gsfluent.inspection.shot import inspect_shot
         from gsfluent.progress import reporter
 
         if self.run is None:
@@ -95,7 +95,7 @@ class Inspect(Verb):
 
 def _regions(path: Path, out: Path) -> dict[str, Any] | None:
     """The regions of a solid; None for a splat, or a solid without any."""
-    from gsfluent.inspect.shot import inspect_solid
+    from gsfluent.inspection.shot import inspect_solid
     from gsfluent.io.solid import volume_path
 
     if not volume_path(path).is_file() or load_solid(path).regions is None:
@@ -114,7 +114,7 @@ class Plan(Verb):
       gsfluent plan shot.yaml --no-probe    # do not measure; no times where nothing was measured
 
     The first plan on a machine measures for about ten seconds what work costs there and keeps it
-    in the user's cache; every run then corrects it. See docs/plan.md.
+    in the user's cache; every run then corrects it. See docs/theory/plan.md.
     """
 
     shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
@@ -180,7 +180,7 @@ class Metrics(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Compare the two sides."""
-        from gsfluent.inspect.compare import compare
+        from gsfluent.inspection.compare import compare
 
         existing(self.judged, "A")
         existing(self.reference, "B")

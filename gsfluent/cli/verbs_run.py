@@ -34,7 +34,7 @@ class Run(Verb):
     out: Out
     """Folder for the results; made when missing."""
     config: Path | None = None
-    """PhysGaussian's JSON config of the model; see docs/physgaussian.md."""
+    """PhysGaussian's JSON config of the model; see docs/guide/physgaussian.md."""
     write_shot: bool = False
     """With --config: only write OUT/physgaussian/shot.yaml and say what became of every key."""
     force: bool = False
@@ -123,9 +123,9 @@ class Render(Verb):
       gsfluent render out                                   # as the shot says: out/render.mp4
       gsfluent render out --size 1920x1080 -o big.mp4
       gsfluent render out --camera 3                        # from the pose of photograph 3
-      gsfluent render out --camera path.json                # eyes and targets, see docs/render.md
+      gsfluent render out --camera path.json                # eyes and targets
       gsfluent render out --light=-1,-1,3 --ambient 0.3     # harder light from the left
-      gsfluent render out --light studio.yaml               # a light: section, see docs/light.md
+      gsfluent render out --light studio.yaml               # a light: section
       gsfluent render out --lamp 'point=0.3,-0.3,0.5;intensity=0.4;color=1,0.8,0.6'
       gsfluent render out --environment sky --spin 90       # the key light goes round
       gsfluent render out --frame 20 -o still.png           # one picture
@@ -136,7 +136,7 @@ class Render(Verb):
     to: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Where the video (.mp4) or picture (.png) goes."""
     camera: str | None = None
-    """orbit, turntable, dolly, the index of a photograph, or a path (docs/export.md)."""
+    """orbit, turntable, dolly, the index of a photograph, or a path (docs/guide/export.md)."""
     size: str | None = None
     """Such as 1280x720."""
     light: str | None = None

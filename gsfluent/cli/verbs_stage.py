@@ -178,7 +178,7 @@ class Texture(Verb):
     model: str | None = None
     """Path or hub id of a diffusers SD-XL inpainting model."""
     inpaint: tuple[str, ...] = ()
-    """Settings of the slice methods, name=value (see texture.inpaint in docs/shot.md)."""
+    """Settings of the slice methods, name=value (texture.inpaint in docs/guide/shot-keys.md)."""
     resume: Path | None = None
     """Folder for finished slices, found again after a kill."""
     polish: bool = False

@@ -22,7 +22,7 @@ class View(Verb):
       gsfluent view out --host 0.0.0.0         # for other machines, too
       gsfluent view out --splats               # the browser draws the splats (up to 200 000)
       gsfluent view out --check                # draws one picture, out/view.png, and exits
-      gsfluent view out --live                 # throw, shoot and cut its objects: docs/live.md
+      gsfluent view out --live                 # throw, shoot and cut its objects
       gsfluent view melon.ply --live --material fruit.watermelon   # a filled solid
       gsfluent view shot.yaml --live --run out # a shot, whose objects are prepared in out
 

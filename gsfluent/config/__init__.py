@@ -1,4 +1,4 @@
-"""The shot file: YAML in, frozen dataclasses out. docs/shot.md lists every key.
+"""The shot file: YAML in, frozen dataclasses out. docs/guide/shot-keys.md lists every key.
 
 A key that is unknown, or that would do nothing, is an error that names its full path and the
 nearest known key.

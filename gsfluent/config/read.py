@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import logging
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 from gsfluent.errors import InputError
 
 _Section = TypeVar("_Section")
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,18 +39,25 @@ Reader = Callable[[Any, Place], Any]
 
 
 def key(
-    read: Reader, *, doc: str, example: str, default: Any = dataclasses.MISSING, name: str = ""
+    read: Reader,
+    *,
+    doc: str,
+    example: str,
+    default: Any = dataclasses.MISSING,
+    name: str = "",
+    old: str = "",
 ) -> Any:
     """Declare a setting as a dataclass field.
 
     Args:
         read: Turns the YAML value into the field's value.
-        doc: One sentence for docs/shot.md, with the unit.
+        doc: One sentence for docs/guide/shot-keys.md, with the unit.
         example: A YAML value, read by the documentation's test.
         default: Value when the key is absent; without one the key is required.
         name: Key in the file when it is not a legal field name (``from``).
+        old: Name the key had before, still read, with a warning that says the new one.
     """
-    facts = {"read": read, "doc": doc, "example": example, "name": name}
+    facts = {"read": read, "doc": doc, "example": example, "name": name, "old": old}
     if default is not dataclasses.MISSING and default.__class__.__hash__ is None:
         return dataclasses.field(default_factory=lambda: dict(default), metadata=facts)
     return dataclasses.field(default=default, metadata=facts)
@@ -86,8 +95,8 @@ def section(cls: type[_Section], value: Any, place: Place) -> _Section:
     Raises:
         InputError: An unknown, later or missing key, or a value that its reader refuses.
     """
-    given = mapping(value, place)
     fields = {key_name(field): field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    given = _renamed(mapping(value, place), fields, place)
     refuse_unknown(given, fields, place, getattr(cls, "LATER", {}))
     values = {}
     for name, field in fields.items():
@@ -97,6 +106,25 @@ def section(cls: type[_Section], value: Any, place: Place) -> _Section:
             hint = f"add it, for example {name}: {field.metadata['example']}"
             raise InputError(f"{place.inside(name).path} is missing", hint)
     return cls(**values)
+
+
+def _renamed(
+    given: dict[str, Any], fields: Mapping[str, dataclasses.Field[Any]], place: Place
+) -> dict[str, Any]:
+    """The keys given, those of before under their names of today.
+
+    Raises:
+        InputError: A key stands there under both names.
+    """
+    for name, field in fields.items():
+        old = field.metadata.get("old")
+        if old and old in given:
+            path = place.inside(old).path
+            if name in given:
+                raise InputError(f"{path} is called {name} now, and both are given", f"keep {name}")
+            _log.warning("%s is called %s now; the old name still works", path, name)
+            given = {name if key == old else key: value for key, value in given.items()}
+    return given
 
 
 def refuse_unknown(

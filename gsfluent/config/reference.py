@@ -1,4 +1,4 @@
-"""The tables of docs/shot.md, made from the dataclasses so that page and program cannot differ."""
+"""The tables of docs/guide/shot-keys.md, made from the dataclasses: page and program agree."""
 
 from __future__ import annotations
 

@@ -84,12 +84,13 @@ class SolveSettings:
         "something comes near; else its weight begins to act at the start.",
         example="true",
     )
-    loose_crumbs: bool = key(
+    loose_debris: bool = key(
         flag,
         default=False,
         doc="Broken matter with next to nothing around it falls freely and stays where it meets "
         "the floor: much faster where an object goes to dust.",
         example="true",
+        old="loose_crumbs",
     )
     deterministic: bool = key(
         flag,

@@ -242,7 +242,7 @@ def load_shot(path: str | Path) -> Shot:
     if not isinstance(values, Mapping):
         raise InputError(
             f"{path}: must be a YAML mapping, got {type(values).__name__}",
-            "see docs/shot.md",
+            "see docs/guide/shot-keys.md",
         )
     try:
         return Shot.from_dict(values, path.resolve().parent)

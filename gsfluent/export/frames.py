@@ -69,7 +69,7 @@ def upright(up: str) -> Frame:
     return Frame(torch.tensor(_TURNS[up], dtype=torch.float64), torch.zeros(3).double(), 1.0)
 
 
-class Reel:
+class FrameSequence:
     """The chosen frames of a finished (or running) simulation.
 
     Args:
@@ -134,9 +134,9 @@ class Reel:
         for place in range(len(self)):
             yield self.moment(place)
 
-    def turned(self, up: str) -> Reel:
+    def turned(self, up: str) -> FrameSequence:
         """The same frames with another axis up (formats that fix it)."""
-        other = object.__new__(Reel)
+        other = object.__new__(FrameSequence)
         other.__dict__.update(self.__dict__, up=up, turn=upright(up))
         return other
 
@@ -189,10 +189,10 @@ def _chosen(text: str | None, count: int) -> list[int]:
     return chosen
 
 
-class DeltaReel(Reel):
+class DeltaSequence(FrameSequence):
     """The chosen frames of a ``.gsd`` file; there are no material points, only their fragments.
 
-    Args: as :class:`Reel`, with the file for ``out``.
+    Args: as :class:`FrameSequence`, with the file for ``out``.
 
     Raises:
         InputError: Not such a file, or damaged.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from gsfluent.export.frames import Moment, Reel
+from gsfluent.export.frames import FrameSequence, Moment
 from gsfluent.io import write_json
 from gsfluent.progress import Progress, report_progress
 from gsfluent.results.store import content_digest, fingerprint
@@ -71,7 +71,7 @@ class Job:
     Attributes:
         out: Folder of the run.
         folder: Where the files go.
-        reel: The chosen frames.
+        sequence: The chosen frames.
         options: How.
         fps: Frames per second of the simulation's frames.
         device: Where pictures are rendered.
@@ -80,7 +80,7 @@ class Job:
 
     out: Path
     folder: Path
-    reel: Reel
+    sequence: FrameSequence
     options: ExportOptions
     fps: float
     device: torch.device
@@ -106,27 +106,27 @@ class Job:
             folder: Below the export's folder.
             name: Of the files, with a field for the frame's number from 1.
             write: Writes one file, atomically.
-            frames: The frames, where they are not simply those of the reel.
+            frames: The frames, where they are not simply those of the sequence.
 
         Returns:
             The names of the files.
         """
         target = self.folder / folder
         target.mkdir(parents=True, exist_ok=True)
-        names = [name.format(index + 1) for index in self.reel.indices]
+        names = [name.format(index + 1) for index in self.sequence.indices]
         done = self._finished(target, kind)
         moments = None if frames is None else iter(frames)
         for place, file in enumerate(names):
             moment = None if moments is None else next(moments)
             if not (done and (target / file).is_file()):
-                write(target / file, moment or self.reel.moment(place))
+                write(target / file, moment or self.sequence.moment(place))
             self.report(place + 1, len(names), kind)
         self._forget_stale(target, name)
         return names
 
     def _finished(self, target: Path, kind: str) -> bool:
         """Whether files in the folder are of this very export; notes down that they will be."""
-        source = self.reel.source()
+        source = self.sequence.source()
         known = content_digest(source) if source.is_file() else None
         wanted = repr(replace(self.options, frames=None))
         key = fingerprint("export", kind, wanted, known, self._light())
@@ -151,7 +151,7 @@ class Job:
 
     def _forget_stale(self, target: Path, name: str) -> None:
         """Remove files beyond the run's last frame: an older, longer run's, which would play on."""
-        number = self.reel.total + 1
+        number = self.sequence.total + 1
         while (stale := target / name.format(number)).is_file():
             stale.unlink()
             number += 1

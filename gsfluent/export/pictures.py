@@ -30,8 +30,8 @@ def mp4(job: Job) -> str:
     """
     if job.options.alpha:
         raise InputError("--alpha: mp4 has no transparency", "use --to png or --to webp")
-    reel = _Takes(job)
-    write_video(job.folder / "video.mp4", reel.frames("mp4"), fps=job.fps, size=reel.size)
+    sequence = _Pictures(job)
+    write_video(job.folder / "video.mp4", sequence.frames("mp4"), fps=job.fps, size=sequence.size)
     return "video.mp4"
 
 
@@ -43,13 +43,13 @@ def gif(job: Job) -> str:
     """
     if job.options.alpha:
         raise InputError("--alpha: gif has no soft transparency", "use --to png or --to webp")
-    write_animation(job.folder / "video.gif", _Takes(job).frames("gif"), fps=job.fps)
+    write_animation(job.folder / "video.gif", _Pictures(job).frames("gif"), fps=job.fps)
     return "video.gif"
 
 
 def webp(job: Job) -> str:
     """``video.webp``."""
-    write_animation(job.folder / "video.webp", _Takes(job).frames("webp"), fps=job.fps)
+    write_animation(job.folder / "video.webp", _Pictures(job).frames("webp"), fps=job.fps)
     return "video.webp"
 
 
@@ -61,7 +61,7 @@ def png(job: Job) -> str:
 
     folder = job.folder / "pictures"
     names: list[str] = []
-    for frame in _Takes(job).frames("png"):
+    for frame in _Pictures(job).frames("png"):
         names.append(f"picture_{len(names) + 1:04d}.png")
         with atomic_path(folder / names[-1]) as part:
             Image.fromarray(frame).save(part, compress_level=4)
@@ -72,7 +72,7 @@ def png(job: Job) -> str:
     return span("pictures", names)
 
 
-class _Takes:
+class _Pictures:
     """The film of an export: which frame each picture shows, and from where."""
 
     def __init__(self, job: Job) -> None:
@@ -95,12 +95,12 @@ class _Takes:
         cuts = [Cut(index, camera) for index, camera in enumerate(self.film.cameras)]
         if frozen:
             cuts = self._freeze(str(choice))
-        wanted = set(job.reel.indices)
+        wanted = set(job.sequence.indices)
         self.cuts = [cut for cut in cuts if cut.frame in wanted]
 
     def _freeze(self, choice: str) -> list[Cut]:
         """Cuts for ``freeze`` (shortly after the largest break) or ``freeze:FRAME``."""
-        folder, count = self.job.reel.folder, count_frames(self.job.reel.folder)
+        folder, count = self.job.sequence.folder, count_frames(self.job.sequence.folder)
         saved = [load_frame(folder, index) for index in range(count)]
         text = choice.partition(":")[2]
         if text and not text.isdigit():

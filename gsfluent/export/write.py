@@ -1,4 +1,4 @@
-"""A finished simulation in other programs' formats; docs/export.md says which reads what."""
+"""A finished simulation in other programs' formats; docs/guide/export.md says which reads what."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from gsfluent.config.read import nearest
 from gsfluent.errors import InputError
-from gsfluent.export.frames import DeltaReel, Reel
+from gsfluent.export.frames import DeltaSequence, FrameSequence
 from gsfluent.export.job import ExportOptions, Job
 from gsfluent.export.relit import relight_of
 from gsfluent.progress import Progress
@@ -123,16 +123,16 @@ def export(
             raise InputError(f"--to {kind}: gsfluent cannot write that", _instead(kind))
     if not kinds:
         raise InputError("--to names no format", f"choose from {', '.join(FORMATS)}")
-    reel: Reel
+    sequence: FrameSequence
     if out.is_file():
-        reel = DeltaReel(out, frames=options.frames, sh=options.sh, up=options.up)
+        sequence = DeltaSequence(out, frames=options.frames, sh=options.sh, up=options.up)
         for kind in kinds:
             if options.relit or not FORMATS[kind].splats_only:
                 what = "--relit" if options.relit else f"--to {kind}"
                 raise InputError(f"{what}: {out} holds splats only", "export from the run")
         to = to or out.with_suffix("")
     else:
-        reel = Reel(
+        sequence = FrameSequence(
             out,
             frames=options.frames,
             sh=options.sh,
@@ -140,7 +140,7 @@ def export(
             up=options.up,
             device=device if options.relit else None,
         )
-    job = Job(out, to or out, reel, options, options.fps or reel.rate(), device, progress)
+    job = Job(out, to or out, sequence, options, options.fps or sequence.rate(), device, progress)
     return _write(job, kinds)
 
 
@@ -148,9 +148,9 @@ def write_exports(
     out: Path, kinds: list[str], *, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Write the formats that need no rendering, with the usual options; see :func:`export`."""
-    reel = Reel(out)
-    rate, cpu = reel.rate(), torch.device("cpu")
-    return _write(Job(out, out, reel, ExportOptions(), rate, cpu, progress), kinds)
+    sequence = FrameSequence(out)
+    rate, cpu = sequence.rate(), torch.device("cpu")
+    return _write(Job(out, out, sequence, ExportOptions(), rate, cpu, progress), kinds)
 
 
 def _instead(kind: str) -> str:

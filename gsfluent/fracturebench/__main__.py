@@ -15,7 +15,7 @@ from .score import markdown, plain, read_scenes, score
 _ABOUT = """FractureBench: frozen scenes with known answers for simulators of elastic and brittle
 bodies, and their scorer. A scene is an .npz of points, velocities, volumes, materials and the times
 asked for, with a YAML header beside it; a run is an .npz of positions and velocities at those
-times. docs/fracturebench.md says how to read one and write the other in ten lines of NumPy."""
+times. docs/guide/fracturebench.md reads one and writes the other in ten lines of NumPy."""
 
 _SCORE = """Judge all runs under a folder. Every file RUNS/**/*.npz is one run: arrays times [T],
 x [T, N, 3], v [T, N, 3], and header, a JSON text with scene, method, wall_seconds, steps, and

@@ -207,7 +207,7 @@ class Member:
 
 
 def ensemble(
-    case: Case, dx: float, per_cell: int, seeds: Iterable[int], play: Callable[[Scene], Run]
+    case: Case, dx: float, per_cell: int, seeds: Iterable[int], run_case: Callable[[Scene], Run]
 ) -> list[Member]:
     """Run a case once for every seed.
 
@@ -216,7 +216,7 @@ def ensemble(
         dx: Node spacing [m].
         per_cell: Points per cell.
         seeds: Seeds of :func:`jitter`.
-        play: Runs a scene.
+        run_case: Runs a scene.
 
     Raises:
         SceneError: A run broke off.
@@ -225,7 +225,7 @@ def ensemble(
     members = []
     for seed in seeds:
         scene = jitter(base, seed)
-        run = play(scene)
+        run = run_case(scene)
         found = figures(scene, run)
         # what only the figures needed is large and goes
         members.append(Member(scene, dataclasses.replace(run, damage=None, stress=None), found))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gsfluent import geometry
 from gsfluent.colors import srgb_to_linear
 from gsfluent.data.gaussians import Gaussians
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 from gsfluent.io.atomic import atomic_path
 
 _THREE_SIGMA = 3.0
@@ -46,10 +46,9 @@ def open_usd(path: str | Path, *, fps: float, up: str = "z") -> Iterator[UsdWrit
         raise InputError(f"{path}: not a USD name", "end it with .usdc, .usda or .usdz")
     if up not in ("z", "y"):
         raise InputError(f"USD has no up axis {up}", "choose z or y")
-    try:
-        from pxr import Usd, UsdUtils
-    except ImportError as error:
-        raise InputError("usd: usd-core is not installed", 'pip install "gsfluent[usd]"') from error
+    need("pxr", "usd", "usd: a USD file")
+    from pxr import Usd, UsdUtils
+
     with atomic_path(path) as part:
         zipped = part.suffix.lower() == ".usdz"
         crate = part.with_suffix(".usdc") if zipped else part

@@ -118,7 +118,7 @@ def _stood(scene: Scene) -> Scene:
 
 
 BUDGET = {"cpu": 6_000, "cuda": 30_000}
-"""Material points of quality ``live`` by device: what docs/live.md measures as interactive."""
+"""Material points of quality ``live`` by device (docs/measured/live.md)."""
 
 
 CELLS = (8, 64)

@@ -18,7 +18,7 @@ from torch import Tensor
 from gsfluent.ops import _mpm_fake, _mpm_slope  # noqa: F401  (register shape functions, slopes)
 from gsfluent.ops.blocks import Blocks
 
-MASS_FLOOR = 1e-30  # core/contact.h mass_floor
+MASS_FLOOR = 1e-30  # core/mpm/contact.h mass_floor
 
 
 def _full(stress: Tensor) -> Tensor:

@@ -2,8 +2,8 @@
 
 ``transfer_slope`` is the derivative of ``sum_i w_i g_i . (c + S (x_i - x_p))``: with g the gradient
 of the grid it is what p2g needs, with g the grid velocity what g2p needs. Its CPU kernel is
-``csrc/cpu/mpm.cpp``; here is its definition, which also serves CUDA. ``moments_backward`` is the
-gradient of the contact moments of p2g.
+``csrc/cpu/mpm/transfer.cpp``; here is its definition, which also serves CUDA. ``moments_backward``
+is the gradient of the contact moments of p2g.
 """
 
 from __future__ import annotations

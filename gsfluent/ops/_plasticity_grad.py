@@ -1,9 +1,9 @@
 """Gradient of ``return_mapping``.
 
-On the CPU a kernel (csrc/core/return_gradient.h) does the laws elastic and nacc; on CUDA elastic
-particles, which most particles of most steps are, have their page of algebra here. What is left
-(other laws, guarded states) goes through :mod:`gsfluent.ops.reference.plasticity`, with the alpha
-the forward pass found: the implicit function theorem needs the root and not the search.
+On the CPU a kernel (csrc/core/material/return_gradient.h) does the laws elastic and nacc; on CUDA
+elastic particles, which most particles of most steps are, have their page of algebra here. What is
+left (other laws, guarded states) goes through :mod:`gsfluent.ops.reference.plasticity`, with the
+alpha the forward pass found: the implicit function theorem needs the root and not the search.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A blade is a straight edge that moves along a polyline. Particles near the sheet that the edge has
 swept get a side once and keep it; a field is a body and its sides. Fields of one body move as one,
 except two on opposite sides of a blade, which are in contact. The mathematics is
-``csrc/core/blade.h``.
+``csrc/core/collider/blade.h``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def blade_rows(
         number: Which blade, 0 to 14.
 
     Returns:
-        float64 [P - 1, 16]; see ``csrc/core/blade.h``.
+        float64 [P - 1, 16]; see ``csrc/core/collider/blade.h``.
 
     Raises:
         ValueError: A path that does not move, an edge along the path, or a number out of range.

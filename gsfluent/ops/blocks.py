@@ -1,7 +1,7 @@
 """The sparse grid of the material point method: 4x4x4-node blocks where matter is, cell order.
 
 Node ``(i, j, k)`` of block ``b`` sits at ``(coords[b] * 4 + (i, j, k)) * dx`` and has local index
-``(i * 4 + j) * 4 + k``. CPU kernel: ``csrc/cpu/mpm_blocks.cpp``; on CUDA torch operations.
+``(i * 4 + j) * 4 + k``. CPU kernel: ``csrc/cpu/mpm/blocks.cpp``; on CUDA torch operations.
 """
 
 from __future__ import annotations

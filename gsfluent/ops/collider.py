@@ -1,7 +1,7 @@
 """Rigid colliders as rows of numbers: collider_row, collider_distance, advance_colliders.
 
 :func:`gsfluent.ops.grid_update` and the solver push matter out of them. The physics is
-``csrc/core/collider.h``; the columns are documented in ``csrc/core/collider_shape.h``.
+``csrc/core/collider/collider.h``; the columns are documented in ``csrc/core/collider/shape.h``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TYPES = {"nothing": -1, "plane": 0, "sphere": 1, "box": 2, "capsule": 3, "cylind
          "face": 6}  # fmt: skip
 MODES = {"sticky": 0, "slip": 1, "separate": 2}
 
-# Columns, as in csrc/core/collider_shape.h.
+# Columns, as in csrc/core/collider/shape.h.
 TYPE, MODE, FRICTION, POINT, NORMAL, RADIUS, VELOCITY, RESTITUTION = 0, 1, 2, 3, 6, 9, 10, 13
 MASS, SWEEP, ORIENTATION, ANGULAR_VELOCITY, INERTIA, EXTENT, OFFSET = 14, 15, 16, 20, 23, 26, 29
 ONLY_CUT = 30

@@ -79,7 +79,7 @@ def covariance_axes(covariance: Tensor) -> tuple[Tensor, Tensor]:
 def carry_axes(
     quats: Tensor, scales: Tensor, map: Tensor, rotation: Tensor, *, rigid: float
 ) -> tuple[Tensor, Tensor]:
-    """Axes of Gaussians that ride on deforming matter: covariance ``A S A^T``.
+    """Axes of Gaussians carried by deforming matter: covariance ``A S A^T``.
 
     Where no entry of ``map - rotation`` exceeds ``rigid`` a Gaussian is turned and keeps its scales
     exactly; elsewhere the new axes are the singular vectors and values of ``A R(q) diag(s)``.

@@ -192,7 +192,8 @@ def mpm_step(
         ValueError: A shape, device, range, law, parameter or row is wrong; a position is not
             finite.
 
-    Gradient: every floating tensor but ``colliders``, see docs/gradients.md. Deterministic on the
+    Gradient: every floating tensor but ``colliders``, see docs/theory/gradients.md. Deterministic
+    on the
     CPU.
     """
     contact = fields > 1

@@ -63,7 +63,7 @@ def ssim(
         computes it in the forward pass and holds one image; otherwise the backward pass recomputes
         the moments and holds nothing but the two images.
     Determinism: bit-identical on the CPU for any number of threads, and on CUDA from run to run.
-    Source: Wang et al. 2004, equation 13; docs/losses.md.
+    Source: Wang et al. 2004, equation 13; docs/theory/losses.md.
     """
     inside = _check_images("ssim", image, target, padding)
     if reduction not in ("mean", "none"):
@@ -120,7 +120,7 @@ def photometric_loss(
         requires it; what is held is one gradient image (and one of alpha's). On CUDA the forward
         pass needs three times the image for a moment. The slope of |0| is 0.
     Determinism: bit-identical on the CPU for any number of threads, and on CUDA from run to run.
-    Source: Kerbl et al. 2023, equation 7; docs/losses.md.
+    Source: Kerbl et al. 2023, equation 7; docs/theory/losses.md.
     """
     op = "photometric_loss"
     inside = _check_images(op, image, target, padding)

@@ -1,7 +1,8 @@
 """Material point method on a sparse grid: build_blocks, p2g, grid_update, g2p.
 
 MLS-MPM with quadratic B-splines and APIC transfer (Jiang et al. 2015; Hu et al. 2018). The formulas
-with their sources are in ``docs/mpm.md``. Sparse grid: :mod:`gsfluent.ops.blocks`; shape functions
+with their sources are in ``docs/theory/mpm.md``. Sparse grid: :mod:`gsfluent.ops.blocks`; shape
+functions
 and gradients: :mod:`gsfluent.ops._mpm_grad`.
 """
 
@@ -79,9 +80,10 @@ def p2g(
 
     A particle that is not finite, not covered by ``blocks`` or not in a field gives nothing;
     :func:`g2p` counts the same particles. Gradient: every floating tensor, ``position`` included,
-    through ``grid`` and ``moments`` (docs/gradients.md). Determinism: on the CPU the result does
+    through ``grid`` and ``moments`` (docs/theory/gradients.md). Determinism: on the CPU the result
+    does
     not depend on the number of threads; on CUDA
-    sums are reordered by atomics. Source: Jiang et al. 2015; Hu et al. 2018; docs/mpm.md.
+    sums are reordered by atomics. Source: Jiang et al. 2015; Hu et al. 2018; docs/theory/mpm.md.
     """
     op = "p2g"
     check_tensor(op, "position", position, shape=(None, 3))
@@ -188,7 +190,8 @@ def grid_update(
     """Turn nodal momentum into velocity: gravity, contact between fields, rigid colliders.
 
     Contact between every pair of fields that meet at a node uses the corrected Collision-MPM
-    impulse: normal from the moments of the node and its neighbours (docs/contact.md), active only
+    impulse: normal from the moments of the node and its neighbours (docs/theory/contact.md),
+    active only
     while the centroids of the two masses overlap within ``contact_gap * dx`` and the bodies
     approach, Coulomb friction.
     Momentum is exchanged exactly. Colliders act afterwards, in row order. A collider with mass
@@ -212,7 +215,7 @@ def grid_update(
         friction: Coulomb coefficient between fields, >= 0.
         restitution: Of contact between fields, in [0, 1]. Exact in this step; over the steps of a
             lasting contact it makes energy, which is why :class:`Solver` has none
-            (docs/contact.md).
+            (docs/theory/contact.md).
         contact_gap: Centroid separation [dx] below which fields touch; 1.0 to 1.1 is right for
             8 particles per cell.
         return_torque: Also return the torque of the colliders.
@@ -232,7 +235,7 @@ def grid_update(
     Gradient: ``grid`` and ``moments``, through velocity and impulse; on the piece (touching or not,
     sticking or sliding) the forward pass was on. Determinism: independent of thread count on the
     CPU and of scheduling on CUDA.
-    Source: Bardenhagen et al. 2001; the corrected force of docs/mpm.md.
+    Source: Bardenhagen et al. 2001; the corrected force of docs/theory/mpm.md.
     """
     op = "grid_update"
     check_tensor(op, "grid", grid, shape=(None, None, 64, 4))
@@ -351,7 +354,7 @@ def g2p(
 
     Gradient: ``velocity_grid``, ``position``, ``deformation``, ``velocity``. Deterministic on
     CPU and CUDA.
-    Source: Jiang et al. 2015; Hu et al. 2018; docs/mpm.md.
+    Source: Jiang et al. 2015; Hu et al. 2018; docs/theory/mpm.md.
     """
     op = "g2p"
     check_tensor(op, "position", position, shape=(None, 3))

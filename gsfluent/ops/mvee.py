@@ -43,7 +43,8 @@ def mvee(
 
     Gradient: none.
     Source: primal-dual interior-point method on the lifted problem (Sun and Freund 2004 compare
-    such methods), ten unknowns per step; derivation in docs/mvee.md. Fracture-GS uses Khachiyan's.
+    such methods), ten unknowns per step; derivation in docs/theory/mvee.md. Fracture-GS uses
+    Khachiyan's.
     """
     check_tensor("mvee", "points", points, shape=("B", "N", 3))
     if points.shape[0] and not points.shape[1]:
@@ -70,7 +71,7 @@ def _mvee_no_gradient(ctx: Any, *grads: Tensor) -> None:
 torch.library.register_autograd("gsfluent::mvee", _mvee_no_gradient)
 
 _ORDER = (0, 4, 8, 1, 2, 5)
-# In the order of LensFault (csrc/core/mvee_lens.h), of the first Gaussian and of the second.
+# In the order of LensFault (csrc/core/mvee/lens.h), of the first Gaussian and of the second.
 _NOT_FINITE = "finite, got NaN or infinity in row {}"
 _FAULTS = [
     (f"{name}_{side}", what)
@@ -139,7 +140,7 @@ def mvee_lens(
 
     Gradient: none.
     Source: Fracture-GS (transition Gaussians); closed form from John's conditions, and the fit of
-    unlike ellipsoids, derived in docs/mvee.md.
+    unlike ellipsoids, derived in docs/theory/mvee.md.
     """
     op = "mvee_lens"
     check_tensor(op, "mean_a", mean_a, shape=("B", 3))

@@ -170,7 +170,7 @@ def return_mapping(
       ``(J^(2/3) - 1) I`` and J follows ``det(I + A)``.
     * 5 ``rigid``: no strain, no stress; how the body moves is the solver's matter.
 
-    The stored energy never increases. See docs/return-mapping.md and docs/materials.md.
+    The stored energy never increases. See docs/theory/return-mapping.md and docs/theory/laws.md.
 
     Args:
         strain: Elastic strain e = b - I of every particle, order xx, yy, zz, xy, xz, yz, [N, 6].
@@ -318,7 +318,7 @@ def wave_speed(
         ValueError: A shape, device, law, parameter or material row is wrong.
 
     Gradient: with respect to strain and params (plain PyTorch).
-    Source: csrc/core/wave_speed.h, which the solver's kernels use.
+    Source: csrc/core/material/wave_speed.h, which the solver's kernels use.
     """
     check_tensor("wave_speed", "strain", strain, shape=("N", 6))
     count = strain.shape[0]

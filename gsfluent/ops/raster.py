@@ -137,7 +137,7 @@ def rasterize(
         reordered by atomics.
     Source: Kerbl et al. 2023 (3D Gaussian Splatting), Zwicker et al. 2001 (EWA), Yu et al. 2024
         (Mip-Splatting, the antialiased mode), Ye et al. 2024 (AbsGS, the absolute gradients);
-        conventions in docs/rasterizer.md.
+        conventions in docs/theory/rasterizer.md.
     """
     arguments = (
         means,

@@ -2,12 +2,12 @@
 
 :class:`Solver` advances many explicit MLS-MPM steps per call without a look from the host: the
 time step, the search for active blocks, the re-sorting of particles and the stopping time are
-decided on the device (``csrc/core/solver_clock.h``). The composable operators
+decided on the device (``csrc/core/solver/clock.h``). The composable operators
 (:func:`gsfluent.ops.p2g` and its siblings) are the differentiable face of the same mathematics and
 the reference it is tested against.
 
 Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Wang et al. 2020 and Fei et al. 2021
-(block-sorted GPU transfers); fixed-point sums: docs/solver.md.
+(block-sorted GPU transfers); fixed-point sums: docs/theory/solver-sums.md.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ _REASONS = {
 
 
 def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
-    """Refuse what would make energy: see docs/contact.md."""
+    """Refuse what would make energy: see docs/theory/contact.md."""
     rows = None if colliders is None else pad_colliders(colliders)
     bounces = rows is not None and bool((rows[:, RESTITUTION] > 0).any())
     if contact != 0.0 or bounces:
         raise ValueError(
             f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: given back "
-            "at nodes in every step of a lasting contact it makes energy (docs/contact.md); how "
-            "far bodies bounce follows from their elasticity"
+            "at nodes in every step of a lasting contact it makes energy (docs/theory/contact.md);"
+            " how far bodies bounce follows from their elasticity"
         )
 
 
@@ -62,7 +62,7 @@ class SolverError(GsfluentError, RuntimeError):
     """The solver stopped before the time it was asked for.
 
     Args:
-        reason: Number in ``SolverReason`` (``csrc/core/solver_state.h``).
+        reason: Number in ``SolverReason`` (``csrc/core/solver/state.h``).
         time: Simulated time at which it stopped [s].
         step: Steps so far.
     """
@@ -100,7 +100,7 @@ class Solver(SolverState):
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
         friction: Coulomb friction between fields.
         restitution: 0. Given back at nodes in every step of a lasting contact, it makes energy
-            (docs/contact.md); bodies bounce by their elasticity. Likewise that of colliders.
+            (docs/theory/contact.md); bodies bounce by their elasticity. Likewise that of colliders.
         contact_gap: Distance of the centroids, in cells, up to which fields touch.
         cfl: Courant number of the automatic time step.
         gradient_limit: Largest ``dt |grad v|`` of unbroken matter.

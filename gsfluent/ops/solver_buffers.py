@@ -17,7 +17,7 @@ BLOCK_RANGE = 2**16
 MAX_FIELDS = 2**12 - 2
 MAX_ROWS = 2**23
 MAX_PARTICLES = 2**26
-"""More could overflow the fixed-point sums (``csrc/core/solver_clock.h``)."""
+"""More could overflow the fixed-point sums (``csrc/core/solver/clock.h``)."""
 
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
@@ -41,7 +41,7 @@ INDEX = {name: index for index, name in enumerate(CLOCK)}
 
 @dataclasses.dataclass
 class Buffers:
-    """Every tensor of a solver; see ``csrc/core/solver_state.h`` for what each holds."""
+    """Every tensor of a solver; see ``csrc/core/solver/state.h`` for what each holds."""
 
     clock: Tensor
     offset: Tensor
@@ -132,7 +132,7 @@ class Buffers:
 def planes(values: Tensor) -> Tensor:
     """Rows [N, W] in planes of up to four components, as a device keeps them: flat, N W values.
 
-    See ``csrc/core/solver_layout.h``.
+    See ``csrc/core/solver/layout.h``.
     """
     return torch.cat([part.reshape(-1) for part in values.split(4, dim=1)])
 

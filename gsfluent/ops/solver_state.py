@@ -208,7 +208,7 @@ class SolverState:
         )
 
     def _store(self, offset: Tensor, word: Tensor, rows: dict[str, Tensor]) -> None:
-        """Lay the rows out as ``csrc/core/solver_layout.h`` says."""
+        """Lay the rows out as ``csrc/core/solver/layout.h`` says."""
         b = self._buffers
         if self.device.type == "cuda":
             bits = layout.word_as_real(word, offset)[:, None]

@@ -1,6 +1,6 @@
 """Stages: each an ``nn.Module``, containers in, containers out; ``gsfluent run`` chains them.
 
-Beside them the functions around an object's solid (docs/solid.md).
+Beside them the functions around an object's solid (docs/theory/solid.md).
 """
 
 from __future__ import annotations

@@ -362,7 +362,7 @@ BYTES: dict[str, dict[str, dict[str, float]]] = {
         "export": {"start": 20e6, "gaussians": 688.0},
     },
 }
-"""``cpu``: fitted to six gallery shots, each in a process of its own (scripts/plan_accuracy.py
+"""``cpu``: fitted to six gallery shots, each in a process of its own (scripts/study/shots/plan.py
 --fit-memory); residuals are 5 % in the median, 20 % at most. What those shots are too small to show
 is counted from the tensors: training state of a splat (``splats_most``), the solver's buffers of a
 block (``blocks_most``, gsfluent/ops/solver_buffers.py). ``cuda``: counted from tensors, and taken

@@ -4,7 +4,7 @@ Nothing is simulated. Bodies and rigid things fly as boxes on parabolas until th
 near as the solver lets them (:data:`gsfluent.pipeline.simulate.groups.LANDING`); from then
 on a
 body is on the grid, and keeps the speed it came with. That is enough for the time step, the number
-of steps and the time that the grid is used at all; docs/plan.md compares both with runs.
+of steps and the time that the grid is used at all; docs/theory/plan.md compares both with runs.
 """
 
 from __future__ import annotations

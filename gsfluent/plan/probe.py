@@ -25,7 +25,7 @@ from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import GsfluentError
 from gsfluent.io import load_capture, save_image
 from gsfluent.io.solid import load_solid, save_solid
-from gsfluent.pipeline.capture.coarse_hull import masked_views
+from gsfluent.pipeline.capture.hull import masked_views
 from gsfluent.pipeline.render.cuts import save_cut_views
 from gsfluent.plan.cost import BYTES, CostModel, machine_key
 from gsfluent.plan.fact import actual_work

@@ -17,9 +17,9 @@ from torch import Tensor
 from gsfluent.config import Shot
 from gsfluent.data import INTERIOR, SURFACE, Capture, Frame, Gaussians, Solid, View
 from gsfluent.errors import InputError
-from gsfluent.inspect.capture import inspect
+from gsfluent.inspection.capture import inspect
 from gsfluent.io import load_capture, load_splats
-from gsfluent.pipeline.capture.coarse_hull import hull_grid, masked_views
+from gsfluent.pipeline.capture.hull import hull_grid, masked_views
 from gsfluent.pipeline.capture.orient import DEFAULT_SIZE, look_at_point, make_frame
 from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.reconstruct.recipe import recipe_for

@@ -50,11 +50,11 @@ _SCENE_GROWTH = 0.6
 _SPACING = 1.25
 """Distance of interior splats [voxels]."""
 _PRUNED = 0.12
-"""Share of them that the photographs contradict (docs/plan.md: 0.09 to 0.39, median 0.12)."""
+"""Share of them that the photographs contradict: 0.09 to 0.39, median 0.12 (measured)."""
 _MOST_INTERIOR = 200_000
 _BORN = 0.22
 """Splats born at cracks by the end of a shot that breaks, as a share of all (median of the gallery;
-docs/plan.md)."""
+docs/theory/plan.md)."""
 _PADDING = 6
 """Empty voxels around a solid, both sides together."""
 
@@ -95,7 +95,7 @@ def reconstruct_work(photographs: Photographs, shot: Shot, splats: float | None 
 def splat_growth(most: float, start: float) -> float:
     """Mean number of splats over a training that starts with ``start`` and may have ``most``.
 
-    Measured on the gallery (docs/plan.md): the count rises for the first half and stays.
+    Measured on the gallery (docs/theory/plan.md): the count rises for the first half and stays.
     """
     begin = min(start, most)
     return 0.25 * 0.5 * (begin + most) + 0.75 * most * _FULL

@@ -47,7 +47,7 @@ class Part:
             ``box`` ([[x, y, z], [x, y, z]]) and ``sphere`` ([x, y, z, radius]) in scene metres
             before any event moves the solid, ``mask`` (folder of masks), ``labels`` (segmentation
             of the photographs) or ``label_image`` (picture, or pictures by axis) with ``label``
-            (name or number), ``region`` (number in ``Solid.regions``). See docs/regions.md.
+            (name or number), ``region`` (number in ``Solid.regions``). See docs/guide/regions.md.
         overrides: Material parameters of the region; ``material`` starts from another preset.
     """
 
@@ -243,7 +243,7 @@ class Blade:
 
 
 @dataclasses.dataclass(frozen=True)
-class Kick:
+class Impulse:
     """A velocity given to all matter of a body at a moment after the start.
 
     Args:

@@ -15,6 +15,7 @@ from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
 from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.walls import thin_shells
@@ -95,10 +96,21 @@ def moving_settings(shot: Shot) -> list[Any]:
         [event_dict(event) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.standing, shot.solve.loose_crumbs],
+        [shot.solve.standing, shot.solve.loose_debris],
         shot.output.fps,
         shot.output.seconds,
     ]
+
+
+def solver_options(shot: Shot) -> SolverOptions:
+    """How the matter of a shot is moved."""
+    solve = shot.solve
+    return SolverOptions(
+        cfl=solve.cfl,
+        standing=solve.standing,
+        loose_debris=solve.loose_debris,
+        deterministic=solve.deterministic,
+    )
 
 
 def simulate_stage(context: RunContext) -> None:
@@ -116,10 +128,7 @@ def simulate_stage(context: RunContext) -> None:
             seed=context.seed,
             device=context.device,
             dx=None if cells is None else grid_spacing(scene, cells),
-            cfl=shot.solve.cfl,
-            standing=shot.solve.standing,
-            loose_crumbs=shot.solve.loose_crumbs,
-            deterministic=shot.solve.deterministic,
+            options=solver_options(shot),
             repair=shot.output.cracks,
         )
         state = folder / _STATE
@@ -134,8 +143,8 @@ def simulate_stage(context: RunContext) -> None:
         for frame in frames:
             save_frame(folder, saved(frame, scene))
             # after the frame: a state on disk always has its picture
-            stage.save_state(state)
-        return stage.report() | {"thin": thin_walls(scene, stage.report()["dx"])}
+            frames.save(state)
+        return frames.report | {"thin": thin_walls(scene, frames.run.matter.dx)}
 
     result = context.store.run("simulate", key, work)
     report = dict(result.report)

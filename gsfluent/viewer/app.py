@@ -27,8 +27,8 @@ from gsfluent.viewer.model.pace import Pace
 from gsfluent.viewer.model.playback import Playback
 from gsfluent.viewer.model.source import Source
 from gsfluent.viewer.model.timeline import Timeline
-from gsfluent.viewer.page import Page
 from gsfluent.viewer.panels.look import LookPanel
+from gsfluent.viewer.panels.page import Page
 from gsfluent.viewer.panels.plot import PlotPanel
 from gsfluent.viewer.panels.time import TimePanel
 from gsfluent.viewer.server import start_server, stop_server

@@ -29,7 +29,7 @@ from torch import Tensor
 from gsfluent.data import Camera
 from gsfluent.draw import draw
 from gsfluent.figure.markdown import enter
-from gsfluent.inspect.compare_weights import Lpips
+from gsfluent.inspection.compare_weights import Lpips
 from gsfluent.io import save_image
 from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud, TruePicture
 from gsfluent.metrics import psnr, ssim

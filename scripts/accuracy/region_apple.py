@@ -20,8 +20,8 @@ import torch
 from gsfluent.data import Capture, Frame, Solid
 from gsfluent.draw import draw
 from gsfluent.figure.markdown import enter
-from gsfluent.inspect.parts import solid_regions
-from gsfluent.inspect.parts_picture import save_parts_picture
+from gsfluent.inspection.parts import solid_regions
+from gsfluent.inspection.parts_picture import save_parts_picture
 from gsfluent.io import load_capture, load_splats
 from gsfluent.io.segmentation.masks import LabelView, Segmentation, load_segmentation
 from gsfluent.pipeline import Fill, Isolate, Reconstruct, label_regions

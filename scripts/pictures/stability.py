@@ -14,6 +14,7 @@ from gsfluent.figure.map import Plane, draw_planes
 from gsfluent.figure.markdown import enter
 from gsfluent.lab.stability import maps as stability
 from gsfluent.lab.stability import report as stability_report
+from gsfluent.lab.stability import run as running
 from gsfluent.lab.stability.peers import marks, measured
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -98,7 +99,7 @@ def main() -> int:
     given = parser.parse_args()
     programs = measured(given.peers) if given.peers.is_file() else []
     points = [p for path in given.lines for p in stability.read(path)]
-    known = stability.all_maps()
+    known = running.all_maps()
     cpu = [p for p in points if p.device == "cpu"] or points
     maps = [m for m in known.values() if any(p.map == m.name for p in cpu)]
     for sheet, rows in SHEETS.items():

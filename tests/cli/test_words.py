@@ -109,7 +109,7 @@ def test_unexpected_failure_exits_1_without_traceback(
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError("boom")
 
-    monkeypatch.setattr("gsfluent.inspect.doctor.examine", fail)
+    monkeypatch.setattr("gsfluent.inspection.doctor.examine", fail)
     monkeypatch.delenv("GSFLUENT_DEBUG", raising=False)
     assert main(["doctor"]) == 1
     text = capsys.readouterr().err

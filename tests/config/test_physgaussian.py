@@ -329,6 +329,7 @@ def test_folders_and_files_that_are_none(model: Path, tmp_path: Path) -> None:
 
 
 def test_the_page_has_the_tables_of_the_program() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "physgaussian.md").read_text(encoding="utf-8")
+    path = Path(__file__).parents[2] / "docs" / "guide" / "physgaussian.md"
+    page = path.read_text(encoding="utf-8")
     for table in (physgaussian_page.keys, physgaussian_page.filling, physgaussian_page.boundaries):
-        assert table() in page, f"docs/physgaussian.md: enter {table.__name__} again"
+        assert table() in page, f"{path.name}: enter {table.__name__} again"

@@ -52,6 +52,21 @@ def read(folder: Path, **keys: Any) -> Shot:
     return Shot.from_dict({**base, **keys}, folder)
 
 
+def test_a_key_is_read_under_its_old_name_with_a_warning(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shot = read(folder, solve={"loose_crumbs": True, "quality": "preview"})
+    assert shot == read(folder, solve={"loose_debris": True, "quality": "preview"})
+    assert shot.solve.loose_debris and "loose_crumbs" not in shot.resolved()["solve"]
+    assert caplog.messages == [
+        "solve.loose_crumbs is called loose_debris now; the old name still works"
+    ]
+    with pytest.raises(InputError, match="both are given"):
+        read(folder, solve={"loose_crumbs": True, "loose_debris": True})
+    with pytest.raises(InputError, match=r"solve\.loose_crumbs must be true or false|loose_debris"):
+        read(folder, solve={"loose_crumbs": 3})
+
+
 def test_full_form_reads_into_types(folder: Path) -> None:
     (folder / "shot.yaml").write_text(FULL)
     shot = load_shot(folder / "shot.yaml")

@@ -1,4 +1,4 @@
-"""docs/shot.md holds every key, as the program has it."""
+"""docs/guide/shot-keys.md holds every key, as the program has it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import yaml
 from gsfluent.config import Shot, reference
 from gsfluent.config.read import Place, key_name
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "shot.md"
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "guide"
+PAGE = GUIDE / "shot-keys.md"
 CASES = [
     (section, field)
     for section, cls in reference.SECTIONS.items()
@@ -45,7 +46,7 @@ def test_every_example_is_accepted(folder: Path, section: str, field: dataclasse
 
 
 def test_shots_on_the_page_read(folder: Path) -> None:
-    shots = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(shots) == 2
+    shots = re.findall(r"```yaml\n(.*?)```", (GUIDE / "shot-file.md").read_text(), re.DOTALL)
+    assert len(shots) == 4
     for text in shots:
         assert Shot.from_dict(yaml.safe_load(text), folder).events

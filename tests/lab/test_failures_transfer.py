@@ -1,6 +1,6 @@
 """Failure catalogue (solver.md section 4), rows of the transfer: 1, 2, 4, 5, 16, 17, 18, 20 to 22.
 
-docs/failures.md has the table: what fails in the peers, and the figures of these tests.
+docs/theory/failures.md has the table: what fails in the peers, and the figures of these tests.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.lab.problems.fracture.slab import between_planes, sheet, wave_speed
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import ball, box, parameters
+from gsfluent.lab.world.shapes import ball, box, parameters, sheet, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 DX = 0.1
 SOFT = parameters(1e6, 0.3, 1000.0)

@@ -1,4 +1,4 @@
-"""Range of the solver's fixed-point sums on a GPU: the proof of docs/solver.md in numbers.
+"""Range of the solver's fixed-point sums on a GPU: docs/theory/solver-sums.md in numbers.
 
 The units come from where they are made, the clock of a primed solver; the sums are those of
 ``gsfluent/ops/reference/fixed_point.py``, whose constants must be the ones of the kernel.
@@ -20,7 +20,7 @@ from gsfluent.ops.reference import fixed_point as fixed
 from gsfluent.ops.solver_buffers import MAX_PARTICLES
 
 CUDA = Path(__file__).parents[2] / "csrc" / "cuda"
-KERNEL = "\n".join(p.read_text(encoding="utf-8") for p in sorted(CUDA.glob("solver_*")))
+KERNEL = "\n".join(p.read_text(encoding="utf-8") for p in sorted(CUDA.glob("solver/*")))
 WEIGHT = Fraction(3, 4) ** 3
 """Largest weight of a quadratic B-spline in three dimensions."""
 
@@ -59,7 +59,7 @@ def primed(given: dict[str, Any]) -> tuple[fixed.Transfer, dict[str, float]]:
 def test_the_constants_are_those_of_the_kernel() -> None:
     def found(pattern: str) -> float:
         match = re.search(pattern, KERNEL)
-        assert match, f"{pattern} is not in csrc/cuda/solver_*"
+        assert match, f"{pattern} is not in csrc/cuda/solver"
         return float(match.group(1))
 
     assert found(r"Fixed<float> \{[^}]*kBits = (\d+);") == fixed.WINDOW_BITS
@@ -137,7 +137,7 @@ def test_the_most_points_a_solver_takes_fit_into_a_window() -> None:
 
 
 def test_light_points_beside_heavy_ones_keep_their_velocity() -> None:
-    """The figure that docs/solver.md gives for a jump of 1000 in the mass of points of one home."""
+    """The figure of docs/theory/solver-sums.md for a jump of 1000 in the mass of points."""
     given = points(1.0, 0.01)
     light = given["position"][:, 0] < 0.05
     given["mass"] = torch.where(light, 1e-6, 1e-3)

@@ -53,7 +53,7 @@ def test_recorded_lines_become_a_figure_and_tables(
 def test_the_page_names_what_there_is() -> None:
     text = (ROOT / "docs" / "measured" / "chart.md").read_text(encoding="utf-8")
     tests = "".join(
-        (ROOT / "tests" / "charts" / name).read_text(encoding="utf-8")
+        (ROOT / "tests" / "lab" / "charts" / name).read_text(encoding="utf-8")
         for name in ("test_trades_nothing.py", "test_trades_nothing_cuda.py")
     )
     named = set(re.findall(r"`(test_\w+)`", text))

@@ -1,7 +1,7 @@
 """The keys of PhysGaussian's JSON configs: what each becomes here, or why it becomes nothing.
 
 Learned from the public repository (github.com/XPandora/PhysGaussian, commit 8339ed6); nothing of it
-is copied. ``docs/physgaussian.md`` shows these tables.
+is copied. ``docs/guide/physgaussian.md`` shows these tables.
 """
 
 from __future__ import annotations
@@ -133,13 +133,15 @@ def read_config(path: Path) -> tuple[dict[str, Any], list[Note]]:
     except ValueError as error:
         raise InputError(f"--config {path}: not JSON ({error})", "correct the file") from error
     if not isinstance(values, dict):
-        raise InputError(f"--config {path}: must hold one JSON object", "see docs/physgaussian.md")
+        raise InputError(
+            f"--config {path}: must hold one JSON object", "see docs/guide/physgaussian.md"
+        )
     notes: list[Note] = []
     known = _known(values, KEYS, "", notes)
     if "particle_filling" in known:
         filling = _section(known["particle_filling"], "particle_filling")
         for key in _known(filling, FILLING, "particle_filling.", notes):
-            text = "the inside is found by rays and votes here (docs/filling.md)"
+            text = "the inside is found by rays and votes here (docs/theory/solid.md)"
             notes.append(Note(f"particle_filling.{key}", INERT, text))
     name = "additional_material_params"
     known[name] = [

@@ -1,4 +1,4 @@
-"""The tables of docs/physgaussian.md, made from the keys that the program knows."""
+"""The tables of docs/guide/physgaussian.md, made from the keys that the program knows."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Segmentations: which part every pixel of the photographs shows, from any segmenter's files.
 
-What is read (docs/regions.md): a label image per photograph; a folder of masks per label; Segment
+What is read (docs/guide/regions.md): a label image per photograph; a folder of masks per label;
+Segment
 Anything's folders and JSON; NumPy maps. Everything becomes a label map in the pinhole view that the
 photograph itself is resampled to (:func:`gsfluent.io.images.load_view`), nearest neighbour.
 """
@@ -262,7 +263,8 @@ def _of_file(
         return _sam_items(str(path), sam.read_json(path), capture, names, max_size, least)
     if suffix not in (".npy", ".npz"):
         raise InputError(
-            f"{path}: a segmentation must be a folder, .json, .npy or .npz", "see docs/regions.md"
+            f"{path}: a segmentation must be a folder, .json, .npy or .npz",
+            "see docs/guide/regions.md",
         )
     import zipfile
 

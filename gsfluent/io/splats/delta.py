@@ -2,7 +2,7 @@
 
 Only numpy and the standard library are used, and nothing else of gsfluent's is but its errors.
 
-Layout (little-endian; docs/export.md has the reasons)::
+Layout (little-endian; docs/guide/export.md has the reasons)::
 
     "GSFDELTA", version u32, size of header u32, header (JSON, UTF-8)
     block of the roster, then one block per frame in order, then the index
@@ -378,9 +378,15 @@ def predict(
 
 def multiply(a: Floats, b: Floats) -> Floats:
     """Hamilton product of quaternions ``wxyz``, normalised."""
+    product = hamilton(a, b)
+    return product / np.linalg.norm(product, axis=1, keepdims=True)
+
+
+def hamilton(a: Floats, b: Floats) -> Floats:
+    """Hamilton product of quaternions ``wxyz``."""
     w, x, y, z = a.T
     q, r, s, t = b.T
-    product = np.stack(
+    return np.stack(
         [
             w * q - x * r - y * s - z * t,
             w * r + x * q + y * t - z * s,
@@ -389,7 +395,6 @@ def multiply(a: Floats, b: Floats) -> Floats:
         ],
         axis=1,
     )
-    return product / np.linalg.norm(product, axis=1, keepdims=True)
 
 
 def rotation_to_quaternion(vectors: Floats) -> Floats:

@@ -11,8 +11,8 @@ import torch
 
 from gsfluent.lab.charts.ladder import OFF_GRID, Setting, work
 from gsfluent.lab.charts.off_grid import measure_off_grid
-from gsfluent.lab.charts.play import measure
 from gsfluent.lab.charts.record import Record, append, commit, machine, now, read
+from gsfluent.lab.charts.run_case import measure
 from gsfluent.progress import Progress, report_progress
 
 __all__ = ["BYTES", "Done", "bandwidth", "run"]
@@ -110,8 +110,8 @@ def run(
             left_out.append(setting)
             continue
         start = time.monotonic()
-        player = measure_off_grid if setting.case in OFF_GRID else measure
-        have[key] = player(setting, device, repeat)
+        judge = measure_off_grid if setting.case in OFF_GRID else measure
+        have[key] = judge(setting, device, repeat)
         append(path, have[key])
         fresh += 1
         spent = (time.monotonic() - start) / work(setting)

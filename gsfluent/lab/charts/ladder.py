@@ -38,7 +38,7 @@ KNOBS = {
     "dtype": "float32 or float64",
     "engine": "resident solver or composed operators",
     "fields": "a velocity field per body, or one for all",
-    "gaussians": "Gaussians ride on material points, or each is one",
+    "gaussians": "Gaussians carried by material points, or each is one",
     "dt": "automatic time step, or a fixed one as in PhysGaussian's demos",
     "return_map": "implicit or explicit alpha, centre of the yield surface",
     "free": "measures that trade nothing",
@@ -74,7 +74,7 @@ class Setting:
         method: ``gsfluent`` or ``textbook``.
         knob: What was turned, of :data:`KNOBS`.
         variant: How, in words; empty for the base.
-        options: For the player (:mod:`gsfluent.lab.charts.play`).
+        options: Of :mod:`gsfluent.lab.charts.run_case`.
         trades: Whether the knob may move the error.
     """
 
@@ -96,7 +96,7 @@ class Setting:
 
 def work(setting: Setting) -> float:
     """Points times steps up to a factor of the case: what a run's time goes with."""
-    points = int(setting.options.get("ride_on", setting.ppc))
+    points = int(setting.options.get("carried_by", setting.ppc))
     courant = float(setting.options.get("courant", setting.options.get("cfl", 0.5)))
     return points / setting.dx**3 / (courant * setting.dx)
 
@@ -213,8 +213,8 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("ppc", "27 per cell", 27)
     yield turned("dt", f"fixed dt, c dt/dx {DEMO_COURANT}", courant=DEMO_COURANT)
     yield turned("engine", "composed operators", engine="ops")
-    if case.kind != "fracture":  # there riders part, which is the splats' matter (docs/cracks.md)
-        yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, ride_on=8)
+    if case.kind != "fracture":  # there splats part (docs/theory/cracks.md)
+        yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, carried_by=8)
         yield turned("gaussians", f"{DENSE} per cell", DENSE)
     if device.startswith("cpu"):
         yield turned("free", "one thread", trades=False, threads=1)

@@ -19,8 +19,8 @@ from torch import Tensor
 from gsfluent import materials
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.lab.charts.ladder import OFF_GRID, Setting
-from gsfluent.lab.charts.play import broken
 from gsfluent.lab.charts.record import Record, commit, machine, now
+from gsfluent.lab.charts.run_case import broken
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.progress import quiet_logs
 from gsfluent.scene.scene import Scene
@@ -67,7 +67,7 @@ def _runs(setting: Setting, device: str, repeat: int) -> Record:
         if device.startswith("cuda"):
             torch.cuda.synchronize()
         walls.append(time.perf_counter() - start)
-    return _record(setting, device, frames, simulate.report(), walls[1:])
+    return _record(setting, device, frames, coming.report, walls[1:])
 
 
 def _record(

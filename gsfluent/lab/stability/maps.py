@@ -1,9 +1,9 @@
 """Stability maps: where in a plane of two settings a run first breaks a law, one JSON line a point.
 
 A map is two axes, one or more variants (the first is gsfluent as it comes) and a function that runs
-one point and says what it broke and when (:mod:`gsfluent.lab.world.violations`). The maps
-themselves are
-in ``stability_*.py`` beside this file; what is drawn from the lines, in ``stability_report.py``.
+one point and says what it broke and when (:mod:`gsfluent.lab.world.invariants`). The maps
+themselves are in the files beside this one, gathered in ``run.py``; what is drawn from the lines,
+in ``report.py``.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent.errors import InputError
-from gsfluent.lab.world.violations import KINDS, Violation
+from gsfluent.lab.world.invariants import KINDS, Violation
 
-__all__ = ["LETTERS", "Axis", "Map", "Outcome", "Place", "Point", "Value", "read", "register"]
+__all__ = ["LETTERS", "Axis", "Map", "Outcome", "Place", "Point", "Value", "read"]
 
 Value = float | str
 KIND_WORDS = {**KINDS, "order": "two numberings of the same points parted by 1e-4 dx"}
@@ -192,21 +192,6 @@ def key_of(name: str, variant: str, x: Value, y: Value, device: str) -> str:
 
 def _text(value: Value) -> str:
     return value if isinstance(value, str) else f"{value:.8g}"
-
-
-_MAPS: dict[str, Map] = {}
-
-
-def register(made: Map) -> Map:
-    """Add a map.
-
-    Raises:
-        ValueError: There is one of that name.
-    """
-    if made.name in _MAPS:
-        raise ValueError(f"a map {made.name!r} is there already")
-    _MAPS[made.name] = made
-    return made
 
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Point))

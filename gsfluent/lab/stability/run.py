@@ -11,12 +11,14 @@ from pathlib import Path
 
 from gsfluent.errors import InputError
 from gsfluent.lab.charts.record import commit, machine, now
-from gsfluent.lab.stability.maps import _MAPS, Map, Place, Point, Value, key_of, read
+from gsfluent.lab.stability import contact, matter, rounding, steps, transfer
+from gsfluent.lab.stability.maps import Map, Place, Point, Value, key_of, read
 
 
 def all_maps() -> dict[str, Map]:
     """All maps by name, in the order of the page."""
-    return dict(_MAPS)
+    rooms = (contact, matter, rounding, steps, transfer)
+    return {m.name: m for room in rooms for m in vars(room).values() if isinstance(m, Map)}
 
 
 def chosen(names: Sequence[str] | None = None, *, gpu: bool = False) -> list[Map]:

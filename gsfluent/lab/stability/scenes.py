@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.fracture.slab import SEPARATE, nacc, plane, wave_speed
 from gsfluent.lab.stability.maps import Outcome, Place
 from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.invariants import Limits, OfWorld, Violation, first_violation
 from gsfluent.lab.world.resident import Resident
-from gsfluent.lab.world.shapes import ball, box, parameters
-from gsfluent.lab.world.violations import Limits, OfWorld, Violation, first_violation
+from gsfluent.lab.world.shapes import ball, box, nacc, parameters, wave_speed
+from gsfluent.lab.world.walls import wall
 
 __all__ = [
     "BRITTLE", "DENSITY", "DX", "FLOOR", "IMPACT", "SPACING", "STRENGTH", "YOUNG", "Courant",
@@ -23,7 +23,7 @@ __all__ = [
 DX = 0.1
 DENSITY = 1000.0
 YOUNG = 1e5
-FLOOR = plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE)[None]
+FLOOR = wall(2, mode="separate")[None]
 SHIFT = torch.tensor([0.37, 0.21, 0.11], dtype=torch.float64) * DX
 """Lattices do not start on nodes: that would be the easy case."""
 
@@ -83,7 +83,7 @@ def thrown(
     stretch = Courant(0.5 if courant is None else courant)
     volume = (0.5 * DX) ** 3
     world = World(
-        points, [0.0, 0.0, -speed], mass=DENSITY * volume, volume=volume, dx=DX, law=0, params=row,
+        points, [0.0, 0.0, -speed], volume=volume, dx=DX, law=0, params=row,
         colliders=FLOOR, cfl=stretch.cfl, dt=dt, dtype=torch.float32, device=place.device,
         **options,
     )  # fmt: skip
@@ -127,9 +127,9 @@ def brittle(
     if order is not None:
         points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(order))]
     volume = (0.5 * SPACING) ** 3
-    floor = plane([0.0, 0.0, height], [0.0, 0.0, 1.0], mode=SEPARATE, friction=0.3)[None]
+    floor = wall(2, height, mode="separate", friction=0.3)[None]
     return World(
-        points, [0.0, 0.0, -mach * c], mass=volume, volume=volume, dx=SPACING, law=1, params=row,
+        points, [0.0, 0.0, -mach * c], volume=volume, dx=SPACING, law=1, params=row,
         alpha=torch.full((len(points),), -STRENGTH / hardening), colliders=floor,
         gravity=(0.0, 0.0, -9.81), dt=courant * SPACING / (c * (1.0 + mach)), dtype=torch.float32,
         device=place.device, **options,

@@ -14,7 +14,7 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.stability.maps import Outcome, Place
 from gsfluent.lab.stability.scenes import DX
 from gsfluent.lab.textbook.solver import Textbook, Variant
-from gsfluent.lab.world.violations import Limits, State, first_violation, observe
+from gsfluent.lab.world.invariants import Limits, State, first_violation, observe
 
 __all__ = ["OfTextbook", "scene_of", "watched_textbook"]
 

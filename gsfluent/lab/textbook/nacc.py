@@ -148,7 +148,7 @@ def _dynamic(m: Nacc, t: Trial, alpha: Tensor, k: float, epsilon: float) -> _Ans
 
 
 def _root(change: Callable[[Tensor], Tensor], start: Tensor) -> Tensor:
-    """Alpha with ``alpha = start + change(alpha)``, the one that docs/return-mapping.md defines.
+    """Alpha with ``alpha = start + change(alpha)``, the one of docs/theory/return-mapping.md.
 
     Secant steps (of one to four times the last, 0.2 in all) walk to a bracket, Anderson and
     Bjoerck's secants close it: where there are several roots, this decides which one is meant.

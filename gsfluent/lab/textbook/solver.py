@@ -20,7 +20,6 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen.fracture import Drives, damage
 from gsfluent.lab.textbook import laws
 from gsfluent.lab.textbook.grid import (
     Stencil,
@@ -33,8 +32,9 @@ from gsfluent.lab.textbook.grid import (
 )
 from gsfluent.lab.textbook.nacc import Nacc, return_map
 from gsfluent.lab.textbook.variant import Birth, Variant
+from gsfluent.lab.world.drives import Drives, damage
 
-__all__ = ["Birth", "Textbook", "Variant", "play_textbook"]
+__all__ = ["Birth", "Textbook", "Variant", "run_textbook"]
 
 
 def six(m: Tensor) -> Tensor:
@@ -382,7 +382,7 @@ class Textbook:
         )  # fmt: skip
 
 
-def play_textbook(
+def run_textbook(
     scene: Scene,
     *,
     device: str | torch.device = "cpu",

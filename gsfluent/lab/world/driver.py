@@ -47,8 +47,8 @@ class World:
     Args:
         position: [m], [N, 3].
         velocity: [m/s], [N, 3], or three numbers for all points.
-        mass: [kg], [N] or one number.
         volume: Initial volume [m^3], [N] or one number.
+        mass: [kg], [N] or one number; default: the volume times the density of the row.
         dx: Node spacing [m].
         law: Constitutive law of every row of ``params``: int32 [M], or one number.
         params: [M, 8] or [8], see :func:`gsfluent.ops.return_mapping`.
@@ -85,8 +85,8 @@ class World:
         position: Tensor,
         velocity: Tensor | Sequence[float],
         *,
-        mass: Tensor | float,
         volume: Tensor | float,
+        mass: Tensor | float | None = None,
         dx: float,
         law: Tensor | int,
         params: Tensor,
@@ -97,7 +97,7 @@ class World:
         affine: Tensor | None = None,
         deformation: bool = False,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
-        colliders: Tensor | None = None,
+        colliders: Tensor | Sequence[Tensor] | None = None,
         friction: float = 0.0,
         restitution: float = 0.0,
         contact_gap: float = 1.0,
@@ -133,6 +133,11 @@ class World:
             return data.expand(shape).contiguous()
 
         rows = params.reshape(-1, 8).to(device, dtype).contiguous()
+        if mass is None:
+            which = slice(0, 1) if material is None else material.cpu().long()
+            density = params.reshape(-1, 8)[which, 6].double().cpu()
+            mass = density * torch.as_tensor(volume, dtype=torch.float64).cpu()
+        walls = None if colliders is None else torch.stack([*colliders]).to(device, dtype)
         self.scene = Scene(
             mass=number(mass, count),
             volume=number(volume, count),
@@ -143,7 +148,7 @@ class World:
             body=None if body is None else index(body, count),
             fields=1 if body is None else int(body.max()) + 1,
             gravity=(float(gravity[0]), float(gravity[1]), float(gravity[2])),
-            colliders=None if colliders is None else colliders.to(device, dtype).contiguous(),
+            colliders=walls,
             friction=friction,
             restitution=restitution,
             contact_gap=contact_gap,

@@ -1,6 +1,7 @@
 """One MPM step of a :class:`gsfluent.lab.world.driver.World` on the composable ops.
 
-p2g, grid update, g2p and return map, as in docs/mpm.md. A periodic axis is made of images: points
+p2g, grid update, g2p and return map, as in docs/theory/mpm.md. A periodic axis is made of images:
+points
 within reach of one face appear again behind the other, give mass and momentum there, and are
 forgotten before the points move. That is exact, since every node near a face receives all it would
 receive on a torus.

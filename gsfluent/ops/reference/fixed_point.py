@@ -1,8 +1,9 @@
 """Sums of the resident solver on a GPU, in whole numbers: 32 bits in a window, 64 between windows.
 
-The definition of what p2g of ``csrc/cuda/solver_*`` adds up, and of what may lie
+The definition of what p2g of ``csrc/cuda/solver`` adds up, and of what may lie
 between that and the exact sums. The units come from the clock of a :class:`gsfluent.ops.Solver`;
-docs/solver.md has the proof that nothing overflows. ``scripts/study/solver.py`` and a test use it.
+docs/theory/solver-sums.md has the proof that nothing overflows. ``scripts/study/solver.py`` and a
+test use it.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class NodeSums:
     Attributes:
         fixed: As the GPU takes them.
         exact: In float64.
-        slack: Largest difference that rounding can make, by docs/solver.md.
+        slack: Largest difference that rounding can make, by docs/theory/solver-sums.md.
         node: Which row each point's nodes are, int64 [N, 27].
     """
 

@@ -1,4 +1,7 @@
-"""The laws beside neo-Hookean and NACC in plain PyTorch (csrc/core/laws.h), and their energies."""
+"""The laws beside neo-Hookean and NACC in plain PyTorch, and their energies.
+
+The kernels have them in ``csrc/core/material/laws.h``.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The MPM operators in plain PyTorch, dense over (particle, 27 nodes): the definition, for tests.
 
-Written from docs/mpm.md, not from the kernels; run it in float64.
+Written from docs/theory/mpm.md, not from the kernels; run it in float64.
 """
 
 from __future__ import annotations

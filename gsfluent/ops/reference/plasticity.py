@@ -65,7 +65,7 @@ def _gather_law(law: Tensor, rows: Tensor | None, count: int) -> Tensor:
 
 
 class Trial(NamedTuple):
-    """Guarded trial state (csrc/core/elastic.h); ``e`` is the strain before any pull."""
+    """Guarded trial state (csrc/core/material/elastic.h); ``e`` is the strain before any pull."""
 
     e: Tensor
     d: Tensor
@@ -103,7 +103,7 @@ def _neo_hookean(
     valid: Tensor,
     root: Tensor | None,
 ) -> other.Returned:
-    """Laws 0 and 1 (csrc/core/nacc.h)."""
+    """Laws 0 and 1 (csrc/core/material/nacc.h)."""
     d, j2m1, log_j = t.d, t.j2m1, t.log_j
     p, q = -0.5 * m.kappa * j2m1, 1.5**0.5 * m.mu * t.n
     alpha = torch.where(nacc & valid, alpha.clamp(ALPHA_MIN, ALPHA_MAX), alpha)
@@ -215,7 +215,7 @@ def elastic_energy(strain: Tensor, m: Material, laws: Tensor | None = None) -> T
 
 
 def wave_speed_squared(strain: Tensor, m: Material, laws: Tensor) -> Tensor:
-    """Square of the fastest wave speed [m^2/s^2], [N]: csrc/core/wave_speed.h."""
+    """Square of the fastest wave speed [m^2/s^2], [N]: csrc/core/material/wave_speed.h."""
     finite = torch.isfinite(strain).all(1)
     strain = torch.where(finite[:, None], strain, 0.0)
     j2m1 = det_minus_one(to_matrix(strain)).clamp(J_MIN**2 - 1.0, J_MAX**2 - 1.0)

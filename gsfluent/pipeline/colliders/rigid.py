@@ -218,7 +218,7 @@ class RigidSet:
         """Volume of grid nodes that each free body can touch, its lever counted in [m^3], [M].
 
         The box around the body, half a cell wider; times ``1 + m r^2 / I`` for what its turning
-        gives way (``collider_give`` in ``csrc/core/collider.h``). 0 for other colliders.
+        gives way (``collider_give`` in ``csrc/core/collider/collider.h``). 0 for other colliders.
         """
         volume = rows.new_zeros(rows.shape[0])
         for i in self._free:

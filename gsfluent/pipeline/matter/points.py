@@ -1,7 +1,7 @@
 """From solids to material points: sampling, masses, material rows, seeded weakness.
 
 Gaussians are not material points: a grid cell wants 4 to 8 points whatever the number of splats,
-so points are sampled from the solid's voxels and the splats ride on them
+so points are sampled from the solid's voxels which carry the splats
 (:mod:`gsfluent.pipeline.matter.carry`).
 """
 
@@ -251,7 +251,8 @@ def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
 def _cell_order(points: Tensor, edge: float) -> Tensor:
     """Order of points [N, 3] by block of 4^3 cells, then by cell: neighbours in memory as in space.
 
-    The transfers run several times faster on points that are stored in this order (docs/mpm.md).
+    The transfers run several times faster on points that are stored in this order
+    (docs/theory/mpm.md).
     """
     cell = torch.floor((points - points.amin(dim=0)) / edge).to(torch.int64)
     block, local = cell // 4, cell % 4

@@ -147,7 +147,7 @@ LONG = replace(
     opacity_pull=0.03,
 )
 """Long runs: no resets; a pull on opacities instead frees what is not needed (measured in
-docs/reconstruction.md)."""
+docs/theory/reconstruction.md)."""
 
 RECIPES = {recipe.name: recipe for recipe in (QUICK, LONG, CLASSIC)}
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.viewer.model import look
 from gsfluent.viewer.model.look import Cut, Look
-from gsfluent.viewer.page import Page
 from gsfluent.viewer.panels.light import LightPanel
+from gsfluent.viewer.panels.page import Page
 
 if TYPE_CHECKING:
     import viser

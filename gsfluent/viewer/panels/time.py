@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from gsfluent.viewer.page import Page
+from gsfluent.viewer.panels.page import Page
 
 if TYPE_CHECKING:
     import viser

@@ -26,7 +26,7 @@ from gsfluent import demo
 from gsfluent.data import INTERIOR, Camera, Capture, Gaussians
 from gsfluent.draw import draw
 from gsfluent.figure.markdown import enter
-from gsfluent.io import load_capture, load_splats
+from gsfluent.io import load_capture, load_splats, save_splats
 from gsfluent.pipeline import Isolate, Reconstruct, Texture
 from gsfluent.pipeline.fill.interior import INTERIOR_OPACITY, interior_gaussians
 from gsfluent.pipeline.fill.stage import Fill
@@ -206,7 +206,7 @@ def demos(cache: Path) -> Iterator[Case]:
         path = folder / "object.ply"
         if not path.is_file():
             whole, _ = Reconstruct(800, 30_000)(capture)
-            Isolate().split(whole, capture)[0].save(path)
+            save_splats(Isolate().split(whole, capture)[0], path)
         label = f"{name}, " + ("masks" if support == "none" else "on a table, no masks")
         texture = {"exemplar": str(folder / "cut.png"), "quality": "preview"}
         yield label, load_splats(path), capture, demo.make_object(name, 0).depth, texture

@@ -81,7 +81,7 @@ def methods(model: str) -> dict[str, Maker]:
 
 def tiny(folder: Path) -> str:
     """The random pipeline of the tests."""
-    sys.path.insert(0, str(ROOT / "tests" / "pipeline"))
+    sys.path.insert(0, str(ROOT / "tests" / "pipeline" / "texture"))
     import tiny_diffusers
 
     return str(tiny_diffusers.save_sdxl(folder))

@@ -57,6 +57,7 @@ def test_the_gloss_is_seen_from_the_mirrored_side() -> None:
 
 
 def test_the_smallest_charts_of_rendering(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     """All splats in float32 are round-off away from float64; fewer and plainer ones are not."""
     result = chart_quality("rendering", tmp_path, device=CPU, quick=True, repeat=1)
     records = {(r.case, r.variant): r for r in read(result["lines"])}
@@ -78,6 +79,7 @@ def test_the_smallest_charts_of_rendering(tmp_path: Path) -> None:
 
 
 def test_what_has_a_line_is_not_done_again(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     calls: list[str] = []
 
     def job(name: str, error: float) -> Job:

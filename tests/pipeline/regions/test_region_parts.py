@@ -17,8 +17,8 @@ from gsfluent.config import Shot
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.data.regions import with_inclusions
 from gsfluent.errors import InputError
-from gsfluent.inspect.parts import body_parts, solid_regions
-from gsfluent.inspect.parts_picture import part_colors, save_parts_picture
+from gsfluent.inspection.parts import body_parts, solid_regions
+from gsfluent.inspection.parts_picture import part_colors, save_parts_picture
 from gsfluent.io.solid import save_solid
 from gsfluent.pipeline.matter.points import build_matter, grid_spacing
 from gsfluent.pipeline.regions.project import label_regions
@@ -63,7 +63,8 @@ def test_two_materials_part_at_a_weak_interface(tmp_path: Path, weak: bool) -> N
         glue = {"label_image": {"y": file}, "label": 2}
         parts.append({"name": "glue", "where": glue, "cohesion": 0.1, "alpha0": -0.002})
     scene = Scene(floor=None, gravity=(0, 0, 0))
-    scene.add(bar(), "plaster", parts=parts, angular_velocity=(0, 0, 200))
+    labelled = label_regions(bar(), [part["where"] for part in parts])
+    scene.add(labelled, "plaster", parts=parts, angular_velocity=(0, 0, 200))
     stage = Simulate("preview", repair=False, splats=False, free_flight=False, piece_flight=False,
                      sleep=False)  # fmt: skip
     *_, last = stage(scene, fps=1000, seconds=0.002)
@@ -215,7 +216,7 @@ def test_the_shot_of_the_page_is_a_shot(tmp_path: Path) -> None:
 
     import yaml
 
-    page = Path(__file__).resolve().parents[3] / "docs" / "regions.md"
+    page = Path(__file__).resolve().parents[3] / "docs" / "guide" / "regions.md"
     found = re.search(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     assert found is not None
     for name in ("captures/apple", "parts/stem", "segmentation"):

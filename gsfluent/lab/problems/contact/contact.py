@@ -31,7 +31,7 @@ def bodies(
     body = torch.cat([torch.full((n,), i, dtype=torch.int32) for i, n in enumerate(count)])
     speed = torch.cat([v.expand(n, 3) for v, n in zip(velocities, count, strict=True)])
     volume = SPACING**3
-    options = {"mass": volume, "volume": volume, "dx": 1.0, "law": 0, **options}
+    options = {"volume": volume, "dx": 1.0, "law": 0, **options}
     return World(
         torch.cat(parts),
         speed,
@@ -114,7 +114,7 @@ def _impact(
     parts = [points + sign * place + shift for sign in (-1.0, 1.0)]
     volume = torch.cat([volume, volume])
     world = bodies(
-        parts, [speed * along, -speed * along], mass=volume, volume=volume, **options
+        parts, [speed * along, -speed * along], volume=volume, **options
     )  # fmt: skip
     first = torch.arange(len(world.position)) < len(parts[0])
     return world, [first, ~first], line
@@ -189,7 +189,7 @@ def hertz_spheres(
         compare("hertz_spheres", "contact time / Hertz", (touching[-1] - touching[0]) / time, 1.0,
                 tolerance=0.1, source=source, note=note),
         compare("hertz_spheres", "restitution", after, 1.0, tolerance=0.05,
-                source="elastic impact", note="damping of the transfer, see docs/contact.md"),
+                source="elastic impact", note="damping of the transfer (docs/theory/contact.md)"),
     ]  # fmt: skip
 
 
@@ -232,7 +232,7 @@ def colliding_discs(dx: float = 0.025) -> list[Result]:
     parts = [disc((c, c, 0.5 * thick), 0.2, thick, spacing) for c in (0.3, 0.7)]
     push = torch.tensor([0.1, 0.1, 0.0], dtype=torch.float64)
     world = bodies(
-        parts, [push, -push], dx=dx, mass=1000.0 * spacing**3, volume=spacing**3,
+        parts, [push, -push], dx=dx, volume=spacing**3,
         params=parameters(1000.0, 0.3, 1000.0), period=(None, None, thick),
     )  # fmt: skip
     start, lowest = world.kinetic(), [world.kinetic()]

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from gsfluent.lab.problems.contact.contact import SPACING, bodies, smooth_ball, turning
-from gsfluent.lab.problems.fracture.slab import STICKY, plane
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box
+from gsfluent.lab.world.walls import wall
 
 PULL = 0.0025
 """Gravity [cells / s^2]: strains of a percent, a tenth of the wave speed after a few cells."""
@@ -35,7 +35,7 @@ def _on_slab(
     world = bodies(
         [top, slab], [along, torch.zeros(3, dtype=torch.float64)], friction=friction,
         gravity=(pull * math.sin(slope), 0.0, -pull * math.cos(slope)),
-        colliders=plane((0.0, 0.0, -2.0), (0.0, 0.0, 1.0), mode=STICKY)[None], **options,
+        colliders=[wall(2, -2.0, mode="sticky")], **options,
     )  # fmt: skip
     return world, torch.arange(len(world.position)) < len(top)
 
@@ -163,7 +163,7 @@ def ball_rolls(radius: float = 6.0, angle: float = 20.0, friction: float = 0.5) 
             now.velocity = now.velocity + dt * tilted.to(now.velocity)
 
     world, ball = _on_slab(
-        points, 24.0, 12.0, 0.0, friction, pull=0.0, force=gravity, mass=volume, volume=volume
+        points, 24.0, 12.0, 0.0, friction, pull=0.0, force=gravity, volume=volume
     )  # fmt: skip
     world.run(calm + 40.0)
     first = _speed(world, ball)

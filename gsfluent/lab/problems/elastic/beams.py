@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.elastic.statics import FACE, STICK, plane
-from gsfluent.lab.problems.elastic.vortex import plane_strain
+from gsfluent.lab.problems.elastic.statics import FACE
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
+from gsfluent.lab.world.walls import PLANE_STRAIN, wall
 
 ROOT = 1.8751040687119611
 """First root of cos(x) cosh(x) = -1."""
@@ -50,8 +50,8 @@ def swing(cells: int, periods: float) -> tuple[float, float, float, int]:
     velocity = torch.zeros_like(points)
     velocity[:, 1] = tip * first_mode(((points[:, 0] + FACE * dx) / free).clamp(0.0, 1.0))
     world = World(
-        points, velocity, mass=density * spacing**3, volume=spacing**3, dx=dx, law=0,
-        params=parameters(young, 0.3, density), colliders=plane(0, 0.0, 1, STICK)[None],
+        points, velocity, volume=spacing**3, dx=dx, law=0,
+        params=parameters(young, 0.3, density), colliders=[wall(0, mode="sticky")],
     )  # fmt: skip
     end = (points[:, 0] > 0.95 * length).to(world.position.device)
     rest = float(points[:, 1][points[:, 0] > 0.95 * length].mean())
@@ -181,9 +181,9 @@ def bend(
         world.velocity, world.affine = velocity, world.affine * keep
 
     world = World(
-        points, [0.0, 0.0, 0.0], mass=density * volume, volume=volume, dx=dx, law=0,
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=0,
         params=parameters(young, 0.0, density), force=pull, cfl=0.8,
-        colliders=torch.cat([plane(0, 0.0, 1, STICK)[None], plane_strain()]),
+        colliders=[wall(0, mode="sticky"), PLANE_STRAIN],
     ).run(1.5 * period)  # fmt: skip
     moved = (world.position.double().cpu() - points)[end].mean(0)
     return float(moved[1]) / arm, -float(moved[0]) / arm, world.steps

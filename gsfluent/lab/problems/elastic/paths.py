@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.lab.problems.fracture.slab import nacc
 from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.shapes import nacc
 
 __all__ = ["PATHS", "breaking_step", "return_map_paths"]
 

@@ -49,7 +49,7 @@ def run_wave(cells: int, periods: float, cfl: float = 0.2) -> Wave:
     steps = round(periods / (cfl * dx))
     dt = periods / steps
     world = World(
-        points, velocity, affine=affine, mass=0.125 * dx**3, volume=0.125 * dx**3, dx=dx, law=0,
+        points, velocity, affine=affine, volume=0.125 * dx**3, dx=dx, law=0,
         params=parameters(1.0, 0.0, 1.0), dt=dt, period=(1.0, None, None),
     )  # fmt: skip
     shape = shape.to(world.position.device)
@@ -124,7 +124,7 @@ def push_bar(width: float) -> tuple[float, list[float], list[float]]:
         world.velocity, world.affine = velocity, affine
 
     world = World(
-        points, [0.0, 0.0, 0.0], mass=BAR_DENSITY * spacing**3, volume=spacing**3, dx=2 * spacing,
+        points, [0.0, 0.0, 0.0], volume=spacing**3, dx=2 * spacing,
         law=0, params=parameters(BAR_YOUNG, 0.3, BAR_DENSITY), force=push,
     )  # fmt: skip
     times, moved = [0.0], [0.0]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import torch
 
-from gsfluent.lab.problems.fracture.slab import STICKY, between_planes, plane, sheet
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
-from gsfluent.lab.world.shapes import parameters
+from gsfluent.lab.world.shapes import parameters, sheet
+from gsfluent.lab.world.walls import between_planes, wall
 
 __all__ = ["run_out", "sand_column"]
 
@@ -37,14 +37,10 @@ def run_out(
     alpha_dp = math.sqrt(2.0 / 3.0) * 2.0 * sine / (3.0 - sine)
     points = sheet([0.0, 0.0], [1.0, aspect], dx)
     volume, density = 0.25 * dx**3, 2000.0
-    walls = torch.cat([
-        between_planes(dx),
-        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])[None],
-        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0], mode=STICKY)[None],
-    ])  # fmt: skip
     world = World(
-        points, [0.0, 0.0, 0.0], mass=density * volume, volume=volume, dx=dx, law=DRUCKER_PRAGER,
-        params=parameters(2e6, 0.3, density, c2=alpha_dp), colliders=walls,
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=DRUCKER_PRAGER,
+        params=parameters(2e6, 0.3, density, c2=alpha_dp), 
+        colliders=[*between_planes(dx), wall(0), wall(1, mode="sticky")],
         gravity=(0.0, -9.81, 0.0), dtype=dtype,
     )  # fmt: skip
     world.run(seconds=seconds or 4.4 * math.sqrt(aspect / 9.81))

@@ -10,9 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.fracture.slab import SLIP, STICKY, between_planes, plane, sheet
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.shapes import sheet
+from gsfluent.lab.world.walls import between_planes, wall
 
 __all__ = ["dam_break", "dam_front", "liquid_at_rest", "water"]
 
@@ -37,14 +38,14 @@ def hydrostatic(depth: Tensor, row: Tensor) -> Tensor:
 
 
 def dam_front(
-    cells: int, *, until: float, bed: float, dtype: torch.dtype = torch.float32
+    cells: int, *, until: float, bed: str, dtype: torch.dtype = torch.float32
 ) -> list[tuple[float, float]]:
     """Front of a water column twice as high as wide after the gate is gone.
 
     Args:
         cells: Cells along the base a.
         until: End, as ``t sqrt(2 g / a)``.
-        bed: Mode of the bed: sticky (no slip, as in the experiment) or slip.
+        bed: Mode of the bed: ``sticky`` (no slip, as in the experiment) or ``slip``.
         dtype: Precision.
 
     Returns:
@@ -56,14 +57,10 @@ def dam_front(
     points = sheet([0.0, 0.0], [base, 2.0 * base], dx)
     row = water(10.0 * math.sqrt(2.0 * GRAVITY * base))
     volume = 0.25 * dx**3
-    walls = torch.cat([
-        between_planes(dx),
-        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], mode=SLIP)[None],
-        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0], mode=bed)[None],
-    ])  # fmt: skip
     world = World(
-        points, [0.0, 0.0, 0.0], mass=float(row[6]) * volume, volume=volume, dx=dx, law=FLUID,
-        params=row, colliders=walls, gravity=(0.0, -GRAVITY, 0.0), dtype=dtype,
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=FLUID,
+        params=row, colliders=[*between_planes(dx), wall(0), wall(1, mode=bed)],
+        gravity=(0.0, -GRAVITY, 0.0), dtype=dtype,
         strain=hydrostatic(2.0 * base - points[:, 1], row),
     )  # fmt: skip
     scale = math.sqrt(2.0 * GRAVITY / base)
@@ -114,7 +111,7 @@ def dam_break(
         )
     source = "Martin and Moyce 1952, fig. 3, n^2 = 2, a = 1.125 and 2.25 in"
     results = []
-    for bed, kind in ((STICKY, "no-slip bed"), (SLIP, "slip bed")):
+    for bed, kind in (("sticky", "no-slip bed"), ("slip", "slip bed")):
         trace = dam_front(cells, until=until, bed=bed, dtype=dtype)
         errors = []
         for time, place in measured:
@@ -145,20 +142,15 @@ def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     points = torch.cat([sheet([0.0, 0.0], [0.5, 0.625], dx), sheet([0.5, 0.0], [0.5, 0.375], dx)])
     row = water(8.0 * math.sqrt(GRAVITY * depth))
     volume = 0.25 * dx**3
-    walls = torch.cat([
-        between_planes(dx),
-        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])[None],
-        plane([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])[None],
-        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0])[None],
-    ])  # fmt: skip
     damping = [2.0]
 
     def damp(world: World, dt: float) -> None:
         world.velocity = world.velocity * (1.0 - damping[0] * dt)
 
     world = World(
-        points, [0.0, 0.0, 0.0], mass=float(row[6]) * volume, volume=volume, dx=dx, law=FLUID,
-        params=row, colliders=walls, gravity=(0.0, -GRAVITY, 0.0), dtype=dtype, force=damp,
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=FLUID,
+        params=row, colliders=[*between_planes(dx), wall(0), wall(0, 1.0, -1), wall(1)],
+        gravity=(0.0, -GRAVITY, 0.0), dtype=dtype, force=damp,
     )  # fmt: skip
     world.run(seconds=4.0)
     damping[0] = 0.0
@@ -181,7 +173,7 @@ def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     scale = float(row[6]) * GRAVITY * depth
     off = torch.stack(pressures).mean(dim=0)[:layers] / scale - (depth - height) / depth
     level = float((top - top.mean()).abs().max()) / dx
-    inside, wall = float(off[2:].abs().max()), float(off[:2].abs().max())
+    inside, beside = float(off[2:].abs().max()), float(off[:2].abs().max())
     surface = float(top.mean()) + 0.25 * dx
     name, source = "liquid_at_rest", "hydrostatics"
     return [
@@ -191,5 +183,5 @@ def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
             "volume is kept",
         ),
         Result(name, "pressure over rho g H, two cells up", inside, 0.0, inside, 0.05, "", source),
-        Result(name, "pressure over rho g H at the floor", wall, 0.0, wall, 0.1, "", source),
+        Result(name, "pressure over rho g H at the floor", beside, 0.0, beside, 0.1, "", source),
     ]  # fmt: skip

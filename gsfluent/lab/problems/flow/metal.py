@@ -6,10 +6,10 @@ import math
 
 import torch
 
-from gsfluent.lab.problems.fracture.slab import SEPARATE, plane
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
+from gsfluent.lab.world.walls import wall
 
 __all__ = ["taylor_bar"]
 
@@ -36,14 +36,10 @@ def taylor_bar(cells: int = 4, dtype: torch.dtype = torch.float32) -> list[Resul
     points = points[points[:, :2].norm(dim=1) <= radius]
     start = float(points[:, 2].max()) + 0.5 * step
     volume = 0.25 * math.pi * radius**2 * start / points.shape[0]
-    walls = torch.stack([
-        plane([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
-        plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
-        plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE),
-    ])  # fmt: skip
     world = World(
-        points, [0.0, 0.0, -227.0], mass=density * volume, volume=volume, dx=dx, law=VON_MISES,
-        params=parameters(117e9, 0.35, density, c2=400e6, c4=100e6), colliders=walls,
+        points, [0.0, 0.0, -227.0], volume=volume, dx=dx, law=VON_MISES,
+        params=parameters(117e9, 0.35, density, c2=400e6, c4=100e6),
+        colliders=[wall(0), wall(1), wall(2, mode="separate")],
         deformation=True, dtype=dtype,
     )  # fmt: skip
     world.run(seconds=80e-6)

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.fracture.slab import between_planes, nacc, sheet, wave_speed
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
-from gsfluent.lab.world.shapes import parameters
+from gsfluent.lab.world.shapes import nacc, parameters, sheet, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 __all__ = ["brazilian_disc", "loaded_disc"]
 
@@ -67,7 +67,7 @@ def loaded_disc(
         world.velocity = v
 
     world = World(
-        points, [0.0, 0.0, 0.0], mass=mass, volume=volume, dx=dx, law=torch.tensor([0, 1]),
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=torch.tensor([0, 1]),
         params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]),
         material=(points[:, 1].abs() < breakable * radius).int(),
         alpha=torch.full_like(points[:, 0], alpha), colliders=between_planes(dx), dtype=dtype,

@@ -19,8 +19,8 @@ from gsfluent.fracturebench.scene import Floats, Scene
 from gsfluent.lab.textbook.grid import stencil
 from gsfluent.lab.textbook.solver import Textbook, Variant
 from gsfluent.lab.textbook.variant import Birth
+from gsfluent.lab.world.invariants import Limits, State, Violation, check, observe
 from gsfluent.lab.world.shapes import ball, box
-from gsfluent.lab.world.violations import Limits, State, Violation, check, observe
 
 __all__ = [
     "DX",
@@ -151,7 +151,7 @@ class Outcome(NamedTuple):
         broken: Share of points without strength.
         kinetic: Kinetic energy over that at the start.
         smallest: Smallest volume ratio met.
-        violation: The first law that it broke (:mod:`gsfluent.lab.world.violations`; momentum is
+        violation: The first law that it broke (:mod:`gsfluent.lab.world.invariants`; momentum is
         not
             judged, the floor takes it), if asked for.
         exposure: Expected deaths by an unguarded division so far (:func:`exposure`), if asked for.

@@ -5,7 +5,8 @@ density of the law times a few ``dx``: finer grids break more easily, without en
 softening by ``reference / dx`` at unchanged strength keeps the product (Bazant and Oh 1983, "Crack
 band theory for fracture of concrete"). For NACC, whose strength is
 ``p0 = kappa sinh(xi max(-alpha, 0))`` and whose damage is a strain, that is
-``alpha0 -> alpha0 s``, ``xi -> xi / s`` with ``s = reference / dx``. docs/fracture.md has the
+``alpha0 -> alpha0 s``, ``xi -> xi / s`` with ``s = reference / dx``. docs/theory/fracture.md has
+the
 measured slopes with and without.
 """
 
@@ -20,7 +21,7 @@ __all__ = ["BAND_CELLS", "brittle_spacing", "crack_band", "fracture_energy", "so
 
 BAND_CELLS = 2.0
 """Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
-the crack runs along a plane of nodes (measured, docs/fracture.md)."""
+the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""
 _ALPHA_MIN = -10.0
 """Smallest alpha the return map keeps."""
 
@@ -63,7 +64,7 @@ def brittle_spacing(params: Tensor, *, reference: float) -> Tensor:
 
     ``reference / (beta xi)``: above it ``cohesion * hardening > 1`` after :func:`crack_band`, a
     point past the tensile tip has no neighbouring state to soften to, and loses its strength in one
-    step (docs/return-mapping.md).
+    step (docs/theory/return-mapping.md).
 
     Args:
         params: [M, 8] or [8], as given to :func:`crack_band`.
@@ -124,7 +125,7 @@ def fracture_energy(params: Tensor, alpha: float, *, dx: float) -> float:
     """Energy per crack area of a NACC material on a grid of spacing ``dx`` [J/m^2].
 
     :func:`softening_energy` times a band of ``BAND_CELLS`` cells, so a lower bound: measured cracks
-    are up to a half wider, depending on how they lie on the grid (docs/fracture.md).
+    are up to a half wider, depending on how they lie on the grid (docs/theory/fracture.md).
 
     Args:
         params: One NACC row, [8], as used on that grid (after :func:`crack_band` if any).

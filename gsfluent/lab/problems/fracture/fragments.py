@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import torch
 
 from gsfluent.lab.problems.fracture.crack_band import fracture_energy
-from gsfluent.lab.problems.fracture.slab import between_planes, nacc, wave_speed
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, problem
-from gsfluent.lab.world.shapes import box
+from gsfluent.lab.world.shapes import box, nacc, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 __all__ = ["expected_size", "fragment_size", "mean_size"]
 
@@ -64,7 +64,7 @@ def mean_size(rate: float, seed: int = 0, dtype: torch.dtype = torch.float32) ->
     affine[:, 0, 0] = rate
     volume = (0.5 * dx) ** 3
     world = World(
-        points, velocity, mass=DENSITY * volume, volume=volume, dx=dx, law=1, params=ROW,
+        points, velocity, volume=volume, dx=dx, law=1, params=ROW,
         alpha=ALPHA0 * strength[cell], colliders=between_planes(dx, (1, 2)), affine=affine,
         dtype=dtype,
     )  # fmt: skip

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import torch
 
 from gsfluent.lab.problems.fracture.crack_band import crack_band
-from gsfluent.lab.problems.fracture.slab import between_planes, nacc, plane, sheet
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, problem
-from gsfluent.lab.world.shapes import parameters
+from gsfluent.lab.world.shapes import nacc, parameters, sheet
+from gsfluent.lab.world.walls import between_planes, wall
 
 __all__ = ["Crack", "kalthoff_winkler", "shear_notch"]
 
@@ -61,12 +61,11 @@ def shear_notch(cells: int, *, speed: float = 33.0, dtype: torch.dtype = torch.f
     breakable[len(plate) :] = False
     volume = 0.25 * dx**3
     start = torch.tensor([dx * round(0.05 / dx + 4.0), 0.0, 0.0], dtype=torch.float64)
-    symmetry = plane([0.0, 0.0, 0.0], [0.0, 1.0, 0.0])[None]
     world = World(
-        points + start, velocity, mass=DENSITY * volume, volume=volume, dx=dx,
+        points + start, velocity, volume=volume, dx=dx,
         law=torch.tensor([0, 1]), params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]),
         material=breakable.int(), alpha=torch.full_like(points[:, 0], float(alpha)),
-        colliders=torch.cat([between_planes(dx), symmetry]), dtype=dtype,
+        colliders=[*between_planes(dx), wall(1)], dtype=dtype,
     )  # fmt: skip
     world.run(seconds=80e-6)
     broken = points[breakable & (world.peak >= 0.0).cpu(), :2]

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import torch
 
 from gsfluent.lab.problems.fracture.crack_band import crack_band
-from gsfluent.lab.problems.fracture.slab import between_planes, nacc, sheet, wave_speed
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, problem
-from gsfluent.lab.world.shapes import parameters
+from gsfluent.lab.world.shapes import nacc, parameters, sheet, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 __all__ = ["Run", "rayleigh_speed", "run_crack", "single_edge_notch"]
 
@@ -78,7 +78,7 @@ def run_crack(
 
     volume = 0.25 * dx**3
     world = World(
-        points, velocity, mass=DENSITY * volume, volume=volume, dx=dx, law=torch.tensor([0, 1]),
+        points, velocity, volume=volume, dx=dx, law=torch.tensor([0, 1]),
         params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]),
         material=(y.abs() < 0.125).int(), alpha=torch.full_like(x, float(alpha)),
         colliders=between_planes(dx), dtype=dtype, force=hold,

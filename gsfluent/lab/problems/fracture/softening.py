@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from gsfluent.lab.problems.fracture.crack_band import crack_band, softening_energy
-from gsfluent.lab.problems.fracture.slab import Dissipation, between_planes, nacc, sheet, wave_speed
+from gsfluent.lab.problems.fracture.dissipation import Dissipation
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
-from gsfluent.lab.world.shapes import box, parameters
+from gsfluent.lab.world.shapes import box, nacc, parameters, sheet, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 __all__ = ["Opening", "double_cantilever", "open_cantilever", "pull_bar", "slope", "softening_bar"]
 
@@ -66,7 +67,7 @@ def pull_bar(cells: int, *, regularised: bool, softening: float = 0.05) -> float
 
     volume = (0.5 * dx) ** 3
     world = World(
-        points, velocity, mass=DENSITY * volume, volume=volume, dx=dx, law=1, params=row,
+        points, velocity, volume=volume, dx=dx, law=1, params=row,
         alpha=alpha0 * strength, colliders=between_planes(dx, (1, 2)), force=grip,
     )  # fmt: skip
     meter = Dissipation(world)
@@ -168,7 +169,7 @@ def open_cantilever(
     volume = 0.25 * dx**3
     world = World(
         points + torch.tensor([0.0, shift * dx, 0.0], dtype=torch.float64), [0.0, 0.0, 0.0],
-        mass=DENSITY * volume, volume=volume, dx=dx, law=torch.tensor([0, 1]),
+        volume=volume, dx=dx, law=torch.tensor([0, 1]),
         params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]), material=layer.int(),
         alpha=torch.full_like(x, float(alpha0)), colliders=between_planes(dx), dtype=dtype,
         force=wedge,

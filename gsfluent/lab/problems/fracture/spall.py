@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.fracture.slab import between_planes, nacc, wave_speed
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
-from gsfluent.lab.world.shapes import box
+from gsfluent.lab.world.shapes import box, nacc, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 __all__ = ["plate_impact_spall", "spall_strength"]
 
@@ -58,7 +58,7 @@ def plate_impact_spall(
     velocity[:, 0] = 0.5 * speed * (1.0 - torch.tanh((x - flyer * dx) / (4.0 * dx)))
     volume = (0.5 * dx) ** 3
     world = World(
-        points, velocity, mass=float(row[6]) * volume, volume=volume, dx=dx, law=1, params=row,
+        points, velocity, volume=volume, dx=dx, law=1, params=row,
         alpha=torch.full_like(x, alpha0), colliders=between_planes(dx, (1, 2)), dtype=dtype,
     )  # fmt: skip
     face = x > length - dx

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
 
 logger = logging.getLogger(__name__)
@@ -84,25 +84,11 @@ def _packages(options: InpaintOptions) -> Any:
 
     Without transformers diffusers hands out dummy classes that fail only when called.
     """
-    try:
-        import diffusers
-        from diffusers.utils import is_accelerate_available, is_transformers_available
-    except ImportError as error:
-        raise InputError(
-            "texture: method 'diffusion' needs the package diffusers, which is not installed",
-            hint="pip install 'gsfluent[inpaint]'",
-        ) from error
-    if not is_transformers_available():
-        raise InputError(
-            "texture: method 'diffusion' needs the package transformers, which is not installed",
-            hint="pip install 'gsfluent[inpaint]'",
-        )
-    if options.memory != "high" and not is_accelerate_available():
-        raise InputError(
-            f"texture: inpaint memory {options.memory} needs the package accelerate, which is not "
-            "installed",
-            hint="pip install 'gsfluent[inpaint]', or use memory: high",
-        )
+    method = "texture: method 'diffusion'"
+    need("transformers", "inpaint", method)
+    if options.memory != "high":
+        need("accelerate", "inpaint", f"{method} with inpaint memory {options.memory} (high: not)")
+    diffusers = need("diffusers", "inpaint", method)
     diffusers.utils.logging.set_verbosity_error()
     diffusers.utils.logging.disable_progress_bar()
     return diffusers

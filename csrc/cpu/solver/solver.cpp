@@ -1,0 +1,110 @@
+// The resident solver on the CPU: priming and the loop over steps. See cpu/solver/solver.h.
+#include "host/solver.h"
+
+#include "cpu/solver/homes.h"
+#include "cpu/solver/nodes.h"
+
+namespace gsf::cpu {
+namespace {
+
+constexpr int64_t kParticleGrain = 2048;
+
+void give_largest(const Largest& l, SolverClock& c) {
+  c.speed = bits_of(std::sqrt(l.speed2));
+  // Not every step looks at these: what an earlier one saw stays until the clock forgets it. The
+  // bits of floats that are not negative are ordered as the floats are.
+  c.wave = std::max<uint64_t>(c.wave, bits_of(std::sqrt(l.wave2)));
+  c.gradient = std::max<uint64_t>(c.gradient, bits_of(std::sqrt(l.gradient2)));
+}
+
+template <typename T>
+class Stepper {
+ public:
+  Stepper(const SolverView<T>& s, int laws)
+      : s_(s), laws_(laws), contact_(s), homes_(s, contact_), nodes_(s, contact_) {}
+
+  // Everything that follows from the blocks; again after each build.
+  void plan() {
+    const SolverClock& c = *s_.clock;
+    STD_TORCH_CHECK(c.homes >= 0 && c.homes <= s_.home_capacity && c.slots >= 0 &&
+                        c.slots <= s_.slot_capacity && c.sites >= 0 && c.sites <= c.slots,
+                    "solver: the clock counts more blocks than there is room for");
+    touched_.assign(c.slots, 0);
+    contact_.make();
+    homes_.plan();
+    nodes_.plan();
+  }
+
+  void step() {
+    SolverClock& c = *s_.clock;
+    Counts all = homes_.to_nodes(touched_);
+    nodes_.run(static_cast<T>(c.dt), touched_);
+    all.add(homes_.from_nodes(laws_));
+    c.plastic += all.plastic;
+    c.guarded += all.guarded;
+    c.inverted += all.inverted;
+    c.invalid += all.invalid;
+    c.lost += all.lost;
+    if (all.leaves) c.leaving += 1;
+    give_largest(all.largest, c);
+    end_step(c, double(s_.dx), s_.count);
+  }
+
+ private:
+  const SolverView<T>& s_;
+  const int laws_;
+  ContactPlan<T> contact_;
+  HomePass<T> homes_;
+  NodePass<T> nodes_;
+  std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
+};
+
+template <typename T>
+void prime_particles(const SolverView<T>& s, bool measure) {
+  SolverClock& c = *s.clock;
+  const T dt = static_cast<T>(c.dt);
+  const Counts all =
+      parallel_counts(s.count, kParticleGrain, [&](int64_t begin, int64_t end, Counts& counts) {
+        for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, counts.largest);
+      });
+  if (measure)
+    give_largest(all.largest, c);
+  else
+    c.bound = bits_of(all.largest.bound);
+}
+
+struct Cpu {
+  using Scope = CpuScope;
+
+  template <typename T>
+  static void prime(const SolverView<T>& s, int, const Scope&) {
+    SolverClock& c = *s.clock;
+    if (s.row_count == 0) return;
+    prime_particles(s, true);
+    start_clock(c, double(s.dx));
+    if (c.done != 0 || c.reason != kFine) return;
+    prime_particles(s, false);
+    choose_unit(c);
+  }
+
+  template <typename T>
+  static void run(const SolverView<T>& s, int laws, int64_t rounds, int64_t steps, const Scope&) {
+    SolverClock& c = *s.clock;
+    if (s.row_count == 0) return;
+    Stepper<T> stepper(s, laws);
+    if (may_step(c)) stepper.plan();
+    for (int64_t i = 0; i < rounds * steps; ++i) {
+      if (may_build(c)) {
+        solver_build(s);
+        if (may_step(c)) stepper.plan();
+      }
+      if (!may_step(c)) return;
+      stepper.step();
+    }
+  }
+};
+
+}  // namespace
+}  // namespace gsf::cpu
+
+GSF_REGISTER(CPU, gsf::SolverOps<gsf::cpu::Cpu>)

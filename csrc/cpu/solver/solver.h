@@ -1,0 +1,68 @@
+// The CPU half of the resident solver: blocks (build.cpp), particles of a home to its window
+// and back (homes.h, packet.h, update.h), nodes (nodes.h, contact.h), the loop
+// over steps (solver.cpp). Every sum is taken in an order that depends on neither the number of
+// threads nor the order in which the particles were loaded.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <vector>
+
+#include "core/solver/particle.h"
+#include "torch_api.h"
+
+namespace gsf::cpu {
+
+// New homes and slots for the particles as they are, which are re-sorted; or clock.grow or
+// clock.reason, and nothing else changed.
+template <typename T>
+void solver_build(const SolverView<T>& s);
+
+// What a slot holds in this step.
+enum Touched : uint8_t { kTouchedSums = 1, kTouchedMoments = 2 };
+
+// Counts and largest values of some particles. They do not depend on the order in which they meet.
+struct Counts {
+  int64_t plastic = 0, guarded = 0, inverted = 0, invalid = 0, lost = 0;
+  bool leaves = false;
+  Largest largest{};
+
+  void add(const StepFlags& f) {
+    plastic += f.plastic;
+    guarded += f.guarded;
+    inverted += f.inverted;
+    invalid += f.invalid;
+    lost += f.lost;
+    leaves = leaves || f.leaves;
+  }
+  void add(const Counts& o) {
+    plastic += o.plastic;
+    guarded += o.guarded;
+    inverted += o.inverted;
+    invalid += o.invalid;
+    lost += o.lost;
+    leaves = leaves || o.leaves;
+    largest.speed2 = larger(o.largest.speed2, largest.speed2);
+    largest.wave2 = larger(o.largest.wave2, largest.wave2);
+    largest.gradient2 = larger(o.largest.gradient2, largest.gradient2);
+    largest.bound = larger(o.largest.bound, largest.bound);
+  }
+};
+
+// What f(begin, end, Counts&) counts over [0, n), on all threads.
+template <typename F>
+Counts parallel_counts(int64_t n, int64_t grain, const F& f) {
+  Counts all;
+  std::atomic_flag busy;
+  parallel_for(n, grain, [&](int64_t begin, int64_t end) {
+    Counts mine;
+    f(begin, end, mine);
+    while (busy.test_and_set(std::memory_order_acquire)) busy.wait(true);
+    all.add(mine);
+    busy.clear(std::memory_order_release);
+    busy.notify_one();
+  });
+  return all;
+}
+
+}  // namespace gsf::cpu

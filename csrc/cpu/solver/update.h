@@ -1,0 +1,169 @@
+// Update of a packet of particles as long as they are elastic. Whatever a lane's particle does
+// beyond that is left to finish_particle (core/solver/particle.h), which this file repeats without
+// branches; tests/ops/test_solver_cpu.py holds the two together.
+#pragma once
+
+#include "cpu/solver/packet.h"
+
+namespace gsf::cpu {
+
+// Largest squares of the particles done in packets.
+template <typename T>
+struct PacketLargest {
+  Pack<T> speed2{0}, wave2{0}, gradient2{0};
+
+  void give(Largest& l) const {
+    l.speed2 = larger(float(largest_lane(speed2)), l.speed2);
+    l.wave2 = larger(float(largest_lane(wave2)), l.wave2);
+    l.gradient2 = larger(float(largest_lane(gradient2)), l.gradient2);
+  }
+};
+
+// Elastic trial state inside the NACC yield surface for certain: in units of kappa, with the lower
+// bound x + x^3/6 + x^5/120 for sinh x (the surface grows with p0 and contains the origin).
+template <typename T>
+typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<T> alpha,
+                                     Pack<T> j2m1, Pack<T> n2) {
+  using P = Pack<T>;
+  const P beta = min(cohesion, P(kCohesionMax));
+  const P x = min(row[4] * max(P(0) - alpha, P(0)), P(5));
+  const P x2 = x * x;
+  const P below = x * (P(1) + x2 * (P(1.0 / 6.0) + x2 * P(1.0 / 120.0)));
+  const P p0 = min(P(kYieldPressureFloor) + below, P(kYieldPressureCap));
+  const P p = P(-0.5) * j2m1 - P(0.5) * (P(1) - beta) * p0, a = P(0.5) * (P(1) + beta) * p0;
+  const P m2 = row[2] * row[2], b2 = m2 * a * a, flat = P(1) + P(2) * beta;
+  const P mu = row[0] / row[1], q2 = P(1.5) * mu * mu * n2;
+  // u^2 + w^2 < 1 times (M A)^2. Written so that NaN means no; alpha out of its bounds is for the
+  // full map to clamp, and so is a surface without height.
+  return (m2 * p * p + flat * q2 <= P(0.9999) * b2) & (alpha >= P(kAlphaMin)) &
+         (alpha <= P(kAlphaMax)) & (b2 > P(1e-16) * flat);
+}
+
+// finish_particle for every active lane.
+template <typename T, int kLaws, bool kTrack, typename Count>
+void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t reach,
+                   const Pack<T>* offset, const PacketGathered<T>& gathered, T dt, T dt_next,
+                   PacketLargest<T>& largest, Count& counts) {
+  const Pack<T>* value = gathered.value;
+  const Mat3<Pack<T>>& first = gathered.first;
+  using P = Pack<T>;
+  using Int = typename P::Int;
+  const T inv_dx = s.inv_dx, slack = T(s.clock->slack);
+  Mat3<P> c;
+  for (int i = 0; i < 9; ++i) c.m[i] = P(T(4) * inv_dx) * first.m[i];
+
+  using Word = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
+  const Int meta = int_pack_of<T>([&](int lane) { return Word(packet.meta[lane]); });
+  Int plain = packet.used_lanes(), leaves{}, moved = meta & ~(Int{} + 511);
+  P rest[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const P there = offset[axis] + P(dt * inv_dx) * value[axis];
+    plain &= (there > P(-8)) & (there < P(8));
+    Int whole;
+    const P below = floor(there, whole);
+    const P part = there - below;
+    const Int up = part >= P(1);  // rounding of a tiny negative number
+    rest[axis] = select<T>(up, P(0), part);
+    const Int cell = ((meta >> (3 * axis)) & 7) + whole - up;
+    plain &= (cell >= 0) & (cell <= kLastCell);
+    const P reached = P(__builtin_convertvector(cell, typename P::Raw)) + rest[axis];
+    leaves |= (reached < P(slack)) | (reached > P(T(kLastCell + 1) - slack));
+    if ((reach >> axis & 1u) == 0) leaves |= cell < 1;
+    if ((reach >> (3 + axis) & 1u) == 0) leaves |= cell > 2;
+    moved |= cell << (3 * axis);
+  }
+
+  const auto row_of = [&](int lane) { return int64_t(s.row_of(packet.meta[lane])); };
+  P row[kRowColumns];
+  if (packet.same_rows()) {
+    for (int i = 0; i < kRowColumns; ++i) row[i] = P(s.rows[row_of(0) * kRowColumns + i]);
+  } else {
+    for (int i = 0; i < kRowColumns; ++i)
+      row[i] = pack_of<T>([&](int lane) { return s.rows[row_of(lane) * kRowColumns + i]; });
+  }
+
+  Mat3<P> increment;
+  for (int i = 0; i < 9; ++i) increment.m[i] = P(dt) * c.m[i];
+  const Sym3<P> e = update_strain(packet.load6(s.strain), increment);
+  const P j2m1 = det_minus_one(e);
+  const P isochoric = reciprocal_cube_root(P(1) + j2m1);
+  const Sym3<P> d = isochoric * deviator(e);
+  const P n2 = norm2(d);
+  plain &= (max_abs(e) <= P(kStrainMax)) & (j2m1 >= P(kJMin * kJMin - 1.0)) &
+           (j2m1 <= P(kJMax * kJMax - 1.0)) & (n2 <= P(kDeviatorMax * kDeviatorMax)) &
+           (det_identity_plus(increment) > P(0));
+  Int whole = Int{} - 1;  // not broken
+  if constexpr (kLaws != kElasticOnly) {
+    Int nacc{}, elastic{};
+    if (packet.same_rows()) {
+      nacc -= s.law[row_of(0)] == int(kNacc) ? 1 : 0;
+      elastic -= s.law[row_of(0)] == int(kElastic) ? 1 : 0;
+    } else {
+      nacc = -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kNacc)); });
+      elastic =
+          -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kElastic)); });
+    }
+    plain &= nacc | elastic;
+    if (mask_bits(nacc) != 0) {
+      const P alpha = packet.load1(s.alpha), peak = packet.load1(s.peak);
+      P cohesion = row[3];
+      if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
+      plain &= ~nacc | (surely_elastic(row, cohesion, alpha, j2m1, n2) & (alpha <= peak));
+      whole = ~nacc | (peak < P(0));
+    }
+  }
+
+  const Sym3<P> stress = add_diagonal(row[0] * d, P(0.5) * row[1] * j2m1);
+  P slope[9];
+  const P scale = P(dt_next) * row[kStressColumn];
+  const Mat3<P> tau = to_mat3(stress);
+  for (int i = 0; i < 9; ++i) slope[i] = row[kMassColumn] * c.m[i] - scale * tau.m[i];
+
+  const P speed2 = value[0] * value[0] + value[1] * value[1] + value[2] * value[2];
+  const auto keep = [&](P& most, Int mask, P x) {
+    most = max(most, select<T>(plain & mask, x, P(0)));
+  };
+  keep(largest.speed2, plain, speed2);
+  if (measures_waves(*s.clock, kLaws)) {
+    P gradient2(0);
+    for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
+    // elastic_wave_squared
+    const P n = sqrt(n2);
+    const P mean = clamp(isochoric * (P(1) + trace(e) * P(1.0 / 3.0)), P(1), P(kDeviatorMax));
+    const P along =
+        row[0] * (P(4.0 / 3.0) * mean + P(0.272165526975909) * n) + P(0.5) * row[1] * (P(2) + j2m1);
+    const P across = row[0] * (mean + P(0.816496580927726) * n);
+    keep(largest.wave2, plain, max(along, across) * row[kInverseDensityColumn]);
+    keep(largest.gradient2, whole, gradient2);
+  }
+
+  const uint32_t done = mask_bits(plain);
+  if (done != 0) {
+    counts.leaves = counts.leaves || (mask_bits(leaves) & done) != 0;
+    packet.store3(rest, s.offset, done);
+    packet.store3(value, s.velocity, done);
+    packet.store6(e, s.strain, done);
+    packet.store9(slope, s.slope, done);
+    for (uint32_t left = done; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      s.meta[packet.index[lane]] = static_cast<uint32_t>(moved[lane]);
+    }
+    if constexpr (kTrack) {
+      Mat3<P> f;
+      packet.load9(s.deformation, f.m);
+      f = f + P(dt) * matmul(c, f);
+      packet.store9(f.m, s.deformation, done);
+    }
+  }
+  for (uint32_t left = packet.active & ~done; left != 0; left &= left - 1) {
+    const int lane = __builtin_ctz(left);
+    T one[3];
+    Mat3<T> moment;
+    for (int i = 0; i < 3; ++i) one[i] = value[i][lane];
+    for (int i = 0; i < 9; ++i) moment.m[i] = first.m[i][lane];
+    counts.add(finish_particle<T, kLaws, kTrack>(s, packet.index[lane], reach, one, moment, dt,
+                                                 dt_next, counts.largest));
+  }
+}
+
+}  // namespace gsf::cpu

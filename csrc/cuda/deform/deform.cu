@@ -1,0 +1,73 @@
+// CUDA kernels of the deformation ops: one thread per matrix or Gaussian.
+#include "core/deform/carry.h"
+#include "cuda/deform/launch.h"
+
+namespace gsf::cuda {
+namespace {
+
+template <typename T>
+__global__ void polar_kernel(PolarArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= a.count) return;
+  Mat3<T> rotation, clamped;
+  gsf::polar_clamped(load_mat3(a.deformation + 9 * i), a.lo, a.hi, rotation, clamped);
+  store_mat3(a.rotation + 9 * i, rotation);
+  store_mat3(a.clamped + 9 * i, clamped);
+}
+
+template <typename T>
+__global__ void covariance_axes_kernel(CovarianceAxesArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::covariance_axes(a, i);
+}
+
+template <typename T>
+__global__ void carry_place_kernel(CarryPlaceArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::carry_place(a, i);
+}
+
+template <typename T>
+__global__ void carry_axes_kernel(CarryAxesArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::carry_axes(a, i);
+}
+
+template <typename Args, typename Kernel>
+cudaError_t launch(const Args& args, cudaStream_t stream, Kernel kernel) {
+  if (args.count == 0) return cudaSuccess;
+  constexpr int kThreads = 128;
+  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
+  kernel<<<blocks, kThreads, 0, stream>>>(args);
+  return cudaGetLastError();
+}
+
+}  // namespace
+
+template <typename T>
+cudaError_t polar_clamped(const PolarArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, polar_kernel<T>);
+}
+template <typename T>
+cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, covariance_axes_kernel<T>);
+}
+template <typename T>
+cudaError_t carry_place(const CarryPlaceArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, carry_place_kernel<T>);
+}
+template <typename T>
+cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, carry_axes_kernel<T>);
+}
+
+template cudaError_t polar_clamped(const PolarArgs<float>&, cudaStream_t);
+template cudaError_t polar_clamped(const PolarArgs<double>&, cudaStream_t);
+template cudaError_t covariance_axes(const CovarianceAxesArgs<float>&, cudaStream_t);
+template cudaError_t covariance_axes(const CovarianceAxesArgs<double>&, cudaStream_t);
+template cudaError_t carry_place(const CarryPlaceArgs<float>&, cudaStream_t);
+template cudaError_t carry_place(const CarryPlaceArgs<double>&, cudaStream_t);
+template cudaError_t carry_axes(const CarryAxesArgs<float>&, cudaStream_t);
+template cudaError_t carry_axes(const CarryAxesArgs<double>&, cudaStream_t);
+
+}  // namespace gsf::cuda

@@ -1,0 +1,22 @@
+// Launchers of the deformation kernels: what ops.cpp may call. Torch-free.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "core/deform/args.h"
+
+namespace gsf::cuda {
+
+template <typename T>
+cudaError_t polar_clamped(const PolarArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t covariance_axes(const CovarianceAxesArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t carry_place(const CarryPlaceArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream);
+
+}  // namespace gsf::cuda

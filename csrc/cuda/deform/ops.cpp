@@ -1,0 +1,20 @@
+// CUDA registration of the deformation ops.
+#include "cuda/deform/launch.h"
+#include "cuda/stream.h"
+#include "host/deform.h"
+
+namespace gsf {
+namespace {
+
+struct DeformCuda {
+  using Scope = CudaScope;
+  GSF_LAUNCH(polar_clamped)
+  GSF_LAUNCH(covariance_axes)
+  GSF_LAUNCH(carry_place)
+  GSF_LAUNCH(carry_axes)
+};
+
+}  // namespace
+}  // namespace gsf
+
+GSF_REGISTER(CUDA, gsf::DeformOps<gsf::DeformCuda>)

@@ -1,0 +1,13 @@
+// Launchers of the material kernels: what ops.cpp may call. Torch-free.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "core/material/args.h"
+
+namespace gsf::cuda {
+
+template <typename T>
+cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream);
+
+}  // namespace gsf::cuda

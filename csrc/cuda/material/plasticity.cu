@@ -1,0 +1,40 @@
+// CUDA kernel of return_mapping: one thread per particle; counters reduced per block first.
+#include "core/material/return_mapping.h"
+#include "cuda/material/launch.h"
+
+namespace gsf::cuda {
+namespace {
+
+template <typename T>
+__global__ void __launch_bounds__(128) return_mapping_kernel(const ReturnMappingArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  ReturnFlags f{false, false, false, false};
+  if (i < a.count) f = return_mapping_particle(a, i);
+  // Every thread of the block reaches the barriers below, also those past the end.
+  const int plastic = __syncthreads_count(f.plastic);
+  const int guarded = __syncthreads_count(f.guarded);
+  const int inverted = __syncthreads_count(f.inverted);
+  const int invalid = __syncthreads_count(f.invalid);
+  if (threadIdx.x == 0) {
+    if (plastic) atomicAdd(a.info + 0, plastic);
+    if (guarded) atomicAdd(a.info + 1, guarded);
+    if (inverted) atomicAdd(a.info + 2, inverted);
+    if (invalid) atomicAdd(a.info + 3, invalid);
+  }
+}
+
+}  // namespace
+
+template <typename T>
+cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream) {
+  if (args.count == 0) return cudaSuccess;
+  constexpr int kThreads = 128;
+  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
+  return_mapping_kernel<T><<<blocks, kThreads, 0, stream>>>(args);
+  return cudaGetLastError();
+}
+
+template cudaError_t return_mapping(const ReturnMappingArgs<float>&, cudaStream_t);
+template cudaError_t return_mapping(const ReturnMappingArgs<double>&, cudaStream_t);
+
+}  // namespace gsf::cuda

@@ -1,0 +1,280 @@
+// Nodes of the resident solver: sums to velocities, contact between fields, colliders.
+#pragma once
+
+#include "cuda/solver/reduce.h"
+
+namespace gsf::cuda {
+namespace {
+
+constexpr int kGridCtas = 5;  // of a multiprocessor, for grid_kernel's registers
+
+// Reads the sums of one node.
+template <typename T>
+__device__ NodeSums<T> read_sums(const SolverView<T>& s, int64_t node) {
+  NodeSums<T> out;
+  const longlong2* words =
+      reinterpret_cast<const longlong2*>(static_cast<const int64_t*>(s.sums) + 4 * node);
+  const longlong2 a = words[0], b = words[1];
+  const double unit = s.clock->momentum_unit;
+  out.momentum[0] = double(a.x) * unit;
+  out.momentum[1] = double(a.y) * unit;
+  out.momentum[2] = double(b.x) * unit;
+  out.mass = double(b.y) * s.clock->mass_unit;
+  return out;
+}
+
+// Clears them for the next step.
+template <typename T>
+__device__ void clear_sums(const SolverView<T>& s, int64_t node, int32_t shared) {
+  longlong2* words = reinterpret_cast<longlong2*>(static_cast<int64_t*>(s.sums) + 4 * node);
+  words[0] = words[1] = longlong2{0, 0};
+  if (shared == 0) return;
+  int64_t* m = static_cast<int64_t*>(s.moments) + kContactMoments * node;
+  for (int c = 0; c < kContactMoments; ++c) m[c] = 0;
+}
+
+// Units of the sums over nodes that colliders get. What a collider gives is not bounded by what the
+// points have, so the unit of an impulse is fixed: all points, each as heavy as the heaviest, may
+// change their speed by 8e6 m/s (the clock stops at 1e6). Torque: levers up to 4096 dx.
+template <typename T>
+__device__ double sum_unit(const SolverView<T>& s, int i) {
+  if (i == 6) return s.clock->mass_unit;
+  const double heaviest = s.clock->mass_unit * double(int64_t(1) << (s.clock->unit_bits - 1));
+  const double impulse = heaviest * double(s.count) * (8e6 / double(int64_t(1) << 62));
+  return i < 3 ? impulse : impulse * double(s.dx) * 4096.0;
+}
+
+__device__ inline long long warp_sum(long long v) {
+  for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
+  return v;
+}
+__device__ inline void add_units(void* to, long long units) {
+  atomicAdd(static_cast<unsigned long long*>(to), static_cast<unsigned long long>(units));
+}
+
+// Sums of the first few colliders over a CTA. All nodes of a scene meet at those few words, so they
+// are added up as far as possible before they get there.
+constexpr int kHeldColliders = 4;
+struct HeldSums {
+  unsigned long long units[kHeldColliders * kImpulseSums];
+  int done;  // warps that have added all they have
+
+  __device__ void clear() {
+    for (int i = threadIdx.x; i < kHeldColliders * kImpulseSums; i += blockDim.x) units[i] = 0;
+    if (threadIdx.x == 0) done = 0;
+  }
+  // Called by whole warps; the last one of the CTA hands over, so that none waits for another.
+  template <typename T>
+  __device__ void hand_over(const SolverView<T>& s) {
+    const int lane = threadIdx.x & 31;
+    __threadfence_block();
+    int before = lane == 0 ? atomicAdd(&done, 1) : 0;
+    before = __shfl_sync(kAllLanes, before, 0);
+    if (before + 1 < int(blockDim.x) / 32) return;
+    __threadfence_block();
+    for (int i = lane; i < kHeldColliders * kImpulseSums; i += 32) {
+      const unsigned long long sum = atomicAdd(units + i, 0ull);
+      if (sum != 0) add_units(s.impulse_units + i, static_cast<long long>(sum));
+    }
+  }
+};
+
+// Velocity after the colliders in `near`, for all lanes of a warp together (`near` is the same in
+// all). Out of line: few nodes come here.
+template <typename T>
+__device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& held, uint64_t near,
+                                             bool active, Vec3<T> x, double mass, Vec3<T> v, T dt) {
+  for (; near != 0; near &= near - 1) {
+    const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
+    const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
+    for (int64_t k = first; k < end; ++k) {
+      double sums[kImpulseSums] = {};
+      if (active) node_collide(s, k, x, mass, dt, v, sums);
+      if (!__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
+      const double units_of[3] = {1.0 / sum_unit(s, 0), 1.0 / sum_unit(s, 3), 1.0 / sum_unit(s, 6)};
+      for (int i = 0; i < kImpulseSums; ++i) {
+        const long long units = warp_sum(__double2ll_rn(sums[i] * units_of[i / 3]));
+        if (units == 0 || (threadIdx.x & 31) != 0) continue;
+        if (k < kHeldColliders)
+          add_units(held.units + kImpulseSums * k + i, units);
+        else
+          add_units(s.impulse_units + kImpulseSums * k + i, units);
+      }
+    }
+  }
+  return v;
+}
+
+// Velocities are stored in fours, so that a node is read and written at once.
+__device__ inline void store_velocity(const SolverView<float>& s, int64_t node,
+                                      const Vec3<float>& v) {
+  reinterpret_cast<float4*>(s.node_velocity)[node] = {v.x, v.y, v.z, 0.0f};
+}
+__device__ inline void store_velocity(const SolverView<double>& s, int64_t node,
+                                      const Vec3<double>& v) {
+  double2* out = reinterpret_cast<double2*>(s.node_velocity) + 2 * node;
+  out[0] = {v.x, v.y};
+  out[1] = {v.z, 0.0};
+}
+__device__ inline Vec3<float> load_velocity(const SolverView<float>& s, int64_t node) {
+  const float4 v = reinterpret_cast<const float4*>(s.node_velocity)[node];
+  return {v.x, v.y, v.z};
+}
+__device__ inline Vec3<double> load_velocity(const SolverView<double>& s, int64_t node) {
+  const double2* v = reinterpret_cast<const double2*>(s.node_velocity) + 2 * node;
+  const double2 low = v[0], high = v[1];
+  return {low.x, low.y, high.x};
+}
+
+template <typename T>
+__device__ Vec3<T> node_place(const int32_t* block, T x, T y, T z, T dx) {
+  return {(T(block[0]) * T(kBlockEdge) + x) * dx, (T(block[1]) * T(kBlockEdge) + y) * dx,
+          (T(block[2]) * T(kBlockEdge) + z) * dx};
+}
+
+// What contact reads around the nodes of a block: sums of all slots that hold moments. Those of the
+// first fields of the site lie in shared memory, 6^3 nodes each.
+constexpr int kHaloNodes = 216;
+constexpr int kStagedFields = 3;
+
+template <typename T>
+struct SlotNear {
+  const SolverView<T>& s;
+  const int32_t (*around)[kNeighbours];  // by field of the site
+  const ContactSample<T> (*staged)[kHaloNodes];
+  int local;
+  double mass_unit;
+
+  __device__ ContactSample<T> operator()(int field, int o) const {
+    if (field < kStagedFields) {
+      const int i = local / 16 + o / 9, j = local / 4 % 4 + o / 3 % 3, k = local % 4 + o % 3;
+      return staged[field][(i * 6 + j) * 6 + k];
+    }
+    int there;
+    const int block = near_block(local, o, there);
+    return read(around[field][block], there);
+  }
+
+  // Sample of node `there` of a slot.
+  __device__ ContactSample<T> read(int32_t slot, int there) const {
+    const ContactSample<T> none{T(0), {T(0), T(0), T(0)}};
+    if (slot < 0) return none;
+    const int64_t node = int64_t(slot) * kBlockNodes + there;
+    const int64_t mass = static_cast<const int64_t*>(s.sums)[4 * node + 3];
+    const int64_t* m = static_cast<const int64_t*>(s.moments) + kContactMoments * node;
+    const int64_t x = m[0], y = m[1], z = m[2];
+    if (mass <= 0) return none;
+    return {T(double(mass) * mass_unit),
+            {T(double(x) * mass_unit), T(double(y) * mass_unit), T(double(z) * mass_unit)}};
+  }
+};
+
+// Velocities of the sites that several fields share; `table_mask` lists them. Before grid_kernel,
+// which clears the sums that this one reads, its own and those of the nodes around.
+template <typename T>
+__device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t site, HeldSums& held) {
+  const SolverClock& clock = *s.clock;
+  __shared__ int32_t around[kSiteFields][kNeighbours];
+  __shared__ ContactSample<T> staged[kStagedFields][kHaloNodes];
+  const int local = threadIdx.x;
+  const T dt = T(clock.dt);
+  const int32_t* slots = s.site_slots + site * kSiteFields;
+  int count = 0;
+  while (count < kSiteFields && slots[count] >= 0 && slots[count] < s.slot_capacity) ++count;
+  for (int i = threadIdx.x; i < count * kNeighbours; i += kBlockNodes) {
+    const int32_t* c = s.slot_coord + 4 * int64_t(slots[i / kNeighbours]);
+    const int32_t slot = slot_around(s, c, i % kNeighbours);
+    around[i / kNeighbours][i % kNeighbours] =
+        slot >= 0 && slot < s.slot_capacity && s.slot_shared[slot] != 0 ? slot : -1;
+  }
+  __syncthreads();
+  const SlotNear<T> near_nodes{s, around, staged, local, clock.mass_unit};
+  for (int i = threadIdx.x; i < min(count, kStagedFields) * kHaloNodes; i += kBlockNodes) {
+    const int field = i / kHaloNodes, node = i % kHaloNodes;
+    const int at[3] = {node / 36 - 1, node / 6 % 6 - 1, node % 6 - 1};
+    const int block = (block_of(at[0]) * 3 + block_of(at[1])) * 3 + block_of(at[2]) + 13;
+    staged[field][node] = near_nodes.read(
+        around[field][block], local_index(local_of(at[0]), local_of(at[1]), local_of(at[2])));
+  }
+  __syncthreads();
+  const int32_t* block = s.slot_coord + 4 * int64_t(slots[0]);
+  const Vec3<T> x = node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
+  const uint64_t near = s.collider_count > 0 ? s.slot_near[slots[0]] : 0;
+  Vec3<T> velocity[kSiteFields];
+  bool heavy[kSiteFields];
+  int present = 0;
+  for (int f = 0; f < count; ++f) {
+    const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
+    heavy[f] = node_velocity(s, read_sums(s, node), dt, velocity[f]);
+    present += heavy[f] ? 1 : 0;
+  }
+  int touched = 0;
+  if (present > 1) touched = node_contact(s, count, heavy, near_nodes, velocity);
+  for (int f = 0; f < count; ++f) {
+    const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
+    if (near != 0)
+      velocity[f] =
+          collide_near(s, held, near, heavy[f], x, read_sums(s, node).mass, velocity[f], dt);
+    store_velocity(s, node, velocity[f]);
+  }
+  if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kBlockNodes)
+    contact_kernel(const __grid_constant__ SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock) || int64_t(blockIdx.x) >= clock.shared_sites) return;
+  __shared__ HeldSums held;
+  held.clear();
+  __syncthreads();
+  for (int64_t i = blockIdx.x; i < clock.shared_sites; i += gridDim.x) {
+    contact_site(s, s.table_mask[i], held);
+    __syncthreads();  // what lies in shared memory is used again
+  }
+  held.hand_over(s);
+}
+
+// Velocities of the nodes of one slot, where its field is alone; those of shared sites are done by
+// contact_kernel, only their sums are cleared.
+template <typename T>
+__device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot) {
+  const int local = threadIdx.x % kBlockNodes;
+  const int64_t node = slot * kBlockNodes + local;
+  const int32_t shared = s.moments != nullptr ? s.slot_shared[slot] : 0;
+  const uint64_t near = s.collider_count > 0 ? s.slot_near[slot] : 0;
+  const NodeSums<T> sums = read_sums(s, node);
+  clear_sums(s, node, shared);
+  if (shared == 1) return;
+  Vec3<T> v;
+  const T dt = T(s.clock->dt);
+  const bool heavy = node_velocity(s, sums, dt, v);
+  if (near != 0) {
+    const Vec3<T> x =
+        node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
+    v = collide_near(s, held, near, heavy, x, sums.mass, v, dt);
+  }
+  store_velocity(s, node, v);
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kSolverThreads, kGridCtas)
+    grid_kernel(const __grid_constant__ SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  __shared__ HeldSums held;
+  if (s.collider_count > 0) {
+    held.clear();
+    __syncthreads();
+  }
+  const int64_t slot =
+      int64_t(blockIdx.x) * (kSolverThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
+  // p2g has read the bounds of this step; g2p raises those of the next one from nothing.
+  const int64_t home = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
+  if (home < clock.homes) s.home_bound[home] = T(0);
+  if (slot < clock.slots) update_slot(s, held, slot);
+  if (s.collider_count > 0) held.hand_over(s);
+}
+
+}  // namespace
+}  // namespace gsf::cuda

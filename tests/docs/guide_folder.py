@@ -1,0 +1,117 @@
+"""Small inputs under the names that README and guide use."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from PIL import Image
+
+from gsfluent.data import SURFACE, Gaussians
+from gsfluent.demo import make_capture
+from gsfluent.io import save
+
+TESTS = Path(__file__).resolve().parents[1]
+SHOT: dict[str, Any] = {
+    "capture": "captures/apple",
+    "size": 0.16,
+    "reconstruct": {"iterations": 40, "max_gaussians": 900, "image_size": 48},
+    "fill": {"resolution": 24},
+    "texture": {"method": "color_copy"},
+    "objects": {"apple": {"material": "fruit.apple"}},
+    "events": [{"type": "drop", "height": 0.02}],
+    "solve": {"cells": 8},
+    "output": {"fps": 20, "seconds": 0.25, "size": [96, 64]},
+}
+PHYSGAUSSIAN: dict[str, Any] = {
+    "material": "jelly", "E": 2e4, "nu": 0.3, "density": 200, "g": [0, 0, -9.8], "n_grid": 40,
+    "substep_dt": 1e-4, "frame_dt": 0.02, "frame_num": 3,
+}  # fmt: skip
+CAMERA: dict[str, Any] = {
+    "id": 0, "img_name": "r_0", "width": 97, "height": 64, "fx": 90.0, "fy": 90.0,
+    "position": [0.0, -0.6, 0.1], "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+}  # fmt: skip
+
+
+def shell(count: int = 1500) -> Gaussians:
+    """Splats over an ellipsoid 0.26 m long, striped so that there is a texture to look at."""
+    index = torch.arange(count) + 0.5
+    polar = torch.acos(1 - 2 * index / count)
+    turn = math.pi * (1 + math.sqrt(5)) * index
+    unit = torch.stack([turn.cos() * polar.sin(), turn.sin() * polar.sin(), polar.cos()], dim=-1)
+    size = torch.full((count,), 0.078 * math.sqrt(4 * math.pi / count))
+    stripe = (unit[:, :1] * 20).sin() > 0
+    colors = torch.where(stripe, torch.tensor([0.1, 0.4, 0.1]), torch.tensor([0.5, 0.7, 0.3]))
+    means = unit * torch.tensor([0.13, 0.06, 0.06])
+    return Gaussians.from_colors(means, size, colors, opacities=0.95, label=SURFACE)
+
+
+def write_cut(path: Path) -> None:
+    """A cut of a round fruit before white: green rind, red flesh."""
+    y, x = np.mgrid[-1:1:96j, -1:1:96j]
+    radius = np.hypot(x, y)[..., None]
+    flesh = np.array([0.85, 0.25, 0.2]) + 0.05 * np.sin(40 * x * y)[..., None]
+    rind = np.array([0.2, 0.5, 0.15])
+    pixels = np.where(radius < 0.75, flesh, np.where(radius < 0.85, rind, 1.0))
+    Image.fromarray((255 * pixels.clip(0, 1)).astype(np.uint8)).save(path, quality=95)
+
+
+def write_box(path: Path, edge: float = 0.1) -> None:
+    """A closed cube of triangles."""
+    corners = [(x, y, z) for x in (0, edge) for y in (0, edge) for z in (0, edge)]
+    faces = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners]
+    lines += [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in faces]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_model(folder: Path) -> None:
+    """A model folder as the INRIA trainer leaves it: the shell, one camera."""
+    place = folder / "point_cloud" / "iteration_30"
+    place.mkdir(parents=True)
+    save(shell(800), place / "point_cloud.ply")
+    (folder / "cameras.json").write_text(json.dumps([CAMERA]))
+
+
+def write_parts(folder: Path, capture: Path) -> None:
+    """A mask and a label image per photograph: the upper half of each is both."""
+    (folder / "parts" / "stem").mkdir(parents=True)
+    (folder / "segmentation").mkdir()
+    for photograph in sorted((capture / "images").iterdir()):
+        width, height = Image.open(photograph).size
+        half = np.zeros((height, width), dtype=np.uint8)
+        half[: height // 2] = 255
+        name = f"{photograph.stem}.png"
+        Image.fromarray(half).save(folder / "parts" / "stem" / name)
+        Image.fromarray(half // 255).save(folder / "segmentation" / name)
+    (folder / "segmentation" / "labels.json").write_text(json.dumps({"1": "leaf"}))
+
+
+def write_diffusion(folder: Path) -> None:
+    """An inpainting pipeline with random weights, as the tests of the texture stage make it."""
+    path = TESTS / "pipeline" / "texture" / "tiny_diffusers.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    tiny = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tiny)
+    tiny.save_sdxl(folder)
+
+
+def write_inputs(folder: Path) -> None:
+    """Everything that a user brings."""
+    save(shell(), folder / "melon.ply")
+    write_cut(folder / "cut.jpg")
+    write_box(folder / "scan.obj")
+    make_capture("orange", folder / "captures" / "apple", views=9, size=64)
+    write_parts(folder, folder / "captures" / "apple")
+    if importlib.util.find_spec("transformers"):  # of the extra `inpaint`
+        write_diffusion(folder / "models" / "sdxl-inpainting")
+    write_model(folder / "model")
+    (folder / "phys.json").write_text(json.dumps(PHYSGAUSSIAN))
+    (folder / "shot.yaml").write_text(yaml.safe_dump(SHOT, sort_keys=False))
