@@ -2,7 +2,7 @@
 
 The grid has a fixed number of nodes and a cell of about three splats (``occupancy_cell``); it
 follows the bulk of the matter in whole steps of its coarsest cell, so that nothing swims. Splats
-outside (a crumb that flew far) take no part. Everything is a handful of tensor operations without
+outside (debris that flew far) take no part. Everything is a handful of tensor operations without
 a host synchronisation: one scatter, pooling, and one lookup per quantity.
 """
 

@@ -1,6 +1,6 @@
 """How much shows through the object that should not: holes in its silhouette, and in its front.
 
-When a body breaks, the Gaussians that rode on it part and what is behind shines through. What ought
+When a body breaks, the Gaussians that it carries part and what is behind shines through. What ought
 to be opaque comes from the matter itself: its material points as discs that just overlap at rest. A
 true gap between fragments is therefore no hole, a see-through fragment is, and so is an opening too
 narrow for the points to know of. Measured on true pictures of fractures

@@ -223,19 +223,6 @@ def _csr(rows: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -
         return torch.sparse_csr_tensor(start, columns.int(), values, size)
 
 
-@dataclass(frozen=True)
-class Steps:
-    """How the colours are solved for.
-
-    Attributes:
-        iterations: Conjugate-gradient steps after the vote; 0 is the vote alone.
-        prior: Weight that keeps the colours near the vote.
-    """
-
-    iterations: int = 4
-    prior: float = 0.0
-
-
 def fuse_colors(
     means: Tensor,
     planes: Sequence[SlicePlane],
@@ -245,7 +232,8 @@ def fuse_colors(
     masks: Sequence[Tensor] | None = None,
     initial: Tensor | None = None,
     fixed: Tensor | None = None,
-    steps: Steps | None = None,
+    iterations: int = 4,
+    prior: float = 0.0,
     slab: float | None = None,
 ) -> tuple[Tensor, dict[str, Any]]:
     """Colours of Gaussians that show the slices.
@@ -258,7 +246,8 @@ def fuse_colors(
         masks: Pixels that count, bool [H, W] each; None: all that show enough Gaussians.
         initial: Colours [N, 3] of Gaussians that no slice shows, and of the fixed ones.
         fixed: Gaussians whose colour stays (the surface), bool [N].
-        steps: How to solve.
+        iterations: Conjugate-gradient steps after the vote; 0 is the vote alone.
+        prior: Weight that keeps the colours near the vote.
         slab: Half-thickness of the slices; see :class:`SlabRenderer`.
 
     Returns:
@@ -272,7 +261,6 @@ def fuse_colors(
         raise ValueError(f"{len(planes)} planes for {len(targets)} targets")
     if fixed is not None and initial is None:
         raise ValueError("fixed Gaussians need their colours in initial")
-    steps = steps or Steps()
     device = means.device
     renderer = SlabRenderer(means, planes, spacing, slab)
     valid = []
@@ -303,14 +291,14 @@ def fuse_colors(
     gradient = renderer.adjoint(rest) * loose
     direction = gradient.clone()
     energy = (gradient**2).sum(0)
-    for _ in range(steps.iterations):
+    for _ in range(iterations):
         shown = [s * v for s, v in zip(renderer.render(direction), valid, strict=True)]
         curvature = torch.stack([(s**2).sum(0) for s in shown]).sum(0)
-        curvature = curvature + steps.prior * (direction**2).sum(0)
+        curvature = curvature + prior * (direction**2).sum(0)
         rate = energy / curvature.clamp(min=1e-20)
         colors = colors + rate * direction
         rest = [r - rate * s for r, s in zip(rest, shown, strict=True)]
-        gradient = (renderer.adjoint(rest) - steps.prior * (colors - anchor)) * loose
+        gradient = (renderer.adjoint(rest) - prior * (colors - anchor)) * loose
         following = (gradient**2).sum(0)
         direction = gradient + following / energy.clamp(min=1e-20) * direction
         energy = following
@@ -319,6 +307,6 @@ def fuse_colors(
     return clipped, {
         "rms_before": before,
         "rms_after": after,
-        "iterations": steps.iterations,
+        "iterations": iterations,
         "unseen": int((~seen).sum()),
     }

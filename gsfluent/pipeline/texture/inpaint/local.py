@@ -106,7 +106,7 @@ class ExemplarInpainter(MaskedInpainter):
     """Guided patch projection within each slice: patches of the photograph, matched by depth.
 
     The engine of the exemplar method (:mod:`.synthesis`) confined to one slice. Every slice is
-    made by itself, which is what a 2-D model does too; so this is the offline stand-in for one.
+    made by itself, which is what a 2-D model does too; so this is the offline proxy of one.
 
     Args:
         exemplar: Photograph when a call brings none.

@@ -205,22 +205,18 @@ def inpaint_volume(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> InteriorTexture:
-    """The two-stage loop around any inpainter; arguments as for :func:`diffusion_texture`.
+    """The two-stage loop around any inpainter; more arguments as for :func:`diffusion_texture`.
 
     Args:
         domain: Voxels to fill.
         inpainter: Backend.
         prompt: What a slice shows.
-        options: Settings of the loop (schedule, slices, strength, refine, tile, batch,
-            match_colors).
+        options: Settings of the loop.
         exemplar: Photograph, or one per axis.
         coarse: Backend of the first pass; None takes ``inpainter``.
-        store: Where finished slices are kept.
+        store: Where finished slices are kept; they stay there when the backend fails.
         seed: Seed.
         progress: Optional callback.
-
-    Raises:
-        RunError: The backend failed; finished slices stay in the store.
     """
     store = SliceStore(None, "") if store is None else store
     photos, passes = one_per_axis(exemplar), _passes(domain, options)

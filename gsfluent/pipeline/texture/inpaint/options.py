@@ -108,10 +108,7 @@ class InpaintOptions:
                     f"texture: inpaint {name} must be at least 1, got {getattr(self, name)}",
                     hint="leave it out",
                 )
-        if self.tile not in (1, 2, 4):
-            raise InputError(
-                f"texture: inpaint tile must be 1, 2 or 4, got {self.tile}", hint="leave it out"
-            )
+        check_choice("texture: inpaint tile", self.tile, (1, 2, 4), "leave it out")
         if self.size is not None and self.size < 16:
             raise InputError(
                 f"texture: inpaint size must be at least 16, got {self.size}",

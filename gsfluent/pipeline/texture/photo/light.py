@@ -64,7 +64,8 @@ def shading_field(
     if depth is not None:
         layer = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         knots = np.quantile(layer[small], np.linspace(0.0, 1.0, _KNOTS))
-        columns += [np.clip((layer - a) / (b - a + 1e-6), 0, 1) for a, b in _pairs(knots)]
+        pairs = itertools.pairwise(knots.tolist())
+        columns += [np.clip((layer - a) / (b - a + 1e-6), 0, 1) for a, b in pairs]
     design = np.stack([_slope(c)[:, usable].reshape(-1) for c in columns], 1)
     wanted = _slope(value)[:, usable].reshape(-1)
     hue = np.sqrt(sum((_slope(chroma[..., c]) ** 2).sum(0) for c in range(3)))[usable]
@@ -113,10 +114,6 @@ def _agree(fields: np.ndarray) -> bool:
     """Whether two estimates [2, n] of the same field differ by less than 0.6 of their mean."""
     mean, half = fields.mean(0), 0.5 * (fields[0] - fields[1])
     return bool(np.sqrt((half**2).mean()) < 0.3 * np.sqrt((mean**2).mean()) + 1e-9)
-
-
-def _pairs(knots: np.ndarray) -> list[tuple[float, float]]:
-    return list(itertools.pairwise(knots.tolist()))
 
 
 def _slope(field: np.ndarray) -> np.ndarray:

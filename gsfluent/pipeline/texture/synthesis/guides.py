@@ -154,6 +154,7 @@ def place_photo(
     even = float(stretch.max() / stretch.min())
     fits = photo.silhouette and overlap > _FIT and even < 1.25
     fitted = guided and depth_scale is None and fits
+    deepest = fields.max_depth * (1.0 if depth_scale is None else depth_scale)
     if fitted:
         flat = torch.from_numpy(below)[None, :, :, None].float()
         points = torch.from_numpy(np.concatenate([place, np.full_like(place[..., :1], 0.5)], -1))
@@ -161,7 +162,6 @@ def place_photo(
         # outlines never agree to the pixel: just outside the section is just below the surface
         depth = np.maximum(depth, 0.5 * np.minimum(own_depth * isotropic, 1.0))
     else:
-        deepest = fields.max_depth * (1.0 if depth_scale is None else depth_scale)
         depth = own_depth * (deepest / max(photo.max_depth, 1.0))
     depth = np.where(mask, depth, 0.0).astype(np.float32)
     local = np.zeros((*mask.shape, 3), np.float32)
@@ -171,7 +171,6 @@ def place_photo(
     if fits:
         pitch = isotropic
     elif guided:
-        deepest = fields.max_depth * (1.0 if depth_scale is None else depth_scale)
         pitch = deepest / max(photo.max_depth, 1.0)
     else:
         pitch = float((fields.high - fields.low).max()) / max(photo.mask.shape)

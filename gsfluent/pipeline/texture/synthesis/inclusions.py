@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -106,18 +106,11 @@ def find_inclusions(exemplar: Exemplar, parts: np.ndarray | None = None) -> Incl
     table = np.array([entry[1:] for entry in found])
     grown = cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     profile = _ring_profile(exemplar.image, labels, numbers)
-    radial = float(np.average(table[:, 3], weights=table[:, 1] - table[:, 2] + 1e-3))
+    deep, major_axes, minor_axes, cosines, areas = table[:, :5].T
+    radial = float(np.average(cosines, weights=major_axes - minor_axes + 1e-3))
     logger.info("exemplar: %d inclusions (seeds, stones) found", len(found))
-    return Inclusions(
-        grown & exemplar.mask,
-        table[:, 5:7],
-        table[:, 4],
-        table[:, 0],
-        table[:, 1],
-        table[:, 2],
-        radial,
-        profile,
-    )
+    mask, middles = grown & exemplar.mask, table[:, 5:7]
+    return Inclusions(mask, middles, areas, deep, major_axes, minor_axes, radial, profile)
 
 
 def _unusual(exemplar: Exemplar) -> np.ndarray:
@@ -174,8 +167,6 @@ def _ring_profile(image: np.ndarray, labels: np.ndarray, numbers: list[int]) -> 
 
 def remove_inclusions(exemplar: Exemplar, inclusions: Inclusions) -> Exemplar:
     """The photograph with its blobs painted over from around them."""
-    from dataclasses import replace
-
     pixels = (exemplar.image * 255).round().astype(np.uint8)
     # seeds have pale rims that belong to them: half a minor axis more on every side
     rim = 3 + 2 * int(0.5 * float(inclusions.minor.mean()))
@@ -226,9 +217,8 @@ def paint_inclusions(
         along = delta @ long
         across = np.sqrt(np.maximum((delta**2).sum(-1) - along**2, 0.0))
         radius = np.sqrt((along / a) ** 2 + (across / b) ** 2)
-        color = np.stack(
-            [np.interp(radius, _PAINTED, inclusions.profile[:, c]) for c in range(3)], -1
-        )
+        tones = inclusions.profile.T
+        color = np.stack([np.interp(radius, _PAINTED, tone) for tone in tones], -1)
         opacity = np.clip((_RINGS[-1] - radius) / 0.15, 0.0, 1.0) * inside[box]
         number += 1
         result[box] += opacity[..., None] * (color - result[box])

@@ -211,6 +211,7 @@ def _surface(
     alike = verdict["surface_like_interior"]
     if wanted != "auto":
         return verdict | {"why": f"surface: {wanted} was asked for"}, wanted
+    why, choice = "the surface does not look like the photograph: synthesised", "ignore"
     if verdict["copy_suffices"]:
         why = "the surface copied inwards has the photograph's colours and patches and no streaks"
         choice = "copy"
@@ -219,10 +220,6 @@ def _surface(
         choice = "keep"
     elif alike:
         why = "the surface looks like the photograph, but the inside follows a guide: synthesised"
-        choice = "ignore"
-    else:
-        why = "the surface does not look like the photograph: synthesised"
-        choice = "ignore"
     logger.info("texture: %s", why)
     return verdict | {"why": why}, choice
 
