@@ -20,10 +20,7 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import Gaussians
-from gsfluent.pipeline.light.lamps import (
-    Lamp,
-    Vector,
-)
+from gsfluent.pipeline.light.lamps import Lamp, Vector
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shade import MAP
 from gsfluent.pipeline.light.shadow import ShadowMaps

@@ -20,12 +20,7 @@ from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw_at
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.lamps import (
-    SHININESS,
-    SPECULAR,
-    Lighting,
-    pack_lamps,
-)
+from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import Grid, grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shadow_maps import Bulk, Lit, bulk, faces_of, shadow_maps
