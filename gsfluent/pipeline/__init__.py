@@ -15,6 +15,7 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.pipeline.reconstruct.isolate": ("Isolate",),
         "gsfluent.pipeline.fill.stage": ("Fill",),
         "gsfluent.pipeline.texture": ("Texture",),
+        "gsfluent.pipeline.regions.stage": ("Regions",),
         "gsfluent.pipeline.regions.project": ("label_regions",),
         "gsfluent.pipeline.simulate.stage": ("Simulate",),
         "gsfluent.pipeline.cracks.stage": ("Repair",),

@@ -241,7 +241,7 @@ def training_samples(folder: Path, device: torch.device) -> list[Sample]:
         capture = load_capture(shot.capture)
         start = time.perf_counter()
         stage = Reconstruct(steps, splats, image_size=side, device=device)
-        gaussians, _ = stage(capture)
+        gaussians = stage(capture)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         seconds = time.perf_counter() - start
