@@ -172,11 +172,7 @@ def simulate_work(
         cracks: Whether they are repaired along cracks.
         points: All material points.
     """
-    laws = {
-        material.law
-        for body in scene.bodies
-        for material in [body.material, *(part.material(body.material) for part in body.parts)]
-    }
+    laws = laws_of(scene)
     breaks = cracks and "nacc" in laws and outlook.shatters
     seconds = max(outlook.grid_from + outlook.grid_seconds, 1e-12)
     broken = max(0.0, 1.0 - outlook.struck / seconds) if math.isfinite(outlook.struck) else 0.0

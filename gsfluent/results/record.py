@@ -31,11 +31,7 @@ class RunRecord:
             "seed": seed,
             "shot": shot,
             "stages": [],
-            "reconstruction": None,
-            "fill": None,
-            "texture": None,
-            "simulation": None,
-            "render": None,
+            **dict.fromkeys(("reconstruction", "fill", "texture", "simulation", "render")),
             "outputs": {},
         }
 

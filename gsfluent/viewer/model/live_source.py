@@ -10,7 +10,7 @@ from gsfluent.results.frames import SavedFrame
 
 
 class LiveSource:
-    """Frames of a player since its last reset (see :class:`gsfluent.viewer.model.source.Source`)."""
+    """Frames of a player since its last reset (a :class:`~gsfluent.viewer.model.source.Source`)."""
 
     running = True
 
