@@ -23,8 +23,6 @@ from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.texture.photo import metrics
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
 
-__all__ = ["Pictures", "compare", "load_pictures"]
-
 logger = logging.getLogger(__name__)
 
 SLICES = 4

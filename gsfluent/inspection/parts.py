@@ -14,8 +14,6 @@ from gsfluent.data.regions import FIRST_LABEL, INCLUSION, region_entry, source_k
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, sample_points, select
 from gsfluent.scene.scene import Body, Part
 
-__all__ = ["PartMap", "body_parts", "solid_regions"]
-
 
 @dataclasses.dataclass(frozen=True)
 class PartMap:

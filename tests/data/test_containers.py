@@ -83,8 +83,10 @@ def test_transformed_moves_covariance_and_color_with_the_object() -> None:
     expected = frame.scale**2 * frame.rotation @ matrix @ frame.rotation.T
     torch.testing.assert_close(geometry.unpack_symmetric(moved.covariances()), expected)
     direction = torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64), dim=1)
-    before = geometry.evaluate_sh(gaussians.sh, direction)
-    after = geometry.evaluate_sh(moved.sh, frame.apply_vector(direction))
+    basis = [geometry.sh_basis(d, 3)[..., None] for d in (direction, frame.apply_vector(direction))]
+    before, after = (
+        (b * thing.sh).sum(1) for b, thing in zip(basis, (gaussians, moved), strict=True)
+    )
     torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
 
 

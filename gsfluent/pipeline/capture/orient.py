@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsfluent import geometry
+from gsfluent.config import Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.spatial.shape import cluster, robust_box
-
-if TYPE_CHECKING:
-    from gsfluent.config import Shot
 
 Array = NDArray[np.float64]
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from gsfluent.data import SURFACE, Gaussians, Solid
+from gsfluent.data import SURFACE, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.pipeline.fill.interior import Matter, populate
 from gsfluent.pipeline.fill.refine import refine_opacity
@@ -25,15 +26,10 @@ from gsfluent.progress import Progress, report_progress
 from gsfluent.spatial.voxels import nearest_empty
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import trimesh
-
-    from gsfluent.data import Capture
 
     Source = SignedDistance | trimesh.Trimesh | str | Path
 
-__all__ = ["Fill"]
 
 logger = logging.getLogger(__name__)
 

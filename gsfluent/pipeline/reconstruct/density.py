@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -86,19 +85,21 @@ class Wanted:
     stop: bool = False
 
 
-class Density(Protocol):
-    """What the training loop asks of a density control."""
+class Density:
+    """What the training loop asks of a density control; what one leaves out does nothing."""
 
-    absgrad: bool
+    absgrad = False
 
     def probe(self, model: SplatModel) -> Tensor | None:
         """Zeros [N, 2] that shall receive the screen-space gradient, or None."""
+        return None
 
     def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
         """Take note of one view after its backward pass."""
 
     def penalty(self, model: SplatModel) -> Tensor | None:
         """A term of the loss."""
+        return None
 
     def after_step(self, model: SplatModel, done: int) -> None:
         """Called after every optimiser step."""
@@ -108,12 +109,13 @@ class Density(Protocol):
 
     def state(self) -> dict[str, Tensor]:
         """What must be saved."""
+        return {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Take over what :meth:`state` returned."""
 
 
-class Adc:
+class Adc(Density):
     """Adaptive density control.
 
     Args:
@@ -252,7 +254,7 @@ def densify(
     return room
 
 
-class Mcmc:
+class Mcmc(Density):
     """Relocation, growth to a budget, and noise on the centres.
 
     Args:
@@ -268,15 +270,7 @@ class Mcmc:
     ) -> None:
         self.recipe, self.iterations, self.limit = recipe, iterations, limit
         self.place, self.seed = place, seed
-        self.absgrad = False
         self.generator: torch.Generator | None = None
-
-    def probe(self, model: SplatModel) -> Tensor | None:
-        """None: no gradient is looked at."""
-        return None
-
-    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
-        """Nothing to note."""
 
     def penalty(self, model: SplatModel) -> Tensor | None:
         """Pull on opacities and scales, so that Gaussians that are not needed die."""
@@ -334,13 +328,6 @@ class Mcmc:
         added = min(self.limit, int(_GROWTH * model.count)) - model.count
         if added > 0:
             grow(model, added, model.opacities() if wanted.grow is None else weight, generator)
-
-    def state(self) -> dict[str, Tensor]:
-        """Nothing beside the model."""
-        return {}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Nothing beside the model."""
 
 
 def shared_out(opacity: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

@@ -106,11 +106,7 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
 
 
 _MOST_ROWS = 8
-
-
 _ERROR_GAIN = 4.0  # the error panel shows four times the error, grey
-
-
 _GAP = 4  # pixels between panels
 
 

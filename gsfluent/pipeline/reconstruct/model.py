@@ -221,14 +221,8 @@ class SplatModel:
 
 
 _RATE = 1e-3
-
-
 _RATE_END = 0.02  # of the rate, at the end of the run
-
-
 _PULL = 1e-2  # weight of the squared distance from the identity
-
-
 _BETAS = (0.9, 0.99)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsfluent.data import Capture, Frame
+from gsfluent.data import Capture, Frame, Solid
 from gsfluent.data.regions import FIRST_LABEL, source_key, source_paths, source_volume
 from gsfluent.errors import InputError
 from gsfluent.io.segmentation.masks import Segmentation, load_masks, load_segmentation
@@ -26,11 +26,6 @@ from gsfluent.pipeline.regions.spread import (
 )
 from gsfluent.pipeline.regions.vote import Skin, cast_votes, find_skin
 from gsfluent.progress import Progress
-
-if TYPE_CHECKING:
-    from gsfluent.data import Solid
-
-__all__ = ["SkinLabels", "label_regions", "project_labels"]
 
 _log = logging.getLogger(__name__)
 

@@ -17,18 +17,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsfluent.data import Gaussians
+from gsfluent.data import Gaussians, Solid
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
+from gsfluent.io.segmentation.masks import LabelView, Segmentation
 from gsfluent.progress import Progress, report_progress
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-    from gsfluent.data import Solid
-    from gsfluent.io.segmentation.masks import LabelView, Segmentation
-
-__all__ = ["Skin", "cast_votes", "find_skin", "label_votes", "view_votes"]
 
 _CHANNELS = 32  # of one call of the rasterizer
 _SIGMA = 0.6  # of a splat [voxels]: neighbours overlap, two layers let under 1 % through

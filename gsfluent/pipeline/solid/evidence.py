@@ -5,19 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from gsfluent.data import Camera, Capture, Gaussians
 from gsfluent.pipeline.solid.tsdf import SIZE, ring_of_cameras, zoomed
 from gsfluent.spatial.density import GridBox, choose_grid
 from gsfluent.spatial.shape import robust_box
-
-if TYPE_CHECKING:
-    from gsfluent.data import Camera, Capture, Gaussians
-
-__all__ = ["FEW", "MOST_CAMERAS", "Evidence", "SolidOptions"]
 
 FEW = 16  # splats
 MOST_CAMERAS = 48  # evenly chosen; more say the same again

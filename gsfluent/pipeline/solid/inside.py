@@ -19,16 +19,6 @@ from torch import Tensor
 
 from gsfluent.spatial.voxels import distance_transform, grown
 
-__all__ = [
-    "DIRECTIONS",
-    "Vote",
-    "cast_votes",
-    "find_leaks",
-    "keep_components",
-    "smooth_boundary",
-    "trim_outer_flank",
-]
-
 logger = logging.getLogger(__name__)
 
 DIRECTIONS = np.array(

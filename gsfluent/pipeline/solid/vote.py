@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from gsfluent.data import Capture
 from gsfluent.errors import InputError
 from gsfluent.pipeline.capture.hull import Ground, centre_hull
 from gsfluent.pipeline.capture.orient import orient
@@ -24,11 +25,6 @@ from gsfluent.pipeline.solid.inside import (
 )
 from gsfluent.spatial.density import GridBox, density_field
 from gsfluent.spatial.voxels import distance_transform
-
-if TYPE_CHECKING:
-    from gsfluent.data import Capture
-
-__all__ = ["Closed", "vote_solid"]
 
 _log = logging.getLogger(__name__)
 
