@@ -21,7 +21,7 @@ from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench import registry
 from gsfluent.fracturebench.registry import Case, cases, find, judge
 from gsfluent.fracturebench.scene import SceneError
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCES = Path(registry.__file__).parent / "data" / "references.json"
@@ -42,7 +42,7 @@ def row(case: Case, device: str) -> str:
     errors, cells = [], []
     for dx in case.ladder:
         scene = case.build(dx, 8)
-        errors.append(judge(scene, play(scene, device=device))[0].error)
+        errors.append(judge(scene, run_case(scene, device=device))[0].error)
         cells.append(f"{errors[-1]:.2g} ({scene.count})")
         sys.stderr.write(f"{case.name}, dx {dx:.4g}: {errors[-1]:.3g}\n")
     slope = order(list(case.ladder), errors)

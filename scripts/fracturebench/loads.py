@@ -19,7 +19,7 @@ from gsfluent.fracturebench.scenes.cantilever import cantilever
 from gsfluent.fracturebench.scenes.plane import notch
 from gsfluent.fracturebench.scenes.rock import experiment
 from gsfluent.io.atomic import atomic_path
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "measured" / "fracturebench_fracture.md"
@@ -32,7 +32,7 @@ def speeds(quick: bool) -> list[str]:
         found = []
         for cfl in (0.5, 0.25):
             scene = notch(1 / 32, 8, pull, weight)
-            fastest, mean, _ = judge(scene, play(scene, cfl=cfl))
+            fastest, mean, _ = judge(scene, run_case(scene, cfl=cfl))
             found.append(f"{mean.value:.2f}, fastest tenth {fastest.value:.2f}")
         rows.append(f"| {weight:g} times as heavy | {pull:g} c | {found[0]} | {found[1]} |")
     return rows
@@ -43,7 +43,7 @@ def energies(quick: bool) -> list[str]:
     rows = ["| speed of an arm | energy gone per area | that of the row |", "|---|---|---|"]
     for speed, seconds in ((0.004, 8.0), (0.002, 10.0), (0.001, 14.0))[: 1 if quick else 3]:
         scene = cantilever(1 / 32, 8, speed, seconds)
-        (energy,) = judge(scene, play(scene))
+        (energy,) = judge(scene, run_case(scene))
         rows.append(f"| {speed:g} c | {energy.value:.0f} J/m^2 | {energy.reference:.0f} J/m^2 |")
     return rows
 
@@ -55,7 +55,7 @@ def shapes(quick: bool) -> list[str]:
     case = find("struck_rock")
     for dx in case.ladder[: 1 if quick else None]:
         scene = case.build(dx, 8)
-        modulus, aspect = judge(scene, play(scene))
+        modulus, aspect = judge(scene, run_case(scene))
         rows.append(f"| {scene.count} | {modulus.value:.2f} | {aspect.value:.2f} |")
     (a, b), (c, d) = found["modulus"], found["aspect"]
     rows.append(f"| rocks | {a:.2f} to {b:.2f} | {c:.2f} to {d:.2f} |")

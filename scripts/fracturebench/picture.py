@@ -22,7 +22,7 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.scenes.contact import height_history, momentum_history
 from gsfluent.fracturebench.scenes.elastic import growth_history
 from gsfluent.fracturebench.scenes.flow import wave_history
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 History = Callable[[Scene, Run], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -54,7 +54,7 @@ def main() -> int:
                 scene = case.build(dx, 8)
                 end = float(scene.facts.get("breathing", scene.seconds))
                 scene = dataclasses.replace(scene, times=np.linspace(0.0, end, 101)[1:] * 0.999)
-                time, seen, exact = history(scene, play(scene, device=args.device))
+                time, seen, exact = history(scene, run_case(scene, device=args.device))
                 axes.plot(time, seen, "-", color=color, lw=1.4, label=f"{scene.count} points")
                 sys.stderr.write(f"{name}, dx {dx:.4g}\n")
             axes.plot(time, exact, "--", color=INK, lw=1.0, label="reference")

@@ -26,7 +26,7 @@ from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import SceneError
 from gsfluent.lab.charts.record import commit, machine
-from gsfluent.lab.frozen.answer import clock, play
+from gsfluent.lab.frozen.answer import clock, run_case
 
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")
 
@@ -41,7 +41,7 @@ def answer(name: str, args: argparse.Namespace, path: Path) -> Run:
         "device": args.device, "dtype": getattr(torch, args.dtype), "cfl": args.cfl,
         "fields": not args.one_field,
     }  # fmt: skip
-    run = play(scene, method=args.method, **options)
+    run = run_case(scene, method=args.method, **options)
     wall = run.wall_seconds
     if not run.failed:
         wall = statistics.median(clock(scene, args.repeat, **options))

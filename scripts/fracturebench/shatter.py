@@ -31,7 +31,7 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.scenes.shatter import RADIUS, RECORD, SEEDS, reference
 from gsfluent.fracturebench.statistics import MEASURES, Figures, distance, ensemble
 from gsfluent.io.atomic import atomic_path
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 CELLS, CFL = 10, 0.3
@@ -52,7 +52,7 @@ def player(device: str, cfl: float, dtype: str, explicit: bool = False) -> Calla
     more: dict[str, Any] = {}
     if explicit:  # a fixed centre and the explicit alpha
         more = {"k": float("inf"), "epsilon": 0.0, "implicit": False}
-    return partial(play, device=device, cfl=cfl, dtype=getattr(torch, dtype), **more)
+    return partial(run_case, device=device, cfl=cfl, dtype=getattr(torch, dtype), **more)
 
 
 def record(out: Path, device: str) -> None:

@@ -241,11 +241,11 @@ class Search:
         """Error of a run."""
         import torch
 
-        from gsfluent.lab.frozen.answer import play
+        from gsfluent.lab.frozen.answer import run_case
 
         if choice not in self.made:
             scene = self.scene(choice)
-            run = play(scene, device=self.device, dtype=torch.float32, cfl=choice[0])
+            run = run_case(scene, device=self.device, dtype=torch.float32, cfl=choice[0])
             error = demo_scenes.error(scene, run, self.mode)
             self.made[choice] = error, run.steps, run.wall_seconds
         return self.made[choice][0]

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from gsfluent.fracturebench.registry import find, judge
-from gsfluent.lab.frozen.answer import clock, play
+from gsfluent.lab.frozen.answer import clock, run_case
 
 pytestmark = pytest.mark.cuda
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.cuda
 def test_errors_are_those_of_the_cpu(name: str) -> None:
     case = find(name)
     scene = case.build(case.ladder[0], 8)
-    there, here = judge(scene, play(scene, device="cuda")), judge(scene, play(scene))
+    there, here = judge(scene, run_case(scene, device="cuda")), judge(scene, run_case(scene))
     # the GPU sums momenta as whole numbers: rounding of about 1e-6 of the fastest point
     assert there[0].error == pytest.approx(here[0].error, rel=5e-3, abs=2e-5)
 

@@ -23,7 +23,7 @@ from gsfluent.fracturebench.__main__ import main
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError, quantised
-from gsfluent.lab.frozen.answer import clock, play
+from gsfluent.lab.frozen.answer import clock, run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = ROOT / "scripts" / "fracturebench"
@@ -46,7 +46,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def run(scene: Scene) -> Run:
-    return play(scene)
+    return run_case(scene)
 
 
 def test_scene_and_run_come_back_as_they_went(scene: Scene, run: Run, tmp_path: Path) -> None:
@@ -281,8 +281,8 @@ def test_scene_of_wrong_shape_is_refused(scene: Scene) -> None:
 def test_clock_goes_straight_to_the_end(scene: Scene) -> None:
     seconds = clock(scene, 2)
     assert len(seconds) == 2 and all(0.0 < s < math.inf for s in seconds)
-    straight = play(dataclasses.replace(scene, times=scene.times[-1:]))
-    assert straight.steps < play(scene).steps  # stops shorten steps
+    straight = run_case(dataclasses.replace(scene, times=scene.times[-1:]))
+    assert straight.steps < run_case(scene).steps  # stops shorten steps
     with pytest.raises(ValueError, match="repeat"):
         clock(scene, 0)
 

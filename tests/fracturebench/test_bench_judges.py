@@ -19,7 +19,7 @@ from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
 from gsfluent.fracturebench.scenes import contact, elastic, flow
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 
 Answer = tuple[np.ndarray, np.ndarray]
 
@@ -393,7 +393,7 @@ def test_gsfluent_converges_to_the_exact_motion(name: str, at_least: float) -> N
     errors = []
     for dx in case.ladder[:2]:
         scene = case.build(dx, 8)
-        errors.append(judge(scene, play(scene))[0].error)
+        errors.append(judge(scene, run_case(scene))[0].error)
     ratio = case.ladder[0] / case.ladder[1]
     assert math.log(errors[0] / errors[1]) / math.log(ratio) > at_least
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.fracture.slab import SEPARATE, plane, wave_speed
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import ball, box, parameters
+from gsfluent.lab.world.shapes import ball, box, parameters, wave_speed
+from gsfluent.lab.world.walls import wall
 
 DX = 0.1
 POINT = (0.5 * DX) ** 3
@@ -81,7 +81,7 @@ def test_row_13_frictionless_oblique_spheres_do_not_spin() -> None:
 
 @pytest.mark.parametrize("share", [0.01, 0.1, 0.3])
 def test_row_14_a_ball_does_not_sink_into_the_floor_and_bounces(share: float) -> None:
-    floor = plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE)[None]
+    floor = wall(2, mode="separate")[None]
     world = World(
         ball([0.0, 0.0, 0.3], 0.25, 0.5 * DX), [0.0, 0.0, -share * C], mass=1000.0 * POINT,
         volume=POINT, dx=DX, law=0, params=ROW, colliders=floor, dtype=torch.float32,

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.lab.problems.fracture import softening
-from gsfluent.lab.problems.fracture.slab import SEPARATE, between_planes, nacc, plane, wave_speed
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import ball, box, parameters
+from gsfluent.lab.world.shapes import ball, box, nacc, parameters, wave_speed
+from gsfluent.lab.world.walls import between_planes, wall
 
 DX = 0.1
 POINT = (0.5 * DX) ** 3
@@ -75,7 +75,7 @@ def test_row_3_damage_comes_before_numerical_fracture() -> None:
 def test_row_6_a_ball_at_wave_speed_is_squeezed_and_comes_back(speed: float, guards: bool) -> None:
     row = parameters(1e3, 0.3, 1000.0)
     c = wave_speed(row)
-    floor = plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE)[None]
+    floor = wall(2, mode="separate")[None]
     world = World(
         ball([0.0, 0.0, 0.4], 0.25, 0.5 * DX), [0.0, 0.0, -speed * c], mass=1000.0 * POINT,
         volume=POINT, dx=DX, law=0, params=row, colliders=floor, dtype=torch.float32,
@@ -133,7 +133,7 @@ def drop(
     if order is not None:
         points = points[order]
     volume = (0.5 * SPACING) ** 3
-    floor = plane([0.0, 0.0, 3.0 * SPACING], [0.0, 0.0, 1.0], mode=SEPARATE, friction=0.3)[None]
+    floor = wall(2, 3.0 * SPACING, mode="separate", friction=0.3)[None]
     world = World(
         points, [0.0, 0.0, -SPEED], mass=volume, volume=volume, dx=SPACING, law=law, params=row,
         alpha=torch.full((len(points),), -0.04), colliders=floor, gravity=(0.0, 0.0, -9.81),

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.lab.problems.fracture.slab import between_planes, sheet, wave_speed
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import ball, box, parameters
+from gsfluent.lab.world.shapes import ball, box, parameters, sheet, wave_speed
+from gsfluent.lab.world.walls import between_planes
 
 DX = 0.1
 SOFT = parameters(1e6, 0.3, 1000.0)

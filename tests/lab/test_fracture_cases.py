@@ -15,17 +15,17 @@ import torch
 
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
-from gsfluent.fracturebench.scene import Scene, SceneError
+from gsfluent.fracturebench.scene import Scene, SceneError, wave_speed
 from gsfluent.fracturebench.scenes import bars as fracture_bars
 from gsfluent.fracturebench.scenes import cantilever as fracture_cantilever
 from gsfluent.fracturebench.scenes import plane as fracture_plane
 from gsfluent.fracturebench.scenes import rock as fracture_rock
 from gsfluent.fracturebench.scenes.rows import levels, moduli, shape_noise
-from gsfluent.fracturebench.shapes import box, elastic, free, wave_speed
-from gsfluent.lab.frozen.answer import play
+from gsfluent.fracturebench.shapes import box, elastic, free
+from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.problems.fracture import crack_band
-from gsfluent.lab.problems.fracture.slab import nacc
 from gsfluent.lab.problems.fracture.spall import spall_strength
+from gsfluent.lab.world.shapes import nacc
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {
@@ -250,20 +250,22 @@ def flying(**drive: Any) -> Scene:
 
 def test_drives_push_ramp_and_damp_as_they_say() -> None:
     scene = flying(force=[[0.0, 2.0, 0.0]] * 216)
-    run = play(scene, dtype=torch.float64)
+    run = run_case(scene, dtype=torch.float64)
     assert run.impulse is not None
     wanted = 216 * 2.0 * scene.times
     assert run.impulse[:, 0, 1] == pytest.approx(wanted, rel=1e-9)
     assert np.einsum("n,tn->t", scene.mass, run.v[:, :, 1]) == pytest.approx(wanted, rel=1e-9)
     ramped = flying(force=[[0.0, 2.0, 0.0]] * 216, ramp=float(scene.times[-1]))
-    half = play(ramped, dtype=torch.float64).v[-1, :, 1].mean()
+    half = run_case(ramped, dtype=torch.float64).v[-1, :, 1].mean()
     assert half == pytest.approx(0.5 * run.v[-1, :, 1].mean(), rel=0.1)
-    held = play(flying(velocity=[None, 0.5, None], end=float(scene.times[0])), dtype=torch.float64)
+    held = run_case(
+        flying(velocity=[None, 0.5, None], end=float(scene.times[0])), dtype=torch.float64
+    )
     # held at first, and free flight from then on
     assert held.v[:, :, 1] == pytest.approx(0.5) and held.v[:, :, 0] == pytest.approx(0.0)
     slow = flying(damping=5.0 / scene.seconds)
     slow = Scene(**{**slow.__dict__, "v": np.full_like(slow.x, 1.0)})
-    run = play(slow, dtype=torch.float64)
+    run = run_case(slow, dtype=torch.float64)
     assert run.v[-1] == pytest.approx(math.exp(-5.0), rel=0.5)
 
 
@@ -284,12 +286,12 @@ def test_gsfluent_on_a_small_setting_passes_or_misses_what_the_page_says(
 ) -> None:
     dx = 0.1 / 48 if name == "kalthoff" else SMALL[name]
     scene = find(name).build(dx, 8)
-    run = play(scene)
+    run = run_case(scene)
     assert not run.failed
     assert {m.quantity for m in judge(scene, run) if not m.passed} == missed
 
 
 def test_heavy_grips_make_the_speed_of_a_crack_that_of_the_strip_and_not_of_the_time_step() -> None:
     scene = fracture_plane.notch(1 / 24, 8, 3e-5, 30.0)
-    means = [judge(scene, play(scene, cfl=cfl))[1].value for cfl in (0.5, 0.3)]
+    means = [judge(scene, run_case(scene, cfl=cfl))[1].value for cfl in (0.5, 0.3)]
     assert means[1] == pytest.approx(means[0], rel=0.1) and means[0] > 0.5

@@ -11,8 +11,8 @@ import torch
 from gsfluent.lab.problems.elastic.paths import breaking_step
 from gsfluent.lab.problems.flow import granular, liquid
 from gsfluent.lab.problems.fracture import crack_band, notch, spall
-from gsfluent.lab.problems.fracture.slab import nacc
 from gsfluent.lab.world import registry
+from gsfluent.lab.world.shapes import nacc
 
 FAST = (
     "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",

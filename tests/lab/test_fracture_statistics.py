@@ -17,7 +17,7 @@ from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene, SceneError
 from gsfluent.fracturebench.scenes.shatter import RADIUS, SEEDS, lattice_ball, reference
 from gsfluent.fracturebench.shapes import box, elastic, free
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 
 DX = 0.1
 TIMES = np.linspace(0.0, 1.0, 21)[1:]
@@ -186,9 +186,9 @@ def test_shatter_breaks_and_its_record_is_one_of_pieces() -> None:
     bands = statistics.distance(runs, runs)
     assert all(0.0 < d.band < 0.2 for d in bands.values())
     case = find("shatter")
-    members = statistics.ensemble(case, RADIUS / 4.0, 8, (0,), lambda scene: play(scene))
+    members = statistics.ensemble(case, RADIUS / 4.0, 8, (0,), lambda scene: run_case(scene))
     (member,) = members
-    measures = judge(member.scene, play(member.scene))
+    measures = judge(member.scene, run_case(member.scene))
     assert measures[0].quantity.startswith("mass over pieces")
     found = statistics.distance(runs, members)
     for m in measures:

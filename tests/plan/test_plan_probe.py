@@ -51,8 +51,8 @@ def test_contact_is_seen_only_between_two() -> None:
 
 
 def test_crumbs_fill_more_blocks_than_their_volume() -> None:
-    whole, crumbs = ball(0.1, 40), ball(0.1, 40, crumbs=True)
-    assert float(crumbs.occupancy.sum()) < 0.02 * float(whole.occupancy.sum())
+    whole, debris = ball(0.1, 40), ball(0.1, 40, debris=True)
+    assert float(debris.occupancy.sum()) < 0.02 * float(whole.occupancy.sum())
 
 
 def test_an_export_whose_extra_is_missing_is_not_measured(

@@ -15,11 +15,6 @@ from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import Case, cases
 from gsfluent.fracturebench.scene import Scene
 
-__all__ = [
-    "CASES", "DEMO_COURANT", "KNOBS", "OFF_GRID", "OURS", "TEXTBOOK", "Setting", "ladder", "rungs",
-    "work",
-]  # fmt: skip
-
 CASES = (
     "bar", "bar_wave", "beam", "spin", "two_material_bar", "drop", "collide", "oblique",
     "pull_apart", "shatter",
@@ -38,7 +33,7 @@ KNOBS = {
     "dtype": "float32 or float64",
     "engine": "resident solver or composed operators",
     "fields": "a velocity field per body, or one for all",
-    "gaussians": "Gaussians ride on material points, or each is one",
+    "gaussians": "Gaussians carried by material points, or each is one",
     "dt": "automatic time step, or a fixed one as in PhysGaussian's demos",
     "return_map": "implicit or explicit alpha, centre of the yield surface",
     "free": "measures that trade nothing",
@@ -65,27 +60,16 @@ _MOST_NUMBERS = 1.2e7
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One point of the chart before it is run.
+    """One point of the chart before it is run."""
 
-    Attributes:
-        case: Name of the case.
-        dx: Node spacing [m].
-        ppc: Points per cell of the scene that is judged.
-        method: ``gsfluent`` or ``textbook``.
-        knob: What was turned, of :data:`KNOBS`.
-        variant: How, in words; empty for the base.
-        options: For the player (:mod:`gsfluent.lab.charts.play`).
-        trades: Whether the knob may move the error.
-    """
-
-    case: str
-    dx: float
-    ppc: int = 8
-    method: str = OURS
-    knob: str = "dx"
-    variant: str = ""
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    trades: bool = True
+    case: str  # name of the case
+    dx: float  # node spacing [m]
+    ppc: int = 8  # points per cell of the scene that is judged
+    method: str = OURS  # gsfluent or textbook
+    knob: str = "dx"  # what was turned, of KNOBS
+    variant: str = ""  # how, in words; empty for the base
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of run_case
+    trades: bool = True  # whether the knob may move the error
 
     def key(self, device: str) -> str:
         """As :attr:`gsfluent.lab.charts.record.Record.key`."""
@@ -96,7 +80,7 @@ class Setting:
 
 def work(setting: Setting) -> float:
     """Points times steps up to a factor of the case: what a run's time goes with."""
-    points = int(setting.options.get("ride_on", setting.ppc))
+    points = int(setting.options.get("carried_by", setting.ppc))
     courant = float(setting.options.get("courant", setting.options.get("cfl", 0.5)))
     return points / setting.dx**3 / (courant * setting.dx)
 
@@ -213,10 +197,8 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     yield turned("ppc", "27 per cell", 27)
     yield turned("dt", f"fixed dt, c dt/dx {DEMO_COURANT}", courant=DEMO_COURANT)
     yield turned("engine", "composed operators", engine="ops")
-    if (
-        case.kind != "fracture"
-    ):  # there riders part, which is the splats' matter (docs/theory/cracks.md)
-        yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, ride_on=8)
+    if case.kind != "fracture":  # there splats part (docs/theory/cracks.md)
+        yield turned("gaussians", f"{DENSE} per cell ride on 8", DENSE, carried_by=8)
         yield turned("gaussians", f"{DENSE} per cell", DENSE)
     if device.startswith("cpu"):
         yield turned("free", "one thread", trades=False, threads=1)

@@ -19,13 +19,11 @@ from torch import Tensor
 from gsfluent import materials
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.lab.charts.ladder import OFF_GRID, Setting
-from gsfluent.lab.charts.play import broken
 from gsfluent.lab.charts.record import Record, commit, machine, now
+from gsfluent.lab.charts.run_case import broken
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.progress import quiet_logs
 from gsfluent.scene.scene import Scene
-
-__all__ = ["measure_off_grid"]
 
 _RADIUS, _SPIN, _VELOCITY = 0.05, 3.0, (0.5, 0.2, 1.5)
 _SECONDS = {"flight": 0.3, "rest": 4.0}
@@ -34,11 +32,6 @@ _FPS = 20.0
 
 def measure_off_grid(setting: Setting, device: str, repeat: int) -> Record:
     """Run ``flight`` or ``rest``; the time is that of all frames, with checks and figures.
-
-    Args:
-        setting: Of :data:`gsfluent.lab.charts.ladder.OFF_GRID`; its options go to Simulate.
-        device: Where.
-        repeat: Timed runs.
 
     Returns:
         The record; a run that raises is one that failed.
@@ -67,7 +60,7 @@ def _runs(setting: Setting, device: str, repeat: int) -> Record:
         if device.startswith("cuda"):
             torch.cuda.synchronize()
         walls.append(time.perf_counter() - start)
-    return _record(setting, device, frames, simulate.report(), walls[1:])
+    return _record(setting, device, frames, coming.report, walls[1:])
 
 
 def _record(

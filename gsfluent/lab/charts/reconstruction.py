@@ -21,8 +21,6 @@ from gsfluent.lab.charts.quality import Job, Outcome
 from gsfluent.pipeline.reconstruct.evaluate import HOLD_OUT, evaluate
 from gsfluent.pipeline.reconstruct.stage import Reconstruct
 
-__all__ = ["XLABEL", "YLABEL", "jobs"]
-
 XLABEL = "seconds of training"
 YLABEL = "rms error on held-out photographs"
 

@@ -13,13 +13,11 @@ import torch
 
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen.fracture import Drives, damage
 from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.drives import Drives, damage
 from gsfluent.lab.world.shapes import parameters
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
-
-__all__ = ["clock", "play", "rows"]
 
 
 def rows(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -75,7 +73,7 @@ def _padded(values: list[np.ndarray], count: int) -> np.ndarray | None:
     return np.stack(values + missing)
 
 
-def play(
+def run_case(
     scene: Scene,
     *,
     device: str | torch.device = "cpu",
@@ -112,7 +110,7 @@ def play(
     several = fields and int(scene.body.max()) > 0
     drives = Drives(scene, dtype, device) if scene.drives else None
     world = World(
-        torch.from_numpy(scene.x), torch.from_numpy(scene.v), mass=torch.from_numpy(scene.mass),
+        torch.from_numpy(scene.x), torch.from_numpy(scene.v),
         volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
         material=torch.from_numpy(scene.material), alpha=alpha,
         body=torch.from_numpy(scene.body) if several else None,
@@ -161,7 +159,7 @@ def clock(scene: Scene, repeat: int = 3, **options: Any) -> list[float]:
     Args:
         scene: The scene.
         repeat: Runs that count; one more goes before them to warm up.
-        **options: Of :func:`play`.
+        **options: Of :func:`run_case`.
 
     Returns:
         Seconds that the steps of each run took; infinite for one that broke off.
@@ -172,5 +170,5 @@ def clock(scene: Scene, repeat: int = 3, **options: Any) -> list[float]:
     if repeat < 1:
         raise ValueError(f"clock: repeat must be at least 1, got {repeat}")
     straight = dataclasses.replace(scene, times=scene.times[-1:])
-    runs = [play(straight, **options) for _ in range(repeat + 1)]
+    runs = [run_case(straight, **options) for _ in range(repeat + 1)]
     return [math.inf if run.failed else run.wall_seconds for run in runs[1:]]

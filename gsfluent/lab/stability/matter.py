@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place, register
+from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place
 from gsfluent.lab.stability.scenes import IMPACT, SPACING, brittle, watched
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.violations import OfWorld, Violation, check, search
+from gsfluent.lab.world.invariants import OfWorld, Violation, check, search
 
 STEPS = 100
 APART = 1e-4
@@ -65,11 +65,11 @@ class Twins:
         return None
 
 
-def twins(make: Callable[[int | None], World], place: Place, steps: int = STEPS) -> Outcome:
+def twins(make: Callable[[int | None], World], place: Place) -> Outcome:
     """Run both numberings until a law is broken or they part."""
     pair = Twins(make)
-    found = search(pair, pair.judge, steps, every=place.every)
-    return Outcome(steps, found, len(pair.back))
+    found = search(pair, pair.judge, STEPS, every=place.every)
+    return Outcome(STEPS, found, len(pair.back))
 
 
 # --- the map itself ---
@@ -85,18 +85,16 @@ def map_point(k: float, epsilon: float, variant: str, place: Place) -> Outcome:
     return twins(lambda o: brittle(order=o, place=place, engine=engine, **options), place)
 
 
-register(
-    Map(
-        "return_map", "A brittle ball: k and epsilon of the return map",
-        Axis("k", "k, exponent of the dynamic centre (100: fixed centre)",
-             (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0, 100.0), 2.0),
-        Axis("epsilon", "epsilon, its regularisation", (0.0, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5), 0.1,
-             log=False),
-        ("implicit, exact sums", "implicit, ordinary sums", "explicit, ordinary sums"), map_point,
-        "test_boundary_return_map_against_the_order_of_the_points",
-        "O: the same points numbered differently end elsewhere (1e-4 dx, RMS). Exact sums cannot; "
-        "with ordinary sums it is the map that lets rounding grow or not.",
-    )
+RETURN_MAP_MAP = Map(
+    "return_map", "A brittle ball: k and epsilon of the return map",
+    Axis("k", "k, exponent of the dynamic centre (100: fixed centre)",
+         (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0, 100.0), 2.0),
+    Axis("epsilon", "epsilon, its regularisation", (0.0, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5), 0.1,
+         log=False),
+    ("implicit, exact sums", "implicit, ordinary sums", "explicit, ordinary sums"), map_point,
+    "test_boundary_return_map_against_the_order_of_the_points",
+    "O: the same points numbered differently end elsewhere (1e-4 dx, RMS). Exact sums cannot; "
+    "with ordinary sums it is the map that lets rounding grow or not.",
 )  # fmt: skip
 
 MAPS: dict[str, dict[str, Any]] = {
@@ -112,13 +110,11 @@ def centre_point(courant: float, which: str, variant: str, place: Place) -> Outc
     return watched(brittle(courant=courant, place=place, **MAPS[which]), STEPS, place)
 
 
-register(
-    Map(
-        "centre", "A brittle ball: variants of the return map",
-        COURANT, Axis("map", "return map", tuple(MAPS), "dynamic, implicit"),
-        ("gsfluent",), centre_point, "test_boundary_courant_number_brittle_ball",
-        "Sums are exact and divisions guarded here, so that the map alone is seen.", gpu=True,
-    )
+CENTRE_MAP = Map(
+    "centre", "A brittle ball: variants of the return map",
+    COURANT, Axis("map", "return map", tuple(MAPS), "dynamic, implicit"),
+    ("gsfluent",), centre_point, "test_boundary_courant_number_brittle_ball",
+    "Sums are exact and divisions guarded here, so that the map alone is seen.", gpu=True,
 )  # fmt: skip
 
 # --- how brittle ---
@@ -136,12 +132,10 @@ def softening_point(courant: float, hardening: float, variant: str, place: Place
     return watched(world, STEPS, place)
 
 
-register(
-    Map(
-        "softening", "A brittle ball: how fast strength is lost",
-        COURANT, HARDENING, ("gsfluent", "fixed centre, explicit"),
-        softening_point, "test_boundary_courant_number_softening", "", gpu=True,
-    )
+SOFTENING_MAP = Map(
+    "softening", "A brittle ball: how fast strength is lost",
+    COURANT, HARDENING, ("gsfluent", "fixed centre, explicit"),
+    softening_point, "test_boundary_courant_number_softening", "", gpu=True,
 )  # fmt: skip
 
 
@@ -151,16 +145,14 @@ def impact_point(courant: float, mach: float, variant: str, place: Place) -> Out
     return watched(brittle(courant=courant, mach=mach, place=place, **options), STEPS, place)
 
 
-register(
-    Map(
-        "impact", "A brittle ball hits a floor", COURANT,
-        Axis("mach", "speed over wave speed, v / c", (0.03, 0.1, 0.2, IMPACT, 0.5, 0.7, 1.0, 2.0),
-             IMPACT, setting=False),
-        ("gsfluent", "fixed centre, explicit"), impact_point,
-        "test_boundary_courant_number_brittle_impact",
-        "At a touch nothing breaks and the elastic limit counts; where all breaks, matter without "
-        "strength forgives longer steps.",
-    )
+IMPACT_MAP = Map(
+    "impact", "A brittle ball hits a floor", COURANT,
+    Axis("mach", "speed over wave speed, v / c", (0.03, 0.1, 0.2, IMPACT, 0.5, 0.7, 1.0, 2.0),
+         IMPACT, setting=False),
+    ("gsfluent", "fixed centre, explicit"), impact_point,
+    "test_boundary_courant_number_brittle_impact",
+    "At a touch nothing breaks and the elastic limit counts; where all breaks, matter without "
+    "strength forgives longer steps.",
 )  # fmt: skip
 
 SUMS = ("exact", "ordinary")
@@ -176,11 +168,9 @@ def order_point(hardening: float, sums: str, variant: str, place: Place) -> Outc
     )
 
 
-register(
-    Map(
-        "order", "A brittle ball whose points are shuffled", HARDENING,
-        Axis("sums", "sums at nodes", SUMS, "exact"), ("gsfluent", "fixed centre, explicit"),
-        order_point, "test_boundary_order_of_the_points",
-        "Shuffled points are what atomic additions on a GPU do to a sum in every step.",
-    )
+ORDER_MAP = Map(
+    "order", "A brittle ball whose points are shuffled", HARDENING,
+    Axis("sums", "sums at nodes", SUMS, "exact"), ("gsfluent", "fixed centre, explicit"),
+    order_point, "test_boundary_order_of_the_points",
+    "Shuffled points are what atomic additions on a GPU do to a sum in every step.",
 )  # fmt: skip

@@ -7,12 +7,11 @@ from typing import Any
 import torch
 
 from gsfluent import ops
-from gsfluent.lab.problems.fracture.slab import wave_speed
-from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place, register
+from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place
 from gsfluent.lab.stability.scenes import DENSITY, DX, YOUNG, block, noise, refused, watched
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import parameters, rotation
-from gsfluent.lab.world.violations import Limits, Violation
+from gsfluent.lab.world.invariants import Limits, Violation
+from gsfluent.lab.world.shapes import parameters, rotation, wave_speed
 
 CELL, ABSOLUTE = "cell and offset", "absolute positions"
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -31,7 +30,7 @@ def far(cells: float, mach: float, dtype: torch.dtype, variant: str, place: Plac
     engine: Any = "solver" if variant == CELL else "ops"
     try:
         world = World(
-            points + cells * DX, velocity, mass=DENSITY * volume, volume=volume, dx=DX, law=0,
+            points + cells * DX, velocity, volume=volume, dx=DX, law=0,
             params=row, dt=0.5 * DX / c, dtype=dtype, engine=engine, device=place.device,
         )  # fmt: skip
     except ValueError as error:
@@ -50,29 +49,25 @@ def creep_point(cells: float, mach: float, variant: str, place: Place) -> Outcom
 
 
 _DISTANCES = (1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 2.5e5, 3e5, 1e6)
-register(
-    Map(
-        "precision", "A body far from the origin",
-        Axis("distance", "distance from the origin [dx]", _DISTANCES, 100.0, setting=False,
-             span=(0.0, 2.5e5)),
-        Axis("precision", "precision of the state", ("float32", "float64"), "float32"),
-        (CELL, ABSOLUTE), precision_point, "test_boundary_distance_from_the_origin",
-        "P: the centre of mass lags behind its momentum by 5 %. The solver refuses at 262 000 "
-        "cells; up to there distance costs nothing.", gpu=True,
-    )
+PRECISION_MAP = Map(
+    "precision", "A body far from the origin",
+    Axis("distance", "distance from the origin [dx]", _DISTANCES, 100.0, setting=False,
+         span=(0.0, 2.5e5)),
+    Axis("precision", "precision of the state", ("float32", "float64"), "float32"),
+    (CELL, ABSOLUTE), precision_point, "test_boundary_distance_from_the_origin",
+    "P: the centre of mass lags behind its momentum by 5 %. The solver refuses at 262 000 "
+    "cells; up to there distance costs nothing.", gpu=True,
 )  # fmt: skip
-register(
-    Map(
-        "creep", "A slow body far from the origin, float32",
-        Axis("distance", "distance from the origin [dx]", (1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 100.0,
-             setting=False),
-        Axis("mach", "speed over wave speed, v / c",
-             (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1), 1e-2, setting=False,
-             span=(1e-5, 1.0)),
-        (CELL, ABSOLUTE), creep_point, "test_boundary_speed_below_rounding",
-        "A step below half a unit in the last place is lost: with cell and offset that is 6e-8 dx "
-        "wherever the body is.",
-    )
+CREEP_MAP = Map(
+    "creep", "A slow body far from the origin, float32",
+    Axis("distance", "distance from the origin [dx]", (1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 100.0,
+         setting=False),
+    Axis("mach", "speed over wave speed, v / c",
+         (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1), 1e-2, setting=False,
+         span=(1e-5, 1.0)),
+    (CELL, ABSOLUTE), creep_point, "test_boundary_speed_below_rounding",
+    "A step below half a unit in the last place is lost: with cell and offset that is 6e-8 dx "
+    "wherever the body is.",
 )  # fmt: skip
 
 # --- storage ---
@@ -114,17 +109,15 @@ def storage_point(mach: float, storage: str, variant: str, place: Place) -> Outc
     return Outcome(steps, None, axes)
 
 
-register(
-    Map(
-        "storage", "Points that only turn: strain made by rounding",
-        Axis("mach", "speed of turning over wave speed",
-             (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 1e-2, 0.1), 1e-2, setting=False,
-             span=(1e-6, 1.0)),
-        Axis("storage", "what is stored",
-             ("strain, float32", "F, float32", "strain, float64", "F, float64"),
-             "strain, float32"),
-        ("gsfluent",), storage_point, "test_boundary_storage_of_the_strain",
-        "The slower the turning, the smaller the energy that rounding has to outgrow; 2000 steps, "
-        "looked at every 50.", gpu=True,
-    )
+STORAGE_MAP = Map(
+    "storage", "Points that only turn: strain made by rounding",
+    Axis("mach", "speed of turning over wave speed",
+         (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 1e-2, 0.1), 1e-2, setting=False,
+         span=(1e-6, 1.0)),
+    Axis("storage", "what is stored",
+         ("strain, float32", "F, float32", "strain, float64", "F, float64"),
+         "strain, float32"),
+    ("gsfluent",), storage_point, "test_boundary_storage_of_the_strain",
+    "The slower the turning, the smaller the energy that rounding has to outgrow; 2000 steps, "
+    "looked at every 50.", gpu=True,
 )  # fmt: skip

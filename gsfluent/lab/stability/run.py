@@ -11,19 +11,14 @@ from pathlib import Path
 
 from gsfluent.errors import InputError
 from gsfluent.lab.charts.record import commit, machine, now
-from gsfluent.lab.stability import (  # noqa: F401  (they register their maps, in this order)
-    contact,
-    matter,
-    rounding,
-    steps,
-    transfer,
-)
-from gsfluent.lab.stability.maps import _MAPS, Map, Place, Point, Value, key_of, read
+from gsfluent.lab.stability import contact, matter, rounding, steps, transfer
+from gsfluent.lab.stability.maps import Map, Place, Point, Value, key_of, read
 
 
 def all_maps() -> dict[str, Map]:
     """All maps by name, in the order of the page."""
-    return dict(_MAPS)
+    rooms = (contact, matter, rounding, steps, transfer)
+    return {m.name: m for room in rooms for m in vars(room).values() if isinstance(m, Map)}
 
 
 def chosen(names: Sequence[str] | None = None, *, gpu: bool = False) -> list[Map]:
@@ -79,14 +74,6 @@ def run_maps(
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Point]:
     """Run what is missing of these maps; every point is written as soon as it is done.
-
-    Args:
-        wanted: The maps.
-        path: The file of lines; points that it has (of this device) are not run again.
-        device: ``cpu`` or ``cuda``.
-        quick: Three by three points of each map.
-        jobs: Processes.
-        progress: Called with (done, all, what).
 
     Returns:
         The points of these maps, those of the file included.

@@ -7,8 +7,7 @@ from typing import Any
 
 import torch
 
-from gsfluent.lab.problems.fracture.slab import nacc, wave_speed
-from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place, register
+from gsfluent.lab.stability.maps import Axis, Map, Outcome, Place
 from gsfluent.lab.stability.matter import COURANT, HARDENING, STEPS
 from gsfluent.lab.stability.scenes import (
     BRITTLE,
@@ -28,8 +27,8 @@ from gsfluent.lab.stability.scenes import (
 from gsfluent.lab.stability.steps import courant_axis, shaken
 from gsfluent.lab.stability.textbook import scene_of, watched_textbook
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import box, parameters
-from gsfluent.lab.world.violations import Limits
+from gsfluent.lab.world.invariants import Limits
+from gsfluent.lab.world.shapes import box, nacc, parameters, wave_speed
 
 ELASTIC = {
     "law": "elastic", "young_modulus": YOUNG, "poisson_ratio": 0.3, "density": DENSITY,
@@ -59,12 +58,10 @@ def transfer_point(courant: float, which: str, variant: str, place: Place) -> Ou
     return free_scene(courant, place, which, 100)
 
 
-register(
-    Map(
-        "transfer", "A free cube, against the transfer", courant_axis(),
-        Axis("transfer", "transfer (textbook solver but for the first)", TRANSFERS, TRANSFERS[0]),
-        ("free cube",), transfer_point, "test_boundary_courant_number_transfer",
-    )
+TRANSFER_MAP = Map(
+    "transfer", "A free cube, against the transfer", courant_axis(),
+    Axis("transfer", "transfer (textbook solver but for the first)", TRANSFERS, TRANSFERS[0]),
+    ("free cube",), transfer_point, "test_boundary_courant_number_transfer",
 )  # fmt: skip
 
 # --- loose points ---
@@ -86,18 +83,16 @@ def loose_point(courant: float, poisson: float, variant: str, place: Place) -> O
     )  # fmt: skip
 
 
-register(
-    Map(
-        "loose", "Clusters of two points, against Poisson's ratio",
-        Axis("courant", "c dt / dx",
-             (0.2, 0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0, 1.1), 0.5),
-        # 0.45 is the largest of the presets; beyond 0.47 the margin is below 1.2 (docs)
-        Axis("poisson", "Poisson's ratio", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.495), 0.3,
-             setting=False, span=(0.0, 0.45), log=False),
-        ("gsfluent", GRADIENTS), loose_point, "test_boundary_courant_number_of_loose_points",
-        "gsfluent's boundary is sqrt((1 - nu) / (1 + nu)): the bulk wave alone, on a point that "
-        "nothing else holds.",
-    )
+LOOSE_MAP = Map(
+    "loose", "Clusters of two points, against Poisson's ratio",
+    Axis("courant", "c dt / dx",
+         (0.2, 0.3, 0.4, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0, 1.1), 0.5),
+    # 0.45 is the largest of the presets; beyond 0.47 the margin is below 1.2 (docs)
+    Axis("poisson", "Poisson's ratio", (0.0, 0.1, 0.2, 0.3, 0.4, 0.45, 0.48, 0.495), 0.3,
+         setting=False, span=(0.0, 0.45), log=False),
+    ("gsfluent", GRADIENTS), loose_point, "test_boundary_courant_number_of_loose_points",
+    "gsfluent's boundary is sqrt((1 - nu) / (1 + nu)): the bulk wave alone, on a point that "
+    "nothing else holds.",
 )  # fmt: skip
 
 # --- divisions ---
@@ -110,7 +105,7 @@ def lone_point(away: float, which: str, variant: str, place: Place) -> Outcome:
     still = torch.zeros(1, 3, dtype=torch.float64)
     if which == "gsfluent":
         world = World(
-            at, still, mass=DENSITY * DX**3, volume=DX**3, dx=DX, law=0,
+            at, still, volume=DX**3, dx=DX, law=0,
             params=parameters(YOUNG, 0.3, DENSITY), dt=1e-4, dtype=torch.float32,
             device=place.device,
         )  # fmt: skip
@@ -122,17 +117,15 @@ def lone_point(away: float, which: str, variant: str, place: Place) -> Outcome:
     )  # fmt: skip
 
 
-register(
-    Map(
-        "zero_weight", "A point alone where a weight is exactly zero",
-        Axis("away", "distance from (n + 1/2) dx [dx]", (0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.1),
-             0.0, setting=False, log=False),
-        Axis("division", "division by the mass of a node",
-             ("gsfluent", "apic, guarded", "apic, unguarded", "flip, guarded", "flip, unguarded"),
-             "gsfluent"),
-        ("one step is enough",), lone_point, "test_boundary_weight_of_exactly_zero",
-        "0 / 0 in the first step: GaussianFluent's path to NaN, if a point is alone.", gpu=True,
-    )
+ZERO_WEIGHT_MAP = Map(
+    "zero_weight", "A point alone where a weight is exactly zero",
+    Axis("away", "distance from (n + 1/2) dx [dx]", (0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.1),
+         0.0, setting=False, log=False),
+    Axis("division", "division by the mass of a node",
+         ("gsfluent", "apic, guarded", "apic, unguarded", "flip, guarded", "flip, unguarded"),
+         "gsfluent"),
+    ("one step is enough",), lone_point, "test_boundary_weight_of_exactly_zero",
+    "0 / 0 in the first step: GaussianFluent's path to NaN, if a point is alone.", gpu=True,
 )  # fmt: skip
 
 # --- the kernel ---
@@ -151,7 +144,7 @@ def kernel_point(amplitude: float, which: str, variant: str, place: Place) -> Ou
     dt = 0.3 * DX / c
     if which == "gsfluent":
         world = World(
-            points, velocity, mass=DENSITY * volume, volume=volume, dx=DX, law=0, params=row,
+            points, velocity, volume=volume, dx=DX, law=0, params=row,
             dt=dt, dtype=torch.float32, device=place.device,
         )  # fmt: skip
         return watched(world, steps, place)
@@ -163,14 +156,12 @@ def kernel_point(amplitude: float, which: str, variant: str, place: Place) -> Ou
     )  # fmt: skip
 
 
-register(
-    Map(
-        "kernel", "A free bar whose points cross cells",
-        Axis("amplitude", "amplitude of its ends [dx]",
-             (0.03, 0.1, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), 0.3, setting=False),
-        Axis("kernel", "kernel and transfer", KERNELS, "gsfluent"),
-        ("free bar",), kernel_point, "test_boundary_kernel_of_crossed_cells",
-    )
+KERNEL_MAP = Map(
+    "kernel", "A free bar whose points cross cells",
+    Axis("amplitude", "amplitude of its ends [dx]",
+         (0.03, 0.1, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), 0.3, setting=False),
+    Axis("kernel", "kernel and transfer", KERNELS, "gsfluent"),
+    ("free bar",), kernel_point, "test_boundary_kernel_of_crossed_cells",
 )  # fmt: skip
 
 # --- what released solvers do with brittle matter ---
@@ -221,14 +212,12 @@ def released_point(courant: float, which: str, variant: str, place: Place) -> Ou
     )  # fmt: skip
 
 
-register(
-    Map(
-        "released", "A brittle ball by other solvers",
-        Axis("courant", COURANT.label, (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.2, 1.5, 2.0, 3.0),
-             0.5),
-        Axis("solver", "solver", tuple(SOLVERS), "gsfluent"),
-        ("textbook variants",), released_point, "test_boundary_released_solvers",
-        "Two of them gain energy at any step: claymore's stress is the energy where its derivative "
-        "belongs, GaussianFluent's released force carries the weight twice.",
-    )
+RELEASED_MAP = Map(
+    "released", "A brittle ball by other solvers",
+    Axis("courant", COURANT.label, (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.2, 1.5, 2.0, 3.0),
+         0.5),
+    Axis("solver", "solver", tuple(SOLVERS), "gsfluent"),
+    ("textbook variants",), released_point, "test_boundary_released_solvers",
+    "Two of them gain energy at any step: claymore's stress is the energy where its derivative "
+    "belongs, GaussianFluent's released force carries the weight twice.",
 )  # fmt: skip

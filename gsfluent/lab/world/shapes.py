@@ -1,4 +1,4 @@
-"""Lattices of material points: boxes, balls and discs, with the volume each point stands for."""
+"""Lattices of material points (boxes, balls, discs, sheets), and rows of what they are made of."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-
-__all__ = ["ball", "box", "disc", "moduli", "parameters", "rotation"]
 
 
 def box(lower: Sequence[float], size: Sequence[float], spacing: float) -> Tensor:
@@ -47,6 +45,26 @@ def disc(center: Sequence[float], radius: float, thickness: float, spacing: floa
     return inside + torch.tensor([float(c) for c in center], dtype=torch.float64)
 
 
+def sheet(lower: Sequence[float], size: Sequence[float], dx: float, per_cell: int = 2) -> Tensor:
+    """One layer of points in the x-y plane, in the middle of the cell 0 <= z <= dx, [N, 3].
+
+    Each point stands for ``(dx / per_cell)**2 * dx``.
+
+    Args:
+        lower: Lower x and y [m].
+        size: Extents in x and y [m], whole numbers of ``dx / per_cell``.
+        dx: Node spacing [m].
+        per_cell: Points along each edge of a cell.
+    """
+    step = dx / per_cell
+    axes = [
+        low + (torch.arange(round(edge / step), dtype=torch.float64) + 0.5) * step
+        for low, edge in zip(lower, size, strict=True)
+    ]
+    flat = torch.cartesian_prod(*axes)
+    return torch.cat([flat, torch.full((flat.shape[0], 1), 0.5 * dx, dtype=flat.dtype)], dim=1)
+
+
 def rotation(axis: Sequence[float], angle: float) -> Tensor:
     """Rotation matrix by ``angle`` [rad] about ``axis`` (Rodrigues), float64 [3, 3]."""
     length = math.sqrt(sum(float(a) ** 2 for a in axis))
@@ -76,3 +94,24 @@ def parameters(young: float, poisson: float, density: float, **columns: float) -
     for name, value in columns.items():
         row[int(name.removeprefix("c"))] = value
     return row
+
+
+def nacc(
+    young: float,
+    poisson: float,
+    density: float,
+    *,
+    friction: float,
+    cohesion: float,
+    hardening: float,
+    shear_damage: float = 0.0,
+) -> Tensor:
+    """One NACC row of ``params``, float64 [8] (see :func:`gsfluent.ops.return_mapping`)."""
+    return parameters(
+        young, poisson, density, c2=friction, c3=cohesion, c4=hardening, c5=shear_damage
+    )
+
+
+def wave_speed(row: Tensor) -> float:
+    """Speed of the pressure wave of a solid's row at rest [m/s]."""
+    return math.sqrt((float(row[1]) + 4.0 / 3.0 * float(row[0])) / float(row[6]))

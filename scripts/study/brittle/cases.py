@@ -16,9 +16,9 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.frozen.answer import rows
 from gsfluent.lab.peers.known import POINTS, find
 from gsfluent.lab.problems.fracture import brittle
-from gsfluent.lab.problems.fracture.slab import SEPARATE, plane
 from gsfluent.lab.textbook.solver import Variant
 from gsfluent.lab.world.driver import World
+from gsfluent.ops.collider import collider_row
 
 MAPS = (
     "fixed_explicit",
@@ -183,7 +183,9 @@ def ours(scene: Scene, job: Job, dt: float, device: str) -> list[brittle.Outcome
             torch.from_numpy(scene.x[order]), torch.from_numpy(scene.v[order]),
             mass=torch.from_numpy(scene.mass[order]), volume=torch.from_numpy(scene.volume[order]),
             dx=scene.dx, law=law, params=params, alpha=alpha, gravity=scene.gravity,
-            colliders=plane(floor["point"], floor["normal"], mode=SEPARATE, friction=0.3)[None],
+            colliders=[
+                collider_row("plane", point=floor["point"], normal=floor["normal"], friction=0.3)
+            ],
             dt=dt, dtype=DTYPES[job.dtype], device=device, engine="solver", irreversible=False,
         ).run(steps=job.steps)  # fmt: skip
         back = np.argsort(order)

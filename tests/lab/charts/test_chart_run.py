@@ -16,15 +16,15 @@ from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.charts import play as playing
+from gsfluent.lab.charts import run_case as running
+from gsfluent.lab.charts.carried_splats import CarriedSplats
 from gsfluent.lab.charts.chart import run
 from gsfluent.lab.charts.draw import gathered, of_records
 from gsfluent.lab.charts.ladder import KNOBS, Setting, ladder, rungs, work
 from gsfluent.lab.charts.off_grid import measure_off_grid
-from gsfluent.lab.charts.play import measure, shuffled
 from gsfluent.lab.charts.record import Record, append, read
-from gsfluent.lab.charts.ride import Riders
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.charts.run_case import measure, shuffled
+from gsfluent.lab.frozen.answer import run_case
 
 COARSE = max(find("pull_apart").ladder)
 
@@ -81,7 +81,7 @@ def test_a_shuffled_run_comes_back_in_the_order_of_the_scene() -> None:
     assert sorted(map(tuple, seen[0].x)) == sorted(map(tuple, scene.x))
 
 
-def test_riders_follow_an_affine_motion_exactly() -> None:
+def test_carried_follow_an_affine_motion_exactly() -> None:
     case = find("bar")
     dense, sparse = case.build(1 / 8, 64), case.build(1 / 8, 8)
     turn = torch.tensor([[0.9, -0.3, 0.0], [0.3, 1.1, 0.1], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -94,18 +94,18 @@ def test_riders_follow_an_affine_motion_exactly() -> None:
         velocity = position @ flow.T
         affine = flow.expand(sparse.count, 3, 3)
 
-    riders = Riders(dense, sparse, "cpu")
-    riders.watch(Moved(), 0)  # type: ignore[arg-type]
+    carried = CarriedSplats(dense, sparse, "cpu")
+    carried.watch(Moved(), 0)  # type: ignore[arg-type]
     place = torch.from_numpy(dense.x) @ turn.T + 0.2
-    assert np.allclose(riders.x[0], place.numpy(), atol=1e-12)
-    assert np.allclose(riders.v[0], (place @ flow.T).numpy(), atol=1e-12)
-    assert len(riders.seconds) == 1
+    assert np.allclose(carried.x[0], place.numpy(), atol=1e-12)
+    assert np.allclose(carried.v[0], (place @ flow.T).numpy(), atol=1e-12)
+    assert len(carried.seconds) == 1
 
 
 def test_gaussians_that_ride_move_like_points_of_their_own() -> None:
     each, riding = (
         measure(Setting("bar", 1 / 8, 64, variant=v, options=o), "cpu", 1)
-        for v, o in (("points", {}), ("riders", {"ride_on": 8}))
+        for v, o in (("points", {}), ("carried", {"carried_by": 8}))
     )
     assert riding.points == each.points // 8 and riding.settings["gaussians"] == each.points
     # eight points a cell are a little softer than 64: the difference of their errors, and no more
@@ -137,9 +137,9 @@ def test_time_is_that_of_runs_without_a_stop(monkeypatch: pytest.MonkeyPatch) ->
 
     def told(scene: Scene, **options: object) -> Run:
         lengths.append(scene.times.shape[0])
-        return dataclasses.replace(play(scene), wall_seconds=100.0 / scene.times.shape[0])
+        return dataclasses.replace(run_case(scene), wall_seconds=100.0 / scene.times.shape[0])
 
-    monkeypatch.setattr(playing, "play", told)
+    monkeypatch.setattr(running, "run_case", told)
     scene = find("pull_apart").build(COARSE, 8)
     made = measure(Setting("pull_apart", COARSE), "cpu", 1)
     assert lengths == [scene.times.shape[0], 1] and made.wall_seconds == [100.0]
@@ -149,7 +149,7 @@ def test_what_raises_is_a_run_that_failed(monkeypatch: pytest.MonkeyPatch) -> No
     def broken(scene: Scene, **options: object) -> Run:
         raise RuntimeError("out of memory\nmore words")
 
-    monkeypatch.setattr(playing, "play", broken)
+    monkeypatch.setattr(running, "run_case", broken)
     made = measure(Setting("pull_apart", COARSE), "cpu")
     assert made.failed == "RuntimeError: out of memory" and made.error == math.inf and not made.ok
 
@@ -209,6 +209,7 @@ def test_the_machine_moves_bytes_and_a_floor_follows(tmp_path: Path) -> None:
 def test_the_verb_draws_recorded_lines_of_several_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("matplotlib")
     peer = dataclasses.replace(fast(Setting("bar", 0.1), "cpu", 1), method="peer",
                                wall_per_simulated=0.5, error=0.2)  # fmt: skip
     broken = dataclasses.replace(peer, variant="b", error=math.inf, failed="exploded")
@@ -244,6 +245,7 @@ def test_a_chart_has_one_device(tmp_path: Path) -> None:
 
 
 def test_the_verb_runs_a_small_ladder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
     out = tmp_path / "chart"
     words = ["chart", "--quick", "--only", "dx", "free", "--device", "cpu", "-o", str(out)]
     assert main([*words, "--json"]) == 0

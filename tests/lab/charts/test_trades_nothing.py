@@ -23,8 +23,8 @@ from trades import COARSE, all_laws, apart, judged, same_bits, same_error
 from gsfluent import ops
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene as Frozen
-from gsfluent.lab.charts.play import even_dt, shuffled, stepwise
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.charts.run_case import even_dt, shuffled, stepwise
+from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.world import stepper
 from gsfluent.ops.reference import plasticity
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
@@ -44,7 +44,7 @@ def test_resident(case: str) -> None:
     scene = COARSE(case)
     dt = even_dt(scene, 0.4)
     with_, without = (
-        play(scene, engine=engine, dtype=torch.float64, dt=dt) for engine in ("solver", "ops")
+        run_case(scene, engine=engine, dtype=torch.float64, dt=dt) for engine in ("solver", "ops")
     )
     assert (with_.settings["engine"], without.settings["engine"]) == ("solver", "ops")
     assert with_.steps == without.steps
@@ -59,7 +59,7 @@ def test_sorted(case: str, dtype: torch.dtype) -> None:
     scene = COARSE(case)
 
     def run(given: Frozen) -> Run:
-        return play(given, dtype=dtype)
+        return run_case(given, dtype=dtype)
 
     with_, without = run(scene), shuffled(scene, run, seed=5)
     same_error(scene, with_, without)
@@ -70,7 +70,7 @@ def test_sorted(case: str, dtype: torch.dtype) -> None:
 def test_deterministic(case: str) -> None:
     """Sums in one order: a run repeated has the same bits."""
     scene = COARSE(case)
-    same_bits(play(scene), play(scene))
+    same_bits(run_case(scene), run_case(scene))
 
 
 def test_threads() -> None:
@@ -81,7 +81,7 @@ def test_threads() -> None:
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            runs.append(play(scene))
+            runs.append(run_case(scene))
     finally:
         torch.set_num_threads(before)
     same_error(scene, *runs)
@@ -94,9 +94,9 @@ def test_many_steps_in_a_call(case: str, fixed: bool) -> None:
     """``advance`` to a time against a call for every step."""
     scene = COARSE(case)
     dt = even_dt(scene, 0.4) if fixed else None
-    with_ = play(scene, dt=dt, dtype=torch.float64)
+    with_ = run_case(scene, dt=dt, dtype=torch.float64)
     with stepwise(True):
-        without = play(scene, dt=dt, dtype=torch.float64)
+        without = run_case(scene, dt=dt, dtype=torch.float64)
     same_error(scene, with_, without)
     if fixed:  # the automatic step looks at speeds anew in every call
         assert apart(with_, without) < 1e-9 * scene.dx
@@ -107,7 +107,9 @@ def test_law_kernels(case: str) -> None:
     """A scene of elastic matter has kernels of its own, against those of all laws."""
     scene = COARSE(case)
     dt = even_dt(scene, 0.4)  # the automatic step looks at wave speeds in every step there
-    with_, without = (play(given, dt=dt, dtype=torch.float64) for given in (scene, all_laws(scene)))
+    with_, without = (
+        run_case(given, dt=dt, dtype=torch.float64) for given in (scene, all_laws(scene))
+    )
     same_error(scene, with_, without)
     assert apart(with_, without) < 1e-9 * scene.dx
 
@@ -115,7 +117,7 @@ def test_law_kernels(case: str) -> None:
 @each_case
 def test_deformation_tracked_only_when_asked_for(case: str) -> None:
     scene = COARSE(case)
-    with_, without = play(scene), play(scene, deformation=True)
+    with_, without = run_case(scene), run_case(scene, deformation=True)
     same_error(scene, with_, without)
     same_bits(with_, without)
 
@@ -126,7 +128,7 @@ def test_contact_only_where_bodies_meet() -> None:
     x = scene.x.copy()
     x[scene.body == 1] += 64 * scene.dx
     away = dataclasses.replace(scene, x=x)
-    with_, without = play(away), play(away, fields=False)
+    with_, without = run_case(away), run_case(away, fields=False)
     assert with_.settings["fields"] and not without.settings["fields"]
     same_error(scene, with_, without)
     same_bits(with_, without)
@@ -137,7 +139,7 @@ def test_places_kept_relative_to_their_cell() -> None:
     scene = COARSE("bar")
     away = np.array([4.0 * 2**15 * scene.dx, 0.0, -4.0 * 2**15 * scene.dx])
     far = dataclasses.replace(scene, x=scene.x + away)
-    with_, without = play(far), play(scene)
+    with_, without = run_case(far), run_case(scene)
     at_home = dataclasses.replace(with_, x=with_.x - away)
     # what is left is the rounding of the places that are given and read, in float64
     same_error(scene, at_home, without, slack=1e-6)
@@ -147,7 +149,7 @@ def test_places_kept_relative_to_their_cell() -> None:
 
 
 def _composed(scene: Frozen) -> Run:
-    return play(scene, engine="ops", dtype=torch.float64)
+    return run_case(scene, engine="ops", dtype=torch.float64)
 
 
 sparse_blocks = ops.build_blocks
@@ -216,7 +218,7 @@ def test_elastic_early_out(monkeypatch: pytest.MonkeyPatch) -> None:
         "alpha": -0.04,
     }  # fmt: skip
     scene = dataclasses.replace(scene, materials=(brittle,), times=scene.times[:6])
-    early = play(scene, dtype=torch.float64)
+    early = run_case(scene, dtype=torch.float64)
     with_ = _composed(scene)
 
     def whole_way(
@@ -242,9 +244,9 @@ DX = 0.02
 def _frames(
     scene: Scene, fps: float, seconds: float, **options: bool
 ) -> tuple[list[SimulationFrame], Any]:
-    simulate = Simulate(dx=DX, splats=False, **options)
-    frames = list(simulate(scene, fps=fps, seconds=seconds))
-    report = simulate.report()
+    simulation = Simulate(dx=DX, splats=False, **options)(scene, fps=fps, seconds=seconds)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "clean", report["reason"]
     return frames, report
 
@@ -302,12 +304,12 @@ def _straight_error(frames: list[SimulationFrame]) -> float:
     return worst
 
 
-@pytest.mark.parametrize("measure", ["piece_flight", "contact_near"])
+@pytest.mark.parametrize("measure", ["piece_flight", "contact_proximity"])
 def test_bodies_that_pass_each_other(measure: str) -> None:
     """Two balls that come near and do not touch fly straight on.
 
-    ``piece_flight`` takes them off the grid again behind each other; ``contact_near`` looks for
-    contact only while they are near.
+    ``piece_flight`` takes them off the grid again behind each other; ``contact_proximity`` looks
+    for contact only while they are near.
     """
     (on, with_), (off, without) = (
         _frames(near_miss(), 40, 0.3, resident=False, **{measure: flag}) for flag in (True, False)
@@ -340,8 +342,8 @@ def test_sleep() -> None:
 def test_the_comparison_itself_sees_a_difference() -> None:
     """The bar is no matter of course: a coarser step and another dx fail it."""
     scene = COARSE("bar")
-    base = play(scene)
-    for other in (play(scene, cfl=0.2), dataclasses.replace(base, x=base.x * 1.001)):
+    base = run_case(scene)
+    for other in (run_case(scene, cfl=0.2), dataclasses.replace(base, x=base.x * 1.001)):
         with pytest.raises(AssertionError):
             same_error(scene, base, other)
     assert judged(scene, base) > 0.0

@@ -13,8 +13,8 @@ from trades import all_laws, apart, coarse, same_bits, same_error
 from gsfluent import has_cuda, ops
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.charts.play import even_dt, shuffled, stepwise
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.charts.run_case import even_dt, shuffled, stepwise
+from gsfluent.lab.frozen.answer import run_case
 
 pytestmark = [
     pytest.mark.cuda,
@@ -29,11 +29,11 @@ def test_fixed_point_sums(case: str) -> None:
     """Sums of integers against sums of floats: the composed operators on the CPU, in float64."""
     scene = coarse(case)
     dt = even_dt(scene, 0.4)
-    with_ = play(scene, device="cuda", dt=dt, dtype=torch.float64)
-    without = play(scene, engine="ops", dt=dt, dtype=torch.float64)
+    with_ = run_case(scene, device="cuda", dt=dt, dtype=torch.float64)
+    without = run_case(scene, engine="ops", dt=dt, dtype=torch.float64)
     same_error(scene, with_, without)
     assert apart(with_, without) < 1e-6 * scene.dx
-    single = play(scene, device="cuda", dt=dt)
+    single = run_case(scene, device="cuda", dt=dt)
     same_error(scene, single, without)
 
 
@@ -44,7 +44,7 @@ def test_sorted(case: str, dtype: torch.dtype) -> None:
     scene = coarse(case)
 
     def run(given: Scene) -> Run:
-        return play(given, device="cuda", dtype=dtype)
+        return run_case(given, device="cuda", dtype=dtype)
 
     with_, without = run(scene), shuffled(scene, run, seed=5)
     same_error(scene, with_, without)
@@ -55,7 +55,7 @@ def test_sorted(case: str, dtype: torch.dtype) -> None:
 def test_deterministic(case: str) -> None:
     """Atomics of integers have no order to depend on: a run repeated has the same bits."""
     scene = coarse(case)
-    same_bits(play(scene, device="cuda"), play(scene, device="cuda"))
+    same_bits(run_case(scene, device="cuda"), run_case(scene, device="cuda"))
 
 
 @pytest.mark.parametrize("length", [1, 32])
@@ -63,9 +63,9 @@ def test_deterministic(case: str) -> None:
 def test_graph_of_a_round(case: str, length: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight steps in a graph against graphs of one step and of 32: the clock is on the device."""
     scene = coarse(case)
-    with_ = play(scene, device="cuda")
+    with_ = run_case(scene, device="cuda")
     monkeypatch.setattr(ops.Solver, "steps_per_round", length)
-    without = play(scene, device="cuda")
+    without = run_case(scene, device="cuda")
     same_error(scene, with_, without)
     assert with_.steps == without.steps
 
@@ -75,9 +75,9 @@ def test_many_steps_in_a_call(case: str) -> None:
     """``advance`` to a time against a call for every step."""
     scene = coarse(case)
     dt = even_dt(scene, 0.4)
-    with_ = play(scene, device="cuda", dt=dt, dtype=torch.float64)
+    with_ = run_case(scene, device="cuda", dt=dt, dtype=torch.float64)
     with stepwise(True):
-        without = play(scene, device="cuda", dt=dt, dtype=torch.float64)
+        without = run_case(scene, device="cuda", dt=dt, dtype=torch.float64)
     same_error(scene, with_, without)
     assert apart(with_, without) < 1e-6 * scene.dx
 
@@ -88,7 +88,8 @@ def test_law_kernels(case: str) -> None:
     scene = coarse(case)
     dt = even_dt(scene, 0.4)
     with_, without = (
-        play(given, device="cuda", dt=dt, dtype=torch.float64) for given in (scene, all_laws(scene))
+        run_case(given, device="cuda", dt=dt, dtype=torch.float64)
+        for given in (scene, all_laws(scene))
     )
     same_error(scene, with_, without)
     assert apart(with_, without) < 1e-6 * scene.dx
@@ -97,6 +98,9 @@ def test_law_kernels(case: str) -> None:
 @each_case
 def test_deformation_tracked_only_when_asked_for(case: str) -> None:
     scene = coarse(case)
-    with_, without = play(scene, device="cuda"), play(scene, device="cuda", deformation=True)
+    with_, without = (
+        run_case(scene, device="cuda"),
+        run_case(scene, device="cuda", deformation=True),
+    )
     same_error(scene, with_, without)
     same_bits(with_, without)

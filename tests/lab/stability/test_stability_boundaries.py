@@ -7,14 +7,14 @@ import math
 import pytest
 import torch
 
-from gsfluent.lab.problems.fracture.slab import nacc, wave_speed
 from gsfluent.lab.stability import report as report
 from gsfluent.lab.stability.maps import Place, Value, Violation
 from gsfluent.lab.stability.run import all_maps
 from gsfluent.lab.stability.scenes import DENSITY, DX, YOUNG, block, clusters, noise
 from gsfluent.lab.stability.steps import shaken
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.violations import OfWorld, first_violation
+from gsfluent.lab.world.invariants import OfWorld, first_violation
+from gsfluent.lab.world.shapes import nacc, wave_speed
 
 CPU = Place("cpu")
 

@@ -8,7 +8,7 @@ from gsfluent.lab.stability.maps import Place
 from gsfluent.lab.stability.run import all_maps
 from gsfluent.lab.stability.scenes import block
 from gsfluent.lab.stability.steps import shaken
-from gsfluent.lab.world.violations import OfWorld, first_violation
+from gsfluent.lab.world.invariants import OfWorld, first_violation
 
 pytestmark = pytest.mark.cuda
 GPU = Place("cuda")

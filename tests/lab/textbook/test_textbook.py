@@ -13,10 +13,10 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.scene import Scene
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.textbook.laws import Elastic, measure
 from gsfluent.lab.textbook.nacc import MAPS, Nacc, return_map
-from gsfluent.lab.textbook.solver import Textbook, Variant, play_textbook
+from gsfluent.lab.textbook.solver import Textbook, Variant, run_textbook
 from gsfluent.lab.world.shapes import ball
 
 DX = 1.0 / 32.0
@@ -49,9 +49,9 @@ def drop(material: dict[str, Any], kind: str = "separate", *, radius: float = 0.
 def test_it_is_gsfluent_in_the_common_special_case(kind: str) -> None:
     """APIC, e = b - I, neo-Hookean, float64: two programs, one motion."""
     scene = drop(ROCK, kind)
-    ours = play(scene, dtype=DOUBLE, dt=5e-4, engine="ops")
+    ours = run_case(scene, dtype=DOUBLE, dt=5e-4, engine="ops")
     for local in (False, True):
-        its = play_textbook(scene, storage="strain", dtype=DOUBLE, dt=5e-4, local_positions=local)
+        its = run_textbook(scene, storage="strain", dtype=DOUBLE, dt=5e-4, local_positions=local)
         assert its.steps == ours.steps
         assert np.abs(ours.v[-1] - scene.v).max() > 3.0  # it did hit the floor
         assert np.abs(its.x - ours.x).max() / DX < 1e-10
@@ -61,7 +61,7 @@ def test_it_is_gsfluent_in_the_common_special_case(kind: str) -> None:
 def test_f_and_strain_are_the_same_state() -> None:
     scene = drop(ROCK)
     runs = [
-        play_textbook(scene, storage=s, dtype=DOUBLE, dt=5e-4, law=law)  # type: ignore[arg-type]
+        run_textbook(scene, storage=s, dtype=DOUBLE, dt=5e-4, law=law)  # type: ignore[arg-type]
         for law in ("neo_hookean", "corotated")
         for s in ("F", "strain")
     ]
@@ -73,8 +73,8 @@ def test_f_and_strain_are_the_same_state() -> None:
 def test_a_breaking_ball_moves_as_gsfluents_does() -> None:
     """The dynamic centre with implicit alpha, written twice: the same motion to rounding."""
     scene = drop(FLESH)
-    ours = play(scene, dtype=DOUBLE, dt=4e-4, engine="ops", irreversible=False)
-    its = play_textbook(
+    ours = run_case(scene, dtype=DOUBLE, dt=4e-4, engine="ops", irreversible=False)
+    its = run_textbook(
         scene, storage="strain", return_map="dynamic_implicit", dtype=DOUBLE, dt=4e-4
     )
     broken = its.damage
@@ -232,7 +232,7 @@ def test_bodies_stick_in_one_field_and_part_in_two() -> None:
     scene = find("pull_apart").build(0.02, 8)
     kept = {}
     for fields in (False, True):
-        run = play_textbook(scene, fields=fields)
+        run = run_textbook(scene, fields=fields)
         second = scene.body == 1
         kept[fields] = run.v[-1][second, 0].mean() / scene.facts["speed"]
     assert kept[False] < 0.0 and kept[True] == pytest.approx(1.0, abs=1e-3)

@@ -7,20 +7,16 @@ from collections.abc import Iterator
 
 import torch
 
-from gsfluent.lab.problems.elastic.vortex import plane_strain
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import disc, parameters
+from gsfluent.lab.world.walls import PLANE_STRAIN
 
 SOURCE = "elastic; Sulsky et al. 1994, solver.md 3, row 7"
 
 
 def collide(cells: int, fields: int) -> tuple[float, float, float, float, str]:
     """Let two discs (r 0.2 m, E 1000, nu 0.3, rho 1000, 0.14 m/s each) meet head-on and part.
-
-    Args:
-        cells: Cells per radius.
-        fields: 1: they meet in one velocity field; 2: by contact of two.
 
     Returns:
         Kinetic and whole energy after over before, largest gain of energy, largest momentum over
@@ -37,9 +33,9 @@ def collide(cells: int, fields: int) -> tuple[float, float, float, float, str]:
     velocity[:, :2] = torch.where(second[:, None], -speed, speed).to(velocity)
     volume = spacing**3
     world = World(
-        points, velocity, mass=1000.0 * volume, volume=volume, dx=dx, law=0,
+        points, velocity, volume=volume, dx=dx, law=0,
         body=second.to(torch.int32) if fields == 2 else None,
-        params=parameters(1000.0, 0.3, 1000.0), colliders=plane_strain(),
+        params=parameters(1000.0, 0.3, 1000.0), colliders=[PLANE_STRAIN],
     )  # fmt: skip
     start, ends = world.kinetic(), second.to(world.position.device)
     content = float((1000.0 * volume * velocity.norm(dim=1)).sum())

@@ -78,7 +78,7 @@ class Axes:
 
         world = World(
             self.place(start, 0.0), velocity, affine=torch.diag_embed(slope), strain=strain,
-            mass=DENSITY * volume, volume=volume, dx=dx, law=0, dt=dt, force=force,
+            volume=volume, dx=dx, law=0, dt=dt, force=force,
             params=parameters(YOUNG, POISSON, DENSITY), period=(1.0, 1.0, 1.0),
         )  # fmt: skip
         world.run(steps=steps)

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.elastic.statics import FACE, STICK, plane
-from gsfluent.lab.problems.elastic.vortex import plane_strain
+from gsfluent.lab.problems.elastic.statics import FACE
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
+from gsfluent.lab.world.walls import PLANE_STRAIN, wall
 
 ROOT = 1.8751040687119611
 """First root of cos(x) cosh(x) = -1."""
@@ -34,10 +34,6 @@ def swing(cells: int, periods: float) -> tuple[float, float, float, int]:
 
     It is held behind x = 0 by the grid; the face it is clamped at lies :data:`FACE` behind.
 
-    Args:
-        cells: Cells across its height.
-        periods: Time to run for, in periods of the reference.
-
     Returns:
         Frequency [Hz], its reference [Hz], damping ratio, steps.
     """
@@ -50,8 +46,8 @@ def swing(cells: int, periods: float) -> tuple[float, float, float, int]:
     velocity = torch.zeros_like(points)
     velocity[:, 1] = tip * first_mode(((points[:, 0] + FACE * dx) / free).clamp(0.0, 1.0))
     world = World(
-        points, velocity, mass=density * spacing**3, volume=spacing**3, dx=dx, law=0,
-        params=parameters(young, 0.3, density), colliders=plane(0, 0.0, 1, STICK)[None],
+        points, velocity, volume=spacing**3, dx=dx, law=0,
+        params=parameters(young, 0.3, density), colliders=[wall(0, mode="sticky")],
     )  # fmt: skip
     end = (points[:, 0] > 0.95 * length).to(world.position.device)
     rest = float(points[:, 1][points[:, 0] > 0.95 * length].mean())
@@ -111,10 +107,6 @@ def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
     integrals); one of finite slenderness also shears and stretches (Reissner 1972; nu = 0, shear
     factor 5/6).
 
-    Args:
-        load: P L^2 / (E I).
-        slenderness: Length over height.
-
     Returns:
         Deflection across and shortening along, over the length.
     """
@@ -144,22 +136,14 @@ def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
     return y, 1.0 - x
 
 
-def bend(
-    load: float, cells: int = 4, slenderness: float = 12.0, per_cell: int = 6
-) -> tuple[float, float, int]:
+def bend(load: float) -> tuple[float, float, int]:
     """Bend a slab (nu = 0, plane) by a dead load on its end and let it come to rest.
-
-    Args:
-        load: P L^2 / (E I).
-        cells: Cells across its height.
-        slenderness: Length over height.
-        per_cell: Points per cell and axis.
 
     Returns:
         Deflection across and shortening along over the length, and the steps taken.
     """
-    dx, young, density = 1.0 / cells, 1.0, 1.0
-    spacing, length = dx / per_cell, slenderness
+    dx, young, density = 1.0 / 4, 1.0, 1.0
+    spacing, length = dx / 6, 12.0
     points = box([-1.5 * dx, 0.0, 0.0], [length + 1.5 * dx, 1.0, spacing], spacing)
     free = length + FACE * dx
     volume = spacing**3
@@ -181,9 +165,9 @@ def bend(
         world.velocity, world.affine = velocity, world.affine * keep
 
     world = World(
-        points, [0.0, 0.0, 0.0], mass=density * volume, volume=volume, dx=dx, law=0,
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=0,
         params=parameters(young, 0.0, density), force=pull, cfl=0.8,
-        colliders=torch.cat([plane(0, 0.0, 1, STICK)[None], plane_strain()]),
+        colliders=[wall(0, mode="sticky"), PLANE_STRAIN],
     ).run(1.5 * period)  # fmt: skip
     moved = (world.position.double().cpu() - points)[end].mean(0)
     return float(moved[1]) / arm, -float(moved[0]) / arm, world.steps

@@ -12,32 +12,13 @@ from torch import Tensor
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, moduli, parameters
+from gsfluent.lab.world.walls import PLANE_STRAIN, wall
 
-SLIP, STICK = 1, 0
-"""Collider modes: no normal motion, no motion."""
 FACE = 1.0 / (3.0 + math.sqrt(3.0))
 """How far behind the outermost held node a face acts [dx], 0.211. In equilibrium the coefficients
 of quadratic B-splines obey -c(i-2)/6 - c(i-1)/3 + c(i) - c(i+1)/3 - c(i+2)/6 = 0, whose solutions
 are straight lines and the decaying (-2 + sqrt 3)^i; with c = 0 at the nodes 0 and -1 the line meets
 zero at -1 / (3 + sqrt 3)."""
-
-
-def plane(
-    axis: int, at: float, side: int, mode: int, speed: tuple[float, ...] = (0, 0, 0)
-) -> Tensor:
-    """Collider row: the half space below (side 1) or above (side -1) ``at`` on an axis.
-
-    Args:
-        axis: 0, 1, 2.
-        at: Where its face is [m].
-        side: Sign of its normal.
-        mode: :data:`SLIP` or :data:`STICK`.
-        speed: Velocity of the nodes inside [m/s].
-    """
-    row = torch.zeros(16, dtype=torch.float64)
-    row[1], row[3 + axis], row[6 + axis] = mode, at, side
-    row[10:13] = torch.tensor(speed, dtype=torch.float64)
-    return row
 
 
 def damping(rate: float) -> Callable[[World, float], None]:
@@ -70,11 +51,11 @@ def settle(
     """
     force = damping(rate)
     world = World(
-        position, [0.0, 0.0, 0.0], colliders=torch.stack(load(1.0)), force=force, **given
+        position, [0.0, 0.0, 0.0], colliders=load(1.0), force=force, **given
     ).run(ramp)  # fmt: skip
     moved = {"affine": world.affine, "strain": world.strain}
     again = World(
-        world.position, world.velocity, colliders=torch.stack(load(0.0)), force=force,
+        world.position, world.velocity, colliders=load(0.0), force=force,
         **{**given, **moved},
     )  # fmt: skip
     return again.run(hold)
@@ -87,15 +68,9 @@ def slope(x: Tensor, y: Tensor) -> float:
 
 
 def bar_strains(
-    young: tuple[float, float], poisson: float, laws: tuple[int, int], mode: int
+    young: tuple[float, float], poisson: float, laws: tuple[int, int], mode: str
 ) -> tuple[list[float], list[float]]:
     """Pull the bar of GaussianBench B1 (soft left half, stiff right half) by 1 %.
-
-    Args:
-        young: Young's modulus of the halves [Pa].
-        poisson: Of both.
-        laws: Of the halves.
-        mode: How the ends are held, :data:`SLIP` or :data:`STICK`.
 
     Returns:
         Strain in the middle of each half, measured and by two springs in series, where the ends
@@ -107,14 +82,12 @@ def bar_strains(
     material = (x > 0.05).to(torch.int32)
 
     def load(share: float) -> list[Tensor]:
-        return [
-            plane(0, 0.0, 1, mode),
-            plane(0, 0.1, -1, mode, (share * pull / ramp, 0.0, 0.0)),
-        ]
+        speed = (share * pull / ramp, 0.0, 0.0)
+        return [wall(0, mode=mode), wall(0, 0.1, -1, mode, velocity=speed)]
 
     rows = torch.stack([parameters(e, poisson, 1000.0) for e in young])
     world = settle(
-        points, load, ramp, 0.3, 40.0, mass=1000.0 * spacing**3, volume=spacing**3, dx=0.01,
+        points, load, ramp, 0.3, 40.0, volume=spacing**3, dx=0.01,
         law=torch.tensor(laws), params=rows, material=material,
     )  # fmt: skip
     end = world.position.double().cpu()[:, 0]
@@ -134,12 +107,12 @@ def bar_strains(
 def two_material_bar() -> Iterator[Result]:
     """Bar of a soft and a stiff half in series: strains 4 to 1, equal traction."""
     cases = (
-        ("free of Poisson's effect, slip ends", 0.0, (0, 0), SLIP, "exact in one dimension"),
+        ("free of Poisson's effect, slip ends", 0.0, (0, 0), "slip", "exact in one dimension"),
         (
             "nu 0.3, corotated and neo-Hookean",
             0.3,
             (6, 0),
-            STICK,
+            "sticky",
             "GaussianBench B1 allows 15 %",
         ),
     )
@@ -185,10 +158,10 @@ def poisson_contraction() -> Iterator[Result]:
         ramp = 0.1
 
         def load(share: float, speed: float = pull * edge / ramp) -> list[Tensor]:
-            return [plane(0, 0.0, 1, SLIP), plane(0, edge, -1, SLIP, (share * speed, 0.0, 0.0))]
+            return [wall(0), wall(0, edge, -1, velocity=(share * speed, 0.0, 0.0))]
 
         world = settle(
-            points, load, ramp, 0.15, 40.0, mass=1000.0 * spacing**3, volume=spacing**3, dx=0.02,
+            points, load, ramp, 0.15, 40.0, volume=spacing**3, dx=0.02,
             law=0, params=parameters(young, poisson, 1000.0),
         )  # fmt: skip
         end = world.position.double().cpu()
@@ -213,18 +186,13 @@ def shear_and_back() -> Iterator[Result]:
     y = points[:, 1]
     seconds = 1.0
 
-    def load(sense: float) -> Tensor:
+    def load(sense: float) -> list[Tensor]:
         speed = sense * (height + 2.0 * FACE * dx) / seconds  # the gap between the faces
-        return torch.stack(
-            [
-                plane(1, 0.0, 1, STICK),
-                plane(1, height, -1, STICK, (speed, 0.0, 0.0)),
-                plane(2, 1e6, 1, SLIP),
-            ]
-        )
+        top = wall(1, height, -1, "sticky", velocity=(speed, 0.0, 0.0))
+        return [wall(1, mode="sticky"), top, PLANE_STRAIN]
 
     given: dict[str, Any] = {
-        "mass": 1000.0 * spacing**3, "volume": spacing**3, "dx": dx, "law": 0,
+        "volume": spacing**3, "dx": dx, "law": 0,
         "params": parameters(5e4, 0.3, 1000.0), "period": (width, None, None),
         "force": damping(20.0),
     }  # fmt: skip

@@ -11,16 +11,7 @@ from torch import Tensor
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import box, parameters
-
-FAR = 1e6
-"""A slip plane so far up that every node is behind it: no motion along z, which is plane strain."""
-
-
-def plane_strain() -> Tensor:
-    """Collider row that holds every node in its plane z."""
-    row = torch.zeros(1, 16, dtype=torch.float64)
-    row[0, 1], row[0, 5], row[0, 8] = 1.0, FAR, 1.0
-    return row
+from gsfluent.lab.world.walls import PLANE_STRAIN
 
 
 class Vortex:
@@ -97,12 +88,6 @@ class Vortex:
     ) -> tuple[float, float]:
         """Run one layer of points with ``cells`` cells per metre to ``until``.
 
-        Args:
-            cells: Cells per metre.
-            until: Time [s].
-            per_cell: Points per cell and axis.
-            dtype: Precision.
-
         Returns:
             Root mean square and largest distance from the exact place [m], inside the vortex.
         """
@@ -123,9 +108,9 @@ class Vortex:
             world.affine = world.affine.masked_fill(rest[:, None], 0.0)
 
         world = World(
-            points, velocity, affine=affine, mass=self.density * volume, volume=volume, dx=dx,
+            points, velocity, affine=affine, volume=volume, dx=dx,
             law=0, params=parameters(self.young, self.poisson, self.density), dtype=dtype,
-            colliders=plane_strain(), force=push, cfl=0.4,
+            colliders=[PLANE_STRAIN], force=push, cfl=0.4,
         )  # fmt: skip
         world.run(until)
         far = (world.position.double().cpu() - self.place(points, until))[~held].norm(dim=1)

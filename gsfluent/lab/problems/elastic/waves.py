@@ -33,11 +33,6 @@ def run_wave(cells: int, periods: float, cfl: float = 0.2) -> Wave:
     The bar is one cell wide with free faces: without Poisson's effect every point of a cross
     section moves alike, so that this is the problem of one dimension. The velocity of symplectic
     Euler belongs to the half step before.
-
-    Args:
-        cells: Cells per wavelength.
-        periods: Time to run for, in periods.
-        cfl: Time step over dx / c.
     """
     dx, k, amplitude = 1.0 / cells, 2.0 * math.pi, 1e-6
     points = box([0.0, 0.0, 0.0], [1.0, dx, dx], 0.5 * dx)
@@ -49,7 +44,7 @@ def run_wave(cells: int, periods: float, cfl: float = 0.2) -> Wave:
     steps = round(periods / (cfl * dx))
     dt = periods / steps
     world = World(
-        points, velocity, affine=affine, mass=0.125 * dx**3, volume=0.125 * dx**3, dx=dx, law=0,
+        points, velocity, affine=affine, volume=0.125 * dx**3, dx=dx, law=0,
         params=parameters(1.0, 0.0, 1.0), dt=dt, period=(1.0, None, None),
     )  # fmt: skip
     shape = shape.to(world.position.device)
@@ -100,9 +95,6 @@ def standing_wave() -> Iterator[Result]:
 def push_bar(width: float) -> tuple[float, list[float], list[float]]:
     """Push the end of the bar of GaussianBench A3 by a half sine and watch the other end.
 
-    Args:
-        width: Duration of the push [s].
-
     Returns:
         Distance of the two ends [m], times [s] and mean displacement of the far end [m].
     """
@@ -124,7 +116,7 @@ def push_bar(width: float) -> tuple[float, list[float], list[float]]:
         world.velocity, world.affine = velocity, affine
 
     world = World(
-        points, [0.0, 0.0, 0.0], mass=BAR_DENSITY * spacing**3, volume=spacing**3, dx=2 * spacing,
+        points, [0.0, 0.0, 0.0], volume=spacing**3, dx=2 * spacing,
         law=0, params=parameters(BAR_YOUNG, 0.3, BAR_DENSITY), force=push,
     )  # fmt: skip
     times, moved = [0.0], [0.0]

@@ -16,20 +16,18 @@ from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.scenes.shatter import reference
 from gsfluent.fracturebench.statistics import distance, jitter
+from gsfluent.lab.charts.carried_splats import CarriedSplats
 from gsfluent.lab.charts.ladder import TEXTBOOK, Setting
 from gsfluent.lab.charts.record import Record, commit, machine, now, of_run
-from gsfluent.lab.charts.ride import Riders
-from gsfluent.lab.frozen.answer import play
+from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.world.driver import World
-
-__all__ = ["broken", "even_dt", "measure", "shuffled", "stepwise"]
 
 MASS = "mass over pieces, KS"
 _SEEDS = 3
 """Runs of a fracture case, moved on the grid; their median error counts."""
 _ENOUGH = 6.0
 """Seconds that a setting is timed at least before fewer repeats than asked for have to do."""
-Player = Callable[[Scene], Run]
+Runner = Callable[[Scene], Run]
 
 
 def measure(setting: Setting, device: str, repeat: int = 3) -> Record:
@@ -38,11 +36,6 @@ def measure(setting: Setting, device: str, repeat: int = 3) -> Record:
     The error is that of a run that stops at every time the case asks for. The times are those of
     runs that go straight to the last one: what a stop costs is the reader's, not the method's. (The
     textbook solver's own steps cost as much as a stop: its time is that of the judged run.)
-
-    Args:
-        setting: What to run.
-        device: Where.
-        repeat: Timed runs; fewer once they have taken 6 s.
 
     Returns:
         The record; a run that raises or runs out of memory is one that failed.
@@ -82,10 +75,10 @@ def _band() -> float:
     return distance(runs, runs[:1])[MASS].band
 
 
-def _moved(player: Player, scene: Scene, seed: int) -> Run:
+def _moved(runner: Runner, scene: Scene, seed: int) -> Run:
     """A run of the scene somewhere else on the grid, brought back."""
     there = jitter(scene, seed)
-    run = player(there)
+    run = runner(there)
     shift = np.asarray(there.facts.get("shift", (0.0, 0.0, 0.0)))
     return dataclasses.replace(run, x=run.x - shift)
 
@@ -111,49 +104,49 @@ def _runs(
     """The judged runs, the times, the steps of a timed run, and facts."""
     below = scene
     more: dict[str, Any] = {}
-    riders = None
-    if (ride_on := options.pop("ride_on", None)) is not None:
-        below = find(setting.case).build(setting.dx, ride_on)
-        riders = Riders(scene, below, device)
+    splats = None
+    if (carried_by := options.pop("carried_by", None)) is not None:
+        below = find(setting.case).build(setting.dx, carried_by)
+        splats = CarriedSplats(scene, below, device)
         options["deformation"] = True
         more = {"gaussians": scene.count, "points": below.count}
-    player = _player(setting, device, options)
+    runner = _runner(setting, device, options)
     if setting.method == TEXTBOOK:  # once, for the kernels of PyTorch to be loaded
-        player(dataclasses.replace(below, times=below.times[:1]))
-    run = player(below) if riders is None else player(below, watch=riders.watch)
-    runs = [run if riders is None else riders.run(run)]
-    runs += [_moved(player, below, seed) for seed in range(1, seeds)]
+        runner(dataclasses.replace(below, times=below.times[:1]))
+    run = runner(below) if splats is None else runner(below, watch=splats.watch)
+    runs = [run if splats is None else splats.run(run)]
+    runs += [_moved(runner, below, seed) for seed in range(1, seeds)]
     last = dataclasses.replace(below, times=below.times[-1:])
-    carried = 0.0 if riders is None else float(np.median(riders.seconds)) * scene.times.shape[0]
+    carried = 0.0 if splats is None else float(np.median(splats.seconds)) * scene.times.shape[0]
     steps = run.steps
     wall: list[float] = []
     if run.failed or setting.method == TEXTBOOK:  # its steps are the host's: a stop costs nothing
         return runs, [run.wall_seconds], run.steps, more
     if device.startswith("cuda"):
-        player(last)  # a graph of this length; on a CPU the judged run has warmed everything
+        runner(last)  # a graph of this length; on a CPU the judged run has warmed everything
     while len(wall) < repeat and (not wall or sum(wall) < _ENOUGH):
-        timed = player(last)
+        timed = runner(last)
         steps = timed.steps
         wall.append(timed.wall_seconds + carried)
     return runs, wall, steps, more
 
 
-def _player(setting: Setting, device: str, options: dict[str, Any]) -> Callable[..., Run]:
+def _runner(setting: Setting, device: str, options: dict[str, Any]) -> Callable[..., Run]:
     seed = options.pop("shuffle", None)
     single = options.pop("single_steps", False)
     if setting.method == TEXTBOOK:
-        from gsfluent.lab.textbook.solver import play_textbook
+        from gsfluent.lab.textbook.solver import run_textbook
 
-        return lambda scene: play_textbook(scene, device=device, **options)
+        return lambda scene: run_textbook(scene, device=device, **options)
 
     def run(scene: Scene, **more: Any) -> Run:
         with stepwise(single):
-            return play(scene, device=device, **options, **more)
+            return run_case(scene, device=device, **options, **more)
 
     return run if seed is None else lambda scene, **more: shuffled(scene, run, seed)
 
 
-def shuffled(scene: Scene, run: Player, seed: int) -> Run:
+def shuffled(scene: Scene, run: Runner, seed: int) -> Run:
     """Run a scene with its points in another order; the run that comes back has the scene's own."""
     order = np.random.default_rng(seed).permutation(scene.count)
     back = np.argsort(order)
@@ -212,17 +205,7 @@ def broken(
     seconds: float,
     **facts: Any,
 ) -> Record:
-    """The record of a setting that raised.
-
-    Args:
-        setting: What was to be run.
-        device: Where.
-        error: What it raised.
-        kind: Of the case.
-        points: Material points.
-        seconds: To be simulated [s].
-        **facts: Further settings.
-    """
+    """The record of a setting that raised."""
     words = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
     return Record(
         case=setting.case, kind=kind, method=setting.method, variant=setting.variant,

@@ -8,10 +8,8 @@ import math
 import pytest
 import torch
 
-from gsfluent.lab.problems.fracture.slab import SEPARATE, plane, wave_speed
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.shapes import ball, box, parameters
-from gsfluent.lab.world.violations import (
+from gsfluent.lab.world.invariants import (
     Limits,
     OfWorld,
     State,
@@ -20,6 +18,8 @@ from gsfluent.lab.world.violations import (
     first_violation,
     observe,
 )
+from gsfluent.lab.world.shapes import ball, box, parameters, wave_speed
+from gsfluent.lab.world.walls import wall
 
 REST = State(
     step=0, time=0.0, finite=True, kinetic=2.0, elastic=1.0, momentum=((1.0, 0.0, 0.0),),
@@ -179,7 +179,7 @@ def test_a_real_blow_up_is_found_at_the_same_step_however_often_it_is_looked_at(
 
 
 def test_a_ball_that_falls_and_bounces_is_within_the_laws() -> None:
-    floor = plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE, friction=0.3)[None]
+    floor = wall(2, mode="separate", friction=0.3)[None]
     world = World(
         ball([0.0, 0.0, 0.28], 0.2, 0.5 * DX), [0.2 * C, 0.0, -0.1 * C], mass=1000.0 * POINT,
         volume=POINT, dx=DX, law=0, params=ROW, colliders=floor, gravity=(0.0, 0.0, -9.81),
@@ -196,7 +196,7 @@ def test_a_ball_that_falls_and_bounces_is_within_the_laws() -> None:
 
 def test_a_crushed_ball_breaks_the_range_of_j() -> None:
     row = parameters(1e3, 0.3, 1000.0)
-    floor = plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], mode=SEPARATE)[None]
+    floor = wall(2, mode="separate")[None]
     world = World(
         ball([0.0, 0.0, 0.3], 0.25, 0.5 * DX), [0.0, 0.0, -3.0 * wave_speed(row)],
         mass=1000.0 * POINT, volume=POINT, dx=DX, law=0, params=row, colliders=floor,

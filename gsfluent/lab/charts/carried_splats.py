@@ -1,4 +1,4 @@
-"""Gaussians that ride on material points, judged like points of their own.
+"""Gaussians that are carried by material points, judged like points of their own.
 
 The points of a dense scene (as many as a splat has Gaussians) are carried by those of a sparse one
 as :mod:`gsfluent.pipeline.matter.carry` carries splats: each by its nearest points of its body at
@@ -22,17 +22,9 @@ from gsfluent.pipeline.matter.carry import BLEND
 from gsfluent.pipeline.matter.links import NEIGHBOURS
 from gsfluent.spatial.neighbours import nearest_rows
 
-__all__ = ["Riders"]
 
-
-class Riders:
-    """The points of a dense scene on those of a sparse one.
-
-    Args:
-        dense: Scene whose points ride.
-        sparse: The same body with fewer points.
-        device: Where.
-    """
+class CarriedSplats:
+    """The points of a dense scene on those of a sparse one."""
 
     def __init__(self, dense: Scene, sparse: Scene, device: str) -> None:
         self.dense, self.sparse, self.device = dense, sparse, torch.device(device)
@@ -50,13 +42,13 @@ class Riders:
         """What carrying took at each time [s]."""
 
     def watch(self, world: World, i: int) -> None:
-        """Carry the points to where the world is (for ``frozen.answer.play``).
+        """Carry the points to where the world is (for ``frozen.answer.run_case``).
 
         Raises:
             ValueError: The world tracks no deformation.
         """
         if world.deformation is None:
-            raise ValueError("Riders: the world must track the deformation (deformation=True)")
+            raise ValueError("CarriedSplats: the world tracks no deformation (deformation=True)")
         if self.device.type == "cuda":
             torch.cuda.synchronize()
         start = time.perf_counter()
@@ -74,7 +66,7 @@ class Riders:
         self.x[i], self.v[i] = x.cpu().numpy(), v.cpu().numpy()
 
     def run(self, below: Run) -> Run:
-        """The riders' run, from that of the points below."""
+        """The run of what is carried, from that of the points below."""
         return Run(
             below.scene, below.method, below.times, self.x, self.v, below.wall_seconds,
             below.steps, below.settings, below.device, below.failed,
@@ -84,7 +76,7 @@ class Riders:
 def _bind(
     rest: Tensor, place: Tensor, dense: Scene, sparse: Scene, spacing: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Nearest point of the own body of each rider, and neighbours of each point.
+    """Nearest point of the own body of each carried one, and neighbours of each point.
 
     Returns:
         Owners int64 [M], neighbours int64 [N, K], and which of these are there only to fill the
