@@ -38,35 +38,24 @@ _MASK_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
 
 @dataclasses.dataclass(frozen=True)
 class LabelView:
-    """The labels of one photograph.
+    """The labels of one photograph."""
 
-    Attributes:
-        camera: Pinhole camera of the map.
-        labels: Label per pixel, int32 [H, W]: 0 for none, -1 where the photograph says nothing.
-    """
-
-    camera: Camera
+    camera: Camera  # pinhole camera of the map
+    # label per pixel, int32 [H, W]: 0 for none, -1 where the photograph says nothing.
     labels: NDArray[np.int32]
 
 
 @dataclasses.dataclass(frozen=True)
 class Segmentation:
-    """Label maps of some of a capture's photographs.
+    """Label maps of some of a capture's photographs."""
 
-    Attributes:
-        source: Where they are from, for messages.
-        views: Maps, in the order of the capture's cameras.
-        names: Name of every label number above 0.
-        linked: A number means the same part in all views. When False the numbers are instances of
-            one view (Segment Anything), and 0 means unknown, not "no part".
-        notes: What was noticed while reading.
-    """
-
-    source: str
-    views: tuple[LabelView, ...]
-    names: dict[int, str]
+    source: str  # where they are from, for messages
+    views: tuple[LabelView, ...]  # maps, in the order of the capture's cameras
+    names: dict[int, str]  # name of every label number above 0
+    # A number means the same part in all views. When False the numbers are instances of one view
+    # (Segment Anything), and 0 means unknown, not "no part".
     linked: bool = True
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what was noticed while reading
 
     def number(self, label: str | int) -> int:
         """Return the number of a label given by name or number.

@@ -36,22 +36,14 @@ _OPAQUE = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Orientation:
-    """How an input stands in its own coordinates.
+    """How an input stands in its own coordinates."""
 
-    Attributes:
-        up: Unit up axis [3], world.
-        up_from: What it was taken from: ``given``, ``support plane``, ``cameras`` or
-            ``convention``.
-        floor: Coordinate of the floor along ``up``, world units.
-        floor_from: ``given``, ``support plane`` or ``lowest point``.
-        focus: Point that the cameras look at [3], or the centre of the splats.
-    """
-
-    up: Array
+    up: Array  # unit up axis [3], world
+    # what it was taken from: ``given``, ``support plane``, ``cameras`` or ``convention``.
     up_from: str
-    floor: float
-    floor_from: str
-    focus: Array
+    floor: float  # coordinate of the floor along ``up``, world units
+    floor_from: str  # ``given``, ``support plane`` or ``lowest point``
+    focus: Array  # point that the cameras look at [3], or the centre of the splats
 
 
 def orient(

@@ -44,15 +44,10 @@ def draws(seed: int, purpose: int, step: int) -> torch.Generator:
 
 @dataclass(frozen=True)
 class Place:
-    """Where Gaussians may be.
+    """Where Gaussians may be."""
 
-    Attributes:
-        hull: Visual hull of the object; None for a whole scene.
-        eyes: Camera positions [V, 3].
-    """
-
-    hull: Hull | None
-    eyes: Tensor
+    hull: Hull | None  # visual hull of the object; None for a whole scene
+    eyes: Tensor  # camera positions [V, 3]
 
     @torch.no_grad()
     def misplaced(self, model: SplatModel) -> Tensor:
@@ -72,17 +67,11 @@ class Place:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the image error asks of the next change of the count.
+    """What the image error asks of the next change of the count."""
 
-    Attributes:
-        grow: Gaussians that may be multiplied, bool [N]; None for all.
-        drop: Gaussians that the images do not need, bool [N]; None for none.
-        stop: Add none at all.
-    """
-
-    grow: Tensor | None = None
-    drop: Tensor | None = None
-    stop: bool = False
+    grow: Tensor | None = None  # gaussians that may be multiplied, bool [N]; None for all
+    drop: Tensor | None = None  # gaussians that the images do not need, bool [N]; None for none
+    stop: bool = False  # add none at all
 
 
 class Density:

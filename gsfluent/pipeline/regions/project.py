@@ -32,21 +32,16 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class SkinLabels:
-    """What the photographs say about a solid's skin.
+    """What the photographs say about a solid's skin."""
 
-    Attributes:
-        skin: The voxels.
-        label: Label per voxel, int64 [S]: 0 for none, -1 where no photograph shows it.
-        share: Share of the votes that the label got, float32 [S]; 0 where it got none.
-        field: What the inside is labelled from (:func:`label_field`), float32 [S, L + 2].
-        segmentation: The labels, linked between views.
-    """
-
-    skin: Skin
+    skin: Skin  # the voxels
+    # label per voxel, int64 [S]: 0 for none, -1 where no photograph shows it.
     label: NDArray[np.int64]
+    # share of the votes that the label got, float32 [S]; 0 where it got none.
     share: NDArray[np.float32]
+    # what the inside is labelled from (:func:`label_field`), float32 [S, L + 2].
     field: NDArray[np.float32]
-    segmentation: Segmentation
+    segmentation: Segmentation  # the labels, linked between views
 
     @property
     def numbers(self) -> NDArray[np.int64]:

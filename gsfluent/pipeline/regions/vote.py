@@ -37,23 +37,15 @@ _FACING = 0.15  # cosine below which a voxel is seen edge-on and its pixels are 
 
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """Voxels of a solid that border the outside.
+    """Voxels of a solid that border the outside."""
 
-    Attributes:
-        index: Voxels, int64 [S, 3], in row-major order.
-        normals: Outward unit normals, float32 [S, 3].
-        centers: Centres, world units, float32 [S, 3].
-        surface: Where the surface passes by, found between voxels, world units, float32 [S, 3].
-        splats: What is drawn: the skin first, then the layer below it.
-        neighbours: Adjacency of the skin's voxels (26 neighbours), csr [S, S] of ones.
-    """
-
-    index: NDArray[np.int64]
-    normals: NDArray[np.float32]
-    centers: NDArray[np.float32]
+    index: NDArray[np.int64]  # voxels, int64 [S, 3], in row-major order
+    normals: NDArray[np.float32]  # outward unit normals, float32 [S, 3]
+    centers: NDArray[np.float32]  # centres, world units, float32 [S, 3]
+    # where the surface passes by, found between voxels, world units, float32 [S, 3].
     surface: NDArray[np.float32]
-    splats: Gaussians
-    neighbours: csr_matrix
+    splats: Gaussians  # what is drawn: the skin first, then the layer below it
+    neighbours: csr_matrix  # adjacency of the skin's voxels (26 neighbours), csr [S, S] of ones
 
     def __len__(self) -> int:
         """Return the number of voxels."""

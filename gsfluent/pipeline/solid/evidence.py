@@ -51,19 +51,12 @@ class SolidOptions:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the solid of splats is decided from, gathered once.
+    """What the solid of splats is decided from, gathered once."""
 
-    Attributes:
-        splats: Those that can be part of a surface.
-        unusable: How many of the visible ones cannot.
-        capture: Their photographs, or None.
-        resolution: Voxels along the longest side of the object.
-    """
-
-    splats: Gaussians
-    unusable: int
-    capture: Capture | None
-    resolution: int
+    splats: Gaussians  # those that can be part of a surface
+    unusable: int  # how many of the visible ones cannot
+    capture: Capture | None  # their photographs, or None
+    resolution: int  # voxels along the longest side of the object
 
     @staticmethod
     def of(gaussians: Gaussians, capture: Capture | None, resolution: int) -> Evidence:

@@ -31,17 +31,11 @@ _CHUNK = 1 << 18  # points at a time: their values stay in the caches of a CPU
 
 @dataclass(frozen=True)
 class Fused:
-    """What cameras say about points; arrays of the shape of the points or the grid.
+    """What cameras say about points; arrays of the shape of the points or the grid."""
 
-    Attributes:
-        values: Truncated signed distance [voxels], negative inside.
-        near: Cameras that saw a surface there.
-        known: Cameras that saw it, free or near the surface.
-    """
-
-    values: np.ndarray
-    near: np.ndarray
-    known: np.ndarray
+    values: np.ndarray  # truncated signed distance [voxels], negative inside
+    near: np.ndarray  # cameras that saw a surface there
+    known: np.ndarray  # cameras that saw it, free or near the surface
 
     def on_grid(self, chosen: np.ndarray, free: float) -> Fused:
         """Values of points on the grid that they were chosen from, bool [X, Y, Z].
@@ -58,19 +52,12 @@ class Fused:
 
 @dataclass(frozen=True)
 class DepthView:
-    """Depths as one camera sees them, [H, W] each.
+    """Depths as one camera sees them, [H, W] each."""
 
-    Attributes:
-        camera: The camera.
-        depth: Median depth [world units].
-        slant: Cosine between ray and surface.
-        state: 2 where the ray is stopped, 1 next to such a pixel, 0 where light passes.
-    """
-
-    camera: Camera
-    depth: Tensor
-    slant: Tensor
-    state: Tensor
+    camera: Camera  # the camera
+    depth: Tensor  # median depth [world units]
+    slant: Tensor  # cosine between ray and surface
+    state: Tensor  # 2 where the ray is stopped, 1 next to such a pixel, 0 where light passes
 
 
 @torch.no_grad()

@@ -34,23 +34,14 @@ _BURIED = 3.5  # voxels below the closed surface
 
 @dataclass(frozen=True)
 class Closed:
-    """Result of :func:`vote_solid`; voxels bool [X, Y, Z].
+    """Result of :func:`vote_solid`; voxels bool [X, Y, Z]."""
 
-    Attributes:
-        box: The grid.
-        shell: Where the density is that of a surface.
-        loose: Shell and everything that it encloses.
-        solid: The same with the outer flank of the shell peeled off.
-        hull: What the masks allow, or None without masks.
-        notes: What was noticed.
-    """
-
-    box: GridBox
-    shell: np.ndarray
-    loose: np.ndarray
-    solid: np.ndarray
-    hull: np.ndarray | None
-    notes: dict[str, Any]
+    box: GridBox  # the grid
+    shell: np.ndarray  # where the density is that of a surface
+    loose: np.ndarray  # shell and everything that it encloses
+    solid: np.ndarray  # the same with the outer flank of the shell peeled off
+    hull: np.ndarray | None  # what the masks allow, or None without masks
+    notes: dict[str, Any]  # what was noticed
 
 
 def vote_solid(known: Evidence, options: SolidOptions) -> Closed:
