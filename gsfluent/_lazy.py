@@ -1,4 +1,8 @@
-"""Names of a package that cost nothing until somebody takes one (PEP 562)."""
+"""Names of a package, and modules that take a while to import, that cost nothing until used.
+
+:func:`lazy` makes the public names of a package (PEP 562). ``from gsfluent._lazy import cv2``
+stands at the top of a file like any other import, and ``import gsfluent`` still costs torch alone.
+"""
 
 from __future__ import annotations
 
@@ -32,3 +36,15 @@ def lazy(
         return found[name]
 
     return get, lambda: sorted({*vars(sys.modules[package]), *home}), list(home)
+
+
+class _Lazy:
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, key: str) -> Any:
+        return getattr(importlib.import_module(self._name), key)
+
+
+cv2 = _Lazy("cv2")
+ndimage = _Lazy("scipy.ndimage")
