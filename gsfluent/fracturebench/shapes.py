@@ -111,8 +111,7 @@ def free(
 
     return Scene(
         name=name, dx=float(dx), x=points, v=np.array(np.broadcast_to(velocity, (n, 3)), float),
-        volume=np.full(n, dx**3 / per_cell) if volume is None else volume,
-        material=index(material), body=index(body),
-        affine=np.zeros((n, 3, 3)) if affine is None else affine,
-        times=times, materials=rows, facts=dict(facts or {}), **more,
+        volume=np.full(n, dx**3 / per_cell) if volume is None else volume, material=index(material),
+        body=index(body), affine=np.zeros((n, 3, 3)) if affine is None else affine, times=times,
+        materials=rows, facts=dict(facts or {}), **more,
     )  # fmt: skip

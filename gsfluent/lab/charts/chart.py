@@ -46,10 +46,9 @@ def bandwidth(device: str) -> Record:
     rate = moved / min(seconds[1:])
     return Record(
         case="copy", kind="machine", method="torch copy", variant="",
-        settings={"gigabytes_per_second": rate / 1e9, "bytes_per_point_step": BYTES},
-        device=device, machine=machine(device), points=0, steps=0, simulated_seconds=0.0,
-        wall_seconds=seconds[1:], wall_per_simulated=0.0, ns_per_point_step=1e9 * BYTES / rate,
-        error=0.0, commit=commit(),
+        settings={"gigabytes_per_second": rate / 1e9, "bytes_per_point_step": BYTES}, device=device,
+        machine=machine(device), points=0, steps=0, simulated_seconds=0.0, wall_seconds=seconds[1:],
+        wall_per_simulated=0.0, ns_per_point_step=1e9 * BYTES / rate, error=0.0, commit=commit(),
         date=now(),
     )  # fmt: skip
 

@@ -123,8 +123,7 @@ def _record(kind: str, job: Job, repeat: int, device: str, where: str, version: 
         simulated_seconds=1.0, wall_seconds=list(out.wall_seconds), wall_per_simulated=wall,
         ns_per_point_step=1e9 * wall / max(1, out.count), error=out.error,
         measures=[{"quantity": name, "value": value} for name, value in out.measures.items()],
-        failed=failed, commit=version,
-        date=now(),
+        failed=failed, commit=version, date=now(),
     )  # fmt: skip
 
 

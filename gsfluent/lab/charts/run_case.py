@@ -210,8 +210,7 @@ def broken(
     return Record(
         case=setting.case, kind=kind, method=setting.method, variant=setting.variant,
         settings={"dx": setting.dx, "ppc": setting.ppc, **facts}, device=device,
-        machine=machine(device), points=points, steps=0, simulated_seconds=seconds,
-        wall_seconds=[], wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
-        failed=words.rstrip(": "), commit=commit(),
-        date=now(),
+        machine=machine(device), points=points, steps=0, simulated_seconds=seconds, wall_seconds=[],
+        wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
+        failed=words.rstrip(": "), commit=commit(), date=now(),
     )  # fmt: skip

@@ -31,11 +31,9 @@ def scene_of(
     n = len(points)
     return Scene(
         name="stability", dx=dx, x=points.double().numpy(), v=velocity.double().numpy(),
-        volume=np.full(n, volume), material=np.zeros(n, np.int32),
-        body=np.zeros(n, np.int32),
-        affine=np.zeros((n, 3, 3)),
-        times=np.array([1.0]), materials=(dict(material),), gravity=gravity,
-        colliders=tuple(colliders),
+        volume=np.full(n, volume), material=np.zeros(n, np.int32), body=np.zeros(n, np.int32),
+        affine=np.zeros((n, 3, 3)), times=np.array([1.0]), materials=(dict(material),),
+        gravity=gravity, colliders=tuple(colliders),
     )  # fmt: skip
 
 

@@ -105,9 +105,8 @@ def lone_point(away: float, which: str, variant: str, place: Place) -> Outcome:
     still = torch.zeros(1, 3, dtype=torch.float64)
     if which == "gsfluent":
         world = World(
-            at, still, volume=DX**3, dx=DX, law=0,
-            params=parameters(YOUNG, 0.3, DENSITY), dt=1e-4, dtype=torch.float32,
-            device=place.device,
+            at, still, volume=DX**3, dx=DX, law=0, params=parameters(YOUNG, 0.3, DENSITY), dt=1e-4,
+            dtype=torch.float32, device=place.device,
         )  # fmt: skip
         return watched(world, steps, place)
     return watched_textbook(

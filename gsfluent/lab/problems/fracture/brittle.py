@@ -200,9 +200,8 @@ def run(
         pass
     broken = float((solver.brittle & (solver.alpha >= 0.0)).double().mean())
     return Outcome(
-        last.cpu().numpy(), solver.alpha.double().cpu().numpy(), solver.steps, solver.birth,
-        broken, solver.kinetic() / start, smallest, violation, expected,
-        np.stack(track) if track else None,
+        last.cpu().numpy(), solver.alpha.double().cpu().numpy(), solver.steps, solver.birth, broken,
+        solver.kinetic() / start, smallest, violation, expected, np.stack(track) if track else None,
     )  # fmt: skip
 
 
