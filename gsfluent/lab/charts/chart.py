@@ -64,14 +64,8 @@ def run(
 ) -> Done:
     """Run what a file does not hold yet; a line is added as soon as its run is done.
 
-    Args:
-        settings: The ladder.
-        path: Of the records.
-        device: Where.
-        repeat: Timed runs of each.
-        budget: Seconds in all; what is expected to pass them is left out. A run's time is expected
-            to go with points times steps of the last similar one.
-        progress: Told before every run.
+    What is expected to pass the budget [s] is left out: a run's time goes with points times steps of
+    the last similar one.
     """
     begun = time.monotonic()
     have = {r.key: r for r in read(path)} if path.exists() else {}

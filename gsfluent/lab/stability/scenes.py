@@ -101,7 +101,10 @@ def brittle(
     place: Place,
     **options: Any,
 ) -> World:
-    """A NACC ball that breaks on a floor (equations.md, the drop of row 8), at a fixed step."""
+    """A NACC ball that breaks on a floor (equations.md, the drop of row 8), (c + v) dt / dx fixed.
+
+    ``order`` is the seed of another numbering of its points.
+    """
     row = nacc(
         BRITTLE["young_modulus"], BRITTLE["poisson_ratio"], BRITTLE["density"],
         friction=BRITTLE["friction"], cohesion=BRITTLE["cohesion"], hardening=hardening,

@@ -203,7 +203,7 @@ def released_point(courant: float, which: str, variant: str, place: Place) -> Ou
     }  # fmt: skip
     scene = scene_of(
         points, velocity, (0.5 * SPACING) ** 3, material, dx=SPACING, gravity=(0.0, 0.0, -9.81),
-        colliders=[floor],
+        colliders=(floor,),
     )  # fmt: skip
     return watched_textbook(
         scene, STEPS, place, dt=courant * SPACING / (c * (1.0 + IMPACT)),

@@ -33,12 +33,9 @@ def bodies(
     volume = SPACING**3
     options = {"volume": volume, "dx": 1.0, "law": 0, **options}
     return World(
-        torch.cat(parts),
-        speed,
-        params=options.pop("params", parameters(YOUNG, POISSON, 1.0)),
-        body=None if one_field else body,
-        **options,
-    )
+        torch.cat(parts), speed, params=options.pop("params", parameters(YOUNG, POISSON, 1.0)),
+        body=None if one_field else body, **options,
+    )  # fmt: skip
 
 
 def turning(world: World, of: Tensor) -> Tensor:
@@ -113,9 +110,7 @@ def _impact(
     points, volume = smooth_ball(radius)
     parts = [points + sign * place + shift for sign in (-1.0, 1.0)]
     volume = torch.cat([volume, volume])
-    world = bodies(
-        parts, [speed * along, -speed * along], volume=volume, **options
-    )  # fmt: skip
+    world = bodies(parts, [speed * along, -speed * along], volume=volume, **options)
     first = torch.arange(len(world.position)) < len(parts[0])
     return world, [first, ~first], line
 

@@ -163,16 +163,10 @@ def bend(load: float) -> tuple[float, float, int]:
         world.velocity, world.affine = velocity, world.affine * keep
 
     world = World(
-        points,
-        [0.0, 0.0, 0.0],
-        volume=volume,
-        dx=dx,
-        law=0,
-        params=parameters(young, 0.0, density),
-        force=pull,
-        cfl=0.8,
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=0,
+        params=parameters(young, 0.0, density), force=pull, cfl=0.8,
         colliders=[wall(0, mode="sticky"), PLANE_STRAIN],
-    ).run(1.5 * period)
+    ).run(1.5 * period)  # fmt: skip
     moved = (world.position.double().cpu() - points)[end].mean(0)
     return float(moved[1]) / arm, -float(moved[0]) / arm, world.steps
 

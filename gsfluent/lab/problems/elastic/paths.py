@@ -105,6 +105,5 @@ def return_map_paths() -> Iterator[Result]:
         ("q / mu after uniaxial compression", shear, 0.70, 0.01),
     ):
         yield compare(
-            quantity, value, reference, error=abs(value - reference), tolerance=bar,
-            source=_SOURCE,
+            quantity, value, reference, error=abs(value - reference), tolerance=bar, source=_SOURCE,
         )  # fmt: skip

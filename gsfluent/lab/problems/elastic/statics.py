@@ -39,15 +39,9 @@ def settle(
     rate: float,
     **given: Any,
 ) -> World:
-    """Move the colliders for ``ramp`` seconds, stop them, and let the body come to rest.
+    """Move the colliders for ``ramp`` seconds, hold them for ``hold``, damped at ``rate`` [1/s].
 
-    Args:
-        position: [m], [N, 3].
-        load: Collider rows for a share of full speed: 1 while they move, 0 while they hold.
-        ramp: Time of motion [s].
-        hold: Time at rest afterwards [s].
-        rate: Damping [1/s] in both.
-        given: Further arguments of World.
+    ``load`` gives their rows at a share of full speed: 1 while they move, 0 while they hold.
     """
     force = damping(rate)
     world = World(position, [0.0, 0.0, 0.0], colliders=load(1.0), force=force, **given).run(ramp)
@@ -210,13 +204,9 @@ def shear_and_back() -> Iterator[Result]:
         source="simple shear; GaussianBench C2",
     )  # fmt: skip
     again = World(
-        out.position,
-        out.velocity,
-        affine=out.affine,
-        strain=out.strain,
-        colliders=load(-1.0),
+        out.position, out.velocity, affine=out.affine, strain=out.strain, colliders=load(-1.0),
         **given,
-    ).run(seconds)
+    ).run(seconds)  # fmt: skip
     left = slope_of_shear(again, inner)
     yield compare(
         "shear left in the middle after the way back", left, tolerance=0.05, source="elastic",

@@ -30,16 +30,9 @@ def projectile() -> Iterator[Result]:
     v, g = torch.tensor(speed, dtype=torch.float64), torch.tensor(gravity, dtype=torch.float64)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
         world = World(
-            points,
-            speed,
-            volume=1e-6,
-            dx=0.02,
-            law=0,
-            params=parameters(1e5, 0.3, 1000.0),
-            gravity=gravity,
-            dt=5e-4,
-            dtype=dtype,
-        ).run(steps=100)
+            points, speed, volume=1e-6, dx=0.02, law=0, params=parameters(1e5, 0.3, 1000.0),
+            gravity=gravity, dt=5e-4, dtype=dtype,
+        ).run(steps=100)  # fmt: skip
         t = world.time
         flight = v * t + 0.5 * g * t * (t + world.dt)
         error = largest(world.position.double().cpu() - points - flight) / float(v.norm() * t)
@@ -102,17 +95,9 @@ def covariance_transport() -> Iterator[Result]:
     wanted = exact @ spread @ exact.T
     for dtype, tolerance in ((torch.float64, 1e-11), (torch.float32, 1e-4)):
         world = World(
-            points,
-            [0.0, 0.0, 0.0],
-            volume=1e-6,
-            dx=0.02,
-            law=0,
-            params=parameters(1e-16, 0.3, 1000.0),
-            dt=dt,
-            deformation=True,
-            dtype=dtype,
-            force=stir,
-        ).run(steps=steps)
+            points, [0.0, 0.0, 0.0], volume=1e-6, dx=0.02, law=0,
+            params=parameters(1e-16, 0.3, 1000.0), dt=dt, deformation=True, dtype=dtype, force=stir,
+        ).run(steps=steps)  # fmt: skip
         assert world.deformation is not None
         f = world.deformation.double().cpu()
         error = largest(f @ spread @ f.mT - wanted) / largest(wanted)
@@ -244,16 +229,9 @@ def far_from_origin() -> Iterator[Result]:
     ends = []
     for dtype, shift in ((torch.float64, 0.0), (torch.float32, away)):
         world = World(
-            points + shift,
-            points @ turn.T,
-            affine=turn.expand(points.shape[0], 3, 3),
-            volume=1e-6,
-            dx=0.02,
-            law=0,
-            params=parameters(1e5, 0.3, 1000.0),
-            dt=4e-4,
-            dtype=dtype,
-        ).run(steps=200)
+            points + shift, points @ turn.T, affine=turn.expand(points.shape[0], 3, 3), volume=1e-6,
+            dx=0.02, law=0, params=parameters(1e5, 0.3, 1000.0), dt=4e-4, dtype=dtype,
+        ).run(steps=200)  # fmt: skip
         ends.append(world.position.double().cpu() - shift)
     error = largest(ends[1] - ends[0]) / 0.02
     yield compare(
@@ -264,15 +242,9 @@ def far_from_origin() -> Iterator[Result]:
     # points that creep: less than half a unit in the last place per step
     speed = 0.25 * away * torch.finfo(torch.float32).eps / 4e-4
     world = World(
-        points + away,
-        [speed, 0.0, 0.0],
-        volume=1e-6,
-        dx=0.02,
-        law=0,
-        params=parameters(1e5, 0.3, 1000.0),
-        dt=4e-4,
-        dtype=torch.float32,
-    ).run(steps=200)
+        points + away, [speed, 0.0, 0.0], volume=1e-6, dx=0.02, law=0,
+        params=parameters(1e5, 0.3, 1000.0), dt=4e-4, dtype=torch.float32,
+    ).run(steps=200)  # fmt: skip
     moved = float(world.center()[0]) - away
     yield compare(
         "distance crept at a quarter of a rounding per step", moved, speed * 200 * 4e-4,
@@ -291,14 +263,9 @@ def turned_frame() -> Result:
         rate = turn @ pull @ turn.T
         x = points @ turn.T
         world = World(
-            x,
-            x @ rate.T,
-            affine=rate.expand(x.shape[0], 3, 3),
-            volume=1.25e-7,
-            dx=0.01,
-            law=0,
+            x, x @ rate.T, affine=rate.expand(x.shape[0], 3, 3), volume=1.25e-7, dx=0.01, law=0,
             params=parameters(1e5, 0.3, 1000.0),
-        ).run(0.02)
+        ).run(0.02)  # fmt: skip
         energies.append((world.kinetic(), world.elastic()))
     whole = sum(energies[0])
     error = max(abs(a - b) for a, b in zip(*energies, strict=True)) / whole

@@ -109,8 +109,7 @@ def single_edge_notch() -> Iterator[Result]:
         error = run.fastest if run.mean > 0.0 else math.inf
         yield compare(
             f"fastest crack over c_R, {n} cells", run.fastest, 1.0, error=error, tolerance=1.0,
-            source=source,
-            note=f"mean {run.mean:.2f} c_R, within {run.spread:.2f} dx of the line",
+            source=source, note=f"mean {run.mean:.2f} c_R, within {run.spread:.2f} dx of the line",
         )  # fmt: skip
     change = abs(runs[-1].mean - runs[0].mean) / max(runs[0].mean, 1e-9)
     yield compare(
