@@ -51,7 +51,7 @@ class Run:
     device: str = ""  # on what
     failed: str = ""  # why it broke off, or empty
     damage: Floats | None = None  # 0 intact to 1 broken, [T, N], if the method knows
-    # cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept
+    # Cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept
     stress: Floats | None = None
     # given by each collider, and then by each drive, so far [N s], [T, K, 3], if kept
     impulse: Floats | None = None

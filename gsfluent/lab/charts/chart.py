@@ -64,7 +64,7 @@ def run(
 ) -> Done:
     """Run what a file does not hold yet; a line is added as soon as its run is done.
 
-    What is expected to pass the budget [s] is left out: a run's time goes with points times steps of
+    What is expected to pass the budget [s] is left out: time goes with points times steps of
     the last similar one.
     """
     begun = time.monotonic()

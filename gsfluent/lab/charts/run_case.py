@@ -94,12 +94,7 @@ def even_dt(scene: Scene, courant: float) -> float:
 
 
 def _runs(
-    setting: Setting,
-    scene: Scene,
-    device: str,
-    options: dict[str, Any],
-    repeat: int,
-    seeds: int,
+    setting: Setting, scene: Scene, device: str, options: dict[str, Any], repeat: int, seeds: int
 ) -> tuple[list[Run], list[float], int, dict[str, Any]]:
     """The judged runs, the times, the steps of a timed run, and facts."""
     below = scene

@@ -161,7 +161,7 @@ def run(
 ) -> Outcome:
     """Run a scene by the textbook solver for a number of steps, or until a number is none.
 
-    Positions are kept (``every``), :func:`exposure` is looked at (``exposed``), energy and volume are
+    Positions are kept (``every``), :func:`exposure` looked at (``exposed``), energy and volume
     judged (``judged``) every so manieth step; 0 is never.
     """
     solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt)
