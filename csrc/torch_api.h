@@ -175,7 +175,9 @@ struct Boxed<kOp> {
 // The operators of a family, `Ops` for the back end of dispatch key `key`: `Ops::name(...)`
 // implements gsfluent::name. GSF_IMPL stands in `Ops::register_all(m)`.
 using Library = torch::stable::detail::StableLibrary;
-#define GSF_IMPL(Ops, name) m.impl(#name, &gsf::Boxed<&Ops::name>::call)
+#define GSF_IMPL(Ops, name) m.impl(#name, TORCH_BOX(&Ops::name))
+// The same where a parameter stands for several values of the schema.
+#define GSF_IMPL_UNBOX(Ops, name) m.impl(#name, &gsf::Boxed<&Ops::name>::call)
 #define GSF_REGISTER(key, ...) \
   STABLE_TORCH_LIBRARY_IMPL(gsfluent, key, m) { __VA_ARGS__::register_all(m); }
 

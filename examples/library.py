@@ -15,7 +15,7 @@ from pathlib import Path
 
 import gsfluent as gf
 from gsfluent.demo import make_capture
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 from gsfluent.pipeline.render.studio import Studio
 
 
@@ -38,7 +38,8 @@ def main() -> int:
     reconstruct = gf.pipeline.Reconstruct(
         iterations=options.iterations, max_gaussians=8000, device=options.device
     )
-    gaussians, report = reconstruct(capture)
+    gaussians = reconstruct(capture)
+    report = gaussians.report
     gaussians = gf.pipeline.Isolate()(gaussians, capture)
     solid = gf.pipeline.Fill()(gaussians.to(options.device), capture)
     texture = gf.pipeline.Texture(method="exemplar", exemplar=paths.cut, device=options.device)
@@ -51,21 +52,22 @@ def main() -> int:
 
     camera = gf.Camera.look_at((0.42, -0.5, 0.34), (0.0, 0.0, 0.05), width=320, height=240)
     studio = Studio(height=0.0, center=(0.0, 0.0), radius=0.05, extent=0.3)
-    render = gf.pipeline.Render(camera, Light(direction=(1.0, -1.0, 2.0)), studio=studio)
-    simulate = gf.pipeline.Simulate(quality="preview", device=options.device)
+    render = gf.pipeline.Render(camera, key_light(direction=(1.0, -1.0, 2.0)), studio=studio)
     fps = 30.0
     fall = round(fps * 0.37)  # it lands after 0.38 s; pictures are made from then on
-    for frame in simulate(scene, fps=fps, seconds=(fall + options.frames) / fps):
+    simulate = gf.pipeline.Simulate(quality="preview", device=options.device)
+    simulation = simulate(scene, fps=fps, seconds=(fall + options.frames) / fps)
+    for frame in simulation:
         if frame.index < fall:
             continue
-        image = render(frame.gaussians, groups=frame.groups)  # [H, W, 3], on the device
+        image = render(frame.gaussians, groups=frame.groups).image  # [H, W, 3], on the device
         gf.io.save_image(image.cpu(), options.out / f"frame_{frame.index:03d}.png")
         sys.stdout.write(
             f"t = {frame.time:.3f} s: {frame.stats['fragments']} pieces, "
             f"{frame.energy['kinetic']:.3f} J, {frame.gaussians.count} splats\n"
         )
     gf.save(frame.gaussians, options.out / "last.ply")  # opens in any splat viewer
-    sys.stdout.write(f"{report['psnr']:.1f} dB held out; {simulate.report()['verdict']}\n")
+    sys.stdout.write(f"{report['psnr']:.1f} dB held out; {simulation.report['verdict']}\n")
     return 0
 
 

@@ -2,6 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
+from collections.abc import Iterable
+from types import ModuleType
+
+EXTRAS = {
+    "mesh": ("scikit-image",),
+    "viewer": ("viser",),
+    "usd": ("usd-core",),
+    "inpaint": ("transformers", "accelerate"),
+    "figures": ("matplotlib",),
+}
+"""Packages that gsfluent does without until they are asked for: extra -> names on the index."""
+
 
 class GsfluentError(Exception):
     """Base class of gsfluent's own errors."""
@@ -23,6 +36,39 @@ class InputError(GsfluentError, ValueError):
         self.what = what
         self.hint = hint
         super().__init__(f"{what}\n  hint: {hint}" if hint else what)
+
+
+def check_choice(what: str, value: object, allowed: Iterable[object], hint: str = "") -> None:
+    """Raise :class:`InputError` unless ``value`` is one of ``allowed``; ``what`` names it."""
+    names = list(allowed)
+    if value not in names:
+        listed = ", ".join(str(name) for name in names if name != "")
+        raise InputError(f"{what} must be one of {listed}, got {value!r}", hint)
+
+
+class MissingPackage(InputError):
+    """A package of an extra is asked for and not installed."""
+
+
+def need(module: str, extra: str, what: str) -> ModuleType:
+    """Import a package that only an extra installs.
+
+    Args:
+        module: Its module.
+        extra: The extra of gsfluent that brings it.
+        what: Who needs it, the first words of the message.
+
+    Raises:
+        MissingPackage: It cannot be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        raise MissingPackage(
+            f"{what} needs {package}, which is not installed ({error})",
+            f'pip install "gsfluent[{extra}]"',
+        ) from error
 
 
 class RunError(GsfluentError, RuntimeError):

@@ -149,20 +149,6 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack([columns[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], dim=-1)
 
 
-def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colour max(0, SH(direction) + 0.5) as 3DGS defines it.
-
-    Args:
-        sh: Coefficients [N, K, 3].
-        directions: Directions from the camera to the splats [N, 3]; normalised here.
-
-    Returns:
-        Colours [N, 3], not negative.
-    """
-    basis = sh_basis(functional.normalize(directions, dim=-1), sh_degree(sh.shape[-2]))
-    return ((basis[..., None] * sh).sum(dim=-2) + 0.5).clamp_min(0.0)
-
-
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
     """Constant SH coefficient of a colour: ``(rgb - 0.5) / 0.28209``."""
     return (rgb - 0.5) / SH0
@@ -209,6 +195,22 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
         block = inverse @ basis
         parts.append(block @ sh[..., order * order : (order + 1) ** 2, :])
     return torch.cat(parts, dim=-2)
+
+
+def trilinear(grid: Tensor, place: Tensor) -> Tensor:
+    """Values [N] of a grid [X, Y, Z] between its points, at places [N, 3] in steps; 0 outside."""
+    size = torch.tensor(grid.shape, device=place.device)
+    base = place.floor()
+    fraction, base = place - base, base.to(torch.int64)
+    total = grid.new_zeros(len(place))
+    for corner in range(8):
+        step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=place.device)
+        index = base + step
+        inside = ((index >= 0) & (index < size)).all(dim=1)
+        weight = torch.where(step.bool(), fraction, 1 - fraction).prod(dim=1) * inside
+        index = torch.minimum(index.clamp_min(0), size - 1)
+        total += weight.to(grid) * grid[index[:, 0], index[:, 1], index[:, 2]]
+    return total
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # before torch starts its threads: spinning barriers crawl on a busy machine (see gsfluent/cli)
@@ -45,3 +46,16 @@ def data_root() -> Path:
     if not (root / "README.md").exists():
         pytest.skip(f"real data not found at {root}; set GSFLUENT_DATA to its folder")
     return root
+
+
+@pytest.fixture
+def without(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Make a package look as if it were not installed."""
+
+    def block(package: str) -> None:
+        for name in list(sys.modules):
+            if name.startswith(package + "."):
+                monkeypatch.delitem(sys.modules, name)
+        monkeypatch.setitem(sys.modules, package, None)
+
+    return block

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 import gsfluent as gf
 from gsfluent.errors import InputError
 from gsfluent.io import save_splats
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 
 
 def shell(radius: float = 0.1, count: int = 4000) -> gf.Gaussians:
@@ -40,16 +41,16 @@ def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
     scene = gf.Scene(floor=0.0)
     scene.add(solid, material=gf.materials.fruit.watermelon)
     camera = gf.Camera.look_at((0.5, -0.5, 0.3), (0.0, 0.0, 0.1), width=64, height=48)
-    render = gf.pipeline.Render(camera, Light())
-    simulate = gf.pipeline.Simulate(dx=0.025)
-    for frame in simulate(scene, fps=30, seconds=2 / 30):
-        image = render(frame.gaussians)
+    render = gf.pipeline.Render(camera, key_light())
+    simulation = gf.pipeline.Simulate(dx=0.025)(scene, fps=30, seconds=2 / 30)
+    for frame in simulation:
+        image = render(frame.gaussians).image
         assert image.shape == (48, 64, 3) and bool(image.isfinite().all())
         # the green ball is in the picture, before a white ground
         assert float((image[..., 1] - image[..., 0]).max()) > 0.1
         assert frame.damage.shape == frame.fragments.shape
         assert frame.energy["kinetic"] >= 0.0
-    assert simulate.report()["verdict"] == "clean"
+    assert simulation.report["verdict"] == "clean"
     # a solid without a frame stands on the floor, not in the ground
     assert abs(float(frame.particles.position[:, 2].min())) < 0.03
 
@@ -57,6 +58,17 @@ def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
 @pytest.mark.parametrize("name", gf.ops.__all__)
 def test_every_op_is_public(name: str) -> None:
     assert callable(getattr(gf.ops, name))
+
+
+@pytest.mark.parametrize("package", [gf, gf.ops, gf.pipeline])
+def test_a_package_lists_what_it_gives_and_refuses_the_rest(package: ModuleType) -> None:
+    assert set(package.__all__) <= set(dir(package))
+    for name in package.__all__:
+        assert getattr(package, name) is getattr(package, name)
+    with pytest.raises(
+        AttributeError, match=f"module '{package.__name__}' has no attribute 'teapot'"
+    ):
+        _ = package.teapot
 
 
 def test_nothing_below_the_floor_is_accepted_with_a_frame() -> None:

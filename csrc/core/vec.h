@@ -79,7 +79,9 @@ GSF_HOST_DEVICE Vec3<T> load_vec3(const T* p) {
 }
 template <typename T>
 GSF_HOST_DEVICE void store_vec3(T* p, const Vec3<T>& v) {
-  for (int i = 0; i < 3; ++i) p[i] = v[i];
+  p[0] = v.x;
+  p[1] = v.y;
+  p[2] = v.z;
 }
 template <typename T>
 GSF_HOST_DEVICE Mat3<T> load_mat3(const T* p) {

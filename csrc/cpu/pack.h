@@ -97,21 +97,22 @@ T largest_lane(Pack<T> x) {
   return largest;
 }
 
-// One value per lane of a vector, from f(lane).
-template <typename Vector, typename F>
-Vector lanes_of(const F& f) {
-  if constexpr (sizeof(Vector{}[0]) == 4)
-    return Vector{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)};
-  else
-    return Vector{f(0), f(1), f(2), f(3)};
-}
+// One value per lane, from f(lane).
 template <typename T, typename F>
 Pack<T> pack_of(const F& f) {
-  return lanes_of<typename Pack<T>::Raw>(f);
+  using Raw = typename Pack<T>::Raw;
+  if constexpr (sizeof(T) == 4)
+    return Raw{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)};
+  else
+    return Raw{f(0), f(1), f(2), f(3)};
 }
 template <typename T, typename F>
 typename Pack<T>::Int int_pack_of(const F& f) {
-  return lanes_of<typename Pack<T>::Int>(f);
+  using Int = typename Pack<T>::Int;
+  if constexpr (sizeof(T) == 4)
+    return Int{f(0), f(1), f(2), f(3), f(4), f(5), f(6), f(7)};
+  else
+    return Int{f(0), f(1), f(2), f(3)};
 }
 
 // Sign bit of every lane; for a mask, the lanes where it holds.

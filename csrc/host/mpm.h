@@ -273,9 +273,9 @@ struct MpmOps {
   }
 
   static void register_all(Library& m) {
-    GSF_IMPL(MpmOps, p2g);
-    GSF_IMPL(MpmOps, g2p);
-    GSF_IMPL(MpmOps, p2g_adjoint);
+    GSF_IMPL_UNBOX(MpmOps, p2g);
+    GSF_IMPL_UNBOX(MpmOps, g2p);
+    GSF_IMPL_UNBOX(MpmOps, p2g_adjoint);
     GSF_IMPL(MpmOps, grid_update);
   }
 };

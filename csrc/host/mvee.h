@@ -11,7 +11,8 @@ struct MveeOps {
   static std::tuple<Tensor, Tensor> mvee(const Tensor& points, double tolerance,
                                          int64_t max_iterations) {
     const char* op = "mvee";
-    const Tensor x = ready(op, "points", points, points, {-1, -1, 3});
+    check_shape(op, "points", points, {-1, -1, 3});
+    const Tensor x = gsf::contiguous(points);
     const int64_t batch = x.size(0), count = x.size(1);
     STD_TORCH_CHECK(batch == 0 || count > 0, op, ": points must hold at least one point per set");
     STD_TORCH_CHECK(count <= INT32_MAX && max_iterations >= 0 && max_iterations <= INT32_MAX, op,
@@ -40,12 +41,20 @@ struct MveeOps {
                                                               const Tensor& covariance_b,
                                                               double radius, double flat) {
     const char* op = "mvee_lens";
-    const Tensor ma = ready(op, "mean_a", mean_a, mean_a, {-1, 3});
-    const int64_t batch = ma.size(0);
-    const ScalarType dtype = ma.scalar_type();
-    const Tensor ca = ready(op, "covariance_a", covariance_a, ma, {batch, 6});
-    const Tensor mb = ready(op, "mean_b", mean_b, ma, {batch, 3});
-    const Tensor cb = ready(op, "covariance_b", covariance_b, ma, {batch, 6});
+    check_shape(op, "mean_a", mean_a, {-1, 3});
+    const int64_t batch = mean_a.size(0);
+    const ScalarType dtype = mean_a.scalar_type();
+    check_shape(op, "covariance_a", covariance_a, {batch, 6});
+    check_shape(op, "mean_b", mean_b, {batch, 3});
+    check_shape(op, "covariance_b", covariance_b, {batch, 6});
+    check_dtype(op, "covariance_a", covariance_a, dtype);
+    check_dtype(op, "mean_b", mean_b, dtype);
+    check_dtype(op, "covariance_b", covariance_b, dtype);
+    check_same_device(op, "covariance_a", covariance_a, mean_a);
+    check_same_device(op, "mean_b", mean_b, mean_a);
+    check_same_device(op, "covariance_b", covariance_b, mean_a);
+    const Tensor ma = gsf::contiguous(mean_a), ca = gsf::contiguous(covariance_a),
+                 mb = gsf::contiguous(mean_b), cb = gsf::contiguous(covariance_b);
     Tensor mean = gsf::new_empty(ma, {batch, 3}, dtype);
     Tensor covariance = gsf::new_empty(ma, {batch, 6}, dtype);
     Tensor overlap = gsf::new_empty(ma, {batch}, ScalarType::Bool);

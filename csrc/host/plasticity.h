@@ -13,17 +13,34 @@ struct PlasticityOps {
       const Tensor& params, const OptTensor& material, double k, double epsilon, bool implicit,
       double dt) {
     const char* op = "return_mapping";
-    const Tensor e = ready(op, "strain", strain, strain, {-1, 6});
-    const int64_t n = e.size(0);
-    const ScalarType dtype = e.scalar_type();
-    const Tensor a = ready(op, "alpha", alpha, e, {n});
-    const Tensor inc = ready(op, "increment", increment, e, {n, 3, 3});
-    const Tensor l = ready(op, "law", law, e, {-1}, ScalarType::Int);
-    const int64_t rows = l.size(0);
-    const Tensor par = ready(op, "params", params, e, {rows, kParamColumns});
-    const OptTensor mat = ready(op, "material", material, e, {n}, ScalarType::Int);
+    check_shape(op, "strain", strain, {-1, 6});
+    const int64_t n = strain.size(0);
+    const ScalarType dtype = strain.scalar_type();
+    check_shape(op, "alpha", alpha, {n});
+    check_shape(op, "increment", increment, {n, 3, 3});
+    check_shape(op, "law", law, {-1});
+    const int64_t rows = law.size(0);
+    check_shape(op, "params", params, {rows, kParamColumns});
+    check_dtype(op, "alpha", alpha, dtype);
+    check_dtype(op, "increment", increment, dtype);
+    check_dtype(op, "params", params, dtype);
+    check_dtype(op, "law", law, ScalarType::Int);
+    check_same_device(op, "alpha", alpha, strain);
+    check_same_device(op, "increment", increment, strain);
+    check_same_device(op, "law", law, strain);
+    check_same_device(op, "params", params, strain);
+    if (material) {
+      check_shape(op, "material", *material, {n});
+      check_dtype(op, "material", *material, ScalarType::Int);
+      check_same_device(op, "material", *material, strain);
+    }
     STD_TORCH_CHECK(material || rows == 1 || rows == n, op,
                     ": without material, params must have 1 or N rows, got ", rows);
+
+    const Tensor e = gsf::contiguous(strain), a = gsf::contiguous(alpha),
+                 inc = gsf::contiguous(increment), l = gsf::contiguous(law),
+                 par = gsf::contiguous(params);
+    const OptTensor mat = material ? OptTensor(gsf::contiguous(*material)) : OptTensor();
     Tensor strain_out = gsf::new_empty(e, {n, 6}, dtype);
     Tensor alpha_out = gsf::new_empty(e, {n}, dtype);
     Tensor stress_out = gsf::new_empty(e, {n, 6}, dtype);
@@ -38,7 +55,7 @@ struct PlasticityOps {
                                       .rows = rows,
                                       .law = cptr<int32_t>(l),
                                       .params = cptr<T>(par),
-                                      .material = cptr<int32_t>(mat),
+                                      .material = mat ? cptr<int32_t>(*mat) : nullptr,
                                       .k = T(k),
                                       .epsilon = T(epsilon),
                                       .implicit_alpha = implicit,

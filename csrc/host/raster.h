@@ -84,19 +84,20 @@ RasterArgs<T> raster_args(const RasterInputs& in, int64_t width, int64_t height,
   STD_TORCH_CHECK(width > 0 && height > 0 && width <= 65536 && height <= 65536, kRasterOp,
                   ": width and height must lie in 1..65536, got ", width, " x ", height);
   RasterArgs<T> a{};
+  const auto pointer = [](const OptTensor& t) { return t ? cptr<T>(*t) : nullptr; };
   a.means = cptr<T>(in.means);
   a.opacities = cptr<T>(in.opacities);
   a.viewmat = cptr<T>(in.viewmat);
   a.intrinsics = cptr<T>(in.intrinsics);
-  a.quats = cptr<T>(in.quats);
-  a.scales = cptr<T>(in.scales);
-  a.covars = cptr<T>(in.covars);
-  a.sh = cptr<T>(in.sh);
-  a.colors = cptr<T>(in.colors);
-  a.normals = cptr<T>(in.normals);
-  a.background = cptr<T>(in.background);
-  a.offset = cptr<T>(in.offset);
-  a.groups = cptr<int32_t>(in.groups);
+  a.quats = pointer(in.quats);
+  a.scales = pointer(in.scales);
+  a.covars = pointer(in.covars);
+  a.sh = pointer(in.sh);
+  a.colors = pointer(in.colors);
+  a.normals = pointer(in.normals);
+  a.background = pointer(in.background);
+  a.offset = pointer(in.offset);
+  a.groups = in.groups ? cptr<int32_t>(*in.groups) : nullptr;
   a.count = in.means.size(0);
   a.cameras = static_cast<int>(in.cameras());
   a.sh_degree = in.sh ? raster_sh_degree(*in.sh) : -1;
@@ -250,10 +251,11 @@ struct RasterOps {
       a.tile_start = const_cast<int32_t*>(cptr<int32_t>(lists[1]));
       a.instances = const_cast<int32_t*>(cptr<int32_t>(lists[2]));
       a.instance_count = lists[2].numel();
-      b.grad_image = cptr<T>(grad_image);
-      b.grad_alpha = cptr<T>(grad_alpha);
-      b.grad_depth = cptr<T>(grad_depth);
-      b.grad_normal = cptr<T>(grad_normal);
+      const auto pointer = [](const OptTensor& t) { return t ? cptr<T>(*t) : nullptr; };
+      b.grad_image = pointer(grad_image);
+      b.grad_alpha = pointer(grad_alpha);
+      b.grad_depth = pointer(grad_depth);
+      b.grad_normal = pointer(grad_normal);
 
       const auto zeros_like = [&](const OptTensor& t) {
         return t ? torch::stable::new_zeros(like, t->sizes(), scalar_type_of<T>())

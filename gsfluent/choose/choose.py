@@ -26,17 +26,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.simulate.engine import CFL
 from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
-
-__all__ = [
-    "LEVELS",
-    "Growth",
-    "Probing",
-    "Probes",
-    "choose",
-    "choose_setting",
-    "run_probes",
-    "summary",
-]
+from gsfluent.stages.simulate import solver_options
 
 _log = logging.getLogger(__name__)
 
@@ -49,19 +39,12 @@ LONG_STEP = 0.7
 
 @dataclasses.dataclass(frozen=True)
 class Probing:
-    """How a shot is probed.
+    """How a shot is probed."""
 
-    Args:
-        levels: Cells of the probes, coarse to fine, at least three.
-        frames: Frames from just before something happens.
-        seeds: Runs per level; None: three where something can break, else two.
-        cfl: Courant numbers to offer beside 0.5.
-    """
-
-    levels: tuple[int, ...] = LEVELS
-    frames: int = FRAMES
-    seeds: int | None = None
-    cfl: tuple[float, ...] = (LONG_STEP,)
+    levels: tuple[int, ...] = LEVELS  # Cells of the probes, coarse to fine, at least three
+    frames: int = FRAMES  # Frames from just before something happens
+    seeds: int | None = None  # Runs per level; None: three where something can break, else two
+    cfl: tuple[float, ...] = (LONG_STEP,)  # Courant numbers to offer beside 0.5
 
     def __post_init__(self) -> None:
         if len(self.levels) < 3 or list(self.levels) != sorted(set(self.levels)):
@@ -81,37 +64,25 @@ QUICK = Probing(levels=(8, 10, 12), frames=6, seeds=2)
 
 @dataclasses.dataclass(frozen=True)
 class Growth:
-    """Factors from the window to the end of the shot, by observable.
+    """Factors from the window to the end of the shot, by observable."""
 
-    Attributes:
-        mean: On the error of the mean of many runs.
-        spread: On the scatter between runs.
-    """
-
-    mean: Mapping[str, float]
-    spread: Mapping[str, float]
+    mean: Mapping[str, float]  # On the error of the mean of many runs
+    spread: Mapping[str, float]  # On the scatter between runs
 
 
 @dataclasses.dataclass(frozen=True)
 class Probes:
-    """What was run.
+    """What was run."""
 
-    Attributes:
-        whole: Over the whole shot: the first runs of the two coarsest levels.
-        levels: All levels by seed, at least to the end of the window; the two coarsest to the end
-            where matter breaks, else their first seeds.
-        long: With the longer steps, Courant number to its runs on the middle level.
-        first: First frame of the window.
-        last: Last frame + 1.
-        fps: Frames per second.
-    """
-
-    whole: tuple[Probe, Probe]
+    whole: tuple[Probe, Probe]  # Over the whole shot: the first runs of the two coarsest levels
+    # All levels by seed, at least to the end of the window; the two coarsest to the end where
+    # matter breaks, else their first seeds.
     levels: tuple[tuple[Probe, ...], ...]
+    # With the longer steps, Courant number to its runs on the middle level.
     long: Mapping[float, tuple[Probe, ...]]
-    first: int
-    last: int
-    fps: float
+    first: int  # First frame of the window
+    last: int  # Last frame + 1
+    fps: float  # Frames per second
 
     @property
     def seconds(self) -> float:
@@ -148,8 +119,8 @@ def run_probes(
     def go(cells: int, number: int, frames: int, cfl: float = CFL) -> Probe:
         nonlocal done
         found = probe(
-            scene, cells, fps=fps, frames=frames, cfl=cfl, seed=seed + number, device=device,
-            standing=shot.solve.standing, loose_crumbs=shot.solve.loose_crumbs,
+            scene, cells, fps=fps, frames=frames, seed=seed + number, device=device,
+            options=dataclasses.replace(solver_options(shot), cfl=cfl),
         )  # fmt: skip
         if found.failed:
             raise InputError(

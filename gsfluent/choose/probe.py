@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from gsfluent.choose.fit import History
 from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
-
-__all__ = ["ACTIVE", "Probe", "Seen", "distance", "histories", "probe", "window"]
 
 Array = NDArray[np.float64]
 
@@ -34,29 +33,17 @@ ACTIVE = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What one run showed.
+    """What one run showed."""
 
-    Attributes:
-        tracks: Per body centre of mass and extents by frame [m], name to [T, 6].
-        kinetic: Kinetic energy of all matter [J], [T].
-        elastic: Stored energy [J], [T].
-        dissipated: Energy lost, beyond what gravity gave [J], [T].
-        momentum: [N s], [T, 3].
-        broken: Share of the mass that is broken, [T].
-        largest: Share of the mass in the largest piece, [T].
-        mass: Of all matter [kg].
-        length: Extent of the largest solid along its longest side [m].
-    """
-
-    tracks: dict[str, Array]
-    kinetic: Array
-    elastic: Array
-    dissipated: Array
-    momentum: Array
-    broken: Array
-    largest: Array
-    mass: float
-    length: float
+    tracks: dict[str, Array]  # Per body centre of mass and extents by frame [m], name to [T, 6]
+    kinetic: Array  # Kinetic energy of all matter [J], [T]
+    elastic: Array  # Stored energy [J], [T]
+    dissipated: Array  # Energy lost, beyond what gravity gave [J], [T]
+    momentum: Array  # [N s], [T, 3]
+    broken: Array  # Share of the mass that is broken, [T]
+    largest: Array  # Share of the mass in the largest piece, [T]
+    mass: float  # Of all matter [kg]
+    length: float  # Extent of the largest solid along its longest side [m]
 
     @property
     def frames(self) -> int:
@@ -66,35 +53,20 @@ class Seen:
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """One run at one setting.
+    """One run at one setting."""
 
-    Attributes:
-        cells: Cells along the largest solid.
-        cfl: Courant number.
-        seed: Of point positions and weakness.
-        seen: What it showed, from time 0.
-        seconds: Wall time of the steps [s].
-        points: Material points.
-        point_steps: Points moved on the grid, summed over steps, by frame, [T].
-        steps: Steps of the grid.
-        blocks: Blocks of the grid in use, mean over the steps.
-        fields: Most velocity fields.
-        composed: Steps of the composable operators.
-        failed: Why it broke off, or empty.
-    """
-
-    cells: int
-    cfl: float
-    seed: int
-    seen: Seen
-    seconds: float
-    points: int
-    point_steps: Array
-    steps: int
-    blocks: float
-    fields: int
-    composed: int
-    failed: str = ""
+    cells: int  # Cells along the largest solid
+    cfl: float  # Courant number
+    seed: int  # Of point positions and weakness
+    seen: Seen  # What it showed, from time 0
+    seconds: float  # Wall time of the steps [s]
+    points: int  # Material points
+    point_steps: Array  # Points moved on the grid, summed over steps, by frame, [T]
+    steps: int  # Steps of the grid
+    blocks: float  # Blocks of the grid in use, mean over the steps
+    fields: int  # Most velocity fields
+    composed: int  # Steps of the composable operators
+    failed: str = ""  # Why it broke off, or empty
 
 
 def probe(
@@ -103,11 +75,9 @@ def probe(
     *,
     fps: float,
     frames: int,
-    cfl: float,
+    options: SolverOptions,
     seed: int,
     device: torch.device | str = "cpu",
-    standing: bool = False,
-    loose_crumbs: bool = False,
     tick: Callable[[], None] | None = None,
 ) -> Probe:
     """Run a scene without its splats and watch it.
@@ -117,16 +87,14 @@ def probe(
         cells: Cells along the largest solid.
         fps: Frames per second.
         frames: How many, from time 0.
-        cfl: Courant number.
+        options: How the matter is moved.
         seed: Seed of point positions and weakness.
         device: Where to compute.
-        standing: See :class:`Simulate`.
-        loose_crumbs: See :class:`Simulate`.
         tick: Called after every frame.
     """
     stage = Simulate(
-        dx=grid_spacing(scene, cells), seed=seed, device=device, cfl=cfl, splats=False,
-        repair=False, standing=standing, loose_crumbs=loose_crumbs,
+        dx=grid_spacing(scene, cells), seed=seed, device=device, splats=False, repair=False,
+        options=options,
     )  # fmt: skip
     with torch.no_grad():
         run = stage.run_of(scene, fps)
@@ -155,7 +123,7 @@ def probe(
         mass=float(run.matter.particles.mass.sum()), length=length,
     )  # fmt: skip
     return Probe(
-        cells=cells, cfl=cfl, seed=seed, seen=seen, seconds=run.seconds,
+        cells=cells, cfl=options.cfl, seed=seed, seen=seen, seconds=run.seconds,
         points=run.matter.particles.count, point_steps=np.array(spent, dtype=np.float64),
         steps=counters.steps, blocks=counters.block_steps / max(counters.steps, 1),
         fields=counters.fields_max, composed=counters.composed_steps, failed=run.failure,

@@ -12,17 +12,15 @@ import torch
 
 from gsfluent.choose.choose import Probing, choose
 from gsfluent.config import Shot
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, MissingPackage
 from gsfluent.io import write_json
-from gsfluent.plan.stand_in import stand_in
+from gsfluent.plan.proxy import proxy
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import fingerprint, publish
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.context import RunContext
 from gsfluent.stages.simulate import build_scene, moving_settings
 from gsfluent.stages.solids import context_of, load_solids, make_solids
-
-__all__ = ["chart_shot", "choose_stage", "readable", "shot_scene"]
 
 _log = logging.getLogger(__name__)
 FILE, PICTURE = "chart.json", "chart.png"
@@ -44,7 +42,7 @@ def chart_shot(
         shot: The shot.
         bound: Largest error, a share.
         out: Folder for ``chart.json`` and ``chart.png``. If it is the folder of a run, the solids
-            of its finished stages are probed; else a stand-in of the right size.
+            of its finished stages are probed; else a proxy of the right size.
         probing: How to probe.
         device: Where to compute.
         seed: Seed of everything random.
@@ -64,8 +62,10 @@ def chart_shot(
     )  # fmt: skip
     result["solid"] = solid
     out.mkdir(parents=True, exist_ok=True)
-    _write(result, out)
-    result["outputs"] = {"chart": str(out / FILE), "picture": str(out / PICTURE)}
+    drawn = _write(result, out)
+    result["outputs"] = {"chart": str(out / FILE)}
+    if drawn:
+        result["outputs"]["picture"] = str(out / PICTURE)
     return result
 
 
@@ -86,7 +86,7 @@ def shot_scene(
         device: Where to compute.
         seed: Seed of everything random.
         reporter: Receives progress; log lines by default.
-        make: Do the stages up to the solids where they are not there, instead of a stand-in.
+        make: Do the stages up to the solids where they are not there, instead of a proxy.
 
     Raises:
         InputError: The shot is wrong.
@@ -97,17 +97,23 @@ def shot_scene(
         make_solids(context)
         return build_scene(shot, load_solids(context), context.frame), f"the stages in {out}"
     warnings: list[str] = []
-    standing = stand_in(shot, warnings)
+    found = proxy(shot, warnings)
     for warning in warnings:
         _log.warning("chart: %s", warning)
-    return build_scene(shot, dict(standing.solids), standing.frame), standing.assumed
+    return build_scene(shot, dict(found.solids), found.frame), found.assumed
 
 
-def _write(result: dict[str, Any], folder: Path) -> None:
+def _write(result: dict[str, Any], folder: Path) -> bool:
+    """Write the choice and draw it; whether it could be drawn."""
     from gsfluent.figure.choice import draw_choice
 
     write_json(folder / FILE, result)
-    draw_choice(result, folder / PICTURE)
+    try:
+        draw_choice(result, folder / PICTURE)
+    except MissingPackage as missing:  # the choice is worth having without its picture
+        _log.warning("%s is not drawn: %s", PICTURE, missing)
+        return False
+    return True
 
 
 def readable(result: dict[str, Any]) -> dict[str, Any]:
@@ -200,11 +206,12 @@ def choose_stage(context: RunContext) -> bool:
         return result
 
     result = context.store.run("choose", key, work)
-    publish(result.folder / PICTURE, context.out / PICTURE)
     publish(result.folder / FILE, context.out / FILE)
+    if (result.folder / PICTURE).is_file():
+        publish(result.folder / PICTURE, context.out / PICTURE)
+        context.record.values["outputs"]["chart"] = PICTURE
     found = result.report
     context.record.values["choice"] = {k: v for k, v in found.items() if k != "settings"}
-    context.record.values["outputs"]["chart"] = PICTURE
     chosen = found["chosen"]
     if chosen is None and found["floor"] > bound:
         chosen = found["enough"]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 
 Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")]
 
@@ -62,6 +62,7 @@ class Chart(Verb):
 
         if self.shot is not None or self.error is not None:
             return self._shot()
+        need("matplotlib", "figures", "chart")  # missing is better said before the runs
         if self.repeat < 1:
             raise InputError(f"--repeat {self.repeat}", "give at least 1")
         if self.budget is not None and self.budget < 0:
@@ -94,7 +95,6 @@ class Chart(Verb):
         from gsfluent.choose.shot import chart_shot, readable
         from gsfluent.config import load_shot
         from gsfluent.config.settings_solve import read_error
-        from gsfluent.progress import reporter
 
         if self.shot is None or self.error is None:
             got = "a bound without a shot" if self.shot is None else "a shot without a bound"
@@ -105,7 +105,7 @@ class Chart(Verb):
             )
         bound = read_error(self.error, "--error")
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
-        with reporter(quiet=self.json) as progress:
+        with self.reporter() as progress:
             result = chart_shot(
                 shot, bound, self.out, probing=QUICK if self.quick else None,
                 device=self.torch_device(), seed=self.seed, reporter=progress,
@@ -184,6 +184,7 @@ class Stability(Verb):
         from gsfluent.lab.stability.report import verdict, write_all
         from gsfluent.lab.stability.run import chosen, run_maps
 
+        need("matplotlib", "figures", "stability")  # missing is better said before the runs
         programs = measured(existing(self.peers, "--peers", folder=False)) if self.peers else []
         maps = [m for name in self.maps for m in name.split(",") if m]
         if self.draw:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from gsfluent import geometry
 from gsfluent.data._fields import TensorContainer, shape
 from gsfluent.data.frame import Frame
 from gsfluent.data.gaussians import Gaussians
@@ -84,9 +85,8 @@ class Solid(TensorContainer):
 
     def depth_at(self, points: Tensor) -> Tensor:
         """Depth below the surface [N] at world points [N, 3], trilinear; 0 off the grid."""
-        return _trilinear(self.depth[..., None], (points - self.origin.to(points)) / self.voxel)[
-            :, 0
-        ]
+        place = (points - self.origin.to(points)) / self.voxel - 0.5
+        return geometry.trilinear(self.depth, place)
 
     def color_at(self, points: Tensor) -> Tensor:
         """Colour [N, 3] of the voxel that holds each world point [N, 3]; nearest off the grid.
@@ -104,21 +104,3 @@ class Solid(TensorContainer):
     def transformed(self, frame: Frame) -> Solid:
         """Return the solid placed by ``frame`` after its present frame; tensors stay."""
         return self.replace(frame=frame if self.frame is None else frame.compose(self.frame))
-
-
-def _trilinear(grid: Tensor, position: Tensor) -> Tensor:
-    """Sample a grid [X, Y, Z, C], voxel centres at +0.5, at grid positions [N, 3]; 0 outside."""
-    size = torch.tensor(grid.shape[:3], device=position.device)
-    base = (position - 0.5).floor()
-    fraction = position - 0.5 - base
-    total = grid.new_zeros(position.shape[0], grid.shape[3])
-    for corner in range(8):
-        offset = torch.tensor(
-            [corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=position.device
-        )
-        index = base.to(torch.int64) + offset
-        inside = ((index >= 0) & (index < size)).all(dim=1)
-        weight = torch.where(offset.bool(), fraction, 1 - fraction).prod(dim=1) * inside
-        index = torch.minimum(index.clamp_min(0), size - 1)
-        total += weight.to(grid)[:, None] * grid[index[:, 0], index[:, 1], index[:, 2]]
-    return total

@@ -20,32 +20,32 @@ the splats are larger. Not of the smallest one, as thin discs have none to speak
 
 def delta(job: Job) -> str:
     """``splats.gsd``: every splat once, then only what changes; SH degree 0."""
-    reel, roster = job.reel, Roster()
+    sequence, roster = job.sequence, Roster()
     error = float("inf")
-    for place, moment in enumerate(reel):
+    for place, moment in enumerate(sequence):
         frame = delta_frame(moment, place)
         roster.meet(frame)
         # splats that close cracks are finer than those they are born between
         middle = np.sort(frame.scales, axis=1)[:, 1]
         error = min(error, _SHARE * float(np.quantile(middle, _FINE)))
-        job.report(place + 1, len(reel), "delta: which splats there are")
+        job.report(place + 1, len(sequence), "delta: which splats there are")
     write_delta(
         job.folder / "splats.gsd",
         _told(job),
         roster,
-        times=reel.times(),
+        times=sequence.times(),
         fps=job.fps,
         step=steps(error),
         key_every=job.options.key_every,
-        up=reel.up,
+        up=sequence.up,
     )
     return "splats.gsd"
 
 
 def _told(job: Job) -> Iterator[DeltaFrame]:
-    for place, moment in enumerate(job.reel):
+    for place, moment in enumerate(job.sequence):
         yield delta_frame(moment, place)
-        job.report(place + 1, len(job.reel), "delta")
+        job.report(place + 1, len(job.sequence), "delta")
 
 
 def delta_frame(moment: Moment, place: int) -> DeltaFrame:

@@ -31,18 +31,14 @@ UPS = tuple(_TURNS)
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One frame for export.
+    """One frame for export."""
 
-    Attributes:
-        saved: The frame; its splats are turned, relit and cut to the wanted SH degree, and its
-            points and velocities are turned.
-        fragment: Fragment of each splat (that of the point it follows), int32 [N], -1 for none.
-        material: Row of each splat in the scene's table of materials, int32 [N], -1 for none.
-    """
-
+    # The frame; its splats are turned, relit and cut to the wanted SH degree, and its points and
+    # velocities are turned.
     saved: SavedFrame
+    # Fragment of each splat (that of the point it follows), int32 [N], -1 for none.
     fragment: Tensor
-    material: Tensor
+    material: Tensor  # Row of each splat in the scene's table of materials, int32 [N], -1 for none
 
     @property
     def gaussians(self) -> Gaussians:
@@ -69,7 +65,7 @@ def upright(up: str) -> Frame:
     return Frame(torch.tensor(_TURNS[up], dtype=torch.float64), torch.zeros(3).double(), 1.0)
 
 
-class Reel:
+class FrameSequence:
     """The chosen frames of a finished (or running) simulation.
 
     Args:
@@ -134,9 +130,9 @@ class Reel:
         for place in range(len(self)):
             yield self.moment(place)
 
-    def turned(self, up: str) -> Reel:
+    def turned(self, up: str) -> FrameSequence:
         """The same frames with another axis up (formats that fix it)."""
-        other = object.__new__(Reel)
+        other = object.__new__(FrameSequence)
         other.__dict__.update(self.__dict__, up=up, turn=upright(up))
         return other
 
@@ -189,10 +185,10 @@ def _chosen(text: str | None, count: int) -> list[int]:
     return chosen
 
 
-class DeltaReel(Reel):
+class DeltaSequence(FrameSequence):
     """The chosen frames of a ``.gsd`` file; there are no material points, only their fragments.
 
-    Args: as :class:`Reel`, with the file for ``out``.
+    Args: as :class:`FrameSequence`, with the file for ``out``.
 
     Raises:
         InputError: Not such a file, or damaged.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from gsfluent.export.frames import Moment, Reel
+from gsfluent.export.frames import FrameSequence, Moment
 from gsfluent.io import write_json
 from gsfluent.progress import Progress, report_progress
 from gsfluent.results.store import content_digest, fingerprint
@@ -17,74 +17,45 @@ from gsfluent.results.store import content_digest, fingerprint
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """How the formats are written; each reads what concerns it.
+    """How the formats are written; each reads what concerns it."""
 
-    Attributes:
-        frames: Which frames, as in Python (``12``, ``10:40``, ``::2``); all by default.
-        sh: Highest SH degree to keep.
-        up: Axis that points up where the format leaves it open: ``z``, ``y`` or ``-y``.
-        constant: The same number and order of splats in every frame.
-        compressed: SuperSplat's compressed layout for PLY.
-        attributes: Properties ``fragment`` and ``material`` in PLY.
-        spz_version: 2 or 3.
-        usd_ending: ``usdc``, ``usda`` or ``usdz``.
-        usd_parts: Some of ``splats``, ``particles``, ``meshes``.
-        mesh_ending: ``ply``, ``obj`` or ``glb``.
-        mesh_blur: Point spacings over which fragments' surfaces are smoothed.
-        key_every: Frames from one key frame to the next of a delta file.
-        camera: Camera or camera path of pictures; the shot's own by default.
-        size: (width, height) of pictures [px]; the shot's own by default.
-        fps: Pictures or time codes per second; the shot's own by default.
-        alpha: Pictures with a transparent background instead of the studio.
-        relit: Bake the light into the colours of splats and meshes.
-        light: Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
-        lamps: More lamps.
-        environment: An equirectangular picture, ``sky`` or ``none``.
-    """
-
+    # Which frames, as in Python (``12``, ``10:40``, ``::2``); all by default.
     frames: str | None = None
-    sh: int = 0
-    up: str = "z"
-    constant: bool = False
-    compressed: bool = False
-    attributes: bool = False
-    spz_version: int = 3
-    usd_ending: str = "usdc"
+    sh: int = 0  # Highest SH degree to keep
+    up: str = "z"  # Axis that points up where the format leaves it open: ``z``, ``y`` or ``-y``
+    constant: bool = False  # The same number and order of splats in every frame
+    compressed: bool = False  # SuperSplat's compressed layout for PLY
+    attributes: bool = False  # Properties ``fragment`` and ``material`` in PLY
+    spz_version: int = 3  # 2 or 3
+    usd_ending: str = "usdc"  # ``usdc``, ``usda`` or ``usdz``
+    # Some of ``splats``, ``particles``, ``meshes``.
     usd_parts: tuple[str, ...] = ("splats", "particles")
-    mesh_ending: str = "ply"
-    mesh_blur: float = 1.0
-    key_every: int = 30
-    camera: str | None = None
+    mesh_ending: str = "ply"  # ``ply``, ``obj`` or ``glb``
+    mesh_blur: float = 1.0  # Point spacings over which fragments' surfaces are smoothed
+    key_every: int = 30  # Frames from one key frame to the next of a delta file
+    camera: str | None = None  # Camera or camera path of pictures; the shot's own by default
+    # (width, height) of pictures [px]; the shot's own by default.
     size: tuple[int, int] | None = None
-    fps: float | None = None
-    alpha: bool = False
-    relit: bool = False
+    fps: float | None = None  # Pictures or time codes per second; the shot's own by default
+    alpha: bool = False  # Pictures with a transparent background instead of the studio
+    relit: bool = False  # Bake the light into the colours of splats and meshes
+    # Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
     light: str | None = None
-    lamps: tuple[str, ...] = ()
-    environment: str | None = None
+    lamps: tuple[str, ...] = ()  # More lamps
+    environment: str | None = None  # An equirectangular picture, ``sky`` or ``none``
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One export.
+    """One export."""
 
-    Attributes:
-        out: Folder of the run.
-        folder: Where the files go.
-        reel: The chosen frames.
-        options: How.
-        fps: Frames per second of the simulation's frames.
-        device: Where pictures are rendered.
-        progress: Called per frame.
-    """
-
-    out: Path
-    folder: Path
-    reel: Reel
-    options: ExportOptions
-    fps: float
-    device: torch.device
-    progress: Progress | None = None
+    out: Path  # Folder of the run
+    folder: Path  # Where the files go
+    sequence: FrameSequence  # The chosen frames
+    options: ExportOptions  # How
+    fps: float  # Frames per second of the simulation's frames
+    device: torch.device  # Where pictures are rendered
+    progress: Progress | None = None  # Called per frame
 
     def report(self, done: int, total: int, note: str) -> None:
         """Tell whoever listens."""
@@ -106,27 +77,27 @@ class Job:
             folder: Below the export's folder.
             name: Of the files, with a field for the frame's number from 1.
             write: Writes one file, atomically.
-            frames: The frames, where they are not simply those of the reel.
+            frames: The frames, where they are not simply those of the sequence.
 
         Returns:
             The names of the files.
         """
         target = self.folder / folder
         target.mkdir(parents=True, exist_ok=True)
-        names = [name.format(index + 1) for index in self.reel.indices]
+        names = [name.format(index + 1) for index in self.sequence.indices]
         done = self._finished(target, kind)
         moments = None if frames is None else iter(frames)
         for place, file in enumerate(names):
             moment = None if moments is None else next(moments)
             if not (done and (target / file).is_file()):
-                write(target / file, moment or self.reel.moment(place))
+                write(target / file, moment or self.sequence.moment(place))
             self.report(place + 1, len(names), kind)
         self._forget_stale(target, name)
         return names
 
     def _finished(self, target: Path, kind: str) -> bool:
         """Whether files in the folder are of this very export; notes down that they will be."""
-        source = self.reel.source()
+        source = self.sequence.source()
         known = content_digest(source) if source.is_file() else None
         wanted = repr(replace(self.options, frames=None))
         key = fingerprint("export", kind, wanted, known, self._light())
@@ -151,7 +122,7 @@ class Job:
 
     def _forget_stale(self, target: Path, name: str) -> None:
         """Remove files beyond the run's last frame: an older, longer run's, which would play on."""
-        number = self.reel.total + 1
+        number = self.sequence.total + 1
         while (stale := target / name.format(number)).is_file():
             stale.unlink()
             number += 1

@@ -7,7 +7,7 @@ volume of its points (marching cubes, Lewiner et al. 2003).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsfluent.colors import srgb_to_linear
 from gsfluent.data import Gaussians
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 from gsfluent.export.frames import Moment, upright
 from gsfluent.export.job import Job, span
 from gsfluent.export.points import deposit
 from gsfluent.io import atomic_path
-from gsfluent.io.gltf import to_linear
-from gsfluent.pipeline.matter.rubble import REACH, clinging
+from gsfluent.pipeline.matter.debris import REACH, clinging
 from gsfluent.pipeline.solid.colors import surface_colors
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ BLUR = 1.0
 """Point spacings over which the matter of fragments is blurred: below, the points show as bumps;
 above, edges go round."""
 
-_CRUMBS = 0.75  # share of it for debris, whose crumbs are a few points each and would melt together
+_DEBRIS_BLUR = 0.75  # share of it for debris: parts of a few points each would melt together
 _APART = 2.0  # point spacings between heaps whose surfaces do not meet
 _REACHES = 3.0  # blurs around the matter that are looked at
 _NEAR = 1e-4  # a grid value this near to the level would make triangles without area
@@ -47,21 +47,13 @@ _TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The surface of one fragment in one frame.
+    """The surface of one fragment in one frame."""
 
-    Attributes:
-        fragment: Its number, -1 for all debris together.
-        vertices: [V, 3] in metres.
-        faces: [F, 3], normals out.
-        colors: [V, 3] in 0..1, display values.
-        volume: Volume of the points that make it up [m^3].
-    """
-
-    fragment: int
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    colors: NDArray[np.float32]
-    volume: float
+    fragment: int  # Its number, -1 for all debris together
+    vertices: NDArray[np.float64]  # [V, 3] in metres
+    faces: NDArray[np.int64]  # [F, 3], normals out
+    colors: NDArray[np.float32]  # [V, 3] in 0..1, display values
+    volume: float  # Volume of the points that make it up [m^3]
 
     @property
     def name(self) -> str:
@@ -73,7 +65,7 @@ class Piece:
         import trimesh
 
         rgba = np.full((len(self.vertices), 4), 255, np.uint8)
-        rgba[:, :3] = np.round((to_linear(self.colors) if linear else self.colors) * 255.0)
+        rgba[:, :3] = np.round((srgb_to_linear(self.colors) if linear else self.colors) * 255.0)
         number = np.full(len(self.vertices), self.fragment, np.int32)
         return trimesh.Trimesh(
             self.vertices,
@@ -95,7 +87,9 @@ def meshes(job: Job) -> str:
         raise InputError(f"--mesh-ending {ending}", f"choose from {', '.join(FORMATS)}")
     if not 0.5 <= job.options.mesh_blur <= 5.0:
         raise InputError(f"--mesh-blur {job.options.mesh_blur:g}", "give 0.5 to 5 point spacings")
-    _marching_cubes()  # missing is better said before the first frame
+    need(
+        "skimage.measure", "mesh", "meshes: a surface"
+    )  # missing is better said before the first frame
 
     def write(path: Path, moment: Moment) -> None:
         pieces = fragment_meshes(moment, job.options.mesh_blur)
@@ -105,7 +99,7 @@ def meshes(job: Job) -> str:
         save_pieces(path, list(pieces))
 
     if ending == "glb":
-        job = replace(job, reel=job.reel.turned("z"))
+        job = replace(job, sequence=job.sequence.turned("z"))
     return span("meshes", job.write_each("meshes", "meshes", f"frame_{{:04d}}.{ending}", write))
 
 
@@ -175,7 +169,7 @@ def fragment_meshes(moment: Moment, blur: float = BLUR) -> Iterator[Piece]:
     splats = np.where(anchor >= 0, piece[np.maximum(anchor, 0)], DEBRIS - 1)
     for number in np.unique(piece).tolist():
         mine = piece == number
-        width = blur * (_CRUMBS if number == DEBRIS else 1.0)
+        width = blur * (_DEBRIS_BLUR if number == DEBRIS else 1.0)
         vertices, faces = surface(where[mine], volumes[mine], spacing, width)
         rows = np.flatnonzero(splats == number)
         colors = _colors(moment.gaussians, rows, vertices, _CELL * spacing)
@@ -239,7 +233,7 @@ def _heap(
     """The surface around points that hang together."""
     from scipy.ndimage import gaussian_filter
 
-    marching_cubes = _marching_cubes()
+    measure = need("skimage.measure", "mesh", "meshes: a surface")
     cell = _CELL * spacing
     margin = 1 + int(np.ceil(_REACHES * blur / _CELL))
     filled, _, origin = deposit(where, volumes, np.zeros(len(where)), cell, margin)
@@ -255,7 +249,9 @@ def _heap(
         level = float(samples[-int(np.clip(round(cells), 1, len(samples) - 1))])
         shifted = level + np.where(density < level, -near, near)
         values = np.where(np.abs(density - level) < near, shifted, density)
-        corners, faces, _, _ = marching_cubes(values, level=level, gradient_direction="ascent")
+        corners, faces, _, _ = measure.marching_cubes(
+            values, level=level, gradient_direction="ascent"
+        )
         vertices = origin + corners.astype(np.float64) * cell
         got = _volume(vertices, faces)
         if got < 0:
@@ -299,14 +295,3 @@ def _colors(
     if len(rows):
         plain = plain.select(torch.from_numpy(rows).to(plain.device))
     return surface_colors(plain, points, width)
-
-
-def _marching_cubes() -> Callable[..., Any]:
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise InputError(
-            "meshes: scikit-image is not installed", 'pip install "gsfluent[mesh]"'
-        ) from error
-    found: Callable[..., Any] = marching_cubes
-    return found

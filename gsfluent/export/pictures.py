@@ -12,7 +12,6 @@ from torch import Tensor
 from gsfluent.errors import InputError
 from gsfluent.export.job import Job, span
 from gsfluent.export.relit import lighting_for
-from gsfluent.pipeline.light.from_shot import gloss_of
 from gsfluent.pipeline.render.camera import Action
 from gsfluent.pipeline.render.film import Film, poster_frame
 from gsfluent.pipeline.render.path import FREEZE_SECONDS, Cut, freeze
@@ -31,8 +30,8 @@ def mp4(job: Job) -> str:
     """
     if job.options.alpha:
         raise InputError("--alpha: mp4 has no transparency", "use --to png or --to webp")
-    reel = _Takes(job)
-    write_video(job.folder / "video.mp4", reel.frames("mp4"), fps=job.fps, size=reel.size)
+    sequence = _Pictures(job)
+    write_video(job.folder / "video.mp4", sequence.frames("mp4"), fps=job.fps, size=sequence.size)
     return "video.mp4"
 
 
@@ -44,13 +43,13 @@ def gif(job: Job) -> str:
     """
     if job.options.alpha:
         raise InputError("--alpha: gif has no soft transparency", "use --to png or --to webp")
-    write_animation(job.folder / "video.gif", _Takes(job).frames("gif"), fps=job.fps)
+    write_animation(job.folder / "video.gif", _Pictures(job).frames("gif"), fps=job.fps)
     return "video.gif"
 
 
 def webp(job: Job) -> str:
     """``video.webp``."""
-    write_animation(job.folder / "video.webp", _Takes(job).frames("webp"), fps=job.fps)
+    write_animation(job.folder / "video.webp", _Pictures(job).frames("webp"), fps=job.fps)
     return "video.webp"
 
 
@@ -62,7 +61,7 @@ def png(job: Job) -> str:
 
     folder = job.folder / "pictures"
     names: list[str] = []
-    for frame in _Takes(job).frames("png"):
+    for frame in _Pictures(job).frames("png"):
         names.append(f"picture_{len(names) + 1:04d}.png")
         with atomic_path(folder / names[-1]) as part:
             Image.fromarray(frame).save(part, compress_level=4)
@@ -73,7 +72,7 @@ def png(job: Job) -> str:
     return span("pictures", names)
 
 
-class _Takes:
+class _Pictures:
     """The film of an export: which frame each picture shows, and from where."""
 
     def __init__(self, job: Job) -> None:
@@ -89,19 +88,19 @@ class _Takes:
             output = replace(output, size=options.size)
         self.size = output.size
         shot = replace(shot, output=output)
-        self.film = Film.of(job.out, shot, lighting_for(shot, options), job.device)
+        self.film = Film(job.out, shot, lighting_for(shot, options), job.device)
         if options.alpha:
-            self.film.render.studio = self.film.render.backdrop = None
+            self.film.render.studio = self.film.backdrop = None
             self.film.render.background = (0.0, 0.0, 0.0)
         cuts = [Cut(index, camera) for index, camera in enumerate(self.film.cameras)]
         if frozen:
             cuts = self._freeze(str(choice))
-        wanted = set(job.reel.indices)
+        wanted = set(job.sequence.indices)
         self.cuts = [cut for cut in cuts if cut.frame in wanted]
 
     def _freeze(self, choice: str) -> list[Cut]:
         """Cuts for ``freeze`` (shortly after the largest break) or ``freeze:FRAME``."""
-        folder, count = self.job.reel.folder, count_frames(self.job.reel.folder)
+        folder, count = self.job.sequence.folder, count_frames(self.job.sequence.folder)
         saved = [load_frame(folder, index) for index in range(count)]
         text = choice.partition(":")[2]
         if text and not text.isdigit():
@@ -117,14 +116,8 @@ class _Takes:
         for done, cut in enumerate(self.cuts, start=1):
             if loaded is None or loaded.index != cut.frame:
                 loaded = self.film.frame(cut.frame)
-            layers = self.film.render.layers(
-                loaded.gaussians,
-                cut.camera,
-                groups=loaded.groups,
-                gloss=gloss_of(self.film.shot, loaded),
-                time=loaded.time,
-            )
-            image = straight(layers.image, layers.alpha) if self.job.options.alpha else layers.image
+            made = self.film.drawn(loaded.gaussians, loaded, cut.camera)
+            image = straight(made.image, made.alpha) if self.job.options.alpha else made.image
             yield to_bytes(image)
             self.job.report(done, len(self.cuts), kind)
 

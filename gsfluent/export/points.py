@@ -33,7 +33,7 @@ def vtk(job: Job) -> str:
         save_vtk_points(path, saved.positions.cpu().numpy(), point_fields(moment), title)
 
     names = job.write_each("vtk", "particles", "particles_{:04d}.vtk", write)
-    save_series(job.folder / "particles" / "particles.vtk.series", names, job.reel.times())
+    save_series(job.folder / "particles" / "particles.vtk.series", names, job.sequence.times())
     return span("particles", names)
 
 
@@ -76,7 +76,7 @@ def vti(job: Job) -> str:
         save_vti(path, fields, origin=origin.tolist(), spacing=step)
 
     names = job.write_each("vti", "density", "density_{:04d}.vti", write)
-    save_series(job.folder / "density" / "density.pvd", names, job.reel.times())
+    save_series(job.folder / "density" / "density.pvd", names, job.sequence.times())
     return span("density", names)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.export.frames import NOBODY, Moment, Reel
+from gsfluent.export.frames import NOBODY, FrameSequence, Moment
 from gsfluent.export.job import Job, span
 from gsfluent.io.axes import nearest_axes
 from gsfluent.io.gltf import save_glb
@@ -30,8 +30,8 @@ def _sequence(
 ) -> str:
     """One file per frame, in a folder called like the format."""
     if up is not None:
-        job = replace(job, reel=job.reel.turned(up))
-    frames = Constant(job.reel, job.progress) if job.options.constant else None
+        job = replace(job, sequence=job.sequence.turned(up))
+    frames = Constant(job.sequence, job.progress) if job.options.constant else None
     return span(kind, job.write_each(kind, kind, name, write, frames=frames))
 
 
@@ -57,7 +57,7 @@ def ply_sequence(job: Job) -> str:
     # not in one folder: a player would take both for one sequence
     folder = "frames_compressed" if options.compressed else "frames"
     name = "frame_{:04d}.compressed.ply" if options.compressed else "frame_{:04d}.ply"
-    frames = Constant(job.reel, job.progress) if options.constant else None
+    frames = Constant(job.sequence, job.progress) if options.constant else None
     return span(folder, job.write_each("ply-seq", folder, name, write, frames=frames))
 
 
@@ -106,10 +106,10 @@ def usd(job: Job) -> str:
             raise InputError(f"--usd-parts {part}", f"choose from {', '.join(_USD_PARTS)}")
     name = f"scene.{job.options.usd_ending}"
     # many readers cannot follow a changing number of splats
-    frames: Iterable[Moment] = job.reel
+    frames: Iterable[Moment] = job.sequence
     if job.options.constant or "splats" in parts:
-        frames = Constant(job.reel, job.progress)
-    with open_usd(job.folder / name, fps=job.fps, up=job.reel.up) as stage:
+        frames = Constant(job.sequence, job.progress)
+    with open_usd(job.folder / name, fps=job.fps, up=job.sequence.up) as stage:
         for place, moment in enumerate(frames):
             saved, code = moment.saved, float(moment.number)
             if "splats" in parts:
@@ -133,44 +133,44 @@ def usd(job: Job) -> str:
 
                 for piece in fragment_meshes(moment, job.options.mesh_blur):
                     stage.mesh(code, piece.name, piece.vertices, piece.faces, piece.colors)
-            job.report(place + 1, len(job.reel), "usd")
+            job.report(place + 1, len(job.sequence), "usd")
     return name
 
 
 class Constant:
-    """The frames of a reel with a constant number and order of splats.
+    """The frames of a sequence with a constant number and order of splats.
 
     Iterating gives :class:`Moment`; rows are sorted by id. Axes keep their names and quaternions
     their sign from frame to frame, so that a player may interpolate.
 
     Args:
-        reel: The chosen frames; read twice.
+        sequence: The chosen frames; read twice.
         progress: Called per frame of the first reading.
     """
 
-    def __init__(self, reel: Reel, progress: Progress | None = None) -> None:
-        self.reel = reel
+    def __init__(self, sequence: FrameSequence, progress: Progress | None = None) -> None:
+        self.sequence = sequence
         ids = torch.zeros(0, dtype=torch.int64)
         first: list[Gaussians] = []
-        for place, moment in enumerate(reel):
+        for place, moment in enumerate(sequence):
             new = ~torch.isin(moment.saved.ids.cpu(), ids)
             if bool(new.any()):
                 ids = torch.cat([ids, moment.saved.ids.cpu()[new]])
                 first.append(_plain(moment.gaussians.to("cpu").select(new)))
-            report_progress(progress, place + 1, len(reel), "which splats there are")
+            report_progress(progress, place + 1, len(sequence), "which splats there are")
         order = torch.argsort(ids)
         self.ids = ids[order]
         self.born = Gaussians.cat(first).select(order)
 
     def __len__(self) -> int:
         """Number of frames."""
-        return len(self.reel)
+        return len(self.sequence)
 
     def __iter__(self) -> Iterator[Moment]:
         """The frames."""
         now = self.born
         count = now.count
-        for moment in self.reel:
+        for moment in self.sequence:
             saved = moment.saved
             rows = torch.searchsorted(self.ids, saved.ids.cpu())
             here = _least_turned(_plain(moment.gaussians.to("cpu")), now.quats[rows])

@@ -11,7 +11,7 @@ import torch
 
 from gsfluent.config.read import nearest
 from gsfluent.errors import InputError
-from gsfluent.export.frames import DeltaReel, Reel
+from gsfluent.export.frames import DeltaSequence, FrameSequence
 from gsfluent.export.job import ExportOptions, Job
 from gsfluent.export.relit import relight_of
 from gsfluent.progress import Progress
@@ -19,23 +19,14 @@ from gsfluent.progress import Progress
 
 @dataclass(frozen=True)
 class Format:
-    """One thing that can be written.
+    """One thing that can be written."""
 
-    Attributes:
-        what: Files and who reads them, in one line.
-        module: Module of the writer, beside this one.
-        function: The writer: takes a :class:`Job`, returns what was written.
-        pictures: Rendered; needs the shot's camera and light.
-        splats_only: Needs splats and nothing else, so it can be made of a ``.gsd`` file.
-        key: Name in the report.
-    """
-
-    what: str
-    module: str
-    function: str
-    pictures: bool = False
-    splats_only: bool = False
-    key: str = ""
+    what: str  # Files and who reads them, in one line
+    module: str  # Module of the writer, beside this one
+    function: str  # The writer: takes a :class:`Job`, returns what was written
+    pictures: bool = False  # Rendered; needs the shot's camera and light
+    splats_only: bool = False  # Needs splats and nothing else, so it can be made of a ``.gsd`` file
+    key: str = ""  # Name in the report
 
 
 FORMATS: dict[str, Format] = {
@@ -53,16 +44,10 @@ FORMATS: dict[str, Format] = {
         ".spz per frame: phones, web viewers", "splats", "spz_sequence", splats_only=True
     ),
     "splat": Format(
-        ".splat per frame: the first web viewers",
-        "splats",
-        "splat_sequence",
-        splats_only=True,
+        ".splat per frame: the first web viewers", "splats", "splat_sequence", splats_only=True
     ),
     "glb": Format(
-        "glTF with KHR_gaussian_splatting per frame",
-        "splats",
-        "glb_sequence",
-        splats_only=True,
+        "glTF with KHR_gaussian_splatting per frame", "splats", "glb_sequence", splats_only=True
     ),
     "delta": Format(
         "one small .gsd file: gsfluent.io.DeltaReader, gsfluent export",
@@ -123,16 +108,16 @@ def export(
             raise InputError(f"--to {kind}: gsfluent cannot write that", _instead(kind))
     if not kinds:
         raise InputError("--to names no format", f"choose from {', '.join(FORMATS)}")
-    reel: Reel
+    sequence: FrameSequence
     if out.is_file():
-        reel = DeltaReel(out, frames=options.frames, sh=options.sh, up=options.up)
+        sequence = DeltaSequence(out, frames=options.frames, sh=options.sh, up=options.up)
         for kind in kinds:
             if options.relit or not FORMATS[kind].splats_only:
                 what = "--relit" if options.relit else f"--to {kind}"
                 raise InputError(f"{what}: {out} holds splats only", "export from the run")
         to = to or out.with_suffix("")
     else:
-        reel = Reel(
+        sequence = FrameSequence(
             out,
             frames=options.frames,
             sh=options.sh,
@@ -140,7 +125,7 @@ def export(
             up=options.up,
             device=device if options.relit else None,
         )
-    job = Job(out, to or out, reel, options, options.fps or reel.rate(), device, progress)
+    job = Job(out, to or out, sequence, options, options.fps or sequence.rate(), device, progress)
     return _write(job, kinds)
 
 
@@ -148,9 +133,9 @@ def write_exports(
     out: Path, kinds: list[str], *, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Write the formats that need no rendering, with the usual options; see :func:`export`."""
-    reel = Reel(out)
-    rate, cpu = reel.rate(), torch.device("cpu")
-    return _write(Job(out, out, reel, ExportOptions(), rate, cpu, progress), kinds)
+    sequence = FrameSequence(out)
+    rate, cpu = sequence.rate(), torch.device("cpu")
+    return _write(Job(out, out, sequence, ExportOptions(), rate, cpu, progress), kinds)
 
 
 def _instead(kind: str) -> str:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsfluent.errors import need
 from gsfluent.io.atomic import atomic_path
 
 if TYPE_CHECKING:
@@ -48,7 +49,11 @@ def new_figure(width: float, height: float) -> Iterator[Figure]:
     """Yield an empty figure of this size [inches] under gsfluent's style; save it inside the block.
 
     No window system and no global state of pyplot are touched.
+
+    Raises:
+        MissingPackage: matplotlib is not installed.
     """
+    need("matplotlib", "figures", "a figure")
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

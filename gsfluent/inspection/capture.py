@@ -15,7 +15,7 @@ from gsfluent.data import Capture, Frame
 from gsfluent.errors import InputError
 from gsfluent.inspection.picture import Picture, draw
 from gsfluent.io import load_capture, load_splats, save_image
-from gsfluent.pipeline.capture.coarse_hull import hull_points, inside_masks, masked_views
+from gsfluent.pipeline.capture.hull import hull_points, inside_masks, masked_views
 from gsfluent.pipeline.capture.orient import (
     DEFAULT_SIZE,
     Orientation,

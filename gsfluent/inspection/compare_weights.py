@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 
 __all__ = [
     "Lpips",
@@ -49,6 +49,8 @@ def clip_scores(
         InputError: No usable model there.
     """
     from PIL import Image
+
+    need("transformers", "inpaint", "--clip")
     from transformers import CLIPModel, CLIPProcessor
 
     try:

@@ -22,6 +22,7 @@ from torch import Tensor
 import gsfluent
 from gsfluent import ops
 from gsfluent._load import HAS_CUDA_KERNELS
+from gsfluent.errors import EXTRAS
 from gsfluent.ops._memory import available_memory
 
 _LIBRARIES = (
@@ -32,7 +33,6 @@ _LIBRARIES = (
     "opencv-python-headless",
     "imageio-ffmpeg",
     "diffusers",
-    "transformers",
 )
 
 
@@ -68,6 +68,7 @@ def examine(device: torch.device, *, every_device: bool = True) -> dict[str, Any
         "cuda_library": "loaded" if HAS_CUDA_KERNELS else "not built, or torch has no CUDA",
         "gpus": [_describe_gpu(i) for i in range(torch.cuda.device_count())],
         "libraries": {name: _version(name) for name in _LIBRARIES},
+        "extras": {extra: {name: _version(name) for name in EXTRAS[extra]} for extra in EXTRAS},
         "ops": {name: compiled_for(name) for name in registered_ops()},
         "self_test": tests,
     }

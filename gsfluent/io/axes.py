@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsfluent.io.splats.delta import hamilton
+
 
 def _cube() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Quaternions ``wxyz`` [24, 4] of the cube's rotations; what each new axis was, [24, 3]."""
@@ -37,6 +39,7 @@ def _cube() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 _QUATS, _SOURCE = _cube()
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def nearest_axes(
@@ -53,28 +56,8 @@ def nearest_axes(
         Quaternions (of the sign nearest to ``wanted``) and scales of the same ellipsoids.
     """
     # (q c) . r = c . (conj(q) r)
-    w, x, y, z = quats.T
-    q, r, s, t = wanted.T
-    rest = np.stack(
-        [
-            w * q + x * r + y * s + z * t,
-            w * r - x * q - y * t + z * s,
-            w * s + x * t - y * q - z * r,
-            w * t - x * s + y * r - z * q,
-        ],
-        axis=1,
-    )
-    score = rest @ _QUATS.T
+    score = hamilton(quats * _CONJUGATE, wanted) @ _QUATS.T
     best = np.abs(score).argmax(axis=1)
-    a, b, c, d = _QUATS[best].T
-    turned = np.stack(
-        [
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ],
-        axis=1,
-    )
+    turned = hamilton(quats, _QUATS[best])
     sign = np.where(score[np.arange(len(best)), best] < 0, -1.0, 1.0)[:, None]
     return turned * sign, np.take_along_axis(scales, _SOURCE[best], axis=1)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gsfluent import geometry
+from gsfluent.colors import srgb_to_linear
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.io.atomic import atomic_path
 
@@ -39,9 +39,8 @@ def save_glb(gaussians: Gaussians, path: str | Path) -> None:
     """
     host = gaussians.validated(f"save to {path}").to("cpu", torch.float64)
     quats = geometry.normalize_quaternions(host.quats)
-    rgba = np.concatenate(
-        [to_linear(host.colors().clamp(max=1.0).numpy()), host.opacities[:, None].numpy()], axis=1
-    )
+    linear = srgb_to_linear(host.colors().numpy())
+    rgba = np.concatenate([linear, host.opacities[:, None].numpy()], axis=1)
     attributes: dict[str, np.ndarray] = {
         "POSITION": host.means.numpy().astype("<f4"),
         "COLOR_0": np.round(rgba * 255.0).astype(np.uint8),
@@ -56,13 +55,6 @@ def save_glb(gaussians: Gaussians, path: str | Path) -> None:
     document, body = _document(attributes)
     with atomic_path(path) as part:
         part.write_bytes(_container(document, body))
-
-
-def to_linear(display: NDArray[Any]) -> NDArray[np.float32]:
-    """From sRGB display values 0..1 to linear light (IEC 61966-2-1), which glTF and USD hold."""
-    low = display / 12.92
-    high = ((np.maximum(display, 0.04045) + 0.055) / 1.055) ** 2.4
-    return np.where(display <= 0.04045, low, high).astype(np.float32)
 
 
 def _document(attributes: dict[str, np.ndarray]) -> tuple[dict[str, Any], bytes]:

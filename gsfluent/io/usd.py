@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 
 from gsfluent import geometry
+from gsfluent.colors import srgb_to_linear
 from gsfluent.data.gaussians import Gaussians
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 from gsfluent.io.atomic import atomic_path
-from gsfluent.io.gltf import to_linear
 
 _THREE_SIGMA = 3.0
 
@@ -46,10 +46,9 @@ def open_usd(path: str | Path, *, fps: float, up: str = "z") -> Iterator[UsdWrit
         raise InputError(f"{path}: not a USD name", "end it with .usdc, .usda or .usdz")
     if up not in ("z", "y"):
         raise InputError(f"USD has no up axis {up}", "choose z or y")
-    try:
-        from pxr import Usd, UsdUtils
-    except ImportError as error:
-        raise InputError("usd: usd-core is not installed", 'pip install "gsfluent[usd]"') from error
+    need("pxr", "usd", "usd: a USD file")
+    from pxr import Usd, UsdUtils
+
     with atomic_path(path) as part:
         zipped = part.suffix.lower() == ".usdz"
         crate = part.with_suffix(".usdc") if zipped else part
@@ -205,7 +204,7 @@ class UsdWriter:
         corners = np.ascontiguousarray(faces.reshape(-1), np.int32)
         prim.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(corners), time)
         # display colours of a stage are linear light
-        prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(to_linear(colors)), time)
+        prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(srgb_to_linear(colors)), time)
         prim.CreateExtentAttr().Set(_box(where, 0.0), time)
         self._seen[name].add(time)
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, InputError, RunError
-from gsfluent.live.recording import Take
+from gsfluent.live.recording import Recording
 from gsfluent.live.session import LiveSession
 from gsfluent.results.frames import SavedFrame
 
@@ -55,7 +55,7 @@ class Status:
         particles: Material points.
         dropped: Points that left because they were far away.
         message: The last thing that went wrong, or empty.
-        recording: Frames in the take, or None.
+        recording: Frames in the recording, or None.
     """
 
     state: str
@@ -75,7 +75,7 @@ class LivePlayer:
 
     Args:
         session: The session; nobody else may touch it from now on.
-        shot: The shot of the scene, for takes.
+        shot: The shot of the scene, for recordings.
         clock: Wall seconds.
     """
 
@@ -95,7 +95,7 @@ class LivePlayer:
         self._stop = self._paused = False
         self._message = ""
         self._speed: collections.deque[tuple[float, float, float]] = collections.deque()
-        self._take: Take | None = None
+        self._recording: Recording | None = None
         self.automatic = False
         self.count = self.revision = 0
         self._keep(session.frame())
@@ -108,7 +108,7 @@ class LivePlayer:
         return self
 
     def close(self) -> None:
-        """End the thread after the frame in hand, and the take."""
+        """End the thread after the frame in hand, and the recording."""
         with self._wake:
             self._stop = True
             self._wake.notify_all()
@@ -116,8 +116,8 @@ class LivePlayer:
             self._thread.join(timeout=60.0)
         while self._queue:
             self._queue.popleft()[1].cancel()
-        if self._take is not None:
-            self._finish_take()
+        if self._recording is not None:
+            self._finish_recording()
 
     # --- from any thread ---
 
@@ -162,19 +162,19 @@ class LivePlayer:
         return self._enqueue(lambda: act(self.session))
 
     def reset(self) -> Future[Any]:
-        """Back to the prepared object; ends a take."""
+        """Back to the prepared object; ends a recording."""
         return self._enqueue(self._reset)
 
     def set_slow(self, slow: float | None) -> Future[Any]:
-        """Slow motion; not while a take is recorded, whose frames are evenly spaced.
+        """Slow motion; not while a recording is made, whose frames are evenly spaced.
 
         Args:
             slow: How many times slower; None lets it follow what the machine can do.
         """
 
         def act() -> None:
-            if self._take is not None:
-                raise InputError("a take has one speed", hint="end the recording first")
+            if self._recording is not None:
+                raise InputError("a recording has one speed", hint="end the recording first")
             self.automatic = slow is None
             if slow is not None:
                 self.session.set_slow(slow)
@@ -187,7 +187,7 @@ class LivePlayer:
 
         A frame of more slow motion has fewer steps; what does not depend on them remains.
         """
-        if not self.automatic or self._take is not None or len(self._speed) < 4:
+        if not self.automatic or self._recording is not None or len(self._speed) < 4:
             return
         busy = sum(ready for _, _, ready in self._speed) / len(self._speed)
         steps = [value for value in AUTOMATIC if value != self.session.slow]
@@ -219,17 +219,19 @@ class LivePlayer:
             if self.shot is None:
                 raise InputError("record: the session has no shot", hint="open a run or a shot")
             self._reset()
-            self._take = Take(out, self.session, self.shot)
+            self._recording = Recording(out, self.session, self.shot)
 
         return self._enqueue(act)
 
-    def end_take(self) -> Future[Any]:
-        """Finish the take; the future has its folder."""
+    def end_recording(self) -> Future[Any]:
+        """Finish the recording; the future has its folder."""
 
         def act() -> Path:
-            if self._take is None:
-                raise InputError("record: nothing is being recorded", hint="begin a take first")
-            return self._finish_take()
+            if self._recording is None:
+                raise InputError(
+                    "record: nothing is being recorded", hint="begin a recording first"
+                )
+            return self._finish_recording()
 
         return self._enqueue(act)
 
@@ -304,8 +306,8 @@ class LivePlayer:
         before = session.time
         try:
             frame = session.step()
-            if frame is not None and self._take is not None:
-                self._take.add(frame)
+            if frame is not None and self._recording is not None:
+                self._recording.add(frame)
         except Exception as error:
             # the page must live on, and its user be told
             _log.exception("live: a frame failed")
@@ -338,8 +340,8 @@ class LivePlayer:
         self._adapt()
 
     def _reset(self) -> None:
-        if self._take is not None:
-            self._finish_take()
+        if self._recording is not None:
+            self._finish_recording()
         self.session.reset()
         self._paused = False
         with self._wake:
@@ -354,10 +356,10 @@ class LivePlayer:
         self._bytes = self.count = 0
         self.revision += 1
 
-    def _finish_take(self) -> Path:
-        take, self._take = self._take, None
-        assert take is not None
-        return take.close()
+    def _finish_recording(self) -> Path:
+        recording, self._recording = self._recording, None
+        assert recording is not None
+        return recording.close()
 
     def _keep(self, frame: SavedFrame) -> None:
         frame = dataclasses.replace(frame, index=self.count)
@@ -388,7 +390,7 @@ class LivePlayer:
             particles=session.run.matter.particles.count,
             dropped=session.dropped,
             message=self._message,
-            recording=None if self._take is None else len(self._take.frames),
+            recording=None if self._recording is None else len(self._recording.frames),
         )
 
 

@@ -1,4 +1,4 @@
-"""A take: what happened in a live session, as an ordinary run folder and a shot."""
+"""A recording: what happened in a live session, as an ordinary run folder and a shot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsfluent.results.record import RunRecord
 from gsfluent.results.store import StageResult, fingerprint
 
 
-class Take:
+class Recording:
     """Writes the frames of a session from its reset on.
 
     Args:
@@ -32,7 +32,7 @@ class Take:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(f"record: {out} is there already", hint="name a new folder")
         if session.pokes:
-            raise InputError("record: a take begins at rest", hint="reset() first")
+            raise InputError("record: a recording begins at rest", hint="reset() first")
         self.out, self.session, self.shot = out, session, shot
         self.folder = out / "stages" / "simulate"
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -42,7 +42,7 @@ class Take:
         self.add(session.frame())
 
     def add(self, frame: SavedFrame) -> None:
-        """Write the next frame; its number and time count from the take's first.
+        """Write the next frame; its number and time count from the recording's first.
 
         Raises:
             RunError: The disk is full.
@@ -81,14 +81,14 @@ class Take:
         return self.out
 
     def _as_shot(self, count: int) -> Shot:
-        """The shot that would show this: the pokes at the times of the take."""
+        """The shot that would show this: the pokes at the times of the recording."""
         session = self.session
         events = [poke | {"at": poke["at"] - self._start} for poke in session.pokes]
         values = self.shot.resolved() | {"events": events}
         values["solve"] = dict(values["solve"]) | {
             "cells": session.cells,
             "standing": True,
-            "loose_crumbs": True,
+            "loose_debris": True,
         }
         fps = session.fps * self._slow
         values["output"] = dict(values["output"]) | {

@@ -1,8 +1,7 @@
 """A prepared object one can poke while it is simulated: throw it, shoot at it, cut it.
 
 Each poke is an event of a shot with ``at`` = now, entered into the running simulation
-(:mod:`gsfluent.pipeline.simulate.grow`), so there is one physics for both, and what happened
-here
+(:mod:`gsfluent.pipeline.simulate.grow`), so there is one physics for both, and what happened here
 can be written down as a shot. A session is driven frame by frame from one thread;
 :class:`gsfluent.live.player.LivePlayer` drives it beside a viewer.
 """
@@ -22,10 +21,10 @@ from gsfluent.pipeline.cracks.stage import Repair
 from gsfluent.pipeline.matter.carry import Carry
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.simulate.debris import reach_of
 from gsfluent.pipeline.simulate.grow import copy_of, grow, shrink
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import QUALITY, Simulate, frame_of
-from gsfluent.pipeline.simulate.strays import reach_of
 from gsfluent.results.frames import SavedFrame
 from gsfluent.scene.parts import number, unit, vector
 from gsfluent.scene.scene import Scene
@@ -107,14 +106,13 @@ class LiveSession:
             dx=self.dx,
             seed=seed,
             device=device,
-            **({"standing": True, "loose_crumbs": True} | options),
+            **({"standing": True, "loose_debris": True} | options),
         )
         start = copy_of(scene)
         self._first = self._simulate.run_of(start, fps)
         self.solids = len(scene.bodies)
-        self._carry = Carry.bind(start, self._first.matter)
         self.cracks = cracks
-        self._repair = Repair(self.cracks)
+        self._history = Repair(cracks).begin(Carry.bind(start, self._first.matter))
         self._reach = reach_of(self._first.matter)
         self._prepared = self._first.twin(), 0, (0, 0.0)
         self.dropped = 0
@@ -125,7 +123,7 @@ class LiveSession:
     def _restart(self, index: int, run: Run, base: tuple[int, float]) -> None:
         self.index, self._base, self.failure = index, base, ""
         self.run = run.twin()
-        self._repair.restore({})
+        self._history.restore({})
         self.pokes: list[dict[str, Any]] = []
         self._frame: SavedFrame | None = None
         self._rest: tuple[State, bool] | None = None
@@ -168,7 +166,7 @@ class LiveSession:
 
     def _rests(self, state: State) -> bool:
         run = self.run
-        if not all(state.landed) or run.kicks.next_change(state) < math.inf:
+        if not all(state.landed) or run.impulses.next_change(state) < math.inf:
             return False
         stepper = run.stepper
         changes = min(stepper.rigid.next_change(state.time), stepper.blades.next_change(state.time))
@@ -176,10 +174,9 @@ class LiveSession:
             return False
         if stepper.rigid.count and stepper.rigid.moving(state.colliders).shape[0]:
             return False
-        if not bool((state.asleep | state.stray).all()):
+        if not bool((state.asleep | state.loose).all()):
             return False
-        crumbs = state.stray
-        return not bool((state.particles.velocity[crumbs].abs() > 1e-6).any())
+        return not bool((state.particles.velocity[state.loose].abs() > 1e-6).any())
 
     def settle(self, seconds: float = SETTLE) -> bool:
         """Let everything come to rest and remember it for :meth:`reset`; frames are not kept.
@@ -241,7 +238,7 @@ class LiveSession:
         """This moment as a frame of a run."""
         if self._frame is None:
             with torch.no_grad():
-                whole = frame_of(self.run, self.index, self._carry, self._repair, self.time)
+                whole = frame_of(self.run, self.index, self._history, self.time)
                 self._frame = saved(whole, self.scene)
                 del self.run.per_frame[:]
         return self._frame
@@ -322,7 +319,7 @@ class LiveSession:
         if event["type"] == "throw" and event["at"] == 0.0:  # what stands here stands already
             scene = copy_of(self.scene)
             rest = (0.0, 0.0, 0.0)
-            scene.kick(event["velocity"], event.get("spin", rest), event.get("object"), 0.0)
+            scene.impulse(event["velocity"], event.get("spin", rest), event.get("object"), 0.0)
         return scene
 
     def throw(
@@ -331,7 +328,7 @@ class LiveSession:
         spin: Sequence[float] = (0.0, 0.0, 0.0),
         object: str | None = None,
     ) -> dict[str, Any]:
-        """Kick the object: ``velocity`` [m/s] and ``spin`` [rad/s] are added to its motion."""
+        """Push the object: ``velocity`` [m/s] and ``spin`` [rad/s] are added to its motion."""
         event: dict[str, Any] = {"type": "throw", "velocity": list(vector("velocity", velocity))}
         event["spin"] = list(vector("spin", spin))
         return self.poke(event | ({} if object is None else {"object": object}))

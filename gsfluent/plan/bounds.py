@@ -18,8 +18,6 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL
 from gsfluent.scene.scene import Body
 
-__all__ = ["CELLS", "Bound", "bounds_of", "budget_spacing", "choose_cells", "thickness"]
-
 THIN_CELLS = 4.0
 """Cells that the thinnest part of a body needs for bending to be felt (solver.md: 4 to 6)."""
 PIECE_CELLS = 3.0
@@ -30,21 +28,13 @@ CELLS = (8, 512)
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """One limit of the grid spacing.
+    """One limit of the grid spacing."""
 
-    Attributes:
-        name: ``thinnest part``, ``fragment size``, ``damage length`` or ``time budget``.
-        dx: The spacing [m]: the coarsest, or with ``least`` the finest.
-        least: Whether it limits from below.
-        why: In words.
-        kept: Whether the plan keeps to it.
-    """
-
-    name: str
-    dx: float
-    least: bool
-    why: str
-    kept: bool
+    name: str  # ``thinnest part``, ``fragment size``, ``damage length`` or ``time budget``
+    dx: float  # The spacing [m]: the coarsest, or with ``least`` the finest
+    least: bool  # Whether it limits from below
+    why: str  # In words
+    kept: bool  # Whether the plan keeps to it
 
     def row(self) -> dict[str, Any]:
         """Plain values."""

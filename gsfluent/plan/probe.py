@@ -25,18 +25,16 @@ from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import GsfluentError
 from gsfluent.io import load_capture, save_image
 from gsfluent.io.solid import load_solid, save_solid
-from gsfluent.pipeline.capture.coarse_hull import masked_views
+from gsfluent.pipeline.capture.hull import masked_views
 from gsfluent.pipeline.render.cuts import save_cut_views
 from gsfluent.plan.cost import BYTES, CostModel, machine_key
 from gsfluent.plan.fact import actual_work
 from gsfluent.plan.fit import Sample, fit
-from gsfluent.plan.stand_in import look_at_photographs
+from gsfluent.plan.proxy import look_at_photographs
 from gsfluent.plan.work import isolate_work, reconstruct_work, render_work
 from gsfluent.progress import Progress, quiet_logs, report_progress
 from gsfluent.stages.chain import run_stages
 from gsfluent.stages.solids import context_of
-
-__all__ = ["FEATURES", "calibrate"]
 
 _log = logging.getLogger(__name__)
 
@@ -188,15 +186,9 @@ def run_small(
                 "image_size": size.image_size,
             },
             "fill": {"resolution": size.resolution},
-            "texture": {
-                "method": "exemplar",
-                "exemplar": str(folder / "photographs" / "cut.png"),
-            },
+            "texture": {"method": "exemplar", "exemplar": str(folder / "photographs" / "cut.png")},
             "objects": {"melon": {"material": size.material}},
-            "events": [
-                {"type": "drop", "height": 0.01},
-                {"type": "throw", "velocity": [0, 0, -4]},
-            ],
+            "events": [{"type": "drop", "height": 0.01}, {"type": "throw", "velocity": [0, 0, -4]}],
             "solve": {"quality": "preview", "cells": size.cells},
             "output": {"fps": fps, "seconds": size.frames / fps, "size": list(size.picture)},
         }
@@ -233,7 +225,7 @@ def figures_sample(out: Path, device: torch.device) -> Sample:
 
     shot = shot_of(out)
     start = time.perf_counter()
-    film = Film.of(out, shot, light_of(shot), device)
+    film = Film(out, shot, light_of(shot), device)
     first = film.frame(0)
     FilmFigures(first, film.around)
     if device.type == "cuda":
@@ -254,7 +246,7 @@ def training_samples(folder: Path, device: torch.device) -> list[Sample]:
         capture = load_capture(shot.capture)
         start = time.perf_counter()
         stage = Reconstruct(steps, splats, image_size=side, device=device)
-        gaussians, _ = stage(capture)
+        gaussians = stage(capture)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         seconds = time.perf_counter() - start

@@ -27,8 +27,6 @@ from gsfluent.results.frames import save_frame
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import saved, thin_walls
 
-__all__ = ["ball", "measure_solver"]
-
 _STEPS = 48
 _WARM = 8
 _SPEED = 6.0
@@ -52,7 +50,7 @@ def measure_solver(device: torch.device | str) -> tuple[dict[str, float], float]
         _measure(brittle, 17, device),
         _measure(liquid, 12, device),
         _measure(soft, 12, device, law_kernels=False),
-        _measure(brittle, 40, device, crumbs=True),
+        _measure(brittle, 40, device, debris=True),
         _measure(brittle, 10, device, two=True),
         _measure(brittle, 13, device, two=True),
         _measure(soft, 8, device, resident=False),
@@ -71,26 +69,26 @@ def _measure(
     device: torch.device | str,
     *,
     two: bool = False,
-    crumbs: bool = False,
+    debris: bool = False,
     resident: bool = True,
     law_kernels: bool = True,
 ) -> Sample:
-    """Time some steps of a ball that strikes the floor, two that meet, or crumbs in flight."""
+    """Time some steps of a ball that strikes the floor, two that meet, or debris in flight."""
     radius = 0.1
     scene = Scene()
     for side in (-1.0, 1.0) if two else (0.0,):
         place = Frame(torch.eye(3), torch.tensor([side * radius * 0.98, 0.0, radius]), 1.0)
         velocity = (-side * _SPEED, 0.0, 0.0) if two else (0.0, 0.0, -_SPEED)
         scene.add(
-            ball(radius, 2 * cells, crumbs=crumbs), material, frame=place,
-            velocity=(0.0, 0.0, 0.0) if crumbs else velocity, parts=[],
+            ball(radius, 2 * cells, debris=debris), material, frame=place,
+            velocity=(0.0, 0.0, 0.0) if debris else velocity, parts=[],
         )  # fmt: skip
     stage = Simulate(
         dx=2.0 * radius / cells, splats=False, free_flight=False, sleep=False,
         resident=resident, law_kernels=law_kernels, device=device,
     )  # fmt: skip
     wave = scene.bodies[0].material.wave_speed
-    step = CFL * 2.0 * radius / cells / (wave + (0.0 if crumbs else _SPEED))
+    step = CFL * 2.0 * radius / cells / (wave + (0.0 if debris else _SPEED))
     run = stage.run_of(scene, 1.0)
     with torch.no_grad():
         run.advance_to(0, None, time=_WARM * step)
@@ -119,13 +117,13 @@ def _counted(run: Run, device: torch.device | str) -> tuple[dict[str, Any], floa
     return counters, time.perf_counter()
 
 
-def ball(radius: float, voxels: int, *, splats: int = 16, crumbs: bool = False) -> Solid:
-    """A ball about the origin; as crumbs, of every fifth voxel in each direction only."""
+def ball(radius: float, voxels: int, *, splats: int = 16, debris: bool = False) -> Solid:
+    """A ball about the origin; as debris, of every fifth voxel in each direction only."""
     axis = (torch.arange(voxels) + 0.5) / voxels * 2.0 - 1.0
     x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
     level = (x * x + y * y + z * z).sqrt()
     inside = level <= 1.0
-    if crumbs:
+    if debris:
         row = torch.arange(voxels) % 5 == 0
         inside = inside & row[:, None, None] & row[:, None] & row
     depth = (1.0 - level).clamp(min=0.0) * radius
@@ -191,9 +189,9 @@ def _times(solid: Solid, material: str, device: torch.device) -> tuple[float, fl
     with tempfile.TemporaryDirectory(prefix="gsfluent_probe_") as name:
         for frame in frames:
             save_frame(Path(name), saved(frame, scene))
-            stage.save_state(Path(name) / "state.pt")
+            frames.save(Path(name) / "state.pt")
             points = float(frame.particles.count)
-    rest = time.perf_counter() - start - float(stage.report()["seconds"])
+    rest = time.perf_counter() - start - float(frames.report["seconds"])
     start = time.perf_counter()
     thin_walls(scene, side / _CELLS)
     return setup + time.perf_counter() - start, max(rest, 1e-4), points

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, MissingPackage
 from gsfluent.figure.page import Page
 from gsfluent.figure.series import Panel, curves
-
-__all__ = ["REPORT", "read_run", "report_page", "write_report"]
 
 REPORT = "report.html"
 _KINDS = {"clean": "good", "healed": "warn", "failed": "bad"}
@@ -197,15 +196,27 @@ def _motion(page: Page, frames: Values, simulation: Values) -> None:
             whole=True,
         ),
     ]  # fmt: skip
-    panels = [_only(panel, len(time)) for panel in panels]
-    if drawing := curves(time, "time [s]", panels):
-        page.heading("Motion").svg(drawing, "dashed: the largest value that passes")
+    _curves(page, "Motion", time, "time [s]", panels, "dashed: the largest value that passes")
 
 
-def _only(panel: Panel, count: int) -> Panel:
-    """Without the series that the run did not keep."""
-    kept = {name: values for name, values in panel.series.items() if len(values) == count}
-    return Panel(panel.title, panel.unit, kept, panel.bar, panel.whole, panel.log)
+def _curves(
+    page: Page,
+    head: str,
+    along: Sequence[float],
+    label: str,
+    panels: list[Panel],
+    caption: str = "",
+) -> None:
+    """A section of curves; without matplotlib a line that says what would draw them."""
+    kept = [  # without the series that the run did not keep
+        replace(p, series={n: v for n, v in p.series.items() if len(v) == len(along)})
+        for p in panels
+    ]
+    try:
+        if drawing := curves(along, label, kept):
+            page.heading(head).svg(drawing, caption)
+    except MissingPackage as missing:
+        page.heading(head).text(f"{missing.what}: {missing.hint}", kind="warn")
 
 
 def _pictures(page: Page, values: Values) -> None:
@@ -221,9 +232,7 @@ def _pictures(page: Page, values: Values) -> None:
         Panel("Splats born at cracks", "count", {"born": render.get("transition_gaussians", [])},
               whole=True),
     ]  # fmt: skip
-    panels = [_only(panel, len(holes)) for panel in panels]
-    if drawing := curves(list(range(len(holes))), "frame", panels):
-        page.heading("Pictures").svg(drawing)
+    _curves(page, "Pictures", range(len(holes)), "frame", panels)
 
 
 def _stages(page: Page, stages: Sequence[Values]) -> None:

@@ -15,7 +15,7 @@ from gsfluent.scene.parts import (
     Blade,
     Body,
     Collider,
-    Kick,
+    Impulse,
     Vector,
     add,
     known_key,
@@ -39,7 +39,7 @@ class RigidThings:
         self.bodies: list[Body] = []
         self.colliders: list[Collider] = []
         self.blades: list[Blade] = []
-        self.kicks: list[Kick] = []
+        self.impulses: list[Impulse] = []
 
     def press(
         self,

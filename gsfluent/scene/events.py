@@ -17,7 +17,7 @@ from gsfluent.scene.colliders import RigidThings
 from gsfluent.scene.parts import (
     Body,
     Collider,
-    Kick,
+    Impulse,
     Vector,
     add,
     known_key,
@@ -68,7 +68,7 @@ class Events(RigidThings):
         """Give a solid a velocity and a spin about its centre of mass.
 
         At time 0 they are what the solid starts with. Later they are added to the motion of all its
-        matter, broken off or not: a kick of ``mass * velocity``.
+        matter, broken off or not: an impulse of ``mass * velocity``.
 
         Args:
             velocity: [m/s], [3].
@@ -80,7 +80,7 @@ class Events(RigidThings):
             InputError: A number out of range or an unknown body.
         """
         if number("throw at", at, low=0.0) > 0.0:
-            self.kick(velocity, spin, object, at)
+            self.impulse(velocity, spin, object, at)
             return
         moved, turned_ = vector("throw velocity", velocity), vector("throw spin", spin)
         for index in self._targets(object):
@@ -88,12 +88,12 @@ class Events(RigidThings):
                 self.bodies[index], velocity=moved, angular_velocity=turned_
             )
 
-    def kick(
+    def impulse(
         self, velocity: Sequence[float], spin: Sequence[float], object: str | None, at: float
     ) -> None:
         """Add to the motion of a solid at a time: what :meth:`throw` does after time 0."""
-        kick = Kick(0, vector("throw velocity", velocity), vector("throw spin", spin), at)
-        self.kicks += [dataclasses.replace(kick, body=index) for index in self._targets(object)]
+        push = Impulse(0, vector("throw velocity", velocity), vector("throw spin", spin), at)
+        self.impulses += [dataclasses.replace(push, body=index) for index in self._targets(object)]
 
     def collide(
         self,

@@ -243,7 +243,7 @@ class Blade:
 
 
 @dataclasses.dataclass(frozen=True)
-class Kick:
+class Impulse:
     """A velocity given to all matter of a body at a moment after the start.
 
     Args:

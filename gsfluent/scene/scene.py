@@ -11,6 +11,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
+
 from gsfluent import materials
 from gsfluent.data import Frame, Solid
 from gsfluent.data.regions import require_labels
@@ -50,6 +52,12 @@ class Scene(Events):
         known_key("floor_mode", floor_mode, MODES)
         self.floor_mode = floor_mode
         super().__init__()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the first solid is; the CPU without one."""
+        solids = (body.solid for body in self.bodies if body.solid is not None)
+        return next((solid.gaussians.device for solid in solids), torch.device("cpu"))
 
     def add(
         self,

@@ -8,11 +8,14 @@ voxels or divide by zero, and a splat as large as the room costs a bounded numbe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from gsfluent.geometry import quaternion_to_matrix
 
 __all__ = ["GridBox", "choose_grid", "density_field"]
 
@@ -32,6 +35,12 @@ class GridBox:
     origin: tuple[float, float, float]
     voxel: float
     shape: tuple[int, int, int]
+
+    @staticmethod
+    def of(origin: Tensor | np.ndarray, voxel: float, shape: Sequence[int]) -> GridBox:
+        """A grid from its corner [3] and its numbers of voxels."""
+        x, y, z = (float(part) for part in origin)
+        return GridBox((x, y, z), voxel, (int(shape[0]), int(shape[1]), int(shape[2])))
 
     def centers(self, index: np.ndarray) -> np.ndarray:
         """World positions [M, 3] of voxel indices [M, 3]."""
@@ -73,12 +82,7 @@ def choose_grid(means: Tensor, opacities: Tensor, resolution: int) -> tuple[Grid
     origin = middle - 0.5 * shape * voxel
     corners = torch.from_numpy(np.stack([origin, origin + shape * voxel])).to(points.device)
     outside = int(((points < corners[0]) | (points > corners[1])).any(1).sum())
-    box = GridBox(
-        (float(origin[0]), float(origin[1]), float(origin[2])),
-        voxel,
-        (int(shape[0]), int(shape[1]), int(shape[2])),
-    )
-    return box, outside
+    return GridBox.of(origin, voxel, shape), outside
 
 
 def _quantile(ordered: Tensor, share: float) -> np.ndarray:
@@ -131,7 +135,7 @@ def density_field(
     keep = ((position > -0.5) & (position < limit)).all(1) & (opacities.detach() > 1e-3)
     position = position[keep]
     sigma = (scales.detach().double()[keep] / box.voxel).clamp(_MIN_SIGMA, _MAX_SIGMA)
-    rotation = _rotation(quats.detach().double()[keep])
+    rotation = quaternion_to_matrix(quats.detach().double()[keep])
     alpha = opacities.detach().float()[keep]
     precision = torch.einsum("nij,nj,nkj->nik", rotation, sigma**-2, rotation)
     reach = _CUTOFF * torch.einsum("nij,nj->ni", rotation**2, sigma**2).sqrt()
@@ -162,26 +166,6 @@ def density_field(
             field.index_add_(0, index.reshape(-1), weight.reshape(-1))
     inner = field.view(shape)[pad:-pad, pad:-pad, pad:-pad]
     return (inner.double() / _FIXED).float() if fixed else inner.clone()
-
-
-def _rotation(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of wxyz quaternions; a zero quaternion counts as no rotation."""
-    norm = quats.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
-    q = torch.where(norm > 1e-12, quats / norm.clamp(min=1e-12), identity)
-    w, x, y, z = q.unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
 
 
 def _quadratic_coefficients(precision: Tensor, fraction: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["distance_transform", "grown", "nearest_empty"]
+__all__ = ["distance_transform", "grown", "nearest_empty", "surface"]
 
 _FAR = 1 << 14  # voxels: farther than any grid is long; its square still fits in int32
 _CHUNK = 1 << 27  # sums of a parabola and a value at a time, int32
@@ -56,6 +56,14 @@ def grown(occupied: np.ndarray, steps: int) -> np.ndarray:
     found = np.ascontiguousarray(occupied).view(np.uint8)
     result: np.ndarray = ndimage.maximum_filter(found, 2 * steps + 1, mode="constant")
     return result.view(bool)
+
+
+def surface(occupied: np.ndarray) -> np.ndarray:
+    """Occupied voxels with an empty neighbour across a face, bool [X, Y, Z]; around is empty."""
+    from scipy import ndimage
+
+    result: np.ndarray = occupied & ~ndimage.binary_erosion(occupied)
+    return result
 
 
 def _separable(occupied: Tensor) -> tuple[Tensor, Tensor]:

@@ -36,7 +36,7 @@ def render_stage(context: RunContext) -> None:
     key = fingerprint("render", context.key(context.source_key, looks, output, camera_key))
 
     def work(folder: Path) -> dict[str, Any]:
-        film = Film.of(context.out, shot, light, context.device)
+        film = Film(context.out, shot, light, context.device)
         report: dict[str, Any] = {"frames": len(film)}
         figures = FilmFigures(film.frame(0), film.around)
         counts: list[int] = []
@@ -48,10 +48,10 @@ def render_stage(context: RunContext) -> None:
             for index in range(len(film)):
                 frame = film.frame(index)
                 start = time.perf_counter()
-                layers = film.layers(frame)
-                picture = to_bytes(layers.image)
+                made = film.picture(frame)
+                picture = to_bytes(made.image)
                 drawing += time.perf_counter() - start
-                figures.add(frame, film.cameras[index], layers.alpha, layers.depth)
+                figures.add(frame, film.cameras[index], made.alpha, made.depth)
                 counts.append(int(frame.facts.get("fragments", 1)))
                 report_progress(progress, index + 1, len(film), "")
                 yield picture
@@ -63,7 +63,7 @@ def render_stage(context: RunContext) -> None:
         report["seconds_per_frame"] = drawing / len(film)
         report["poster_frame"] = poster_frame(counts, shot.output.fps)
         best = film.frame(report["poster_frame"])
-        save_image(film.picture(best).cpu(), folder / "poster.png")
+        save_image(film.picture(best).image.cpu(), folder / "poster.png")
         return report
 
     result = context.store.run("render", key, work)
@@ -125,13 +125,13 @@ def render_again(
     if size is not None:
         output = replace(output, size=size)
     shot = replace(shot, output=output)
-    film = Film.of(out, shot, changed(light_of(shot), **light), device)
+    film = Film(out, shot, changed(light_of(shot), **light), device)
     target = to or out / ("render.mp4" if frame is None else "render.png")
     start = time.perf_counter()
     if frame is not None:
         if not 0 <= frame < len(film):
             raise InputError(f"--frame {frame}", f"the run has frames 0 to {len(film) - 1}")
-        save_image(film.picture(film.frame(frame)).cpu(), target)
+        save_image(film.picture(film.frame(frame)).image.cpu(), target)
         return {
             "output": str(target),
             "frames": 1,
@@ -142,7 +142,7 @@ def render_again(
 
     def pictures() -> Iterator[np.ndarray]:
         for index in range(len(film)):
-            yield to_bytes(film.picture(film.frame(index)))
+            yield to_bytes(film.picture(film.frame(index)).image)
             report_progress(progress, index + 1, len(film), "")
 
     count = write_video(target, pictures(), fps=shot.output.video_fps, size=shot.output.size)

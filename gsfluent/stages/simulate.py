@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials
-from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
+from gsfluent.config import COLLIDERS, EVENTS, ColliderSettings, ObjectSettings, Shot, typed_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
 from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.walls import thin_shells
@@ -52,10 +53,10 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     if shot.floor == "auto":
         _lift(scene)
     for collider in shot.colliders:
-        keys = collider_dict(collider)
+        keys = typed_dict(collider, COLLIDERS)
         scene.add_collider(keys.pop("type"), **keys)
     for event in shot.events:
-        scene.add_event(event_dict(event))
+        scene.add_event(typed_dict(event, EVENTS))
     return scene
 
 
@@ -68,7 +69,7 @@ def _lift(scene: Scene) -> None:
 
 def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
     """What a collider depends on: its settings, and the content of its mesh instead of its path."""
-    keys = collider_dict(collider)
+    keys = typed_dict(collider, COLLIDERS)
     if "mesh" in keys:
         keys["mesh"] = content_digest(Path(keys["mesh"]))
     return keys
@@ -92,13 +93,24 @@ def moving_settings(shot: Shot) -> list[Any]:
     }
     return [
         objects,
-        [event_dict(event) for event in shot.events],
+        [typed_dict(event, EVENTS) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.standing, shot.solve.loose_crumbs],
+        [shot.solve.standing, shot.solve.loose_debris],
         shot.output.fps,
         shot.output.seconds,
     ]
+
+
+def solver_options(shot: Shot) -> SolverOptions:
+    """How the matter of a shot is moved."""
+    solve = shot.solve
+    return SolverOptions(
+        cfl=solve.cfl,
+        standing=solve.standing,
+        loose_debris=solve.loose_debris,
+        deterministic=solve.deterministic,
+    )
 
 
 def simulate_stage(context: RunContext) -> None:
@@ -116,10 +128,7 @@ def simulate_stage(context: RunContext) -> None:
             seed=context.seed,
             device=context.device,
             dx=None if cells is None else grid_spacing(scene, cells),
-            cfl=shot.solve.cfl,
-            standing=shot.solve.standing,
-            loose_crumbs=shot.solve.loose_crumbs,
-            deterministic=shot.solve.deterministic,
+            options=solver_options(shot),
             repair=shot.output.cracks,
         )
         state = folder / _STATE
@@ -134,8 +143,8 @@ def simulate_stage(context: RunContext) -> None:
         for frame in frames:
             save_frame(folder, saved(frame, scene))
             # after the frame: a state on disk always has its picture
-            stage.save_state(state)
-        return stage.report() | {"thin": thin_walls(scene, stage.report()["dx"])}
+            frames.save(state)
+        return frames.report | {"thin": thin_walls(scene, frames.run.matter.dx)}
 
     result = context.store.run("simulate", key, work)
     report = dict(result.report)

@@ -22,7 +22,7 @@ from gsfluent.pipeline.fill.stage import Fill, fill_resolution, visible_extent
 from gsfluent.pipeline.reconstruct.evaluate import write_report
 from gsfluent.pipeline.reconstruct.isolate import Isolate
 from gsfluent.pipeline.reconstruct.stage import Reconstruct
-from gsfluent.pipeline.regions.project import label_regions
+from gsfluent.pipeline.regions.stage import Regions
 from gsfluent.pipeline.render.backdrop import no_background
 from gsfluent.pipeline.render.cuts import save_cut_views
 from gsfluent.pipeline.simulate.stage import QUALITY
@@ -53,10 +53,10 @@ def reconstruct_stage(context: RunContext) -> None:
             device=context.device,
             seed=context.seed,
         )
-        gaussians, report = stage(capture, progress=context.reporter.task("reconstruct"))
+        gaussians = stage(capture, progress=context.reporter.task("reconstruct"))
         save_splats(gaussians, folder / "model.ply")
-        write_report(folder, gaussians, capture, report)
-        return dict(report)
+        write_report(folder, gaussians, capture)
+        return dict(gaussians.report)
 
     result = context.store.run("reconstruct", key, work)
     context.record.values["reconstruction"] = result.report
@@ -78,8 +78,7 @@ def isolate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load_splats(source).validated(source.name)
-        stage = Isolate(seed=context.seed)
-        whole, background = stage.split(gaussians, context.capture)
+        whole, background = Isolate(seed=context.seed).split(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
         save_splats(whole, folder / "object.ply")
@@ -88,7 +87,7 @@ def isolate_stage(context: RunContext) -> None:
         elif captured:
             raise no_background()
         write_json(folder / "frame.json", frame.to_dict())
-        return dict(stage.report) | {
+        return dict(whole.report) | {
             "gaussians_kept": whole.count,
             "gaussians_removed": background.count,
             "up": stance.up.tolist(),
@@ -144,9 +143,7 @@ def fill_stage(context: RunContext) -> None:
             wanted = {"resolution": fill_resolution(extents[name], largest, cells)}
             stage = Fill(**wanted | options, down=down, seed=context.seed)
             solid = stage(
-                splats.to(context.device),
-                context.capture,
-                progress=context.reporter.task("fill"),
+                splats.to(context.device), context.capture, progress=context.reporter.task("fill")
             )
             save_solid(solid.transformed(frame), folder / f"{name}.ply")
             reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
@@ -236,18 +233,10 @@ def regions_stage(context: RunContext) -> None:
         reports = {}
         for name, sources in wanted.items():
             solid = load_solid(context.store.root / "texture" / f"{name}.ply").to(context.device)
-            labelled = label_regions(
-                solid,
-                sources,
-                context.capture,
-                frame=context.frame,
-                progress=context.reporter.task("regions"),
-            )
+            progress = context.reporter.task("regions")
+            labelled = Regions(sources)(solid, context.capture, progress, frame=context.frame)
             assert labelled.regions is not None
-            with (
-                atomic_path(folder / f"{name}.npz") as temporary,
-                open(temporary, "wb") as stream,
-            ):
+            with atomic_path(folder / f"{name}.npz") as temporary, open(temporary, "wb") as stream:
                 np.savez_compressed(stream, regions=labelled.regions.cpu().numpy())
             write_json(folder / f"{name}.json", {k: labelled.report[k] for k in _KEYS})
             reports[name] = labelled.report["region_sources"]
@@ -286,11 +275,7 @@ def _with_labels(solid: Solid, path: Path) -> Solid:
 
 
 def context_of(
-    shot: Shot,
-    out: Path,
-    device: torch.device | str,
-    seed: int,
-    reporter: Reporter | None = None,
+    shot: Shot, out: Path, device: torch.device | str, seed: int, reporter: Reporter | None = None
 ) -> RunContext:
     """What stages need to take up, or to begin, a run in a folder; nothing is done or written yet.
 

@@ -49,7 +49,7 @@ def view_live(
         browser: Open the page where there is a desktop.
 
     Returns:
-        ``url``, the session's figures, and ``takes``, the folders that were recorded.
+        ``url``, the session's figures, and ``recordings``, the folders that were recorded.
 
     Raises:
         InputError: Nothing to poke, no viser, no port, or a number out of range.
@@ -64,7 +64,7 @@ def view_live(
     player = LivePlayer(session, stage.shot)
     player.automatic = slow is None
     home = run or (source if source.is_dir() else source.parent)
-    before = set(home.glob("take_*"))
+    before = set(home.glob("recording_*"))
     panel = PokePanel(player, home)
     app = App(
         LiveSource(player, stage.title, stage.shot), device, host=host, port=port, panels=[panel]
@@ -77,5 +77,5 @@ def view_live(
         panel.close()
         player.close()
         app.close()
-    takes = sorted(str(path) for path in set(home.glob("take_*")) - before)
-    return {"url": app.url, "takes": takes} | session.report()
+    recordings = sorted(str(path) for path in set(home.glob("recording_*")) - before)
+    return {"url": app.url, "recordings": recordings} | session.report()

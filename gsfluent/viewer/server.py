@@ -8,7 +8,7 @@ import logging
 import socket
 from typing import TYPE_CHECKING
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 
 if TYPE_CHECKING:
     import viser
@@ -29,13 +29,7 @@ def start_server(host: str, port: int, label: str) -> viser.ViserServer:
     Raises:
         InputError: viser is not installed, or host and port cannot be had.
     """
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError(
-            f"view: the viewer needs viser, which is not installed ({error})",
-            'pip install "gsfluent[viewer]"',
-        ) from error
+    viser = need("viser", "viewer", "view: the page")
     free = free_port(host, port)
     if port not in (0, free):
         _log.warning("viewer: port %d is in use; taking %d", port, free)

@@ -17,7 +17,7 @@ from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.demo.catalogue import OBJECTS
 from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud
 from gsfluent.lab.truth.interiors import known_interior
-from gsfluent.pipeline.cracks.stage import Repair
+from gsfluent.pipeline.cracks.stage import CrackHistory, Repair
 from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.matter.carry import Carry
 from gsfluent.pipeline.matter.points import Matter, body_frame
@@ -164,6 +164,7 @@ class Broken:
         self.stage = Simulate(dx=longest / cells)
         self.matter: Matter = self.stage.prepare(self.scene)
         self.carry = Carry.bind(self.scene, self.matter)
+        self.histories: dict[str, CrackHistory] = {}
         self.count = round(FPS * self.case.seconds)
         if not self._file(self.count - 1).exists():
             self._simulate()
@@ -270,12 +271,11 @@ def carried(broken: Broken, moment: Moment) -> Drawn:
 
 def repaired(broken: Broken, moment: Moment, **options: str) -> Drawn:
     """Our carry and a repair, which is kept from frame to frame as in a run."""
-    kept = _STAGES.setdefault((broken.name, *options.values()), Repair(**options))
-    made = kept(broken.carry, moment.motion(broken.carry))
+    repair = Repair(**options)
+    history = broken.histories.setdefault(repair.method, repair.begin(broken.carry))
+    made = repair(broken.carry, moment.motion(broken.carry), history=history)
     return made.gaussians, made.groups
 
-
-_STAGES: dict[tuple[str, ...], Repair] = {}
 
 METHODS: dict[str, Callable[[Broken, Moment], Drawn]] = {
     "raw": raw,

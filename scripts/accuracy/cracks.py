@@ -253,7 +253,7 @@ def of_run(out: Path) -> Iterator[str]:
 def every_camera(out: Path) -> Iterator[str]:
     """Holes in every frame of a finished run, in the film's camera and the three around."""
     shot = shot_of(out)
-    film = Film.of(out, shot, light_of(shot), torch.device("cpu"))
+    film = Film(out, shot, light_of(shot), torch.device("cpu"))
     raw = RawCarry(film.frame(0))
     worst: dict[tuple[int, str], float] = {}
     for index in range(len(film)):

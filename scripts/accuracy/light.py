@@ -25,11 +25,12 @@ from gsfluent.figure.markdown import enter
 from gsfluent.io import save_image
 from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
+from gsfluent.pipeline.light.albedo import to_albedo
 from gsfluent.pipeline.light.bake import bake_light
-from gsfluent.pipeline.light.delight import delight
-from gsfluent.pipeline.light.lamps import Lamp, Lighting, pack_lamps, to_display, to_linear
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import grid_for
 from gsfluent.pipeline.light.occlusion import ambient_occlusion
+from gsfluent.pipeline.light.shade import to_display, to_linear
 from gsfluent.pipeline.light.shadow import transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.stage import Render
@@ -111,7 +112,7 @@ def sphere(splats: Gaussians, name: str) -> tuple[float, Tensor]:
     lighting, lamps, specular, shininess = lit_cases()[name]
     ball = truth.Ball((0.0, 0.0, 0.0), RADIUS)
     camera = Camera.look_at((0.15, -0.8, 0.25), (0.0, 0.0, 0.0), width=SIZE, height=SIZE, fov=15.5)
-    layers = Render(camera, lighting, background=(0.0, 0.0, 0.0))(splats)
+    layers = Render(camera, lighting, background=(0.0, 0.0, 0.0))(splats).image
     eye, rays = truth.rays_of(camera)
     reach = ball.hit(eye.expand_as(rays), rays)
     hit = torch.isfinite(reach)
@@ -285,7 +286,7 @@ def delighting(splats: Gaussians) -> dict[str, dict[str, float]]:
     for day, lighting in days.items():
         for paint, true in paints(splats).items():
             captured = bake_light(true, lighting)
-            bare = delight(captured)
+            bare = to_albedo(captured)
             wanted = bake_light(true, other)
             found[f"{paint}, {day}"] = {
                 "paint_before": off(captured, true),

@@ -83,6 +83,7 @@ def measure(
     studio = Studio(0.0, (0.0, 0.0), 0.1, 0.2)
     render = Render(camera, lighting, studio=studio)
     plain = Render(camera, studio=None)
+    room = render(matter).room
     grid = grid_for(matter)
     drawn = lighting.drawn()
     whole = bulk(matter)
@@ -112,8 +113,8 @@ def measure(
         "shadow maps": lambda: shadow_maps(matter, drawn, faces, texels, whole),
         "occupancy": lambda: grid.of(matter.means, whole.center),
         "normals": lambda: splat_normals(matter, occupied),
-        "unlit picture": lambda: plain(matter),
-        "lit picture": lambda: render(matter),
+        "unlit picture": lambda: plain(matter).image,
+        "lit picture": lambda: render(matter, room=room).image,
     }
     with torch.no_grad():
         times = {name: clock(work, device, repeats) for name, work in parts.items()}

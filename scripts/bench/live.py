@@ -121,16 +121,14 @@ def measured(points: int, frames: int, slow: float, device: torch.device) -> dic
             break
         whole = watch.timed(
             "pieces and figures",
-            lambda: frame_of(
-                session.run, session.index, session._carry, session._repair, session.time
-            ),
+            lambda: frame_of(session.run, session.index, session._history, session.time),
         )
         watch.timed("carry", lambda whole=whole: whole.carried)
         watch.timed("repair", lambda whole=whole: whole.repaired)
         frame = watch.timed("frame", lambda whole=whole: saved(whole, session.scene))
         watch.timed(
             "draw",
-            lambda frame=frame: render(frame.gaussians, camera, groups=frame.groups).cpu(),
+            lambda frame=frame: render(frame.gaussians, camera, groups=frame.groups).image.cpu(),
         )
         pieces = frame.facts["fragments"]
     wall = watch.now() - begun

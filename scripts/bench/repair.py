@@ -63,18 +63,18 @@ def ball(splats: int, voxels: int) -> Solid:
 
 
 def moment(carry: Carry, share: float) -> Points:
-    """The points when the gap is ``share`` of its full width, 2 cm; a fifth of them is crumbs."""
+    """The points when the gap is ``share`` of its full width, 2 cm; a fifth of them is debris."""
     rest, spacing = carry.matter.rest, carry.matter.spacing[0]
     side = torch.sign(rest[:, :1])
     bottom = rest[:, 2] < -0.4 * RADIUS
     gap = torch.tensor([0.01, 0.0, 0.0], device=rest.device) * share * side
-    # crumbs spread from the middle of the bottom
+    # debris spreads from the middle of the bottom
     spread = (rest - rest.new_tensor([0.0, 0.0, -0.4 * RADIUS])) * (1.5 * share)
     position = rest + torch.where(bottom[:, None], spread, gap)
     eye = torch.eye(3, device=rest.device).expand(rest.shape[0], 3, 3).contiguous()
-    crumb = bottom & (share > 0.02 * spacing)
-    piece = torch.where(crumb, -1, (rest[:, 0] > 0).to(torch.int32)).to(torch.int32)
-    return Points(position, eye, eye, piece, crumb)
+    debris = bottom & (share > 0.02 * spacing)
+    piece = torch.where(debris, -1, (rest[:, 0] > 0).to(torch.int32)).to(torch.int32)
+    return Points(position, eye, eye, piece, debris)
 
 
 def clock(device: torch.device) -> float:
@@ -112,20 +112,20 @@ def measure(given: argparse.Namespace, device: torch.device) -> dict[str, Any]:
             scales=splats.scales, sh=splats.sh, depth=False,
         ).image  # fmt: skip
 
-    repair = Repair()
+    history = Repair().begin(carry)
     rows = []
     with torch.no_grad():
         # the first opening also places the sites; it is a second run that is timed
-        repair.step(carry, moment(carry, 1.0))
-        repair.restore({})
+        history.step(moment(carry, 1.0))
+        history.restore({})
         for index in range(given.frames):
             share = min(1.0, index / (0.5 * given.frames))
             points = moment(carry, share)
             start = clock(device)
-            cracks = repair.step(carry, points)
+            cracks = history.step(points)
             first = 1e3 * (clock(device) - start)
             assert cracks is not None  # method gap
-            still, cracks = timed(device, lambda p=points: repair.step(carry, p), given.repeats)
+            still, cracks = timed(device, lambda p=points: history.step(p), given.repeats)
             move, motion = timed(
                 device, lambda c=cracks: carry.apply(carry.follow(c.points, c.rest), c.rest), 1
             )

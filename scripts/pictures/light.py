@@ -17,7 +17,7 @@ from torch import Tensor
 from gsfluent.data import Camera, Gaussians
 from gsfluent.io import load_splats, save_image
 from gsfluent.lab.truth import light as truth
-from gsfluent.pipeline.light.delight import delight
+from gsfluent.pipeline.light.albedo import to_albedo
 from gsfluent.pipeline.light.environment import sky_and_ground
 from gsfluent.pipeline.light.from_shot import light_of
 from gsfluent.pipeline.light.lamps import Lamp, Lighting
@@ -54,7 +54,7 @@ def run_pictures(out: Path, index: int, size: tuple[int, int]) -> Tensor:
     shot = shot_of(out)
     shot = replace(shot, output=replace(shot.output, size=size))
     usual = light_of(shot)
-    frame = Film.of(out, shot, usual, torch.device("cpu")).frame(index)
+    frame = Film(out, shot, usual, torch.device("cpu")).frame(index)
     center, radius, _ = bulk(frame.gaussians)
     lights = [
         usual,
@@ -66,8 +66,8 @@ def run_pictures(out: Path, index: int, size: tuple[int, int]) -> Tensor:
     ]
     pictures = []
     for light in lights:
-        film = Film.of(out, shot, light, torch.device("cpu"))
-        pictures.append(film.picture(frame))
+        film = Film(out, shot, light, torch.device("cpu"))
+        pictures.append(film.picture(frame).image)
     return torch.cat([torch.cat(pictures[:2], 1), torch.cat(pictures[2:], 1)])
 
 
@@ -83,13 +83,13 @@ def splat_pictures(path: Path, up: Tensor, front: Tensor, size: tuple[int, int])
     camera = Camera.look_at(
         eye.tolist(), center, width=size[0], height=size[1], fov=40.0, up=above.tolist()
     )
-    bare = delight(splats)
-    rows = [[Render(camera)(splats)], [Render(camera)(bare)]]
+    bare = to_albedo(splats)
+    rows = [[Render(camera)(splats).image], [Render(camera)(bare).image]]
     for sign in (-1.0, 1.0):
         x, y, z = (sign * side + 0.5 * above + 0.6 * front).tolist()
         light = Lighting((Lamp(direction=(x, y, z), intensity=0.9),), ambient=0.25)
         for row, matter in zip(rows, (splats, bare), strict=True):
-            row.append(Render(camera, light)(matter))
+            row.append(Render(camera, light)(matter).image)
     return torch.cat([torch.cat(row, 1) for row in rows])
 
 
@@ -105,7 +105,7 @@ def penumbra_pictures(size: tuple[int, int]) -> Tensor:
             camera,
             Lighting((Lamp(direction=(0.6, -0.2, 1.0), size=width, intensity=0.7),), ambient=0.4),
             studio=studio,
-        )(matter)
+        )(matter).image
         for width in (0.5, 6.0, 20.0)
     ]
     return torch.cat(pictures, 1)

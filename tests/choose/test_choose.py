@@ -237,6 +237,7 @@ def ball_shot(tmp_path: Path, **keys: Any) -> tuple[Scene, Shot]:
 
 
 def test_a_ball_on_the_floor_from_end_to_end(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     scene, shot = ball_shot(tmp_path)
     probing = Probing(levels=(8, 10, 14), frames=5, seeds=2, cfl=())
     result = choose(scene, shot, 0.2, probing=probing)

@@ -36,6 +36,7 @@ def record(folder: Path) -> dict[str, Any]:
 
 
 def test_a_run_takes_the_cells_that_meet_its_error(done: Path) -> None:
+    pytest.importorskip("matplotlib")
     values = record(done)
     choice = values["choice"]
     assert choice["met"] and choice["bound"] == 0.4 and choice["sure"] >= 0.9

@@ -17,7 +17,7 @@ from gsfluent import geometry
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.export.delta import delta_frame
-from gsfluent.export.frames import Reel
+from gsfluent.export.frames import FrameSequence
 from gsfluent.export.write import ExportOptions, export
 from gsfluent.io import axes
 from gsfluent.io.axes import nearest_axes
@@ -175,7 +175,7 @@ def test_a_run_goes_there_and_back(tmp_path: Path) -> None:
     export(run, ["delta"], device=CPU, to=tmp_path, options=ExportOptions(key_every=3))
     reader = DeltaReader(tmp_path / "splats.gsd")
     assert reader.header["fps"] == pytest.approx(FPS)
-    for place, moment in enumerate(Reel(run)):
+    for place, moment in enumerate(FrameSequence(run)):
         check(reader.frame(place), delta_frame(moment, place), reader.header["error"])
     export(tmp_path / "splats.gsd", ["ply-seq"], device=CPU)
     from gsfluent.io import load_splats

@@ -13,10 +13,10 @@ import trimesh
 from export_run import FRAMES, make_run, points_of_a_cube
 
 from gsfluent.errors import InputError
-from gsfluent.export.frames import Reel
+from gsfluent.export.frames import FrameSequence
 from gsfluent.export.meshes import Piece, fragment_meshes, surface
 from gsfluent.export.write import ExportOptions, export
-from gsfluent.pipeline.matter.rubble import clinging
+from gsfluent.pipeline.matter.debris import clinging
 
 pytest.importorskip("skimage")
 CPU = torch.device("cpu")
@@ -84,7 +84,7 @@ def test_pieces_of_a_few_points_and_far_apart() -> None:
         assert mesh.volume == pytest.approx(volumes.sum(), rel=0.05)
 
 
-def test_rubble_goes_with_the_piece_it_lies_on() -> None:
+def test_debris_goes_with_the_piece_it_lies_on() -> None:
     line = np.arange(10.0)[:, None] * [1.0, 0.0, 0.0]
     fragment = np.array([3, 3, -1, -1, -1, -1, 8, 8, -1, -1])
     line[8:] += 5.0  # a spray
@@ -94,7 +94,7 @@ def test_rubble_goes_with_the_piece_it_lies_on() -> None:
 
 
 def test_debris_is_a_surface_too(run: Path) -> None:
-    moment = Reel(run).moment(FRAMES - 1)
+    moment = FrameSequence(run).moment(FRAMES - 1)
     saved = moment.saved
     saved.fragments[:30] = -1
     saved.positions[:30, 2] -= 1.0
@@ -106,7 +106,7 @@ def test_debris_is_a_surface_too(run: Path) -> None:
 
 
 def test_colours_come_from_the_piece_itself(run: Path) -> None:
-    moment = Reel(run).moment(2)
+    moment = FrameSequence(run).moment(2)
     red, blue = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])
     upper = moment.fragment == int(moment.fragment.max())
     colors = torch.where(upper[:, None], red, blue)
@@ -120,7 +120,7 @@ def test_obj_and_glb_hold_an_object_per_fragment(run: Path, tmp_path: Path) -> N
     last = str(FRAMES - 1)
     write(run, tmp_path, mesh_ending="obj", frames=last)
     write(run, tmp_path, mesh_ending="glb", frames=last)
-    truth = {piece.name: piece for piece in fragment_meshes(Reel(run).moment(FRAMES - 1))}
+    truth = {piece.name: piece for piece in fragment_meshes(FrameSequence(run).moment(FRAMES - 1))}
     path = tmp_path / "meshes" / f"frame_{FRAMES:04d}.obj"
     text = path.read_text().splitlines()
     assert [line[2:] for line in text if line.startswith("o ")] == list(truth)

@@ -63,12 +63,12 @@ def test_baked_light_looks_like_the_lit_picture(run: Path, tmp_path: Path) -> No
     lighting: Lighting = light_of(shot)
     key = replace(lighting.lamps[0], direction=(-1.0, -0.5, 1.0))
     lighting = replace(lighting, lamps=(key, *lighting.lamps[1:]), specular=0.0)
-    lit = Render(camera, lighting, normal_cell=occupancy_cell(plain)).layers(plain)
+    lit = Render(camera, lighting, normal_cell=occupancy_cell(plain))(plain)
     unlit = Render(camera, None)
     solid = lit.alpha > 0.9
     assert solid.float().mean() > 0.2
-    assert psnr(unlit(baked), lit.image, solid) > 45.0
-    assert psnr(unlit(plain), lit.image, solid) < 22.0
+    assert psnr(unlit(baked).image, lit.image, solid) > 45.0
+    assert psnr(unlit(plain).image, lit.image, solid) < 22.0
     # lit from the left and above, in the shade below
     shade = baked.colors().mean(dim=1)
     low = baked.means[:, 2] < 0.33

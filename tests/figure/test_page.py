@@ -56,6 +56,7 @@ def page() -> Page:
 
 
 def test_page_is_balanced_escaped_and_fetches_nothing() -> None:
+    pytest.importorskip("matplotlib")
     reader = Balance()
     reader.feed(page().render())
     assert reader.open == []
@@ -65,6 +66,7 @@ def test_page_is_balanced_escaped_and_fetches_nothing() -> None:
 
 
 def test_same_numbers_same_bytes() -> None:
+    pytest.importorskip("matplotlib")
     assert page().render() == page().render()
 
 
@@ -79,6 +81,7 @@ def test_an_unknown_kind_is_refused() -> None:
 
 
 def test_pictures_travel_inside(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     with new_figure(1.0, 1.0) as figure:
         figure.subplots().plot([0, 1], [0, 1])
         save_png(figure, tmp_path / "a.png")

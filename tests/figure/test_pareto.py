@@ -10,6 +10,8 @@ import pytest
 from gsfluent.figure.pareto import Dot, Panel, Rates, colors_of, draw
 from gsfluent.figure.style import OURS, save_png
 
+pytest.importorskip("matplotlib")
+
 
 def panel() -> Panel:
     ours = [Dot("gsfluent", 1.0, 0.1, "dx 0.1"), Dot("gsfluent", 4.0, 0.01, "dx 0.05")]

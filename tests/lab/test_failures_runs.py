@@ -42,9 +42,11 @@ def spoil(name: str, value: float, *, after: int, times: int) -> Callable[[Any],
 def test_row_7_a_run_takes_shorter_steps_in_stiffer_matter() -> None:
     dt = []
     for young in (2e4, 8e4):
-        simulate = Simulate(dx=0.04, splats=False)
-        frames = list(simulate(dropped(0.05, young_modulus=young), fps=20, seconds=0.2))
-        report = simulate.report()
+        simulation = Simulate(dx=0.04, splats=False)(
+            dropped(0.05, young_modulus=young), fps=20, seconds=0.2
+        )
+        frames = list(simulation)
+        report = simulation.report
         assert report["verdict"] == "clean" and len(frames) == 4
         dt.append(report["dt_max"])
     assert dt[1] == pytest.approx(0.5 * dt[0], rel=0.15)  # the falling speed counts too
@@ -70,9 +72,9 @@ def test_row_15_points_outside_the_grid_are_counted_and_never_read() -> None:
 @pytest.mark.parametrize("value", [math.nan, 1e12, -1e12])
 def test_row_15_a_point_thrown_out_of_the_world_once_is_healed(value: float) -> None:
     hook = spoil("position", value, after=12, times=1)
-    simulate = Simulate(dx=0.04, splats=False, step_hook=hook)
-    frames = list(simulate(dropped(), fps=20, seconds=0.2))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, splats=False, step_hook=hook)(dropped(), fps=20, seconds=0.2)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "healed" and report["reason"] and len(frames) == 4
     last = frames[-1].particles.position
     assert bool(torch.isfinite(last).all()) and float(last.abs().max()) < 1.0
@@ -80,9 +82,11 @@ def test_row_15_a_point_thrown_out_of_the_world_once_is_healed(value: float) -> 
 
 def test_row_15_a_point_thrown_out_again_and_again_ends_the_run_with_the_reason() -> None:
     hook = spoil("position", 1e12, after=12, times=-1)
-    simulate = Simulate(dx=0.04, splats=False, step_hook=hook, max_rollbacks=2)
-    frames = list(simulate(dropped(), fps=20, seconds=0.3))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, splats=False, step_hook=hook, max_rollbacks=2)(
+        dropped(), fps=20, seconds=0.3
+    )
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "failed" and len(frames) == report["frames"] < 6
     assert "frame" in report["reason"] and "step" in report["reason"]
 
@@ -100,24 +104,26 @@ def test_row_24_the_number_of_splats_does_not_set_the_number_of_points() -> None
 
 
 def test_row_26_a_nan_at_step_seven_is_healed_and_the_clock_stays_right() -> None:
-    clean = Simulate(dx=0.04, splats=False)
-    *_, wanted = clean(dropped(), fps=20, seconds=0.2)
+    clean = Simulate(dx=0.04, splats=False)(dropped(), fps=20, seconds=0.2)
+    *_, wanted = clean
     hook = spoil("velocity", math.nan, after=7, times=1)
-    simulate = Simulate(dx=0.04, splats=False, step_hook=hook)
-    frames = list(simulate(dropped(), fps=20, seconds=0.2))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, splats=False, step_hook=hook)(dropped(), fps=20, seconds=0.2)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "healed" and report["rollbacks"] == 1
     assert [frame.time for frame in frames] == [k / 20 for k in range(4)]
     apart = (frames[-1].particles.position - wanted.particles.position).abs().max()
     assert float(apart) < 0.05 * 0.04
-    assert report["dt_min"] < 0.6 * clean.report()["dt_max"]  # it went on with half the step
+    assert report["dt_min"] < 0.6 * clean.report["dt_max"]  # it went on with half the step
 
 
 def test_row_26_a_nan_in_every_step_fails_and_keeps_what_was_good() -> None:
     hook = spoil("velocity", math.nan, after=7, times=-1)
-    simulate = Simulate(dx=0.04, splats=False, step_hook=hook, max_rollbacks=2)
-    frames = list(simulate(dropped(), fps=20, seconds=0.3))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, splats=False, step_hook=hook, max_rollbacks=2)(
+        dropped(), fps=20, seconds=0.3
+    )
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "failed" and report["rollbacks"] == 2
     assert "frame" in report["reason"] and "step" in report["reason"]
     for frame in frames:

@@ -11,10 +11,10 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.errors import InputError
 from gsfluent.live.session import MOST_LOOSE, LiveSession
+from gsfluent.pipeline.simulate.debris import find_loose
 from gsfluent.pipeline.simulate.grow import copy_of, grow, shrink
 from gsfluent.pipeline.simulate.health import figures_of
 from gsfluent.pipeline.simulate.stage import Simulate
-from gsfluent.pipeline.simulate.strays import find_lonely
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import saved
 
@@ -46,8 +46,9 @@ def test_a_poke_is_the_event_of_a_shot(event) -> None:
     frames = live.advance((count - 3 - 1) / 100.0)
     scene = standing()
     scene.add_event(event | {"at": at})
-    simulate = Simulate(dx=DX, standing=True, loose_crumbs=True)
-    *_, last = simulate(scene, fps=100.0, seconds=count / 100.0)
+    simulate = Simulate(dx=DX, standing=True, loose_debris=True)
+    simulation = simulate(scene, fps=100.0, seconds=count / 100.0)
+    *_, last = simulation
     assert last.index == live.index and last.time == live.time
     # to the bit: the same matter in the same state goes through the same code
     assert torch.equal(last.particles.position, frames[-1].positions)
@@ -55,7 +56,7 @@ def test_a_poke_is_the_event_of_a_shot(event) -> None:
     assert torch.equal(last.damage, frames[-1].damage)
     moved = last.particles.position[:100] - simulate.prepare(scene).rest[:100]
     assert float(moved.norm(dim=1).max()) > 1e-4
-    assert simulate.report()["substeps"] == live.report()["substeps"] > 0
+    assert simulation.report["substeps"] == live.report()["substeps"] > 0
 
 
 def test_with_many_frames_a_second_it_still_is_that_event() -> None:
@@ -69,7 +70,7 @@ def test_with_many_frames_a_second_it_still_is_that_event() -> None:
     scene = standing()
     scene.add_event(BULLET | {"at": live.pokes[0]["at"]})
     scene.add_event(THROW | {"at": live.pokes[1]["at"]})
-    simulate = Simulate(dx=DX, standing=True, loose_crumbs=True)
+    simulate = Simulate(dx=DX, standing=True, loose_debris=True)
     *_, last = simulate(scene, fps=600.0, seconds=26 / 600)
     assert last.index == live.index == 25
     assert torch.equal(last.particles.position, frames[-1].positions)
@@ -156,18 +157,18 @@ def test_no_more_than_so_many_bullets_at_a_time() -> None:
     assert live.report()["verdict"] == "clean"
 
 
-def test_a_kick_gives_exactly_its_momentum() -> None:
+def test_an_impulse_gives_exactly_its_momentum() -> None:
     live = LiveSession(standing(SOFT), dx=DX, fps=100.0)
     velocity = (0.4, -0.2, 1.5)
     live.throw(velocity, spin=(0, 0, 12.0))
     run = live.run
-    kicked = run.kicks.given(run.state)
-    now = figures_of(run.matter, kicked, run.scene.gravity)
+    pushed = run.impulses.given(run.state)
+    now = figures_of(run.matter, pushed, run.scene.gravity)
     mass = float(run.matter.particles.mass.double().sum())
     assert now.momentum == pytest.approx([mass * v for v in velocity], rel=1e-6)
-    p = kicked.particles
-    center = (p.mass[:, None] * kicked.position).sum(0) / p.mass.sum()
-    arm = kicked.position - center
+    p = pushed.particles
+    center = (p.mass[:, None] * pushed.position).sum(0) / p.mass.sum()
+    arm = pushed.position - center
     inertia = float((p.mass * (arm[:, 0] ** 2 + arm[:, 1] ** 2)).sum()) + 0.5 * mass * DX**2
     spin = now.angular_momentum[2] - float(
         torch.linalg.cross(center, mass * torch.tensor(velocity).double())[2]
@@ -248,7 +249,7 @@ def test_a_late_bullet_hits_as_an_early_one_does(rigid) -> None:
     for at in (0.0, 0.5):
         scene = standing()
         scene.add_event(BULLET | {"at": at, "rigid": rigid, "radius": 0.012})
-        simulate = Simulate(dx=DX, standing=True, loose_crumbs=True)
+        simulate = Simulate(dx=DX, standing=True, loose_debris=True)
         frames = list(simulate(scene, fps=50.0, seconds=at + 0.06))
         ends.append(frames[-1])
         seen = saved(frames[0], scene).gaussians
@@ -263,7 +264,7 @@ def test_a_late_bullet_hits_as_an_early_one_does(rigid) -> None:
     )
 
 
-def test_crumbs_that_are_alone_leave_the_grid_with_their_momentum() -> None:
+def test_loose_debris_leaves_the_grid_with_its_momentum() -> None:
     generator = torch.Generator().manual_seed(0)
     cloud = torch.rand(40, 3, generator=generator, dtype=torch.float64) * 0.1
     clump = torch.rand(400, 3, generator=generator, dtype=torch.float64) * 0.04 + 0.5
@@ -272,10 +273,10 @@ def test_crumbs_that_are_alone_leave_the_grid_with_their_momentum() -> None:
     peak = torch.ones(len(position))
     peak[-1] = -0.1  # an unbroken point near the single one keeps it
     everyone = torch.ones(len(position), dtype=torch.bool)
-    lonely = find_lonely(position, peak, everyone, 0.02)
+    lonely = find_loose(position, peak, everyone, 0.02)
     assert lonely[:40].all() and not lonely[40:].any()
     everyone[:20] = False
-    assert find_lonely(position, peak, everyone, 0.02)[:40].tolist() == [False] * 20 + [True] * 20
+    assert find_loose(position, peak, everyone, 0.02)[:40].tolist() == [False] * 20 + [True] * 20
 
     scene = Scene(floor=None, gravity=(0, 0, 0))
     scene.add(ellipsoid((0.05,) * 3, splats=200), name="ball")
@@ -283,8 +284,8 @@ def test_crumbs_that_are_alone_leave_the_grid_with_their_momentum() -> None:
     live.shoot((0.2, 0, 0), (-1, 0, 0), 80.0, 0.01)
     live.advance(0.03)
     run, state = live.run, live.run.state
-    assert len(run.scene.bodies) == 2 and 50 < int(state.stray.sum()) < state.stray.numel()
+    assert len(run.scene.bodies) == 2 and 50 < int(state.loose.sum()) < state.loose.numel()
     now = figures_of(run.matter, state, run.scene.gravity)
     bullet = 4 / 3 * math.pi * 0.01**3 * 7800 * 80.0
     assert now.momentum == pytest.approx((-bullet, 0, 0), abs=1e-5 * bullet)
-    assert not state.particles.strain[state.stray].any()
+    assert not state.particles.strain[state.loose].any()

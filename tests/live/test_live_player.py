@@ -1,4 +1,4 @@
-"""The thread that drives a live session: order of pokes, honest figures, failures, takes."""
+"""The thread that drives a live session: order of pokes, honest figures, failures, recordings."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def test_a_take_is_a_run_and_its_shot_gives_the_same(solid, tmp_path) -> None:
         slow = player.set_slow(1.0)
         player._obey()
         slow.result(0)
-    done.append(player.end_take())
+    done.append(player.end_recording())
     player._obey()
     assert [future.exception(0) for future in done] == [None] * 4
     folder = out / "stages" / "simulate"
@@ -198,7 +198,7 @@ def test_a_take_is_a_run_and_its_shot_gives_the_same(solid, tmp_path) -> None:
     scene = build_scene(shot, solids, stage.scene.bodies[0].frame)
     assert scene.bodies[0].offset == pytest.approx(stage.scene.bodies[0].offset)
     solve = shot.solve
-    simulate = Simulate(dx=DX, standing=solve.standing, loose_crumbs=solve.loose_crumbs)
+    simulate = Simulate(dx=DX, standing=solve.standing, loose_debris=solve.loose_debris)
     *_, end = simulate(scene, fps=shot.output.fps, seconds=shot.output.seconds)
     assert end.index == 6
     count = last.positions.shape[0]

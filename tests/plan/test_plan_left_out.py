@@ -13,7 +13,7 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.config import Shot
 from gsfluent.io.splats.load import save_splats
-from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.pipeline.simulate.stage import Simulate, Simulation
 from gsfluent.plan.motion import foresee
 from gsfluent.plan.work import passes_of
 from gsfluent.scene.scene import Scene
@@ -37,13 +37,13 @@ def needed(shot: Shot, scene: Scene, seconds: float) -> dict[str, bool]:
     return {row["pass"]: row["needed"] for row in rows}
 
 
-def ran(scene: Scene, seconds: float) -> tuple[dict[str, Any], Simulate]:
-    stage = Simulate(dx=DX, splats=False)
-    for _ in stage(scene, fps=4 / seconds, seconds=seconds):
+def ran(scene: Scene, seconds: float) -> tuple[dict[str, Any], Simulation]:
+    simulation = Simulate(dx=DX, splats=False)(scene, fps=4 / seconds, seconds=seconds)
+    for _ in simulation:
         pass
-    report = stage.report()
+    report = simulation.report
     assert report["verdict"] == "clean"
-    return report, stage
+    return report, simulation
 
 
 def ball(material: materials.Material, height: float, speed: float = 0.0) -> Scene:
@@ -56,11 +56,10 @@ def ball(material: materials.Material, height: float, speed: float = 0.0) -> Sce
 def test_no_brittle_part_gets_no_damage_variable(shot: Shot) -> None:
     wanted = needed(shot, ball(SOFT, 0.0), 0.05)
     assert not wanted["damage variable"] and not wanted["return map"] and not wanted["repair"]
-    report, stage = ran(ball(SOFT, 0.0), 0.05)
+    report, simulation = ran(ball(SOFT, 0.0), 0.05)
     assert report["substeps"] > 0
     assert report["skipped"]["damage_steps"] == report["substeps"]
-    assert stage._run is not None
-    assert bool((stage._run.state.peak == -1.0).all())
+    assert bool((simulation.run.state.peak == -1.0).all())
 
 
 def test_a_brittle_part_has_a_damage_variable(shot: Shot) -> None:
@@ -103,9 +102,9 @@ def test_an_object_in_free_fall_gets_no_grid(shot: Shot) -> None:
 
 
 def test_what_rests_in_a_standing_shot_sleeps() -> None:
-    stage = Simulate(dx=DX, splats=False, standing=True)
-    frames = list(stage(ball(SOFT, 0.0), fps=20, seconds=0.2))
-    report = stage.report()
+    simulation = Simulate(dx=DX, splats=False, standing=True)(ball(SOFT, 0.0), fps=20, seconds=0.2)
+    frames = list(simulation)
+    report = simulation.report
     assert report["substeps"] == 0 and report["skipped"]["sleeping_fraction"] == pytest.approx(1.0)
     moved = frames[-1].particles.position - frames[0].particles.position
     assert torch.equal(moved, torch.zeros_like(moved))

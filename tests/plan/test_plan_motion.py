@@ -57,10 +57,10 @@ def test_steps_points_and_blocks_are_those_of_the_run(height: float) -> None:
     scene = dropped(height)
     frames, fps = 10, 60.0
     seen = foresee(scene, DX, (frames - 1) / fps, frames, counts(scene))
-    stage = Simulate(dx=DX, splats=False)
-    for _ in stage(dropped(height), fps=fps, seconds=frames / fps):
+    simulation = Simulate(dx=DX, splats=False)(dropped(height), fps=fps, seconds=frames / fps)
+    for _ in simulation:
         pass
-    report = stage.report()
+    report = simulation.report
     assert sum(counts(scene)) == pytest.approx(report["particles"], rel=0.03)
     assert seen.substeps == pytest.approx(report["substeps"], rel=0.1)
     assert seen.grid_from == pytest.approx(report["skipped"]["free_flight_seconds"], abs=0.01)

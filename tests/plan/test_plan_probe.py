@@ -11,7 +11,7 @@ from gsfluent import materials
 from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
-from gsfluent.pipeline.capture.coarse_hull import hull_grid, masked_views
+from gsfluent.pipeline.capture.hull import hull_grid, masked_views
 from gsfluent.pipeline.capture.orient import look_at_point
 from gsfluent.plan import probe as plan_probe
 from gsfluent.plan.fit import Sample
@@ -51,8 +51,8 @@ def test_contact_is_seen_only_between_two() -> None:
 
 
 def test_crumbs_fill_more_blocks_than_their_volume() -> None:
-    whole, crumbs = ball(0.1, 40), ball(0.1, 40, crumbs=True)
-    assert float(crumbs.occupancy.sum()) < 0.02 * float(whole.occupancy.sum())
+    whole, debris = ball(0.1, 40), ball(0.1, 40, debris=True)
+    assert float(debris.occupancy.sum()) < 0.02 * float(whole.occupancy.sum())
 
 
 def test_an_export_whose_extra_is_missing_is_not_measured(

@@ -37,6 +37,7 @@ def record(**more: Any) -> dict[str, Any]:
 
 
 def test_what_was_measured_stands_there(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     text = report_page(tmp_path, record()).render()
     assert "clean: every stage finished" in text and 'class="good"' in text
     for words in ("1 234", "75 %", "taken up from before", "free flight seconds", "0.125", "0.5"):
@@ -90,6 +91,7 @@ def test_no_record_is_named(content: str | None, tmp_path: Path) -> None:
 
 
 def test_curves_leave_out_what_holds_no_number_and_refuse_other_lengths() -> None:
+    pytest.importorskip("matplotlib")
     assert curves([0.0, 1.0], "t", [Panel("none", "m", {"a": [None, None]})]) == ""
     assert curves([0.0, 1.0], "t", [Panel("zero", "m", {"a": [0.0, 0.0]}, log=True)]) == ""
     assert "<svg" in curves([0.0, 1.0], "t", [Panel("one", "m", {"a": [None, 2.0]})])

@@ -107,29 +107,22 @@ struct ParticleMomentum {
 };
 
 template <typename T>
-GSF_HOST_DEVICE ParticleMomentum<T> momentum_given(const Stencil<T>& s, const T* velocity,
-                                                   const T* slope, T mass, T dx) {
+GSF_HOST_DEVICE ParticleMomentum<T> particle_momentum(const Stencil<T>& s, T mass,
+                                                      const T* velocity, const T* affine,
+                                                      const T* stress, T volume, T dx, T dt) {
   ParticleMomentum<T> q;
-  for (int i = 0; i < 9; ++i) q.slope.m[i] = slope[i] * dx;
+  for (int i = 0; i < 9; ++i) q.slope.m[i] = mass * affine[i];
+  if (stress != nullptr) {
+    const T scale = -dt * volume * T(4) / (dx * dx);
+    const Mat3<T> tau = to_mat3(load_sym3(stress));
+    for (int i = 0; i < 9; ++i) q.slope.m[i] += scale * tau.m[i];
+  }
+  for (int i = 0; i < 9; ++i) q.slope.m[i] *= dx;
   for (int i = 0; i < 3; ++i)
     q.constant[i] = mass * velocity[i] -
                     (q.slope(i, 0) * s.f[0] + q.slope(i, 1) * s.f[1] + q.slope(i, 2) * s.f[2]);
   q.mass = mass;
   return q;
-}
-
-template <typename T>
-GSF_HOST_DEVICE ParticleMomentum<T> particle_momentum(const Stencil<T>& s, T mass,
-                                                      const T* velocity, const T* affine,
-                                                      const T* stress, T volume, T dx, T dt) {
-  Mat3<T> slope;
-  for (int i = 0; i < 9; ++i) slope.m[i] = mass * affine[i];
-  if (stress != nullptr) {
-    const T scale = -dt * volume * T(4) / (dx * dx);
-    const Mat3<T> tau = to_mat3(load_sym3(stress));
-    for (int i = 0; i < 9; ++i) slope.m[i] += scale * tau.m[i];
-  }
-  return momentum_given(s, velocity, slope.m, mass, dx);
 }
 
 // What one particle gathers: value = sum w g (four channels) and first = sum w g (x_i - x_p)^T

@@ -68,6 +68,19 @@ GSF_HOST_DEVICE void gather_stencil(const Stencil<T>& s, const Node& node, const
   }
 }
 
+// Momentum given to stencil node n in {0, 1, 2}^3 before its weight: constant + slope n.
+template <typename T>
+GSF_HOST_DEVICE ParticleMomentum<T> momentum_given(const Stencil<T>& s, const T* velocity,
+                                                   const T* slope, T mass, T dx) {
+  ParticleMomentum<T> q;
+  for (int i = 0; i < 9; ++i) q.slope.m[i] = slope[i] * dx;
+  for (int i = 0; i < 3; ++i)
+    q.constant[i] = mass * velocity[i] -
+                    (q.slope(i, 0) * s.f[0] + q.slope(i, 1) * s.f[1] + q.slope(i, 2) * s.f[2]);
+  q.mass = mass;
+  return q;
+}
+
 // The larger of two values; NaN counts as larger than any.
 template <typename T>
 GSF_HOST_DEVICE T larger(T a, T b) {

@@ -10,19 +10,28 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> return_mapping_adjoint(
     const Tensor& strain, const Tensor& alpha, const Tensor& increment, const Tensor& law,
     const Tensor& params, const OptTensor& material, double k, double epsilon, bool implicit) {
   const char* op = "return_mapping_adjoint";
-  const Tensor e = ready(op, "strain", strain, strain, {-1, 6});
-  const int64_t n = e.size(0);
-  const ScalarType dtype = e.scalar_type();
-  const Tensor l = ready(op, "law", law, e, {-1}, ScalarType::Int);
-  const int64_t rows = l.size(0);
-  const Tensor gs = ready(op, "grad_strain", g_strain, e, {n, 6});
-  const Tensor ga = ready(op, "grad_alpha", g_alpha, e, {n});
-  const Tensor gt = ready(op, "grad_stress", g_stress, e, {n, 6});
-  const Tensor na = ready(op, "new_alpha", new_alpha, e, {n});
-  const Tensor a = ready(op, "alpha", alpha, e, {n});
-  const Tensor inc = ready(op, "increment", increment, e, {n, 3, 3});
-  const Tensor par = ready(op, "params", params, e, {rows, kParamColumns});
-  const OptTensor mat = ready(op, "material", material, e, {n}, ScalarType::Int);
+  check_shape(op, "strain", strain, {-1, 6});
+  const int64_t n = strain.size(0);
+  const ScalarType dtype = strain.scalar_type();
+  check_shape(op, "law", law, {-1});
+  check_dtype(op, "law", law, ScalarType::Int);
+  const int64_t rows = law.size(0);
+  const auto ready = [&](const char* name, const Tensor& t, std::initializer_list<int64_t> shape) {
+    check_shape(op, name, t, shape);
+    check_dtype(op, name, t, dtype);
+    check_same_device(op, name, t, strain);
+    return gsf::contiguous(t);
+  };
+  const Tensor gs = ready("grad_strain", g_strain, {n, 6}), ga = ready("grad_alpha", g_alpha, {n}),
+               gt = ready("grad_stress", g_stress, {n, 6}), na = ready("new_alpha", new_alpha, {n}),
+               e = ready("strain", strain, {n, 6}), a = ready("alpha", alpha, {n}),
+               inc = ready("increment", increment, {n, 3, 3}),
+               par = ready("params", params, {rows, kParamColumns}), l = gsf::contiguous(law);
+  if (material) {
+    check_shape(op, "material", *material, {n});
+    check_dtype(op, "material", *material, ScalarType::Int);
+  }
+  const OptTensor mat = material ? OptTensor(gsf::contiguous(*material)) : OptTensor();
   STD_TORCH_CHECK(mat || rows == 1 || rows == n, op,
                   ": without material, params must have 1 or N rows, got ", rows);
   const Tensor out_strain = new_zeros(e, {n, 6}, dtype), out_alpha = new_zeros(e, {n}, dtype),
@@ -32,7 +41,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> return_mapping_adjoint(
   dispatch_floating(op, e, [&]<typename T>() {
     const T* row_of = cptr<T>(par);
     const int32_t* law_of = cptr<int32_t>(l);
-    const int32_t* index = cptr<int32_t>(mat);
+    const int32_t* index = mat ? cptr<int32_t>(*mat) : nullptr;
     const NaccOptions<T> options{T(k), T(epsilon), implicit};
     const T *strains = cptr<T>(e), *alphas = cptr<T>(a), *increments = cptr<T>(inc),
             *news = cptr<T>(na), *g_strains = cptr<T>(gs), *g_alphas = cptr<T>(ga),

@@ -345,5 +345,5 @@ struct Cpu {
 STABLE_TORCH_LIBRARY_IMPL(gsfluent, CPU, m) {
   gsf::MpmOps<gsf::cpu::Cpu>::register_all(m);
   // CUDA has this one in torch operations: gsfluent/ops/_mpm_grad.py.
-  GSF_IMPL(gsf::MpmOps<gsf::cpu::Cpu>, transfer_slope);
+  GSF_IMPL_UNBOX(gsf::MpmOps<gsf::cpu::Cpu>, transfer_slope);
 }

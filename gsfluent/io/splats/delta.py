@@ -378,9 +378,15 @@ def predict(
 
 def multiply(a: Floats, b: Floats) -> Floats:
     """Hamilton product of quaternions ``wxyz``, normalised."""
+    product = hamilton(a, b)
+    return product / np.linalg.norm(product, axis=1, keepdims=True)
+
+
+def hamilton(a: Floats, b: Floats) -> Floats:
+    """Hamilton product of quaternions ``wxyz``."""
     w, x, y, z = a.T
     q, r, s, t = b.T
-    product = np.stack(
+    return np.stack(
         [
             w * q - x * r - y * s - z * t,
             w * r + x * q + y * t - z * s,
@@ -389,7 +395,6 @@ def multiply(a: Floats, b: Floats) -> Floats:
         ],
         axis=1,
     )
-    return product / np.linalg.norm(product, axis=1, keepdims=True)
 
 
 def rotation_to_quaternion(vectors: Floats) -> Floats:

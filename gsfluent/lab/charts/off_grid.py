@@ -60,7 +60,7 @@ def _runs(setting: Setting, device: str, repeat: int) -> Record:
         if device.startswith("cuda"):
             torch.cuda.synchronize()
         walls.append(time.perf_counter() - start)
-    return _record(setting, device, frames, simulate.report(), walls[1:])
+    return _record(setting, device, frames, coming.report, walls[1:])
 
 
 def _record(

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.data import Capture, View
 from gsfluent.errors import InputError
 from gsfluent.pipeline.capture.views import TrainView
+from gsfluent.spatial.density import GridBox
+from gsfluent.spatial.voxels import surface
+
+Array = NDArray[np.float64]
+_View = TypeVar("_View")
 
 _SCRAP = 0.3  # share of the largest body of a hull below which another one is a scrap
-
-
 _COARSE = 40  # cells per side of the first hull
+_COARSE_SIZE = 128  # pixels of the masks then: finer than a voxel
+_COARSE_VIEWS = 24
+_AGREE = 0.9  # share of them that must agree on a voxel; one bad mask must not cut the object
 
 
 @dataclass(frozen=True)
@@ -121,8 +131,8 @@ def _reach(views: list[TrainView], middle: Tensor) -> float:
     reach = []
     for view in views:
         assert view.mask is not None  # callers pass masked views
-        depth = float((view.viewmat[:3, :3] @ middle + view.viewmat[:3, 3])[2])
         spot = view.viewmat[:3, :3] @ middle + view.viewmat[:3, 3]
+        depth = float(spot[2])
         pixel = (view.K @ (spot / spot[2]))[:2]
         row, column = (view.mask > 0.5).nonzero().unbind(1)
         if depth <= 0 or len(row) == 0:
@@ -140,34 +150,86 @@ def _carve(
     views: list[TrainView], lower: Tensor, voxel: float, shape: tuple[int, int, int], allowed: int
 ) -> Hull:
     """Voxels that at most ``allowed`` masks contradict."""
-    device = views[0].color.device
+    start = lower.to(views[0].color.device)
+    points = start + lattice(shape, start.device) * voxel
+    kept = carved(points, views, lambda part, view: ~_allowed(part, view, voxel), allowed)
+    return Hull(kept.view(shape), start, voxel)
+
+
+def lattice(shape: Sequence[int], device: torch.device | None = None) -> Tensor:
+    """Centres of the voxels of a grid in voxels, float32 [X * Y * Z, 3]."""
     axes = [torch.arange(n, device=device, dtype=torch.float32) + 0.5 for n in shape]
-    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    points = lower.to(device) + grid * voxel
-    alive = torch.arange(len(points), device=device)
-    misses = torch.zeros(len(points), dtype=torch.int32, device=device)
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def carved(
+    points: Tensor,
+    views: Iterable[_View],
+    denied: Callable[[Tensor, _View], Tensor],
+    allowed: int,
+) -> Tensor:
+    """Points [N, 3] that at most so many views deny, bool [N]; what is gone is asked no more.
+
+    Args:
+        points: World positions.
+        views: What has seen them.
+        denied: Which of the points [M, 3] a view denies, bool [M].
+        allowed: Views that may be wrong about a point.
+    """
+    alive = torch.arange(len(points), device=points.device)
+    misses = torch.zeros(len(points), dtype=torch.int32, device=points.device)
     for view in views:
-        misses[alive] += (~_allowed(points[alive], view, voxel)).int()
+        misses[alive] += denied(points[alive], view).int()
         alive = alive[misses[alive] <= allowed]
-    occupancy = torch.zeros(len(points), dtype=torch.bool, device=device)
-    occupancy[alive] = True
-    return Hull(occupancy.view(shape), lower.to(device), voxel)
+    return misses <= allowed
+
+
+Ground = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Pixels known to show something else than the object, bool [H, W]; world to camera [4, 4]; K."""
+
+
+def centre_hull(
+    box: GridBox, views: Sequence[Ground], device: torch.device | None = None
+) -> np.ndarray:
+    """Voxels whose centre falls inside the mask of (nearly) every view that sees it.
+
+    One stray mask must not cut the object in two: from eight views on, two views have to agree
+    before a voxel goes. Voxels outside every image are kept.
+
+    Args:
+        box: The grid.
+        views: What is not the object.
+        device: Where to compute.
+
+    Returns:
+        Hull bool [X, Y, Z].
+    """
+    grid = lattice(box.shape, device)
+    points = grid * box.voxel + grid.new_tensor(box.origin)
+
+    def outside(points: Tensor, view: Ground) -> Tensor:
+        ground, viewmat, intrinsics = view
+        height, width = ground.shape
+        pose, lens = points.new_tensor(viewmat), points.new_tensor(intrinsics)
+        camera = points @ pose[:3, :3].T + pose[:3, 3]
+        z = camera[:, 2]
+        u, v = ((camera @ lens.T)[:, :2] / z[:, None]).unbind(1)
+        seen = (z > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        column, row = torch.where(seen, u, 0).long(), torch.where(seen, v, 0).long()
+        return seen & torch.from_numpy(ground).to(points.device)[row, column]
+
+    kept = carved(points, views, outside, 1 if len(views) >= 8 else 0)
+    return kept.view(box.shape).cpu().numpy()
 
 
 def _allowed(points: Tensor, view: TrainView, voxel: float) -> Tensor:
     """Whether voxels at ``points`` [N, 3] touch the mask of a view, or lie out of its sight."""
     assert view.mask is not None
-    local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    depth = local[:, 2]
-    pixel = local @ view.K.T
-    pixel = pixel[:, :2] / depth.clamp_min(1e-6)[:, None]
+    row, column, on, depth = view.locate(points)
     footprint = 0.5 * voxel * float(view.K[0, 0])
     grow = max(1, math.ceil(footprint / max(float(depth.median()), 1e-6)))
     grown = functional.max_pool2d(view.mask[None, None], 2 * grow + 1, 1, grow)[0, 0]
-    width, height = view.size
-    column, row = pixel.floor().long().unbind(1)
-    on = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    keep = grown[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5
+    keep = grown[row, column] > 0.5
     # Off the crop means off the mask, unless the mask touches the edge of the photograph.
     unseen = torch.full_like(keep, _touches_edge(view.mask)) | (depth <= 0)
     return torch.where(on, keep, unseen)
@@ -189,3 +251,87 @@ def _dilated(occupancy: Tensor, cells: int) -> Tensor:
         return occupancy
     grown = functional.max_pool3d(occupancy[None, None].float(), 2 * cells + 1, 1, cells)
     return grown[0, 0] > 0.5
+
+
+def masked_views(capture: Capture) -> list[View]:
+    """Read evenly chosen photographs, small, those that come with a mask."""
+    step = max(1, len(capture) // _COARSE_VIEWS)
+    views = [capture.view(index, _COARSE_SIZE) for index in range(0, len(capture), step)]
+    return [view for view in views if view.mask is not None]
+
+
+def inside_masks(views: list[View], points: Tensor) -> Array:
+    """Share of the views with each point [N, 3] inside their mask, [N]; out of view is outside."""
+    votes = torch.zeros(len(points), dtype=torch.float64)
+    for view in views:
+        if view.mask is None:
+            continue
+        pixels, depth = view.camera.project(points)
+        place = pixels.floor().long()
+        limit = torch.tensor([view.camera.width, view.camera.height])
+        seen = (depth > 0) & (place >= 0).all(dim=1) & (place < limit).all(dim=1)
+        votes[seen] += (view.mask[place[seen, 1], place[seen, 0]] > 0.5).double()
+    return np.asarray((votes / max(1, len(views))).numpy())
+
+
+def hull_points(capture: Capture, focus: Array) -> tuple[Array, Array]:
+    """Surface of the visual hull: points [M, 3] and their colours [M, 3]; empty without masks.
+
+    Args:
+        capture: Photographs with masks.
+        focus: Point the cameras look at [3].
+    """
+    views = masked_views(capture)
+    grid, inside = hull_grid(views, capture, focus)
+    if not inside.any():
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    points = grid[surface(inside)]
+    return points, _colors(views, points)
+
+
+def hull_grid(
+    views: list[View], capture: Capture, focus: Array, voxels: int = _COARSE
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Lattice around the visual hull.
+
+    Args:
+        views: From :func:`masked_views`; fewer than three see nothing.
+        capture: Photographs they are of.
+        focus: Point the cameras look at [3].
+        voxels: Points of the lattice along each axis, V.
+
+    Returns:
+        Its points [V, V, V, 3], and which of them lie in the hull, bool [V, V, V]; where nothing
+        does the lattice may be coarser.
+    """
+    reach = float(np.median(np.linalg.norm(capture.centers().numpy() - focus, axis=1)))
+    low, high = focus - 0.6 * reach, focus + 0.6 * reach
+    grid, inside = np.zeros((*(voxels,) * 3, 3)), np.zeros((voxels,) * 3, dtype=bool)
+    # each round fits the grid to what the last left; only the last has to be fine
+    for count in (voxels // 2, voxels // 2, voxels) if len(views) >= 3 else ():
+        axes = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        shares = inside_masks(views, torch.from_numpy(grid.reshape(-1, 3)))
+        inside = (shares >= _AGREE).reshape((count,) * 3)
+        if not inside.any():
+            break
+        occupied = grid[inside]
+        margin = 1.5 * (high - low) / (count - 1)
+        low, high = occupied.min(axis=0) - margin, occupied.max(axis=0) + margin
+    return grid, inside
+
+
+def _colors(views: list[View], points: Array) -> Array:
+    """Colour of each point in the view that faces it most."""
+    outward = torch.from_numpy(points - points.mean(axis=0))
+    best = torch.full((len(points),), -np.inf, dtype=torch.float64)
+    colors = torch.full((len(points), 3), 0.5, dtype=torch.float64)
+    for view in views:
+        facing = outward @ (view.camera.center() - torch.from_numpy(points.mean(axis=0)))
+        pixels, _ = view.camera.project(torch.from_numpy(points))
+        limit = torch.tensor([view.camera.width - 1, view.camera.height - 1])
+        place = torch.minimum(pixels.floor().long().clamp_min(0), limit)
+        better = facing > best
+        colors[better] = view.image[place[better, 1], place[better, 0]].double()
+        best = torch.maximum(best, facing)
+    return np.asarray(colors.numpy())

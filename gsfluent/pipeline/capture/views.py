@@ -43,6 +43,20 @@ class TrainView:
         """Width and height [px]."""
         return int(self.color.shape[1]), int(self.color.shape[0])
 
+    def locate(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Rows and columns of the pixels that show points [N, 3], kept within the picture.
+
+        Returns:
+            Row and column, int64 [N]; whether the point lies in the picture, bool [N]; depth [N].
+        """
+        local = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depth = local[:, 2]
+        pixel = (local @ self.K.T)[:, :2] / depth.clamp_min(1e-6)[:, None]
+        width, height = self.size
+        column, row = pixel.floor().long().unbind(1)
+        on = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        return row.clamp(0, height - 1), column.clamp(0, width - 1), on, depth
+
 
 def read_views(
     capture: Capture, max_size: int, device: torch.device, *, crop: bool

@@ -47,7 +47,7 @@ def distance(a: Tensor, b: Tensor, dx: float) -> float:
     return 0.0
 
 
-def near_pairs(position: Tensor, label: Tensor, edge: float) -> Tensor:
+def proximity_pairs(position: Tensor, label: Tensor, edge: float) -> Tensor:
     """Pairs of labels with points in the same or in touching cubes of ``edge`` metres.
 
     Args:
@@ -120,4 +120,4 @@ def _half_star() -> list[int]:
 def _cubes_meet(a: Tensor, b: Tensor, edge: float) -> bool:
     """Tell whether points of both lie in the same or in touching cubes of ``edge``."""
     label = torch.cat([torch.zeros_like(a[:, 0]), torch.ones_like(b[:, 0])])
-    return near_pairs(torch.cat([a, b]), label, edge).shape[0] > 0
+    return proximity_pairs(torch.cat([a, b]), label, edge).shape[0] > 0

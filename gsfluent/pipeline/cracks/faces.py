@@ -4,7 +4,7 @@ At rest every site (:mod:`gsfluent.pipeline.cracks.sites`) belongs to the materi
 nearest. Where the cells of two points meet that have moved apart there is a face: the plane halfway
 between the two. A *face element* is a flat splat on it, one for each site beside it, with the
 colour of the matter there and the normal of the plane. All of this is known at rest and computed
-once, when the gap opens; from frame to frame the elements only ride along.
+once, when the gap opens; from frame to frame the elements are only carried along.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Fit(NamedTuple):
 
 PIECE = Fit(layer=0.85, overlap=0.3, width=0.55, inset=0.3, slack=0.0)
 """On pieces, whose faces are broad: what counts is that nothing shows through."""
-CRUMB = Fit(layer=0.5, overlap=0.0, width=0.4, inset=0.45, slack=-0.8)
-"""On crumbs, which are a few elements wide: what counts is that they do not swell."""
+DEBRIS = Fit(layer=0.5, overlap=0.0, width=0.4, inset=0.45, slack=-0.8)
+"""On debris, which is a few elements wide: what counts is that it does not swell."""
 THICKNESS = 0.25
 """Standard deviation across the face, in pitches."""
 RIM = 1.5
@@ -128,7 +128,7 @@ def find_elements(
         rest: Material points at rest [m], [N, 3].
         near: Neighbours of every point, itself first, int64 [N, K].
         opened: Which of them have moved away, bool [N, K].
-        fit: :data:`PIECE` or :data:`CRUMB`.
+        fit: :data:`PIECE` or :data:`DEBRIS`.
 
     Returns:
         Their elements, sorted.

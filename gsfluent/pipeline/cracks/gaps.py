@@ -17,7 +17,7 @@ from gsfluent import geometry, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.cracks.cuts import cut_splats
-from gsfluent.pipeline.cracks.faces import CRUMB, PIECE, Elements, Fit, find_elements
+from gsfluent.pipeline.cracks.faces import DEBRIS, PIECE, Elements, Fit, find_elements
 from gsfluent.pipeline.cracks.sites import Sites
 from gsfluent.pipeline.matter.carry import Carry, Points
 from gsfluent.pipeline.matter.links import BACK, FULL, OPEN, Hanging
@@ -83,7 +83,7 @@ class Gaps:
         """Go on from :meth:`state` of another run of the same scene; from nothing when empty."""
         self._before: Hanging | None = self.carry.links.restored(state) if state else None
         self._opened = torch.zeros_like(self.carry.links.near, dtype=torch.bool)
-        self._crumb = torch.zeros_like(self._opened[:, 0])
+        self._debris = torch.zeros_like(self._opened[:, 0])
         self._elements: Elements | None = None
         self._rest = self.carry.gaussians
 
@@ -101,11 +101,11 @@ class Gaps:
         hanging = self.carry.links.look(points.position, points.fragments, self._before)
         self._before = hanging
         points = points._replace(hanging=hanging)
-        crumb = points.fragments[: hanging.opened.shape[0]] < 0
+        debris = points.fragments[: hanging.opened.shape[0]] < 0
         changed = (hanging.opened != self._opened).any(dim=1)
-        changed |= (crumb != self._crumb) & hanging.opened.any(dim=1)
+        changed |= (debris != self._debris) & hanging.opened.any(dim=1)
         if bool(changed.any()):
-            self._opened, self._crumb = hanging.opened, crumb
+            self._opened, self._debris = hanging.opened, debris
             self._cut(changed)
             self._open(changed)
         if self._elements is None or self._elements.count == 0:
@@ -137,8 +137,8 @@ class Gaps:
         stale = changed[self._sites.owner]
         old = self._elements
         parts = [] if old is None else [old.select(~stale[old.site])]
-        crumb = self._crumb[self._sites.owner]
-        for fit, which in ((PIECE, ~crumb), (CRUMB, crumb)):
+        debris = self._debris[self._sites.owner]
+        for fit, which in ((PIECE, ~debris), (DEBRIS, debris)):
             for rows in (stale & which).nonzero()[:, 0].split(CHUNK):
                 parts.append(self._found(rows, fit))
         self._elements = Elements.sorted(parts) if parts else None

@@ -3,7 +3,7 @@
 After Fracture-GS (ICLR 2026): a splat whose point is broken gets, for the nearest unbroken splat on
 either side of it, a copy shaped as the smallest ellipsoid around the overlap of the two
 (:func:`gsfluent.ops.mvee_lens`). Unlike there, the overlap is taken at rest, where it exists by
-construction, and the copy then rides rigidly with the unbroken side, so that it stays when the
+construction, and the copy is then carried rigidly with the unbroken side, so that it stays when the
 pieces part. The parent stays as well; parent and copies form one sibling group, of which a
 rasterizer shows only the nearest per pixel.
 """

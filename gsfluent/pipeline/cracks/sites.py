@@ -22,7 +22,7 @@ from gsfluent.spatial.neighbours import nearest_rows
 from gsfluent.spatial.pieces import sample, signed_depth
 
 PER_POINT = (2.0, 3.0)
-"""Sites per spacing of the material points and axis, at least, so that a crumb of one point has a
+"""Sites per spacing of the material points and axis, at least, so that debris of one point has a
 shape, and at most; between them the voxels of the colours decide."""
 MOST = 1_000_000
 """Largest number of sites of a scene; more would make a coarser lattice."""

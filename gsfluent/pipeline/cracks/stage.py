@@ -10,6 +10,7 @@ Two ways, see docs/theory/cracks.md:
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import torch
@@ -42,6 +43,11 @@ class Repaired(NamedTuple):
     added: int
     ids: Tensor
     anchor: Tensor
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """How many splats there are, and how many of them were added."""
+        return {"splats": self.gaussians.count, "transition_splats": self.added}
 
     @classmethod
     def none(cls, carried: Gaussians, anchor: Tensor) -> Repaired:
@@ -81,33 +87,14 @@ class Repair(Stage):
         self.method = method
         self.radius = radius
         self.neighbour_radius = neighbour_radius
-        self._graph: CrackGraph | None = None
-        self._gaps: Gaps | None = None
-        self._resumed: dict[str, Any] | None = None
 
-    def step(self, carry: Carry, points: Points) -> Cracks | None:
-        """Go on to the next frame (method ``gap``): call once per frame, in their order.
-
-        What was open before decides with what is open now, so that nothing flickers.
-
-        Args:
-            carry: The binding of the splats; another one than last time starts a new run.
-            points: Where the material points are.
-
-        Returns:
-            The cracks; None with the other methods.
+    def begin(self, carry: Carry) -> CrackHistory:
+        """Begin a run with the splats of a binding.
 
         Raises:
-            InputError: The binding knows no scene.
+            InputError: The binding knows no scene (method ``gap``).
         """
-        if self.method != "gap":
-            return None
-        if self._gaps is None or self._gaps.carry is not carry:
-            self._gaps = Gaps(carry)
-        if self._resumed is not None:
-            self._gaps.restore(self._resumed)
-            self._resumed = None
-        return self._gaps.step(points)
+        return CrackHistory(self, carry)
 
     def forward(
         self,
@@ -115,6 +102,7 @@ class Repair(Stage):
         motion: Motion,
         carried: Gaussians | None = None,
         *,
+        history: CrackHistory | None = None,
         cracks: Cracks | None = None,
     ) -> Repaired:
         """Repair the splats of one moment.
@@ -123,16 +111,19 @@ class Repair(Stage):
             carry: The binding of the splats.
             motion: Their motion.
             carried: The carried splats, when they are at hand (method ``gap``: the cut ones).
-            cracks: What :meth:`step` returned for this moment; without it the step is made here.
+            history: The run this moment belongs to; without it the moment stands alone.
+            cracks: What its :meth:`CrackHistory.step` returned for this moment; without it the step
+                is made here.
 
         Returns:
             All splats, sibling groups, and how many were added.
 
         Raises:
-            InputError: As :meth:`step`.
+            InputError: As :meth:`begin`.
         """
+        history = self.begin(carry) if history is None else history
         if cracks is None and self.method == "gap":
-            cracks, carried = self.step(carry, motion.points), None
+            cracks, carried = history.step(motion.points), None
             assert cracks is not None  # method gap
             motion = carry.follow(cracks.points, cracks.rest)
         if cracks is not None:
@@ -141,9 +132,7 @@ class Repair(Stage):
         moved = carry.apply(motion) if carried is None else carried
         if self.method == "none":
             return Repaired.none(moved, motion.anchor)
-        if self._graph is None or self._graph.carry is not carry:
-            self._graph = CrackGraph(carry, self.radius, self.neighbour_radius)
-        made = transitions(self._graph, motion, moved)
+        made = transitions(history.graph, motion, moved)
         if made is None:
             return Repaired.none(moved, motion.anchor)
         added, parent, side = made
@@ -156,13 +145,40 @@ class Repair(Stage):
         anchor = torch.cat([motion.anchor, motion.anchor[side]])
         return Repaired(Gaussians.cat([moved, added]), groups, parent.numel(), ids, anchor)
 
+
+class CrackHistory:
+    """The cracks of one run, frame by frame (:meth:`Repair.begin`)."""
+
+    def __init__(self, repair: Repair, carry: Carry) -> None:
+        self.repair, self.carry = repair, carry
+        self._gaps = Gaps(carry) if repair.method == "gap" else None
+
+    @functools.cached_property
+    def graph(self) -> CrackGraph:
+        """Neighbours of the splats at rest (method ``mvee``)."""
+        return CrackGraph(self.carry, self.repair.radius, self.repair.neighbour_radius)
+
+    def step(self, points: Points) -> Cracks | None:
+        """Go on to the next frame (method ``gap``): call once per frame, in their order.
+
+        What was open before decides with what is open now, so that nothing flickers.
+
+        Args:
+            points: Where the material points are.
+
+        Returns:
+            The cracks; None with the other methods.
+        """
+        return None if self._gaps is None else self._gaps.step(points)
+
     def state(self) -> dict[str, Any]:
         """What a resumed run needs besides the points: plain tensors."""
         return {} if self._gaps is None else self._gaps.state()
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state` at the next :meth:`step`; from nothing for an empty one."""
-        self._resumed = state
+        """Go on from :meth:`state`; from nothing for an empty one."""
+        if self._gaps is not None:
+            self._gaps.restore(state)
 
 
 def _with_births(moved: Gaussians, motion: Motion, births: Births | None) -> Repaired:

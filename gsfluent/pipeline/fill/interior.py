@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gsfluent.data import Gaussians
     from gsfluent.spatial.density import GridBox
 
-__all__ = ["Placed", "interior_gaussians", "populate", "splat_sizes"]
+__all__ = ["Matter", "Placed", "interior_gaussians", "populate", "splat_sizes"]
 
 INTERIOR_OPACITY = 0.98
 _SIGMA_PER_SPACING = 0.45
@@ -33,6 +33,19 @@ _GROWTH = 0.3  # growth of the spacing per depth
 _FINER = 0.75  # of the skin's splats: leaves a narrower gap below the skin
 _STANDOFF = 1.25  # standard deviations between the outermost centres and the skin
 _ROOM = 0.5  # voxels; the largest stand-off
+
+
+class Matter(NamedTuple):
+    """Voxels to be filled."""
+
+    solid: np.ndarray
+    """Matter, bool [X, Y, Z]."""
+    depth: np.ndarray
+    """Depth below the surface [world units], float32 [X, Y, Z]; 0 outside."""
+    nearest: np.ndarray
+    """Index of the nearest outer voxel [3, X, Y, Z]."""
+    box: GridBox
+    """The grid."""
 
 
 class Placed(NamedTuple):
@@ -168,10 +181,7 @@ def splat_sizes(gaussians: Gaussians, points: np.ndarray, cell: float) -> np.nda
 
 def populate(
     surface: Gaussians,
-    solid: np.ndarray,
-    depth: np.ndarray,
-    nearest: np.ndarray,
-    box: GridBox,
+    matter: Matter,
     *,
     spacing: float | None,
     max_interior: int,
@@ -181,10 +191,7 @@ def populate(
 
     Args:
         surface: Splats of the shell.
-        solid: Matter, bool [X, Y, Z].
-        depth: Depth below the surface [X, Y, Z], world units.
-        nearest: Index of the nearest outer voxel [3, X, Y, Z].
-        box: The grid.
+        matter: Where the interior is.
         spacing: Largest distance between interior Gaussians in voxels; None takes 1.25.
         max_interior: Upper bound on their number.
         seed: Seed of the jitter.
@@ -196,6 +203,7 @@ def populate(
     """
     from gsfluent.data import INTERIOR, Gaussians
 
+    solid, depth, nearest, box = matter
     device, dtype = surface.means.device, surface.dtype
     index = np.argwhere(solid)
     # few distinct skin voxels serve many voxels; asking the tree from deep inside is slow

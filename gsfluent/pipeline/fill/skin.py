@@ -12,6 +12,7 @@ from torch import Tensor
 from gsfluent.data import Gaussians
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.tsdf import depth_views
+from gsfluent.spatial.voxels import surface
 
 if TYPE_CHECKING:
     from gsfluent.data import Capture
@@ -39,20 +40,16 @@ def skin_gaussians(field: SignedDistance, capture: Capture | None = None) -> Gau
         One splat for each voxel of the skin (at most 60 000), with normals.
     """
     inside = field.inside.cpu().numpy()
-    padded = np.pad(inside, 1)
-    buried = np.ones_like(inside)
-    for axis in range(3):
-        for step in (-1, 1):
-            buried &= np.roll(padded, step, axis)[1:-1, 1:-1, 1:-1]
-    index = np.argwhere(inside & ~buried)
-    if len(index) > _MOST:
+    index = np.argwhere(surface(inside))
+    count = len(index)
+    if count > _MOST:
         index = index[np.random.default_rng(0).choice(len(index), _MOST, replace=False)]
     values = field.values.cpu()
     slopes = torch.stack(torch.gradient(values), -1)[tuple(index.T)]
     normal = torch.nn.functional.normalize(slopes, dim=1)
     center = field.origin.cpu() + (torch.from_numpy(index) + 0.5) * field.voxel
     points = center - values[tuple(index.T)][:, None] * normal
-    size = 0.7 * field.voxel * math.sqrt(max(1.0, float((inside & ~buried).sum()) / len(index)))
+    size = 0.7 * field.voxel * math.sqrt(max(1.0, float(count) / len(index)))
     scales = torch.tensor([size, size, _FLAT * size]).repeat(len(points), 1)
     colors = torch.full((len(points), 3), _GREY)
     made = Gaussians.from_colors(

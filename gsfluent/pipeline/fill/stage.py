@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from gsfluent.data import Gaussians
+from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.errors import InputError
-from gsfluent.pipeline.fill.interior import populate
+from gsfluent.pipeline.fill.interior import Matter, populate
 from gsfluent.pipeline.fill.refine import refine_opacity
 from gsfluent.pipeline.fill.skin import skin_gaussians
+from gsfluent.pipeline.solid.evidence import Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.hollow import cavity_volume
-from gsfluent.pipeline.solid.vote import VoteOptions, evidence
+from gsfluent.pipeline.solid.source import find_solid
 from gsfluent.pipeline.solid.walls import walls
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     import trimesh
 
-    from gsfluent.data import Capture, Gaussians, Solid
+    from gsfluent.data import Capture
 
     Source = SignedDistance | trimesh.Trimesh | str | Path
 
@@ -124,15 +125,19 @@ class Fill(Stage):
         self.method = method
         self.hollow = _parse_hollow(hollow)
         self.solid_through = hollow == "none"
-        self.threshold = float(threshold)
-        self.agreement = float(agreement)
-        self.rays = rays
+        self.options = SolidOptions(
+            float(threshold),
+            float(agreement),
+            rays,
+            None if down is None else np.asarray(down, dtype=float),
+            close_underside,
+            masks=method != "vote",
+            match_masks=match_masks,
+            match_drawn=False,
+            finer=finer,
+        )
         self.spacing = spacing
         self.max_interior = int(max_interior)
-        self.down = None if down is None else np.asarray(down, dtype=float)
-        self.close_underside = close_underside
-        self.match_masks = match_masks
-        self.finer = finer
         self.refine_views = int(refine_views)
         self.refine_image_size = int(refine_image_size)
 
@@ -165,36 +170,26 @@ class Fill(Stage):
         Raises:
             InputError: Values are not finite, or no inside was found.
         """
-        from gsfluent.data import SURFACE, Solid
-
         began = time.perf_counter()
-        unusable = 0
+        known = None
         if gaussians is not None:
-            gaussians, unusable = evidence(gaussians)
-            gaussians = gaussians.validated("fill")
+            known = Evidence.of(gaussians, capture, self.resolution)
+            gaussians = known.splats.validated("fill")
         total = 5
         report_progress(progress, 0, total, "inside")
-        field = self.inside(gaussians, capture, solid)
+        field = self._inside(known, capture, solid)
         report_progress(progress, 2, total, "depth")
         if gaussians is None:
             gaussians = skin_gaussians(field, capture)
         device = gaussians.means.device
-        box = field.box
-        occupied, depth, nearest, hollow = self._depth(
-            field.inside.cpu().numpy(), box.voxel, device
-        )
+        matter, hollow = self._matter(field, device)
+        occupied, depth, _, box = matter
         if float(depth.max()) < 1.5 * box.voxel:
             logger.warning("fill: nothing but thin parts at this resolution")
         report_progress(progress, 3, total, "interior Gaussians")
-        surface = gaussians.replace(
-            labels=torch.full((gaussians.count,), SURFACE, dtype=torch.int32, device=device)
-        )
         merged, inner, placed = populate(
-            surface,
-            occupied,
-            depth,
-            nearest,
-            box,
+            gaussians.labelled(SURFACE),
+            matter,
             spacing=self.spacing,
             max_interior=self.max_interior,
             seed=self.seed,
@@ -222,7 +217,7 @@ class Fill(Stage):
                 if self.hollow is None
                 else SignedDistance.of_voxels(occupied, np.array(box.origin), box.voxel, "hollow")
             ),
-            "unusable_gaussians": unusable,
+            "unusable_gaussians": 0 if known is None else known.unusable,
             "hollow_fraction": hollow,
             "grid": list(box.shape),
             "voxel": box.voxel,
@@ -247,27 +242,10 @@ class Fill(Stage):
             report=report,
         )
 
-    def inside(
-        self,
-        gaussians: Gaussians | None,
-        capture: Capture | None = None,
-        solid: Source | None = None,
+    def _inside(
+        self, known: Evidence | None, capture: Capture | None, solid: Source | None
     ) -> SignedDistance:
-        """Decide what is matter, and put nothing there.
-
-        Args:
-            gaussians: Splats of one object, or None.
-            capture: The photographs it came from.
-            solid: Distances or a mesh that already say what is matter.
-
-        Returns:
-            Signed distances to its surface; ``report`` says where from and what was noticed.
-
-        Raises:
-            InputError: Nothing to decide from, or nothing is inside.
-        """
-        from gsfluent.pipeline.solid.source import find_solid
-
+        """Decide what is matter, and put nothing there."""
         if isinstance(solid, SignedDistance):
             if not bool(solid.inside.any()):
                 raise InputError("fill: nothing is inside the solid that was given", "check it")
@@ -278,36 +256,23 @@ class Fill(Stage):
                 hint="add masks or use method: vote",
             )
         method = {"vote": "density"}.get(self.method, self.method)
-        if gaussians is not None and (method == "hull" or self.solid_through):
+        if known is not None and (method == "hull" or self.solid_through):
             method = "density"
         if solid is not None:
             method = "mesh"
-        options = VoteOptions(
-            self.threshold, self.agreement, self.rays, self.down, self.close_underside,
-            masks=self.method != "vote",
-        )  # fmt: skip
         return find_solid(
-            gaussians,
-            capture,
-            solid,
-            method=method,
-            resolution=self.resolution,
-            options=options,
-            match_masks=self.match_masks,
-            match_drawn=False,
-            finer=self.finer,
+            known, capture, solid, method=method, resolution=self.resolution, options=self.options
         )
 
-    def _depth(
-        self, solid: np.ndarray, voxel: float, device: torch.device
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Hollow the solid if asked; depth in world units and nearest outer voxel [3, X, Y, Z]."""
+    def _matter(self, field: SignedDistance, device: torch.device) -> tuple[Matter, float]:
+        """Voxels to fill, hollowed if asked, and the share that hollowing took."""
+        solid, voxel = field.inside.cpu().numpy(), field.voxel
         # the grid has a rim of empty voxels, so every solid voxel has an outer one
         distance, nearest = nearest_empty(solid, device)
         # voxel centres are half a voxel from the boundary that the transform measures to
         depth = np.where(solid, (distance - 0.5) * voxel, 0.0).astype(np.float32)
         if self.hollow is None:
-            return solid, depth, nearest, 0.0
+            return Matter(solid, depth, nearest, field.box), 0.0
         if self.hollow < voxel:
             raise InputError(
                 f"fill: hollow wall {self.hollow:g} is thinner than a voxel ({voxel:g})",
@@ -315,7 +280,8 @@ class Fill(Stage):
             )
         wall = solid & (depth <= self.hollow)
         removed = 1.0 - float(wall.sum()) / max(int(solid.sum()), 1)
-        return wall, np.where(wall, depth, 0.0).astype(np.float32), nearest, removed
+        depth = np.where(wall, depth, 0.0).astype(np.float32)
+        return Matter(wall, depth, nearest, field.box), removed
 
 
 def _parse_hollow(hollow: str | float) -> float | None:

@@ -1,4 +1,4 @@
-"""Gaussians ride on material points.
+"""Gaussians carried by material points.
 
 Each splat belongs to the point of its body that is nearest at rest. At a later time it moves with
 that point and those of its neighbours that it still hangs together with
@@ -6,7 +6,7 @@ that point and those of its neighbours that it still hangs together with
 point's total deformation, its stretches clamped so that no splat becomes a needle or a balloon; the
 covariance becomes ``A S A^T`` (PhysGaussian, section 3.3, with total instead of elastic
 deformation) and the colour turns with the rotation of A. What has parted is never strung across the
-gap: crumbs fly on their own, with the rotation alone.
+gap: debris flies on its own, with the rotation alone.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ BLEND = 0.6
 
 
 class Points(NamedTuple):
-    """Where the material points are, and what each does to the splats that ride on it.
+    """Where the material points are, and what each does to the splats it carries.
 
     Attributes:
         position: Positions [m], [N, 3].
         map: Total deformation, stretches clamped; outside of pieces the rotation alone, since
-            crumbs have no shape to keep, [N, 3, 3].
+            debris has no shape to keep, [N, 3, 3].
         rotation: Rotation of the deformation, [N, 3, 3].
         fragments: Piece of each point, int32 [N], -1 for none.
         broken: Broken points, bool [N].
@@ -69,7 +69,7 @@ class Motion(NamedTuple):
         rotation: Rotation of A, [M, 3, 3].
         anchor: Material point of each splat, int64 [M].
         broken: Whether that point is broken, bool [M].
-        riding: Whether that point belongs to a piece, bool [M].
+        carried: Whether that point belongs to a piece, bool [M].
         points: The material points.
     """
 
@@ -78,7 +78,7 @@ class Motion(NamedTuple):
     rotation: Tensor
     anchor: Tensor
     broken: Tensor
-    riding: Tensor
+    carried: Tensor
     points: Points
 
 
@@ -141,8 +141,8 @@ class Carry:
             points = points._replace(hanging=self.links.look(points.position, points.fragments))
         means, blend = self.place((rest or self.gaussians).means, self.owner, points)
         turn, blend = ops.polar_clamped(blend, *STRETCH)
-        riding = points.fragments[self.owner] >= 0
-        return Motion(means, blend, turn, self.owner, points.broken[self.owner], riding, points)
+        carried = points.fragments[self.owner] >= 0
+        return Motion(means, blend, turn, self.owner, points.broken[self.owner], carried, points)
 
     def place(self, places: Tensor, owner: Tensor, points: Points) -> tuple[Tensor, Tensor]:
         """Where places at rest have gone.

@@ -103,7 +103,7 @@ def number_fields(
     rank = torch.empty_like(ids)
     order = torch.argsort(weight, descending=True, stable=True)
     rank[order] = torch.arange(ids.shape[0], device=ids.device)
-    crumbs = limit - 1
+    room = limit - 1
     crowded = rank >= most - 1
     block = torch.floor(position[on_grid] / (4.0 * dx) - 0.125).long()
     block = block - block.amin(dim=0) + 1
@@ -121,11 +121,11 @@ def number_fields(
         reached // count, return_inverse=True, return_counts=True
     )
     first = torch.cumsum(counts, 0) - counts
-    behind = torch.arange(reached.shape[0], device=key.device) - first[place] >= crumbs
+    behind = torch.arange(reached.shape[0], device=key.device) - first[place] >= room
     is_crowded = torch.zeros_like(crowded)
     is_crowded[reached[behind] % count] = True
     crowded = crowded | is_crowded[rank]
-    # The crumbs share the number of the heaviest of them.
+    # What is crowded shares the number of the heaviest of them.
     rank = torch.where(crowded, rank[crowded].min() if bool(crowded.any()) else rank, rank)
     return torch.unique(rank[index], return_inverse=True)[1].to(torch.int32)
 

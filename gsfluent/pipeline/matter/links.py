@@ -1,7 +1,7 @@
 """What hangs together: each material point and its nearest neighbours at rest, and who has parted.
 
 Two neighbours of one piece hang together; those of different pieces do not. Where matter is in no
-piece (broken points, crumbs), neighbours have parted once they are half as far again from each
+piece (broken points, debris), neighbours have parted once they are half as far again from each
 other as at rest, and hang together again only below a smaller ratio, so that nothing toggles from
 frame to frame. An *opening*, where faces show, is a pair that has parted and moved apart.
 """

@@ -1,7 +1,7 @@
 """From solids to material points: sampling, masses, material rows, seeded weakness.
 
 Gaussians are not material points: a grid cell wants 4 to 8 points whatever the number of splats,
-so points are sampled from the solid's voxels and the splats ride on them
+so points are sampled from the solid's voxels which carry the splats
 (:mod:`gsfluent.pipeline.matter.carry`).
 """
 

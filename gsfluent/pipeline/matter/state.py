@@ -18,8 +18,10 @@ from gsfluent.pipeline.matter.points import Matter
 
 VERSION = 7
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
-_POINTS = ("position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit")
+_POINTS = ("position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit")
 _WHOLE = ("impulse", "colliders", "work", "dissipated")
+_SAVED = {"loose": "stray"}
+"""Names in the file that are not those of the fields: files outlive names."""
 
 
 def at_rows(values: Tensor, rows: Tensor | None) -> Tensor:
@@ -41,8 +43,8 @@ class State(NamedTuple):
         impulse: Sum of collider impulses on the bodies [N s], float64 [3].
         colliders: Rows of the rigid colliders as of ``time``, float64 [M, 32].
         work: Most energy that colliders can have given to the bodies [J], float64 [].
-        stray: Crumbs that left the grid for good, bool [N] (see
-            :mod:`gsfluent.pipeline.simulate.strays`).
+        loose: Debris that left the grid for good, bool [N] (see
+            :mod:`gsfluent.pipeline.simulate.debris`).
         field: Velocity field of each point, int32 [N]: its body, or its piece of a broken one.
         cut: Sides of blades each point lies on, int32 [N] (:func:`gsfluent.ops.blade_sides`).
         group: First row of the group that moves without the grid and holds the point, int32 [N];
@@ -53,7 +55,7 @@ class State(NamedTuple):
             [J], float64 [].
         unit: What each point hung together with when that was last looked at, int64 [N]: the first
             row of its body or piece, -1 for powder.
-        kicked: How many of the scene's kicks have been given.
+        pushed: How many of the scene's impulses have been given.
     """
 
     particles: Particles
@@ -65,7 +67,7 @@ class State(NamedTuple):
     impulse: Tensor
     colliders: Tensor
     work: Tensor
-    stray: Tensor
+    loose: Tensor
     field: Tensor
     cut: Tensor
     group: Tensor
@@ -73,7 +75,7 @@ class State(NamedTuple):
     calm: Tensor
     dissipated: Tensor
     unit: Tensor
-    kicked: int = 0
+    pushed: int = 0
 
     @staticmethod
     def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...]) -> State:
@@ -91,7 +93,7 @@ class State(NamedTuple):
             impulse=torch.zeros(3, dtype=torch.float64, device=p.device),
             colliders=colliders,
             work=zero,
-            stray=none,
+            loose=none,
             field=p.body,
             cut=torch.zeros_like(p.body),
             group=torch.full_like(p.body, -1),
@@ -124,11 +126,13 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "version": VERSION,
         "fingerprint": _fingerprint(matter),
         "particles": {name: v if v is None else v.cpu() for name, v in moving.items()},
-        "tensors": {name: getattr(state, name).cpu() for name in _POINTS + _WHOLE},
+        "tensors": {
+            _SAVED.get(name, name): getattr(state, name).cpu() for name in _POINTS + _WHOLE
+        },
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
-        "kicked": state.kicked,
+        "kicked": state.pushed,
         "extra": extra,
     }
     with atomic_path(path) as temporary:
@@ -160,14 +164,14 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
             f"resume: {path} belongs to another scene, quality or seed",
             hint="resume with the settings it was made with, or start without resume",
         )
-    tensors = values["tensors"]
+    tensors = {name: values["tensors"][_SAVED.get(name, name)] for name in _POINTS + _WHOLE}
     rounded = tensors["position"].to(matter.particles.dtype)
     state = State(
         particles=matter.particles.replace(position=rounded, **values["particles"]),
         time=float(values["time"]),
         step=int(values["step"]),
         landed=tuple(bool(v) for v in values["landed"]),
-        kicked=int(values["kicked"]),
+        pushed=int(values["kicked"]),
         **tensors,
     )
     return state, values["extra"]

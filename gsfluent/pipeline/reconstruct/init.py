@@ -94,15 +94,9 @@ def _facing_colors(points: Tensor, normal: Tensor, views: list[TrainView]) -> Te
     mean = torch.stack([view.color.mean((0, 1)) for view in views]).mean(0)
     total += 1e-6 * mean
     for view in views:
-        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        row, column, on, _ = view.locate(points)
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         facing = (functional.normalize(eye - points, dim=1) * normal).sum(1).clamp_min(0.0)
-        pixel = local @ view.K.T
-        pixel = pixel[:, :2] / pixel[:, 2:].clamp_min(1e-6)
-        width, height = view.size
-        column, row = pixel.floor().long().unbind(1)
-        on = (local[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
         trust = on.float() * facing**4
         if view.mask is not None:
             trust = trust * (view.mask[row, column] > 0.98)
@@ -189,12 +183,7 @@ def _far_shell(
     seen = torch.zeros(count, dtype=torch.bool, device=device)
     placed = points.to(device)
     for view in views:
-        local = placed @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        pixel = local @ view.K.T
-        pixel = pixel[:, :2] / pixel[:, 2:].clamp_min(1e-6)
-        width, height = view.size
-        inside = (pixel >= 0) & (pixel < pixel.new_tensor([width, height]))
-        seen |= inside.all(1) & (local[:, 2] > 0)
+        seen |= view.locate(placed)[2]
     color = _facing_colors(placed, -direction.to(device), views).cpu()
     kept = seen.cpu()
     size = torch.full((count,), radius * math.sqrt(4.0 * math.pi / count))

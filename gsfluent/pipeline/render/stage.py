@@ -11,23 +11,16 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
+from gsfluent.draw import draw_at
 from gsfluent.errors import InputError
-from gsfluent.ops.raster import Rendered
-from gsfluent.pipeline.light.lamps import (
-    SHININESS,
-    SPECULAR,
-    Light,
-    Lighting,
-    lighting_of,
-    pack_lamps,
-)
+from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import Grid, grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shadow_maps import Bulk, Lit, bulk, faces_of, shadow_maps
@@ -40,31 +33,49 @@ _LARGE = 800
 _RESOLUTIONS = (512, 1024)
 # Room of the occupancy grid for matter that flies apart; beyond, a new one is laid out.
 _ROOM = 1.25
+_NEAR = 0.01  # camera z [m] from which on splats are drawn
 
 
 @dataclass(frozen=True)
-class Layers:
-    """One rendered frame in layers.
+class Room:
+    """The occupancy grid of a film, and the matter it was made for.
 
     Attributes:
-        image: Finished picture, display values, shape [H, W, 3].
+        grid: Its size.
+        radius: Largest radius of the matter [m] it has room for.
+        count: Splats at that time.
+    """
+
+    grid: Grid
+    radius: float
+    count: int
+
+    def fits(self, count: int, matter: Bulk) -> bool:
+        """Whether it will do for this matter too."""
+        alike = self.count < _ROOM * count and count < _ROOM * self.count
+        return alike and 0.5 * self.radius < matter.radius <= self.radius
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What :class:`Render` returns.
+
+    Attributes:
+        image: Finished picture, display values in [0, 1], shape [H, W, 3].
         alpha: Opacity of the splats, shape [H, W].
         depth: Expected depth of the splats [m], 0 where there is none, shape [H, W].
         blended: Blended normals of the splats and what stands beside them, [H, W, K]; None when
             nothing was lit.
+        room: What the next picture of a film takes on; None when nothing was lit.
+        report: ``gaussians``, ``lamps``, ``shadow_maps`` and ``grid_cell`` [m].
     """
 
     image: Tensor
     alpha: Tensor
     depth: Tensor
     blended: Tensor | None
-
-    @property
-    def normal(self) -> Tensor:
-        """Unit normals of the splats, zero where there is none, shape [H, W, 3]."""
-        if self.blended is None:
-            return torch.zeros_like(self.image)
-        return normalize(self.blended[..., :3], dim=-1)
+    room: Room | None
+    report: dict[str, Any]
 
 
 class Render(Stage):
@@ -74,13 +85,11 @@ class Render(Stage):
         camera: Default camera; a call may bring its own.
         light: The light; None leaves the captured colours as they are.
         studio: Floor and backdrop; None composites over ``background``.
-        backdrop: Captured surroundings before the studio; None for none.
         background: Display colour behind the splats when there is no studio.
         antialiased: Antialiased splatting (opacity compensation for the pixel filter).
-        normal_cell: Spacing [m] of the grid behind normals and occlusion; found anew every few
-            pictures when None (a video fixes it with
+        normal_cell: Spacing [m] of the grid behind normals and occlusion; found for every picture
+            when None (a video fixes it with
             :func:`gsfluent.pipeline.light.normals.occupancy_cell` of its first frame).
-        seed: Unused; rendering has no randomness.
     """
 
     name = "render"
@@ -88,25 +97,22 @@ class Render(Stage):
     def __init__(
         self,
         camera: Camera | None = None,
-        light: Light | Lighting | None = None,
+        light: Lighting | None = None,
         *,
         studio: Studio | None = None,
-        backdrop: Backdrop | None = None,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         antialiased: bool = False,
         normal_cell: float | None = None,
-        seed: int = 0,
     ) -> None:
-        super().__init__(seed=seed)
+        super().__init__()
         self.camera = camera
         self.light = light
         self.studio = studio
-        self.backdrop = backdrop
         self.background = background
         self.antialiased = antialiased
         self.normal_cell = normal_cell
-        self._size: _Size | None = None
 
+    @torch.no_grad()
     def forward(
         self,
         gaussians: Gaussians,
@@ -114,8 +120,10 @@ class Render(Stage):
         *,
         groups: Tensor | None = None,
         gloss: Tensor | None = None,
+        backdrop: Backdrop | None = None,
         time: float = 0.0,
-    ) -> Tensor:
+        room: Room | None = None,
+    ) -> Picture:
         """Render one picture.
 
         Args:
@@ -124,139 +132,73 @@ class Render(Stage):
             groups: int32 [N], siblings of which only the nearest shades a pixel; -1 for none.
             gloss: k_s and n_s of Blinn-Phong per splat, [N, 2]; the default plastic when None. Not
                 read when the light says what everything is like.
+            backdrop: Captured surroundings before the studio; None for none.
             time: Moment [s], for lamps that move.
-
-        Returns:
-            Display values in [0, 1], shape [H, W, 3].
+            room: ``room`` of the picture before in a film, so that the grid behind normals and
+                occlusion stays what it was while the matter fits.
 
         Raises:
             InputError: No camera, or a camera with lens distortion.
         """
-        return self.layers(gaussians, camera, groups=groups, gloss=gloss, time=time).image
-
-    @torch.no_grad()
-    def layers(
-        self,
-        gaussians: Gaussians,
-        camera: Camera | None = None,
-        *,
-        groups: Tensor | None = None,
-        gloss: Tensor | None = None,
-        time: float = 0.0,
-    ) -> Layers:
-        """As :meth:`forward`, with opacity, depth and normals."""
         camera = self._camera(camera)
         means = gaussians.means
-        viewmat, intrinsics = _moved(camera.viewmat, means), _moved(camera.K, means)
-        lighting = lighting_of(self.light)
+        view = (_moved(camera.viewmat, means), _moved(camera.K, means))
+        lighting = None if self.light is None else self.light.at(time)
         lit, extras = None, None
         if lighting is not None:
-            lit = self._light(gaussians, camera, lighting.at(time), groups)
-            eye = -(viewmat[:3, 3] @ viewmat[:3, :3])
+            lit, room = self._light(gaussians, camera, lighting, groups, room)
+            eye = -(view[0][:3, 3] @ view[0][:3, :3])
             extras = splat_normals(gaussians, lit.grid, eye)
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
-        seen = ops.rasterize(
-            means,
-            gaussians.opacities,
-            viewmat,
-            intrinsics,
-            camera.width,
-            camera.height,
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            sh=gaussians.sh,
+        seen = draw_at(
+            gaussians,
+            *view,
+            (camera.width, camera.height),
+            near=_NEAR,
+            depth=True,
             antialiased=self.antialiased,
             normals=extras,
             groups=groups,
         )
         assert seen.depth is not None  # asked for
-        front = seen.image
+        image, alpha, depth = seen.image, seen.alpha, seen.depth
         behind = _constant(self.background, means.dtype, means.device)
+        whole = lit is not None and backdrop is None  # object, floor and backdrop at once
         if lit is not None and lighting is not None and seen.normal is not None:
-            vectors, gloss = _gloss(lighting, seen.normal, seen.alpha)
-            whole = self.backdrop is None  # object, floor and backdrop at once
-            front = self._shaded(
-                seen.image,
-                seen.alpha,
-                seen.depth,
-                vectors,
-                gloss,
-                (viewmat, intrinsics),
-                lit,
-                behind if whole else torch.zeros_like(behind),
-                whole,
-            )
-            if whole:
-                return Layers(front, seen.alpha, seen.depth, seen.normal)
-        image = self._over_backdrop(front, behind, seen, (viewmat, intrinsics), camera, lit)
-        return Layers(image.clamp(0.0, 1.0), seen.alpha, seen.depth, seen.normal)
-
-    def _shaded(
-        self,
-        image: Tensor,
-        alpha: Tensor,
-        depth: Tensor,
-        vectors: Tensor,
-        gloss: Tensor | None,
-        view: tuple[Tensor, Tensor],
-        lit: Lit,
-        background: Tensor,
-        studio: bool,
-    ) -> Tensor:
-        """The lit picture, over the studio if that is wanted."""
-        floor = self.studio if studio else None
-        maps, grid = lit.maps, lit.grid
-        return ops.shade(
-            image,
-            alpha,
-            depth,
-            vectors,
-            *view,
-            lit.lamps,
-            lit.environment,
-            background,
-            gloss=gloss,
-            maps=None if maps is None else tuple(maps),
-            grid=tuple(grid) if lit.occlusion > 0.0 else None,
-            occlusion=lit.occlusion,
-            studio=None if floor is None else floor.packed(image),
-        )
-
-    def _over_backdrop(
-        self,
-        front: Tensor,
-        behind: Tensor,
-        seen: Rendered,
-        view: tuple[Tensor, Tensor],
-        camera: Camera,
-        lit: Lit | None,
-    ) -> Tensor:
-        """The matter, times its opacity, over the studio and the captured surroundings."""
-        assert seen.depth is not None  # asked for
-        alpha = seen.alpha[..., None]
-        if self.studio is not None:
-            nothing = torch.zeros_like(front)
-            behind = self._shaded(
-                nothing,
-                torch.zeros_like(seen.alpha),
-                torch.zeros_like(seen.alpha),
-                nothing,
-                _constant((0.0, 1.0), front.dtype, front.device),
-                view,
-                _plain_light(front) if lit is None else lit,
-                behind,
-                True,
-            )
-        if self.backdrop is None:
-            return front + behind * (1.0 - alpha)
-        captured = self.backdrop.draw(camera, lit)
-        cover = captured.alpha[..., None]
-        behind = captured.image + behind * (1.0 - cover)
-        image = front + behind * (1.0 - alpha)
-        # what is nearer than the matter hides it
-        before = (cover > 0.5) & (captured.depth < seen.depth)[..., None] & (alpha > 0.0)
-        return torch.where(before, captured.image + image * (1.0 - cover), image)
+            vectors, gloss = _gloss(lighting, seen.normal, alpha)
+            ground = behind if whole else torch.zeros_like(behind)
+            floor = self.studio if whole else None
+            image = _shaded((image, alpha, depth, vectors), gloss, view, lit, ground, floor)
+        if not whole:
+            if self.studio is not None:
+                light = _plain_light(image) if lit is None else lit
+                none, dull = (
+                    torch.zeros_like(alpha),
+                    _constant((0.0, 1.0), image.dtype, image.device),
+                )
+                nothing = torch.zeros_like(image)
+                empty = (nothing, none, none, nothing)
+                behind = _shaded(empty, dull, view, light, behind, self.studio)
+            cover = alpha[..., None]
+            if backdrop is None:
+                image = image + behind * (1.0 - cover)
+            else:
+                captured, opacity, away = backdrop.draw(camera, lit)
+                opaque = opacity[..., None]
+                behind = captured + behind * (1.0 - opaque)
+                image = image + behind * (1.0 - cover)
+                # what is nearer than the matter hides it
+                before = (opaque > 0.5) & (away < depth)[..., None] & (cover > 0.0)
+                image = torch.where(before, captured + image * (1.0 - opaque), image)
+            image = image.clamp(0.0, 1.0)
+        report = {
+            "gaussians": gaussians.count,
+            "lamps": 0 if lit is None else len(lit.lamps),
+            "shadow_maps": 0 if lit is None or lit.maps is None else len(lit.maps.depth),
+            "grid_cell": None if room is None else room.grid.cell,
+        }
+        return Picture(image, alpha, depth, seen.normal, room, report)
 
     def _camera(self, camera: Camera | None) -> Camera:
         camera = camera or self.camera
@@ -270,49 +212,54 @@ class Render(Stage):
         return camera
 
     def _light(
-        self, gaussians: Gaussians, camera: Camera, lighting: Lighting, groups: Tensor | None
-    ) -> Lit:
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        lighting: Lighting,
+        groups: Tensor | None,
+        room: Room | None,
+    ) -> tuple[Lit, Room]:
         """Shadow maps and occupancy of this state of the matter."""
         matter = bulk(gaussians)
-        size = self._size
-        if size is None or not size.fits(gaussians.count, matter):
-            size = self._size = _Size.of(gaussians, matter, self.normal_cell)
+        if room is None or not room.fits(gaussians.count, matter):
+            radius = _ROOM * matter.radius
+            grid = grid_for(gaussians, cell=self.normal_cell, radius=radius)
+            room = Room(grid, radius, gaussians.count)
         lamps = lighting.drawn()
         faces = faces_of(lamps, matter)
         large = max(camera.width, camera.height) > _LARGE
         texels = lighting.resolution or _RESOLUTIONS[large]
-        return Lit(
+        lit = Lit(
             pack_lamps(lamps, faces, gaussians.means),
             lighting.around(gaussians.means),
             shadow_maps(gaussians, lamps, faces, texels, matter, groups=groups),
-            size.grid.of(gaussians.means, matter.center),
+            room.grid.of(gaussians.means, matter.center),
             lighting.occlusion,
         )
+        return lit, room
 
 
-@dataclass(frozen=True)
-class _Size:
-    """The occupancy grid, and the matter it was made for.
-
-    Attributes:
-        grid: Its size.
-        radius: Largest radius of the matter [m] it has room for.
-        count: Splats at that time.
-    """
-
-    grid: Grid
-    radius: float
-    count: int
-
-    @classmethod
-    def of(cls, gaussians: Gaussians, matter: Bulk, cell: float | None) -> _Size:
-        radius = _ROOM * matter.radius
-        return cls(grid_for(gaussians, cell=cell, radius=radius), radius, gaussians.count)
-
-    def fits(self, count: int, matter: Bulk) -> bool:
-        """Whether it will do for this matter too."""
-        alike = self.count < _ROOM * count and count < _ROOM * self.count
-        return alike and 0.5 * self.radius < matter.radius <= self.radius
+def _shaded(
+    seen: tuple[Tensor, Tensor, Tensor, Tensor],
+    gloss: Tensor | None,
+    view: tuple[Tensor, Tensor],
+    lit: Lit,
+    background: Tensor,
+    studio: Studio | None,
+) -> Tensor:
+    """The lit picture of image, alpha, depth and vectors, over the studio if there is one."""
+    return ops.shade(
+        *seen,
+        *view,
+        lit.lamps,
+        lit.environment,
+        background,
+        gloss=gloss,
+        maps=None if lit.maps is None else tuple(lit.maps),
+        grid=tuple(lit.grid) if lit.occlusion > 0.0 else None,
+        occlusion=lit.occlusion,
+        studio=None if studio is None else studio.packed(seen[0]),
+    )
 
 
 def _gloss(lighting: Lighting, given: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -15,11 +15,11 @@ from gsfluent import ops
 from gsfluent.data import Particles
 from gsfluent.ops.plasticity import weakened
 from gsfluent.pipeline.colliders.blades import BladeSet
-from gsfluent.pipeline.colliders.proximity import near_pairs
+from gsfluent.pipeline.colliders.proximity import proximity_pairs
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
-from gsfluent.pipeline.simulate.engine import Counters, Points, Settings, Unhealthy
+from gsfluent.pipeline.simulate.engine import Counters, Points, SolverOptions, Unhealthy
 from gsfluent.scene.scene import Scene
 
 FIELDS = 8
@@ -40,12 +40,13 @@ class Composed:
         rigid: RigidSet,
         state: State,
         rows: Tensor | None,
-        settings: Settings,
+        options: SolverOptions,
+        dt_scale: float,
         counters: Counters,
     ) -> None:
         self.scene, self.matter, self.rigid = scene, matter, rigid
-        self.settings, self.counters = settings, counters
-        self._map = dict(settings.return_map or {})
+        self.options, self.dt_scale, self.counters = options, dt_scale, counters
+        self._map = dict(options.return_map)
         self.points = state.particles if rows is None else state.particles.select(rows)
         self.peak, self._brittle = at_rows(state.peak, rows), at_rows(matter.brittle, rows)
         field = torch.unique(at_rows(state.field, rows), return_inverse=True)[1]
@@ -61,7 +62,7 @@ class Composed:
         self._blocks: ops.Blocks | None = None
         self._travelled = self._speed = self._limit = 0.0
         self._refresh = 0
-        self._near = False
+        self._proximity = False
         self._lost: Tensor | int = 0
         self._info = torch.zeros(4, dtype=torch.int64, device=device)
         p = self.points
@@ -79,7 +80,7 @@ class Composed:
                 self._refresh = REFRESH
             self._refresh -= 1
             left = until - self.time
-            dt = min(self._limit * self.settings.dt_scale, left)
+            dt = min(self._limit * self.dt_scale, left)
             if dt < left < 2.0 * dt:  # two even steps instead of a whole one and a sliver
                 dt = 0.5 * left
             self._step(dt)
@@ -128,14 +129,14 @@ class Composed:
                 f"speed {self._speed:.3g} m/s, wave speed {fastest:.3g} m/s is not finite",
                 bad if bool(bad.any()) else None,
             )
-        step = self.settings.cfl * matter.dx / (fastest + self._speed)
+        step = self.options.cfl * matter.dx / (fastest + self._speed)
         if steepest > 0:
             # The floor of a quarter keeps one wild point from freezing the whole scene.
             step = max(min(step, GRADIENT_LIMIT / steepest), 0.25 * step)
         self._limit = step
         self._row: Tensor | None = p.material
         self._params, self._law = matter.params, matter.law
-        if self.settings.irreversible and bool((peak > 0).any()):
+        if self.options.irreversible and bool((peak > 0).any()):
             self._law, self._params = weakened(matter.law, matter.params, p.material, peak)
             self._row = None
 
@@ -148,7 +149,7 @@ class Composed:
             blocks = self._build()
         self._travelled += reach
         rows = self._cut(dt)
-        several = self._near or self._merged is not None
+        several = self._proximity or self._merged is not None
         body = self._body if several else None
         grid, moments = ops.p2g(
             p.position, p.velocity, p.affine, p.mass,
@@ -205,9 +206,9 @@ class Composed:
         self.counters.block_builds += 1
         self.counters.blocks_max = max(self.counters.blocks_max, blocks.block_count)
         # Kernel reach of both (2 x 1.5) plus the slack of the blocks on both sides.
-        self._near = self._fields > 1 and (
-            not self.settings.contact_near
-            or near_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
+        self._proximity = self._fields > 1 and (
+            not self.options.contact_proximity
+            or proximity_pairs(p.position, self._unit, 4.0 * self.matter.dx).shape[0] > 0
         )
         return blocks
 

@@ -1,12 +1,15 @@
-"""What an engine is: the time step seen from outside, its settings, points and counters."""
+"""What an engine is: the time step seen from outside, its options, points and counters."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
 
 from torch import Tensor
+
+from gsfluent.errors import InputError
 
 CFL = 0.5
 
@@ -74,15 +77,55 @@ class Counters:
     fields_max: int = 1
 
 
-class Settings(NamedTuple):
-    """What an engine needs to know beside the points."""
+@dataclasses.dataclass(frozen=True)
+class SolverOptions:
+    """How the matter is moved: what stage, stepper and engine all read.
+
+    Args:
+        cfl: Courant number of the automatic time step, in (0, 1].
+        free_flight: Move bodies that touch nothing in closed form instead of on the grid.
+        piece_flight: Do so again with bodies and pieces that touch nothing any more.
+        sleep: Take off the grid what rests, until something comes near.
+        separate_fragments: Give the pieces of a broken body velocity fields of their own, so that
+            they do not weld again where they touch.
+        resident: Use the resident solver wherever it knows the colliders; otherwise the composed
+            operators, step by step.
+        irreversible: Broken points stay without cohesion when they are pressed together again.
+        law_kernels: Use kernels made for elastic and brittle matter where there is no other.
+        contact_proximity: Leave out contact where no two bodies or pieces are near each other;
+            False is for comparison: the composed operators then look for contact at every node.
+        deterministic: Refuse what cannot give the same bits from the same input on the same
+            device: the composed operators on a GPU, whose sums have no order.
+        standing: Let what stands still on the floor at time 0 sleep, without a strain, until
+            something comes near; else its weight begins to act then.
+        loose_debris: Take broken points with next to nothing around them off the grid for good:
+            they fall freely and stay where they meet the floor.
+        return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
+            ``implicit``).
+        max_rollbacks: Roll-backs in a row before the run is given up.
+
+    Raises:
+        InputError: ``cfl`` outside its range.
+    """
 
     cfl: float = CFL
+    free_flight: bool = True
+    piece_flight: bool = True
+    sleep: bool = True
+    separate_fragments: bool = True
+    resident: bool = True
     irreversible: bool = True
-    return_map: dict[str, Any] | None = None
     law_kernels: bool = True
-    contact_near: bool = True
-    dt_scale: float = 1.0
+    contact_proximity: bool = True
+    deterministic: bool = False
+    standing: bool = False
+    loose_debris: bool = False
+    return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
+    max_rollbacks: int = 6
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.cfl <= 1.0:
+            raise InputError(f"simulate: cfl must lie in (0, 1], got {self.cfl}", hint="use 0.5")
 
 
 class Points(NamedTuple):

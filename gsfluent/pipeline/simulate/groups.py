@@ -1,8 +1,7 @@
 """Groups of points that move without the grid: first flights, pieces in flight, sleepers.
 
-A group leaves the grid at a frame and comes back as soon as something that moves is close. What
-is decided here is who may leave; :mod:`gsfluent.pipeline.simulate.step` decides when to come
-back.
+A group leaves the grid at a frame and comes back as soon as something that moves is close. What is
+decided here is who may leave; :mod:`gsfluent.pipeline.simulate.step` decides when to come back.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.pipeline.colliders.proximity import boxes, near_pairs, time_to_meet
+from gsfluent.pipeline.colliders.proximity import boxes, proximity_pairs, time_to_meet
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -76,7 +75,7 @@ class Group:
 
 def grid_mask(state: State, matter: Matter) -> Tensor:
     """Points on the grid, bool [N]."""
-    mask = ~state.stray & (state.group < 0)
+    mask = ~state.loose & (state.group < 0)
     for (a, b), landed in zip(matter.ranges, state.landed, strict=True):
         if not landed:
             mask[a:b] = False
@@ -133,14 +132,14 @@ class Leaving:
         gaps = self.rigid.gaps(state.colliders, low, high)
         dx = self.matter.dx
         if self.sleep and bool(calm.any()):
-            pairs = near_pairs(position, label, LANDING * dx).cpu()
+            pairs = proximity_pairs(position, label, LANDING * dx).cpu()
             moving = self.rigid.moving(state.colliders)
             driven = torch.tensor(self.rigid.gaps(moving, low, high)) <= TAKE_OFF * dx
             state = self._nap(state, rows, label, pairs, calm, gaps, driven)
         if self.fly:
             high_up = [i for i, gap in enumerate(gaps) if gap > TAKE_OFF * dx and ids[i] >= 0]
             if high_up and len(high_up) < 200:
-                pairs = near_pairs(position, label, TAKE_OFF * dx).cpu()
+                pairs = proximity_pairs(position, label, TAKE_OFF * dx).cpu()
                 for i in high_up:
                     if not bool((pairs == i).any()):
                         state = self._take_off(state, rows[label == i], gaps[i], frame)

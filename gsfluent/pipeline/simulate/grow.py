@@ -1,4 +1,4 @@
-"""More things in a running simulation: bodies, colliders, blades and kicks that come while it runs.
+"""More things in a running simulation: bodies, colliders, blades, impulses that come meanwhile.
 
 A run whose scene had an event from the start and a run that is told of it when it happens are the
 same: bodies wait, plates stand and blades hang still until their time, and all of them come after
@@ -30,7 +30,7 @@ def copy_of(scene: Scene) -> Scene:
     """A scene that can be added to without changing the first."""
     twin = copy.copy(scene)
     twin.bodies, twin.colliders = list(scene.bodies), list(scene.colliders)
-    twin.blades, twin.kicks = list(scene.blades), list(scene.kicks)
+    twin.blades, twin.impulses = list(scene.blades), list(scene.impulses)
     return twin
 
 
@@ -61,7 +61,7 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
         if matter.particles.deformation is None:
             more = dataclasses.replace(more, particles=more.particles.replace(deformation=None))
         matter = _joined(matter, more)
-        state = _joined_state(state, matter, len(fresh), landed=not run.stepper.free_flight)
+        state = _joined_state(state, matter, len(fresh), landed=not run.stepper.options.free_flight)
     _refit(run, scene, matter, state)
     run.state = run.state._replace(colliders=_colliders(run, old, state))
     if fresh:
@@ -132,12 +132,14 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
         unit=torch.where(unit >= 0, place[unit.clamp(min=0)], unit),
         **{
             key: getattr(state, key)[keep]
-            for key in ("position", "peak", "stray", "field", "cut", "asleep", "calm")
+            for key in ("position", "peak", "loose", "field", "cut", "asleep", "calm")
         },
     )
     scene = copy_of(run.scene)
     scene.bodies = [run.scene.bodies[n] for n in stay]
-    scene.kicks = [dataclasses.replace(kick, body=int(number[kick.body])) for kick in scene.kicks]
+    scene.impulses = [
+        dataclasses.replace(push, body=int(number[push.body])) for push in scene.impulses
+    ]
     run.links = place[run.links[~out[run.links].any(dim=1)]]
     run.stepper.flights = [run.stepper.flights[n] for n in stay]
     _refit(run, scene, matter, state)
@@ -203,7 +205,7 @@ def _joined_state(state: State, matter: Matter, bodies: int, *, landed: bool) ->
         position=torch.cat([state.position, new.position.to(torch.float64)]),
         peak=torch.cat([state.peak, torch.where(brittle, new.alpha, UNBROKEN).to(state.peak)]),
         landed=state.landed + (landed,) * bodies,
-        stray=more("stray", False),
+        loose=more("loose", False),
         field=torch.cat([state.field, new.body.to(state.field)]),
         cut=more("cut", 0),
         group=more("group", -1),

@@ -19,7 +19,7 @@ from gsfluent.ops import collider as columns
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
-from gsfluent.pipeline.simulate.engine import Counters, Points, Settings, Unhealthy
+from gsfluent.pipeline.simulate.engine import Counters, Points, SolverOptions, Unhealthy
 from gsfluent.scene.scene import Scene
 
 FLOOR_DEPTH = 0.05
@@ -69,7 +69,8 @@ class Resident:
         rigid: The colliders.
         state: Where to start.
         rows: Points on the grid, int64 [M], or None for all.
-        settings: See :class:`Settings`.
+        options: How.
+        dt_scale: Factor on the automatic time step.
         counters: Are added to.
     """
 
@@ -80,7 +81,8 @@ class Resident:
         rigid: RigidSet,
         state: State,
         rows: Tensor | None,
-        settings: Settings,
+        options: SolverOptions,
+        dt_scale: float,
         counters: Counters,
     ) -> None:
         p = state.particles if rows is None else state.particles.select(rows)
@@ -89,10 +91,10 @@ class Resident:
         )
         used, field = torch.unique(field, return_inverse=True)
         law, params = matter.law, matter.params
-        if not settings.law_kernels:  # a row that no point has asks for the kernel of all laws
+        if not options.law_kernels:  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
             params = torch.cat([params, params[:1]])
-        self._special = settings.law_kernels and set(law.tolist()) <= {
+        self._special = options.law_kernels and set(law.tolist()) <= {
             LAWS["elastic"],
             LAWS["nacc"],
         }
@@ -105,12 +107,12 @@ class Resident:
                 strain=p.strain, alpha=p.alpha, peak=peak, affine=p.affine,
                 deformation=p.deformation, body=field.to(torch.int32), gravity=scene.gravity,
                 colliders=state.colliders if state.colliders.shape[0] else None, sdf=rigid.sdf,
-                friction=scene.friction, cfl=settings.cfl,
-                irreversible=settings.irreversible, **(settings.return_map or {}),
+                friction=scene.friction, cfl=options.cfl,
+                irreversible=options.irreversible, **options.return_map,
             ),
         )  # fmt: skip
         self._rigid, self._matter, self._counters = rigid, matter, counters
-        self._dt_scale = settings.dt_scale
+        self._dt_scale = dt_scale
         self._material = p.material
         self._start = self.time = state.time
         self.colliders = state.colliders

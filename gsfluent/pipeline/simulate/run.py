@@ -19,9 +19,9 @@ from gsfluent.pipeline.matter.fields import breakable, cut_bodies, units
 from gsfluent.pipeline.matter.fragments import STRETCH_LIMIT, Fragments, find_fragments, rest_links
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State, load_state, save_state
-from gsfluent.pipeline.simulate.engine import Counters, Unhealthy
+from gsfluent.pipeline.simulate.engine import Counters, SolverOptions, Unhealthy
 from gsfluent.pipeline.simulate.health import CHECK_EVERY, Figures, Ledger, Watch, figures_of
-from gsfluent.pipeline.simulate.kick import Kicks
+from gsfluent.pipeline.simulate.impulse import Impulses
 from gsfluent.pipeline.simulate.step import Stepper
 from gsfluent.scene.scene import Scene
 
@@ -41,8 +41,7 @@ class Run:
         scene: The scene.
         matter: Its material points.
         fps: Frames per second.
-        options: Arguments of :class:`Stepper`.
-        max_rollbacks: Roll-backs in a row before giving up.
+        options: How; the defaults when absent.
     """
 
     def __init__(
@@ -50,18 +49,18 @@ class Run:
         scene: Scene,
         matter: Matter,
         fps: float,
-        options: dict[str, Any],
-        max_rollbacks: int,
+        options: SolverOptions | None = None,
     ) -> None:
-        self.fps, self._options = fps, options
-        self.stepper = Stepper(scene, matter, **options)
+        self.fps = fps
+        self.stepper = Stepper(scene, matter, options)
         self._set(scene, matter)
         self.state = self.stepper.initial()
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
         self.watch = Watch(
             matter, scene.gravity, self.start,
-            max_rollbacks=max_rollbacks, names=[body.name for body in scene.bodies],
+            max_rollbacks=self.stepper.options.max_rollbacks,
+            names=[body.name for body in scene.bodies],
         )  # fmt: skip
         held = [body.start if body.held else 0.0 for body in scene.bodies]
         self.ledger = Ledger(matter, scene.gravity, self.start, held)
@@ -74,17 +73,14 @@ class Run:
 
     def _set(self, scene: Scene, matter: Matter) -> None:
         self.scene, self.matter = scene, matter
-        self.kicks = Kicks(scene, matter)
+        self.impulses = Impulses(scene, matter)
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
 
     def fit(self, scene: Scene, matter: Matter) -> None:
         """Go on with another scene and its matter; see :mod:`gsfluent.pipeline.simulate.grow`."""
-        before = self.stepper
-        self.stepper = Stepper(scene, matter, **self._options, flights=before.flights)
-        self.stepper.resume(before.counters)
-        self.stepper.field_limit, self.stepper.dt_scale = before.field_limit, before.dt_scale
+        self.stepper = self.stepper.successor(scene, matter)
         self._set(scene, matter)
         self._pieces = None
         self.watch.matter, self.watch.names = matter, [body.name for body in scene.bodies]
@@ -95,12 +91,8 @@ class Run:
         other.per_frame = list(self.per_frame)
         other.watch, other.ledger = self.watch.twin(), copy.copy(self.ledger)
         other.ledger.held = list(self.ledger.held)
-        other.stepper = Stepper(
-            self.scene, self.matter, **self._options, flights=self.stepper.flights
-        )
-        other.stepper.resume(dataclasses.replace(self.stepper.counters))
-        other.stepper.field_limit = self.stepper.field_limit
-        other.stepper.dt_scale = self.stepper.dt_scale
+        other.stepper = self.stepper.successor(self.scene, self.matter)
+        other.stepper.counters = dataclasses.replace(self.stepper.counters)
         return other
 
     @property
@@ -134,8 +126,8 @@ class Run:
             trouble: Unhealthy | None = None
             try:
                 left = CHECK_EVERY - (state.step - checked)
-                state = self.kicks.given(state)
-                stop = min(until, self.kicks.next_change(state))
+                state = self.impulses.given(state)
+                stop = min(until, self.impulses.next_change(state))
                 now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
@@ -309,7 +301,7 @@ class Run:
                 "empty_block_fraction": 1.0 - c.block_steps / max(c.box_steps, 1),
                 "law_kernel_steps": c.law_kernel_steps,
                 "damage_steps": c.undamaged_steps,
-                "stray_points": int(self.state.stray.sum()),
+                "stray_points": int(self.state.loose.sum()),
                 "block_searches": max(c.steps - c.block_builds, 0),
                 "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),
             },

@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from gsfluent.data import Gaussians, Particles
 from gsfluent.errors import InputError
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.cracks.gaps import Cracks
-from gsfluent.pipeline.cracks.stage import METHODS, Repair, Repaired
+from gsfluent.pipeline.cracks.stage import METHODS, CrackHistory, Repair, Repaired
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.matter.fragments import Fragments
 from gsfluent.pipeline.matter.points import (
@@ -33,9 +33,8 @@ from gsfluent.pipeline.matter.points import (
     build_matter,
     grid_spacing,
 )
-from gsfluent.pipeline.matter.state import State
-from gsfluent.pipeline.simulate.engine import CFL
-from gsfluent.pipeline.simulate.run import Run
+from gsfluent.pipeline.simulate.engine import SolverOptions
+from gsfluent.pipeline.simulate.run import Hook, Run
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
@@ -44,6 +43,8 @@ _log = logging.getLogger(__name__)
 
 QUALITY = {"preview": 20, "shot": 40, "hero": 64}
 """Cells along the longest side of the largest solid."""
+RENAMED = {"loose_crumbs": "loose_debris", "contact_near": "contact_proximity"}
+"""Options under their names of before, which :class:`Simulate` still takes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,15 +76,14 @@ class SimulationFrame:
     broken: Tensor
     rigid: RigidSet
     colliders: Tensor
-    _carry: Carry | None = None
-    _repair: Repair | None = None
+    _history: CrackHistory | None = None
     _points: Points | None = None
     _cracks: Cracks | None = None
 
-    def _binding(self) -> Carry:
-        if self._carry is None:
+    def _binding(self) -> CrackHistory:
+        if self._history is None:
             raise InputError("frame: this run carries no splats", hint="Simulate(splats=True)")
-        return self._carry
+        return self._history
 
     @property
     def _rest(self) -> Gaussians | None:
@@ -97,9 +97,10 @@ class SimulationFrame:
         Splats of all bodies follow each other in the order of the scene; transition splats come
         last.
         """
-        if self._repair is None:
-            return Repaired.none(self.carried, self.motion.anchor)
-        return self._repair(self._binding(), self.motion, self.carried, cracks=self._cracks)
+        history = self._binding()
+        return history.repair(
+            history.carry, self.motion, self.carried, history=history, cracks=self._cracks
+        )
 
     @property
     def gaussians(self) -> Gaussians:
@@ -114,58 +115,88 @@ class SimulationFrame:
     @functools.cached_property
     def carried(self) -> Gaussians:
         """The splats without repair: one for one those of the solids."""
-        return self._binding().apply(self.motion, self._rest)
+        return self._binding().carry.apply(self.motion, self._rest)
 
     @functools.cached_property
     def motion(self) -> Motion:
         """Where each splat has gone."""
-        carry = self._binding()
-        if self._points is None:
-            raise InputError("frame: no deformation was tracked", hint="Simulate(splats=True)")
+        carry = self._binding().carry
+        assert self._points is not None  # with the binding
         return carry.follow(self._points, self._rest)
 
-    @functools.cached_property
-    def splat_damage(self) -> Tensor:
-        """Damage of each splat of :attr:`gaussians`, 0 to 1; transition splats have 1."""
-        damage = self._binding().sample(self.damage)
-        return torch.cat([damage, damage.new_ones(self.repaired.added)])
+
+class Simulation(Iterator[SimulationFrame]):
+    """A scene that is being simulated; iterate over it for its frames.
+
+    When the run cannot be healed the iteration ends early; :attr:`report` has the verdict.
+
+    Args:
+        run: The run, at the frame to go on with.
+        count: Number of frames.
+        history: The splats and their cracks; None to carry none.
+        step_hook: See :class:`Simulate`.
+        progress: Told after each frame.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        count: int,
+        history: CrackHistory | None,
+        step_hook: Hook | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self.run, self.count, self.history = run, count, history
+        self._hook, self._progress = step_hook, progress
+
+    def __next__(self) -> SimulationFrame:
+        """Simulate up to the next frame."""
+        index = self.run.next_frame
+        with torch.no_grad():
+            if (
+                index >= self.count
+                or self.run.failure
+                or not self.run.advance_to(index, self._hook)
+            ):
+                raise StopIteration
+            frame = frame_of(self.run, index, self.history)
+        report_progress(self._progress, index + 1, self.count, f"t = {frame.time:.3f} s")
+        return frame
+
+    def save(self, path: str | Path) -> None:
+        """Write the state of the last frame, to be given to ``resume`` of :class:`Simulate`.
+
+        Raises:
+            InputError: Nothing has been simulated yet.
+        """
+        if self.run.next_frame == 0:
+            raise InputError("simulate: there is no frame to save", hint="take a frame first")
+        self.run.save(path, {} if self.history is None else self.history.state())
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The section ``simulation`` of run.json, plus ``verdict`` and ``reason``."""
+        return self.run.report()
 
 
 class Simulate(Stage):
-    """Simulates a scene; iterate over the call for its frames.
+    """Simulates a scene: the call gives a :class:`Simulation`, iterate over that for the frames.
 
     Args:
         quality: ``preview``, ``shot`` or ``hero``: 20, 40 or 64 cells along the largest solid.
         dx: Grid spacing [m]; overrides ``quality``.
         seed: Seed of point positions and weakness, in object space.
-        device: Where to compute.
+        device: Where to compute; where the first solid is when absent.
         jitter: Relative half-width of the noise on ``alpha0``.
-        cfl: Courant number of the automatic time step.
-        free_flight: Move bodies that touch nothing in closed form instead of on the grid.
-        piece_flight: Do so again with bodies and pieces that touch nothing any more.
-        sleep: Take off the grid what rests, until something comes near.
-        separate_fragments: Give the pieces of a broken body velocity fields of their own, so that
-            they do not weld again where they touch.
-        resident: Use the resident solver wherever it knows the colliders; otherwise the composed
-            operators, step by step.
-        irreversible: Broken points stay without cohesion when they are pressed together again.
-        law_kernels: Use kernels made for elastic and brittle matter where there is no other.
-        contact_near: Leave out contact where no two bodies or pieces are near each other; False
-            is for comparison: the composed operators then look for contact at every node.
-        deterministic: Refuse what cannot give the same bits from the same input on the same
-            device: the composed operators on a GPU, whose sums have no order.
-        standing: Let what stands still on the floor at time 0 sleep, without a strain, until
-            something comes near; else its weight begins to act then.
-        loose_crumbs: Take broken points with next to nothing around them off the grid for good:
-            they fall freely and stay where they meet the floor.
         repair: How ``frame.gaussians`` get splats along cracks: a method of
             :class:`gsfluent.pipeline.Repair`; True for its default, False for ``none``.
         splats: Track the total deformation, which splats and ``frame.gaussians`` need.
-        return_map: Options of :func:`gsfluent.ops.return_mapping`.
-        max_rollbacks: Roll-backs in a row before the run is given up.
         max_particles: Refuse scenes with more material points.
         step_hook: Called with the state after every grid step; what it returns goes on. For tests
             and for forces of one's own.
+        options: How the matter is moved.
+        changes: Fields of :class:`SolverOptions` that differ from ``options``, for example
+            ``cfl=0.3`` or ``sleep=False``.
 
     Raises:
         InputError: An unknown quality or a number outside its range.
@@ -179,26 +210,14 @@ class Simulate(Stage):
         *,
         dx: float | None = None,
         seed: int = 0,
-        device: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
         jitter: float = ALPHA_JITTER,
-        cfl: float = CFL,
-        free_flight: bool = True,
-        piece_flight: bool = True,
-        sleep: bool = True,
-        separate_fragments: bool = True,
-        resident: bool = True,
-        irreversible: bool = True,
-        law_kernels: bool = True,
-        contact_near: bool = True,
-        deterministic: bool = False,
         repair: bool | str = True,
         splats: bool = True,
-        standing: bool = False,
-        loose_crumbs: bool = False,
-        return_map: dict[str, float | bool] | None = None,
-        max_rollbacks: int = 6,
         max_particles: int = MAX_PARTICLES,
-        step_hook: Callable[[State], State] | None = None,
+        step_hook: Hook | None = None,
+        options: SolverOptions | None = None,
+        **changes: Any,
     ) -> None:
         super().__init__(seed=seed)
         if quality not in QUALITY:
@@ -207,31 +226,17 @@ class Simulate(Stage):
             )
         if dx is not None and not (math.isfinite(dx) and dx > 0):
             raise InputError(f"simulate: dx must be positive, got {dx}", hint="give metres")
-        if not 0.0 < cfl <= 1.0:
-            raise InputError(f"simulate: cfl must lie in (0, 1], got {cfl}", hint="use 0.5")
-        self.quality, self.dx, self.device = quality, dx, torch.device(device)
+        self.quality, self.dx, self.device = quality, dx, device
         self.jitter, self.max_particles = jitter, max_particles
-        self.max_rollbacks, self.step_hook = max_rollbacks, step_hook
-        self.splats = splats
-        self._repair = Repair(
+        self.splats, self.step_hook = splats, step_hook
+        for old, new in RENAMED.items():
+            if old in changes:
+                _log.warning("simulate: %s is called %s now; the old name still works", old, new)
+                changes[new] = changes.pop(old)
+        self.options = dataclasses.replace(options or SolverOptions(), **changes)
+        self.repair = Repair(
             repair if isinstance(repair, str) else METHODS[0] if repair else "none"
         )
-        self._options = {
-            "cfl": cfl,
-            "free_flight": free_flight,
-            "piece_flight": piece_flight,
-            "sleep": sleep,
-            "separate_fragments": separate_fragments,
-            "resident": resident,
-            "irreversible": irreversible,
-            "law_kernels": law_kernels,
-            "contact_near": contact_near,
-            "deterministic": deterministic,
-            "standing": standing,
-            "loose_crumbs": loose_crumbs,
-            "return_map": return_map,
-        }
-        self._run: Run | None = None
 
     def prepare(self, scene: Scene) -> Matter:
         """Sample the material points of a scene without simulating it (for ``plan`` and tests)."""
@@ -241,7 +246,7 @@ class Simulate(Stage):
             dx,
             seed=self.seed,
             jitter=self.jitter,
-            device=self.device,
+            device=scene.device if self.device is None else self.device,
             max_particles=self.max_particles,
         )
         if not self.splats:
@@ -257,17 +262,15 @@ class Simulate(Stage):
         *,
         progress: Progress | None = None,
         resume: str | Path | None = None,
-    ) -> Iterator[SimulationFrame]:
+    ) -> Simulation:
         """Simulate ``round(fps * seconds)`` frames; frame k is at time ``k / fps``.
-
-        When the run cannot be healed the iteration ends early; :meth:`report` has the verdict.
 
         Args:
             scene: What to simulate.
             fps: Frames per second.
             seconds: Length.
             progress: Told after each frame.
-            resume: File of :meth:`save_state`; frames up to that one are not yielded again.
+            resume: File of :meth:`Simulation.save`; frames up to that one are not yielded again.
 
         Raises:
             InputError: An empty scene, bad numbers, or a resume file of another scene.
@@ -279,54 +282,20 @@ class Simulate(Stage):
             )
         count = max(1, round(fps * seconds))
         run = self.run_of(scene, fps)
-        self._repair.restore(run.resume(resume) if resume is not None else {})
-        self._run = run
-        carry = Carry.bind(scene, run.matter) if self.splats else None
-        return self._frames(run, count, carry, self._repair, progress)
+        saved = {} if resume is None else run.resume(resume)
+        history = None
+        if self.splats:
+            history = self.repair.begin(Carry.bind(scene, run.matter))
+            history.restore(saved)
+        return Simulation(run, count, history, self.step_hook, progress)
 
     def run_of(self, scene: Scene, fps: float) -> Run:
         """A run of a scene at time 0, to be advanced by hand."""
-        return Run(scene, self.prepare(scene), fps, self._options, self.max_rollbacks)
-
-    def _frames(
-        self,
-        run: Run,
-        count: int,
-        carry: Carry | None,
-        repair: Repair,
-        progress: Progress | None,
-    ) -> Iterator[SimulationFrame]:
-        for index in range(run.next_frame, count):
-            with torch.no_grad():
-                if not run.advance_to(index, self.step_hook):
-                    return
-                frame = frame_of(run, index, carry, repair)
-            report_progress(progress, index + 1, count, f"t = {frame.time:.3f} s")
-            yield frame
-
-    def save_state(self, path: str | Path) -> None:
-        """Write the state of the last frame that was yielded, to be given to ``resume``.
-
-        Raises:
-            InputError: Nothing has been simulated yet.
-        """
-        if self._run is None or self._run.next_frame == 0:
-            raise InputError("simulate: there is no frame to save", hint="take a frame first")
-        self._run.save(path, self._repair.state())
-
-    def report(self) -> dict[str, Any]:
-        """Return the section ``simulation`` of run.json, plus ``verdict`` and ``reason``.
-
-        Raises:
-            InputError: Nothing has been simulated yet.
-        """
-        if self._run is None:
-            raise InputError("simulate: nothing has been simulated", hint="call the stage first")
-        return self._run.report()
+        return Run(scene, self.prepare(scene), fps, self.options)
 
 
 def frame_of(
-    run: Run, index: int, carry: Carry | None, repair: Repair | None, time: float | None = None
+    run: Run, index: int, history: CrackHistory | None, time: float | None = None
 ) -> SimulationFrame:
     """Measure the present state of a run and wrap it up as a frame (``time``: index / fps)."""
     time = index / run.fps if time is None else time
@@ -335,9 +304,9 @@ def frame_of(
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
     damage = torch.where(run.matter.brittle, damage, 0.0)
     particles, broken, points, cracks = run.state.particles, peak >= 0, None, None
-    if carry is not None and particles.deformation is not None:
+    if history is not None and particles.deformation is not None:
         points = Points.of(particles.position, particles.deformation, pieces.labels, broken)
-        cracks = None if repair is None else repair.step(carry, points)
+        cracks = history.step(points)
         points = points if cracks is None else cracks.points
     return SimulationFrame(
         index=index,
@@ -356,8 +325,7 @@ def frame_of(
         broken=broken,
         rigid=run.stepper.rigid,
         colliders=run.state.colliders,
-        _carry=carry,
-        _repair=repair,
+        _history=history,
         _points=points,
         _cracks=cracks,
     )

@@ -1,17 +1,14 @@
 """Advances the state of a simulation: matter on the grid, and what may be left out of it.
 
-The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many
-steps per
-call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and
-strays. A
-call ends when something may come close to a group, which then joins the grid.
+The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many steps per
+call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and loose
+debris. A call ends when something may come close to a group, which then joins the grid.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,9 +20,9 @@ from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.fields import LIMIT, MOST, number_fields
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
-from gsfluent.pipeline.simulate import strays as crumbs
+from gsfluent.pipeline.simulate import debris
 from gsfluent.pipeline.simulate.composed import FIELDS, Composed
-from gsfluent.pipeline.simulate.engine import CFL, Counters, Engine, Points, Settings, Unhealthy
+from gsfluent.pipeline.simulate.engine import Counters, Engine, Points, SolverOptions
 from gsfluent.pipeline.simulate.flight import Flight
 from gsfluent.pipeline.simulate.groups import (
     LANDING,
@@ -37,8 +34,6 @@ from gsfluent.pipeline.simulate.groups import (
 )
 from gsfluent.pipeline.simulate.resident import Resident, resident_can
 from gsfluent.scene.scene import Scene
-
-__all__ = ["CFL", "Counters", "State", "Stepper", "Unhealthy"]
 
 FINE = 8.0
 """Below this distance of their boxes [cells] the points of two things are compared themselves."""
@@ -52,21 +47,7 @@ class Stepper:
     Args:
         scene: Floor, gravity and contact coefficients.
         matter: Points and their parameters.
-        cfl: Courant number of the automatic time step.
-        free_flight: Whether bodies that touch nothing yet skip the grid.
-        piece_flight: Whether bodies and pieces that touch nothing any more leave it.
-        sleep: Whether what rests leaves it.
-        separate_fragments: Whether pieces of a body have velocity fields of their own.
-        resident: Whether the resident solver is used where it can be.
-        irreversible: Whether broken points stay without cohesion when they are pressed together.
-        law_kernels: Whether kernels made for fewer laws are used where these are all.
-        contact_near: Whether the contact pass is left out where no two fields are near; if not,
-            the composed operators take it in every step.
-        deterministic: Whether the composed operators are refused on a GPU.
-        return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
-            ``implicit``).
-        standing: Whether what stands still at time 0 sleeps from then on.
-        loose_crumbs: Whether broken points that are alone leave the grid for good.
+        options: How; the defaults when absent.
         flights: The first flights of the first bodies, when they are known.
     """
 
@@ -74,40 +55,25 @@ class Stepper:
         self,
         scene: Scene,
         matter: Matter,
-        *,
-        cfl: float = CFL,
-        free_flight: bool = True,
-        piece_flight: bool = True,
-        sleep: bool = True,
-        separate_fragments: bool = True,
-        resident: bool = True,
-        irreversible: bool = True,
-        law_kernels: bool = True,
-        contact_near: bool = True,
-        deterministic: bool = False,
-        return_map: dict[str, Any] | None = None,
-        standing: bool = False,
-        loose_crumbs: bool = False,
+        options: SolverOptions | None = None,
         flights: Sequence[Flight] = (),
     ) -> None:
         self.scene, self.matter = scene, matter
-        self.free_flight, self.separate_fragments = free_flight, separate_fragments
-        self._resident = resident and contact_near
-        self._ordered = deterministic and matter.particles.device.type == "cuda"
-        self._settings = Settings(cfl, irreversible, return_map, law_kernels, contact_near)
+        self.options = options = SolverOptions() if options is None else options
+        self._ordered = options.deterministic and matter.particles.device.type == "cuda"
         self.counters = Counters()
         self.dt_scale = 1.0
         self.field_limit = LIMIT
-        self._standing, self._loose = standing, loose_crumbs
-        self._reach = crumbs.reach_of(matter)
+        self._reach = debris.reach_of(matter)
         device = matter.particles.device
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         self._pull = float(self._gravity.norm())
         self.rigid = RigidSet(scene, matter.dx, device)
         self.blades = BladeSet(scene, matter.dx)
         self.leaving = Leaving(
-            matter, self.rigid, self._gravity, sleep=sleep, fly=piece_flight and free_flight
-        )
+            matter, self.rigid, self._gravity, sleep=options.sleep,
+            fly=options.piece_flight and options.free_flight,
+        )  # fmt: skip
         self.flights = list(flights)
         known = len(self.flights)
         for body, (a, b) in zip(scene.bodies[known:], matter.ranges[known:], strict=True):
@@ -132,13 +98,20 @@ class Stepper:
         self.leaving.naps, self.leaving.flights = counters.naps, counters.piece_flights
         self.reset()
 
+    def successor(self, scene: Scene, matter: Matter) -> Stepper:
+        """A stepper that goes on counting where this one stands, with a scene that has more."""
+        other = Stepper(scene, matter, self.options, self.flights)
+        other.resume(self.counters)
+        other.field_limit, other.dt_scale = self.field_limit, self.dt_scale
+        return other
+
     def initial(self) -> State:
         """Return the state at time 0."""
-        landed = (not self.free_flight,) * len(self.flights)
+        landed = (not self.options.free_flight,) * len(self.flights)
         state = State.start(self.matter, self.rigid.start, landed)
         self._take(state)
         state = self._land(state)[0]
-        if not self._standing:
+        if not self.options.standing:
             return state
         return lay_down(state, self.matter, self.rigid, self._gravity, state.unit)
 
@@ -156,9 +129,9 @@ class Stepper:
         state = self._renumber(state, on_grid)
         if not at_frame:
             return state
-        if self._loose:
+        if self.options.loose_debris:
             state = self._let_go(
-                state, crumbs.find_lonely(state.position, state.peak, on_grid, self.matter.dx)
+                state, debris.find_loose(state.position, state.peak, on_grid, self.matter.dx)
             )
             on_grid = grid_mask(state, self.matter)
         state = count_calm(state, on_grid, self._gravity, self.matter.dx)
@@ -172,7 +145,7 @@ class Stepper:
         return self._renumber(state, grid_mask(state, self.matter))
 
     def _renumber(self, state: State, on_grid: Tensor) -> State:
-        if not self.separate_fragments or not bool(on_grid.any()):
+        if not self.options.separate_fragments or not bool(on_grid.any()):
             return state
         field = number_fields(
             state.unit, state.position, self.matter.particles.mass, on_grid, self.matter.dx,
@@ -207,10 +180,10 @@ class Stepper:
                     hint="leave out solve.deterministic, or run on the CPU",
                 )
             if not isinstance(self._engine, make):
-                settings = self._settings._replace(dt_scale=self.dt_scale)
                 self._engine = make(
-                    self.scene, self.matter, self.rigid, state, self._rows, settings, self.counters
-                )
+                    self.scene, self.matter, self.rigid, state, self._rows, self.options,
+                    self.dt_scale, self.counters,
+                )  # fmt: skip
             state = self._on_grid(state, self._engine, min(until, clear), steps)
         self._last = state
         return state
@@ -219,18 +192,19 @@ class Stepper:
         """Marks of the engine's points as marks of all points, bool [N]."""
         if wrong.shape[0] == state.peak.shape[0] or self._rows is None:
             return wrong
-        return torch.zeros_like(state.stray).index_copy(0, self._rows, wrong)
+        return torch.zeros_like(state.loose).index_copy(0, self._rows, wrong)
 
     def _resident_now(self, state: State) -> bool:
         """Whether the resident solver can go on from here: with no blade at work."""
-        if not (self._resident and resident_can(state.colliders, self.rigid, self.matter)):
+        wanted = self.options.resident and self.options.contact_proximity
+        if not (wanted and resident_can(state.colliders, self.rigid, self.matter)):
             return False
         if len(self.blades) == 0:
             return True
         if self.blades.speed(state.time) > 0.0:
             return False
         # On powder a cut leaves nothing to hold; what shares a field has to lie on one side.
-        whole = state.unit if self.separate_fragments else state.field
+        whole = state.unit if self.options.separate_fragments else state.field
         held = state.unit >= 0
         return self.blades.splits(whole[held], state.cut[held]).numel() == 0
 
@@ -369,7 +343,7 @@ class Stepper:
     # --- putting together ---
 
     def _moved(self, state: State, time: float, points: Points | None) -> State:
-        """The state at a later time: points of the grid, groups and strays."""
+        """The state at a later time: points of the grid, groups and loose debris."""
         span = time - state.time
         p = state.particles
         names = ("velocity", "affine", "strain", "alpha", "deformation")
@@ -400,13 +374,13 @@ class Stepper:
                 if value is not None:
                     value[group.rows] = getattr(moved, name)
         self.counters.point_seconds += span * p.count
-        strays = state.stray.nonzero()[:, 0]
-        if strays.numel():
-            push = crumbs.drift(
-                position, values["velocity"], p.mass, strays, span, self.scene.gravity,
+        loose = state.loose.nonzero()[:, 0]
+        if loose.numel():
+            push = debris.drift(
+                position, values["velocity"], p.mass, loose, span, self.scene.gravity,
                 self.scene.floor,
             )  # fmt: skip
-            values["affine"][strays] = 0.0
+            values["affine"][loose] = 0.0
             impulse = impulse + push
         particles = p.replace(position=position.to(p.dtype), **values)
         return state._replace(
@@ -417,12 +391,12 @@ class Stepper:
         """Take broken points that are far away off the grid."""
         candidate = grid_mask(state, self.matter)
         return self._let_go(
-            state, crumbs.find_strays(state.position, state.peak, candidate, self._reach)
+            state, debris.find_far(state.position, state.peak, candidate, self._reach)
         )
 
     def _let_go(self, state: State, gone: Tensor) -> State:
         if bool(gone.any()):
-            state = crumbs.let_go(state, gone)
+            state = debris.let_go(state, gone)
             self._take(state)
         return state
 

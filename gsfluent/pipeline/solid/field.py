@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Solid
+from gsfluent.geometry import trilinear
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.voxels import distance_transform
 
@@ -63,8 +64,7 @@ class SignedDistance:
     @property
     def box(self) -> GridBox:
         """The grid of the values."""
-        x, y, z = self.origin.double().tolist()
-        return GridBox((x, y, z), float(self.voxel), tuple(self.values.shape))  # type: ignore[arg-type]
+        return GridBox.of(self.origin, float(self.voxel), self.values.shape)
 
     @property
     def volume(self) -> float:
@@ -81,15 +81,7 @@ class SignedDistance:
         size = torch.tensor(self.values.shape, device=self.values.device)
         place = (points.to(self.values) - self.origin.to(self.values)) / self.voxel - 0.5
         held = torch.minimum(place.clamp_min(0.0), (size - 1).to(place))
-        base = torch.minimum(held.floor().long(), size - 2).clamp_min(0)
-        fraction = held - base
-        total = torch.zeros(len(points), dtype=self.values.dtype, device=self.values.device)
-        for corner in range(8):
-            step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=size.device)
-            weight = torch.where(step.bool(), fraction, 1 - fraction).prod(dim=1)
-            index = torch.minimum(base + step, size - 1)
-            total += weight * self.values[index[:, 0], index[:, 1], index[:, 2]]
-        return total + (place - held).norm(dim=1) * self.voxel
+        return trilinear(self.values, held) + (place - held).norm(dim=1) * self.voxel
 
     def to(self, device: torch.device | str) -> SignedDistance:
         """Return a copy whose values live on ``device``."""

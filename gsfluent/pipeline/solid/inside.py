@@ -1,4 +1,4 @@
-"""Which voxels are inside: ray vote, visual hull, surface trimming, leak report.
+"""Which voxels are inside: ray vote, surface trimming, leak report.
 
 A bare flood fill from outside is never used to decide: one missing splat and the whole object is
 "outside" (measured IoU 0.13-0.38, against 0.75-0.85 for votes; docs/theory/solid.md). It is used
@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.voxels import distance_transform, grown
 
 __all__ = [
@@ -28,7 +27,6 @@ __all__ = [
     "keep_components",
     "smooth_boundary",
     "trim_outer_flank",
-    "visual_hull",
 ]
 
 logger = logging.getLogger(__name__)
@@ -274,43 +272,3 @@ def find_leaks(
         for i in largest
     ]
     return {"leaks": int(openings), "leaking_voxels": int(wet.sum()), "leak_list": listed}
-
-
-def visual_hull(
-    box: GridBox,
-    views: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    device: torch.device | None = None,
-) -> np.ndarray:
-    """Voxels whose centre falls inside the mask of (nearly) every view that sees it.
-
-    One stray mask must not cut the object in two: from eight views on, two views have to agree
-    before a voxel goes.
-
-    Args:
-        box: The grid.
-        views: Per view ``(ground bool [H, W], viewmat [4, 4], K [3, 3])``: pixels known to show
-            something else than the object; world to camera with OpenCV axes.
-        device: Where to compute.
-
-    Returns:
-        Hull bool [X, Y, Z]. Voxels outside every image are kept.
-    """
-    needed = 2 if len(views) >= 8 else 1
-    axes = [torch.arange(n, device=device, dtype=torch.float32) + 0.5 for n in box.shape]
-    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    points = grid * box.voxel + grid.new_tensor(box.origin)
-    alive = torch.arange(points.shape[0], device=device)
-    votes = torch.zeros(points.shape[0], dtype=torch.uint8, device=device)
-    for ground, viewmat, intrinsics in views:
-        height, width = ground.shape
-        pose, lens = points.new_tensor(viewmat), points.new_tensor(intrinsics)
-        camera = points @ pose[:3, :3].T + pose[:3, 3]
-        z = camera[:, 2]
-        u, v = ((camera @ lens.T)[:, :2] / z[:, None]).unbind(1)
-        seen = (z > 1e-6) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        column, row = torch.where(seen, u, 0).long(), torch.where(seen, v, 0).long()
-        outside = seen & torch.from_numpy(ground).to(points.device)[row, column]
-        votes[alive] += outside
-        keep = votes[alive] < needed
-        alive, points = alive[keep], points[keep]
-    return (votes < needed).view(box.shape).cpu().numpy()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsfluent.data import BACKGROUND, Gaussians
-from gsfluent.errors import InputError, RunError
+from gsfluent.errors import InputError, RunError, need
 from gsfluent.io import atomic_path, load_capture, load_splats
 from gsfluent.io.solid import load_solid, volume_path
 from gsfluent.pipeline.solid.colors import surface_colors
@@ -44,16 +44,11 @@ def closed_mesh(field: SignedDistance, gaussians: Gaussians | None = None) -> tr
     """
     import trimesh
 
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise InputError(
-            "mesh: scikit-image is not installed", "pip install 'gsfluent[mesh]'"
-        ) from error
+    measure = need("skimage.measure", "mesh", "mesh: the surface")
     if not bool(field.inside.any()):
         raise InputError("mesh: the solid is empty", "check the input, or choose another method")
     values = np.pad(field.values.cpu().numpy(), 1, constant_values=_rim(field))
-    vertices, faces, _, _ = marching_cubes(values, level=0.0)
+    vertices, faces, _, _ = measure.marching_cubes(values, level=0.0)
     # the pad is one voxel, and values are those of voxel centres
     vertices = field.origin.double().cpu().numpy() + (vertices - 0.5) * field.voxel
     mesh = trimesh.Trimesh(vertices, faces, process=True)

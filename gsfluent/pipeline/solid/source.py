@@ -12,13 +12,12 @@ import torch
 
 from gsfluent.data import Capture, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.capture.hull import visual_hull
+from gsfluent.pipeline.capture.hull import centre_hull, lattice, visual_hull
 from gsfluent.pipeline.capture.views import read_views
+from gsfluent.pipeline.solid.evidence import Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.inside import find_leaks, keep_components
-from gsfluent.pipeline.solid.inside import visual_hull as centre_hull
 from gsfluent.pipeline.solid.splats import solid_of_splats
-from gsfluent.pipeline.solid.vote import VoteOptions
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.mesh_distance import load_mesh, oriented_samples, signed_distances
 from gsfluent.spatial.winding import winding_numbers
@@ -38,21 +37,18 @@ _FEW_VIEWS = 8  # cameras below which a hull is a cone
 
 
 def find_solid(
-    gaussians: Gaussians | None = None,
+    gaussians: Gaussians | Evidence | None = None,
     capture: Capture | None = None,
     mesh: trimesh.Trimesh | str | Path | None = None,
     *,
     method: str = "auto",
     resolution: int = 96,
-    options: VoteOptions | None = None,
-    match_masks: bool = True,
-    match_drawn: bool = True,
-    finer: bool = True,
+    options: SolidOptions | None = None,
 ) -> SignedDistance:
     """Signed distances to the surface of an object, from whatever there is.
 
     Args:
-        gaussians: The object's splats (without background), or None.
+        gaussians: The object's splats (without background), what was gathered of them, or None.
         capture: Its photographs, with masks for ``hull``; cameras for ``tsdf``.
         mesh: A triangle mesh, or a file that trimesh reads.
         method: ``hull`` (visual hull of the masks), ``density`` (opacity density and ray vote, cut
@@ -60,11 +56,7 @@ def find_solid(
             ``auto``: the mesh when there is one, else what the splats enclose less what their
             depths show to be free, else the hull.
         resolution: Voxels along the longest side of the object.
-        options: Settings of the ray vote.
-        match_masks: Move the skin of splats to the outline that masks show.
-        match_drawn: Without masks, half of the way to the outline of the drawn splats: right for
-            trained ones, whose centres lie too deep, too far for large discs.
-        finer: Take smaller voxels where the walls found are thinner than five of them.
+        options: How the solid of splats is decided.
 
     Returns:
         The field; ``report["why"]`` says why this source was chosen.
@@ -78,7 +70,7 @@ def find_solid(
         raise InputError(
             f"solid: resolution must be in 16..512 voxels, got {resolution}", "96 to 160 is usual"
         )
-    chosen, why = _choose(method, gaussians, capture, mesh)
+    chosen, why = _choose(method, gaussians is not None, capture, mesh)
     began = time.perf_counter()
     if chosen == "mesh":
         assert mesh is not None
@@ -88,16 +80,11 @@ def find_solid(
         field = _of_hull(capture, resolution)
     else:
         assert gaussians is not None
-        field, note = solid_of_splats(
-            gaussians,
-            capture,
-            resolution,
-            method="auto" if method == "auto" else chosen,
-            options=options,
-            match_masks=match_masks,
-            match_drawn=match_drawn,
-            finer=finer,
-        )
+        known = gaussians
+        if not isinstance(known, Evidence):
+            known = Evidence.of(known, capture, resolution)
+        how = "auto" if method == "auto" else chosen
+        field, note = solid_of_splats(known, how, options or SolidOptions())
         why += note
     if chosen in ("hull", "density") and field.source in ("hull", "density"):
         field = field.tidied()
@@ -113,15 +100,10 @@ def find_solid(
     )
 
 
-def _choose(
-    method: str,
-    gaussians: Gaussians | None,
-    capture: Capture | None,
-    mesh: Any,
-) -> tuple[str, str]:
+def _choose(method: str, splats: bool, capture: Capture | None, mesh: Any) -> tuple[str, str]:
     """Which source, and why."""
     masks = capture is not None and capture.shows_masks()
-    needs = {"hull": masks, "density": gaussians is not None, "tsdf": gaussians is not None}
+    needs = {"hull": masks, "density": splats, "tsdf": splats}
     if method != "auto":
         if not needs.get(method, mesh is not None):
             what = {"hull": "a capture with masks", "mesh": "a mesh"}.get(method, "splats")
@@ -129,9 +111,8 @@ def _choose(
         return method, "asked for"
     if mesh is not None:
         return "mesh", "a mesh is exact"
-    if gaussians is not None:
-        reason = "splats, and masks to cut them by" if masks else "splats, no masks"
-        return "density", reason
+    if splats:
+        return "density", "splats, and masks to cut them by" if masks else "splats, no masks"
     if masks:
         return "hull", "masks and no splats"
     raise InputError("solid: neither splats, nor masks, nor a mesh were given", "give one of them")
@@ -141,9 +122,7 @@ def _of_hull(capture: Capture, resolution: int) -> SignedDistance:
     """The conservative hull says where; voxel centres against the masks say exactly how far."""
     views = read_views(capture, _HULL_SIZE, torch.device("cpu"), crop=True)
     rough = visual_hull(views, resolution)
-    origin = rough.origin.double().cpu().numpy()
-    x, y, z = rough.occupancy.shape
-    box = GridBox((float(origin[0]), float(origin[1]), float(origin[2])), rough.voxel, (x, y, z))
+    box = GridBox.of(rough.origin, rough.voxel, rough.occupancy.shape)
     grounds = []
     for view in views:
         assert view.mask is not None  # visual_hull has refused views without
@@ -157,7 +136,7 @@ def _of_hull(capture: Capture, resolution: int) -> SignedDistance:
         "cone": len(views) < _FEW_VIEWS,
         "components_dropped": dropped,
     }
-    return SignedDistance.of_voxels(body, origin, rough.voxel, "hull", notes)
+    return SignedDistance.of_voxels(body, np.array(box.origin), rough.voxel, "hull", notes)
 
 
 def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
@@ -178,10 +157,8 @@ def _of_mesh(mesh: trimesh.Trimesh, resolution: int) -> SignedDistance:
     samples, areas = oriented_samples(triangles, 0.7 * voxel)
     shell = np.zeros(size, dtype=bool)
     shell[tuple(np.floor((samples - origin) / voxel).astype(int).T)] = True
-    axes = [torch.arange(int(n)) + 0.5 for n in size]
-    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     winding = winding_numbers(
-        torch.from_numpy(origin).float() + grid * voxel,
+        torch.from_numpy(origin).float() + lattice(size.tolist()) * voxel,
         torch.from_numpy(samples).float(),
         torch.from_numpy(areas).float(),
         soft=0.35 * voxel,

@@ -13,34 +13,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsfluent.data import Camera, Capture, Gaussians
+from gsfluent.data import Camera
+from gsfluent.pipeline.capture.hull import lattice
+from gsfluent.pipeline.solid.evidence import MOST_CAMERAS, Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance, distances_of
 from gsfluent.pipeline.solid.hollow import hidden_cavity
 from gsfluent.pipeline.solid.inside import find_leaks, keep_components
 from gsfluent.pipeline.solid.outline import drawn_outlines, mask_outlines, match_outline
-from gsfluent.pipeline.solid.tsdf import (
-    SIZE,
-    Fused,
-    depth_views,
-    fuse,
-    fuse_depths,
-    ring_of_cameras,
-    zoomed,
-)
-from gsfluent.pipeline.solid.vote import Closed, VoteOptions, evidence, vote_solid
+from gsfluent.pipeline.solid.tsdf import Fused, depth_views, fuse, fuse_depths
+from gsfluent.pipeline.solid.vote import Closed, vote_solid
 from gsfluent.pipeline.solid.walls import wall_thickness
-from gsfluent.spatial.density import GridBox, choose_grid
-from gsfluent.spatial.voxels import distance_transform, grown
+from gsfluent.spatial.density import GridBox
+from gsfluent.spatial.voxels import distance_transform, grown, surface
 
 __all__ = ["solid_of_splats"]
 
 _log = logging.getLogger(__name__)
 
-_FAINT = 0.05  # opacity below which a splat is no matter
 _DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/theory/solid.md)
 _INNER = 0.05  # share of the surface below the closed one that makes an inner wall
 _ENOUGH = 12  # photographs from which depths decide where the skin is
-_MOST_CAMERAS = 48  # evenly chosen; more say the same again
 _SKIN = 1.5  # voxels; density and depths may disagree by so much about where the skin is
 _CAVITY = 0.02  # share of the solid from which what virtual cameras look into is taken out
 _BUBBLE = 0.01  # of the solid: a smaller enclosed void is a fault of the depths
@@ -55,111 +47,65 @@ _BAND = 2.5  # coarse voxels around the skin that are looked at again
 
 
 def solid_of_splats(
-    gaussians: Gaussians,
-    capture: Capture | None,
-    resolution: int,
-    *,
-    method: str = "auto",
-    options: VoteOptions | None = None,
-    match_masks: bool = True,
-    match_drawn: bool = True,
-    finer: bool = True,
+    known: Evidence, method: str, options: SolidOptions
 ) -> tuple[SignedDistance, str]:
     """Signed distances to the skin of splats, and a word on how they came about.
 
     Args:
-        gaussians: Splats of one object.
-        capture: Its photographs, or None.
-        resolution: Voxels along the longest side of the object.
+        known: The splats of one object and what saw them.
         method: ``density`` (what the splats enclose), ``tsdf`` (fused depths alone) or ``auto``
             (both).
-        options: Settings of the vote.
-        match_masks: Move the skin to the outline in the masks.
-        match_drawn: Without masks, half of the way to the outline of the drawn splats.
-        finer: Raise the resolution where walls are thinner than five voxels.
+        options: Settings.
     """
-    options = options or VoteOptions()
-    gaussians, unusable = evidence(gaussians)
-    visible = gaussians.select(gaussians.opacities > _FAINT)
     if method == "tsdf":
-        box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
         closed = None
-        notes: dict[str, Any] = {"stray_gaussians": strays, "closed_side": None, "leaks": 0}
+        notes: dict[str, Any] = {"stray_gaussians": known.grid[1], "closed_side": None, "leaks": 0}
     else:
-        closed = vote_solid(gaussians, capture, resolution, options)
-        box, notes = closed.box, dict(closed.notes)
-    notes["unusable_gaussians"] = unusable
+        closed = vote_solid(known, options)
+        notes = dict(closed.notes)
+    box = known.box
+    notes["unusable_gaussians"] = known.unusable
     open_side = notes["closed_side"]
     if notes.get("buried_surface_fraction", 0.0) > _INNER:
         open_side = None  # there is a skin inside: the opening is one, not a side nobody saw
-    cameras, virtual = _lookers(capture, box, open_side)
+    cameras, virtual = known.cameras(box, open_side)
     notes |= {"cameras": len(cameras), "virtual_cameras": virtual}
     note = ""
     if method == "density":
         assert closed is not None
         field = SignedDistance.of_voxels(
-            closed.solid, np.array(box.origin), box.voxel, "density", device=gaussians.device
+            closed.solid, np.array(box.origin), box.voxel, "density", device=known.device
         )
     elif closed is None or (not virtual and len(cameras) >= _ENOUGH):
-        field, fused = _seen(visible, cameras, box, closed)
+        field, fused = _seen(known, cameras, closed)
         notes["unseen_surface"] = _unseen(field, fused)
         if closed is not None:
             share = 1.0 - float(field.inside.sum()) / max(1, int(closed.loose.sum()))
             notes["cavity_share"] = max(0.0, share)
             note = f"; depths of {len(cameras)} photographs say where its skin is"
     else:
-        field, note = _carved(visible, cameras, closed, notes, virtual)
+        field, note = _carved(known, cameras, closed, notes, virtual)
     if closed is not None:
         body = _inside_on(field, box) & closed.loose
         notes |= find_leaks(closed.shell, body, np.array(box.origin), box.voxel)
         if closed.notes["closed_side"] is not None:
             notes["leaks"] = max(1, notes["leaks"])
-    if finer and method != "density" and field.source != "density":
-        field, word = _finer(field, visible, capture, closed, open_side)
+    if options.finer and method != "density" and field.source != "density":
+        field, word = _finer(field, known, closed, open_side)
         note += word
-    if match_masks and (match_drawn or (capture is not None and capture.shows_masks())):
-        field = _matched(field, visible, capture, cameras, closed)
+    if options.match_masks and (options.match_drawn or known.masked):
+        field = _matched(field, known, cameras, closed)
     return field.replace(report=notes | field.report), note
 
 
-def _lookers(
-    capture: Capture | None,
-    box: GridBox,
-    open_side: Sequence[float] | None,
-    size: int = SIZE,
-    most: int = _MOST_CAMERAS,
-) -> tuple[list[Camera], bool]:
-    """Cameras of the capture cut to the object, else a ring of cameras around it.
-
-    No camera of the ring looks from an open side: it would see the inside of the far skin.
-    """
-    low, extent = torch.tensor(box.origin), torch.tensor(box.shape) * box.voxel
-    center, radius = low + 0.5 * extent, 0.5 * float(extent.norm())
-    cameras: list[Camera] = []
-    if capture is not None:
-        step = max(1.0, len(capture) / most)
-        chosen = [capture.cameras[int(i * step)] for i in range(min(most, len(capture)))]
-        near = [zoomed(camera, center, radius, size) for camera in chosen]
-        cameras = [camera for camera in near if camera is not None]
-    if cameras:
-        return cameras, False
-    cameras = ring_of_cameras(center, radius, size=size)
-    if open_side is not None:
-        side = torch.tensor(open_side, dtype=torch.float64)
-        cameras = [c for c in cameras if float(c.forward() @ side) > -0.1]
-    return cameras, True
-
-
 def _seen(
-    visible: Gaussians, cameras: Sequence[Camera], box: GridBox, closed: Closed | None
+    known: Evidence, cameras: Sequence[Camera], closed: Closed | None
 ) -> tuple[SignedDistance, Fused]:
     """Fused depths; where nobody looked, what the splats enclose."""
     from scipy import ndimage
 
-    where = None
-    if closed is not None:
-        where = grown(closed.loose, 3)
-    fused = fuse_depths(visible, cameras, box, where)
+    where = None if closed is None else grown(closed.loose, 3)
+    fused = fuse_depths(known.visible, cameras, known.box, where)
     body = fused.values <= 0
     if closed is not None:
         around = ndimage.binary_dilation(closed.loose, iterations=2) & (fused.near > 0)
@@ -172,13 +118,13 @@ def _seen(
     body = _without_bubbles(body)
     report: dict[str, Any] = {"components_dropped": dropped}
     if closed is not None:
-        body, report["hollow"] = _hollowed(body, closed, fused, visible.device)
-    field = _field_of(body, fused, np.array(box.origin), box.voxel, visible.device)
+        body, report["hollow"] = _hollowed(body, closed, fused, known.device)
+    field = _field_of(body, fused, known.box, known.device)
     return field.replace(report=report), fused
 
 
 def _carved(
-    visible: Gaussians,
+    known: Evidence,
     cameras: Sequence[Camera],
     closed: Closed,
     notes: dict[str, Any],
@@ -187,10 +133,9 @@ def _carved(
     """What the splats enclose, less the cavities that their depths show."""
     from scipy import ndimage
 
-    box, solid = closed.box, closed.solid
-    where = grown(solid, 3)
-    fused = fuse_depths(visible, cameras, box, where)
-    cavity = _cavities(solid, fused.values, visible.device)
+    box, solid, device = known.box, closed.solid, known.device
+    fused = fuse_depths(known.visible, cameras, box, grown(solid, 3))
+    cavity = _cavities(solid, fused.values, device)
     share = float(cavity.sum() / max(1, int(solid.sum())))
     notes["cavity_share"] = share
     source, note = "density", ""
@@ -204,11 +149,11 @@ def _carved(
         report["components_dropped"] = notes["components_dropped"] + dropped
         source = "density and tsdf"
         note = f"; cameras look into {100 * share:.0f} % of what the ray vote closed"
-        solid, report["hollow"] = _hollowed(solid, closed, fused, visible.device)
-        field = _field_of(solid, fused, np.array(box.origin), box.voxel, visible.device)
+        solid, report["hollow"] = _hollowed(solid, closed, fused, device)
+        field = _field_of(solid, fused, box, device)
     else:
         field = SignedDistance.of_voxels(
-            solid, np.array(box.origin), box.voxel, source, device=visible.device
+            solid, np.array(box.origin), box.voxel, source, device=device
         )
         if notes["closed_side"] is not None and virtual:
             note = "; one side is open and was closed: if it is no hole, choose tsdf"
@@ -251,17 +196,15 @@ def _cavities(solid: np.ndarray, depths: np.ndarray, device: torch.device) -> np
     return result
 
 
-def _field_of(
-    body: np.ndarray, fused: Fused, origin: np.ndarray, voxel: float, device: torch.device
-) -> SignedDistance:
+def _field_of(body: np.ndarray, fused: Fused, box: GridBox, device: torch.device) -> SignedDistance:
     """Distances to the boundary of voxels; near it those of the depths, which are finer."""
     values = distances_of(body, device=device)
     finer = (np.abs(fused.values) < 1.0) & ((fused.values <= 0) == body) & (fused.near > 0)
     values = np.where(finer, fused.values, values)
     return SignedDistance(
-        torch.from_numpy((values * voxel).astype(np.float32)).to(device),
-        torch.from_numpy(origin).float().to(device),
-        voxel,
+        torch.from_numpy((values * box.voxel).astype(np.float32)).to(device),
+        torch.tensor(box.origin, device=device),
+        box.voxel,
         "tsdf",
     )
 
@@ -283,10 +226,7 @@ def _without_bubbles(body: np.ndarray) -> np.ndarray:
 
 def _unseen(field: SignedDistance, fused: Fused) -> float:
     """Share of the surface that no camera saw: there the boundary is a guess."""
-    from scipy import ndimage
-
-    body = field.inside.cpu().numpy()
-    skin = body & ~ndimage.binary_erosion(body)
+    skin = surface(field.inside.cpu().numpy())
     return float((skin & (fused.known == 0)).sum() / max(1, int(skin.sum())))
 
 
@@ -299,8 +239,7 @@ def _inside_on(field: SignedDistance, box: GridBox) -> np.ndarray:
 
 def _finer(
     field: SignedDistance,
-    visible: Gaussians,
-    capture: Capture | None,
+    known: Evidence,
     closed: Closed | None,
     open_side: Sequence[float] | None,
 ) -> tuple[SignedDistance, str]:
@@ -320,12 +259,7 @@ def _finer(
     voxel = coarse / factor
     shape = (size * factor).ceil().long().tolist()
     device = field.values.device
-    origin = field.origin.double().cpu().numpy()
-    box = GridBox(
-        (float(origin[0]), float(origin[1]), float(origin[2])),
-        voxel,
-        (int(shape[0]), int(shape[1]), int(shape[2])),
-    )
+    box = GridBox.of(field.origin, voxel, shape)
     near = (field.values.abs() < _BAND * coarse).cpu().numpy()
     if closed is not None and closed.shell.shape == near.shape:
         near |= ndimage.binary_dilation(closed.shell)
@@ -337,9 +271,9 @@ def _finer(
     index = np.argwhere(band)
     points = torch.from_numpy(box.centers(index)).float()
     pixels = int(min(2.5 * max(shape), 640))
-    cameras, _ = _lookers(capture, box, open_side, pixels, 2 * _MOST_CAMERAS)
-    limit = _LIM * factor
-    found = fuse(points.to(visible.means), depth_views(visible, cameras), voxel, limit)
+    cameras, _ = known.cameras(box, open_side, pixels, 2 * MOST_CAMERAS)
+    views = depth_views(known.visible, cameras)
+    found = fuse(points.to(known.visible.means), views, voxel, _LIM * factor)
     before = (field.at(points) / voxel).cpu().numpy()
     # far from the coarse skin the depths only repeat it; hidden is hidden
     values = np.where((found.known > 0) | (before > 0), found.values, before)
@@ -355,7 +289,7 @@ def _finer(
         grid = np.full(box.shape, rest, dtype=np.float32)
         grid[band] = column
         grids.append(grid)
-    result = _field_of(body, Fused(grids[0], grids[1], grids[1], grids[1]), origin, voxel, device)
+    result = _field_of(body, Fused(grids[0], grids[1], grids[1], grids[1]), box, device)
     report = field.report | {
         "components_dropped": field.report.get("components_dropped", 0) + dropped,
         "finer": round(factor, 2),
@@ -368,19 +302,17 @@ def _finer(
 
 def _matched(
     field: SignedDistance,
-    visible: Gaussians,
-    capture: Capture | None,
+    known: Evidence,
     cameras: Sequence[Camera],
     closed: Closed | None,
 ) -> SignedDistance:
     """The field with the outline that masks show, or the splats when there are none."""
-    masked = capture is not None and capture.shows_masks()
-    if not masked:
-        grown, offset = match_outline(field, drawn_outlines(visible, cameras), trust=_DRAWN)
+    if not known.masked:
+        grown, offset = match_outline(field, drawn_outlines(known.visible, cameras), trust=_DRAWN)
         notes = {"skin_offset": offset, "skin_from": "splats"}
         return grown.replace(report=field.report | notes)
-    assert capture is not None
-    grown, offset = match_outline(field, mask_outlines(capture))
+    assert known.capture is not None  # masked
+    grown, offset = match_outline(field, mask_outlines(known.capture))
     if offset < 0:
         # an outline is the envelope of all bumps; half of what it asks for is theirs
         offset = round(_DRAWN * offset, 3)
@@ -389,12 +321,11 @@ def _matched(
     if offset > 0 and closed is not None and closed.hull is not None:
         # what was added must lie in the masks as well
         bound = SignedDistance.of_voxels(
-            closed.hull, np.array(closed.box.origin), closed.box.voxel, "hull",
+            closed.hull, np.array(known.box.origin), known.box.voxel, "hull",
             device=values.device,
         )  # fmt: skip
-        axes = [torch.arange(n, device=values.device) + 0.5 for n in field.values.shape]
-        grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        allowed = bound.at(field.origin + grid * field.voxel).reshape(values.shape)
+        places = field.origin + lattice(values.shape, values.device) * field.voxel
+        allowed = bound.at(places).reshape(values.shape)
         values = torch.maximum(values, torch.minimum(allowed, field.values))
     notes = {"skin_offset": offset, "skin_from": "masks"}
     return grown.replace(values=values, report=field.report | notes)

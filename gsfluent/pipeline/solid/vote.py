@@ -11,45 +11,29 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from gsfluent.errors import InputError
+from gsfluent.pipeline.capture.hull import Ground, centre_hull
 from gsfluent.pipeline.capture.orient import orient
+from gsfluent.pipeline.solid.evidence import FEW, Evidence, SolidOptions
 from gsfluent.pipeline.solid.inside import (
     cast_votes,
     keep_components,
     smooth_boundary,
     trim_outer_flank,
-    visual_hull,
 )
-from gsfluent.spatial.density import GridBox, choose_grid, density_field
-from gsfluent.spatial.shape import robust_box
+from gsfluent.spatial.density import GridBox, density_field
 from gsfluent.spatial.voxels import distance_transform
 
 if TYPE_CHECKING:
-    from gsfluent.data import Capture, Gaussians
+    from gsfluent.data import Capture
 
-__all__ = ["Closed", "VoteOptions", "evidence", "vote_solid"]
+__all__ = ["Closed", "vote_solid"]
 
 _log = logging.getLogger(__name__)
 
-_FEW = 16  # splats
-_HUGE = 0.5  # of the object's longest side: a standard deviation above it is no surface
 _MASK_SIZE = 400  # pixels
 _BURIED = 3.5  # voxels below the closed surface
-_SAMPLE = 100_000
-
-
-@dataclass(frozen=True)
-class VoteOptions:
-    """Arguments of :class:`gsfluent.pipeline.Fill` that concern the vote; see there."""
-
-    threshold: float = 0.5
-    agreement: float = 0.7
-    rays: int = 26
-    down: np.ndarray | None = None
-    close_underside: bool = True
-    masks: bool = True
 
 
 @dataclass(frozen=True)
@@ -73,39 +57,8 @@ class Closed:
     notes: dict[str, Any]
 
 
-def evidence(gaussians: Gaussians) -> tuple[Gaussians, int]:
-    """Splats that can be part of a surface, and how many of the visible ones cannot.
-
-    None without a size or a direction, none with a standard deviation above half of the object:
-    a single one would hide the object from every camera and blow up every box.
-    """
-    scales = gaussians.scales
-    finite = torch.isfinite(gaussians.means).all(1) & torch.isfinite(scales).all(1)
-    finite &= torch.isfinite(gaussians.quats).all(1)
-    fine = (scales > 0).all(1) & (gaussians.quats.norm(dim=1) > 1e-12)
-    seen = gaussians.opacities > 0.05
-    if int((fine & seen & finite).sum()) >= _FEW:
-        # quantiles of a hundred thousand points are those of all
-        points = gaussians.means[fine & seen & finite].detach()
-        low, high = robust_box(points[:: max(1, len(points) // _SAMPLE)].double().cpu().numpy())
-        fine &= scales.amax(1) <= _HUGE * float((high - low).max())
-    fine |= ~finite  # for validation to name
-    return gaussians.select(fine), int((seen & ~fine).sum())
-
-
-def vote_solid(
-    gaussians: Gaussians,
-    capture: Capture | None,
-    resolution: int,
-    options: VoteOptions,
-) -> Closed:
-    """Close a shell of splats.
-
-    Args:
-        gaussians: What :func:`evidence` left.
-        capture: Photographs; with masks, their visual hull is cut out of the result.
-        resolution: Voxels along the longest side of the object.
-        options: Settings of the vote.
+def vote_solid(known: Evidence, options: SolidOptions) -> Closed:
+    """Close a shell of splats; what masks show to be free is cut out of it.
 
     Raises:
         InputError: Too few splats, none reaches the density of a surface, or the masks do not
@@ -113,12 +66,13 @@ def vote_solid(
     """
     from scipy import ndimage
 
-    if gaussians.count < _FEW:
+    gaussians, capture = known.splats, known.capture
+    if gaussians.count < FEW:
         raise InputError(
-            f"fill: needs at least {_FEW} Gaussians, got {gaussians.count}",
+            f"fill: needs at least {FEW} Gaussians, got {gaussians.count}",
             hint="check that isolation kept the object",
         )
-    box, strays = choose_grid(gaussians.means, gaussians.opacities, resolution)
+    box, strays = known.grid
     field = density_field(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, box
     )
@@ -143,7 +97,7 @@ def vote_solid(
     hull = None
     views = masked_views(capture) if options.masks else []
     if views:
-        hull = visual_hull(box, views, gaussians.device)
+        hull = centre_hull(box, views, gaussians.device)
         # masks say what is not the object; rays cap the cone under objects seen only from above
         # (just outside a convex surface about half of the rays hit it)
         loose = hull & (shell | (vote.score >= 0.65))
@@ -175,16 +129,14 @@ def vote_solid(
     return Closed(box, shell, loose, solid, hull, notes)
 
 
-def masked_views(
-    capture: Capture | None, size: int = _MASK_SIZE
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def masked_views(capture: Capture | None) -> list[Ground]:
     """Background pixels and undistorted cameras of the views that have a mask."""
     from scipy import ndimage
 
     if capture is None:
         return []
     views = []
-    for view in capture.views(range(len(capture)), size):
+    for view in capture.views(range(len(capture)), _MASK_SIZE):
         if view.mask is None:
             continue
         ground = view.mask < 0.5

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.pipeline.solid.field import SignedDistance
-from gsfluent.spatial.voxels import distance_transform
+from gsfluent.spatial.voxels import distance_transform, surface
 
 __all__ = ["thin_shells", "wall_thickness", "walls"]
 
@@ -32,27 +32,21 @@ def wall_thickness(field: SignedDistance, most: float) -> tuple[Tensor, Tensor]:
         Points on the surface [M, 3], and the thickness below each [world units], at most ``most``,
         [M]. M is 0 when nothing is inside.
     """
-    inside = field.inside
-    lonely = torch.nn.functional.pad(~inside, (1,) * 6, value=True)
-    open_side = torch.zeros_like(inside)
-    for axis in range(3):
-        for step in (-1, 1):
-            rolled = torch.roll(lonely, step, dims=axis)[1:-1, 1:-1, 1:-1]
-            open_side |= rolled
-    index = (inside & open_side).nonzero()
+    skin = torch.from_numpy(surface(field.inside.cpu().numpy()))
+    index = skin.to(field.values.device).nonzero()
     if len(index) == 0:
         empty = field.values.new_zeros(0)
         return empty.reshape(0, 3), empty
     slopes = torch.stack(torch.gradient(field.values), -1)[tuple(index.T)]
     normal = torch.nn.functional.normalize(slopes, dim=1)
     center = field.origin.to(field.values) + (index + 0.5) * field.voxel
-    surface = center - field.values[tuple(index.T)][:, None] * normal
-    thickness = torch.full_like(surface[:, 0], float(most))
-    alive = torch.arange(len(surface), device=surface.device)
+    start = center - field.values[tuple(index.T)][:, None] * normal
+    thickness = torch.full_like(start[:, 0], float(most))
+    alive = torch.arange(len(start), device=start.device)
     before = torch.full_like(thickness, -1.0)
     depth = _FIRST * field.voxel
     while depth < most and len(alive):
-        value = field.at(surface[alive] - depth * normal[alive])
+        value = field.at(start[alive] - depth * normal[alive])
         through = value > 0
         # where the line from the last sample crosses zero
         last = before[alive]
@@ -61,7 +55,7 @@ def wall_thickness(field: SignedDistance, most: float) -> tuple[Tensor, Tensor]:
         before[alive] = value
         alive = alive[~through]
         depth += _STEP * field.voxel
-    return surface, thickness.clamp_max(most)
+    return start, thickness.clamp_max(most)
 
 
 def walls(field: SignedDistance, most: float = 12.0) -> dict[str, float | None]:

@@ -32,19 +32,12 @@ _BARE = (0.93, 0.93, 0.94)  # ground when there is no floor
 
 @dataclass(frozen=True)
 class Drawn:
-    """What of a frame is drawn.
+    """What of a frame is drawn."""
 
-    Attributes:
-        gaussians: Splats, coloured and cut.
-        groups: Siblings, int32 [N].
-        gloss: Highlights of each splat, [N, 2], or None.
-        legend: What the colours mean, or None.
-    """
-
-    gaussians: Gaussians
-    groups: Tensor
-    gloss: Tensor | None
-    legend: Legend | None
+    gaussians: Gaussians  # Splats, coloured and cut
+    groups: Tensor  # Siblings, int32 [N]
+    gloss: Tensor | None  # Highlights of each splat, [N, 2], or None
+    legend: Legend | None  # What the colours mean, or None
 
 
 class PictureMaker:
@@ -60,7 +53,6 @@ class PictureMaker:
         self.shot = timeline.source.shot
         self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
         self._backdrop = self._captured()
-        self._render: tuple[object, Render] | None = None
 
     def first_light(self) -> Lighting:
         """The shot's light, or the usual one."""
@@ -102,28 +94,22 @@ class PictureMaker:
         """
         frame = self.timeline.frame(index)
         drawn = self.splats(frame, look)
-        gaussians, groups, gloss = drawn.gaussians, drawn.groups, drawn.gloss
-        render = self._renderer(index, look)
-        if gaussians.count == 0:  # everything is cut away
-            image = self._empty(frame, camera, render)
-        else:
-            image = render(gaussians, camera, groups=groups, gloss=gloss, time=frame.time)
-        values = (image * 255.0).round().clamp(0, 255).to(torch.uint8)
+        gaussians, gloss, time = drawn.gaussians, drawn.gloss, frame.time
+        groups: Tensor | None = drawn.groups
+        if gaussians.count == 0:  # everything is cut away: one splat that nobody sees
+            speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
+            gaussians = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
+            groups, gloss, time = None, None, 0.0
+        render = Render(
+            light=look.light,
+            studio=self._studio() if look.floor else None,
+            background=_BARE,
+            normal_cell=self.timeline.normal_cell,
+        )
+        backdrop = self._backdrop if look.floor else None
+        made = render(gaussians, camera, groups=groups, gloss=gloss, backdrop=backdrop, time=time)
+        values = (made.image * 255.0).round().clamp(0, 255).to(torch.uint8)
         return values.cpu().numpy(), drawn.legend
-
-    def _renderer(self, index: int, look: Look) -> Render:
-        """The render stage of a state of matter and light; it remembers how large matter is."""
-        key = (self.timeline.revision, index, look)
-        if self._render is None or self._render[0] != key:
-            render = Render(
-                light=look.light,
-                studio=self._studio() if look.floor else None,
-                backdrop=self._backdrop if look.floor else None,
-                background=_BARE,
-                normal_cell=self.timeline.normal_cell,
-            )
-            self._render = (key, render)
-        return self._render[1]
 
     def splats(self, frame: SavedFrame, look: Look) -> Drawn:
         """The splats of a frame as a look shows them."""
@@ -137,12 +123,6 @@ class PictureMaker:
             gaussians, groups = gaussians.select(kept), groups[kept]
             gloss = None if gloss is None else gloss[kept]
         return Drawn(gaussians, groups, gloss, legend)
-
-    def _empty(self, frame: SavedFrame, camera: Camera, render: Render) -> Tensor:
-        """Floor and backdrop alone: one splat that nobody sees keeps to the renderer's path."""
-        speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
-        speck = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
-        return render(speck, camera)
 
     def _studio(self) -> Studio | None:
         if self.floor is None:

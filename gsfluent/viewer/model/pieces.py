@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.pipeline.matter.rubble import REACH, clinging
+from gsfluent.pipeline.matter.debris import REACH, clinging
 from gsfluent.results.frames import SavedFrame
 
 _KEPT = 64  # frames whose assignment is remembered
@@ -60,7 +60,7 @@ class Pieces:
 def _joined(slots: Tensor, broken: Tensor, frame: SavedFrame) -> Tensor:
     """Give broken points the piece they hang on, through other broken points if need be, [P].
 
-    Shortest paths over links between close points: rubble that lies on a piece is reached, a spray
+    Shortest paths over links between close points: debris that lies on a piece is reached, a spray
     in the air is not.
     """
     reach = REACH * max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)

@@ -34,11 +34,11 @@ class PokePanel:
 
     Args:
         player: The session's player.
-        takes: Folder in which takes are recorded, ``take_1`` and so on.
+        recordings: Folder of the recordings, ``recording_1`` and so on.
     """
 
-    def __init__(self, player: LivePlayer, takes: Path) -> None:
-        self.player, self.takes = player, takes
+    def __init__(self, player: LivePlayer, recordings: Path) -> None:
+        self.player, self.recordings = player, recordings
         self._app: Page | None = None
         self._stop = threading.Event()
         self._drawn: collections.deque[tuple[float, int]] = collections.deque()
@@ -74,7 +74,7 @@ class PokePanel:
         self._throw.on_click(lambda event: self._with_client(event, self._hurl))
         self._cut.on_click(lambda event: self._with_client(event, self._slice))
         self._reset.on_click(lambda event: self._ask(self.player.reset))
-        self._record.on_click(lambda event: self._take())
+        self._record.on_click(lambda event: self._toggle_recording())
         self._pause.on_click(
             lambda event: self._ask(lambda: self.player.pause(self._pause.label == "Pause"))
         )
@@ -145,14 +145,14 @@ class PokePanel:
         speed = float(self._blade.value)
         self._ask(lambda: self.player.do(lambda s: s.cut_plane(normal.tolist(), speed=speed)))
 
-    def _take(self) -> None:
+    def _toggle_recording(self) -> None:
         if self.player.status.recording is None:
             number = 1
-            while (out := self.takes / f"take_{number}").exists():
+            while (out := self.recordings / f"recording_{number}").exists():
                 number += 1
             self._ask(lambda: self.player.record(out))
         else:
-            self._ask(self.player.end_take)
+            self._ask(self.player.end_recording)
 
     def _ask(self, act: Callable[[], Any]) -> None:
         """Have it done by the player; what a user can mend is said on the page."""

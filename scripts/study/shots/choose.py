@@ -35,6 +35,7 @@ from gsfluent.lab.charts.record import commit, machine
 from gsfluent.pipeline.simulate.engine import CFL
 from gsfluent.run.demo import SIZES, photograph_demo
 from gsfluent.scene.scene import Scene
+from gsfluent.stages.simulate import solver_options
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "examples"
@@ -94,8 +95,8 @@ def runs(
     for number in range(seeds):
         start = time.perf_counter()
         made = probe(
-            scene, cells, fps=shot.output.fps, frames=frames, cfl=cfl, seed=first + number,
-            device=device, standing=shot.solve.standing, loose_crumbs=shot.solve.loose_crumbs,
+            scene, cells, fps=shot.output.fps, frames=frames, seed=first + number, device=device,
+            options=dataclasses.replace(solver_options(shot), cfl=cfl),
         )  # fmt: skip
         spent = time.perf_counter() - start
         logging.info("%d cells, cfl %g, seed %d: %.1f s", cells, cfl, first + number, spent)

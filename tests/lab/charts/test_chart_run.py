@@ -209,6 +209,7 @@ def test_the_machine_moves_bytes_and_a_floor_follows(tmp_path: Path) -> None:
 def test_the_verb_draws_recorded_lines_of_several_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("matplotlib")
     peer = dataclasses.replace(fast(Setting("bar", 0.1), "cpu", 1), method="peer",
                                wall_per_simulated=0.5, error=0.2)  # fmt: skip
     broken = dataclasses.replace(peer, variant="b", error=math.inf, failed="exploded")
@@ -244,6 +245,7 @@ def test_a_chart_has_one_device(tmp_path: Path) -> None:
 
 
 def test_the_verb_runs_a_small_ladder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
     out = tmp_path / "chart"
     words = ["chart", "--quick", "--only", "dx", "free", "--device", "cpu", "-o", str(out)]
     assert main([*words, "--json"]) == 0

@@ -244,9 +244,9 @@ DX = 0.02
 def _frames(
     scene: Scene, fps: float, seconds: float, **options: bool
 ) -> tuple[list[SimulationFrame], Any]:
-    simulate = Simulate(dx=DX, splats=False, **options)
-    frames = list(simulate(scene, fps=fps, seconds=seconds))
-    report = simulate.report()
+    simulation = Simulate(dx=DX, splats=False, **options)(scene, fps=fps, seconds=seconds)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "clean", report["reason"]
     return frames, report
 
@@ -304,12 +304,12 @@ def _straight_error(frames: list[SimulationFrame]) -> float:
     return worst
 
 
-@pytest.mark.parametrize("measure", ["piece_flight", "contact_near"])
+@pytest.mark.parametrize("measure", ["piece_flight", "contact_proximity"])
 def test_bodies_that_pass_each_other(measure: str) -> None:
     """Two balls that come near and do not touch fly straight on.
 
-    ``piece_flight`` takes them off the grid again behind each other; ``contact_near`` looks for
-    contact only while they are near.
+    ``piece_flight`` takes them off the grid again behind each other; ``contact_proximity`` looks
+    for contact only while they are near.
     """
     (on, with_), (off, without) = (
         _frames(near_miss(), 40, 0.3, resident=False, **{measure: flag}) for flag in (True, False)

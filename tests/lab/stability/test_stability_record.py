@@ -169,6 +169,7 @@ def test_where_a_value_lies_on_an_axis() -> None:
 
 
 def test_a_cell_has_the_colour_of_its_step(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     from PIL import Image
 
     cells = {(0, 0): Cell(None), (1, 0): Cell(1, "E"), (2, 0): Cell(90, "E")}
@@ -187,6 +188,7 @@ def test_a_cell_has_the_colour_of_its_step(tmp_path: Path) -> None:
 def test_the_verb_runs_a_map_and_draws_recorded_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    pytest.importorskip("matplotlib")
     out = tmp_path / "out"
     words = ["stability", "--device", "cpu", "--json", "-o", str(out)]
     assert main([*words, "--maps", "zero_weight,precision", "--quick"]) == 0

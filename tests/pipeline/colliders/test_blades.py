@@ -13,6 +13,7 @@ from gsfluent import materials, ops
 from gsfluent.data import Frame
 from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.scene.scene import Scene
 
@@ -262,7 +263,7 @@ def sliced(
         [(0, 0, 0.45), (0, 0, 0.45 - depth)], width=0.4, edge=(0, 1, 0), speed=4.0, at=0.02,
         thickness=thickness,
     )  # fmt: skip
-    return Run(scene, build_matter(scene, 0.04), 25.0, {}, 3)
+    return Run(scene, build_matter(scene, 0.04), 25.0, SolverOptions(max_rollbacks=3))
 
 
 def test_a_simulated_blade_makes_two_pieces_that_part() -> None:

@@ -15,6 +15,7 @@ from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
@@ -30,7 +31,7 @@ def at(x: float, y: float, z: float) -> Frame:
 
 
 def run_of(scene: Scene, fps: float = 20.0, dx: float = DX) -> Run:
-    return Run(scene, build_matter(scene, dx), fps, {}, 3)
+    return Run(scene, build_matter(scene, dx), fps, SolverOptions(max_rollbacks=3))
 
 
 def go(run: Run, frames: int) -> None:

@@ -41,16 +41,18 @@ def parted(bound: Carry, gap: float, *, broken: bool = False, tilt: float = 0.0)
 
 def test_nothing_is_born_while_nothing_parts(bound):
     repair = Repair()
+    history = repair.begin(bound)
     turned = parted(bound, 0.0)
-    assert repair.step(bound, turned).births is None
-    result = repair(bound, bound.follow(turned))
+    assert history.step(turned).births is None
+    result = repair(bound, bound.follow(turned), history=history)
+    assert result.report == {"splats": bound.gaussians.count, "transition_splats": 0}
     assert result.added == 0 and result.gaussians.count == bound.gaussians.count
     assert bool((result.groups == -1).all())
 
 
 def test_faces_lie_where_the_halves_part_and_look_into_the_gap(bound):
     gap = 0.05
-    births = Repair().step(bound, parted(bound, gap)).births
+    births = Repair().begin(bound).step(parted(bound, gap)).births
     assert births is not None
     g, spacing = births.gaussians, bound.matter.spacing[0]
     left = bound.matter.rest[births.anchor, 0] < 0.0
@@ -71,7 +73,7 @@ def test_faces_are_opaque_from_the_gap(bound):
     """Seen through the gap the elements alone cover nine tenths, in the colour of the inside."""
     from gsfluent import geometry, ops
 
-    cracks = Repair().step(bound, parted(bound, 0.3))
+    cracks = Repair().begin(bound).step(parted(bound, 0.3))
     left = bound.matter.rest[cracks.births.anchor, 0] < 0.0
     g = cracks.births.gaussians.select(left)
     view = geometry.look_at(torch.tensor([0.3, 0, 0]), torch.zeros(3), torch.eye(3)[2]).float()
@@ -88,9 +90,9 @@ def test_faces_are_opaque_from_the_gap(bound):
 
 
 def test_faces_ride_rigidly_with_their_piece(bound):
-    repair = Repair()
-    one = repair.step(bound, parted(bound, 0.2)).births
-    two = repair.step(bound, parted(bound, 0.4, tilt=0.5)).births
+    history = Repair().begin(bound)
+    one = history.step(parted(bound, 0.2)).births
+    two = history.step(parted(bound, 0.4, tilt=0.5)).births
     assert torch.equal(one.ids, two.ids)
     right = bound.matter.rest[one.anchor, 0] > 0.0
     cos, sin = torch.cos(torch.tensor(0.5)), torch.sin(torch.tensor(0.5))
@@ -106,10 +108,10 @@ def test_faces_ride_rigidly_with_their_piece(bound):
 
 def test_a_gap_between_the_two_widths_keeps_what_it_had(bound):
     """Hysteresis: a gap on its way shut shows what one as wide on its way open does not."""
-    spacing, repair = bound.matter.spacing[0], Repair()
-    repair.step(bound, parted(bound, 0.2))
-    shut = [repair.step(bound, parted(bound, g * spacing)).births for g in (0.1, 0.05, 0.0)]
-    fresh = [Repair().step(bound, parted(bound, g * spacing)).births for g in (0.1, 0.05)]
+    spacing, history = bound.matter.spacing[0], Repair().begin(bound)
+    history.step(parted(bound, 0.2))
+    shut = [history.step(parted(bound, g * spacing)).births for g in (0.1, 0.05, 0.0)]
+    fresh = [Repair().begin(bound).step(parted(bound, g * spacing)).births for g in (0.1, 0.05)]
     was, soon, none, new, never = (0 if b is None else b.ids.numel() for b in (*shut, *fresh))
     assert was > 2 * new > 0 and soon > 0 and never == none == 0
     # what leaves soon is faint already
@@ -118,11 +120,11 @@ def test_a_gap_between_the_two_widths_keeps_what_it_had(bound):
 
 def test_frames_in_between_change_nothing(bound):
     """A run at twice the frame rate shows the same faces in the frames that both have."""
-    coarse, fine = Repair(), Repair()
+    coarse, fine = Repair().begin(bound), Repair().begin(bound)
     for gap in (0.001, 0.002, 0.004):
-        one = coarse.step(bound, parted(bound, gap, broken=True)).births
-        fine.step(bound, parted(bound, 0.75 * gap, broken=True))
-        two = fine.step(bound, parted(bound, gap, broken=True)).births
+        one = coarse.step(parted(bound, gap, broken=True)).births
+        fine.step(parted(bound, 0.75 * gap, broken=True))
+        two = fine.step(parted(bound, gap, broken=True)).births
         assert (one is None) == (two is None)
         if one is not None:
             assert torch.equal(one.ids, two.ids)
@@ -130,7 +132,7 @@ def test_frames_in_between_change_nothing(bound):
 
 
 def test_a_broken_layer_leaves_one_face_on_either_side(bound):
-    births = Repair().step(bound, parted(bound, 0.05, broken=True)).births
+    births = Repair().begin(bound).step(parted(bound, 0.05, broken=True)).births
     assert births is not None
     inner = births.gaussians.means[:, 1:].norm(dim=1) < 0.06
     assert bool((births.gaussians.means[inner, 0] < 0.02).any())
@@ -156,12 +158,13 @@ def _dropped() -> Scene:
 
 def test_an_interrupted_run_shows_the_same_faces(tmp_path):
     """Ids, places and opacities of every born splat are those of the run in one go."""
-    whole, saved = Simulate(dx=0.012), tmp_path / "state.pt"
+    saved = tmp_path / "state.pt"
     wanted = []
-    for frame in whole(_dropped(), fps=60, seconds=0.62):
+    whole = Simulate(dx=0.012)(_dropped(), fps=60, seconds=0.62)
+    for frame in whole:
         wanted.append(frame.repaired)
         if frame.index == 35:
-            whole.save_state(saved)
+            whole.save(saved)
     assert wanted[35].added > 0 and wanted[-1].added > 0
     again = Simulate(dx=0.012)
     for frame in again(_dropped(), fps=60, seconds=0.62, resume=saved):

@@ -98,7 +98,7 @@ def test_no_splat_is_strung_across_a_gap(bound):
     motion = bound.motion(**split(bound, gap))
     travel = motion.means - bound.gaussians.means
     assert torch.allclose(travel[:, 0].abs(), torch.full((travel.shape[0],), 0.5 * gap), atol=1e-5)
-    assert bool(motion.broken.any()) and not bool(motion.riding.all())
+    assert bool(motion.broken.any()) and not bool(motion.carried.all())
 
 
 def test_repair_adds_splats_only_at_cracks(bound):

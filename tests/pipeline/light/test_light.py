@@ -19,11 +19,11 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
+from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
-from gsfluent.pipeline.light.delight import Delit, delight, estimate_shading
 from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, lighting_of, pack_lamps, to_linear
-from gsfluent.pipeline.light.shade import irradiance
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
+from gsfluent.pipeline.light.shade import irradiance, to_linear
 from gsfluent.pipeline.light.shadow import transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.stage import Render
@@ -166,7 +166,7 @@ def test_spinning_lamp_turns_about_the_vertical() -> None:
         lambda: Lighting(occlusion=1.5),
         lambda: Lighting(ambient=math.inf),
         lambda: Lighting(environment=((1.0, 1.0, 1.0),)),
-        lambda: Light(specular=-0.1),
+        lambda: key_light(specular=-0.1),
     ],
 )
 def test_bad_lights_are_refused(make: Any) -> None:
@@ -176,10 +176,9 @@ def test_bad_lights_are_refused(make: Any) -> None:
 
 def test_short_form_of_light_means_the_same(skin: Gaussians) -> None:
     camera = Camera.look_at((0.3, -0.6, 0.2), (0, 0, 0), width=48, height=48, fov=22.0)
-    light = Light(direction=(1.0, 0.0, 1.0), specular=0.2)
-    long = lighting_of(light)
-    assert long is not None
-    torch.testing.assert_close(Render(camera, light)(skin), Render(camera, long)(skin))
+    light = key_light(direction=(1.0, 0.0, 1.0), specular=0.2)
+    long = Lighting((Lamp(direction=(1.0, 0.0, 1.0)),), specular=0.2, shininess=24.0)
+    torch.testing.assert_close(Render(camera, light)(skin).image, Render(camera, long)(skin).image)
 
 
 def test_specular_follows_the_splats(skin: Gaussians) -> None:
@@ -187,11 +186,11 @@ def test_specular_follows_the_splats(skin: Gaussians) -> None:
     light = Lighting(lamps=(Lamp(direction=(0.0, -1.0, 0.0), shadow=False),), occlusion=0.0)
     left = skin.means[:, 0] < 0
     gloss = torch.stack([torch.where(left, 0.8, 0.0), torch.full_like(left, 4.0, dtype=skin.dtype)])
-    image = Render(camera, light)(skin, gloss=gloss.T.contiguous())
+    image = Render(camera, light)(skin, gloss=gloss.T.contiguous()).image
     assert float(image[32, 24].mean()) > float(image[32, 40].mean()) + 0.1
     flat = Render(camera, Lighting(light.lamps, occlusion=0.0, specular=0.0))(
         skin, gloss=gloss.T.contiguous()
-    )
+    ).image
     assert float(flat[32, 24].mean()) == pytest.approx(float(flat[32, 40].mean()), abs=0.01)
 
 
@@ -241,7 +240,7 @@ def test_captured_light_is_divided_out(skin: Gaussians, kind: str) -> None:
     sky = environment.sky_and_ground((1.1, 1.1, 1.2), (0.35, 0.33, 0.3))
     day = Lighting((sun,), 0.35) if kind == "sun" else Lighting((), 0.0, sky)
     captured = bake_light(true, day)
-    restored = delight(captured)
+    restored = to_albedo(captured)
     assert off(captured, true) > 0.25
     assert off(restored, true) < 0.4 * off(captured, true)
     # and it helps when the object is lit from elsewhere
@@ -253,7 +252,7 @@ def test_captured_light_is_divided_out(skin: Gaussians, kind: str) -> None:
 def test_evenly_lit_capture_is_left_alone(skin: Gaussians) -> None:
     true = painted(skin)
     assert estimate_shading(true).strength < 0.02
-    assert off(delight(true), true) < 0.02
+    assert off(to_albedo(true), true) < 0.02
 
 
 def frame(skin: Gaussians, colors: Gaussians, extra: int = 0) -> Any:
@@ -271,11 +270,11 @@ def frame(skin: Gaussians, colors: Gaussians, extra: int = 0) -> Any:
 
 def test_film_keeps_the_light_out_while_things_move_and_splats_are_born(skin: Gaussians) -> None:
     captured = bake_light(painted(skin), Lighting((Lamp(shadow=False),), 0.3))
-    delit = Delit(frame(skin, captured), 1.0)
-    whole = delit.apply(frame(skin, captured))
-    torch.testing.assert_close(whole.colors(), delight(captured).colors(), atol=1e-5, rtol=1e-4)
+    albedo = Albedo(frame(skin, captured), 1.0)
+    whole = albedo.apply(frame(skin, captured))
+    torch.testing.assert_close(whole.colors(), to_albedo(captured).colors(), atol=1e-5, rtol=1e-4)
     born = Gaussians.cat([captured, captured.select(torch.arange(7))])
-    later = delit.apply(frame(skin, born, extra=7)).colors()
+    later = albedo.apply(frame(skin, born, extra=7)).colors()
     torch.testing.assert_close(later[-7:], whole.colors()[:7], atol=1e-5, rtol=1e-4)
 
 
@@ -374,6 +373,6 @@ def test_picture_is_the_same_on_the_gpu(skin: Gaussians, position: Any) -> None:
     light = Lighting(lamps, environment=environment.sky_and_ground((0.4,) * 3, (0.1,) * 3))
     camera = Camera.look_at((0.3, -0.6, 0.3), (0, 0, 0), width=160, height=120, fov=30.0)
     studio = Studio(-0.1, (0.0, 0.0), 0.1, 0.2)
-    host = Render(camera, light, studio=studio)(skin)
-    device = Render(camera, light, studio=studio)(skin.to(torch.device("cuda"))).cpu()
+    host = Render(camera, light, studio=studio)(skin).image
+    device = Render(camera, light, studio=studio)(skin.to(torch.device("cuda"))).image.cpu()
     assert float((host - device).abs().mean()) < 2e-3

@@ -8,7 +8,8 @@ from loaded_scripts import load_script
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.lab.truth import light as truth
-from gsfluent.pipeline.light.lamps import Lamp, Lighting, to_linear
+from gsfluent.pipeline.light.lamps import Lamp, Lighting
+from gsfluent.pipeline.light.shade import to_linear
 from gsfluent.pipeline.render.stage import Render
 
 light_accuracy = load_script("accuracy/light")
@@ -101,7 +102,7 @@ def test_moving_matter_does_not_shimmer() -> None:
         eye, target = move + torch.tensor([0.15, -0.8, 0.25]), move
         camera = Camera.look_at(eye, target, width=96, height=96, fov=15.5)
         light = Lighting((Lamp(),), ambient=0.3)
-        layers = Render(camera, light).layers(solid.replace(means=solid.means + move))
+        layers = Render(camera, light)(solid.replace(means=solid.means + move))
         pictures.append(to_linear(layers.image)[layers.alpha > 0.999])
     for picture in pictures[1:]:
         change = (picture - pictures[0]).square().mean().sqrt() / pictures[0].square().mean().sqrt()

@@ -41,7 +41,7 @@ def moved(carry: Carry, position: torch.Tensor, deformation: torch.Tensor, piece
 @pytest.mark.parametrize("round_", [True, False])
 @pytest.mark.parametrize("piece", [0, -1])
 def test_a_turned_object_looks_the_same_to_a_turned_camera(round_: bool, piece: int) -> None:
-    """Splats, SH of degree 3 included, ride rigidly, as a piece and as crumbs: same picture."""
+    """Splats, SH of degree 3 included, ride rigidly, as a piece and as debris: same picture."""
     carry = bound(round_)
     shift = torch.tensor([0.3, -0.2, 0.5])
     rest = carry.matter.rest

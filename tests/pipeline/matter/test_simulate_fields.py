@@ -16,6 +16,7 @@ from gsfluent.data import Frame
 from gsfluent.pipeline.matter.fields import breakable, number_fields, units
 from gsfluent.pipeline.matter.fragments import find_fragments, rest_links
 from gsfluent.pipeline.matter.points import Matter, build_matter
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.scene.scene import Scene
 
@@ -109,7 +110,7 @@ def test_pieces_that_were_pressed_together_come_apart_again(separate: bool) -> N
     scene = Scene(floor=None, gravity=(0, 0, 0))
     scene.add(ellipsoid(), APPLE, frame=at(0, 0, 0))
     options = {"free_flight": False, "separate_fragments": separate}
-    run = Run(scene, build_matter(scene, DX), 100.0, options, 3)
+    run = Run(scene, build_matter(scene, DX), 100.0, SolverOptions(**options, max_rollbacks=3))
     rest = run.matter.rest
     right = rest[:, 0] > 0
     # A break without a layer of powder: the halves lie beside each other, the links are cut.

@@ -12,6 +12,7 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
 
@@ -32,15 +33,15 @@ def ball_scene(height: float = 0.3, **scene_options) -> Scene:
 def test_flight_is_exactly_ballistic():
     scene = Scene(floor=None)
     scene.add(ellipsoid(), SOFT, velocity=(1.0, -2.0, 3.0))
-    simulate = Simulate(dx=0.04)
     start = None
-    for frame in simulate(scene, fps=10, seconds=1.0):
+    simulation = Simulate(dx=0.04)(scene, fps=10, seconds=1.0)
+    for frame in simulation:
         center = frame.particles.position.double().mean(dim=0)
         start = center if start is None else start
         t = frame.time
         wanted = torch.tensor([1.0 * t, -2.0 * t, 3.0 * t - 0.5 * 9.81 * t * t])
         assert torch.allclose(center - start, wanted.double(), atol=2e-6)
-    report = simulate.report()
+    report = simulation.report
     assert report["substeps"] == 0 and report["skipped"]["free_flight_seconds"] == 0.9
     assert report["momentum_error"] < 1e-6
 
@@ -63,13 +64,15 @@ def test_flight_equals_the_grid():
     """Leaving the grid out changes nothing but round-off and the grid's own time-step error."""
     ends = []
     for free_flight in (True, False):
-        simulate = Simulate(dx=0.04, free_flight=free_flight)
-        *_, last = simulate(ball_scene(0.6), fps=20, seconds=0.35)
+        simulation = Simulate(dx=0.04, free_flight=free_flight)(
+            ball_scene(0.6), fps=20, seconds=0.35
+        )
+        *_, last = simulation
         ends.append(last.particles.position)
-        steps = simulate.report()["substeps"]
+        steps = simulation.report["substeps"]
         assert (steps == 0) == free_flight
     # symplectic Euler falls g t dt / 2 below the parabola; nothing else may differ
-    bias = 0.5 * 9.81 * 0.3 * simulate.report()["dt_max"]
+    bias = 0.5 * 9.81 * 0.3 * simulation.report["dt_max"]
     gap = ends[0] - ends[1]
     assert 0 < float(gap[:, 2].min()) and float(gap[:, 2].max()) < 1.02 * bias
     assert float(gap[:, :2].abs().max()) < 1e-5
@@ -79,9 +82,9 @@ def test_an_elastic_ball_bounces_and_balances_momentum():
     scene = Scene()
     scene.add(ellipsoid(), materials.elastic)
     scene.drop(0.3)
-    simulate = Simulate(dx=0.025)
-    frames = list(simulate(scene, fps=40, seconds=0.5))
-    report = simulate.report()
+    simulation = Simulate(dx=0.025)(scene, fps=40, seconds=0.5)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "clean"
     assert report["momentum_error"] < 1e-5
     total = [f.energy["kinetic"] + f.energy["elastic"] + f.energy["gravity"] for f in frames]
@@ -95,13 +98,13 @@ def test_an_elastic_ball_bounces_and_balances_momentum():
 
 def test_a_ball_comes_to_rest_on_the_floor():
     scene = ball_scene(0.0)
-    simulate = Simulate(dx=0.04)
-    *_, last = simulate(scene, fps=10, seconds=1.5)
+    simulation = Simulate(dx=0.04)(scene, fps=10, seconds=1.5)
+    *_, last = simulation
     weight = float(last.particles.mass.sum()) * 9.81
     assert last.energy["kinetic"] < 1e-3 * weight * 0.1
     lowest = float(last.particles.position[:, 2].min())
     assert -0.02 < lowest < 0.04
-    assert simulate.report()["momentum_error"] < 1e-5
+    assert simulation.report["momentum_error"] < 1e-5
 
 
 def test_two_bodies_conserve_momentum_and_exchange_it():
@@ -109,8 +112,9 @@ def test_two_bodies_conserve_momentum_and_exchange_it():
     scene.add(ellipsoid((0.06,) * 3), SOFT, frame=at(-0.1, 0, 0), velocity=(2.0, 0, 0))
     scene.add(ellipsoid((0.06,) * 3), SOFT, frame=at(0.1, 0.02, 0))
     simulate = Simulate(dx=0.02)
-    frames = list(simulate(scene, fps=40, seconds=0.2))
-    report = simulate.report()
+    simulation = simulate(scene, fps=40, seconds=0.2)
+    frames = list(simulation)
+    report = simulation.report
     assert report["momentum_error"] < 1e-6
     assert report["skipped"]["contact_steps_done"] > 0
     a, b = simulate.prepare(scene).ranges
@@ -122,9 +126,9 @@ def test_contact_is_left_out_while_bodies_are_apart():
     scene = Scene(floor=0.0)
     scene.add(ellipsoid((0.05,) * 3), SOFT, frame=at(-0.3, 0, 0.05))
     scene.add(ellipsoid((0.05,) * 3), SOFT, frame=at(0.3, 0, 0.05))
-    simulate = Simulate(dx=0.02)
-    list(simulate(scene, fps=20, seconds=0.1))
-    skipped = simulate.report()["skipped"]
+    simulation = Simulate(dx=0.02)(scene, fps=20, seconds=0.1)
+    list(simulation)
+    skipped = simulation.report["skipped"]
     assert skipped["contact_steps"] > 0 and skipped["contact_steps_done"] == 0
 
 
@@ -146,9 +150,9 @@ def poison(after: int, times: int):
 def test_one_nan_is_rolled_back_and_healed():
     clean = Simulate(dx=0.04)
     *_, wanted = clean(ball_scene(0.01), fps=20, seconds=0.3)
-    simulate = Simulate(dx=0.04, step_hook=poison(30, 1))
-    frames = list(simulate(ball_scene(0.01), fps=20, seconds=0.3))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, step_hook=poison(30, 1))(ball_scene(0.01), fps=20, seconds=0.3)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "healed" and report["rollbacks"] == 1
     assert "finite" in report["reason"] or "speed" in report["reason"]
     assert len(frames) == 6
@@ -158,9 +162,11 @@ def test_one_nan_is_rolled_back_and_healed():
 
 
 def test_an_incurable_run_fails_and_says_where():
-    simulate = Simulate(dx=0.04, step_hook=poison(30, -1), max_rollbacks=3)
-    frames = list(simulate(ball_scene(0.01), fps=20, seconds=0.3))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, step_hook=poison(30, -1), max_rollbacks=3)(
+        ball_scene(0.01), fps=20, seconds=0.3
+    )
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "failed" and report["rollbacks"] == 3
     assert "frame" in report["reason"] and "step" in report["reason"]
     assert 0 < len(frames) < 6 and report["frames"] == len(frames)
@@ -174,9 +180,11 @@ def test_energy_from_nowhere_is_noticed():
         velocity = state.particles.velocity * 3.0 + 2.0
         return state._replace(particles=state.particles.replace(velocity=velocity))
 
-    simulate = Simulate(dx=0.04, step_hook=kick, max_rollbacks=2)
-    list(simulate(ball_scene(0.01), fps=20, seconds=0.3))
-    report = simulate.report()
+    simulation = Simulate(dx=0.04, step_hook=kick, max_rollbacks=2)(
+        ball_scene(0.01), fps=20, seconds=0.3
+    )
+    list(simulation)
+    report = simulation.report
     assert report["verdict"] in ("healed", "failed") and "energy rose" in report["reason"]
 
 
@@ -184,28 +192,28 @@ def test_resuming_repeats_the_run_bit_for_bit(tmp_path):
     scene = Scene()
     scene.add(ellipsoid(), materials.fruit.watermelon.override(parts=()))
     scene.drop(1.0)
-    whole = Simulate(dx=0.03)
     wanted, saved = None, tmp_path / "state.pt"
-    for frame in whole(scene, fps=40, seconds=0.65):
+    whole = Simulate(dx=0.03)(scene, fps=40, seconds=0.65)
+    for frame in whole:
         if frame.index == 20:
-            whole.save_state(saved)
+            whole.save(saved)
         wanted = frame
-    again = Simulate(dx=0.03)
-    frames = list(again(scene, fps=40, seconds=0.65, resume=saved))
+    again = Simulate(dx=0.03)(scene, fps=40, seconds=0.65, resume=saved)
+    frames = list(again)
     assert [f.index for f in frames] == list(range(21, 26))
     got = frames[-1]
     for name in ("position", "velocity", "alpha", "strain", "deformation"):
         assert torch.equal(getattr(got.particles, name), getattr(wanted.particles, name)), name
-    one, two = whole.report(), again.report()
+    one, two = whole.report, again.report
     for key in ("substeps", "momentum_error", "verdict", "active_blocks_max"):
         assert one[key] == two[key]
     assert one["per_frame"] == two["per_frame"]
 
 
 def test_a_state_of_another_scene_is_refused(tmp_path):
-    simulate = Simulate(dx=0.04)
-    next(iter(simulate(ball_scene(), fps=20, seconds=0.1)))
-    simulate.save_state(tmp_path / "s.pt")
+    simulation = Simulate(dx=0.04)(ball_scene(), fps=20, seconds=0.1)
+    next(iter(simulation))
+    simulation.save(tmp_path / "s.pt")
     with pytest.raises(InputError, match="another scene"):
         Simulate(dx=0.04, seed=1)(ball_scene(), fps=20, seconds=0.1, resume=tmp_path / "s.pt")
     with pytest.raises(InputError, match="frames per second"):
@@ -224,8 +232,57 @@ def test_bad_settings_are_refused():
         Simulate(dx=-1.0)
     with pytest.raises(InputError, match="fps"):
         Simulate()(ball_scene(), fps=0)
-    with pytest.raises(InputError, match="nothing has been simulated"):
-        Simulate().report()
+    with pytest.raises(InputError, match="no frame to save"):
+        Simulate()(ball_scene()).save("state.pt")
+    with pytest.raises(InputError, match="cfl"):
+        Simulate(cfl=1.5)
+    with pytest.raises(TypeError, match="courant"):
+        Simulate(courant=0.5)
+
+
+def test_options_are_given_by_name_or_as_one_record():
+    options = SolverOptions(cfl=0.3, sleep=False)
+    assert Simulate(cfl=0.3, sleep=False).options == options == Simulate(options=options).options
+    assert Simulate(options=options, cfl=0.4).options == SolverOptions(cfl=0.4, sleep=False)
+
+
+def test_options_are_taken_under_their_old_names(caplog):
+    options = Simulate(loose_crumbs=True, contact_near=False).options
+    assert options == SolverOptions(loose_debris=True, contact_proximity=False)
+    assert "loose_crumbs is called loose_debris now" in caplog.text
+    assert "contact_near is called contact_proximity now" in caplog.text
+
+
+def test_names_in_a_saved_state_stay(tmp_path):
+    """What a version before wrote is read by this one, whatever its fields are called now."""
+    simulation = Simulate(dx=0.04)(ball_scene(), fps=20, seconds=0.1)
+    next(simulation)
+    simulation.save(tmp_path / "s.pt")
+    values = torch.load(tmp_path / "s.pt", weights_only=True)
+    assert sorted(values) == sorted(
+        ["version", "fingerprint", "particles", "tensors", "time", "step", "landed", "kicked"]
+        + ["extra"]
+    )
+    assert sorted(values["particles"]) == ["affine", "alpha", "deformation", "strain", "velocity"]
+    assert sorted(values["tensors"]) == sorted(
+        ["position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit"]
+        + ["impulse", "colliders", "work", "dissipated"]
+    )
+    assert set(values["extra"]) >= {"counters", "watch", "ledger", "per_frame", "repair"}
+
+
+def test_a_stage_keeps_nothing_of_the_scenes_it_was_given():
+    """Two runs of one stage, taken by turns, are those it gives one after the other."""
+    simulate = Simulate(dx=0.04)
+    alone = list(simulate(ball_scene(0.01), fps=20, seconds=0.15))
+    before = dict(vars(simulate))
+    low, high = (simulate(ball_scene(h), fps=20, seconds=0.15) for h in (0.01, 0.3))
+    frames = [pair[0] for pair in zip(low, high, strict=True)]
+    assert dict(vars(simulate)) == before and len(frames) == 3
+    for one, two in zip(alone, frames, strict=True):
+        assert torch.equal(one.particles.position, two.particles.position)
+        assert torch.equal(one.gaussians.means, two.gaussians.means)
+    assert low.report["frames"] == 3 and next(low, None) is None
 
 
 def test_a_bullet_gives_momentum_to_what_it_hits():
@@ -233,9 +290,10 @@ def test_a_bullet_gives_momentum_to_what_it_hits():
     scene.add(ellipsoid((0.04,) * 3), materials.fruit.apple)
     scene.bullet(start=(0.3, 0, 0), toward=(0, 0, 0), speed=40.0, radius=0.006, at=0.0)
     simulate = Simulate(dx=0.006)
-    frames = list(simulate(scene, fps=100, seconds=0.03))
+    simulation = simulate(scene, fps=100, seconds=0.03)
+    frames = list(simulation)
     apple, bullet = simulate.prepare(scene).ranges
-    report = simulate.report()
+    report = simulation.report
     assert report["momentum_error"] < 1e-5
     last = frames[-1].particles
     assert float(last.velocity[bullet[0] : bullet[1], 0].mean()) > -38.0
@@ -294,7 +352,7 @@ def test_irreversible_breaking_changes_what_pressed_debris_can_hold():
     assert not torch.equal(shares[0], shares[1])
 
 
-def test_far_crumbs_leave_the_grid_and_still_balance_momentum():
+def test_far_debris_leaves_the_grid_and_still_balances_momentum():
     def throw(state):
         if state.step != 20:
             return state
@@ -309,14 +367,14 @@ def test_far_crumbs_leave_the_grid_and_still_balance_momentum():
     material = materials.fruit.apple.override(variation=0.0)
     scene.add(ellipsoid((0.05,) * 3), material)
     scene.drop(0.001)
-    simulate = Simulate(dx=0.02, splats=False, step_hook=throw)
-    *_, last = simulate(scene, fps=20, seconds=0.7)
-    report = simulate.report()
+    simulation = Simulate(dx=0.02, splats=False, step_hook=throw)(scene, fps=20, seconds=0.7)
+    *_, last = simulation
+    report = simulation.report
     assert report["skipped"]["stray_points"] == 10
     assert report["active_blocks_max"] < 200
     assert report["momentum_error"] < 1e-5
-    crumbs = last.particles.position[:10]
-    assert float(crumbs[:, 2].abs().max()) < 1e-6 and float(crumbs[:, 0].min()) > 2.5
+    debris = last.particles.position[:10]
+    assert float(debris[:, 2].abs().max()) < 1e-6 and float(debris[:, 0].min()) > 2.5
     assert float(last.particles.velocity[:10].abs().max()) < 1e-6
 
 
@@ -326,12 +384,13 @@ def test_points_on_the_device_are_whole_after_landing_one_by_one():
     scene.add(ellipsoid((0.05,) * 3), SOFT, frame=at(-0.2, 0, 0.06))
     scene.add(ellipsoid((0.05,) * 3), SOFT, frame=at(0.2, 0, 0.4))
     simulate = Simulate(dx=0.025)
-    frames = list(simulate(scene, fps=20, seconds=0.2))
+    simulation = simulate(scene, fps=20, seconds=0.2)
+    frames = list(simulation)
     second = simulate.prepare(scene).ranges[1]
     fallen = frames[-1].particles.position[second[0] : second[1], 2].mean()
     start = frames[0].particles.position[second[0] : second[1], 2].mean()
     t = frames[-1].time
     assert float(start - fallen) == pytest.approx(0.5 * 9.81 * t * t, rel=1e-4)
-    assert simulate.report()["skipped"]["free_flight_body_steps"] > 0
-    assert simulate.report()["momentum_error"] < 1e-5
+    assert simulation.report["skipped"]["free_flight_body_steps"] > 0
+    assert simulation.report["momentum_error"] < 1e-5
     assert dataclasses.is_dataclass(frames[-1])

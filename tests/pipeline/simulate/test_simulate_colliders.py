@@ -11,6 +11,7 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.scene.scene import Scene
 
@@ -20,7 +21,7 @@ DX = 0.05
 
 def run_of(scene: Scene, *, fps: float = 20.0, frames: int, **options: object) -> Run:
     """A finished run, clean and with its momentum balanced."""
-    run = Run(scene, build_matter(scene, DX), fps, options, 3)
+    run = Run(scene, build_matter(scene, DX), fps, SolverOptions(**options, max_rollbacks=3))
     for frame in range(1, frames + 1):
         assert run.advance_to(frame, None), run.failure
         run.record(frame)

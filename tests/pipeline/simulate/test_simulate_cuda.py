@@ -54,9 +54,9 @@ def smashed() -> Scene:
 def run(
     scene: Scene, device: str, fps: float, seconds: float
 ) -> tuple[list[SimulationFrame], dict]:  # type: ignore[type-arg]
-    simulate = Simulate(dx=0.02, device=device)
-    frames = list(simulate(scene, fps=fps, seconds=seconds))
-    report = simulate.report()
+    simulation = Simulate(dx=0.02, device=device)(scene, fps=fps, seconds=seconds)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "clean", report["reason"]
     assert report["momentum_error"] < 1e-5
     return frames, report
@@ -95,16 +95,16 @@ def test_a_run_on_the_gpu_equals_one_on_the_cpu(
 
 def test_a_state_goes_from_one_device_to_the_other(tmp_path: Path) -> None:
     """What was saved on the GPU is taken up on the CPU, with a sleeper in it."""
-    first = Simulate(dx=0.02, device="cuda")
-    for frame in first(resting(True), fps=10, seconds=2.0):
+    first = Simulate(dx=0.02, device="cuda")(resting(True), fps=10, seconds=2.0)
+    for frame in first:
         if frame.index == 15:
-            first.save_state(tmp_path / "state.pt")
+            first.save(tmp_path / "state.pt")
             break
-    assert first.report()["naps"] == 1
-    second = Simulate(dx=0.02)
-    frames = list(second(resting(True), fps=10, seconds=2.0, resume=tmp_path / "state.pt"))
+    assert first.report["naps"] == 1
+    second = Simulate(dx=0.02)(resting(True), fps=10, seconds=2.0, resume=tmp_path / "state.pt")
+    frames = list(second)
     assert [f.index for f in frames] == [16, 17, 18, 19]
-    assert second.report()["wakes"] == 1 and second.report()["verdict"] == "clean"
+    assert second.report["wakes"] == 1 and second.report["verdict"] == "clean"
 
 
 def test_trouble_on_the_gpu_is_healed_and_placed() -> None:
@@ -118,9 +118,9 @@ def test_trouble_on_the_gpu_is_healed_and_placed() -> None:
         velocity[-5:] = torch.nan
         return state._replace(particles=state.particles.replace(velocity=velocity))
 
-    simulate = Simulate(dx=0.02, device="cuda", step_hook=poison)
-    frames = list(simulate(pressed(), fps=20, seconds=0.2))
-    report = simulate.report()
+    simulation = Simulate(dx=0.02, device="cuda", step_hook=poison)(pressed(), fps=20, seconds=0.2)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "healed" and len(frames) == 4
     assert "box (" in report["reason"] and "went back to" in report["reason"]
 

@@ -29,9 +29,9 @@ def smashed(
     scene = Scene()
     scene.add(ellipsoid((0.05,) * 3), material, velocity=(0, 0, -8.0), parts=parts)
     scene.drop(0.01)
-    simulate = Simulate(dx=0.02, **options)
-    frames = list(simulate(scene, fps=50, seconds=0.08))
-    report = simulate.report()
+    simulation = Simulate(dx=0.02, **options)(scene, fps=50, seconds=0.08)
+    frames = list(simulation)
+    report = simulation.report
     assert report["verdict"] == "clean", report["reason"]
     moved = frames[-1].particles.position - frames[0].particles.position
     assert float(moved.abs().max()) > 0.02

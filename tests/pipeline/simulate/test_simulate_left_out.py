@@ -25,9 +25,9 @@ class Ran:
     def __init__(
         self, scene: Scene, *, fps: float, seconds: float, dx: float = DX, **options: Any
     ) -> None:
-        simulate = Simulate(dx=dx, splats=False, **options)
-        self.frames: list[SimulationFrame] = list(simulate(scene, fps=fps, seconds=seconds))
-        self.report = simulate.report()
+        simulation = Simulate(dx=dx, splats=False, **options)(scene, fps=fps, seconds=seconds)
+        self.frames: list[SimulationFrame] = list(simulation)
+        self.report = simulation.report
         self.skipped: dict[str, float] = self.report["skipped"]
         assert self.report["verdict"] == "clean", self.report["reason"]
         assert self.report["momentum_error"] < 1e-5
@@ -110,7 +110,7 @@ def meeting() -> Scene:
 @pytest.mark.parametrize("resident", [True, False])
 def test_contact_is_looked_for_only_where_bodies_are_near(resident: bool) -> None:
     on = Ran(meeting(), fps=40, seconds=0.1, free_flight=False, resident=resident)
-    off = Ran(meeting(), fps=40, seconds=0.1, free_flight=False, contact_near=False)
+    off = Ran(meeting(), fps=40, seconds=0.1, free_flight=False, contact_proximity=False)
     assert on.report["contact_nodes"] > 0 and off.report["contact_nodes"] > 0
     assert on.skipped["contact_block_fraction"] > 0.0 == off.skipped["contact_block_fraction"]
     assert on.skipped["contact_steps"] > 0 == off.skipped["contact_steps"]

@@ -19,10 +19,12 @@ def test_a_dropped_watermelon_breaks_into_chunks(height):
     scene.add(ellipsoid((0.125, 0.105, 0.105), voxels=48), materials.fruit.watermelon)
     scene.drop(height)
     landing = math.sqrt(2 * height / 9.81)
-    simulate = Simulate(quality="preview", splats=False)
     # two frames: the start, and 0.2 s after landing
-    *_, last = simulate(scene, fps=1 / (landing + 0.2), seconds=2 * (landing + 0.2))
-    report = simulate.report()
+    simulation = Simulate(quality="preview", splats=False)(
+        scene, fps=1 / (landing + 0.2), seconds=2 * (landing + 0.2)
+    )
+    *_, last = simulation
+    report = simulation.report
     assert report["verdict"] == "clean"
     assert report["momentum_error"] < 1e-4
     assert last.stats["fragments"] >= 5

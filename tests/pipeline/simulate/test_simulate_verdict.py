@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -50,21 +51,20 @@ def poison(when: Callable[[State], bool], times: int, value: float = math.nan) -
     return hook
 
 
-def simulated(hook: Hook | None, **options: int) -> tuple[list[SimulationFrame], Simulate]:
+def simulated(hook: Hook | None, **options: int) -> tuple[list[SimulationFrame], dict[str, Any]]:
     simulate = Simulate(dx=0.04, splats=False, step_hook=hook, **options)  # type: ignore[arg-type]
-    return list(simulate(two_balls(), fps=FPS, seconds=SECONDS)), simulate
+    simulation = simulate(two_balls(), fps=FPS, seconds=SECONDS)
+    return list(simulation), simulation.report
 
 
 def test_a_clean_run_has_no_reason() -> None:
-    _, simulate = simulated(None)
-    report = simulate.report()
+    _, report = simulated(None)
     assert (report["verdict"], report["reason"], report["rollbacks"]) == ("clean", "", 0)
 
 
 @pytest.mark.parametrize("value", [math.nan, 1e5])
 def test_one_bad_step_is_healed_and_the_reason_says_where_and_how(value: float) -> None:
-    frames, simulate = simulated(poison(lambda s: s.step == 20, 1, value))
-    report = simulate.report()
+    frames, report = simulated(poison(lambda s: s.step == 20, 1, value))
     assert report["verdict"] == "healed" and report["rollbacks"] == 1
     assert [f.index for f in frames] == list(range(6))
     assert [f.time for f in frames] == [k / FPS for k in range(6)]
@@ -78,8 +78,7 @@ def test_one_bad_step_is_healed_and_the_reason_says_where_and_how(value: float) 
 
 
 def test_a_run_that_cannot_be_healed_keeps_its_frames_and_says_what_to_change() -> None:
-    frames, simulate = simulated(poison(lambda s: s.time > 0.12, -1), max_rollbacks=3)
-    report = simulate.report()
+    frames, report = simulated(poison(lambda s: s.time > 0.12, -1), max_rollbacks=3)
     assert report["verdict"] == "failed" and report["frames"] == len(frames) == 3
     assert [f.index for f in frames] == [0, 1, 2]
     reason = report["reason"]
@@ -98,15 +97,13 @@ def test_trouble_that_comes_back_ends_the_run_even_with_good_checks_in_between()
         late = max(late, state.time)
         return state.time > 0.19
 
-    frames, simulate = simulated(poison(when, -1), max_rollbacks=4)
-    report = simulate.report()
+    frames, report = simulated(poison(when, -1), max_rollbacks=4)
     assert report["verdict"] == "failed" and report["rollbacks"] == 4 and len(frames) == 4
     assert report["substeps"] > CHECK_EVERY and late < 0.2
 
 
 def test_each_failure_in_a_row_goes_further_back() -> None:
-    frames, simulate = simulated(poison(lambda s: s.time > 0.14, 3))
-    report = simulate.report()
+    frames, report = simulated(poison(lambda s: s.time > 0.14, 3))
     assert report["verdict"] == "healed" and report["rollbacks"] == 3 and len(frames) == 6
     back = [float(t) for t in re.findall(r"went back to t = ([\d.e-]+)", report["reason"])]
     assert len(back) == 3 and back[2] <= back[1] <= back[0] < 0.14
@@ -119,7 +116,7 @@ def test_too_many_pieces_in_one_place_share_fields(monkeypatch: pytest.MonkeyPat
     """More fields than a block has room for are no reason to stop, nor for shorter steps."""
     simulate = Simulate(dx=0.04, splats=False)
     scene = two_balls()
-    run = Run(scene, simulate.prepare(scene), FPS, {}, 6)
+    run = Run(scene, simulate.prepare(scene), FPS)
     unit = torch.arange(run.matter.particles.count) // 10
     assert int(unit.max()) > 2 * SITE_FIELDS
     monkeypatch.setattr(simulate_run, "units", lambda *_: unit)
@@ -149,8 +146,7 @@ def test_what_stops_the_solver_at_one_time_ends_the_run(monkeypatch: pytest.Monk
             raise SolverError(1, self.time, self.steps)
 
     monkeypatch.setattr(Solver, "advance", breaks)
-    frames, simulate = simulated(None, max_rollbacks=3)
-    report = simulate.report()
+    frames, report = simulated(None, max_rollbacks=3)
     assert report["verdict"] == "failed" and report["rollbacks"] == 3 and len(tries) == 4
     assert len(frames) == 1 and report["reason"].startswith("frame 1: t = 0.0")
     assert "is not finite" in report["reason"] and tries[-1] < 0.2 * tries[0]

@@ -13,6 +13,7 @@ from gsfluent.config import Shot
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import build_scene
@@ -23,7 +24,7 @@ DX = 0.05
 
 def heights(scene: Scene, frames: int, **options: bool) -> list[float]:
     """Height of the mean point [m] at each frame, 20 per second, from time 0."""
-    run = Run(scene, build_matter(scene, DX), 20.0, options, 3)
+    run = Run(scene, build_matter(scene, DX), 20.0, SolverOptions(**options, max_rollbacks=3))
     found = [float(run.state.position[:, 2].mean())]
     for frame in range(1, frames + 1):
         assert run.advance_to(frame, None), run.failure

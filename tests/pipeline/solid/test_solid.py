@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -292,7 +292,7 @@ def test_the_verb_writes_a_mesh_and_leaves_the_background_out(
     assert again["source"] == "mesh" and again["volume"] == pytest.approx(mesh.volume, rel=0.02)
 
 
-def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_is_refused(tmp_path: Path, without: Callable[[str], None]) -> None:
     shell = ellipsoid_shell(500)
     with pytest.raises(InputError, match="neither splats"):
         find_solid()
@@ -307,14 +307,7 @@ def test_what_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     empty = SignedDistance(torch.ones(4, 4, 4), torch.zeros(3), 1.0, "test")
     with pytest.raises(InputError, match="empty"):
         closed_mesh(empty)
-    real = builtins.__import__
-
-    def without_skimage(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("skimage"):
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_skimage)
+    without("skimage")
     with pytest.raises(InputError, match=r"gsfluent\[mesh\]"):
         closed_mesh(empty.replace(values=-torch.ones(4, 4, 4)))
 

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsfluent.colors import linear_to_srgb, srgb_to_linear
 from gsfluent.errors import InputError
 from gsfluent.lab.truth.interiors import KNOWN_INTERIORS, known_interior
 from gsfluent.pipeline.texture.photo.exemplar import (
     PhotoOptions,
     load_exemplar,
-    open_exemplars,
+    load_exemplars,
     rgb_to_lab,
     with_skin,
 )
@@ -24,7 +25,7 @@ from gsfluent.pipeline.texture.photo.light import (
     white_gains,
 )
 from gsfluent.pipeline.texture.photo.stain import remove_stain
-from gsfluent.pipeline.texture.volume.color import linear, srgb
+from gsfluent.pipeline.texture.volume.domain import options_of
 
 DATA = Path(
     os.environ.get("GSFLUENT_DATA", Path(__file__).resolve().parents[4] / "shared" / "data")
@@ -122,8 +123,8 @@ def test_a_known_gradient_of_light_is_found_and_taken_out(gx: float, gy: float) 
     image, mask = fruit()
     y, x = (np.mgrid[:240, :240] + 0.5) / 240 * 2 - 1
     light = np.exp(gx * x + gy * y - 0.3)
-    lit = srgb(linear(image) * light[..., None])
-    truth = srgb(linear(image) * np.exp(-0.3))
+    lit = linear_to_srgb(srgb_to_linear(image) * light[..., None])
+    truth = linear_to_srgb(srgb_to_linear(image) * np.exp(-0.3))
     depth = load_exemplar(image, mask, UNTOUCHED).depth
     field, size = shading_field(lit, mask, depth)
     wanted = np.log(light)[mask]
@@ -168,9 +169,9 @@ def test_white_balance_to_a_known_truth() -> None:
     image, mask = fruit()
     tint = np.array([1.25, 1.0, 0.72])
     ground = np.full(3, 0.72)
-    seen = srgb(linear(on_ground(image, mask, ground)) * tint * 0.8)
-    truth = srgb(linear(image) * 0.8)
-    white = tuple(float(v) for v in srgb(linear(ground) * tint * 0.8))
+    seen = linear_to_srgb(srgb_to_linear(on_ground(image, mask, ground)) * tint * 0.8)
+    truth = linear_to_srgb(srgb_to_linear(image) * 0.8)
+    white = tuple(float(v) for v in linear_to_srgb(srgb_to_linear(ground) * tint * 0.8))
     for option in ("auto", white):
         gains, source = white_gains(option, seen, mask)
         assert source
@@ -197,12 +198,12 @@ def test_brown_flesh_and_strong_grounds_are_left_alone() -> None:
 def test_the_skin_as_reference_only_where_it_is_the_same_skin() -> None:
     image, mask = fruit()
     tint = np.array([1.3, 1.0, 0.7])
-    seen = srgb(linear(image) * tint * 0.7)
+    seen = linear_to_srgb(srgb_to_linear(image) * tint * 0.7)
     options = PhotoOptions(white="skin")
     rim = load_exemplar(image, mask, UNTOUCHED)
     skin = image[mask & (rim.depth < 3)]
-    photo = with_skin([load_exemplar(seen, mask, options)], skin)[0]
-    truth = srgb(linear(image) * 0.7)
+    photo = with_skin(load_exemplar(seen, mask, options), skin)
+    truth = linear_to_srgb(srgb_to_linear(image) * 0.7)
     assert lab_error(photo.image, truth, mask) < 0.4 * lab_error(seen, truth, mask)
     other = with_skin(load_exemplar(seen, mask, options), np.array([[0.2, 0.2, 0.8]]))
     assert "not the object's skin" in other.note
@@ -333,15 +334,18 @@ def test_broken_pictures_and_settings_are_refused_in_plain_words(tmp_path: Path)
         {"shine": True},
     ):
         with pytest.raises(InputError):
-            PhotoOptions.of(options)
+            options_of(PhotoOptions, "photo", options)
 
 
 def test_every_step_can_be_switched_off_and_lists_are_opened() -> None:
     image, mask = fruit()
     _, x = (np.mgrid[:240, :240] + 0.5) / 240 * 2 - 1
-    lit = srgb(linear(on_ground(image, mask, np.full(3, 0.0))) * np.exp(0.5 * x)[..., None])
-    on = open_exemplars([lit, lit], PhotoOptions(shading=True))[0]
-    off = open_exemplars({"x": lit}, PhotoOptions.of({"shading": False, "glints": False}))["x"]
+    dark = srgb_to_linear(on_ground(image, mask, np.full(3, 0.0)))
+    lit = linear_to_srgb(dark * np.exp(0.5 * x)[..., None])
+    on = load_exemplars([lit, lit], PhotoOptions(shading=True))[0][0]
+    off = load_exemplars(
+        {"x": lit}, options_of(PhotoOptions, "photo", {"shading": False, "glints": False})
+    )[0][0]
     assert "shading" in on.note
     assert "shading" not in off.note
     assert np.abs(off.image - lit)[off.mask].max() < 1e-6

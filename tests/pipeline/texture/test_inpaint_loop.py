@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.inpaint.inpainter import MaskedInpainter, SliceContext
+from gsfluent.pipeline.texture.inpaint.inpainter import Job, MaskedInpainter, SliceContext
 from gsfluent.pipeline.texture.inpaint.levels import coarse_domain, fuse_stacks, slice_positions
 from gsfluent.pipeline.texture.inpaint.method import (
     InpaintOptions,
@@ -23,7 +23,7 @@ from gsfluent.pipeline.texture.inpaint.method import (
     make_inpainter,
 )
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
-from gsfluent.pipeline.texture.volume.domain import InteriorDomain
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, options_of
 
 
 def ball(size: int = 20) -> InteriorDomain:
@@ -57,16 +57,8 @@ class Painter(MaskedInpainter):
         self.calls: list[tuple[float, SliceContext]] = []
         self.book, self.die_at = book, die_at
 
-    def paint(
-        self,
-        slices: np.ndarray,
-        mask: np.ndarray,
-        prompt: str,
-        exemplar: Exemplar | None,
-        strength: float,
-        seeds: list[int],
-        context: SliceContext,
-    ) -> np.ndarray:
+    def paint(self, job: Job) -> np.ndarray:
+        slices, strength, context = job.slices, job.strength, job.context
         self.calls.append((strength, context))
         if self.book is not None:
             with self.book.open("a") as stream:
@@ -75,7 +67,7 @@ class Painter(MaskedInpainter):
             import os
 
             os.kill(os.getpid(), signal.SIGKILL)
-        tones = [np.random.default_rng(s).random(3).astype(np.float32) for s in seeds]
+        tones = [np.random.default_rng(s).random(3).astype(np.float32) for s in job.seeds]
         return slices + strength * (np.stack(tones)[:, None, None] - slices)
 
 
@@ -104,8 +96,8 @@ def test_backends_see_slices_upright() -> None:
     domain = replace(domain, skin=np.moveaxis(where, 0, -1).astype(np.float32))
 
     class Look(Painter):
-        def paint(self, slices: np.ndarray, mask: np.ndarray, *rest: Any) -> np.ndarray:
-            context = rest[-1]
+        def paint(self, job: Job) -> np.ndarray:
+            slices, mask, context = job.slices, job.mask, job.context
             right, up = (i for i in range(3) if i != context.axis)
             row, column = np.nonzero(context.inside[0] & ~mask[0])  # the shell, whose skin tells
             low, high = row > row.mean(), row < row.mean()
@@ -281,8 +273,8 @@ def test_options_and_backends_are_checked() -> None:
         with pytest.raises(InputError, match=next(iter(wrong))):
             InpaintOptions(**wrong)
     with pytest.raises(InputError, match="knows no stepz"):
-        InpaintOptions.of({"stepz": 3})
-    assert InpaintOptions.of({"refine": [0.1]}) == InpaintOptions(refine=(0.1,))
+        options_of(InpaintOptions, "inpaint", {"stepz": 3})
+    assert options_of(InpaintOptions, "inpaint", {"refine": [0.1]}) == InpaintOptions(refine=(0.1,))
     with pytest.raises(InputError, match="needs a model"):
         make_inpainter("diffusers", InpaintOptions())
     names = [make_inpainter(n, InpaintOptions()).name for n in ("telea", "color", "exemplar")]

@@ -12,7 +12,7 @@ import pytest
 
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.texture.inpaint.command import CommandInpainter
-from gsfluent.pipeline.texture.inpaint.inpainter import Inpainter, SliceContext
+from gsfluent.pipeline.texture.inpaint.inpainter import Inpainter, Job, SliceContext
 from gsfluent.pipeline.texture.inpaint.local import (
     ColorDiffusionInpainter,
     ExemplarInpainter,
@@ -221,10 +221,11 @@ def test_tiles_show_neighbours_on_one_canvas() -> None:
     seen: list[tuple[int, ...]] = []
 
     class Watch(TeleaInpainter):
-        def paint(self, *arguments: Any) -> np.ndarray:
-            seen.append(arguments[0].shape)
-            assert arguments[-1].inside.shape == arguments[1].shape
-            return super().paint(*arguments)
+        def paint(self, job: Job) -> np.ndarray:
+            seen.append(job.slices.shape)
+            assert job.context.inside is not None
+            assert job.context.inside.shape == job.mask.shape
+            return super().paint(job)
 
     images, masks = slices(7)
     made = call(TiledInpainter(Watch(), 2), images, masks)

@@ -191,5 +191,5 @@ def test_missing_diffusers_is_named(monkeypatch: pytest.MonkeyPatch, model: Path
     import sys
 
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(InputError, match="pip install diffusers"):
+    with pytest.raises(InputError, match=r"gsfluent\[inpaint\]"):
         DiffusersInpainter(model, OPTIONS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from gsfluent.pipeline.texture.photo.exemplar import rgb_to_lab
+from gsfluent.colors import rgb_to_lab
 from gsfluent.pipeline.texture.photo.metrics import (
     Slice,
     depth_profile_difference,

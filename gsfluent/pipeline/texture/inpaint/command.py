@@ -14,6 +14,7 @@ import shlex
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,10 @@ from gsfluent.errors import InputError, RunError
 from gsfluent.io.atomic import write_json
 from gsfluent.pipeline.texture.inpaint.inpainter import (
     Inpainter,
+    Job,
     MaskedInpainter,
-    SliceContext,
     combined_seed,
 )
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar
-
-__all__ = ["CommandInpainter"]
 
 logger = logging.getLogger(__name__)
 
@@ -93,89 +91,61 @@ class CommandInpainter(MaskedInpainter):
         self.timeout = timeout
         self.runs = 0
 
-    def paint(
-        self,
-        slices: np.ndarray,
-        mask: np.ndarray,
-        prompt: str,
-        exemplar: Exemplar | None,
-        strength: float,
-        seeds: list[int],
-        context: SliceContext,
-    ) -> np.ndarray:
+    def paint(self, job: Job) -> np.ndarray:
         """Run the command over all windows."""
-        made = slices.copy()
-        hole = mask.copy()
+        made, hole = job.slices.copy(), job.mask.copy()
         reference = False
         if self.first is not None:
+            one = job.take([0])
             made[:1] = self.first(
-                slices[:1], mask[:1], prompt=prompt, exemplar=exemplar, strength=strength,
-                seeds=seeds[:1], context=context.take([0]),
-            )  # fmt: skip
+                one.slices,
+                one.mask,
+                prompt=one.prompt,
+                exemplar=one.exemplar,
+                strength=one.strength,
+                seeds=one.seeds,
+                context=one.context,
+            )
             reference = True
         start = 0
         while True:
-            stop = min(start + self.window, len(slices))
+            stop = min(start + self.window, len(made))
             if reference:
                 hole[start] = False
             if hole[start:stop].any():
-                out = self._window(
-                    made[start:stop],
-                    hole[start:stop],
-                    prompt,
-                    strength,
-                    combined_seed(seeds[start:stop]),
-                    context.take(range(start, stop)),
-                    reference,
-                )
+                window = replace(job, slices=made, mask=hole).take(range(start, stop))
+                out = self._window(window, reference)
                 made[start:stop] = np.where(hole[start:stop][..., None], out, made[start:stop])
                 hole[start:stop] = False
-            if stop == len(slices):
+            if stop == len(made):
                 return made
             # the overlap is known in the next window: its first slice is the reference
             start = stop - self.overlap
             reference = self.overlap > 0
 
-    def _window(
-        self,
-        slices: np.ndarray,
-        hole: np.ndarray,
-        prompt: str,
-        strength: float,
-        seed: int,
-        context: SliceContext,
-        reference: bool,
-    ) -> np.ndarray:
+    def _window(self, job: Job, reference: bool) -> np.ndarray:
         """One run of the command."""
         meta = {
-            "frames": len(slices),
-            "height": int(slices.shape[1]),
-            "width": int(slices.shape[2]),
-            "axis": "xyz"[context.axis],
-            "offsets": list(context.offsets),
-            "pitch": context.pitch,
-            "strength": strength,
-            "seed": seed,
+            "frames": len(job.slices),
+            "height": int(job.slices.shape[1]),
+            "width": int(job.slices.shape[2]),
+            "axis": "xyz"[job.context.axis],
+            "offsets": list(job.context.offsets),
+            "pitch": job.context.pitch,
+            "strength": job.strength,
+            "seed": combined_seed(job.seeds),
             "reference": reference,
         }
-        digest = hashlib.sha256(json.dumps([self.command, prompt, meta]).encode())
-        digest.update(np.ascontiguousarray(slices).tobytes())
-        digest.update(np.ascontiguousarray(hole).tobytes())
+        digest = hashlib.sha256(json.dumps([self.command, job.prompt, meta]).encode())
+        digest.update(np.ascontiguousarray(job.slices).tobytes())
+        digest.update(np.ascontiguousarray(job.mask).tobytes())
         key = digest.hexdigest()[:16]
         if self.folder is not None:
-            return self._in_folder(self.folder / key, slices, hole, prompt, meta, reference)
+            return self._in_folder(self.folder / key, job, meta)
         with tempfile.TemporaryDirectory(prefix="gsfluent-inpaint-") as temporary:
-            return self._in_folder(Path(temporary) / key, slices, hole, prompt, meta, reference)
+            return self._in_folder(Path(temporary) / key, job, meta)
 
-    def _in_folder(
-        self,
-        folder: Path,
-        slices: np.ndarray,
-        hole: np.ndarray,
-        prompt: str,
-        meta: dict[str, object],
-        reference: bool,
-    ) -> np.ndarray:
+    def _in_folder(self, folder: Path, job: Job, meta: dict[str, object]) -> np.ndarray:
         done = folder / "done.json"
         if not done.is_file():
             try:
@@ -183,21 +153,21 @@ class CommandInpainter(MaskedInpainter):
                     (folder / name).mkdir(parents=True, exist_ok=True)
                 for stale in (folder / "out").glob("*.png"):
                     stale.unlink()
-                for k, (picture, open_) in enumerate(zip(slices, hole, strict=True)):
+                for k, (picture, open_) in enumerate(zip(job.slices, job.mask, strict=True)):
                     _write(folder / "images" / f"{k:04d}.png", picture)
                     _write(folder / "masks" / f"{k:04d}.png", open_.astype(np.float32))
-                if reference:
-                    _write(folder / "inpainted" / "0000.png", slices[0])
-                (folder / "prompt.txt").write_text(prompt + "\n", encoding="utf-8")
+                if meta["reference"]:
+                    _write(folder / "inpainted" / "0000.png", job.slices[0])
+                (folder / "prompt.txt").write_text(job.prompt + "\n", encoding="utf-8")
                 write_json(folder / "meta.json", meta)
             except OSError as error:
                 raise InputError(
                     f"{folder}: slices cannot be written ({error})",
                     hint="choose a writable folder",
                 ) from error
-            self._run(folder, prompt)
-        made = _read_all(folder / "out", slices.shape)
-        write_json(done, {"frames": len(slices)})
+            self._run(folder, job.prompt)
+        made = _read_all(folder / "out", job.slices.shape)
+        write_json(done, {"frames": len(job.slices)})
         return made
 
     def _run(self, folder: Path, prompt: str) -> None:
@@ -209,14 +179,11 @@ class CommandInpainter(MaskedInpainter):
             done = subprocess.run(
                 words, capture_output=True, text=True, timeout=self.timeout, check=False
             )
-        except FileNotFoundError as error:
-            raise InputError(
-                f"inpaint: command not found: {words[0]}", hint="give the full path of the program"
-            ) from error
-        except PermissionError as error:
-            raise InputError(
-                f"inpaint: command cannot be run: {words[0]}", hint="make it executable"
-            ) from error
+        except (FileNotFoundError, PermissionError) as error:
+            missing = isinstance(error, FileNotFoundError)
+            what = "not found" if missing else "cannot be run"
+            hint = "give the full path of the program" if missing else "make it executable"
+            raise InputError(f"inpaint: command {what}: {words[0]}", hint) from error
         except subprocess.TimeoutExpired as error:
             raise RunError(
                 f"inpaint: the command took longer than {self.timeout:g} s",
@@ -240,7 +207,7 @@ def _write(path: Path, picture: np.ndarray) -> None:
 
 def _read_all(folder: Path, shape: Sequence[int]) -> np.ndarray:
     """All frames of ``out/``, checked for number and size."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     count, height, width = (int(s) for s in shape[:3])
     found = sorted(p.name for p in folder.glob("*.png"))
@@ -257,7 +224,7 @@ def _read_all(folder: Path, shape: Sequence[int]) -> np.ndarray:
         try:
             with Image.open(folder / name) as opened:
                 pixels = np.asarray(opened.convert("RGB"))
-        except (UnidentifiedImageError, OSError) as error:
+        except OSError as error:
             raise RunError(f"{folder / name}: not a picture ({error})") from error
         if pixels.shape[:2] != (height, width):
             raise RunError(

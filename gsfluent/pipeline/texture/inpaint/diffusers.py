@@ -18,17 +18,16 @@ import numpy as np
 import torch
 
 from gsfluent.errors import InputError, RunError
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.inpaint.diffusers_load import (
     load_pipeline,
     lower_memory,
     pick_device,
 )
-from gsfluent.pipeline.texture.inpaint.inpainter import MaskedInpainter, SliceContext
+from gsfluent.pipeline.texture.inpaint.inpainter import Job, MaskedInpainter, SliceContext
 from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
 from gsfluent.pipeline.texture.inpaint.tiles import GROUND
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
-
-__all__ = ["DiffusersInpainter", "InpaintOptions"]
 
 logger = logging.getLogger(__name__)
 
@@ -79,37 +78,20 @@ class DiffusersInpainter(MaskedInpainter):
                 self.name,
             )
 
-    def paint(
-        self,
-        slices: np.ndarray,
-        mask: np.ndarray,
-        prompt: str,
-        exemplar: Exemplar | None,
-        strength: float,
-        seeds: list[int],
-        context: SliceContext,
-    ) -> np.ndarray:
+    def paint(self, job: Job) -> np.ndarray:
         """Run the pipeline in batches; smaller and thriftier ones when memory runs out.
 
         Raises:
             RunError: The model returned NaN or a constant picture, its safety checker blanked
                 one, or memory ran out in the thriftiest mode.
         """
-        made = np.empty_like(slices)
+        made = np.empty_like(job.slices)
         batch = self.options.batch
         start = 0
-        while start < len(slices):
-            part = np.arange(start, min(start + batch, len(slices)))
+        while start < len(made):
+            part = np.arange(start, min(start + batch, len(made)))
             try:
-                made[part] = self._run(
-                    slices[part],
-                    mask[part],
-                    prompt,
-                    exemplar,
-                    strength,
-                    [seeds[i] for i in part],
-                    context.take(part),
-                )
+                made[part] = self._run(job.take(part))
             except torch.OutOfMemoryError as error:
                 if batch > 1:
                     batch = max(1, batch // 2)
@@ -128,30 +110,21 @@ class DiffusersInpainter(MaskedInpainter):
             start += len(part)
         return made
 
-    def _run(
-        self,
-        images: np.ndarray,
-        masks: np.ndarray,
-        prompt: str,
-        exemplar: Exemplar | None,
-        strength: float,
-        seeds: list[int],
-        context: SliceContext,
-    ) -> np.ndarray:
+    def _run(self, job: Job) -> np.ndarray:
         """One call of the pipeline on enlarged pictures."""
-        count = len(images)
-        frame = _Frame(masks.shape[1:], self.size)
-        strength = min(strength, _MAX_STRENGTH)
+        count = len(job.slices)
+        frame = _Frame(job.mask.shape[1:], self.size)
+        strength = min(job.strength, _MAX_STRENGTH)
         arguments: dict[str, Any] = {
-            "prompt": [prompt] * count,
+            "prompt": [job.prompt] * count,
             "negative_prompt": [self.options.negative_prompt] * count,
-            "image": _tensor(frame.picture(images).clip(0, 1)),
-            "mask_image": torch.from_numpy(frame.mask(masks))[:, None].contiguous(),
+            "image": _tensor(frame.picture(job.slices).clip(0, 1)),
+            "mask_image": torch.from_numpy(frame.mask(job.mask))[:, None].contiguous(),
             "height": frame.height,
             "width": frame.width,
             "strength": strength,
             "num_inference_steps": max(self.options.steps, math.ceil(_MIN_STEPS / strength)),
-            "generator": [torch.Generator("cpu").manual_seed(s) for s in seeds],
+            "generator": [torch.Generator("cpu").manual_seed(s) for s in job.seeds],
             "output_type": "np",
             # Kontext would scale every picture to a megapixel of its own choice
             "max_area": frame.height * frame.width,
@@ -160,7 +133,7 @@ class DiffusersInpainter(MaskedInpainter):
         if self.options.guidance is not None:
             arguments["guidance_scale"] = self.options.guidance
             arguments["true_cfg_scale"] = self.options.guidance
-        arguments |= self._conditions(exemplar, context, frame, count)
+        arguments |= self._conditions(job.exemplar, job.context, frame)
         arguments = {k: v for k, v in arguments.items() if k in self.accepts}
         self.calls += 1
         with torch.inference_mode():
@@ -182,7 +155,7 @@ class DiffusersInpainter(MaskedInpainter):
         return frame.back(pictures)
 
     def _conditions(
-        self, exemplar: Exemplar | None, context: SliceContext, frame: _Frame, count: int
+        self, exemplar: Exemplar | None, context: SliceContext, frame: _Frame
     ) -> dict[str, Any]:
         """Arguments that show the exemplar and the depth to the model."""
         result: dict[str, Any] = {}
@@ -229,8 +202,6 @@ class _Frame:
 
     def picture(self, images: np.ndarray, ground: float = GROUND) -> np.ndarray:
         """Images [B, H, W, 3] enlarged onto canvases of ground."""
-        import cv2
-
         method = cv2.INTER_LINEAR if self.power >= 0 else cv2.INTER_AREA
         out = np.full((len(images), self.height, self.width, 3), ground, np.float32)
         size = (self.scaled[1], self.scaled[0])
@@ -240,8 +211,6 @@ class _Frame:
 
     def mask(self, masks: np.ndarray) -> np.ndarray:
         """Masks [B, H, W] as 0 or 1 on canvases; a canvas pixel is open when any voxel in it is."""
-        import cv2
-
         out = np.zeros((len(masks), self.height, self.width), np.float32)
         size = (self.scaled[1], self.scaled[0])
         method = cv2.INTER_NEAREST if self.power >= 0 else cv2.INTER_AREA
@@ -252,8 +221,6 @@ class _Frame:
 
     def back(self, pictures: np.ndarray) -> np.ndarray:
         """The slices [B, H, W, 3] out of the model's pictures."""
-        import cv2
-
         if pictures.shape[1:3] != (self.height, self.width):
             raise RunError(
                 f"the model returned {pictures.shape[2]} x {pictures.shape[1]} pixels for a "
@@ -264,8 +231,7 @@ class _Frame:
         method = cv2.INTER_AREA if self.power >= 0 else cv2.INTER_LINEAR
         cut = pictures[:, : self.scaled[0], : self.scaled[1]]
         small = np.stack([cv2.resize(p, size, interpolation=method) for p in cut])
-        result: np.ndarray = small.clip(0.0, 1.0)
-        return result
+        return np.asarray(small.clip(0.0, 1.0))
 
 
 def _own_size(pipe: Any, network: Any) -> int:

@@ -13,10 +13,8 @@ from typing import Any
 
 import torch
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
-
-__all__ = ["lower_memory", "load_pipeline", "pick_device"]
 
 logger = logging.getLogger(__name__)
 
@@ -40,12 +38,7 @@ def pick_device(name: str) -> torch.device:
 
 
 def load_pipeline(model: str | Path, options: InpaintOptions, device: torch.device) -> Any:
-    """Find the pipeline class, load the weights, set the switches.
-
-    Args:
-        model: Local folder (``save_pretrained``), or hub id.
-        options: Settings.
-        device: Where to run.
+    """Find the pipeline class of a model folder or hub id, load the weights, set the switches.
 
     Raises:
         InputError: A package is missing, the weights are not there, no inpainting pipeline belongs
@@ -91,25 +84,11 @@ def _packages(options: InpaintOptions) -> Any:
 
     Without transformers diffusers hands out dummy classes that fail only when called.
     """
-    try:
-        import diffusers
-        from diffusers.utils import is_accelerate_available, is_transformers_available
-    except ImportError as error:
-        raise InputError(
-            "texture: method 'diffusion' needs the package diffusers, which is not installed",
-            hint="pip install diffusers transformers accelerate",
-        ) from error
-    if not is_transformers_available():
-        raise InputError(
-            "texture: method 'diffusion' needs the package transformers, which is not installed",
-            hint="pip install transformers accelerate",
-        )
-    if options.memory != "high" and not is_accelerate_available():
-        raise InputError(
-            f"texture: inpaint memory {options.memory} needs the package accelerate, which is not "
-            "installed",
-            hint="pip install accelerate, or use memory: high",
-        )
+    method = "texture: method 'diffusion'"
+    need("transformers", "inpaint", method)
+    if options.memory != "high":
+        need("accelerate", "inpaint", f"{method} with inpaint memory {options.memory} (high: not)")
+    diffusers = need("diffusers", "inpaint", method)
     diffusers.utils.logging.set_verbosity_error()
     diffusers.utils.logging.disable_progress_bar()
     return diffusers
@@ -203,12 +182,18 @@ def _dtype(options: InpaintOptions, device: torch.device) -> torch.dtype:
     return chosen
 
 
+def _folder(name: str, what: str) -> bool:
+    """Whether a part of the model is a folder; an error when it is neither folder nor hub id."""
+    local = Path(name).expanduser().is_dir()
+    if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
+        raise InputError(f"{name}: {what} folder not found", hint="give a folder or a hub id")
+    return local
+
+
 def _controlnet(diffusers: Any, options: InpaintOptions, dtype: torch.dtype, offline: bool) -> Any:
     """The ControlNet that is shown the depth of a slice."""
     name = str(options.controlnet)
-    local = Path(name).expanduser().is_dir()
-    if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
-        raise InputError(f"{name}: ControlNet folder not found", hint="give a folder or a hub id")
+    local = _folder(name, "ControlNet")
     return diffusers.ControlNetModel.from_pretrained(
         name,
         local_files_only=local or offline,
@@ -225,10 +210,7 @@ def _ip_adapter(pipe: Any, options: InpaintOptions, offline: bool) -> None:
             f"texture: {type(pipe).__name__} takes no IP-adapter",
             hint="leave ip_adapter out, or use an SD or SD-XL model",
         )
-    folder = Path(name).expanduser()
-    local = folder.is_dir()
-    if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
-        raise InputError(f"{name}: IP-adapter folder not found", hint="give a folder or a hub id")
+    folder, local = Path(name).expanduser(), _folder(name, "IP-adapter")
     own = None
     if getattr(pipe, "image_encoder", None) is None:
         # the encoder lies beside the weights or, as in h94/IP-Adapter, in models/image_encoder

@@ -16,8 +16,6 @@ import numpy as np
 from gsfluent.errors import RunError
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 
-__all__ = ["Inpainter", "MaskedInpainter", "SliceContext", "combined_seed", "slice_seed"]
-
 
 @dataclass(frozen=True)
 class SliceContext:
@@ -55,6 +53,40 @@ class SliceContext:
             inside=part(self.inside),
             guide=part(self.guide),
             labels=part(self.labels),
+        )
+
+
+@dataclass(frozen=True)
+class Job:
+    """Slices with holes, and what is known about them.
+
+    Attributes:
+        slices: float32 [B, H, W, 3] in 0..1.
+        mask: Holes, bool [B, H, W].
+        prompt: What a slice shows.
+        exemplar: Photograph of such a cut.
+        strength: 1 repaints from nothing, towards 0 stays closer to ``slices``.
+        seeds: One per slice.
+        context: Where the slices lie.
+    """
+
+    slices: np.ndarray
+    mask: np.ndarray
+    prompt: str
+    exemplar: Exemplar | None
+    strength: float
+    seeds: list[int]
+    context: SliceContext
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Job:
+        """The job for some of the slices."""
+        chosen = np.asarray(index, dtype=int)
+        return replace(
+            self,
+            slices=self.slices[chosen],
+            mask=self.mask[chosen],
+            seeds=[self.seeds[i] for i in chosen.tolist()],
+            context=self.context.take(chosen),
         )
 
 
@@ -139,37 +171,21 @@ class MaskedInpainter:
         if len(wanted) == 0:
             return result
         own = [0] * len(slices) if seeds is None else [int(s) for s in seeds]
-        where = SliceContext() if context is None else context.take(wanted)
-        made = self.paint(
-            result[wanted],
-            mask[wanted],
-            prompt,
-            exemplar,
-            strength,
-            [own[i] for i in wanted],
-            where,
-        )
-        if made.shape != (len(wanted), *slices.shape[1:]):
+        whole = Job(result, mask, prompt, exemplar, strength, own, context or SliceContext())
+        job = whole.take(wanted)
+        made = self.paint(job)
+        if made.shape != job.slices.shape:
             raise RunError(
                 f"{self.name}: made pictures of shape {list(made.shape)} for slices "
-                f"{[len(wanted), *slices.shape[1:]]}"
+                f"{list(job.slices.shape)}"
             )
-        if not np.isfinite(made[mask[wanted]]).all():
+        if not np.isfinite(made[job.mask]).all():
             raise RunError(f"{self.name}: made NaN or infinite colours")
         # models change known pixels too (a VAE round trip does): only holes are taken from them
-        result[wanted] = np.where(mask[wanted][..., None], made.clip(0.0, 1.0), result[wanted])
+        result[wanted] = np.where(job.mask[..., None], made.clip(0.0, 1.0), job.slices)
         return result
 
-    def paint(
-        self,
-        slices: np.ndarray,
-        mask: np.ndarray,
-        prompt: str,
-        exemplar: Exemplar | None,
-        strength: float,
-        seeds: list[int],
-        context: SliceContext,
-    ) -> np.ndarray:
+    def paint(self, job: Job) -> np.ndarray:
         """Pictures [B, H, W, 3] whose holes are filled; other pixels do not matter."""
         raise NotImplementedError(f"{type(self).__name__} has no paint()")
 

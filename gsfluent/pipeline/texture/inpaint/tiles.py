@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from gsfluent.errors import InputError
 from gsfluent.pipeline.texture.inpaint.inpainter import Inpainter, SliceContext, combined_seed
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar
-
-__all__ = ["GROUND", "TiledInpainter"]
 
 GROUND = 0.5
 """Neutral grey around the object; known, so that a model sees the silhouette."""
@@ -42,36 +41,30 @@ class TiledInpainter:
         slices: np.ndarray,
         mask: np.ndarray,
         *,
-        prompt: str = "",
-        exemplar: Exemplar | None = None,
-        strength: float = 1.0,
         seeds: Sequence[int] | None = None,
         context: SliceContext | None = None,
+        **given: Any,
     ) -> np.ndarray:
         """Fill the holes: see :class:`Inpainter`."""
         own = [0] * len(slices) if seeds is None else [int(s) for s in seeds]
-        where = SliceContext() if context is None else context
-        canvas = self._canvas(slices.astype(np.float32), GROUND)
-        holes = self._canvas(mask.astype(bool), False, known_copies=True)
+        where = context or SliceContext()
         group = self.tile * self.tile
-        joined = [combined_seed(own[i : i + group]) for i in range(0, len(own), group)]
-        on_canvas = SliceContext(
-            axis=where.axis,
-            offsets=where.offsets[::group],
-            pitch=where.pitch,
-            inside=None if where.inside is None else self._canvas(where.inside, False),
-            guide=None if where.guide is None else self._canvas(where.guide, 0.0),
-            max_depth=where.max_depth,
-            labels=None if where.labels is None else self._canvas(where.labels, 0),
-        )
+
+        def canvas(field: np.ndarray | None, ground: object) -> np.ndarray | None:
+            return None if field is None else self._canvas(field, ground)
+
         made = self.inner(
-            canvas,
-            holes,
-            prompt=prompt,
-            exemplar=exemplar,
-            strength=strength,
-            seeds=joined,
-            context=on_canvas,
+            self._canvas(slices.astype(np.float32), GROUND),
+            self._canvas(mask.astype(bool), False, known_copies=True),
+            seeds=[combined_seed(own[i : i + group]) for i in range(0, len(own), group)],
+            context=replace(
+                where,
+                offsets=where.offsets[::group],
+                inside=canvas(where.inside, False),
+                guide=canvas(where.guide, 0.0),
+                labels=canvas(where.labels, 0),
+            ),
+            **given,
         )
         height, width = mask.shape[1:]
         cell = [s + -s % _ALIGN for s in (height, width)]
@@ -95,5 +88,4 @@ class TiledInpainter:
         t = self.tile
         grid = cells.reshape(-1, t, t, h, w, *cells.shape[3:])
         grid = np.moveaxis(grid, 3, 2)  # group, row, y, column, x
-        result: np.ndarray = np.ascontiguousarray(grid).reshape(-1, t * h, t * w, *cells.shape[3:])
-        return result
+        return np.ascontiguousarray(grid).reshape(-1, t * h, t * w, *cells.shape[3:])

@@ -1,4 +1,8 @@
-"""What the light left in a photograph and the material does not have: shading, glints, tint."""
+"""What the light left in a photograph and the material does not have: shading, glints, tint.
+
+Every step takes a picture float32 [H, W, 3] in 0..1 and its face, bool [H, W], some the distance to
+the outline [pixels], and gives the picture and a sentence for the report, None for nothing done.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,9 @@ import itertools
 
 import numpy as np
 
+from gsfluent.colors import linear_to_srgb, rgb_to_lab, srgb_to_linear
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.volume.color import linear, rgb_to_lab, srgb
-
-__all__ = [
-    "match_skin",
-    "remove_glints",
-    "remove_shading",
-    "remove_tint",
-    "shading_field",
-    "white_gains",
-]
+from gsfluent.lazy import cv2, ndimage
 
 _WORK = 160  # pixels along the longest side while the shading is fitted
 _LEAST_SHADING = 0.10  # range of log luminance below which shading is left alone
@@ -28,7 +24,7 @@ _LEAST_AREA = 12_000  # pixels of a face in which glints are looked for
 def shading_field(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
-    """Logarithm of a smooth illumination across the photograph.
+    """Logarithm of a smooth illumination across the photograph, and its range.
 
     The gradient of log luminance is explained by a polynomial of the position (the light) and, for
     a cut face with an outline, by a piecewise linear function of depth (the material's layers);
@@ -37,23 +33,15 @@ def shading_field(
     the terms x, y, xy, x^2 - y^2, and x^2 + y^2 only where there is no depth that it would be
     confused with.
 
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: Pixels that count, bool [H, W].
-        depth: Distance to the outline [H, W], or None for a patch of material.
-
     Returns:
         Log illumination float32 [H, W] with mean zero in the mask, and its range there (the
         difference of its 95 and 5 % quantiles; 0.1 is about 10 % of the light).
     """
-    import cv2
-    from scipy import ndimage
-
     height, width = mask.shape
     factor = min(1.0, _WORK / max(height, width))
     size = (max(8, round(width * factor)), max(8, round(height * factor)))
     share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    light = cv2.resize(linear(image) * mask[..., None], size, interpolation=cv2.INTER_AREA)
+    light = cv2.resize(srgb_to_linear(image) * mask[..., None], size, interpolation=cv2.INTER_AREA)
     small = share > 0.98
     blur = 1.5
     norm = ndimage.gaussian_filter(share, blur) + 1e-6
@@ -76,7 +64,8 @@ def shading_field(
     if depth is not None:
         layer = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         knots = np.quantile(layer[small], np.linspace(0.0, 1.0, _KNOTS))
-        columns += [np.clip((layer - a) / (b - a + 1e-6), 0, 1) for a, b in _pairs(knots)]
+        pairs = itertools.pairwise(knots.tolist())
+        columns += [np.clip((layer - a) / (b - a + 1e-6), 0, 1) for a, b in pairs]
     design = np.stack([_slope(c)[:, usable].reshape(-1) for c in columns], 1)
     wanted = _slope(value)[:, usable].reshape(-1)
     hue = np.sqrt(sum((_slope(chroma[..., c]) ** 2).sum(0) for c in range(3)))[usable]
@@ -127,10 +116,6 @@ def _agree(fields: np.ndarray) -> bool:
     return bool(np.sqrt((half**2).mean()) < 0.3 * np.sqrt((mean**2).mean()) + 1e-9)
 
 
-def _pairs(knots: np.ndarray) -> list[tuple[float, float]]:
-    return list(itertools.pairwise(knots.tolist()))
-
-
 def _slope(field: np.ndarray) -> np.ndarray:
     """Differences along rows and columns [2, H, W]."""
     return np.stack(np.gradient(field))
@@ -147,8 +132,6 @@ def _explains(
     Gradients can agree without the light being uneven (a saw of grains lit from one side). Broad
     means over an eighth of the picture; what depth explains is the material's.
     """
-    from scipy import ndimage
-
     width = max(value.shape) / 8.0
     norm = ndimage.gaussian_filter(small.astype(float), width) + 1e-6
 
@@ -168,17 +151,13 @@ def _explains(
 def remove_shading(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray | None
 ) -> tuple[np.ndarray, str | None]:
-    """Divide the photograph by its illumination (:func:`shading_field`) in linear light.
-
-    Returns:
-        The picture, and a sentence when there was shading worth the name.
-    """
+    """Divide the photograph by its illumination (:func:`shading_field`) in linear light."""
     field, size = shading_field(image, mask, depth)
     if size < _LEAST_SHADING:
         return image, None
     if size > _MOST_SHADING:
         return image, f"shading: left alone, too strong for a gradient of light ({size:.1f})"
-    even = srgb(linear(image) * np.exp(-field)[..., None])
+    even = linear_to_srgb(srgb_to_linear(image) * np.exp(-field)[..., None])
     return even, f"shading: light that changes by {100 * np.expm1(size):.0f} % across it evened out"
 
 
@@ -189,13 +168,7 @@ def remove_glints(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str 
     1985): small compact spots that are much lighter and much less coloured than their
     neighbourhood. On grey material a highlight cannot be told from a light grain by its colour;
     there only the smallest spots that reach white on a dark ground count.
-
-    Returns:
-        The picture, and a sentence when spots were found.
     """
-    import cv2
-    from scipy import ndimage
-
     area = float(mask.sum())
     if area < _LEAST_AREA:  # pixels larger than a highlight average it away
         return image, None
@@ -239,18 +212,15 @@ def remove_glints(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str 
 
 
 def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str]:
-    """Factors of linear red, green and blue that take the light's tint out.
+    """Factors [3] of linear red, green (1) and blue that take the light's tint out; their source.
 
     Args:
         white: ``auto`` (the ground around a cut-out when it is nearly neutral and not dark, else
             nothing), ``none``, a colour temperature [K] of the light, or three numbers: the sRGB
             value (0..1 or 0..255) that a white or grey thing has in the photograph. Grey world is
             not offered: the mean of a fruit is not grey.
-        image: float32 [H, W, 3] in 0..1.
+        image: The photograph.
         mask: The object.
-
-    Returns:
-        Gains [3] with green 1, and what they come from ('' when nothing is to be done).
 
     Raises:
         InputError: The value is none of these.
@@ -270,7 +240,8 @@ def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.
         tint = _planck(float(values[0])) / _planck(6504.0)
         return tint[1] / tint, f"light of {values[0]:.0f} K"
     if values.shape == (3,) and np.isfinite(values).all() and (values > 0).all():
-        shade = linear(values / 255.0 if values.max() > 1.0 else values).astype(float)
+        seen = (values / 255.0 if values.max() > 1.0 else values).astype(np.float32)
+        shade = srgb_to_linear(seen).astype(float)
         return shade[1] / np.maximum(shade, 1e-3), "the reference given"
     raise InputError(
         f"texture: white must be 1000 to 25000 kelvin or three positive numbers, got {white!r}",
@@ -280,8 +251,6 @@ def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.
 
 def _ground_gains(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str]:
     """Gains that make a nearly neutral ground neutral."""
-    from scipy import ndimage
-
     ground = ~ndimage.binary_dilation(mask, iterations=max(2, round(0.02 * max(mask.shape))))
     if ground.sum() < 0.02 * ground.size:
         return np.ones(3), ""
@@ -293,7 +262,7 @@ def _ground_gains(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str]
     # dark grounds say nothing, clipped ones hide their tint, strong hues are paint and not light
     if middle[0] < 45.0 or even < 0.6 or not 2.0 < tint < 16.0 or pixels.max(1).mean() > 0.995:
         return np.ones(3), ""
-    shade = linear(np.median(pixels, axis=0)).astype(float)
+    shade = srgb_to_linear(np.median(pixels, axis=0)).astype(float)
     return shade[1] / shade, "its ground, which is nearly neutral"
 
 
@@ -319,41 +288,28 @@ def _planck(kelvin: float) -> np.ndarray:
         ]
     )
     rgb = np.maximum(matrix @ xyz, 0.02)
-    result: np.ndarray = rgb / rgb[1]
-    return result
+    return rgb / rgb[1]
 
 
 def remove_tint(
     image: np.ndarray, mask: np.ndarray, white: object
 ) -> tuple[np.ndarray, str | None]:
-    """White balance by :func:`white_gains`.
-
-    Returns:
-        The picture, and a sentence when it was changed.
-    """
+    """White balance by :func:`white_gains`."""
     gains, source = white_gains(white, image, mask)
     if not source or float(np.abs(gains - 1.0).max()) < 0.01:
         return image, None
     shown = ", ".join(f"{g:.2f}" for g in gains)
-    return srgb(linear(image) * gains.astype(np.float32)), f"white balance from {source} ({shown})"
+    even = linear_to_srgb(srgb_to_linear(image) * gains.astype(np.float32))
+    return even, f"white balance from {source} ({shown})"
 
 
 def match_skin(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray, skin: np.ndarray
 ) -> tuple[np.ndarray, str]:
-    """White balance by which the photographed skin gets the colour of the object's surface.
+    """White balance by which the photographed skin gets the colours [n, 3] of the object's surface.
 
     The rim of the photograph (a thirtieth of the largest depth) is compared with the surface; only
     when both have the same hue within 30 degrees is it the same skin under another light.
-
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: The face.
-        depth: Distance to the outline [pixels].
-        skin: Surface colours [n, 3] in 0..1.
-
-    Returns:
-        The picture, and a sentence for the report.
     """
     rim = mask & (depth <= max(1.5, float(depth.max()) / 30.0))
     if not rim.any() or len(skin) == 0:
@@ -368,7 +324,8 @@ def match_skin(
             f"white: the photograph's rim is not the object's skin (chroma {chroma[0]:.0f} and "
             f"{chroma[1]:.0f}, hues {turn:.0f} degrees apart)"
         )
-    gains = linear(wanted) / np.maximum(linear(seen), 1e-3)
+    gains = srgb_to_linear(wanted) / np.maximum(srgb_to_linear(seen), 1e-3)
     gains = np.clip(gains / gains[1], 0.5, 2.0)
     shown = ", ".join(f"{g:.2f}" for g in gains)
-    return srgb(linear(image) * gains), f"white balance from the object's skin ({shown})"
+    even = linear_to_srgb(srgb_to_linear(image) * gains)
+    return even, f"white balance from the object's skin ({shown})"

@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["Preset", "layers", "mix", "paint"]
-
 Preset = Callable[[np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]]
 """``f(points [n, 3], depth [n], seed) -> (rgb [n, 3], key [n])``; key 0 is the matrix, any other
 number is that of one inclusion (equal for all its points, whatever else is asked)."""
@@ -20,8 +18,7 @@ def paint(*values: float) -> np.ndarray:
 
 def mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Colours between a and b [n, 3] (or one colour [3]) by shares t [n], clipped to 0..1."""
-    result: np.ndarray = a + (b - a) * np.clip(t, 0.0, 1.0)[:, None]
-    return result.astype(np.float32)
+    return (a + (b - a) * np.clip(t, 0.0, 1.0)[:, None]).astype(np.float32)
 
 
 def layers(depth: np.ndarray, stops: list[tuple[float, np.ndarray]]) -> np.ndarray:

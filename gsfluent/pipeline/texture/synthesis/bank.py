@@ -17,8 +17,6 @@ from torch.nn import functional
 
 from gsfluent.pipeline.texture.synthesis.transport import Cells
 
-__all__ = ["Bank", "LevelPhoto"]
-
 _DIMENSIONS = 24  # principal components of a patch that are compared
 _CHUNK_CELLS = 1 << 25  # scores held at once
 _PARTS = 24  # parts of the guide's space whose shares are balanced

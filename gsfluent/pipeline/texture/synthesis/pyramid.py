@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.colors import lab100_to_rgb, rgb_to_lab100
 from gsfluent.pipeline.texture.synthesis.bank import Bank, LevelPhoto
 from gsfluent.pipeline.texture.synthesis.guides import DepthGuide, PlacedPhoto
 from gsfluent.pipeline.texture.synthesis.level_guides import LevelGuides
@@ -22,10 +23,7 @@ from gsfluent.pipeline.texture.synthesis.levels import (
 from gsfluent.pipeline.texture.synthesis.patches import Schedule, SynthesisLevel, synthesize_level
 from gsfluent.pipeline.texture.synthesis.sections import Section
 from gsfluent.pipeline.texture.synthesis.transport import Cells
-from gsfluent.pipeline.texture.volume.color import lab100_to_rgb, rgb_to_lab100
 from gsfluent.progress import Progress, report_progress
-
-__all__ = ["synthesize_pyramid", "to_grid"]
 
 _PARTS = 96  # parts of the guide's space over which the photographs' pixels are spread
 _PATCH = 7  # patches whose statistics are matched
@@ -47,17 +45,10 @@ def synthesize_pyramid(
 ) -> tuple[Tensor, Lattice, dict[str, Any]]:
     """Synthesise an object's inside, coarse to fine.
 
-    Args:
-        fields: The object.
-        prepared: Photographs per slice axis, placed.
-        schedule: Work settings.
-        kind: Guide: ``depth``, ``axis``, ``height``, ``none`` or ``array``.
-        own: The user's coordinate on the solid's grid, for ``array``.
-        directional: Photographs are not turned, and only their own axes are matched.
-        keep: Hold the surface's colours fixed.
-        closed: The core of the section closes towards the poles (:class:`.sections.Section`).
-        seed: Seed.
-        progress: Optional callback.
+    The guide is of the ``kind`` ``depth``, ``axis``, ``height``, ``none`` or ``array`` (the user's
+    ``own`` coordinate on the solid's grid). ``directional`` photographs are not turned, and only
+    their own axes are matched; ``keep`` holds the surface's colours; the core of the section may be
+    ``closed`` (:class:`.sections.Section`).
 
     Returns:
         Lab / 100 [3, X, Y, Z] on the last lattice, that lattice, and figures for the report.

@@ -32,16 +32,16 @@ def clinging(
     loose = fragment < 0
     if not loose.any() or loose.all():
         return fragment
-    rubble, solid = where[loose], fragment[~loose]
-    gap, beside = cKDTree(where[~loose]).query(rubble, distance_upper_bound=reach)
+    debris, solid = where[loose], fragment[~loose]
+    gap, beside = cKDTree(where[~loose]).query(debris, distance_upper_bound=reach)
     seeds = np.flatnonzero(np.isfinite(gap))
     found = fragment.copy()
     if len(seeds) == 0:
         return found
-    links = cKDTree(rubble).query_pairs(reach, output_type="ndarray")
+    links = cKDTree(debris).query_pairs(reach, output_type="ndarray")
     # a zero would not count as a link
-    length = np.linalg.norm(rubble[links[:, 0]] - rubble[links[:, 1]], axis=1) + 1e-12
-    graph = coo_matrix((length, links.T), shape=(len(rubble), len(rubble))).tocsr()
+    length = np.linalg.norm(debris[links[:, 0]] - debris[links[:, 1]], axis=1) + 1e-12
+    graph = coo_matrix((length, links.T), shape=(len(debris), len(debris))).tocsr()
     _, _, source = dijkstra(
         graph, directed=False, indices=seeds, return_predecessors=True, min_only=True
     )

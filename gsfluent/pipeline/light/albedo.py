@@ -16,7 +16,7 @@ limits of one capture. The mean brightness cannot be known; it is kept.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,11 +26,7 @@ from gsfluent import geometry
 from gsfluent.data import INTERIOR, Gaussians
 from gsfluent.pipeline.light.normals import estimate_normals
 from gsfluent.pipeline.light.shade import harmonics, to_display, to_linear
-
-if TYPE_CHECKING:
-    from gsfluent.results.frames import SavedFrame
-
-__all__ = ["Delighting", "Delit", "delight", "estimate_shading"]
+from gsfluent.results.frames import SavedFrame
 
 _SAMPLES = 3000  # splats that the light is estimated from
 _PARTNERS = 40  # pairs per splat
@@ -44,7 +40,7 @@ _FEWEST = 100  # splats that light can be estimated from
 _SEED = 0
 
 
-class Delighting(NamedTuple):
+class Shading(NamedTuple):
     """The light of a capture.
 
     Attributes:
@@ -60,7 +56,7 @@ class Delighting(NamedTuple):
 
 
 @torch.no_grad()
-def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> Delighting:
+def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> Shading:
     """Estimate the light that the colours were captured in.
 
     Args:
@@ -78,7 +74,7 @@ def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> 
     even = torch.zeros(9, dtype=torch.float64, device=grey.device)
     even[0] = 1.0 / 0.28209479177387814
     if index.numel() < _FEWEST:
-        return Delighting(even[:, None].expand(9, 3), 0.0, (0.0, 0.0))
+        return Shading(even[:, None].expand(9, 3), 0.0, (0.0, 0.0))
     generator = torch.Generator().manual_seed(_SEED)
     picked = torch.randperm(index.numel(), generator=generator)[:_SAMPLES].to(index.device)
     index = index[picked]
@@ -97,27 +93,21 @@ def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> 
     rest = target - light.log()[first] + light.log()[second]
     sure = alike > 0.5
     before, after = (values[sure].abs().median() for values in (target, rest))
-    return Delighting(found, float(light.mean(-1).std()), (float(before), float(after)))
+    return Shading(found, float(light.mean(-1).std()), (float(before), float(after)))
 
 
-def delight(
-    gaussians: Gaussians,
-    shading: Delighting | None = None,
-    *,
-    strength: float = 1.0,
-    normals: Tensor | None = None,
+def to_albedo(
+    gaussians: Gaussians, *, strength: float = 1.0, normals: Tensor | None = None
 ) -> Gaussians:
     """Splats with the captured light divided out of their colours; splats of the inside unchanged.
 
     Args:
         gaussians: The object as captured, not broken.
-        shading: From :func:`estimate_shading`; found here when None.
-        strength: Share of it that is divided out, 0 to 1.
+        strength: Share of the light that is divided out, 0 to 1.
         normals: Outward normals [N, 3]; estimated when None.
     """
     normals = estimate_normals(gaussians) if normals is None else normals
-    if shading is None:
-        shading = estimate_shading(gaussians, normals=normals)
+    shading = estimate_shading(gaussians, normals=normals)
     light = harmonics(normalize(normals.double(), dim=-1)) @ shading.coefficients
     light = light.clamp(min=_LEAST).pow(strength).to(gaussians.means)
     # deep below the skin the normal says nothing
@@ -154,7 +144,7 @@ def _solve(
     return found
 
 
-class Delit:
+class Albedo:
     """The captured light of a film's objects, found in its first frame, while they are whole.
 
     Each body has a light of its own, because events turn bodies before they move. Splats that the
@@ -179,7 +169,7 @@ class Delit:
                 continue
             mine = (body == number).nonzero()[:, 0]
             part = gaussians.select(mine)
-            after = delight(part, strength=strength, normals=normals[mine]).colors()
+            after = to_albedo(part, strength=strength, normals=normals[mine]).colors()
             factor[mine] = after / before[mine].clamp(min=1.0 / 255.0)
         # by number of the splat, and by point for splats that come later
         known = (first.ids >= 0) & (body >= 0)

@@ -1,7 +1,7 @@
-"""Crumbs that flew far away: points without a grid.
+"""Debris that flew far away: points without a grid.
 
 A broken point carries no tension and, alone, no stress at all. When it is far from what is left of
-the objects it moves as a free point, so that a few crumbs do not stretch the grid over metres of
+the objects it moves as a free point, so that a few of them do not stretch the grid over metres of
 empty space (or beyond its limit). It falls, and stays where it meets the floor.
 """
 
@@ -20,7 +20,7 @@ DISTANCE = 8.0
 
 
 def reach_of(matter: Matter) -> float:
-    """Distance [m] beyond which a broken point is a stray."""
+    """Distance [m] beyond which a broken point is loose."""
     extents = []
     for a, b in matter.ranges:
         low, high = torch.aminmax(matter.rest[a:b], dim=0)
@@ -28,7 +28,7 @@ def reach_of(matter: Matter) -> float:
     return DISTANCE * max(extents)
 
 
-def find_strays(position: Tensor, peak: Tensor, candidate: Tensor, reach: float) -> Tensor:
+def find_far(position: Tensor, peak: Tensor, candidate: Tensor, reach: float) -> Tensor:
     """Tell which candidates are broken and far from the unbroken matter, bool [N].
 
     Args:
@@ -44,16 +44,16 @@ def find_strays(position: Tensor, peak: Tensor, candidate: Tensor, reach: float)
     return candidate & far & (peak >= 0)
 
 
-def let_go(state: State, crumbs: Tensor) -> State:
-    """The state in which these points [N] are strays, without a strain."""
+def let_go(state: State, debris: Tensor) -> State:
+    """The state in which these points [N] are loose, without a strain."""
     p = state.particles
     return state._replace(
-        particles=p.replace(strain=p.strain.masked_fill(crumbs[:, None], 0.0)),
-        stray=state.stray | crumbs,
+        particles=p.replace(strain=p.strain.masked_fill(debris[:, None], 0.0)),
+        loose=state.loose | debris,
     )
 
 
-def find_lonely(position: Tensor, peak: Tensor, candidate: Tensor, dx: float) -> Tensor:
+def find_loose(position: Tensor, peak: Tensor, candidate: Tensor, dx: float) -> Tensor:
     """Tell which candidates are broken and have next to nothing around them, bool [N].
 
     Less than :data:`LONELY` points, none of them unbroken, in the 3^3 cubes of two cells around
@@ -94,19 +94,19 @@ def drift(
     gravity: tuple[float, float, float],
     floor: float | None,
 ) -> Tensor:
-    """Let strays fall, in place; they stay where they meet the floor.
+    """Let loose debris fall, in place; they stay where they meet the floor.
 
     Args:
-        position: Positions of all points [m], float64 [N, 3]; rows of strays are written.
+        position: Positions of all points [m], float64 [N, 3]; rows of debris are written.
         velocity: Velocities of all points [m/s], [N, 3]; likewise.
         mass: Masses [kg], [N].
-        rows: Rows of the strays, int64 [S].
+        rows: Rows of the debris, int64 [S].
         span: Time [s].
         gravity: Acceleration [m/s^2].
         floor: Height of the floor [m], or None.
 
     Returns:
-        The impulse of the floor on the strays [N s], float64 [3].
+        The impulse of the floor on the debris [N s], float64 [3].
     """
     pull = torch.tensor(gravity, dtype=torch.float64, device=position.device)
     start = velocity[rows].double()
