@@ -15,7 +15,7 @@ from pathlib import Path
 
 import gsfluent as gf
 from gsfluent.demo import make_capture
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 from gsfluent.pipeline.render.studio import Studio
 
 
@@ -52,7 +52,7 @@ def main() -> int:
 
     camera = gf.Camera.look_at((0.42, -0.5, 0.34), (0.0, 0.0, 0.05), width=320, height=240)
     studio = Studio(height=0.0, center=(0.0, 0.0), radius=0.05, extent=0.3)
-    render = gf.pipeline.Render(camera, Light(direction=(1.0, -1.0, 2.0)), studio=studio)
+    render = gf.pipeline.Render(camera, key_light(direction=(1.0, -1.0, 2.0)), studio=studio)
     fps = 30.0
     fall = round(fps * 0.37)  # it lands after 0.38 s; pictures are made from then on
     simulate = gf.pipeline.Simulate(quality="preview", device=options.device)

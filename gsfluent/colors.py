@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsfluent.lazy import cv2
+
 # sRGB primaries over the D65 white point (IEC 61966-2-1)
 _TO_XYZ = (
     (0.412453 / 0.950456, 0.357580 / 0.950456, 0.180423 / 0.950456),
@@ -36,16 +38,12 @@ def linear_to_srgb(light: np.ndarray) -> np.ndarray:
 
 def rgb_to_lab(rgb: np.ndarray) -> np.ndarray:
     """CIE Lab (D65) of sRGB values in 0..1, any leading shape [..., 3]."""
-    import cv2
-
     flat = np.ascontiguousarray(rgb, dtype=np.float32).reshape(1, -1, 3)
     return np.asarray(cv2.cvtColor(flat.clip(0.0, 1.0), cv2.COLOR_RGB2LAB).reshape(rgb.shape))
 
 
 def lab_to_rgb(lab: np.ndarray) -> np.ndarray:
     """Values in 0..1 of CIE Lab (D65) in sRGB, any leading shape [..., 3]."""
-    import cv2
-
     flat = np.ascontiguousarray(lab, dtype=np.float32).reshape(1, -1, 3)
     return np.asarray(cv2.cvtColor(flat, cv2.COLOR_LAB2RGB).reshape(lab.shape).clip(0.0, 1.0))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterable
 from types import ModuleType
 
 EXTRAS = {
@@ -35,6 +36,14 @@ class InputError(GsfluentError, ValueError):
         self.what = what
         self.hint = hint
         super().__init__(f"{what}\n  hint: {hint}" if hint else what)
+
+
+def check_choice(what: str, value: object, allowed: Iterable[object], hint: str = "") -> None:
+    """Raise :class:`InputError` unless ``value`` is one of ``allowed``; ``what`` names it."""
+    names = list(allowed)
+    if value not in names:
+        listed = ", ".join(str(name) for name in names if name != "")
+        raise InputError(f"{what} must be one of {listed}, got {value!r}", hint)
 
 
 class MissingPackage(InputError):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import platform
 from pathlib import Path
 
-__all__ = ["processor"]
-
 
 def processor() -> str:
     """Name of the processor, as the system knows it."""

@@ -7,7 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from gsfluent import ops
+from gsfluent.ops import ssim
+
+__all__ = ["psnr", "ssim"]
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
@@ -24,7 +26,11 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     Raises:
         ValueError: The shapes differ, or the mask is empty.
     """
-    _check_pair("psnr", image, target)
+    if image.dim() != 3 or image.shape != target.shape:
+        raise ValueError(
+            "psnr: image and target must have the same shape [H, W, C], "
+            f"got {list(image.shape)} and {list(target.shape)}"
+        )
     error = (image - target).square().mean(-1)
     if mask is None:
         mean = float(error.mean(dtype=torch.float64))
@@ -36,32 +42,3 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
             )
         mean = float((error * mask).sum(dtype=torch.float64) / mask.sum(dtype=torch.float64))
     return math.inf if mean == 0 else -10.0 * math.log10(mean)
-
-
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of images with values in [0, 1].
-
-    Gaussian window of 11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03, averaged over the pixels whose
-    window lies inside the image and over the channels (Wang et al. 2004, equation 13); see
-    :func:`gsfluent.ops.ssim`.
-
-    Args:
-        image: What is judged, shape [H, W, C].
-        target: What it should be, same shape.
-
-    Returns:
-        A scalar, 1 for equal images. Differentiable once.
-
-    Raises:
-        TypeError: Not float32 or float64 tensors.
-        ValueError: The shapes differ, or a side is shorter than the window.
-    """
-    return ops.ssim(image, target)
-
-
-def _check_pair(name: str, image: Tensor, target: Tensor) -> None:
-    if image.dim() != 3 or image.shape != target.shape:
-        raise ValueError(
-            f"{name}: image and target must have the same shape [H, W, C], "
-            f"got {list(image.shape)} and {list(target.shape)}"
-        )

@@ -11,7 +11,7 @@ import torch
 import gsfluent as gf
 from gsfluent.errors import InputError
 from gsfluent.io import save_splats
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 
 
 def shell(radius: float = 0.1, count: int = 4000) -> gf.Gaussians:
@@ -41,7 +41,7 @@ def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
     scene = gf.Scene(floor=0.0)
     scene.add(solid, material=gf.materials.fruit.watermelon)
     camera = gf.Camera.look_at((0.5, -0.5, 0.3), (0.0, 0.0, 0.1), width=64, height=48)
-    render = gf.pipeline.Render(camera, Light())
+    render = gf.pipeline.Render(camera, key_light())
     simulation = gf.pipeline.Simulate(dx=0.025)(scene, fps=30, seconds=2 / 30)
     for frame in simulation:
         image = render(frame.gaussians).image

@@ -28,17 +28,6 @@ from gsfluent.progress import Progress, report_progress
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import solver_options
 
-__all__ = [
-    "LEVELS",
-    "Growth",
-    "Probing",
-    "Probes",
-    "choose",
-    "choose_setting",
-    "run_probes",
-    "summary",
-]
-
 _log = logging.getLogger(__name__)
 
 LEVELS = (10, 14, 20)
@@ -50,19 +39,12 @@ LONG_STEP = 0.7
 
 @dataclasses.dataclass(frozen=True)
 class Probing:
-    """How a shot is probed.
+    """How a shot is probed."""
 
-    Args:
-        levels: Cells of the probes, coarse to fine, at least three.
-        frames: Frames from just before something happens.
-        seeds: Runs per level; None: three where something can break, else two.
-        cfl: Courant numbers to offer beside 0.5.
-    """
-
-    levels: tuple[int, ...] = LEVELS
-    frames: int = FRAMES
-    seeds: int | None = None
-    cfl: tuple[float, ...] = (LONG_STEP,)
+    levels: tuple[int, ...] = LEVELS  # Cells of the probes, coarse to fine, at least three
+    frames: int = FRAMES  # Frames from just before something happens
+    seeds: int | None = None  # Runs per level; None: three where something can break, else two
+    cfl: tuple[float, ...] = (LONG_STEP,)  # Courant numbers to offer beside 0.5
 
     def __post_init__(self) -> None:
         if len(self.levels) < 3 or list(self.levels) != sorted(set(self.levels)):

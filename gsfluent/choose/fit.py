@@ -17,8 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ORDERS", "Fit", "History", "fit_histories", "fit_history"]
-
 Array = NDArray[np.float64]
 
 ORDERS = (0.5, 2.0)
@@ -30,23 +28,17 @@ _SMALL = 1e-12
 
 @dataclasses.dataclass(frozen=True)
 class History:
-    """One observable on several levels of cells.
+    """One observable on several levels of cells."""
 
-    Args:
-        name: What it is.
-        sizes: Size of the cells of each level, coarse to fine, [L]; any unit.
-        values: Per level the history of each seed, [S, T, K]: S seeds, T moments, K components; in
-            units of the observable's own scale, so that 0.03 is an error of 3 %.
-        chaotic: Runs differ by chance on every level alike (matter has broken): the scatter between
-            seeds does not shrink with the cells.
-        most: No error is larger: 1 for shares.
-    """
-
-    name: str
-    sizes: tuple[float, ...]
+    name: str  # What it is
+    sizes: tuple[float, ...]  # Size of the cells of each level, coarse to fine, [L]; any unit
+    # Per level the history of each seed, [S, T, K]: S seeds, T moments, K components; in units of
+    # the observable's own scale, so that 0.03 is an error of 3 %.
     values: tuple[Array, ...]
+    # Runs differ by chance on every level alike (matter has broken): the scatter between seeds does
+    # not shrink with the cells.
     chaotic: bool = False
-    most: float = math.inf
+    most: float = math.inf  # No error is larger: 1 for shares
 
     @property
     def band(self) -> float:
@@ -81,29 +73,17 @@ class History:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """The error of one observable by size of cells.
+    """The error of one observable by size of cells."""
 
-    Args:
-        name: What it is.
-        order: Best fitting order.
-        orders: Orders drawn, [D].
-        error: Rms error of the mean at the finest level, drawn, [D].
-        chance: Factor on the scatter, drawn, [D]: few seeds do not know it well.
-        finest: Size of the cells of that level.
-        misfit: Rms of what the law does not explain over the change that it does explain.
-        parallel: Cosine between the successive changes; 1 is steady convergence.
-        history: The data.
-    """
-
-    name: str
-    order: float
-    orders: Array
-    error: Array
-    chance: Array
-    finest: float
-    misfit: float
-    parallel: float
-    history: History
+    name: str  # What it is
+    order: float  # Best fitting order
+    orders: Array  # Orders drawn, [D]
+    error: Array  # Rms error of the mean at the finest level, drawn, [D]
+    chance: Array  # Factor on the scatter, drawn, [D]: few seeds do not know it well
+    finest: float  # Size of the cells of that level
+    misfit: float  # Rms of what the law does not explain over the change that it does explain
+    parallel: float  # Cosine between the successive changes; 1 is steady convergence
+    history: History  # The data
 
     def mean_errors(self, size: float) -> Array:
         """Drawn rms errors of the mean of many runs at a size of cells, [D]."""

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from gsfluent.choose.fit import Fit
 
-__all__ = ["CELLS", "SURE", "Choice", "Setting", "pick", "ranked"]
-
 Array = NDArray[np.float64]
 
 CELLS = (8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64, 80, 96, 128)
@@ -127,10 +125,7 @@ def _band(fit: Fit, size: float, spread: Mapping[str, float]) -> float:
 
 
 def _mean(
-    fit: Fit,
-    size: float,
-    growth: Mapping[str, float],
-    added: Mapping[str, tuple[float, float]],
+    fit: Fit, size: float, growth: Mapping[str, float], added: Mapping[str, tuple[float, float]]
 ) -> Array:
     """Drawn errors of the mean of many runs at a setting, over the whole shot, [D]."""
     more, at = added.get(fit.name, (0.0, size))

@@ -22,8 +22,6 @@ from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
 
-__all__ = ["ACTIVE", "Probe", "Seen", "distance", "histories", "probe", "window"]
-
 Array = NDArray[np.float64]
 
 REACH = (0.05, 0.95)

@@ -15,8 +15,6 @@ from gsfluent.plan.cost import CostModel
 from gsfluent.plan.work import laws_of
 from gsfluent.scene.scene import Scene
 
-__all__ = ["Work", "cost_of", "measured_rates", "work_of"]
-
 Seconds = Callable[[int, float], float]
 
 

@@ -22,8 +22,6 @@ from gsfluent.stages.context import RunContext
 from gsfluent.stages.simulate import build_scene, moving_settings
 from gsfluent.stages.solids import context_of, load_solids, make_solids
 
-__all__ = ["chart_shot", "choose_stage", "readable", "shot_scene"]
-
 _log = logging.getLogger(__name__)
 FILE, PICTURE = "chart.json", "chart.png"
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from gsfluent.errors import GsfluentError, InputError, RunError
+from gsfluent.errors import GsfluentError
 
 if TYPE_CHECKING:
     from gsfluent.cli.common import Verb
@@ -177,6 +177,3 @@ def _termination_as_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-__all__ = ["InputError", "RunError", "main"]

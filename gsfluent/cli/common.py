@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from gsfluent.errors import InputError
-from gsfluent.progress import Progress
+from gsfluent.progress import Progress, Reporter, reporter
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
@@ -43,12 +43,18 @@ class Verb:
         """
         return choose_device(self.device, seed=self.seed)
 
+    def given(self, *names: str) -> dict[str, Any]:
+        """Those of its options that are set."""
+        return {n: value for n in names if (value := getattr(self, n)) is not None}
+
+    def reporter(self) -> AbstractContextManager[Reporter]:
+        """Progress of several tasks, drawn as this process and ``--json`` allow."""
+        return reporter(quiet=self.json)
+
     @contextmanager
     def progress(self, name: str) -> Iterator[Progress]:
-        """One progress callback, drawn as this process and ``--json`` allow."""
-        from gsfluent.progress import reporter
-
-        with reporter(quiet=self.json) as report:
+        """Progress of one task."""
+        with self.reporter() as report:
             yield report.task(name)
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["plan_text"]
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 
 def plan_text(plan: Mapping[str, Any]) -> str:
@@ -59,15 +61,15 @@ def _table(rows: list[list[str]], right: tuple[int, ...] = ()) -> list[str]:
     """Rows in columns."""
     if not rows:
         return ["  none"]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "  "
-        + "  ".join(
-            cell.rjust(w) if i in right else cell.ljust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    table = Table.grid(padding=(0, 2, 0, 0))
+    for column in range(len(rows[0])):
+        table.add_column(justify="right" if column in right else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    console = Console(width=sum(map(len, map("".join, rows))) + 100)
+    with console.capture() as drawn:
+        console.print(table)
+    return [f"  {line}".rstrip() for line in drawn.get().splitlines()]
 
 
 def _seconds(value: float | None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -94,27 +94,12 @@ class Export(Verb):
         existing(self.out, "OUT")
         if self.fps is not None and not 0.1 <= self.fps <= 1000.0:
             raise InputError(f"--fps {self.fps:g}", "give a number from 0.1 to 1000")
+        same = {f.name for f in fields(ExportOptions)} - {"size", "lamps", "usd_parts"}
         options = ExportOptions(
-            frames=self.frames,
-            sh=self.sh,
-            up=self.up,
-            compressed=self.compressed,
-            constant=self.constant,
-            attributes=self.attributes,
-            key_every=self.key_every,
-            spz_version=self.spz_version,
-            usd_ending=self.usd_ending,
-            mesh_ending=self.mesh_ending,
-            mesh_blur=self.mesh_blur,
-            camera=self.camera,
             size=parse_size(self.size) if self.size else None,
-            fps=self.fps,
-            alpha=self.alpha,
-            relit=self.relit,
-            light=self.light,
             lamps=self.lamp,
-            environment=self.environment,
             usd_parts=tuple(part.strip() for part in self.usd_parts.split(",")),
+            **{name: getattr(self, name) for name in same},
         )
         with self.progress("export") as progress:
             return export(

@@ -95,7 +95,6 @@ class Chart(Verb):
         from gsfluent.choose.shot import chart_shot, readable
         from gsfluent.config import load_shot
         from gsfluent.config.settings_solve import read_error
-        from gsfluent.progress import reporter
 
         if self.shot is None or self.error is None:
             got = "a bound without a shot" if self.shot is None else "a shot without a bound"
@@ -106,7 +105,7 @@ class Chart(Verb):
             )
         bound = read_error(self.error, "--error")
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
-        with reporter(quiet=self.json) as progress:
+        with self.reporter() as progress:
             result = chart_shot(
                 shot, bound, self.out, probing=QUICK if self.quick else None,
                 device=self.torch_device(), seed=self.seed, reporter=progress,

@@ -73,7 +73,6 @@ class Inspect(Verb):
         """Show the parts of a shot."""
         from gsfluent.config import load_shot
         from gsfluent.inspection.shot import inspect_shot
-        from gsfluent.progress import reporter
 
         if self.run is None:
             raise InputError(
@@ -82,7 +81,7 @@ class Inspect(Verb):
         if self.size is not None:
             raise InputError("--size does nothing with a shot", "set size in the shot")
         shot = load_shot(self.input)
-        with reporter(quiet=self.json) as progress:
+        with self.reporter() as progress:
             return inspect_shot(
                 shot,
                 self.run,
@@ -187,13 +186,8 @@ class Metrics(Verb):
         result = compare(
             self.judged,
             self.reference,
-            size=self.size,
-            clip=self.clip,
-            prompt=self.prompt,
-            lpips=self.lpips,
-            fid=self.fid,
             device=self.torch_device(),
-            seed=self.seed,
+            **self.given("size", "clip", "prompt", "lpips", "fid", "seed"),
         )
         if self.json:
             return result

@@ -43,7 +43,6 @@ class Run(Verb):
     def execute(self) -> dict[str, Any]:
         """Run the shot."""
         from gsfluent.config import load_shot
-        from gsfluent.progress import reporter
         from gsfluent.run.shot import run_shot
 
         if self.config is None:
@@ -60,7 +59,7 @@ class Run(Verb):
                 return {"shot": str(path), **facts["physgaussian"]}
         shot = load_shot(path)
         device = self.torch_device()
-        with reporter(quiet=self.json) as report:
+        with self.reporter() as report:
             return run_shot(
                 shot, self.out, device=device, seed=self.seed, force=self.force, reporter=report,
                 facts=facts,
@@ -94,7 +93,6 @@ class Demo(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Run the demo."""
-        from gsfluent.progress import reporter
         from gsfluent.run.demo import SIZES, photograph_demo, run_demo
 
         if self.photographs is not None:
@@ -103,15 +101,13 @@ class Demo(Verb):
                 return photograph_demo(self.name, self.photographs, scale, seed, progress)
 
         device = self.torch_device()
-        with reporter(quiet=self.json) as report:
+        with self.reporter() as report:
             return run_demo(
                 self.name,
                 self.out,
-                size=self.size,
                 device=device,
-                seed=self.seed,
-                force=self.force,
                 reporter=report,
+                **self.given("size", "seed", "force"),
             )
 
 
@@ -172,23 +168,13 @@ class Render(Verb):
         with self.progress("render") as progress:
             return render_again(
                 self.out,
-                to=self.to,
-                camera=self.camera,
                 size=parse_size(self.size) if self.size else None,
-                light=self.light,
                 lamps=self.lamp,
-                intensity=self.intensity,
-                lamp_size=self.lamp_size,
-                spin=self.spin,
                 surroundings=self.environment,
-                ambient=self.ambient,
-                specular=self.specular,
-                shininess=self.shininess,
-                occlusion=self.occlusion,
-                delight=self.delight,
-                frame=self.frame,
                 device=self.torch_device(),
                 progress=progress,
+                **self.given("to", "camera", "frame", "light", "intensity", "lamp_size", "spin"),
+                **self.given("ambient", "specular", "shininess", "occlusion", "delight"),
             )
 
 

@@ -66,19 +66,6 @@ class Reconstruct(Verb):
         from gsfluent.run.single import reconstruct_to
 
         existing(self.capture, "CAPTURE", folder=True)
-        given = {
-            "iterations": self.iterations,
-            "max_gaussians": self.max_gaussians,
-            "kernel": self.kernel,
-            "scale_regularization": self.scale_regularization,
-            "image_size": self.image_size,
-            "sh_degree": self.sh_degree,
-            "recipe": self.recipe,
-            "densify": self.densify,
-            "target_psnr": self.target_psnr,
-            "exposure": self.exposure,
-        }
-        options = {name: value for name, value in given.items() if value is not None}
         with self.progress("reconstruct") as progress:
             return reconstruct_to(
                 self.capture,
@@ -87,7 +74,9 @@ class Reconstruct(Verb):
                 seed=self.seed,
                 keep_background=self.keep_background,
                 progress=progress,
-                **options,
+                **self.given("iterations", "max_gaussians", "kernel", "scale_regularization"),
+                **self.given("image_size", "sh_degree", "recipe", "densify", "target_psnr"),
+                **self.given("exposure"),
             )
 
 
@@ -126,8 +115,6 @@ class Fill(Verb):
         from gsfluent.run.single import fill_to
 
         existing(self.model, "INPUT")
-        given = {"resolution": self.resolution, "method": self.method, "hollow": self.hollow}
-        options = {name: value for name, value in given.items() if value is not None}
         with self.progress("fill") as progress:
             return fill_to(
                 self.model,
@@ -137,7 +124,7 @@ class Fill(Verb):
                 device=self.torch_device(),
                 seed=self.seed,
                 progress=progress,
-                **options,
+                **self.given("resolution", "method", "hollow"),
             )
 
 
@@ -192,22 +179,17 @@ class Texture(Verb):
         from gsfluent.run.single import texture_to
 
         existing(self.solid, "solid.ply", folder=False)
-        method = self.method or ("exemplar" if self.exemplar else None)
-        given = {
-            "method": method,
-            "exemplar": self.exemplar,
-            "preset": self.preset,
-            "quality": self.quality,
-            "guide": self.guide,
-            "cut": self.cut,
-            "photo": {"stain": True} if self.stain else None,
-            "prompt": self.prompt,
-            "model": self.model,
-            "inpaint": read_inpaint(self.inpaint) or None,
-            "resume": self.resume,
-            "polish": self.polish or None,
-        }
-        options = {name: value for name, value in given.items() if value is not None}
+        options = self.given(
+            "method", "exemplar", "preset", "quality", "guide", "cut", "prompt", "model", "resume"
+        )
+        if self.exemplar:
+            options.setdefault("method", "exemplar")
+        if self.stain:
+            options["photo"] = {"stain": True}
+        if self.polish:
+            options["polish"] = True
+        if self.inpaint:
+            options["inpaint"] = read_inpaint(self.inpaint)
         with self.progress("texture") as progress:
             return texture_to(
                 self.solid,
@@ -253,10 +235,5 @@ class Mesh(Verb):
 
         existing(self.input, "INPUT")
         return mesh_to(
-            self.input,
-            self.out,
-            capture=self.capture,
-            method=self.method,
-            resolution=self.resolution,
-            scale=self.scale,
+            self.input, self.out, **self.given("capture", "method", "resolution", "scale")
         )

@@ -69,12 +69,8 @@ class View(Verb):
         return view_run(
             self.out,
             device=self.torch_device(),
-            host=self.host,
-            port=self.port,
-            splats=self.splats,
-            check=self.check,
-            to=self.to,
             browser=self.open,
+            **self.given("host", "port", "splats", "check", "to"),
         )
 
     def _live(self) -> dict[str, Any]:
@@ -87,13 +83,6 @@ class View(Verb):
         return view_live(
             existing(self.out, "OUT"),
             device=self.torch_device(),
-            material=self.material,
-            run=self.run,
-            quality=self.quality,
-            slow=self.slow,
-            cracks=self.cracks,
-            seed=self.seed,
-            host=self.host,
-            port=self.port,
             browser=self.open,
+            **self.given("material", "run", "quality", "slow", "cracks", "seed", "host", "port"),
         )

@@ -21,8 +21,6 @@ from gsfluent.config.read import (
 )
 from gsfluent.errors import InputError
 
-__all__ = ["InpaintSettings", "read_inpaint"]
-
 
 @dataclasses.dataclass(frozen=True)
 class InpaintSettings(Section):

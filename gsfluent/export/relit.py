@@ -22,10 +22,7 @@ def lighting_for(shot: Shot, options: ExportOptions) -> Lighting:
         InputError: A light that cannot be read.
     """
     return changed(
-        light_of(shot),
-        light=options.light,
-        lamps=options.lamps,
-        surroundings=options.environment,
+        light_of(shot), light=options.light, lamps=options.lamps, surroundings=options.environment
     )
 
 

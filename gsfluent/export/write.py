@@ -44,16 +44,10 @@ FORMATS: dict[str, Format] = {
         ".spz per frame: phones, web viewers", "splats", "spz_sequence", splats_only=True
     ),
     "splat": Format(
-        ".splat per frame: the first web viewers",
-        "splats",
-        "splat_sequence",
-        splats_only=True,
+        ".splat per frame: the first web viewers", "splats", "splat_sequence", splats_only=True
     ),
     "glb": Format(
-        "glTF with KHR_gaussian_splatting per frame",
-        "splats",
-        "glb_sequence",
-        splats_only=True,
+        "glTF with KHR_gaussian_splatting per frame", "splats", "glb_sequence", splats_only=True
     ),
     "delta": Format(
         "one small .gsd file: gsfluent.io.DeltaReader, gsfluent export",

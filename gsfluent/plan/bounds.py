@@ -18,8 +18,6 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL
 from gsfluent.scene.scene import Body
 
-__all__ = ["CELLS", "Bound", "bounds_of", "budget_spacing", "choose_cells", "thickness"]
-
 THIN_CELLS = 4.0
 """Cells that the thinnest part of a body needs for bending to be felt (solver.md: 4 to 6)."""
 PIECE_CELLS = 3.0

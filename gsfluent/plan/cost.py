@@ -28,8 +28,6 @@ import gsfluent
 from gsfluent.hardware import processor
 from gsfluent.io import write_json
 
-__all__ = ["LAW_SETS", "Cost", "CostModel", "cache_folder", "law_set", "machine_key"]
-
 _log = logging.getLogger(__name__)
 
 FORMAT = 1

@@ -19,8 +19,6 @@ from gsfluent.errors import GsfluentError
 from gsfluent.plan.cost import Cost, CostModel, framing, stepping
 from gsfluent.plan.work import mean_splats
 
-__all__ = ["STAGES", "actual_work", "compare", "learn"]
-
 _log = logging.getLogger(__name__)
 
 STAGES = ("reconstruct", "isolate", "fill", "texture", "simulate", "render", "export")

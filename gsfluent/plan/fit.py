@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Sample", "fit"]
-
 
 class Sample(NamedTuple):
     """One measurement."""

@@ -17,8 +17,6 @@ from gsfluent.plan.fact import compare, learn
 from gsfluent.results.store import content_digest, fingerprint
 from gsfluent.stages.context import RunContext
 
-__all__ = ["Foresight", "foresee_run", "judge_plan"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -20,8 +20,6 @@ from gsfluent.pipeline.simulate.engine import CFL
 from gsfluent.pipeline.simulate.groups import LANDING
 from gsfluent.scene.scene import Blade, Body, Collider, Scene
 
-__all__ = ["Mover", "Outlook", "foresee", "intact_blocks"]
-
 _TICKS = 400
 """Moments at which the boxes are compared."""
 _STRIKE = 0.05

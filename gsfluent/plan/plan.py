@@ -42,8 +42,6 @@ from gsfluent.progress import Progress
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import build_scene
 
-__all__ = ["cost_model", "plan_shot"]
-
 
 def cost_model(
     device: torch.device | str,
@@ -130,11 +128,7 @@ class Prospect:
 
 
 def plan_shot(
-    shot: Shot,
-    *,
-    device: torch.device | str = "cpu",
-    seed: int = 0,
-    model: CostModel | None = None,
+    shot: Shot, *, device: torch.device | str = "cpu", seed: int = 0, model: CostModel | None = None
 ) -> dict[str, Any]:
     """Plan a shot.
 
@@ -224,10 +218,7 @@ def _budget(prospect: Prospect, model: CostModel | None) -> dict[str, float] | N
     seconds = prospect.shot.solve.seconds_per_frame
     if seconds is None or model is None:
         return None
-    return {
-        "seconds_per_frame": seconds,
-        "dx_by_formula": rough_spacing(prospect, model, seconds),
-    }
+    return {"seconds_per_frame": seconds, "dx_by_formula": rough_spacing(prospect, model, seconds)}
 
 
 def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:
@@ -281,10 +272,7 @@ def _costs(
         return {"seconds": None, "memory_bytes": memory_of(name, features, kind)}
     cost: Cost = model.stage(name, features)
     unknown = name == "texture" and texture_method(shot) in NOT_PREDICTED
-    return {
-        "seconds": None if unknown else round(cost.seconds, 3),
-        "memory_bytes": cost.bytes,
-    }
+    return {"seconds": None if unknown else round(cost.seconds, 3), "memory_bytes": cost.bytes}
 
 
 def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -> list[str]:

@@ -36,8 +36,6 @@ from gsfluent.progress import Progress, quiet_logs, report_progress
 from gsfluent.stages.chain import run_stages
 from gsfluent.stages.solids import context_of
 
-__all__ = ["FEATURES", "calibrate"]
-
 _log = logging.getLogger(__name__)
 
 FEATURES: dict[str, tuple[str, ...]] = {
@@ -188,15 +186,9 @@ def run_small(
                 "image_size": size.image_size,
             },
             "fill": {"resolution": size.resolution},
-            "texture": {
-                "method": "exemplar",
-                "exemplar": str(folder / "photographs" / "cut.png"),
-            },
+            "texture": {"method": "exemplar", "exemplar": str(folder / "photographs" / "cut.png")},
             "objects": {"melon": {"material": size.material}},
-            "events": [
-                {"type": "drop", "height": 0.01},
-                {"type": "throw", "velocity": [0, 0, -4]},
-            ],
+            "events": [{"type": "drop", "height": 0.01}, {"type": "throw", "velocity": [0, 0, -4]}],
             "solve": {"quality": "preview", "cells": size.cells},
             "output": {"fps": fps, "seconds": size.frames / fps, "size": list(size.picture)},
         }

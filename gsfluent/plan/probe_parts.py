@@ -27,8 +27,6 @@ from gsfluent.results.frames import save_frame
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import saved, thin_walls
 
-__all__ = ["ball", "measure_solver"]
-
 _STEPS = 48
 _WARM = 8
 _SPEED = 6.0

@@ -29,8 +29,6 @@ from gsfluent.stages.select import select_mask
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Photographs", "Proxy", "look_at_photographs", "proxy"]
-
 _VOXELS = 48
 _MARGIN = 8
 """Pixels that training keeps around a mask."""
@@ -164,11 +162,7 @@ def look_at_photographs(
 
 
 def _carved(
-    shot: Shot,
-    capture: Capture,
-    grid: np.ndarray,
-    inside: np.ndarray,
-    photographs: Photographs,
+    shot: Shot, capture: Capture, grid: np.ndarray, inside: np.ndarray, photographs: Photographs
 ) -> Proxy:
     """Proxies from the voxels of a hull, selected as the splats of a run are."""
     occupied = torch.from_numpy(inside)

@@ -23,20 +23,6 @@ from gsfluent.plan.motion import Outlook
 from gsfluent.plan.proxy import Photographs, Proxy
 from gsfluent.scene.scene import Scene
 
-__all__ = [
-    "NOT_PREDICTED",
-    "born_splats",
-    "export_work",
-    "fill_work",
-    "isolate_work",
-    "reconstruct_work",
-    "render_work",
-    "simulate_work",
-    "splat_count",
-    "texture_method",
-    "texture_work",
-]
-
 NOT_PREDICTED = ("diffusion", "inpaint")
 """Texture methods whose cost is that of a model which the user brings."""
 _ITERATIONS = 800

@@ -16,8 +16,6 @@ from gsfluent.errors import InputError, MissingPackage
 from gsfluent.figure.page import Page
 from gsfluent.figure.series import Panel, curves
 
-__all__ = ["REPORT", "read_run", "report_page", "write_report"]
-
 REPORT = "report.html"
 _KINDS = {"clean": "good", "healed": "warn", "failed": "bad"}
 Values = Mapping[str, Any]

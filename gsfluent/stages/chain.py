@@ -9,8 +9,6 @@ from gsfluent.stages.show import export_stage, render_stage
 from gsfluent.stages.simulate import simulate_stage
 from gsfluent.stages.solids import make_solids
 
-__all__ = ["run_stages"]
-
 
 def run_stages(context: RunContext, settle: Callable[[RunContext], None] | None = None) -> None:
     """Do every stage of a shot, or find it done.

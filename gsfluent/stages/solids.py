@@ -143,9 +143,7 @@ def fill_stage(context: RunContext) -> None:
             wanted = {"resolution": fill_resolution(extents[name], largest, cells)}
             stage = Fill(**wanted | options, down=down, seed=context.seed)
             solid = stage(
-                splats.to(context.device),
-                context.capture,
-                progress=context.reporter.task("fill"),
+                splats.to(context.device), context.capture, progress=context.reporter.task("fill")
             )
             save_solid(solid.transformed(frame), folder / f"{name}.ply")
             reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
@@ -238,10 +236,7 @@ def regions_stage(context: RunContext) -> None:
             progress = context.reporter.task("regions")
             labelled = Regions(sources)(solid, context.capture, progress, frame=context.frame)
             assert labelled.regions is not None
-            with (
-                atomic_path(folder / f"{name}.npz") as temporary,
-                open(temporary, "wb") as stream,
-            ):
+            with atomic_path(folder / f"{name}.npz") as temporary, open(temporary, "wb") as stream:
                 np.savez_compressed(stream, regions=labelled.regions.cpu().numpy())
             write_json(folder / f"{name}.json", {k: labelled.report[k] for k in _KEYS})
             reports[name] = labelled.report["region_sources"]
@@ -280,11 +275,7 @@ def _with_labels(solid: Solid, path: Path) -> Solid:
 
 
 def context_of(
-    shot: Shot,
-    out: Path,
-    device: torch.device | str,
-    seed: int,
-    reporter: Reporter | None = None,
+    shot: Shot, out: Path, device: torch.device | str, seed: int, reporter: Reporter | None = None
 ) -> RunContext:
     """What stages need to take up, or to begin, a run in a folder; nothing is done or written yet.
 

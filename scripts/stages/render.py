@@ -10,7 +10,7 @@ import sys
 import gsfluent as gf
 from gsfluent.io import save_image
 from gsfluent.pipeline.capture.orient import make_frame
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 from gsfluent.pipeline.render.camera import look_at
 from gsfluent.pipeline.render.studio import Studio
 
@@ -22,7 +22,7 @@ def main(model: str, out: str, azimuth: str = "-60") -> None:
     radius = 0.5 * float((high - low).norm())
     camera = look_at((low + high) / 2, 4.0 * radius, float(azimuth), 20.0, (800, 600))
     studio = Studio(0.0, (0.0, 0.0), radius, radius)
-    save_image(gf.pipeline.Render(camera, Light(), studio=studio)(gaussians).image, out)
+    save_image(gf.pipeline.Render(camera, key_light(), studio=studio)(gaussians).image, out)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from viewer_scene import FRAMES, HEIGHT, RADIUS, SIGMA, SPEED, frame, write_run
 
 from gsfluent import geometry
 from gsfluent.data import Camera
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 from gsfluent.viewer.draw.picture import PictureMaker, browser_camera, hidden
 from gsfluent.viewer.draw.splats import unit_size
 from gsfluent.viewer.model import look
@@ -72,7 +72,7 @@ def test_light_comes_from_where_it_is_set(maker: PictureMaker) -> None:
     camera = front(160, 160)
     sides = {}
     for name, azimuth in (("right", 0.0), ("left", 180.0)):
-        light = Light(direction=direction(azimuth, 10.0), ambient=0.3, intensity=0.9)
+        light = key_light(direction=direction(azimuth, 10.0), ambient=0.3, intensity=0.9)
         picture = maker.picture(0, camera, Look(light=light)).astype(float)
         green, _ = masks(picture)
         x = np.nonzero(green)[1]

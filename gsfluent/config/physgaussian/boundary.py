@@ -48,12 +48,7 @@ class Boundaries:
     """
 
     def __init__(
-        self,
-        values: Mapping[str, Any],
-        space: Space,
-        points: Array,
-        mass: Array,
-        seconds: float,
+        self, values: Mapping[str, Any], space: Space, points: Array, mass: Array, seconds: float
     ) -> None:
         self.values, self.space = values, space
         self.points, self.mass, self.seconds = points, mass, seconds

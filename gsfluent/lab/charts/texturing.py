@@ -21,9 +21,8 @@ from gsfluent.lab.truth.interiors import KnownInterior, known_interior
 from gsfluent.lab.truth.interiors_judge import Judge
 from gsfluent.pipeline.texture import InteriorTexture, Texture, load_exemplar
 from gsfluent.pipeline.texture.baselines import telea_slices
-from gsfluent.pipeline.texture.photo.exemplar import open_exemplars
+from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
 from gsfluent.pipeline.texture.photo.profile import depth_profile, profile_volume
-from gsfluent.pipeline.texture.synthesis.method import load_exemplars
 from gsfluent.pipeline.texture.volume.domain import blend_skin
 
 XLABEL = "seconds"
@@ -51,8 +50,8 @@ def texture(known: KnownInterior, method: str, device: str, model: str | None) -
     else:
         chosen = stage(known, method, photos, model, device)
         shown = chosen.exemplar
-        opened = None if shown is None else load_exemplars(open_exemplars(shown, chosen.photo))
-        made = chosen._make(known.domain, opened, None)
+        opened = None if shown is None else load_exemplars(shown, chosen.photo)
+        made = chosen.make(known.domain, opened, torch.device(device))
         if device != "cpu":
             torch.cuda.synchronize()
     rgb = blend_skin(known.domain, made.rgb.clip(0.0, 1.0))

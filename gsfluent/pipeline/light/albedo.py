@@ -16,7 +16,7 @@ limits of one capture. The mean brightness cannot be known; it is kept.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,9 +26,7 @@ from gsfluent import geometry
 from gsfluent.data import INTERIOR, Gaussians
 from gsfluent.pipeline.light.normals import estimate_normals
 from gsfluent.pipeline.light.shade import harmonics, to_display, to_linear
-
-if TYPE_CHECKING:
-    from gsfluent.results.frames import SavedFrame
+from gsfluent.results.frames import SavedFrame
 
 _SAMPLES = 3000  # splats that the light is estimated from
 _PARTNERS = 40  # pairs per splat
@@ -99,23 +97,17 @@ def estimate_shading(gaussians: Gaussians, *, normals: Tensor | None = None) -> 
 
 
 def to_albedo(
-    gaussians: Gaussians,
-    shading: Shading | None = None,
-    *,
-    strength: float = 1.0,
-    normals: Tensor | None = None,
+    gaussians: Gaussians, *, strength: float = 1.0, normals: Tensor | None = None
 ) -> Gaussians:
     """Splats with the captured light divided out of their colours; splats of the inside unchanged.
 
     Args:
         gaussians: The object as captured, not broken.
-        shading: From :func:`estimate_shading`; found here when None.
-        strength: Share of it that is divided out, 0 to 1.
+        strength: Share of the light that is divided out, 0 to 1.
         normals: Outward normals [N, 3]; estimated when None.
     """
     normals = estimate_normals(gaussians) if normals is None else normals
-    if shading is None:
-        shading = estimate_shading(gaussians, normals=normals)
+    shading = estimate_shading(gaussians, normals=normals)
     light = harmonics(normalize(normals.double(), dim=-1)) @ shading.coefficients
     light = light.clamp(min=_LEAST).pow(strength).to(gaussians.means)
     # deep below the skin the normal says nothing

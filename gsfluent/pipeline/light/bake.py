@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from gsfluent import geometry
 from gsfluent.data import Gaussians
-from gsfluent.pipeline.light.lamps import Light, Lighting, lighting_of, pack_lamps
+from gsfluent.pipeline.light.lamps import Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import ambient_occlusion
 from gsfluent.pipeline.light.shade import shade_points, to_display, to_linear
@@ -27,7 +27,7 @@ _LIFT = 1.0
 @torch.no_grad()
 def bake_light(
     gaussians: Gaussians,
-    light: Light | Lighting,
+    light: Lighting,
     *,
     groups: Tensor | None = None,
     normal_cell: float | None = None,
@@ -49,9 +49,7 @@ def bake_light(
     Returns:
         The same splats in the same order with relit ``sh``.
     """
-    lighting = lighting_of(light)
-    assert lighting is not None  # not None was given
-    lighting = lighting.at(time)
+    lighting = light.at(time)
     means = gaussians.means
     matter = bulk(gaussians)
     size = grid_for(gaussians, cell=normal_cell, radius=matter.radius)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.errors import InputError
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.light.shade import harmonics, to_linear
 
 Coefficients = tuple[tuple[float, float, float], ...]
@@ -56,8 +57,6 @@ def of_file(path: Path) -> Coefficients:
     Raises:
         InputError: It cannot be read, or is not twice as wide as high.
     """
-    import cv2
-
     if path.suffix.lower() not in _ENDINGS:
         raise InputError(f"{path}: not a picture", f"give one of {', '.join(_ENDINGS)}")
     found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -89,16 +88,9 @@ def turned(coefficients: Coefficients, degrees: float) -> Coefficients:
     return _rows(torch.linalg.lstsq(harmonics(flat), values).solution)
 
 
-def summed(
-    parts: list[tuple[Coefficients, tuple[float, float, float]]],
-) -> Coefficients | None:
-    """Sum of environments, each times a colour; None of none."""
-    if not parts:
-        return None
-    total = torch.zeros(9, 3, dtype=torch.float64)
-    for coefficients, factor in parts:
-        total += torch.tensor(coefficients, dtype=torch.float64) * torch.tensor(factor)
-    return _rows(total)
+def scaled(coefficients: Coefficients, factor: float) -> Coefficients:
+    """The environment, ``factor`` times as bright."""
+    return _rows(torch.tensor(coefficients, dtype=torch.float64) * torch.tensor(factor) + 0.0)
 
 
 def _directions(height: int, width: int) -> tuple[Tensor, Tensor]:

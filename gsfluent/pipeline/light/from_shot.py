@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsfluent import materials
+from gsfluent.config import Shot
 from gsfluent.config.read import Place
 from gsfluent.config.settings_light import EnvironmentSettings, LightSettings, read_light
 from gsfluent.config.yaml_file import read_yaml
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lamp, Lighting
-
-if TYPE_CHECKING:
-    from gsfluent.config import ObjectSettings, Shot
-    from gsfluent.results.frames import SavedFrame
+from gsfluent.results.frames import SavedFrame
 
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
@@ -30,20 +28,14 @@ def light_of(shot: Shot) -> Lighting:
     Raises:
         InputError: A number out of range, or an environment picture that cannot be read.
     """
-    return lighting_from(shot.light)
+    return _lighting(shot.light)
 
 
-def lighting_from(settings: LightSettings) -> Lighting:
-    """As :func:`light_of`, from a ``light:`` section."""
-    lamps = [Lamp(**settings.key.given())]
-    lamps += [Lamp(**lamp.given()) for lamp in settings.lights]
+def _lighting(settings: LightSettings) -> Lighting:
+    lamps = [Lamp(**lamp.given()) for lamp in (settings.key, *settings.lights)]
     shared = {name: value for name, value in settings.given().items() if name in _SHARED}
     around = None if settings.environment is None else _environment(settings.environment)
-    return Lighting(
-        lamps=tuple(lamps),
-        environment=around,
-        **shared,
-    )
+    return Lighting(lamps=tuple(lamps), environment=around, **shared)
 
 
 def changed(
@@ -78,9 +70,8 @@ def changed(
     if light is not None:
         text = light.removeprefix("key=")
         if Path(text).suffix.lower() in (".yaml", ".yml"):
-            lighting = lighting_from(
-                read_light(read_yaml(Path(text)), Place("", Path(text).parent))
-            )
+            place = Place("", Path(text).parent)
+            lighting = _lighting(read_light(read_yaml(Path(text)), place))
         else:
             direction = _numbers(text, "--light")
     key = {"direction": direction, "intensity": intensity, "size": lamp_size, "spin": spin}
@@ -103,12 +94,11 @@ def changed(
 
 def looks_of(shot: Shot) -> dict[str, tuple[float, float]]:
     """k_s and n_s of every object of a shot; a picture hangs on them, its simulation does not."""
-    return {name: _shine(settings) for name, settings in shot.objects.items()}
-
-
-def _shine(settings: ObjectSettings) -> tuple[float, float]:
-    made_of = materials.get(settings.material).override(**dict(settings.overrides))
-    return made_of.specular, made_of.shininess
+    made = {
+        name: materials.get(settings.material).override(**dict(settings.overrides))
+        for name, settings in shot.objects.items()
+    }
+    return {name: (each.specular, each.shininess) for name, each in made.items()}
 
 
 def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
@@ -145,7 +135,7 @@ def _environment(settings: EnvironmentSettings) -> environment.Coefficients | No
         found = environment.sky_and_ground(settings.sky, settings.ground)
     if settings.turn:
         found = environment.turned(found, settings.turn)
-    return environment.summed([(found, (settings.intensity,) * 3)])
+    return environment.scaled(found, settings.intensity)
 
 
 def _surroundings(text: str) -> environment.Coefficients | None:
@@ -165,9 +155,9 @@ def _lamp(text: str) -> Lamp:
         name, _, value = part.strip().partition("=")
         numbers = _numbers(value, f"--lamp {name}", count=None)
         if name in ("point", "sun"):
-            values["position" if name == "point" else "direction"] = _three(numbers, part)
+            values["position" if name == "point" else "direction"] = _numbers(value, "--lamp")
         elif name == "color":
-            values[name] = _three(numbers, part)
+            values[name] = _numbers(value, "--lamp color")
         elif name in {f.name for f in fields(Lamp)} and len(numbers) == 1:
             values[name] = int(numbers[0]) if name == "samples" else numbers[0]
         else:
@@ -187,10 +177,4 @@ def _numbers(text: str, what: str, count: int | None = 3) -> tuple[float, ...]:
         numbers = ()
     if not numbers or (count is not None and len(numbers) != count):
         raise InputError(f"{what} {text!r}", "give numbers such as 1,-1,2")
-    return numbers
-
-
-def _three(numbers: tuple[float, ...], text: str) -> tuple[float, ...]:
-    if len(numbers) != 3:
-        raise InputError(f"--lamp: {text!r}", "give three numbers such as 0.3,0,0.5")
     return numbers

@@ -189,43 +189,17 @@ class Lighting:
         return _around(self.ambient, self.environment, like.dtype, like.device)
 
 
-@dataclass(frozen=True)
-class Light:
-    """One directional key light and an ambient term: the short form of :class:`Lighting`.
-
-    Attributes:
-        direction: From the scene toward the light, scene frame; any length but zero.
-        intensity: I_L of the key light.
-        ambient: I_a.
-        specular: k_s of Blinn-Phong.
-        shininess: n_s of Blinn-Phong.
-        shadow: Whether the key light is occluded by the object.
-    """
-
-    direction: Vector = (1.0, -1.0, 2.0)
-    intensity: float = INTENSITY
-    ambient: float = AMBIENT
-    specular: float = SPECULAR
-    shininess: float = SHININESS
-    shadow: bool = True
-
-    def __post_init__(self) -> None:
-        """Check ranges."""
-        self.lighting()
-
-    def lighting(self) -> Lighting:
-        """The same light in the long form."""
-        return Lighting(
-            lamps=(Lamp(direction=self.direction, intensity=self.intensity, shadow=self.shadow),),
-            ambient=self.ambient,
-            specular=self.specular,
-            shininess=self.shininess,
-        )
-
-
-def lighting_of(light: Light | Lighting | None) -> Lighting | None:
-    """The long form of either, None of None."""
-    return light.lighting() if isinstance(light, Light) else light
+def key_light(
+    direction: Vector = (1.0, -1.0, 2.0),
+    intensity: float = INTENSITY,
+    ambient: float = AMBIENT,
+    specular: float = SPECULAR,
+    shininess: float = SHININESS,
+    shadow: bool = True,
+) -> Lighting:
+    """One directional key light and an ambient term: the short form of :class:`Lighting`."""
+    lamp = Lamp(direction=direction, intensity=intensity, shadow=shadow)
+    return Lighting((lamp,), ambient=ambient, specular=specular, shininess=shininess)
 
 
 def pack_lamps(lamps: tuple[Lamp, ...], faces: tuple[int, ...], like: Tensor) -> Tensor:

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import INTERIOR, Gaussians
-from gsfluent.pipeline.light.occlusion import COARSEST, PER_CELL, Occupancy, occupancy
+from gsfluent.pipeline.light.occlusion import COARSEST, FULL, PER_CELL, Occupancy, box_frame
+from gsfluent.pipeline.light.shadow_maps import bulk
 
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
@@ -62,8 +63,10 @@ class Grid(NamedTuple):
     per_cell: float
 
     def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
-        """Occupancy of centres [N, 3] around ``center`` [m]."""
-        return occupancy(means, center, self.cell, self.nodes, per_cell=self.per_cell)
+        """Occupancy of centres [N, 3] around ``center`` [m]; those off the grid are left out."""
+        frame = means.new_tensor(box_frame(center, self.cell, self.nodes))
+        values = ops.occupancy(means, frame, self.nodes, full=FULL * self.per_cell)
+        return Occupancy(values, frame, self.nodes)
 
 
 def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float = 0.0) -> Grid:
@@ -76,8 +79,6 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
             coarser grid rather than one of gigabytes.
         radius: The matter will not reach farther than this from its mean [m]; found here when 0.
     """
-    from gsfluent.pipeline.light.shadow_maps import bulk
-
     cell = occupancy_cell(gaussians) if cell is None else cell
     radius = radius or bulk(gaussians).radius
     most = _MOST_NODES if gaussians.device.type == "cuda" else _MOST_NODES_CPU
@@ -88,14 +89,7 @@ def grid_for(gaussians: Gaussians, *, cell: float | None = None, radius: float =
 
 
 def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tensor:
-    """Outward vectors of Gaussians, shape [N, 3], to be blended; length up to one by certainty.
-
-    Args:
-        gaussians: In the scene frame, any state.
-        cell: Grid spacing; found from the positions when not given.
-    """
-    from gsfluent.pipeline.light.shadow_maps import bulk
-
+    """Outward vectors of Gaussians, shape [N, 3], to be blended; length up to one by certainty."""
     matter = bulk(gaussians)
     grid = grid_for(gaussians, cell=cell, radius=matter.radius)
     return splat_normals(gaussians, grid.of(gaussians.means, matter.center))

@@ -2,7 +2,7 @@
 
 The grid has a fixed number of nodes and a cell of about three splats (``occupancy_cell``); it
 follows the bulk of the matter in whole steps of its coarsest cell, so that nothing swims. Splats
-outside (a crumb that flew far) take no part. Everything is a handful of tensor operations without
+outside (debris that flew far) take no part. Everything is a handful of tensor operations without
 a host synchronisation: one scatter, pooling, and one lookup per quantity.
 """
 
@@ -15,7 +15,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.ops.density import LEVELS
 
 # Splats per cell of the matter's inside, and the share of it from which a place is full; below one,
@@ -62,27 +61,6 @@ def box_frame(center: Sequence[float], cell: float, nodes: int) -> list[float]:
     """Corner x, y, z and cell of a grid of ``nodes``^3 around ``center`` [m], in whole steps."""
     step = cell * COARSEST
     return [*(round((x - 0.5 * nodes * cell) / step) * step for x in center), cell]
-
-
-def occupancy(
-    means: Tensor,
-    center: Sequence[float],
-    cell: float,
-    nodes: int,
-    *,
-    per_cell: float = PER_CELL,
-) -> Occupancy:
-    """Occupancy of the bulk of ``means`` [N, 3], by :func:`gsfluent.ops.occupancy`.
-
-    Args:
-        means: Centres [m]; those off the grid are left out.
-        center: Middle of the grid [m], about.
-        cell: Finest cell [m].
-        nodes: Cells along each side, a multiple of 16.
-        per_cell: Splats in a full cell.
-    """
-    frame = means.new_tensor(box_frame(center, cell, nodes))
-    return Occupancy(ops.occupancy(means, frame, nodes, full=FULL * per_cell), frame, nodes)
 
 
 def sample(volume: Tensor, frame: Tensor, nodes: int, points: Tensor) -> Tensor:

@@ -20,10 +20,7 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import Gaussians
-from gsfluent.pipeline.light.lamps import (
-    Lamp,
-    Vector,
-)
+from gsfluent.pipeline.light.lamps import Lamp, Vector
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shade import MAP
 from gsfluent.pipeline.light.shadow import ShadowMaps
@@ -99,15 +96,11 @@ def shadow_maps(
     *,
     groups: Tensor | None = None,
 ) -> ShadowMaps | None:
-    """Render the maps of all lamps; None when none casts a shadow.
+    """Render the maps, ``size`` texels wide, of all lamps; None when none casts a shadow.
 
-    Args:
-        gaussians: What blocks the light.
-        lamps: What :meth:`gsfluent.pipeline.light.lamps.Lighting.drawn` gives.
-        faces: What :func:`faces_of` gives.
-        size: Texels along the side of a map.
-        matter: What :func:`bulk` gives.
-        groups: Siblings of which only the nearest shades a texel, int32 [N].
+    Lamps, ``faces`` and matter are what :meth:`gsfluent.pipeline.light.lamps.Lighting.drawn`,
+    :func:`faces_of` and :func:`bulk` give; of siblings (``groups`` int32 [N]) only the nearest
+    shades.
     """
     if not any(faces):
         return None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,29 +18,12 @@ from gsfluent.data import BACKGROUND, Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light.shade import arriving, surface_points, to_display, to_linear
-
-if TYPE_CHECKING:
-    from gsfluent.pipeline.light.shadow_maps import Lit
+from gsfluent.pipeline.light.shadow_maps import Lit
 
 _NEAREST = 24  # splats that colour a covered spot
 _COLUMN = 0.9  # of the object's half width: the column whose inside nobody saw
 _PATCH = 40  # spots along the diameter of the covered disc
 _ALPHA_FLOOR = 1e-4
-
-
-@dataclass(frozen=True)
-class Behind:
-    """The backdrop as one camera sees it.
-
-    Attributes:
-        image: Display values times opacity, [H, W, 3].
-        alpha: Opacity, [H, W].
-        depth: Median camera z [m], 0 where there is none, [H, W].
-    """
-
-    image: Tensor
-    alpha: Tensor
-    depth: Tensor
 
 
 @dataclass(frozen=True)
@@ -57,12 +39,10 @@ class Backdrop:
     radius: float
 
     @torch.no_grad()
-    def draw(self, camera: Camera, lit: Lit | None) -> Behind:
-        """Draw the backdrop.
+    def draw(self, camera: Camera, lit: Lit | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Display values times opacity [H, W, 3], opacity [H, W] and median camera z [m] [H, W].
 
-        Args:
-            camera: Pinhole camera.
-            lit: The light that the matter leaves; None draws no shadows.
+        ``lit`` is the light that the matter leaves; None draws no shadows.
         """
         splats = self.gaussians
         viewmat, intrinsics = camera.viewmat.to(splats.means), camera.K.to(splats.means)
@@ -72,7 +52,7 @@ class Backdrop:
         image, alpha, surface = seen.image, seen.alpha, seen.median_depth
         assert surface is not None  # asked for
         if lit is None or lit.maps is None:
-            return Behind(image, alpha, surface)
+            return image, alpha, surface
         points, _ = surface_points(surface, viewmat, intrinsics)
         up = torch.zeros_like(points)
         up[..., 2] = 1.0
@@ -82,7 +62,7 @@ class Backdrop:
         share = left / open_light.clamp(min=_ALPHA_FLOOR)
         cover = alpha[..., None]
         shaded = to_display(to_linear(image / cover.clamp(min=_ALPHA_FLOOR)) * share) * cover
-        return Behind(torch.where(cover > 0.5, shaded, image), alpha, surface)
+        return torch.where(cover > 0.5, shaded, image), alpha, surface
 
 
 def no_background() -> InputError:

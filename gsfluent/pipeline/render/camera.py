@@ -18,14 +18,12 @@ from gsfluent.pipeline.render.path import dolly, holds_poses, through, turntable
 PATHS = ("orbit", "turntable", "dolly")
 """Camera paths that go by a name."""
 
-_FIELD_OF_VIEW = (
-    32.0  # degrees over the shorter side: a short telephoto, little perspective distortion
-)
+# degrees over the shorter side: a short telephoto, little perspective distortion
+_FIELD_OF_VIEW = 32.0
 _ELEVATION = 20.0
 _START = -60.0
-_SWEEP = (
-    70.0  # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
-)
+# degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
+_SWEEP = 70.0
 _SMOOTH_FRAMES = 5.0
 _ROOM = 1.3  # free space around the matter, as a factor on its radius
 
@@ -85,7 +83,7 @@ def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> li
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
     The distance shows nine tenths of the matter, but the whole object at least and 3.6 times the
-    object at most: a spray of crumbs must not shrink the subject to a dot.
+    object at most: a spray of debris must not shrink the subject to a dot.
 
     Args:
         action: Where the matter is.
@@ -217,12 +215,8 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
         ) from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"output.camera: {path}: {error!r}", hint) from error
-    if (
-        keys.ndim != 2
-        or keys.shape[1] != 6
-        or not keys.isfinite().all()
-        or not 1.0 <= field <= 150.0
-    ):
+    fine = keys.ndim == 2 and keys.shape[1] == 6 and bool(keys.isfinite().all())
+    if not fine or not 1.0 <= field <= 150.0:
         raise InputError(f"output.camera: {path}: fov {field}, frames {tuple(keys.shape)}", hint)
     if bool(((keys[:, :3] - keys[:, 3:]).norm(dim=-1) == 0).any()):
         raise InputError(f"output.camera: {path}: an eye equals its target", hint)

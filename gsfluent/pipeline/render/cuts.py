@@ -6,20 +6,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsfluent.data import Solid
+from gsfluent.data import SURFACE, Camera, Solid
 from gsfluent.draw import draw
 from gsfluent.io import save_image
+from gsfluent.lazy import ndimage
 from gsfluent.pipeline.solid.colors import skin_colors, skin_weights
-
-if TYPE_CHECKING:
-    from gsfluent.data import Solid
 
 _GREY = 0.55  # of matter without colour
 _SMOOTH = 3.0  # voxels; whole voxels seen at their own size are stairs and terraces
@@ -113,8 +111,7 @@ def cut_view(
     view = _Trace(solid, normal, plane, eye, weights)
     image, covered = view.shaded(splats)
     image = image * covered[..., None] + background * (1.0 - covered[..., None])
-    result: np.ndarray = image.reshape(eye.height, eye.width, 3).numpy().clip(0.0, 1.0)
-    return result.astype(np.float32)
+    return (image.reshape(eye.height, eye.width, 3).numpy().clip(0.0, 1.0)).astype(np.float32)
 
 
 def _directions(
@@ -288,8 +285,6 @@ class _Trace:
     @torch.no_grad()
     def _drawn(self, weights: np.ndarray) -> tuple[Tensor, Tensor]:
         """The splats of the skin behind the plane: colours [N, 3] before black, coverage [N]."""
-        from gsfluent.data import SURFACE, Camera
-
         gaussians, eye = self.solid.gaussians, self.eye
         labels = gaussians.labels
         assert labels is not None  # Solid checks it; narrows the type
@@ -322,8 +317,6 @@ class _Trace:
 
 def _smooth_field(occupied: np.ndarray) -> Tensor:
     """Signed distance [voxels], negative inside, without the stairs and hairs of voxels."""
-    from scipy import ndimage
-
     outer = np.maximum(ndimage.distance_transform_edt(~occupied) - 0.5, 0.0)
     inner = np.maximum(ndimage.distance_transform_edt(occupied) - 0.5, 0.0)
     signed = (outer - inner).astype(np.float32)
@@ -344,8 +337,6 @@ def _smooth_field(occupied: np.ndarray) -> Tensor:
 
 def _spread(solid: Solid) -> Tensor:
     """Colours of the matter, continued outward by the nearest, float32 [1, 3, X, Y, Z]."""
-    from scipy import ndimage
-
     assert solid.color is not None
     occupied = solid.occupancy.cpu().numpy()
     nearest = ndimage.distance_transform_edt(~occupied, return_distances=False, return_indices=True)
@@ -364,16 +355,8 @@ def _at(field: Tensor, place: Tensor) -> Tensor:
     return value[0, 0, 0, 0] + (place - held).norm(dim=1).to(field)
 
 
-_HEIGHT = 360
-
-
-_GAP = 12
-
-
+_HEIGHT, _GAP, _GROUND = 360, 12, 0.96  # of the sheet: pixels, pixels, grey
 _TILT = 25.0  # degrees that the viewer of the last cut stands above it
-
-
-_GROUND = 0.96
 
 
 def save_cut_views(solid: Solid, path: Path) -> None:

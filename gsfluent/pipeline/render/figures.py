@@ -36,7 +36,7 @@ _FIGURES = ("hole_fraction", "see_through", "hole_fraction_around", "see_through
 
 
 class RawCarry:
-    """Splats that ride rigidly on the material point that was nearest to them at the start.
+    """Splats carried rigidly by the material point that was nearest to them at the start.
 
     Args:
         first: The first frame of the simulation.

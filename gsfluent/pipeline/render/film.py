@@ -14,7 +14,7 @@ from gsfluent.io import load_capture, load_splats
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.light.albedo import Albedo
 from gsfluent.pipeline.light.from_shot import gloss_of
-from gsfluent.pipeline.light.lamps import Light, Lighting
+from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_background, object_radius
 from gsfluent.pipeline.render.camera import Action, cameras_for
@@ -43,9 +43,7 @@ class Film:
         InputError: There is no simulation, or the camera cannot be.
     """
 
-    def __init__(
-        self, out: Path, shot: Shot, light: Light | Lighting, device: torch.device
-    ) -> None:
+    def __init__(self, out: Path, shot: Shot, light: Lighting, device: torch.device) -> None:
         self.folder, self.shot, self.device = out / "stages" / "simulate", shot, device
         count = count_frames(self.folder)
         if count == 0:

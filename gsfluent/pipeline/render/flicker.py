@@ -4,7 +4,7 @@ The material point that a pixel shows (:class:`gsfluent.pipeline.render.holes.Ma
 says
 where the pixel is in the next frame; there the picture should have the same colour. The camera may
 move as well. Matter that the next frame hides, or shows as something else, is left out, and so are
-the rims of pieces and crumbs that turn: there a picture changes although nothing is wrong with it.
+the rims of pieces and debris that turns: there a picture changes although nothing is wrong with it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How much shows through the object that should not: holes in its silhouette, and in its front.
 
-When a body breaks, the Gaussians that rode on it part and what is behind shines through. What ought
+When a body breaks, the Gaussians that it carries part and what is behind shines through. What ought
 to be opaque comes from the matter itself: its material points as discs that just overlap at rest. A
 true gap between fragments is therefore no hole, a see-through fragment is, and so is an opening too
 narrow for the points to know of. Measured on true pictures of fractures
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsfluent.data import Camera, Gaussians
-from gsfluent.draw import draw
+from gsfluent.data import Camera
 from gsfluent.spatial.zbuffer import nearest_points
 
 REACH = 0.55
@@ -105,34 +104,6 @@ class Holes:
 def small(camera: Camera, longest: int = LONGEST_SIDE) -> Camera:
     """The camera at the size in which figures are measured."""
     return camera.scaled(min(1.0, longest / max(camera.width, camera.height)))
-
-
-def hole_fraction(
-    gaussians: Gaussians,
-    positions: Tensor,
-    volume: Tensor,
-    camera: Camera,
-    *,
-    groups: Tensor | None = None,
-) -> float:
-    """Share of the background that shows through the object's silhouette.
-
-    Args:
-        gaussians: What is rendered, scene frame.
-        positions: Material points [m], shape [P, 3].
-        volume: Their volumes [m^3], shape [P].
-        camera: The view; evaluated at no more than :data:`LONGEST_SIDE` on the longer side.
-        groups: As in :class:`gsfluent.pipeline.Render`.
-
-    Returns:
-        Mean transmittance in the silhouette, in [0, 1]; 0 when the matter is out of view.
-    """
-    camera = small(camera)
-    flat = torch.zeros_like(gaussians.means[:, :1])
-    drawn = draw(gaussians, camera, colors=flat, groups=groups, near=0.01, depth=True)
-    assert drawn.depth is not None  # asked for; narrows the type
-    matter = MatterView.of(positions, volume, camera)
-    return Holes.of(drawn.alpha, drawn.depth, matter).fraction
 
 
 def erode(mask: Tensor, pixels: int = 1) -> Tensor:

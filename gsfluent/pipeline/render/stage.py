@@ -20,14 +20,7 @@ from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw_at
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.lamps import (
-    SHININESS,
-    SPECULAR,
-    Light,
-    Lighting,
-    lighting_of,
-    pack_lamps,
-)
+from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import Grid, grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shadow_maps import Bulk, Lit, bulk, faces_of, shadow_maps
@@ -104,7 +97,7 @@ class Render(Stage):
     def __init__(
         self,
         camera: Camera | None = None,
-        light: Light | Lighting | None = None,
+        light: Lighting | None = None,
         *,
         studio: Studio | None = None,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
@@ -113,7 +106,7 @@ class Render(Stage):
     ) -> None:
         super().__init__()
         self.camera = camera
-        self.light = lighting_of(light)
+        self.light = light
         self.studio = studio
         self.background = background
         self.antialiased = antialiased
@@ -191,13 +184,13 @@ class Render(Stage):
             if backdrop is None:
                 image = image + behind * (1.0 - cover)
             else:
-                captured = backdrop.draw(camera, lit)
-                opaque = captured.alpha[..., None]
-                behind = captured.image + behind * (1.0 - opaque)
+                captured, opacity, away = backdrop.draw(camera, lit)
+                opaque = opacity[..., None]
+                behind = captured + behind * (1.0 - opaque)
                 image = image + behind * (1.0 - cover)
                 # what is nearer than the matter hides it
-                before = (opaque > 0.5) & (captured.depth < depth)[..., None] & (cover > 0.0)
-                image = torch.where(before, captured.image + image * (1.0 - opaque), image)
+                before = (opaque > 0.5) & (away < depth)[..., None] & (cover > 0.0)
+                image = torch.where(before, captured + image * (1.0 - opaque), image)
             image = image.clamp(0.0, 1.0)
         report = {
             "gaussians": gaussians.count,

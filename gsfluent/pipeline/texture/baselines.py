@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
 
@@ -15,8 +16,6 @@ def color_copy(domain: InteriorDomain) -> InteriorTexture:
 
 def telea_slices(domain: InteriorDomain, axes: tuple[int, ...] = (0, 1, 2)) -> InteriorTexture:
     """``cv2.inpaint`` (Telea 2004) slice by slice, averaged over the axes."""
-    import cv2
-
     total = np.zeros((*domain.inside.shape, 3), np.float32)
     slices = 0
     for axis in axes:

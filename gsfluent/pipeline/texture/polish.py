@@ -22,7 +22,6 @@ def polish_colors(
     means: np.ndarray,
     colors: np.ndarray,
     *,
-    iterations: int = 4,
     device: torch.device | None = None,
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Fit colours so that cuts through the Gaussians show the slices of the volume.
@@ -36,7 +35,6 @@ def polish_colors(
         rgb: Its colours, float32 [X, Y, Z, 3].
         means: Centres of the Gaussians in voxel units [N, 3].
         colors: Sampled colours [N, 3], kept where no slice shows a Gaussian.
-        iterations: Conjugate-gradient steps.
         device: Where to compute.
 
     Returns:
@@ -68,21 +66,14 @@ def polish_colors(
         spacing=spacing,
         masks=masks,
         initial=torch.from_numpy(colors),
-        steps=Steps(iterations),
         slab=0.5 * step,
     )
     return fitted.cpu().numpy(), {"polished": True, "spacing": spacing, **report}
 
 
 _SIGMA = 0.55  # standard deviation of a footprint over the spacing of the Gaussians
-
-
 _CUT = 2.5  # standard deviations
-
-
 _LEAST = 0.35  # weight below which a pixel shows too little to count
-
-
 _STORED = 40_000_000  # matrix entries kept (about 0.6 GB); beyond they are made anew each time
 
 
@@ -110,12 +101,8 @@ def stack_planes(
 ) -> list[SlicePlane]:
     """Planes through the voxel centres of slices of a volume; rows of a picture come first.
 
-    Args:
-        axis: Axis that the slices lie across.
-        offsets: Slice indices.
-        shape: Shape of the volume [3].
-        origin: Corner of voxel (0, 0, 0), world units [3].
-        voxel: Edge of a voxel, world units.
+    Slices ``offsets`` lie across ``axis``; ``origin`` is the corner of voxel (0, 0, 0), world
+    units.
     """
     down_axis, right_axis = (i for i in range(3) if i != axis)
     unit = torch.eye(3, dtype=origin.dtype, device=origin.device)
@@ -236,19 +223,6 @@ def _csr(rows: Tensor, columns: Tensor, values: Tensor, size: tuple[int, int]) -
         return torch.sparse_csr_tensor(start, columns.int(), values, size)
 
 
-@dataclass(frozen=True)
-class Steps:
-    """How the colours are solved for.
-
-    Attributes:
-        iterations: Conjugate-gradient steps after the vote; 0 is the vote alone.
-        prior: Weight that keeps the colours near the vote.
-    """
-
-    iterations: int = 4
-    prior: float = 0.0
-
-
 def fuse_colors(
     means: Tensor,
     planes: Sequence[SlicePlane],
@@ -258,7 +232,8 @@ def fuse_colors(
     masks: Sequence[Tensor] | None = None,
     initial: Tensor | None = None,
     fixed: Tensor | None = None,
-    steps: Steps | None = None,
+    iterations: int = 4,
+    prior: float = 0.0,
     slab: float | None = None,
 ) -> tuple[Tensor, dict[str, Any]]:
     """Colours of Gaussians that show the slices.
@@ -271,7 +246,8 @@ def fuse_colors(
         masks: Pixels that count, bool [H, W] each; None: all that show enough Gaussians.
         initial: Colours [N, 3] of Gaussians that no slice shows, and of the fixed ones.
         fixed: Gaussians whose colour stays (the surface), bool [N].
-        steps: How to solve.
+        iterations: Conjugate-gradient steps after the vote; 0 is the vote alone.
+        prior: Weight that keeps the colours near the vote.
         slab: Half-thickness of the slices; see :class:`SlabRenderer`.
 
     Returns:
@@ -285,7 +261,6 @@ def fuse_colors(
         raise ValueError(f"{len(planes)} planes for {len(targets)} targets")
     if fixed is not None and initial is None:
         raise ValueError("fixed Gaussians need their colours in initial")
-    steps = steps or Steps()
     device = means.device
     renderer = SlabRenderer(means, planes, spacing, slab)
     valid = []
@@ -316,14 +291,14 @@ def fuse_colors(
     gradient = renderer.adjoint(rest) * loose
     direction = gradient.clone()
     energy = (gradient**2).sum(0)
-    for _ in range(steps.iterations):
+    for _ in range(iterations):
         shown = [s * v for s, v in zip(renderer.render(direction), valid, strict=True)]
         curvature = torch.stack([(s**2).sum(0) for s in shown]).sum(0)
-        curvature = curvature + steps.prior * (direction**2).sum(0)
+        curvature = curvature + prior * (direction**2).sum(0)
         rate = energy / curvature.clamp(min=1e-20)
         colors = colors + rate * direction
         rest = [r - rate * s for r, s in zip(rest, shown, strict=True)]
-        gradient = (renderer.adjoint(rest) - steps.prior * (colors - anchor)) * loose
+        gradient = (renderer.adjoint(rest) - prior * (colors - anchor)) * loose
         following = (gradient**2).sum(0)
         direction = gradient + following / energy.clamp(min=1e-20) * direction
         energy = following
@@ -332,6 +307,6 @@ def fuse_colors(
     return clipped, {
         "rms_before": before,
         "rms_after": after,
-        "iterations": steps.iterations,
+        "iterations": iterations,
         "unseen": int((~seen).sum()),
     }

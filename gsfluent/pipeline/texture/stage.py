@@ -7,20 +7,25 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
+from gsfluent.data import INTERIOR, Capture, Solid
 from gsfluent.data.regions import with_inclusions
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, check_choice
+from gsfluent.geometry import rgb_to_sh0
 from gsfluent.pipeline.stage import Stage
 from gsfluent.pipeline.texture.baselines import color_copy, telea_slices
+from gsfluent.pipeline.texture.inpaint.method import diffusion_texture, no_model
 from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
 from gsfluent.pipeline.texture.photo.exemplar import (
-    Exemplar,
+    Exemplars,
     PhotoOptions,
-    open_exemplars,
+    each,
+    load_exemplars,
+    one_per_axis,
     with_skin,
 )
 from gsfluent.pipeline.texture.photo.metrics import (
@@ -31,29 +36,28 @@ from gsfluent.pipeline.texture.photo.metrics import (
     volume_slices,
 )
 from gsfluent.pipeline.texture.photo.profile import surface_profile
-from gsfluent.pipeline.texture.presets.procedural import PRESETS, preset_names, procedural_texture
+from gsfluent.pipeline.texture.polish import polish_colors
+from gsfluent.pipeline.texture.presets.procedural import (
+    check_preset,
+    preset_names,
+    procedural_texture,
+)
 from gsfluent.pipeline.texture.structure import take_apart, with_structure
 from gsfluent.pipeline.texture.sweep import CUTS
-from gsfluent.pipeline.texture.synthesis.method import QUALITIES, exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.synthesis.method import SynthesisOptions, exemplar_texture
 from gsfluent.pipeline.texture.unseen_skin import mend_unseen_skin
-from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, blend_skin
+from gsfluent.pipeline.texture.volume.domain import (
+    InteriorDomain,
+    InteriorTexture,
+    blend_skin,
+    options_of,
+)
 from gsfluent.progress import Progress, report_progress
-
-if TYPE_CHECKING:
-    from gsfluent.data import Capture, Solid
 
 logger = logging.getLogger(__name__)
 
-METHODS = (
-    "auto",
-    "exemplar",
-    "procedural",
-    "diffusion",
-    "inpaint",
-    "profile",
-    "color_copy",
-    "telea",
-)
+BASELINES = ("color_copy", "telea")
+METHODS = ("auto", "exemplar", "procedural", "diffusion", "inpaint", "profile", *BASELINES)
 
 
 class Texture(Stage):
@@ -77,13 +81,6 @@ class Texture(Stage):
         preset: Name of a procedural preset.
         prompt: Text for the diffusion model.
         model: Local folder or hub id of an inpainting pipeline.
-        quality: ``preview``, ``fast`` or ``full`` (exemplar method).
-        scale: Size of the exemplar's structure relative to the automatic choice.
-        guide: What the structure follows: ``auto``, ``depth``, ``axis`` (a cut across the object's
-            axis shows what goes on along it), ``height`` (layers along the axis) or ``none``
-            (exemplar method).
-        directional: True for grained materials: the exemplar is not turned or mirrored.
-        inclusions: Detect seeds and stones in the exemplar and place them as labelled parts.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
         cut: ``across`` or ``along`` when the (first) photograph was cut across the object's axis or
             through it: structure seen in one place only (an apple's star, segments) is then swept
@@ -95,16 +92,10 @@ class Texture(Stage):
         resume: Folder in which the diffusion method keeps finished slices.
         polish: Fit the colours of interior Gaussians that are coarser than the voxels to slices
             of the volume, instead of sampling it at their centres (:mod:`.polish`).
-        parts: Label image or mask (file or array) that shows the inclusions of the first
-            photograph, or their colour; None finds them (exemplar method).
-        depth_scale: Depth of the photograph's deepest point in units of the object's largest depth;
-            None works it out (exemplar method).
-        surface: What the surface's colours are to the inside: ``auto``, ``keep``, ``copy`` or
-            ``ignore`` (exemplar method, :func:`.exemplar.exemplar_texture`).
-        core: ``open`` or ``closed``: whether a core seen in a cut across the axis goes on from
-            pole to pole (guide ``axis``).
-        device: Where the exemplar method computes; ``auto`` takes a CUDA device when there is one.
+        device: Where the exemplar method computes; None: where the solid is.
         seed: Seed of everything random.
+        synthesis: Settings of the exemplar method, the fields of
+            :class:`~.synthesis.method.SynthesisOptions`.
 
     Raises:
         InputError: Unknown method or quality, or a method without what it needs.
@@ -120,35 +111,19 @@ class Texture(Stage):
         preset: str | None = None,
         prompt: str = "",
         model: str | Path | None = None,
-        quality: str = "fast",
-        scale: float = 1.0,
-        guide: str = "auto",
-        directional: bool = False,
-        inclusions: bool = True,
         axis: tuple[float, float, float] | None = None,
         cut: str | None = None,
         photo: PhotoOptions | Mapping[str, Any] | None = None,
         inpaint: InpaintOptions | Mapping[str, Any] | None = None,
         resume: str | Path | None = None,
         polish: bool = False,
-        parts: object = None,
-        depth_scale: float | None = None,
-        surface: str = "auto",
-        core: str = "open",
-        device: str = "auto",
+        device: str | torch.device | None = None,
         seed: int = 0,
+        **synthesis: Any,
     ) -> None:
         super().__init__(seed=seed)
-        if method not in METHODS:
-            raise InputError(
-                f"texture: method must be one of {', '.join(METHODS)}, got {method!r}",
-                hint="leave it at auto",
-            )
-        if quality not in QUALITIES:
-            raise InputError(
-                f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
-                hint="leave it at fast",
-            )
+        check_choice("texture: method", method, METHODS, "leave it at auto")
+        self.synthesis = SynthesisOptions(**synthesis)
         if method == "auto":
             method = "exemplar" if exemplar is not None else "procedural" if preset else "profile"
             if method == "profile":
@@ -164,44 +139,20 @@ class Texture(Stage):
             )
         if method == "procedural":
             preset = preset or prompt
-            if preset not in PRESETS:
-                raise InputError(
-                    f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
-                    hint="choose one of these or give an exemplar photograph",
-                )
-        options = InpaintOptions.of(inpaint)
+            check_preset(preset)
+        self.inpaint = options_of(InpaintOptions, "inpaint", inpaint)
         slices = method in ("diffusion", "inpaint")
-        if slices and "diffusers" in (options.backend, options.coarse) and model is None:
-            raise InputError(
-                f"texture: method {method!r} needs a model",
-                hint="give a local folder or hub id, for example "
-                "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
-            )
-        self.method = method
-        self.exemplar = exemplar
-        self.preset = preset
-        self.prompt = prompt
-        self.model = model
-        self.quality = quality
-        self.scale = float(scale)
-        self.guide = guide
-        self.directional = directional
-        self.inclusions = inclusions
+        if slices and "diffusers" in (self.inpaint.backend, self.inpaint.coarse) and model is None:
+            raise no_model(method)
+        if cut is not None:
+            hint = "leave it out when the structure does not follow the object's axis"
+            check_choice("texture: cut", cut, CUTS, hint)
+        self.method, self.exemplar, self.preset, self.cut = method, exemplar, preset, cut
+        self.prompt, self.model = prompt, model
         self.axis = None if axis is None else np.asarray(axis, dtype=float)
-        if cut is not None and cut not in CUTS:
-            raise InputError(
-                f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
-                hint="leave it out when the structure does not follow the object's axis",
-            )
-        self.cut = cut
-        self.photo = PhotoOptions.of(photo)
-        self.inpaint = options
+        self.photo = options_of(PhotoOptions, "photo", photo)
         self.resume = None if resume is None else Path(resume)
         self.polish = bool(polish)
-        self.parts = parts
-        self.depth_scale = depth_scale
-        self.surface = surface
-        self.core = core
         self.device = device
 
     def forward(
@@ -230,16 +181,17 @@ class Texture(Stage):
         domain, mended = mend_unseen_skin(domain, solid.report.get("closed_side"))
         exemplars, shown, structure = None, None, None
         if self.exemplar is not None:
-            opened = open_exemplars(self.exemplar, self.photo)
+            exemplars = load_exemplars(self.exemplar, self.photo)
             if self.photo.white == "skin":
-                opened = with_skin(opened, domain.skin[domain.shell])
-            exemplars = shown = load_exemplars(opened)
+                skin = domain.skin[domain.shell]
+                exemplars = each(exemplars, lambda photo: with_skin(photo, skin))
+            shown = exemplars
             if self.cut is not None:
-                opened, structure = take_apart(opened)
-                exemplars = load_exemplars(opened)
+                exemplars, structure = take_apart(exemplars)
         if not domain.inside.any():
             raise InputError("texture: the solid is empty", hint="run fill first")
-        texture = self._make(domain, exemplars, progress)
+        device = solid.occupancy.device
+        texture = self.make(domain, exemplars, device, progress)
         if structure is not None:
             texture = with_structure(domain, texture, structure, self.cut or CUTS[0])
         rgb = blend_skin(domain, texture.rgb.clip(0.0, 1.0))
@@ -251,7 +203,6 @@ class Texture(Stage):
         report = self._report(domain, texture, shown) | polished
         report["skin_mended"] = mended
         report["seconds"] = time.perf_counter() - began
-        device = solid.occupancy.device
         regions, table = with_inclusions(solid, texture.labels)
         report_progress(progress, 1, 1, "textured")
         return replace(
@@ -262,27 +213,20 @@ class Texture(Stage):
             report={**report, **table, "fill": solid.report},
         )
 
-    def _make(
+    def make(
         self,
         domain: InteriorDomain,
-        exemplars: dict[int, list[Exemplar]] | None,
-        progress: Progress | None,
+        exemplars: Exemplars | None,
+        device: torch.device,
+        progress: Progress | None = None,
     ) -> InteriorTexture:
-        """Run the chosen method."""
+        """Run the chosen method in voxels; ``device`` is where the solid is."""
         if self.method == "exemplar" and exemplars is not None:
             return exemplar_texture(
                 domain,
                 exemplars,
-                quality=self.quality,
-                scale=self.scale,
-                guide=self.guide,
-                directional=self.directional,
-                inclusions=self.inclusions,
-                parts=self.parts,
-                depth_scale=self.depth_scale,
-                surface=self.surface,
-                core=self.core,
-                device=self.device,
+                self.synthesis,
+                device=self.device or device,
                 seed=self.seed,
                 progress=progress,
             )
@@ -293,14 +237,12 @@ class Texture(Stage):
         if self.method == "telea":
             return telea_slices(domain)
         if self.method in ("diffusion", "inpaint"):
-            from gsfluent.pipeline.texture.inpaint.method import diffusion_texture
-
             return diffusion_texture(
                 domain,
                 self.model,
                 prompt=self.prompt,
                 options=self.inpaint,
-                exemplar=None if exemplars is None else _one_per_axis(exemplars),
+                exemplar=exemplars,
                 resume=self.resume,
                 seed=self.seed,
                 progress=progress,
@@ -312,7 +254,7 @@ class Texture(Stage):
         self,
         domain: InteriorDomain,
         texture: InteriorTexture,
-        exemplars: dict[int, list[Exemplar]] | None,
+        exemplars: Exemplars | None,
     ) -> dict[str, Any]:
         """Figures for ``run.json``; distances are to the exemplar and null without one."""
         ratios = neighbour_slice_ratio(texture.rgb, domain.inside)
@@ -326,14 +268,14 @@ class Texture(Stage):
             **texture.report,
         }
         if exemplars is not None:
-            photo = _one_per_axis(exemplars)[0]
+            photo = one_per_axis(exemplars)[0]
             if "photo_pitch" in texture.report:
-                factor = texture.report["photo_pitch"] / self.scale
+                factor = texture.report["photo_pitch"] / self.synthesis.scale
             elif photo.silhouette:
                 factor = domain.max_depth / max(photo.max_depth, 1.0)
             else:
                 factor = max(domain.inside.shape) / max(photo.mask.shape)
-            fitted = photo.resized(self.scale * factor)
+            fitted = photo.resized(self.synthesis.scale * factor)
             slices = volume_slices(texture.rgb, domain.inside)
             report["patch_distance"] = patch_distance(slices, [(fitted.image, fitted.mask)])
             interior = texture.rgb[domain.inside]
@@ -343,19 +285,10 @@ class Texture(Stage):
         return report
 
 
-def _one_per_axis(exemplars: dict[int, list[Exemplar]]) -> dict[int, Exemplar]:
-    """The first photograph of every axis; axes without one share the first of all."""
-    first = next(iter(exemplars.values()))
-    return {axis: exemplars.get(axis, first)[0] for axis in range(3)}
-
-
 def _color_interior(
     solid: Solid, texture: InteriorTexture, domain: InteriorDomain, polish: bool = False
 ) -> tuple[Any, dict[str, Any]]:
     """Gaussians whose INTERIOR rows wear the volume's colour, all others the same; a report."""
-    from gsfluent.data import INTERIOR
-    from gsfluent.geometry import rgb_to_sh0
-
     gaussians = solid.gaussians
     if gaussians.labels is None:
         return gaussians, {}
@@ -367,12 +300,8 @@ def _color_interior(
     color = texture.sample(place, domain.inside)
     report: dict[str, Any] = {}
     if polish:
-        from gsfluent.pipeline.texture.polish import polish_colors
-
-        color, figures = polish_colors(
-            domain, texture.rgb, place, color, device=solid.occupancy.device
-        )
-        report = {"polish": figures}
+        device = solid.occupancy.device
+        color, report["polish"] = polish_colors(domain, texture.rgb, place, color, device=device)
     sh = gaussians.sh.clone()
     sh[chosen] = 0.0
     sh[chosen, 0] = rgb_to_sh0(torch.from_numpy(color).to(sh))

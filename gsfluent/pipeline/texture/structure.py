@@ -8,17 +8,22 @@ material and goes to the synthesis.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from gsfluent.colors import rgb_to_lab
+from gsfluent.colors import lab_to_rgb, rgb_to_lab
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar
+from gsfluent.lazy import cv2, ndimage
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, Exemplars, each
 from gsfluent.pipeline.texture.sweep import Sweep, outline
-from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, smoothstep
+from gsfluent.pipeline.texture.volume.domain import (
+    InteriorDomain,
+    InteriorTexture,
+    nearest_in,
+    smoothstep,
+)
 
 _BINS = 32
 _NEAR = 16.0  # Lab distance within which the next depth of an inner half is the same material
@@ -45,21 +50,13 @@ class Structure:
 
 
 def split_structure(photo: Exemplar) -> tuple[Exemplar, Structure]:
-    """Take structure and material of a cut face apart.
+    """Take material and structure of a cut face with an outline apart.
 
     Structure is what differs from the median colour at its depth, at a scale coarser than grain (a
     fiftieth of the largest depth), by more than three times what is usual in this photograph and by
     more than five units of Lab; single grains do not count. Its place is painted over with the
     median colour of its depth and with the grain mirrored from beside it.
-
-    Args:
-        photo: Photograph with an outline.
-
-    Returns:
-        The material alone, and the structure.
     """
-    from scipy import ndimage
-
     mask, largest = photo.mask, max(photo.max_depth, 1e-6)
     width = max(0.7, 0.02 * largest)
     lab = rgb_to_lab(photo.image)
@@ -123,10 +120,6 @@ def _medians(
 
 def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float) -> Exemplar:
     """The photograph with ``hole`` painted in given Lab colours and the grain from beside it."""
-    from scipy import ndimage
-
-    from gsfluent.colors import lab_to_rgb
-
     if not hole.any():
         return photo
     reach = max(1, round(width))
@@ -134,7 +127,7 @@ def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float
     good = photo.mask & ~hole
     if not good.any():
         return photo
-    nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
+    nearest = np.stack(nearest_in(good))
     here = np.indices(hole.shape)
     # two pixels of distance from the edge of the hole, where its blur begins
     mirror = np.clip(2 * nearest - here, 0, np.array(hole.shape)[:, None, None] - 1)
@@ -151,23 +144,12 @@ def _painted(photo: Exemplar, hole: np.ndarray, middle: np.ndarray, width: float
 def impose_structure(
     domain: InteriorDomain, rgb: np.ndarray, structure: Structure, cut: str = "across"
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Sweep the structure about the object's axis into a synthesised solid.
-
-    Args:
-        domain: The solid.
-        rgb: Colours of its material [X, Y, Z, 3].
-        structure: Of a photograph cut ``across`` or ``along`` the axis.
-        cut: Which of the two.
+    """Sweep a structure cut ``across`` or ``along`` the object's axis into a synthesised solid.
 
     Returns:
         Colours float32 [X, Y, Z, 3], and a report: ``cut``; ``swept``, the share of the solid that
         is structure; ``core``, whether it closes above and below the middle.
-
-    Raises:
-        InputError: Unknown cut.
     """
-    from scipy import ndimage
-
     inside = domain.inside
     share = structure.share
     mask = structure.photo.mask
@@ -191,34 +173,25 @@ def impose_structure(
     return done.clip(0.0, 1.0).astype(np.float32), report
 
 
-def take_apart(opened: Any) -> tuple[Any, Structure]:
+def take_apart(exemplars: Exemplars) -> tuple[Exemplars, Structure]:
     """Material of all exemplars, and the structure of the first.
 
-    Args:
-        opened: What :func:`.photo.open_exemplars` returned.
-
     Raises:
-        InputError: A photograph has no outline.
+        InputError: There is none, or a photograph has no outline.
     """
     found: list[Structure] = []
 
-    def material(part: Any) -> Any:
-        if isinstance(part, Mapping):
-            return {axis: material(item) for axis, item in part.items()}
-        if isinstance(part, list):
-            return [material(item) for item in part]
-        if not isinstance(part, Exemplar):
-            return part
-        if not part.silhouette:
+    def material(photo: Exemplar) -> Exemplar:
+        if not photo.silhouette:
             raise InputError(
-                f"texture: cut needs a photograph with an outline ({part.note})",
+                f"texture: cut needs a photograph with an outline ({photo.note})",
                 hint="cut the object out (RGBA), or leave cut out",
             )
-        plain, structure = split_structure(part)
+        plain, structure = split_structure(photo)
         found.append(structure)
         return plain
 
-    plain = material(opened)
+    plain = each(exemplars, material)
     if not found:
         raise InputError("texture: cut needs an exemplar", hint="give a photograph of the cut")
     return plain, found[0]
@@ -246,7 +219,5 @@ def _core_radius(structure: Structure, center: np.ndarray) -> float:
 
 def _resized(share: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """A plane in 0..1 at another size."""
-    import cv2
-
     method = cv2.INTER_AREA if shape[0] < share.shape[0] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(share, (shape[1], shape[0]), interpolation=method), np.float32)

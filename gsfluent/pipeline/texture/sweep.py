@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfluent.errors import InputError
+from gsfluent.errors import check_choice
+from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.volume.domain import axis_frame
 from gsfluent.pipeline.texture.volume.noise import value_noise
 
@@ -53,11 +54,8 @@ class Sweep:
         cut: str = "across",
         core: float | None = None,
     ) -> None:
-        if cut not in CUTS:
-            raise InputError(
-                f"texture: cut must be one of {', '.join(CUTS)}, got {cut!r}",
-                hint="across: the photograph was cut across the axis; along: through it",
-            )
+        hint = "across: the photograph was cut across the axis; along: through it"
+        check_choice("texture: cut", cut, CUTS, hint)
         self.cut, self.inside = cut, inside
         index = np.argwhere(inside)
         frame = axis_frame(axis)
@@ -95,16 +93,7 @@ class Sweep:
         self.way = np.clip(flat / far, 0.0, 1.0)
 
     def colors(self, image: np.ndarray, mask: np.ndarray, center: np.ndarray) -> np.ndarray:
-        """Values of a picture at the voxels' places.
-
-        Args:
-            image: [H, W, C].
-            mask: The face, bool [H, W].
-            center: Row and column of the core.
-
-        Returns:
-            float32 [n, C], in the order of ``argwhere(inside)``.
-        """
+        """Values float32 [n, C] of a picture [H, W, C] with its core at ``center``."""
         edge = outline(mask, center)
         if self.cut == "across":
             return self._look(image, edge, center, self.azimuth)
@@ -117,8 +106,6 @@ class Sweep:
     def _look(
         self, image: np.ndarray, edge: np.ndarray, center: np.ndarray, angle: np.ndarray
     ) -> np.ndarray:
-        from scipy import ndimage
-
         turn = np.mod(angle / (2 * np.pi) * len(edge), len(edge))
         radius = self.way * np.interp(turn, np.arange(len(edge) + 1), np.append(edge, edge[0]))
         # image rows run down, the second object axis up
@@ -130,14 +117,12 @@ class Sweep:
         return np.stack(channels, 1).astype(np.float32)
 
 
-def outline(mask: np.ndarray, center: np.ndarray, turns: int = 360) -> np.ndarray:
+def outline(mask: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Distance from a point to the edge of a mask at equal steps of azimuth [pixels].
 
     Azimuth 0 points along the columns, a quarter turn up the picture.
     """
-    from scipy import ndimage
-
-    angle = 2 * np.pi * np.arange(turns) / turns
+    angle = 2 * np.pi * np.arange(360) / 360
     reach = float(np.hypot(*mask.shape))
     radius = np.arange(0.0, reach, 0.5)
     place = [
@@ -147,13 +132,11 @@ def outline(mask: np.ndarray, center: np.ndarray, turns: int = 360) -> np.ndarra
     hit = ndimage.map_coordinates(mask.astype(np.float32), place, order=1, mode="constant") > 0.5
     last = hit.shape[1] - 1 - hit[:, ::-1].argmax(1)
     far = np.where(hit.any(1), radius[last], 1.0)
-    return np.asarray(ndimage.gaussian_filter1d(np.maximum(far, 1.0), turns / 120, mode="wrap"))
+    return np.asarray(ndimage.gaussian_filter1d(np.maximum(far, 1.0), 3.0, mode="wrap"))
 
 
 def _core(inside: np.ndarray, index: np.ndarray) -> np.ndarray:
     """The centroid, or the deepest voxel when the centroid is not well inside (a ring, a bow)."""
-    from scipy import ndimage
-
     depth = ndimage.distance_transform_edt(inside)
     middle = index.mean(0)
     if depth[tuple(np.rint(middle).astype(int))] > 0.4 * depth.max():
@@ -171,8 +154,6 @@ def _rays(frame: np.ndarray, rise: np.ndarray) -> np.ndarray:
 
 def _reach(inside: np.ndarray, start: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Way from each start along its ray to the first point outside [voxels]."""
-    from scipy import ndimage
-
     steps = np.arange(0.0, float(np.linalg.norm(inside.shape)), 0.5)
     solid = inside.astype(np.float32)
     far = np.zeros(len(rays))
@@ -189,15 +170,11 @@ def _reach(inside: np.ndarray, start: np.ndarray, rays: np.ndarray) -> np.ndarra
 
 
 def _smooth(table: np.ndarray) -> np.ndarray:
-    from scipy import ndimage
-
     return np.asarray(ndimage.gaussian_filter(table, (1.0, 1.0), mode=("nearest", "wrap")))
 
 
 def _read(table: np.ndarray, row: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     """Values of a table [rows, _TURNS] at fractional rows and azimuths."""
-    from scipy import ndimage
-
     wrapped = np.concatenate([table, table[:, :1]], 1)
     turn = np.mod(azimuth / (2 * np.pi) * _TURNS, _TURNS)
     return np.asarray(ndimage.map_coordinates(wrapped, [row, turn], order=1, mode="nearest"))

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsfluent.colors import rgb_to_lab
-from gsfluent.pipeline.texture.volume.domain import InteriorDomain
+from gsfluent.lazy import ndimage
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, nearest_in
 
 _DARK = 0.5  # lightness over that of the rest of the skin, below which an unseen place is shadow
 _FACING = 0.3  # cosine between outward normal and the closed side
@@ -31,8 +32,6 @@ def mend_unseen_skin(
     Returns:
         The domain with mended skin, and the share of the shell that was mended.
     """
-    from scipy import ndimage
-
     if closed_side is None or not domain.shell.any():
         return domain, 0.0
     side = np.asarray(closed_side, dtype=float)
@@ -62,5 +61,4 @@ def mend_unseen_skin(
         return domain, 0.0
     good = np.zeros(domain.inside.shape, bool)
     good[tuple(index[~bad].T)] = True
-    nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
-    return replace(domain, skin=domain.skin[tuple(nearest)]), float(bad.mean())
+    return replace(domain, skin=domain.skin[nearest_in(good)]), float(bad.mean())

@@ -49,11 +49,7 @@ class BrowserSplats:
         server.scene.set_background_image(np.full((2, 2, 3), _GROUND, np.uint8), format="png")
 
     def show(
-        self,
-        server: viser.ViserServer,
-        index: int,
-        look: Look,
-        shift: tuple[float, float, float],
+        self, server: viser.ViserServer, index: int, look: Look, shift: tuple[float, float, float]
     ) -> Legend | None:
         """Send frame ``index`` unless it is there already; returns the legend.
 

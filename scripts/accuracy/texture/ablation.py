@@ -23,8 +23,10 @@ from gsfluent.lab.truth.interiors import KnownInterior, known_interior
 from gsfluent.lab.truth.interiors_judge import Judge
 from gsfluent.pipeline.texture.baselines import color_copy, telea_slices
 from gsfluent.pipeline.texture.inpaint.method import InpaintOptions, diffusion_texture
+from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
 from gsfluent.pipeline.texture.photo.metrics import lab_histogram_distance, patch_distance
-from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
+from gsfluent.pipeline.texture.volume.domain import options_of
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = ROOT / "docs" / "measured" / "inpainting.md"
@@ -42,7 +44,7 @@ def slices(model: str | None = None, photo: bool = True, **options: Any) -> Make
             known.domain,
             model,
             prompt=f"cross section of a {known.name}",
-            options=InpaintOptions.of(given),
+            options=options_of(InpaintOptions, "inpaint", given),
             exemplar=load_exemplars(known.exemplars()) if photo else None,
         )
         return texture.rgb

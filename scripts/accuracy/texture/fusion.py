@@ -24,7 +24,6 @@ from gsfluent.lab.truth.interiors_judge import held_out_planes
 from gsfluent.pipeline.texture.polish import (
     SlabRenderer,
     SlicePlane,
-    Steps,
     fuse_colors,
     stack_planes,
 )
@@ -134,7 +133,7 @@ def solvers(scene: Scene, adam_steps: Sequence[int]) -> str:
     def solve(count: int) -> Tensor:
         return fuse_colors(
             scene.means, planes, images, spacing=SPACING, masks=masks,
-            initial=scene.centers, steps=Steps(count),
+            initial=scene.centers, iterations=count,
         )[0]  # fmt: skip
 
     row("colour of the volume at the centre", lambda: scene.centers, timed=False)
@@ -168,7 +167,7 @@ def spacings(scene: Scene) -> str:
         for count in (0, 4):
             colors, _ = fuse_colors(
                 scene.means, planes, images, spacing=SPACING, masks=masks,
-                initial=torch.full_like(scene.centers, 0.5), steps=Steps(count), slab=0.5 * step,
+                initial=torch.full_like(scene.centers, 0.5), iterations=count, slab=0.5 * step,
             )  # fmt: skip
             figures.append(f"{psnr(scene, colors, test, None):.2f}")
         rows.append(f"| {step / SPACING:g} | {len(planes)} | {' | '.join(figures)} |")

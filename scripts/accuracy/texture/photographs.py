@@ -29,10 +29,10 @@ from gsfluent.figure.markdown import enter
 from gsfluent.lab.truth.interiors_judge import Plane, sample_plane
 from gsfluent.pipeline.texture.baselines import color_copy
 from gsfluent.pipeline.texture.photo import metrics
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplars
 from gsfluent.pipeline.texture.photo.profile import depth_profile, profile_volume, surface_profile
 from gsfluent.pipeline.texture.structure import take_apart, with_structure
-from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, blend_skin
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -58,10 +58,9 @@ def texture(domain: InteriorDomain, case: Case, photo: Exemplar, method: str) ->
             rgb = np.broadcast_to(photo.image[photo.mask].mean(0), domain.skin.shape)
     else:
         quality = "preview" if method == "preview" else "fast"
-        opened, structure = take_apart(photo) if case.cut else (photo, None)
-        found = exemplar_texture(
-            domain, load_exemplars(opened), quality=quality, seed=1, **case.settings
-        )
+        photos = load_exemplars(photo)
+        opened, structure = take_apart(photos) if case.cut else (photos, None)
+        found = exemplar_texture(domain, opened, quality=quality, seed=1, **case.settings)
         if structure is not None:
             found = with_structure(domain, found, structure, case.cut or "across")
         rgb = found.rgb

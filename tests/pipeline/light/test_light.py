@@ -22,7 +22,7 @@ from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
 from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, lighting_of, pack_lamps
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
 from gsfluent.pipeline.light.shade import irradiance, to_linear
 from gsfluent.pipeline.light.shadow import transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
@@ -166,7 +166,7 @@ def test_spinning_lamp_turns_about_the_vertical() -> None:
         lambda: Lighting(occlusion=1.5),
         lambda: Lighting(ambient=math.inf),
         lambda: Lighting(environment=((1.0, 1.0, 1.0),)),
-        lambda: Light(specular=-0.1),
+        lambda: key_light(specular=-0.1),
     ],
 )
 def test_bad_lights_are_refused(make: Any) -> None:
@@ -176,9 +176,8 @@ def test_bad_lights_are_refused(make: Any) -> None:
 
 def test_short_form_of_light_means_the_same(skin: Gaussians) -> None:
     camera = Camera.look_at((0.3, -0.6, 0.2), (0, 0, 0), width=48, height=48, fov=22.0)
-    light = Light(direction=(1.0, 0.0, 1.0), specular=0.2)
-    long = lighting_of(light)
-    assert long is not None
+    light = key_light(direction=(1.0, 0.0, 1.0), specular=0.2)
+    long = Lighting((Lamp(direction=(1.0, 0.0, 1.0)),), specular=0.2, shininess=24.0)
     torch.testing.assert_close(Render(camera, light)(skin).image, Render(camera, long)(skin).image)
 
 

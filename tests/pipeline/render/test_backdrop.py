@@ -14,7 +14,7 @@ from gsfluent.errors import InputError
 from gsfluent.io import load_capture
 from gsfluent.io.images import load_view
 from gsfluent.pipeline.capture.orient import make_frame, orient
-from gsfluent.pipeline.light.lamps import Light
+from gsfluent.pipeline.light.lamps import key_light
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, object_radius
 from gsfluent.pipeline.render.stage import Render
 
@@ -57,19 +57,19 @@ def test_what_is_nearer_hides_what_is_behind(wall: float, seen: tuple[float, flo
 def test_without_matter_in_the_way_the_captured_colours_are_kept() -> None:
     above = Camera.look_at((0.1, 0.0, 4.0), (0.0, 0.0, 0.0), width=48, height=48, fov=20.0)
     ball = sheet(0.0, BLUE, half=0.05)
-    image = Render(above, Light())(ball, backdrop=Backdrop(table(), 0.1)).image
+    image = Render(above, key_light())(ball, backdrop=Backdrop(table(), 0.1)).image
     assert torch.allclose(image[4, 4], torch.tensor(RED), atol=0.05)
 
 
 def test_the_matter_throws_its_shadow_on_the_table() -> None:
-    light = Light(direction=(0.2, 0.0, 1.0), ambient=0.3, intensity=0.7)
+    light = key_light(direction=(0.2, 0.0, 1.0), ambient=0.3, intensity=0.7)
     lid = sheet(0.0, BLUE, half=0.5)
     # laid flat, half a metre above the table
     raised = lid.means[:, [2, 1, 0]] + torch.tensor([0.0, 0.0, 0.5])
     lid = lid.replace(means=raised, scales=lid.scales[:, [2, 1, 0]])
     camera = Camera.look_at((0.0, -3.0, 1.2), (0.0, 0.0, 0.0), width=64, height=64, fov=60.0)
     backdrop = Backdrop(table(), 0.5)
-    lit = Render(camera, Light(shadow=False))(lid, backdrop=backdrop).image
+    lit = Render(camera, key_light(shadow=False))(lid, backdrop=backdrop).image
     dark = Render(camera, light)(lid, backdrop=backdrop).image
     pixel, _ = camera.project(torch.tensor([[-0.1, 0.0, 0.0], [1.3, 0.0, 0.0]]))
     (u, v), (a, b) = pixel.floor().long().tolist()

@@ -11,15 +11,16 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
+from gsfluent.draw import draw
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.lamps import Lamp, Light, Lighting, pack_lamps
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
 from gsfluent.pipeline.light.normals import estimate_normals, grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import ambient_occlusion
 from gsfluent.pipeline.light.shade import shade_points, surface_points, to_display, to_linear
 from gsfluent.pipeline.light.shadow import transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, shadow_maps
 from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
-from gsfluent.pipeline.render.holes import hole_fraction
+from gsfluent.pipeline.render.holes import Holes, MatterView, small
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
 
@@ -56,13 +57,13 @@ def test_without_light_the_captured_colour_stays() -> None:
 
 
 def test_default_light_is_mild_where_it_falls() -> None:
-    light = Light(direction=(0.0, -1.0, 0.0), shadow=False)
+    light = key_light(direction=(0.0, -1.0, 0.0), shadow=False)
     image = Render(front(), light)(ball()).image
     assert brightness(image, SIZE // 2, SIZE // 2) == pytest.approx(0.5, rel=0.12)
 
 
 def test_side_light_brightens_the_lit_side_only() -> None:
-    light = Light(direction=(1.0, 0.0, 0.0), ambient=0.3, intensity=0.8, shadow=False)
+    light = key_light(direction=(1.0, 0.0, 0.0), ambient=0.3, intensity=0.8, shadow=False)
     image = Render(front(), light)(ball()).image
     offset = SIZE // 5
     lit = brightness(image, SIZE // 2, SIZE // 2 + offset)
@@ -110,7 +111,7 @@ def test_shadow_map_darkens_what_lies_behind() -> None:
 
 
 def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
-    light = Light(direction=(1.0, 0.0, 1.0), ambient=0.3, intensity=1.0)
+    light = key_light(direction=(1.0, 0.0, 1.0), ambient=0.3, intensity=1.0)
     studio = Studio(0.0, (0.0, 0.0), 0.2, 0.2)
     camera = Camera.look_at((0.0, -0.01, 3.0), (0.0, 0.0, 0.0), width=SIZE, height=SIZE, fov=20.0)
     high = ball(center=(0.0, 0.0, 0.3))
@@ -196,11 +197,19 @@ def test_sheet_of_flat_splats_faces_the_eye() -> None:
 def test_hole_fraction_counts_what_shows_through() -> None:
     grey = ball()
     volume = torch.full((grey.count,), 0.008**3)
+
+    def hole_fraction(splats: Gaussians) -> float:
+        view = small(front())
+        drawn = draw(splats, view, colors=splats.means[:, :1], near=0.01, depth=True)
+        assert drawn.depth is not None
+        matter = MatterView.of(grey.means, volume, view)
+        return Holes.of(drawn.alpha, drawn.depth, matter).fraction
+
     # the rasterizer leaves 1e-4 of the light, and a little more at the rim
-    assert hole_fraction(grey, grey.means, volume, front()) < 5e-4
+    assert hole_fraction(grey) < 5e-4
     # drill a square tunnel along the view: the particles stay, the splats go
     tunnel = (grey.means[:, 0].abs() < 0.05) & ((grey.means[:, 2] - 0.1).abs() < 0.05)
-    holed = hole_fraction(grey.select(~tunnel), grey.means, volume, front())
+    holed = hole_fraction(grey.select(~tunnel))
     expected = 0.1**2 / (math.pi * 0.1**2)
     # perspective and the soft rims of the splats make the opening smaller, never larger
     assert 0.5 * expected < holed < expected
@@ -258,7 +267,7 @@ def test_render_refuses_missing_camera_and_distortion() -> None:
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (float("nan"), 0.0, 1.0)])
 def test_light_without_direction_is_refused(direction: tuple[float, float, float]) -> None:
     with pytest.raises(InputError, match=r"light\.key\.direction"):
-        Light(direction=direction)
+        key_light(direction=direction)
 
 
 def test_nearest_sibling_alone_shades_a_pixel() -> None:

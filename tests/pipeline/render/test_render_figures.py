@@ -12,7 +12,7 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.pipeline.render.figures import FilmFigures, RawCarry, cameras_around
 from gsfluent.pipeline.render.flicker import Flow, flicker
-from gsfluent.pipeline.render.holes import REACH, RIM, Holes, MatterView, hole_fraction
+from gsfluent.pipeline.render.holes import REACH, RIM, Holes, MatterView
 from gsfluent.results.frames import SavedFrame
 
 STEP = 0.01
@@ -112,7 +112,7 @@ def test_a_view_through_the_front_wall_of_a_shell_counts_though_no_background_sh
 
 def test_the_matter_out_of_view_has_no_holes() -> None:
     points = slab() + torch.tensor([5.0, 0.0, 0.0])
-    assert hole_fraction(fine(points), points, volume(points), camera()) == 0.0
+    assert measured(fine(points), points).fraction == 0.0
 
 
 def moved(points: torch.Tensor, angle: float, shift: tuple[float, float, float]) -> torch.Tensor:

@@ -14,7 +14,7 @@ from gsfluent.lab.truth.interiors import KNOWN_INTERIORS, known_interior
 from gsfluent.pipeline.texture.photo.exemplar import (
     PhotoOptions,
     load_exemplar,
-    open_exemplars,
+    load_exemplars,
     rgb_to_lab,
     with_skin,
 )
@@ -25,6 +25,7 @@ from gsfluent.pipeline.texture.photo.light import (
     white_gains,
 )
 from gsfluent.pipeline.texture.photo.stain import remove_stain
+from gsfluent.pipeline.texture.volume.domain import options_of
 
 DATA = Path(
     os.environ.get("GSFLUENT_DATA", Path(__file__).resolve().parents[4] / "shared" / "data")
@@ -201,7 +202,7 @@ def test_the_skin_as_reference_only_where_it_is_the_same_skin() -> None:
     options = PhotoOptions(white="skin")
     rim = load_exemplar(image, mask, UNTOUCHED)
     skin = image[mask & (rim.depth < 3)]
-    photo = with_skin([load_exemplar(seen, mask, options)], skin)[0]
+    photo = with_skin(load_exemplar(seen, mask, options), skin)
     truth = linear_to_srgb(srgb_to_linear(image) * 0.7)
     assert lab_error(photo.image, truth, mask) < 0.4 * lab_error(seen, truth, mask)
     other = with_skin(load_exemplar(seen, mask, options), np.array([[0.2, 0.2, 0.8]]))
@@ -333,7 +334,7 @@ def test_broken_pictures_and_settings_are_refused_in_plain_words(tmp_path: Path)
         {"shine": True},
     ):
         with pytest.raises(InputError):
-            PhotoOptions.of(options)
+            options_of(PhotoOptions, "photo", options)
 
 
 def test_every_step_can_be_switched_off_and_lists_are_opened() -> None:
@@ -341,8 +342,10 @@ def test_every_step_can_be_switched_off_and_lists_are_opened() -> None:
     _, x = (np.mgrid[:240, :240] + 0.5) / 240 * 2 - 1
     dark = srgb_to_linear(on_ground(image, mask, np.full(3, 0.0)))
     lit = linear_to_srgb(dark * np.exp(0.5 * x)[..., None])
-    on = open_exemplars([lit, lit], PhotoOptions(shading=True))[0]
-    off = open_exemplars({"x": lit}, PhotoOptions.of({"shading": False, "glints": False}))["x"]
+    on = load_exemplars([lit, lit], PhotoOptions(shading=True))[0][0]
+    off = load_exemplars(
+        {"x": lit}, options_of(PhotoOptions, "photo", {"shading": False, "glints": False})
+    )[0][0]
     assert "shading" in on.note
     assert "shading" not in off.note
     assert np.abs(off.image - lit)[off.mask].max() < 1e-6

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, PhotoOptions, load_exemplar
+from gsfluent.pipeline.texture.photo.exemplar import (
+    Exemplar,
+    PhotoOptions,
+    load_exemplar,
+    load_exemplars,
+)
 from gsfluent.pipeline.texture.structure import (
     Structure,
     impose_structure,
@@ -180,14 +185,14 @@ def test_what_cannot_be_swept_is_refused() -> None:
     photo, _ = starred()
     patch = load_exemplar(photo.image, options=PhotoOptions("none"))
     with pytest.raises(InputError, match="outline"):
-        take_apart(patch)
+        take_apart(load_exemplars(patch))
     with pytest.raises(InputError, match="exemplar"):
-        take_apart([])
+        take_apart({})
     domain, color, _, _ = solid("ball", 24)
     with pytest.raises(InputError, match="across"):
         Sweep(domain.inside, domain.axis, "sideways")
-    materials, structure = take_apart({"z": [photo, photo]})
-    assert len(materials["z"]) == 2
+    materials, structure = take_apart(load_exemplars({"z": [photo, photo]}))
+    assert len(materials[2]) == 2
     assert isinstance(structure, Structure)
     texture = InteriorTexture(color, np.zeros(domain.inside.shape, np.int32), {"levels": 1})
     done = with_structure(domain, texture, structure, "across")

@@ -11,7 +11,6 @@ from torch import Tensor
 from gsfluent.pipeline.texture.polish import (
     SlabRenderer,
     SlicePlane,
-    Steps,
     fuse_colors,
     stack_planes,
 )
@@ -85,13 +84,13 @@ def test_conjugate_gradients_take_the_blur_out() -> None:
     ]
     error = {}
     for count in (0, 2, 5, 20):
-        found, report = fuse_colors(means, where, targets, spacing=1.0, steps=Steps(count))
+        found, report = fuse_colors(means, where, targets, spacing=1.0, iterations=count)
         error[count] = report["rms_after"]
     # each step of the exact method lowers the residual of a consistent system
     assert error[20] < error[5] < error[2] < error[0]
     assert error[5] < 0.3 * error[0]
     assert float((found - truth).abs().mean()) < 0.2 * float(
-        (fuse_colors(means, where, targets, spacing=1.0, steps=Steps(0))[0] - truth).abs().mean()
+        (fuse_colors(means, where, targets, spacing=1.0, iterations=0)[0] - truth).abs().mean()
     )
 
 
@@ -108,7 +107,7 @@ def test_least_squares_solution_is_the_dense_one() -> None:
     counted = torch.cat(renderer.counted)
     aim = torch.cat([t.reshape(-1, 3) for t in targets])[counted]
     wanted = torch.linalg.lstsq(dense[counted].double(), aim.double()).solution.float()
-    found, _ = fuse_colors(means, where, targets, spacing=1.0, steps=Steps(200))
+    found, _ = fuse_colors(means, where, targets, spacing=1.0, iterations=200)
     inside = ((wanted > 0.02) & (wanted < 0.98)).all(1)  # others are clipped
     assert inside.float().mean() > 0.9
     assert float((found - wanted)[inside].abs().max()) < 0.02
@@ -122,7 +121,7 @@ def test_fixed_and_unseen_gaussians_keep_their_colours() -> None:
     initial = torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2))
     targets = [torch.full((*p.shape, 3), 0.5) for p in where]
     found, report = fuse_colors(
-        means, where, targets, spacing=1.0, initial=initial, fixed=fixed, steps=Steps(3)
+        means, where, targets, spacing=1.0, initial=initial, fixed=fixed, iterations=3
     )
     assert torch.equal(found[:200], initial[:200])
     assert torch.equal(found[-1], initial[-1]) and report["unseen"] == 1

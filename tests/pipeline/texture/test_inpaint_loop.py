@@ -23,7 +23,7 @@ from gsfluent.pipeline.texture.inpaint.method import (
     make_inpainter,
 )
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
-from gsfluent.pipeline.texture.volume.domain import InteriorDomain
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, options_of
 
 
 def ball(size: int = 20) -> InteriorDomain:
@@ -273,8 +273,8 @@ def test_options_and_backends_are_checked() -> None:
         with pytest.raises(InputError, match=next(iter(wrong))):
             InpaintOptions(**wrong)
     with pytest.raises(InputError, match="knows no stepz"):
-        InpaintOptions.of({"stepz": 3})
-    assert InpaintOptions.of({"refine": [0.1]}) == InpaintOptions(refine=(0.1,))
+        options_of(InpaintOptions, "inpaint", {"stepz": 3})
+    assert options_of(InpaintOptions, "inpaint", {"refine": [0.1]}) == InpaintOptions(refine=(0.1,))
     with pytest.raises(InputError, match="needs a model"):
         make_inpainter("diffusers", InpaintOptions())
     names = [make_inpainter(n, InpaintOptions()).name for n in ("telea", "color", "exemplar")]

@@ -154,7 +154,8 @@ def test_same_seed_same_texture(melon: tuple[Solid, np.ndarray, InteriorTexture]
 
 
 def test_patch_synthesis_is_deterministic() -> None:
-    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+    from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
+    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
 
     domain = _domain(24)
     photo = load_exemplars(_photo(domain, procedural_texture(domain, "watermelon", 0)))
@@ -163,7 +164,8 @@ def test_patch_synthesis_is_deterministic() -> None:
 
 
 def test_inclusions_are_found_counted_and_labelled() -> None:
-    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+    from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
+    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
 
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:400, :400]
@@ -201,7 +203,8 @@ def _star_photo() -> np.ndarray:
 
 
 def test_axis_guide_keeps_the_star_across_the_axis() -> None:
-    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+    from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
+    from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
 
     domain = _domain(40)
     photo = load_exemplars(_star_photo())

@@ -9,7 +9,8 @@ import torch
 from gsfluent.lab.truth.interiors import known_interior
 from gsfluent.pipeline import Texture
 from gsfluent.pipeline.render.cuts import cut_view
-from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
 
 pytestmark = [
     pytest.mark.cuda,

@@ -10,17 +10,17 @@ import pytest
 import torch
 from scipy import ndimage
 
-from gsfluent.colors import lab_to_rgb, rgb_to_lab, rgb_to_lab100
+from gsfluent.colors import lab100_to_rgb, rgb_to_lab, rgb_to_lab100
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.geometry import rgb_to_sh0
 from gsfluent.pipeline.texture import InteriorDomain, Texture
-from gsfluent.pipeline.texture.photo.exemplar import load_exemplar
+from gsfluent.pipeline.texture.photo.exemplar import load_exemplar, load_exemplars
 from gsfluent.pipeline.texture.synthesis.bank import Bank, LevelPhoto
 from gsfluent.pipeline.texture.synthesis.choice import surface_verdict
 from gsfluent.pipeline.texture.synthesis.guides import DepthGuide, place_photo
 from gsfluent.pipeline.texture.synthesis.levels import ObjectFields, hashed_noise, nearest_inside
-from gsfluent.pipeline.texture.synthesis.method import exemplar_texture, load_exemplars
+from gsfluent.pipeline.texture.synthesis.method import exemplar_texture
 from gsfluent.pipeline.texture.synthesis.transport import match_near
 from gsfluent.pipeline.texture.volume.domain import SHELL
 
@@ -247,7 +247,7 @@ def test_depth_guide_is_steep_where_colours_change() -> None:
 def test_lab_there_and_back() -> None:
     rgb = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
     lab = rgb_to_lab100(rgb)
-    assert torch.allclose(lab_to_rgb(lab), rgb, atol=1e-3)
+    assert torch.allclose(lab100_to_rgb(lab), rgb, atol=1e-3)
     assert np.abs(100 * lab.numpy() - rgb_to_lab(rgb.numpy())).max() < 0.5
 
 

@@ -26,16 +26,8 @@ def match_slices(
 ) -> np.ndarray:
     """Slices with the photograph's colours at each depth; without one, with the stack's cast.
 
-    Args:
-        images: Slices across ``axis`` at ``positions``, float32 [K, H, W, 3].
-        level: The object at the resolution of the slices.
-        axis: Axis.
-        positions: Slice indices [K].
-        photo: Photograph of a cut, or None.
-        seed: Seed of the colour transport.
-
-    Returns:
-        float32 [K, H, W, 3]; pixels that were not painted are the same.
+    Slices are those across ``axis`` at ``positions``, float32 [K, H, W, 3], of the object at their
+    own resolution; pixels that were not painted come back as they are.
     """
     inside, shell, depth = (
         np.moveaxis(np.take(field, positions, axis), axis, 0)

@@ -179,14 +179,11 @@ class CommandInpainter(MaskedInpainter):
             done = subprocess.run(
                 words, capture_output=True, text=True, timeout=self.timeout, check=False
             )
-        except FileNotFoundError as error:
-            raise InputError(
-                f"inpaint: command not found: {words[0]}", hint="give the full path of the program"
-            ) from error
-        except PermissionError as error:
-            raise InputError(
-                f"inpaint: command cannot be run: {words[0]}", hint="make it executable"
-            ) from error
+        except (FileNotFoundError, PermissionError) as error:
+            missing = isinstance(error, FileNotFoundError)
+            what = "not found" if missing else "cannot be run"
+            hint = "give the full path of the program" if missing else "make it executable"
+            raise InputError(f"inpaint: command {what}: {words[0]}", hint) from error
         except subprocess.TimeoutExpired as error:
             raise RunError(
                 f"inpaint: the command took longer than {self.timeout:g} s",
@@ -210,7 +207,7 @@ def _write(path: Path, picture: np.ndarray) -> None:
 
 def _read_all(folder: Path, shape: Sequence[int]) -> np.ndarray:
     """All frames of ``out/``, checked for number and size."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     count, height, width = (int(s) for s in shape[:3])
     found = sorted(p.name for p in folder.glob("*.png"))
@@ -227,7 +224,7 @@ def _read_all(folder: Path, shape: Sequence[int]) -> np.ndarray:
         try:
             with Image.open(folder / name) as opened:
                 pixels = np.asarray(opened.convert("RGB"))
-        except (UnidentifiedImageError, OSError) as error:
+        except OSError as error:
             raise RunError(f"{folder / name}: not a picture ({error})") from error
         if pixels.shape[:2] != (height, width):
             raise RunError(

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from gsfluent.errors import InputError, RunError
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.inpaint.diffusers_load import (
     load_pipeline,
     lower_memory,
@@ -201,8 +202,6 @@ class _Frame:
 
     def picture(self, images: np.ndarray, ground: float = GROUND) -> np.ndarray:
         """Images [B, H, W, 3] enlarged onto canvases of ground."""
-        import cv2
-
         method = cv2.INTER_LINEAR if self.power >= 0 else cv2.INTER_AREA
         out = np.full((len(images), self.height, self.width, 3), ground, np.float32)
         size = (self.scaled[1], self.scaled[0])
@@ -212,8 +211,6 @@ class _Frame:
 
     def mask(self, masks: np.ndarray) -> np.ndarray:
         """Masks [B, H, W] as 0 or 1 on canvases; a canvas pixel is open when any voxel in it is."""
-        import cv2
-
         out = np.zeros((len(masks), self.height, self.width), np.float32)
         size = (self.scaled[1], self.scaled[0])
         method = cv2.INTER_NEAREST if self.power >= 0 else cv2.INTER_AREA
@@ -224,8 +221,6 @@ class _Frame:
 
     def back(self, pictures: np.ndarray) -> np.ndarray:
         """The slices [B, H, W, 3] out of the model's pictures."""
-        import cv2
-
         if pictures.shape[1:3] != (self.height, self.width):
             raise RunError(
                 f"the model returned {pictures.shape[2]} x {pictures.shape[1]} pixels for a "

@@ -38,12 +38,7 @@ def pick_device(name: str) -> torch.device:
 
 
 def load_pipeline(model: str | Path, options: InpaintOptions, device: torch.device) -> Any:
-    """Find the pipeline class, load the weights, set the switches.
-
-    Args:
-        model: Local folder (``save_pretrained``), or hub id.
-        options: Settings.
-        device: Where to run.
+    """Find the pipeline class of a model folder or hub id, load the weights, set the switches.
 
     Raises:
         InputError: A package is missing, the weights are not there, no inpainting pipeline belongs
@@ -187,12 +182,18 @@ def _dtype(options: InpaintOptions, device: torch.device) -> torch.dtype:
     return chosen
 
 
+def _folder(name: str, what: str) -> bool:
+    """Whether a part of the model is a folder; an error when it is neither folder nor hub id."""
+    local = Path(name).expanduser().is_dir()
+    if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
+        raise InputError(f"{name}: {what} folder not found", hint="give a folder or a hub id")
+    return local
+
+
 def _controlnet(diffusers: Any, options: InpaintOptions, dtype: torch.dtype, offline: bool) -> Any:
     """The ControlNet that is shown the depth of a slice."""
     name = str(options.controlnet)
-    local = Path(name).expanduser().is_dir()
-    if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
-        raise InputError(f"{name}: ControlNet folder not found", hint="give a folder or a hub id")
+    local = _folder(name, "ControlNet")
     return diffusers.ControlNetModel.from_pretrained(
         name,
         local_files_only=local or offline,
@@ -209,10 +210,7 @@ def _ip_adapter(pipe: Any, options: InpaintOptions, offline: bool) -> None:
             f"texture: {type(pipe).__name__} takes no IP-adapter",
             hint="leave ip_adapter out, or use an SD or SD-XL model",
         )
-    folder = Path(name).expanduser()
-    local = folder.is_dir()
-    if not local and (name.startswith(("/", ".", "~")) or name.count("/") != 1):
-        raise InputError(f"{name}: IP-adapter folder not found", hint="give a folder or a hub id")
+    folder, local = Path(name).expanduser(), _folder(name, "IP-adapter")
     own = None
     if getattr(pipe, "image_encoder", None) is None:
         # the encoder lies beside the weights or, as in h94/IP-Adapter, in models/image_encoder

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.volume.domain import InteriorDomain
+from gsfluent.pipeline.texture.volume.domain import InteriorDomain, block_mean
+
+logger = logging.getLogger(__name__)
 
 
 def coarse_domain(domain: InteriorDomain, factor: int) -> InteriorDomain:
     """The domain at 1/factor of its resolution; depth in the new voxels."""
-    from dataclasses import replace
-
     if factor == 1:
         return domain
-    pads = [(0, -s % factor) for s in domain.inside.shape]
-
-    def blocks(field: np.ndarray) -> np.ndarray:
-        padded = np.pad(field.astype(np.float32), pads + [(0, 0)] * (field.ndim - 3))
-        x, y, z = (s // factor for s in padded.shape[:3])
-        split = padded.reshape(x, factor, y, factor, z, factor, *padded.shape[3:])
-        mean: np.ndarray = split.mean((1, 3, 5))
-        return mean
-
+    blocks = functools.partial(block_mean, factor=factor, dimensions=3)
     share = blocks(domain.inside)
     inside = share > 0.4
     depth = blocks(domain.depth) / np.maximum(share, 1e-3) / factor
@@ -47,8 +42,6 @@ def coarse_domain(domain: InteriorDomain, factor: int) -> InteriorDomain:
 
 def enlarge(rgb: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Trilinear enlargement by two of a volume [X, Y, Z, 3], cropped or padded to ``shape``."""
-    import torch
-
     tensor = torch.from_numpy(np.moveaxis(rgb, -1, 0)[None].astype(np.float32))
     size = tuple(2 * s for s in rgb.shape[:3])
     big = torch.nn.functional.interpolate(tensor, size=size, mode="trilinear", align_corners=False)
@@ -71,17 +64,11 @@ def slice_positions(inside: np.ndarray, axis: int, count: int) -> list[int]:
 def fuse_stacks(
     shape: Sequence[int], stacks: Sequence[tuple[int, Sequence[int], np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One volume out of slices across several axes: their mean.
+    """One volume [X, Y, Z, 3] out of slices across several axes: their mean; and their variance.
 
     Slices between those made are interpolated. On the lattice of the voxels the mean over the axes
     is the least-squares answer (:func:`.fusion.fuse_colors` is the one for Gaussians anywhere).
-
-    Args:
-        shape: Of the volume [3].
-        stacks: Axis, slice indices [K] and slices [K, ., ., 3] each.
-
-    Returns:
-        Colours float32 [X, Y, Z, 3], and the variance between the axes [X, Y, Z].
+    ``stacks`` holds axis, slice indices [K] and slices [K, ., ., 3] each.
     """
     total = np.zeros((*shape, 3), np.float32)
     square = np.zeros(tuple(shape), np.float32)
@@ -104,11 +91,7 @@ def _interpolate(slices: np.ndarray, positions: Sequence[int], count: int) -> np
     known = np.asarray(positions, dtype=float)
     gap = np.maximum(known[upper] - known[lower], 1e-9)
     t = np.clip((place - known[lower]) / gap, 0.0, 1.0)[:, None, None, None]
-    mixed: np.ndarray = ((1 - t) * slices[lower] + t * slices[upper]).astype(np.float32)
-    return mixed
-
-
-logger = logging.getLogger(__name__)
+    return ((1 - t) * slices[lower] + t * slices[upper]).astype(np.float32)
 
 
 class SliceStore:

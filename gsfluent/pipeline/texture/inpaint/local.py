@@ -2,48 +2,45 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, check_choice
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.inpaint.inpainter import Job, MaskedInpainter
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.patches import Schedule, project_slice
+from gsfluent.pipeline.texture.volume.domain import block_mean, nearest_in
 
+# work per slice; iterations are per pyramid level when repainting
+_SCHEDULE = Schedule(iterations=(4, 3, 2), bank=1536, samples=400)
 _REPAINT = 0.7  # strengths from here on start from nothing instead of from the slice
 
 
 def _without_ground(picture: np.ndarray, inside: np.ndarray | None) -> np.ndarray:
     """The picture with the object's colours continued outward, so that no ground leaks in."""
-    from scipy import ndimage
-
     if inside is None or inside.all() or not inside.any():
         return picture
-    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    return picture[tuple(nearest)]
+    return picture[nearest_in(inside)]
 
 
 class TeleaInpainter(MaskedInpainter):
     """``cv2.inpaint``: fast marching (Telea 2004) or Navier-Stokes (Bertalmio et al. 2001).
 
     Args:
-        radius: Neighbourhood [pixels].
         method: ``telea`` or ``ns``.
     """
 
     name = "telea"
 
-    def __init__(self, radius: float = 3.0, method: str = "telea") -> None:
-        if method not in ("telea", "ns"):
-            raise InputError(f"inpaint: method must be telea or ns, got {method!r}", hint="telea")
-        self.radius = float(radius)
-        self.method = method
+    def __init__(self, method: str = "telea") -> None:
+        check_choice("inpaint: method", method, ("telea", "ns"), "telea is usual")
         self.name = method
 
     def paint(self, job: Job) -> np.ndarray:
         """Fill from the hole's edge inward."""
-        import cv2
-
-        kind = cv2.INPAINT_TELEA if self.method == "telea" else cv2.INPAINT_NS
+        kind = cv2.INPAINT_TELEA if self.name == "telea" else cv2.INPAINT_NS
         made = np.empty_like(job.slices)
         for k, (picture, hole) in enumerate(zip(job.slices, job.mask, strict=True)):
             if hole.all():  # nothing known to start from
@@ -52,7 +49,7 @@ class TeleaInpainter(MaskedInpainter):
             inside = None if job.context.inside is None else job.context.inside[k]
             extended = _without_ground(picture, inside)
             pixels = (extended.clip(0, 1) * 255).round().astype(np.uint8)
-            filled = cv2.inpaint(pixels, hole.astype(np.uint8), self.radius, kind)
+            filled = cv2.inpaint(pixels, hole.astype(np.uint8), 3.0, kind)
             made[k] = filled.astype(np.float32) / 255.0
         return job.slices + np.float32(job.strength) * (made - job.slices)
 
@@ -109,28 +106,16 @@ class ExemplarInpainter(MaskedInpainter):
     """Guided patch projection within each slice: patches of the photograph, matched by depth.
 
     The engine of the exemplar method (:mod:`.synthesis`) confined to one slice. Every slice is
-    made by itself, which is what a 2-D model does too; so this is the offline stand-in for one.
+    made by itself, which is what a 2-D model does too; so this is the offline proxy of one.
 
     Args:
         exemplar: Photograph when a call brings none.
-        schedule: Work per slice; iterations are per pyramid level when repainting.
-        turns: Use the photograph turned and mirrored (off for grained materials).
-        scale: Size of the photograph's structure relative to the automatic choice.
     """
 
     name = "exemplar"
 
-    def __init__(
-        self,
-        exemplar: Exemplar | None = None,
-        schedule: Schedule | None = None,
-        turns: bool = True,
-        scale: float = 1.0,
-    ) -> None:
+    def __init__(self, exemplar: Exemplar | None = None) -> None:
         self.exemplar = exemplar
-        self.schedule = schedule or Schedule(iterations=(4, 3, 2), bank=1536, samples=400)
-        self.turns = turns
-        self.scale = float(scale)
         self._fitted: dict[tuple[int, float, int], Exemplar] = {}
 
     def paint(self, job: Job) -> np.ndarray:
@@ -151,12 +136,12 @@ class ExemplarInpainter(MaskedInpainter):
         rng = np.random.default_rng(job.seeds[k])
         largest = context.max_depth if context.max_depth > 0 else max(hole.shape) / 2
         if depth is not None:
-            factor = self.scale * largest / max(photo.max_depth, 1.0)
+            factor = largest / max(photo.max_depth, 1.0)
         else:
-            factor = self.scale * max(hole.shape) / max(photo.mask.shape)
+            factor = max(hole.shape) / max(photo.mask.shape)
         repaint = strength >= _REPAINT
         factors = [f for f in (4, 2, 1) if min(hole.shape) // f >= 8] if repaint else [1]
-        iterations = self.schedule.iterations[-len(factors) :]
+        iterations = _SCHEDULE.iterations[-len(factors) :]
         if not repaint:
             iterations = (max(1, round(4 * strength)),)
         rgb = picture
@@ -174,8 +159,7 @@ class ExemplarInpainter(MaskedInpainter):
                     shown = _saturating(fitted.depth, fitted.max_depth)
                 rgb = project_slice(
                     image, within, within & ~open_, 3.0 * _saturating(below, largest / shrink),
-                    (fitted.image, fitted.mask, 3.0 * shown), self.schedule, rounds,
-                    turns=self.turns, rng=rng,
+                    (fitted.image, fitted.mask, 3.0 * shown), _SCHEDULE, rounds, rng,
                 )  # fmt: skip
         return rgb
 
@@ -230,14 +214,7 @@ def _reduced(
     below = np.zeros(hole.shape, np.float32) if depth is None else depth
     if factor == 1:
         return picture, hole, inside, below
-    pad = [(0, -s % factor) for s in hole.shape]
-
-    def blocks(field: np.ndarray) -> np.ndarray:
-        padded = np.pad(field.astype(np.float32), pad + [(0, 0)] * (field.ndim - 2))
-        h, w = (s // factor for s in padded.shape[:2])
-        mean: np.ndarray = padded.reshape(h, factor, w, factor, *padded.shape[2:]).mean((1, 3))
-        return mean
-
+    blocks = functools.partial(block_mean, factor=factor, dimensions=2)
     share = blocks(inside)
     within = share > 0.4
     color = blocks(picture * inside[..., None]) / np.maximum(share, 1e-3)[..., None]
@@ -247,8 +224,6 @@ def _reduced(
 
 
 def _enlarged(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    import cv2
-
     big = cv2.resize(picture, (2 * picture.shape[1], 2 * picture.shape[0]))
     grown = [max(0, s - b) for s, b in zip(shape, big.shape[:2], strict=True)]
     padded = np.pad(big, [(0, grown[0]), (0, grown[1]), (0, 0)], mode="edge")

@@ -38,7 +38,7 @@ from gsfluent.pipeline.texture.inpaint.local import (
 )
 from gsfluent.pipeline.texture.inpaint.options import InpaintOptions
 from gsfluent.pipeline.texture.inpaint.tiles import GROUND, TiledInpainter
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, one_per_axis
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 from gsfluent.progress import Progress, report_progress
 
@@ -90,7 +90,7 @@ def diffusion_texture(
         InputError: The model cannot be loaded.
         RunError: The model fails; finished slices stay in ``resume``.
     """
-    photos = _per_axis(exemplar)
+    photos = one_per_axis(exemplar)
     inpainter = make_inpainter(options.backend, options, model, resume)
     coarse = inpainter
     if options.coarse and options.coarse != options.backend:
@@ -133,12 +133,7 @@ def make_inpainter(
 ) -> Inpainter:
     """Backend of a name (:data:`~.inpaint_options.BACKENDS`).
 
-    Args:
-        name: Which.
-        options: Settings.
-        model: Local folder or hub id (diffusers).
-        folder: Where a command's windows are kept.
-        first: Who makes the first reference slice of a command.
+    ``folder`` is where a command's windows are kept, ``first`` who makes its first reference slice.
 
     Raises:
         InputError: The backend lacks what it needs.
@@ -158,14 +153,19 @@ def make_inpainter(
             folder=None if folder is None else folder / "command",
         )
     if model is None:
-        raise InputError(
-            "texture: method 'diffusion' needs a model",
-            hint="give a local folder or hub id, for example "
-            "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
-        )
+        raise no_model("diffusion")
     from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter
 
     return DiffusersInpainter(model, options)
+
+
+def no_model(method: str) -> InputError:
+    """What to raise when diffusers shall paint and no model is named."""
+    return InputError(
+        f"texture: method {method!r} needs a model",
+        hint="give a local folder or hub id, for example "
+        "diffusers/stable-diffusion-xl-1.0-inpainting-0.1 (about 7 GB)",
+    )
 
 
 def inpaint_plan(domain: InteriorDomain, options: InpaintOptions) -> dict[str, int]:
@@ -205,33 +205,24 @@ def inpaint_volume(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> InteriorTexture:
-    """The two-stage loop around any inpainter.
+    """The two-stage loop around any inpainter; more arguments as for :func:`diffusion_texture`.
 
     Args:
         domain: Voxels to fill.
         inpainter: Backend.
         prompt: What a slice shows.
-        options: Settings of the loop (schedule, slices, strength, refine, tile, batch,
-            match_colors).
+        options: Settings of the loop.
         exemplar: Photograph, or one per axis.
         coarse: Backend of the first pass; None takes ``inpainter``.
-        store: Where finished slices are kept.
+        store: Where finished slices are kept; they stay there when the backend fails.
         seed: Seed.
         progress: Optional callback.
-
-    Returns:
-        The texture; ``report`` holds slices, resumed_slices, passes, schedule and
-        axis_disagreement (between the axes' proposals in the last round, before fusion).
-
-    Raises:
-        RunError: The backend failed; finished slices stay in the store.
     """
     store = SliceStore(None, "") if store is None else store
-    run = _Run(domain, inpainter, coarse or inpainter, prompt, options, _per_axis(exemplar), store)
-    passes = _passes(domain, options)
-    run.seed, run.progress = seed, progress
+    photos, passes = one_per_axis(exemplar), _passes(domain, options)
     plan = inpaint_plan(domain, options)
-    run.total = plan["slices"]
+    painters = (inpainter, coarse or inpainter)
+    run = _Run(*painters, prompt, options, photos, store, seed, progress, plan["slices"])
     logger.info(
         "inpainting with %s: %d slices in %d passes, %d calls, %d denoising steps if it denoises",
         inpainter.name,
@@ -276,16 +267,15 @@ def _passes(domain: InteriorDomain, options: InpaintOptions) -> list[_Pass]:
 class _Run:
     """What stays the same over a run."""
 
-    domain: InteriorDomain
     inpainter: Inpainter
     coarse: Inpainter
     prompt: str
     options: InpaintOptions
     photos: dict[int, Exemplar]
     store: SliceStore
-    seed: int = 0
-    progress: Progress | None = None
-    total: int = 0
+    seed: int
+    progress: Progress | None
+    total: int
     done: int = 0
     made: int = 0
     spent: float = 0.0
@@ -346,7 +336,22 @@ class _Run:
                     found[index] = kept
             if any(index not in found for index in part):
                 began = time.perf_counter()
-                images = self._call(backend, volume, level, step, number, axis, part)
+                inside, shell, depth, colors = (
+                    _upright(np.moveaxis(np.take(field, part, axis), axis, 0))
+                    for field in (level.inside, level.shell, level.depth, volume)
+                )
+                made = backend(
+                    np.where(inside[..., None], colors, GROUND).astype(np.float32),
+                    inside & ~shell,
+                    prompt=self.prompt,
+                    exemplar=self.photos.get(axis),
+                    strength=step.strength,
+                    seeds=[slice_seed(self.seed, number, axis, index) for index in part],
+                    context=SliceContext(
+                        axis, tuple(part), level.voxel, inside, depth, level.max_depth
+                    ),
+                )
+                images = np.ascontiguousarray(np.swapaxes(made[:, ::-1], 1, 2))
                 self._estimate(len(part), time.perf_counter() - began)
                 for index, image in zip(part, images, strict=True):
                     found[index] = image
@@ -371,39 +376,6 @@ class _Run:
                 self.inpainter.name,
             )
 
-    def _call(
-        self,
-        backend: Inpainter,
-        volume: np.ndarray,
-        level: InteriorDomain,
-        step: _Pass,
-        number: int,
-        axis: int,
-        part: Sequence[int],
-    ) -> np.ndarray:
-        inside, shell, depth, colors = (
-            _upright(np.moveaxis(np.take(field, part, axis), axis, 0))
-            for field in (level.inside, level.shell, level.depth, volume)
-        )
-        images = np.where(inside[..., None], colors, GROUND).astype(np.float32)
-        made = backend(
-            images,
-            inside & ~shell,
-            prompt=self.prompt,
-            exemplar=self.photos.get(axis),
-            strength=step.strength,
-            seeds=[slice_seed(self.seed, number, axis, index) for index in part],
-            context=SliceContext(
-                axis=axis,
-                offsets=tuple(part),
-                pitch=level.voxel,
-                inside=inside,
-                guide=depth,
-                max_depth=level.max_depth,
-            ),
-        )
-        return np.ascontiguousarray(np.swapaxes(made[:, ::-1], 1, 2))
-
 
 def _upright(slices: np.ndarray) -> np.ndarray:
     """Slices [B, U, V, ...] of a volume as pictures [B, H, W, ...] with V (z where it can) up.
@@ -411,12 +383,3 @@ def _upright(slices: np.ndarray) -> np.ndarray:
     A model knows which way up a cake is, and so does a photograph of one.
     """
     return np.ascontiguousarray(np.swapaxes(slices, 1, 2)[:, ::-1])
-
-
-def _per_axis(exemplar: Photographs) -> dict[int, Exemplar]:
-    """One photograph per axis: the first of a list, and the first axis' where there is none."""
-    if exemplar is None or isinstance(exemplar, Exemplar):
-        return {} if exemplar is None else dict.fromkeys(range(3), exemplar)
-    found = {a: e if isinstance(e, Exemplar) else e[0] for a, e in sorted(exemplar.items())}
-    first = next(iter(found.values()), None)
-    return {} if first is None else {axis: found.get(axis, first) for axis in range(3)}

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, check_choice
 
 BACKENDS = ("diffusers", "command", "exemplar", "telea", "color")
 _CHOICES = {
@@ -97,6 +95,7 @@ class InpaintOptions:
 
     def __post_init__(self) -> None:
         """Check ranges."""
+        object.__setattr__(self, "refine", tuple(float(r) for r in self.refine))
         for name, value in [("strength", self.strength), *(("refine", r) for r in self.refine)]:
             if not 0.0 < value <= 1.0:
                 raise InputError(
@@ -109,49 +108,19 @@ class InpaintOptions:
                     f"texture: inpaint {name} must be at least 1, got {getattr(self, name)}",
                     hint="leave it out",
                 )
-        if self.tile not in (1, 2, 4):
-            raise InputError(
-                f"texture: inpaint tile must be 1, 2 or 4, got {self.tile}", hint="leave it out"
-            )
+        check_choice("texture: inpaint tile", self.tile, (1, 2, 4), "leave it out")
         if self.size is not None and self.size < 16:
             raise InputError(
                 f"texture: inpaint size must be at least 16, got {self.size}",
                 hint="leave it out: the model knows its own",
             )
         for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(
-                    f"texture: inpaint {name} must be one of {', '.join(filter(None, allowed))}, "
-                    f"got {getattr(self, name)!r}",
-                    hint="use balanced when the GPU runs out of memory"
-                    if name == "memory"
-                    else "leave it out",
-                )
+            hint = "leave it out"
+            if name == "memory":
+                hint = "use balanced when the GPU runs out of memory"
+            check_choice(f"texture: inpaint {name}", getattr(self, name), allowed, hint)
         if "command" in (self.backend, self.coarse) and not self.command:
             raise InputError(
                 "texture: inpaint backend 'command' needs a command",
                 hint='add command: "python infer.py --folder {folder}"',
             )
-
-    @staticmethod
-    def of(value: InpaintOptions | Mapping[str, Any] | None) -> InpaintOptions:
-        """Options from a mapping, as a shot file gives them.
-
-        Raises:
-            InputError: A name is unknown.
-        """
-        if value is None:
-            return InpaintOptions()
-        if isinstance(value, InpaintOptions):
-            return value
-        known = {f.name for f in fields(InpaintOptions)}
-        wrong = sorted(set(value) - known)
-        if wrong:
-            raise InputError(
-                f"texture: inpaint knows no {', '.join(wrong)}",
-                hint=f"known are {', '.join(sorted(known))}",
-            )
-        given = dict(value)
-        if "refine" in given:
-            given["refine"] = tuple(float(r) for r in given["refine"])
-        return InpaintOptions(**given)

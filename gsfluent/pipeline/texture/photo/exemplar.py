@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsfluent.colors import rgb_to_lab
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, check_choice
+from gsfluent.lazy import cv2, ndimage
 from gsfluent.pipeline.texture.photo.light import (
     match_skin,
     remove_glints,
@@ -22,6 +23,7 @@ from gsfluent.pipeline.texture.photo.light import (
 from gsfluent.pipeline.texture.photo.mask import CUTOUTS, cut_out, strip_ground, trim_rim
 from gsfluent.pipeline.texture.photo.read import read_pixels
 from gsfluent.pipeline.texture.photo.stain import fill_holes, grey_share, recolor, remove_stain
+from gsfluent.pipeline.texture.volume.domain import nearest_in
 
 logger = logging.getLogger(__name__)
 
@@ -54,41 +56,14 @@ class PhotoOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no step understands."""
-        if self.cutout not in CUTOUTS:
-            raise InputError(
-                f"texture: cutout must be one of {', '.join(CUTOUTS)}, got {self.cutout!r}",
-                hint="leave it at auto",
-            )
+        check_choice("texture: cutout", self.cutout, CUTOUTS, "leave it at auto")
         if self.white != "skin" if isinstance(self.white, str) else True:
             white_gains(self.white, np.zeros((4, 4, 3), np.float32), np.ones((4, 4), bool))
         if self.palette is not None:
-            from gsfluent.pipeline.texture.presets.procedural import PRESETS, preset_names
+            from gsfluent.pipeline.texture.presets.procedural import preset_names
 
-            if self.palette not in PRESETS:
-                raise InputError(
-                    f"texture: palette must be one of {', '.join(preset_names())}, "
-                    f"got {self.palette!r}",
-                    hint="choose one of these, or leave it out",
-                )
-
-    @staticmethod
-    def of(value: PhotoOptions | Mapping[str, Any] | None) -> PhotoOptions:
-        """Options from a mapping, themselves, or the defaults.
-
-        Raises:
-            InputError: A key is unknown or a value is wrong.
-        """
-        if value is None:
-            return PhotoOptions()
-        if isinstance(value, PhotoOptions):
-            return value
-        known = [f.name for f in fields(PhotoOptions)]
-        for key in value:
-            if key not in known:
-                raise InputError(
-                    f"texture: photo has no key {key!r}", hint=f"known: {', '.join(known)}"
-                )
-        return PhotoOptions(**value)
+            hint = "choose one of these, or leave it out"
+            check_choice("texture: palette", self.palette, preset_names(), hint)
 
 
 @dataclass(frozen=True)
@@ -117,9 +92,6 @@ class Exemplar:
 
     def resized(self, factor: float) -> Exemplar:
         """The same photograph with ``factor`` times the pixels along each side."""
-        import cv2
-        from scipy import ndimage
-
         height, width = self.mask.shape
         size = (max(4, round(width * factor)), max(4, round(height * factor)))
         method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
@@ -129,10 +101,14 @@ class Exemplar:
         if not mask.any():
             mask = share >= share.max()
         depth = cv2.resize(self.depth * factor, size, interpolation=method).clip(0.0, None)
-        nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-        image = image[tuple(nearest)].astype(np.float32)
+        image = image[nearest_in(mask)].astype(np.float32)
         depth = np.where(mask, depth, 0.0).astype(np.float32)
         return replace(self, image=image, mask=mask, depth=depth)
+
+
+Exemplars = dict[int, list[Exemplar]]
+"""Photographs per slice axis; axes may share them."""
+_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 def load_exemplar(
@@ -177,46 +153,76 @@ def load_exemplar(
     image, chosen, notes = _prepare(image, chosen, silhouette, options)
     note = "; ".join([note, *notes])
     logger.info("%s: %s", name, note)
-    return _finish(image, chosen, silhouette, note)
+    extended = image[nearest_in(chosen)].astype(np.float32)
+    return Exemplar(extended, chosen, _depth(chosen), silhouette, note)
 
 
-def open_exemplars(source: Any, options: PhotoOptions) -> Any:
-    """Exemplars in place of the files and arrays in whatever holds them.
+def load_exemplars(source: object, options: PhotoOptions | None = None) -> Exemplars:
+    """Photographs per slice axis.
 
     Args:
-        source: A file, an array, a list of them (one kind of material on several photographs), or
-            a mapping from slice axes to these. Anything else comes back as it is.
-        options: What to do to each picture.
+        source: One image (path, array or :class:`Exemplar`) or a list of them for all axes, or a
+            mapping from ``x``, ``y``, ``z`` (axes of the object, z its own axis) to images or
+            lists.
+        options: What to do to each picture; an :class:`Exemplar` stays what it is.
+
+    Returns:
+        Photographs by axis; only the axes that were named, or all three with the same list.
 
     Raises:
-        InputError: A photograph cannot be used.
+        InputError: An axis is unknown or an image cannot be used.
     """
     if isinstance(source, Mapping):
-        return {axis: open_exemplars(part, options) for axis, part in source.items()}
-    if isinstance(source, list | tuple):
-        return [open_exemplars(part, options) for part in source]
-    if isinstance(source, str | Path | np.ndarray):
-        return load_exemplar(source, options=options)
-    return source
+        if not source or any(key not in _AXES for key in source):
+            raise InputError(
+                f"texture: exemplar axes must be x, y, z, got {sorted(map(str, source))}",
+                hint="write exemplar: {x: a.jpg, z: b.jpg} or one file",
+            )
+        return {_AXES[key]: _load_list(source[key], options) for key in sorted(source)}
+    return dict.fromkeys(range(3), _load_list(source, options))
 
 
-def with_skin(opened: Any, skin: np.ndarray) -> Any:
-    """White balance that gives the photographed skin the object's colour.
+def _load_list(source: object, options: PhotoOptions | None) -> list[Exemplar]:
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        if not source:
+            raise InputError("texture: the list of exemplars is empty", hint="name a photograph")
+        return [item for part in source for item in _load_list(part, options)]
+    if isinstance(source, Exemplar):
+        return [source]
+    if not isinstance(source, str | Path | np.ndarray):
+        raise InputError(
+            f"texture: exemplar must be a file, an array or a mapping, got {type(source).__name__}",
+            hint="give the path of a photograph",
+        )
+    return [load_exemplar(source, options=options)]
 
-    Args:
-        opened: What :func:`open_exemplars` returned.
-        skin: Colours of the object's surface [n, 3] in 0..1.
-    """
-    if isinstance(opened, Mapping):
-        return {axis: with_skin(part, skin) for axis, part in opened.items()}
-    if isinstance(opened, list):
-        return [with_skin(part, skin) for part in opened]
-    if not isinstance(opened, Exemplar):
-        return opened
-    if not opened.silhouette:
-        return replace(opened, note=f"{opened.note}; white: no skin in the photograph")
-    image, note = match_skin(opened.image, opened.mask, opened.depth, skin)
-    return replace(opened, image=image, note=f"{opened.note}; {note}")
+
+def each(exemplars: Exemplars, change: Callable[[Exemplar], Exemplar]) -> Exemplars:
+    """The photographs changed, each once however many axes share it."""
+    made: dict[int, Exemplar] = {}
+    for photo in (photo for group in exemplars.values() for photo in group):
+        if id(photo) not in made:
+            made[id(photo)] = change(photo)
+    return {axis: [made[id(photo)] for photo in group] for axis, group in exemplars.items()}
+
+
+def one_per_axis(
+    exemplar: Exemplar | Mapping[int, Exemplar | Sequence[Exemplar]] | None,
+) -> dict[int, Exemplar]:
+    """One photograph per axis: the first of a list, and the first axis' where there is none."""
+    if exemplar is None or isinstance(exemplar, Exemplar):
+        return {} if exemplar is None else dict.fromkeys(range(3), exemplar)
+    found = {a: e if isinstance(e, Exemplar) else e[0] for a, e in sorted(exemplar.items())}
+    first = next(iter(found.values()), None)
+    return {} if first is None else {axis: found.get(axis, first) for axis in range(3)}
+
+
+def with_skin(photo: Exemplar, skin: np.ndarray) -> Exemplar:
+    """White balance that gives the photographed skin the object's colours [n, 3] in 0..1."""
+    if not photo.silhouette:
+        return replace(photo, note=f"{photo.note}; white: no skin in the photograph")
+    image, note = match_skin(photo.image, photo.mask, photo.depth, skin)
+    return replace(photo, image=image, note=f"{photo.note}; {note}")
 
 
 def _prepare(
@@ -268,8 +274,9 @@ def _ground(image: np.ndarray, mask: np.ndarray) -> np.ndarray | None:
     return np.asarray(middle) if even else None
 
 
-def _palette(name: str, bins: int = 24, samples: int = 400) -> np.ndarray:
+def _palette(name: str) -> np.ndarray:
     """Colours of a preset in a ball per relative depth, [bins, samples, 3]."""
+    bins, samples = 24, 400
     from gsfluent.pipeline.texture.presets.procedural import PRESETS
 
     rng = np.random.default_rng(0)
@@ -283,16 +290,5 @@ def _palette(name: str, bins: int = 24, samples: int = 400) -> np.ndarray:
 
 def _depth(mask: np.ndarray) -> np.ndarray:
     """Distance of pixel centres to the outline [pixels]."""
-    from scipy import ndimage
-
     distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     return np.where(mask, distance - 0.5, 0.0).astype(np.float32)
-
-
-def _finish(image: np.ndarray, mask: np.ndarray, silhouette: bool, note: str) -> Exemplar:
-    """Depth below the outline, and colours extended outward."""
-    from scipy import ndimage
-
-    nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    extended = image[tuple(nearest)]
-    return Exemplar(extended.astype(np.float32), mask, _depth(mask), silhouette, note)

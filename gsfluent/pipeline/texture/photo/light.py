@@ -1,4 +1,8 @@
-"""What the light left in a photograph and the material does not have: shading, glints, tint."""
+"""What the light left in a photograph and the material does not have: shading, glints, tint.
+
+Every step takes a picture float32 [H, W, 3] in 0..1 and its face, bool [H, W], some the distance to
+the outline [pixels], and gives the picture and a sentence for the report, None for nothing done.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import numpy as np
 
 from gsfluent.colors import linear_to_srgb, rgb_to_lab, srgb_to_linear
 from gsfluent.errors import InputError
+from gsfluent.lazy import cv2, ndimage
 
 _WORK = 160  # pixels along the longest side while the shading is fitted
 _LEAST_SHADING = 0.10  # range of log luminance below which shading is left alone
@@ -19,7 +24,7 @@ _LEAST_AREA = 12_000  # pixels of a face in which glints are looked for
 def shading_field(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
-    """Logarithm of a smooth illumination across the photograph.
+    """Logarithm of a smooth illumination across the photograph, and its range.
 
     The gradient of log luminance is explained by a polynomial of the position (the light) and, for
     a cut face with an outline, by a piecewise linear function of depth (the material's layers);
@@ -28,18 +33,10 @@ def shading_field(
     the terms x, y, xy, x^2 - y^2, and x^2 + y^2 only where there is no depth that it would be
     confused with.
 
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: Pixels that count, bool [H, W].
-        depth: Distance to the outline [H, W], or None for a patch of material.
-
     Returns:
         Log illumination float32 [H, W] with mean zero in the mask, and its range there (the
         difference of its 95 and 5 % quantiles; 0.1 is about 10 % of the light).
     """
-    import cv2
-    from scipy import ndimage
-
     height, width = mask.shape
     factor = min(1.0, _WORK / max(height, width))
     size = (max(8, round(width * factor)), max(8, round(height * factor)))
@@ -67,7 +64,8 @@ def shading_field(
     if depth is not None:
         layer = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         knots = np.quantile(layer[small], np.linspace(0.0, 1.0, _KNOTS))
-        columns += [np.clip((layer - a) / (b - a + 1e-6), 0, 1) for a, b in _pairs(knots)]
+        pairs = itertools.pairwise(knots.tolist())
+        columns += [np.clip((layer - a) / (b - a + 1e-6), 0, 1) for a, b in pairs]
     design = np.stack([_slope(c)[:, usable].reshape(-1) for c in columns], 1)
     wanted = _slope(value)[:, usable].reshape(-1)
     hue = np.sqrt(sum((_slope(chroma[..., c]) ** 2).sum(0) for c in range(3)))[usable]
@@ -118,10 +116,6 @@ def _agree(fields: np.ndarray) -> bool:
     return bool(np.sqrt((half**2).mean()) < 0.3 * np.sqrt((mean**2).mean()) + 1e-9)
 
 
-def _pairs(knots: np.ndarray) -> list[tuple[float, float]]:
-    return list(itertools.pairwise(knots.tolist()))
-
-
 def _slope(field: np.ndarray) -> np.ndarray:
     """Differences along rows and columns [2, H, W]."""
     return np.stack(np.gradient(field))
@@ -138,8 +132,6 @@ def _explains(
     Gradients can agree without the light being uneven (a saw of grains lit from one side). Broad
     means over an eighth of the picture; what depth explains is the material's.
     """
-    from scipy import ndimage
-
     width = max(value.shape) / 8.0
     norm = ndimage.gaussian_filter(small.astype(float), width) + 1e-6
 
@@ -159,11 +151,7 @@ def _explains(
 def remove_shading(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray | None
 ) -> tuple[np.ndarray, str | None]:
-    """Divide the photograph by its illumination (:func:`shading_field`) in linear light.
-
-    Returns:
-        The picture, and a sentence when there was shading worth the name.
-    """
+    """Divide the photograph by its illumination (:func:`shading_field`) in linear light."""
     field, size = shading_field(image, mask, depth)
     if size < _LEAST_SHADING:
         return image, None
@@ -180,13 +168,7 @@ def remove_glints(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str 
     1985): small compact spots that are much lighter and much less coloured than their
     neighbourhood. On grey material a highlight cannot be told from a light grain by its colour;
     there only the smallest spots that reach white on a dark ground count.
-
-    Returns:
-        The picture, and a sentence when spots were found.
     """
-    import cv2
-    from scipy import ndimage
-
     area = float(mask.sum())
     if area < _LEAST_AREA:  # pixels larger than a highlight average it away
         return image, None
@@ -230,18 +212,15 @@ def remove_glints(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str 
 
 
 def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str]:
-    """Factors of linear red, green and blue that take the light's tint out.
+    """Factors [3] of linear red, green (1) and blue that take the light's tint out; their source.
 
     Args:
         white: ``auto`` (the ground around a cut-out when it is nearly neutral and not dark, else
             nothing), ``none``, a colour temperature [K] of the light, or three numbers: the sRGB
             value (0..1 or 0..255) that a white or grey thing has in the photograph. Grey world is
             not offered: the mean of a fruit is not grey.
-        image: float32 [H, W, 3] in 0..1.
+        image: The photograph.
         mask: The object.
-
-    Returns:
-        Gains [3] with green 1, and what they come from ('' when nothing is to be done).
 
     Raises:
         InputError: The value is none of these.
@@ -272,8 +251,6 @@ def white_gains(white: object, image: np.ndarray, mask: np.ndarray) -> tuple[np.
 
 def _ground_gains(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str]:
     """Gains that make a nearly neutral ground neutral."""
-    from scipy import ndimage
-
     ground = ~ndimage.binary_dilation(mask, iterations=max(2, round(0.02 * max(mask.shape))))
     if ground.sum() < 0.02 * ground.size:
         return np.ones(3), ""
@@ -311,18 +288,13 @@ def _planck(kelvin: float) -> np.ndarray:
         ]
     )
     rgb = np.maximum(matrix @ xyz, 0.02)
-    result: np.ndarray = rgb / rgb[1]
-    return result
+    return rgb / rgb[1]
 
 
 def remove_tint(
     image: np.ndarray, mask: np.ndarray, white: object
 ) -> tuple[np.ndarray, str | None]:
-    """White balance by :func:`white_gains`.
-
-    Returns:
-        The picture, and a sentence when it was changed.
-    """
+    """White balance by :func:`white_gains`."""
     gains, source = white_gains(white, image, mask)
     if not source or float(np.abs(gains - 1.0).max()) < 0.01:
         return image, None
@@ -334,19 +306,10 @@ def remove_tint(
 def match_skin(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray, skin: np.ndarray
 ) -> tuple[np.ndarray, str]:
-    """White balance by which the photographed skin gets the colour of the object's surface.
+    """White balance by which the photographed skin gets the colours [n, 3] of the object's surface.
 
     The rim of the photograph (a thirtieth of the largest depth) is compared with the surface; only
     when both have the same hue within 30 degrees is it the same skin under another light.
-
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: The face.
-        depth: Distance to the outline [pixels].
-        skin: Surface colours [n, 3] in 0..1.
-
-    Returns:
-        The picture, and a sentence for the report.
     """
     rim = mask & (depth <= max(1.5, float(depth.max()) / 30.0))
     if not rim.any() or len(skin) == 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsfluent.colors import rgb_to_lab
+from gsfluent.lazy import cv2, ndimage
 
 CUTOUTS = ("auto", "ground", "grabcut", "none")
 
@@ -15,20 +16,13 @@ _PAINTED = 3.0
 
 
 def cut_out(image: np.ndarray, method: str = "auto") -> tuple[np.ndarray, bool, str]:
-    """Object mask of a photograph without alpha channel.
+    """Object mask of a photograph without alpha channel, whether it is an outline, and a sentence.
 
     ``ground``: what is connected to the border and has its colour is taken away; the colour is that
     of the border if it is even, else that of the corners if at least three of them agree (tight
     crops). ``grabcut``: iterated graph cuts (Rother et al. 2004) from a box, kept only when the
     result is one compact piece that differs from its surroundings. ``auto`` tries them in this
     order and takes the whole picture as material when neither finds an object.
-
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        method: One of :data:`CUTOUTS`.
-
-    Returns:
-        Mask bool [H, W], whether it is an outline, and a sentence for the report.
     """
     whole = np.ones(image.shape[:2], bool)
     if method == "none":
@@ -50,8 +44,6 @@ def cut_out(image: np.ndarray, method: str = "auto") -> tuple[np.ndarray, bool, 
 
 def _by_ground(image: np.ndarray) -> tuple[np.ndarray | None, str]:
     """Mask by the colour of border or corners, or None and why not."""
-    from scipy import ndimage
-
     lab = rgb_to_lab(image)
     border = np.concatenate([lab[:2].reshape(-1, 3), lab[-2:].reshape(-1, 3)])
     border = np.concatenate([border, lab[:, :2].reshape(-1, 3), lab[:, -2:].reshape(-1, 3)])
@@ -94,9 +86,6 @@ def _ends(edge: int) -> tuple[slice, slice]:
 
 def _by_graph_cut(image: np.ndarray) -> tuple[np.ndarray | None, str]:
     """Mask by GrabCut, or None and why not."""
-    import cv2
-    from scipy import ndimage
-
     height, width = image.shape[:2]
     factor = min(1.0, 320.0 / max(height, width))
     size = (max(16, round(width * factor)), max(16, round(height * factor)))
@@ -141,8 +130,6 @@ def strip_ground(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
     Cut-outs exported with a coarse alpha keep corners of their ground.
     """
-    from scipy import ndimage
-
     padded = np.pad(mask, 1)
     ring = mask & ~ndimage.binary_erosion(padded)[1:-1, 1:-1]
     for flat in (image.max(2) < 0.04, image.min(2) > 0.97):
@@ -157,30 +144,21 @@ def strip_ground(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def largest_piece(mask: np.ndarray) -> np.ndarray:
     """Largest component with its holes filled."""
-    from scipy import ndimage
-
     labels, count = ndimage.label(ndimage.binary_opening(mask, iterations=1))
     if count == 0:
         return mask
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    filled: np.ndarray = ndimage.binary_fill_holes(labels == sizes.argmax())
-    return filled
+    return ndimage.binary_fill_holes(labels == sizes.argmax())
 
 
 def trim_rim(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str | None]:
-    """Take leftovers of the surroundings off the rim of a cut-out.
+    """Take leftovers of the surroundings off the rim of a cut-out; a sentence when there were any.
 
     A leftover is a piece of the rim (a twelfth of the largest depth) as thick as a fortieth of it
     whose colour differs from the colour most of the rim has at that depth: ground that a tight crop
     kept, and skin seen from the side beyond the cut. Layers that go all round stay.
-
-    Returns:
-        The mask, and a sentence when something was taken off.
     """
-    import cv2
-    from scipy import ndimage
-
     depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
     largest = float(depth.max())
     reach = 0.12 * largest

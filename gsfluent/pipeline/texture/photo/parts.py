@@ -60,8 +60,7 @@ def resized_parts(labels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """A label image with another number of pixels; numbers stay what they are."""
     rows = ((np.arange(shape[0]) + 0.5) * labels.shape[0] / shape[0]).astype(int)
     columns = ((np.arange(shape[1]) + 0.5) * labels.shape[1] / shape[1]).astype(int)
-    picked: np.ndarray = labels[rows[:, None], columns[None]]
-    return picked
+    return labels[rows[:, None], columns[None]]
 
 
 def _checked(labels: np.ndarray) -> np.ndarray:
@@ -73,12 +72,12 @@ def _checked(labels: np.ndarray) -> np.ndarray:
 
 
 def _read(path: Path) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     if not path.is_file():
         raise InputError(f"{path}: label image not found", hint="check the path")
     try:
         with Image.open(path) as opened:
             return np.asarray(opened)
-    except (UnidentifiedImageError, OSError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: not an image ({error})", hint="use a PNG") from error

@@ -8,13 +8,13 @@ from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 
 
-def depth_profile(exemplar: Exemplar, bins: int = 48) -> tuple[np.ndarray, np.ndarray]:
+def depth_profile(exemplar: Exemplar) -> tuple[np.ndarray, np.ndarray]:
     """Mean colour per depth of a photograph.
 
     Returns:
         Bin depths [B] in pixels of the photograph, and colours [B, 3].
     """
-    depth = exemplar.depth[exemplar.mask]
+    bins, depth = 48, exemplar.depth[exemplar.mask]
     color = exemplar.image[exemplar.mask]
     # square-root spacing: thin layers (rind) lie close to the outline
     edges = exemplar.max_depth * np.linspace(0.0, 1.0, bins + 1) ** 1.5
@@ -42,22 +42,11 @@ def match_colors(
     rng: np.random.Generator,
     rounds: int = 3,
 ) -> np.ndarray:
-    """Move colours to the reference's distribution, separately in overlapping depth ranges.
+    """Move colours [n, 3] to the reference's distribution [m, 3], in overlapping depth ranges.
 
-    Sliced optimal transport (Pitie et al. 2005; Rabin et al. 2011): in each round the colours are
-    projected on three orthogonal directions and their quantiles are matched.
-
-    Args:
-        values: Colours [n, 3].
-        depth: [n], in the unit of ``reference_depth``.
-        reference: Colours [m, 3].
-        reference_depth: [m].
-        bins: Number of depth ranges; 1 ignores depth.
-        rng: Random generator (directions).
-        rounds: Rotations per range.
-
-    Returns:
-        Colours float32 [n, 3].
+    Sliced optimal transport (Pitie et al. 2005; Rabin et al. 2011): in each of ``rounds`` the
+    colours are projected on three orthogonal directions and their quantiles are matched. Both
+    depths are in one unit; ``bins`` of 1 ignore them.
     """
     knots = _depth_knots(reference_depth, bins)
     result = np.zeros_like(values, dtype=np.float64)
@@ -83,8 +72,7 @@ def _depth_knots(depth: np.ndarray, bins: int) -> np.ndarray:
     # half uniform in depth, half uniform in area: thin layers and broad cores both get knots
     uniform = np.linspace(depth.min(), depth.max(), bins)
     area = np.quantile(depth, np.linspace(0, 1, bins))
-    knots: np.ndarray = np.unique(0.5 * (uniform + area))
-    return knots
+    return np.unique(0.5 * (uniform + area))
 
 
 def _hat(depth: np.ndarray, knots: np.ndarray, k: int) -> np.ndarray:
@@ -127,5 +115,4 @@ def surface_profile(domain: InteriorDomain) -> np.ndarray:
     """
     mean = np.median(domain.skin[domain.shell], axis=0)
     fade = 1.0 - np.exp(-3.0 * domain.depth / max(domain.max_depth, 1e-6))
-    rgb: np.ndarray = domain.skin + fade[..., None] * (mean - domain.skin)
-    return rgb.astype(np.float32)
+    return (domain.skin + fade[..., None] * (mean - domain.skin)).astype(np.float32)

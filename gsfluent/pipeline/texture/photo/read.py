@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsfluent.errors import InputError
+from gsfluent.lazy import cv2
 
 _LARGEST = 1024  # pixels; exemplars are reduced to voxel pitch anyway
 _SMALLEST = 16
@@ -53,8 +54,6 @@ def read_pixels(source: str | Path | np.ndarray, name: str) -> np.ndarray:
         )
     longest = max(values.shape[:2])
     if longest > _LARGEST:
-        import cv2
-
         factor = _LARGEST / longest
         size = (max(1, round(values.shape[1] * factor)), max(1, round(values.shape[0] * factor)))
         values = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
@@ -63,7 +62,7 @@ def read_pixels(source: str | Path | np.ndarray, name: str) -> np.ndarray:
 
 def _read(path: Path) -> np.ndarray:
     """Pixels of an image file as uint8 [H, W, 3 or 4], turned upright."""
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import Image, ImageOps
 
     if not path.is_file():
         raise InputError(f"{path}: exemplar not found", hint="check the path")
@@ -78,13 +77,7 @@ def _read(path: Path) -> np.ndarray:
             has_alpha = "A" in picture.getbands() or "transparency" in picture.info
             picture = picture.convert("RGBA" if has_alpha else "RGB")
             return np.asarray(picture)
-    except (
-        UnidentifiedImageError,
-        OSError,
-        ValueError,
-        SyntaxError,
-        Image.DecompressionBombError,
-    ) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(
             f"{path}: exemplar cannot be read ({error})", hint="use a PNG or JPEG file"
         ) from error

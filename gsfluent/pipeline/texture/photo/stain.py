@@ -1,10 +1,11 @@
-"""Holes, stains and greyness of a photographed cut."""
+"""Holes, stains and greyness of a photographed cut; arguments as in :mod:`.light`."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gsfluent.colors import lab_to_rgb, rgb_to_lab
+from gsfluent.lazy import cv2, ndimage
 from gsfluent.pipeline.texture.volume.domain import smoothstep
 
 _GREY = 8.0  # Lab chroma below which a pixel counts as grey
@@ -14,25 +15,14 @@ _CAVITY = 0.65  # light at the bottom of a small cavity relative to its rim
 def fill_holes(
     image: np.ndarray, mask: np.ndarray, depth: np.ndarray, ground: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, str | None]:
-    """Give open cavities of the core the colour of their walls.
+    """Give open cavities of the core, bool [H, W], the colour of their walls.
 
-    Where a cut face has a hole (the carpels of an apple), the camera sees the ground through it, or
-    nothing; as a material that would be soot. Dark pieces in the innermost third of the face, black
-    or of the ground's colour, are painted with the colour of their rim, darker towards their
-    middle as a cavity is. Seeds lie farther out or have a colour of their own, and stay.
-
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: The face, holes included.
-        depth: Distance to the outline [pixels].
-        ground: Lab colour around the object, or None.
-
-    Returns:
-        The picture, the cavities bool [H, W], and a sentence when there are any.
+    Where a cut face has a hole (the carpels of an apple), the camera sees the ground (its Lab
+    colour) through it, or nothing; as a material that would be soot. Dark pieces in the innermost
+    third of the face, black or of the ground's colour, are painted with the colour of their rim,
+    darker towards their middle as a cavity is. Seeds lie farther out or have a colour of their own,
+    and stay.
     """
-    import cv2
-    from scipy import ndimage
-
     area, largest = float(mask.sum()), float(depth.max())
     lab = rgb_to_lab(cv2.GaussianBlur(image, (0, 0), max(0.5, 0.003 * np.sqrt(area))))
     face = np.median(lab[mask], axis=0)
@@ -84,23 +74,13 @@ def grey_share(image: np.ndarray, mask: np.ndarray) -> float:
 def remove_stain(
     image: np.ndarray, mask: np.ndarray, keep: np.ndarray | None = None
 ) -> tuple[np.ndarray, str | None]:
-    """Take a grey stain out of a coloured material.
+    """Take a grey stain out of a coloured material; pixels to ``keep`` (cavities) are not stained.
 
     For faces stained for a test (iodine turns starch blue-black) that show some unstained material:
     where the local mean colour has lost most of the chroma of the most coloured tenth, it is
     replaced by that of the unstained part, and the texture is scaled to the contrast it has there.
     Small coloured things (seeds, veins) are above the local mean's scale and stay.
-
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: The face.
-        keep: Pixels that are not stained whatever their colour (cavities), bool [H, W].
-
-    Returns:
-        The picture, and a sentence when something was stained.
     """
-    from scipy import ndimage
-
     if keep is not None:
         mask = mask & ~keep
 
@@ -109,8 +89,7 @@ def remove_stain(
     share = ndimage.gaussian_filter(mask.astype(float), width) + 1e-6
 
     def smooth(field: np.ndarray) -> np.ndarray:
-        result: np.ndarray = ndimage.gaussian_filter(np.where(mask, field, 0.0), width) / share
-        return result
+        return ndimage.gaussian_filter(np.where(mask, field, 0.0), width) / share
 
     low = np.stack([smooth(lab[..., c]) for c in range(3)], -1)
     chroma = np.hypot(low[..., 1], low[..., 2])
@@ -143,17 +122,8 @@ def recolor(
     """Colours of a palette on the lightness pattern of a photograph.
 
     In every depth range the lightness is moved to the palette's mean and contrast there; hue and
-    chroma are the palette's.
-
-    Args:
-        image: float32 [H, W, 3] in 0..1.
-        mask: The face.
-        depth: Distance to the outline [pixels].
-        palette: Colours per relative depth, [B, n, 3] in 0..1: n samples of the material in each
-            of B equal ranges from the outline to the deepest point.
-
-    Returns:
-        The picture.
+    chroma are the palette's: [B, n, 3] in 0..1, n samples of the material in each of B equal ranges
+    from the outline to the deepest point.
     """
     bins = len(palette)
     lab = rgb_to_lab(image).astype(np.float64)

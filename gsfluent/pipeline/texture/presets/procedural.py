@@ -9,33 +9,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.presets import food as presets_food
-from gsfluent.pipeline.texture.presets import matter as presets_matter
+from gsfluent.errors import check_choice
+from gsfluent.pipeline.texture.presets import food, matter
 from gsfluent.pipeline.texture.presets.tools import Preset
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, axis_frame
 
 _CHUNK = 32_000
 """Points evaluated at a time: their fifty numbers each should stay in the cache."""
 
-PRESETS: dict[str, Preset] = {
-    "apple": presets_food.apple,
-    "bone": presets_matter.bone,
-    "bread": presets_food.bread,
-    "cake": presets_food.cake,
-    "concrete": presets_matter.concrete,
-    "jelly": presets_matter.jelly,
-    "marble": presets_matter.marble,
-    "orange": presets_food.orange,
-    "stuffing": presets_matter.stuffing,
-    "watermelon": presets_food.watermelon,
-    "wood": presets_matter.wood,
-}
+_FOOD = (food.apple, food.bread, food.cake, food.orange, food.watermelon)
+_MATTER = (matter.bone, matter.concrete, matter.jelly, matter.marble, matter.stuffing, matter.wood)
+PRESETS: dict[str, Preset] = {preset.__name__: preset for preset in (*_FOOD, *_MATTER)}
 
 
 def preset_names() -> list[str]:
     """Names of the presets, sorted."""
     return sorted(PRESETS)
+
+
+def check_preset(preset: str | None) -> None:
+    """Raise :class:`InputError` unless there is such a preset."""
+    hint = "choose one of these or give an exemplar photograph"
+    check_choice("texture: preset", preset, preset_names(), hint)
 
 
 def procedural_texture(domain: InteriorDomain, preset: str, seed: int) -> InteriorTexture:
@@ -44,11 +39,7 @@ def procedural_texture(domain: InteriorDomain, preset: str, seed: int) -> Interi
     Raises:
         InputError: Unknown preset.
     """
-    if preset not in PRESETS:
-        raise InputError(
-            f"texture: preset must be one of {', '.join(preset_names())}, got {preset!r}",
-            hint="choose one of these or give an exemplar photograph",
-        )
+    check_preset(preset)
     index = np.argwhere(domain.inside)
     scale = max(domain.max_depth, 1.0)
     middle = 0.5 * (index.min(0) + index.max(0)) + 0.5

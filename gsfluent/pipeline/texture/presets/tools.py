@@ -18,8 +18,7 @@ def paint(*values: float) -> np.ndarray:
 
 def mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Colours between a and b [n, 3] (or one colour [3]) by shares t [n], clipped to 0..1."""
-    result: np.ndarray = a + (b - a) * np.clip(t, 0.0, 1.0)[:, None]
-    return result.astype(np.float32)
+    return (a + (b - a) * np.clip(t, 0.0, 1.0)[:, None]).astype(np.float32)
 
 
 def layers(depth: np.ndarray, stops: list[tuple[float, np.ndarray]]) -> np.ndarray:

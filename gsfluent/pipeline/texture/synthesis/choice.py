@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsfluent.colors import rgb_to_lab
+from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.photo.metrics import lab_histogram_distance
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient
@@ -27,15 +28,10 @@ _STREAKS = 0.75  # least share of the photograph's change along the depth
 def surface_verdict(
     domain: InteriorDomain, photos: list[PlacedPhoto], seed: int = 0
 ) -> dict[str, Any]:
-    """Compare the surface, and the surface copied inwards, with the photographs.
-
-    Args:
-        domain: The object with the colours of its surface.
-        photos: Photographs of the inside, placed.
-        seed: Seed of the samples.
+    """Compare the surface, and the surface copied inwards, with the photographs of the inside.
 
     Returns:
-        ``surface_hist``, ``surface_patch`` (distance surface to photograph, Lab; NaN where no
+        ``surface_hist``, ``surface_patch`` (distance surface to photograph, Lab; None where no
         patch of the surface is flat enough to be seen from along an axis), ``photo_hist`` and
         ``photo_patch`` (between the photograph's halves), ``copy_radial`` and ``photo_radial``
         (change along the depth over change across it), ``surface_like_interior`` and
@@ -81,24 +77,19 @@ def surface_verdict(
     }
 
 
-def _patches(
-    lab: np.ndarray, mask: np.ndarray, rng: np.random.Generator, limit: int = 3000
-) -> np.ndarray:
+def _patches(lab: np.ndarray, mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Patches [n, 75] of a picture that lie wholly in a mask."""
-    from scipy import ndimage
-
     half = _PATCH // 2
     centers = np.argwhere(ndimage.binary_erosion(mask, np.ones((_PATCH, _PATCH))))
-    centers = centers[rng.permutation(len(centers))[:limit]]
+    centers = centers[rng.permutation(len(centers))[:3000]]
     window = np.arange(-half, half + 1)
     rows = centers[:, 0, None, None] + window[:, None]
     columns = centers[:, 1, None, None] + window
-    found: np.ndarray = lab[rows, columns].reshape(len(centers), 3 * _PATCH**2)
-    return found
+    return lab[rows, columns].reshape(len(centers), 3 * _PATCH**2)
 
 
 def _surface_patches(
-    domain: InteriorDomain, skin: np.ndarray, rng: np.random.Generator, limit: int = 1500
+    domain: InteriorDomain, skin: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """Patches [n, 75] of the surface where it faces along an axis of the grid."""
     slope = gradient(domain.depth)
@@ -110,7 +101,7 @@ def _surface_patches(
     for axis in range(3):
         flat = near & (np.abs(slope[axis]) > 0.94 * np.maximum(length, 1e-6)) & (length > 0.3)
         centers = np.argwhere(flat)
-        centers = centers[rng.permutation(len(centers))[: 2 * limit]]
+        centers = centers[rng.permutation(len(centers))[:3000]]
         rows, columns = (i for i in range(3) if i != axis)
         fits = np.ones(len(centers), bool)
         for i in (rows, columns):
@@ -121,7 +112,7 @@ def _surface_patches(
         index[columns] = index[columns] + window
         place = tuple(np.broadcast_arrays(*index))
         whole = domain.inside[place].all((1, 2))
-        result.append(skin[place].reshape(len(centers), 3 * _PATCH**2)[whole][:limit])
+        result.append(skin[place].reshape(len(centers), 3 * _PATCH**2)[whole][:1500])
     return np.concatenate(result)
 
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.colors import rgb_to_lab100
+from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 
@@ -65,8 +66,6 @@ class PlacedPhoto:
 
     def at(self, pitch: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Image, mask, depth and place with pixels of ``pitch`` voxels of the solid."""
-        import cv2
-
         factor = self.pitch / pitch
         image, mask, depth, local = self.image, self.mask, self.depth, self.local
         if abs(factor - 1.0) < 2e-2:
@@ -113,7 +112,6 @@ def place_photo(
     photo: Exemplar,
     fields: ObjectFields,
     axis: int,
-    *,
     guided: bool,
     scale: float,
     depth_scale: float | None,
@@ -156,6 +154,7 @@ def place_photo(
     even = float(stretch.max() / stretch.min())
     fits = photo.silhouette and overlap > _FIT and even < 1.25
     fitted = guided and depth_scale is None and fits
+    deepest = fields.max_depth * (1.0 if depth_scale is None else depth_scale)
     if fitted:
         flat = torch.from_numpy(below)[None, :, :, None].float()
         points = torch.from_numpy(np.concatenate([place, np.full_like(place[..., :1], 0.5)], -1))
@@ -163,7 +162,6 @@ def place_photo(
         # outlines never agree to the pixel: just outside the section is just below the surface
         depth = np.maximum(depth, 0.5 * np.minimum(own_depth * isotropic, 1.0))
     else:
-        deepest = fields.max_depth * (1.0 if depth_scale is None else depth_scale)
         depth = own_depth * (deepest / max(photo.max_depth, 1.0))
     depth = np.where(mask, depth, 0.0).astype(np.float32)
     local = np.zeros((*mask.shape, 3), np.float32)
@@ -173,7 +171,6 @@ def place_photo(
     if fits:
         pitch = isotropic
     elif guided:
-        deepest = fields.max_depth * (1.0 if depth_scale is None else depth_scale)
         pitch = deepest / max(photo.max_depth, 1.0)
     else:
         pitch = float((fields.high - fields.low).max()) / max(photo.mask.shape)
@@ -223,11 +220,11 @@ class DepthGuide:
         return values[right - 1] + share * (values[right] - values[right - 1])
 
 
-def explained(value: np.ndarray, color: np.ndarray, bins: int = 24) -> float:
+def explained(value: np.ndarray, color: np.ndarray) -> float:
     """Share of the colours' variance [n, 3] that a coordinate [n] explains (correlation ratio)."""
     if len(value) == 0 or float(np.ptp(value)) <= 0:
         return 0.0
     order = np.argsort(value, kind="stable")
     total = float(((color - color.mean(0)) ** 2).sum())
-    within = sum(float(((c - c.mean(0)) ** 2).sum()) for c in np.array_split(color[order], bins))
+    within = sum(float(((c - c.mean(0)) ** 2).sum()) for c in np.array_split(color[order], 24))
     return 1.0 - within / max(total, 1e-9)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsfluent.colors import rgb_to_lab
+from gsfluent.lazy import cv2, ndimage
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient
@@ -16,6 +17,7 @@ logger = logging.getLogger(__name__)
 
 _RINGS = np.array([0.0, 0.4, 0.7, 0.95, 1.2, 1.4])  # normalised radii of the colour profile
 _PAINTED = np.array([0.0, 0.4, 0.7, 0.97, 1.08, 1.4])  # the same, with the edge where it is sharp
+_POPULATION = 4  # fewer blobs than this are none
 _SECTION_BIAS = 4.0 / np.pi  # a random section of a ball shows pi/4 of its diameter on average
 
 
@@ -49,26 +51,14 @@ class Inclusions:
         return len(self.depth)
 
 
-def find_inclusions(
-    exemplar: Exemplar, minimum: int = 4, parts: np.ndarray | None = None
-) -> Inclusions | None:
+def find_inclusions(exemplar: Exemplar, parts: np.ndarray | None = None) -> Inclusions | None:
     """Find compact blobs whose colour is unusual for their depth, or take those that are given.
 
-    Robust z-score of Lab within depth bins; connected components that are small, compact and of
-    one colour. Veins, fibres and the core are not compact or not alike and stay texture.
-
-    Args:
-        exemplar: Photograph, at most a few hundred pixels wide.
-        minimum: Fewer blobs than this are not a population.
-        parts: Blobs known already: bool [H, W], or instance numbers int [H, W] (0 is none). They
-            are neither judged nor counted against ``minimum``.
-
-    Returns:
-        The blobs, or None.
+    Robust z-score of Lab within depth bins; connected components that are small, compact and of one
+    colour. Veins, fibres and the core are not compact or not alike and stay texture. Given
+    ``parts``, bool [H, W] or instance numbers int [H, W] (0 is none), are not judged, and may be
+    few.
     """
-    import cv2
-    from scipy import ndimage
-
     if parts is None:
         labels, _ = ndimage.label(_unusual(exemplar), np.ones((3, 3)))
     elif parts.dtype == bool:
@@ -105,35 +95,26 @@ def find_inclusions(
             (number, float(depth[row, column]), float(major), float(minor), cosine, pixels, *middle)
         )
         colors.append(np.median(lab[box][blob], axis=0))
-    if not given and len(found) >= minimum:
+    if not given and len(found) >= _POPULATION:
         palette = np.stack(colors)
         alike = np.linalg.norm(palette - np.median(palette, axis=0), axis=1) < 25.0
         found = [entry for entry, good in zip(found, alike, strict=True) if good]
-    if len(found) < (1 if given else minimum):
+    if len(found) < (1 if given else _POPULATION):
         return None
     numbers = [int(entry[0]) for entry in found]
     chosen = np.isin(labels, numbers)
     table = np.array([entry[1:] for entry in found])
     grown = cv2.dilate(chosen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     profile = _ring_profile(exemplar.image, labels, numbers)
-    radial = float(np.average(table[:, 3], weights=table[:, 1] - table[:, 2] + 1e-3))
+    deep, major_axes, minor_axes, cosines, areas = table[:, :5].T
+    radial = float(np.average(cosines, weights=major_axes - minor_axes + 1e-3))
     logger.info("exemplar: %d inclusions (seeds, stones) found", len(found))
-    return Inclusions(
-        grown & exemplar.mask,
-        table[:, 5:7],
-        table[:, 4],
-        table[:, 0],
-        table[:, 1],
-        table[:, 2],
-        radial,
-        profile,
-    )
+    mask, middles = grown & exemplar.mask, table[:, 5:7]
+    return Inclusions(mask, middles, areas, deep, major_axes, minor_axes, radial, profile)
 
 
 def _unusual(exemplar: Exemplar) -> np.ndarray:
     """Pixels whose lightness is far from the median of their depth, bool [H, W]."""
-    from scipy import ndimage
-
     mask = exemplar.mask
     lightness = ndimage.gaussian_filter(rgb_to_lab(exemplar.image)[..., 0], 0.5)
     score = np.zeros(mask.shape, np.float32)
@@ -151,14 +132,11 @@ def _unusual(exemplar: Exemplar) -> np.ndarray:
             1.4826 * np.median(np.abs(values - middle)) + 2.0
         )
     margin = 0.06 * exemplar.max_depth if exemplar.silhouette else 0.0
-    found: np.ndarray = ndimage.binary_fill_holes((score > 4.5) & mask & (depth >= margin))
-    return found
+    return ndimage.binary_fill_holes((score > 4.5) & mask & (depth >= margin))
 
 
 def _ring_profile(image: np.ndarray, labels: np.ndarray, numbers: list[int]) -> np.ndarray:
     """Mean colour of the blobs per normalised radius (0 centre, 1 outline)."""
-    from scipy import ndimage
-
     sums = np.zeros((len(_RINGS), 3))
     counts = np.zeros(len(_RINGS))
     boxes = ndimage.find_objects(labels)
@@ -189,10 +167,6 @@ def _ring_profile(image: np.ndarray, labels: np.ndarray, numbers: list[int]) -> 
 
 def remove_inclusions(exemplar: Exemplar, inclusions: Inclusions) -> Exemplar:
     """The photograph with its blobs painted over from around them."""
-    from dataclasses import replace
-
-    import cv2
-
     pixels = (exemplar.image * 255).round().astype(np.uint8)
     # seeds have pale rims that belong to them: half a minor axis more on every side
     rim = 3 + 2 * int(0.5 * float(inclusions.minor.mean()))
@@ -215,21 +189,12 @@ def paint_inclusions(
 
     The share of the volume is the share of the cut's area (Delesse 1847), per depth range; section
     sizes are enlarged by 4/pi (DeHoff & Rhines 1961); centres keep a distance (Poisson disc) and
-    are drawn in the object, so that another grid gives the same ones.
-
-    Args:
-        rgb: Volume [X, Y, Z, 3] in 0..1.
-        domain: The object.
-        placed: The photograph the blobs came from, in the object.
-        inclusions: The blobs.
-        anchor: Rotation [3, 3] and origin [3] of the object's frame, and its size [voxels].
-        rng: Random generator.
+    are drawn in the object (``anchor``: its rotation [3, 3], origin [3] and size [voxels]), so that
+    another grid gives the same ones.
 
     Returns:
-        New colours, labels int32 (1..K inside inclusions), and K.
+        New colours [X, Y, Z, 3], labels int32 (1..K inside inclusions), and K.
     """
-    from scipy import ndimage
-
     inside, pitch = domain.inside, placed.pitch
     result = rgb.copy()
     labels = np.zeros(inside.shape, np.int32)
@@ -252,9 +217,8 @@ def paint_inclusions(
         along = delta @ long
         across = np.sqrt(np.maximum((delta**2).sum(-1) - along**2, 0.0))
         radius = np.sqrt((along / a) ** 2 + (across / b) ** 2)
-        color = np.stack(
-            [np.interp(radius, _PAINTED, inclusions.profile[:, c]) for c in range(3)], -1
-        )
+        tones = inclusions.profile.T
+        color = np.stack([np.interp(radius, _PAINTED, tone) for tone in tones], -1)
         opacity = np.clip((_RINGS[-1] - radius) / 0.15, 0.0, 1.0) * inside[box]
         number += 1
         result[box] += opacity[..., None] * (color - result[box])

@@ -19,16 +19,10 @@ _OWN_WEIGHT = 4.5  # of a user's coordinate that runs from 0 to 1, like the dept
 
 
 class LevelGuides:
-    """Guide values on one level.
+    """Guide values on one level; kinds: ``depth``, ``axis``, ``height``, ``none`` and ``array``.
 
-    Args:
-        kind: ``depth``, ``axis``, ``height``, ``none`` or ``array``.
-        fields: The object.
-        lattice: The level.
-        section: The cut across the axis (kind ``axis``).
-        own: The user's coordinate [X, Y, Z] on the solid's grid (kind ``array``).
-        depth_guide: Weight of the depth.
-        directional: The section is carried along whole (fibres), not only its lines.
+    The kind ``axis`` has a section, carried along whole (fibres) when ``directional``, else its
+    lines only; the kind ``array`` has the user's own coordinate [X, Y, Z] on the solid's grid.
     """
 
     def __init__(
@@ -133,15 +127,10 @@ class LevelGuides:
 
 
 def _regress(query: Tensor, color: Tensor, place: Tensor, width: list[float]) -> Tensor:
-    """Mean colour [n, 3] of the photographs near guide values [n, G], G one or two.
+    """Mean colour [n, 3] of the photographs' pixels [m, 3] near guide values [n, G], G one or two.
 
-    Kernel regression (Nadaraya 1964; Watson 1964) on a table, read bilinearly.
-
-    Args:
-        query: Guide values wanted [n, G].
-        color: Colours of the photographs' pixels [m, 3].
-        place: Their guide values [m, G].
-        width: Bandwidth per guide value [G].
+    Kernel regression (Nadaraya 1964; Watson 1964) on a table, read bilinearly; ``width`` is the
+    bandwidth per guide value.
     """
     if len(place) > 6000:
         some = torch.linspace(0, len(place) - 1, 6000, device=place.device).long()

@@ -116,14 +116,10 @@ class ObjectFields:
         corners = torch.nonzero(self.inside).float().add_(0.5).cpu().numpy()
         local = (corners - self.center) @ self.rotation.T
         self.low, self.high = local.min(0) - 0.5, local.max(0) + 0.5
-        self.on_grid = bool(np.abs(np.abs(self.rotation).max(1) - 1.0).max() < 1e-6)
 
-    def lattices(self, levels: int | None = None) -> list[Lattice]:
-        """Lattices coarse to fine; the last one has the pitch of the solid's grid.
-
-        Args:
-            levels: At most this many, the finest ones; None takes all that make sense.
-        """
+    def lattices(self) -> list[Lattice]:
+        """Lattices coarse to fine; the last one has the pitch of the solid's grid."""
+        on_grid = bool(np.abs(np.abs(self.rotation).max(1) - 1.0).max() < 1e-6)
         pitches = []
         pitch = self.size / _COARSEST
         while pitch >= 1.5:
@@ -131,21 +127,13 @@ class ObjectFields:
             if 2.0 * self.max_depth >= 3.0 * pitch:
                 pitches.append(pitch)
             pitch /= 2.0
-        found = [self._anchored(p) for p in pitches] + [self._finest()]
-        return found if levels is None else found[-levels:]
-
-    def _anchored(self, pitch: float) -> Lattice:
-        first = np.floor(self.low / pitch) - 1
-        last = np.ceil(self.high / pitch) + 1
-        return self._lattice(first * pitch, pitch, last - first)
-
-    def _finest(self) -> Lattice:
-        """Cells of the solid's own grid; of the same size where the object's axis is oblique."""
-        low = self.low
-        if self.on_grid:
-            # the lattice has to fall on the voxels; -0.0 and +0.0 alike
-            return self._lattice(self.low, 1.0, np.rint(self.high - self.low))
-        return self._lattice(low, 1.0, np.ceil(self.high - low))
+        found = []
+        for pitch in pitches:
+            first, last = np.floor(self.low / pitch) - 1, np.ceil(self.high / pitch) + 1
+            found.append(self._lattice(first * pitch, pitch, last - first))
+        # cells of the solid's own grid; of the same size where the object's axis is oblique
+        span = self.high - self.low
+        return [*found, self._lattice(self.low, 1.0, np.rint(span) if on_grid else np.ceil(span))]
 
     def _lattice(self, corner: np.ndarray, pitch: float, count: np.ndarray) -> Lattice:
         a, b, c = (float(v) for v in corner)

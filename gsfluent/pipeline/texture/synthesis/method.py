@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from gsfluent.errors import InputError
-from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
+from gsfluent.errors import InputError, check_choice
+from gsfluent.pipeline.texture.photo.exemplar import Exemplar, Exemplars
 from gsfluent.pipeline.texture.photo.parts import read_parts, resized_parts
 from gsfluent.pipeline.texture.synthesis.choice import surface_verdict
 from gsfluent.pipeline.texture.synthesis.guides import GUIDES, PlacedPhoto, explained, place_photo
@@ -38,78 +37,21 @@ QUALITIES: dict[str, Schedule] = {
 }
 SURFACES = ("auto", "keep", "copy", "ignore")
 CORES = ("open", "closed")
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
-def load_exemplars(source: object) -> dict[int, list[Exemplar]]:
-    """Photographs per slice axis.
+@dataclass(frozen=True)
+class SynthesisOptions:
+    """How a texture is synthesised from photographs.
 
-    Args:
-        source: One image (path or array) or a list of them for all axes, or a mapping from ``x``,
-            ``y``, ``z`` (axes of the object, z its own axis) to images or lists.
-
-    Returns:
-        Photographs by axis; only the axes that were named, or all three with the same list.
-
-    Raises:
-        InputError: An axis is unknown or an image cannot be used.
-    """
-    if isinstance(source, Mapping):
-        if not source or any(key not in _AXES for key in source):
-            raise InputError(
-                f"texture: exemplar axes must be x, y, z, got {sorted(map(str, source))}",
-                hint="write exemplar: {x: a.jpg, z: b.jpg} or one file",
-            )
-        return {_AXES[key]: _load_list(source[key]) for key in sorted(source)}
-    one = _load_list(source)
-    return {0: one, 1: one, 2: one}
-
-
-def _load_list(source: object) -> list[Exemplar]:
-    if isinstance(source, Sequence) and not isinstance(source, str):
-        if not source:
-            raise InputError("texture: the list of exemplars is empty", hint="name a photograph")
-        return [item for part in source for item in _load_list(part)]
-    if isinstance(source, Exemplar):
-        return [source]
-    if not isinstance(source, str | Path | np.ndarray):
-        raise InputError(
-            f"texture: exemplar must be a file, an array or a mapping, got {type(source).__name__}",
-            hint="give the path of a photograph",
-        )
-    return [load_exemplar(source)]
-
-
-def exemplar_texture(
-    domain: InteriorDomain,
-    exemplars: Mapping[int, Exemplar | Sequence[Exemplar]],
-    *,
-    quality: str = "fast",
-    scale: float = 1.0,
-    guide: str | np.ndarray = "auto",
-    directional: bool = False,
-    inclusions: bool = True,
-    parts: object = None,
-    depth_scale: float | None = None,
-    surface: str = "auto",
-    core: str = "open",
-    device: str | torch.device = "auto",
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> InteriorTexture:
-    """Synthesise the interior from photographs.
-
-    Args:
-        domain: Voxels to fill.
-        exemplars: Photographs per axis of the object (:func:`load_exemplars`).
+    Attributes:
         quality: ``preview``, ``fast`` or ``full``.
         scale: Size of the photographed structure relative to the automatic choice, which lays the
             photograph into the object (or, for a patch of material, makes the photograph as wide
             as the object).
-        guide: ``depth``; ``axis`` (depth, distance to the object's axis, and a cut across it whose
-            structure is carried along it); ``height`` (depth, and height along the axis); ``none``;
-            an array [X, Y, Z] of the user's own coordinate; or ``auto``, which takes what explains
-            the photographs' colours.
+        guide: What the structure follows: ``depth``; ``axis`` (depth, distance to the object's
+            axis, and a cut across it whose structure is carried along it); ``height`` (depth, and
+            height along the axis: layers); ``none``; an array [X, Y, Z] of the user's own
+            coordinate; or ``auto``, which takes what explains the photographs' colours.
         directional: True for grained materials: the photographs are not turned or mirrored, and
             slices across an axis without a photograph are not matched.
         inclusions: Find seeds and stones and place them as labelled ellipsoids.
@@ -124,31 +66,67 @@ def exemplar_texture(
             and its surface looks like the photograph, else ignored (:mod:`.choice`).
         core: With guide ``axis``: ``open``, the core goes on from pole to pole (orange, log), or
             ``closed``, it ends below the surface (apple).
-        device: Where to compute; ``auto`` takes a CUDA device when there is one.
+    """
+
+    quality: str = "fast"
+    scale: float = 1.0
+    guide: str | np.ndarray = "auto"
+    directional: bool = False
+    inclusions: bool = True
+    parts: object = None
+    depth_scale: float | None = None
+    surface: str = "auto"
+    core: str = "open"
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        check_choice("texture: quality", self.quality, QUALITIES, "leave it at fast")
+        if isinstance(self.guide, str):
+            check_choice("texture: guide", self.guide, GUIDES, "leave it at auto")
+        check_choice("texture: surface", self.surface, SURFACES, "leave it at auto")
+        check_choice("texture: core", self.core, CORES, "leave it at open")
+        for name in ("scale", "depth_scale"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError(f"texture: {name} must be positive, got {value}", "1 is neutral")
+
+
+def exemplar_texture(
+    domain: InteriorDomain,
+    exemplars: Exemplars,
+    options: SynthesisOptions | None = None,
+    *,
+    device: str | torch.device = "cpu",
+    seed: int = 0,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> InteriorTexture:
+    """Synthesise the interior from photographs.
+
+    Args:
+        domain: Voxels to fill.
+        exemplars: Photographs per axis of the object (:func:`.exemplar.load_exemplars`).
+        options: Settings; None takes ``settings``.
+        device: Where to compute.
         seed: Seed. The same seed gives the same texture on the same kind of device.
         progress: Optional callback.
+        settings: Fields of :class:`SynthesisOptions`.
 
     Returns:
         The texture; ``report`` holds quality, guide, photographs, inclusions, levels and
         axis_disagreement.
 
     Raises:
-        InputError: Unknown quality or guide, a guide that needs an outline, a scale that is not
-            positive, or an empty solid.
+        InputError: A guide that needs an outline or has another shape, or an empty solid.
     """
-    _check(quality, scale, guide, depth_scale)
-    for name, value, allowed in (("surface", surface, SURFACES), ("core", core, CORES)):
-        if value not in allowed:
-            raise InputError(
-                f"texture: {name} must be one of {', '.join(allowed)}, got {value!r}",
-                hint=f"leave it at {allowed[0]}",
-            )
+    options = options or SynthesisOptions(**settings)
     began = time.process_time()
-    where = _device(device)
-    photos = {a: [e] if isinstance(e, Exemplar) else list(e) for a, e in exemplars.items()}
+    where = torch.device(device)
+    photos, guide = exemplars, options.guide
     everything = [e for group in photos.values() for e in group]
     outlined = all(e.silhouette for e in everything)
-    if isinstance(guide, str) and guide in ("axis", "height") and not outlined:
+    along = isinstance(guide, str) and guide in ("axis", "height")
+    if along and not outlined:
         raise InputError(
             f"texture: guide {guide!r} needs a photograph with an outline",
             hint="cut the object out (RGBA) or use guide: none",
@@ -163,37 +141,33 @@ def exemplar_texture(
             )
         guide = guide[back]
     shared = len({id(e) for e in everything}) == len(photos[min(photos)])
-    along = isinstance(guide, str) and guide in ("axis", "height")
-    aligned = shared and not (directional or along)
-    fields = ObjectFields(crop, aligned, where)
-    guided = not (guide == "none" if isinstance(guide, str) else False) and (
-        outlined if isinstance(guide, str) else True
-    )
+    fields = ObjectFields(crop, shared and not (options.directional or along), where)
+    guided = not isinstance(guide, str) or (guide != "none" and outlined)
     rng = np.random.default_rng([seed, 99])
 
     def place(photo: Exemplar, axis: int) -> PlacedPhoto:
-        return place_photo(photo, fields, axis, guided=guided, scale=scale, depth_scale=depth_scale)
+        return place_photo(photo, fields, axis, guided, options.scale, options.depth_scale)
 
     # one photograph for everything: across the axis if that is what carries the structure
     across = isinstance(guide, str) and guide == "axis"
     home = None if not shared else 2 if across else 0
-    prepared, blobs = _prepare(photos, place, home, inclusions, parts)
+    prepared, blobs = _prepare(photos, place, home, options.inclusions, options.parts)
     kind = guide if isinstance(guide, str) else "array"
     if kind == "auto":
         kind = choose_guide(prepared) if guided else "none"
-    verdict, surface = _surface(crop, prepared, kind, surface, seed)
+    verdict, surface = _surface(crop, prepared, kind, options.surface, seed)
     if surface == "copy":
         rgb, figures = crop.skin, {"levels": 0, "axis_disagreement": 0.0}
     else:
         volume, lattice, figures = synthesize_pyramid(
             fields,
             prepared,
-            QUALITIES[quality],
+            QUALITIES[options.quality],
             kind,
             own=guide if isinstance(guide, np.ndarray) else None,
-            directional=directional,
+            directional=options.directional,
             keep=surface == "keep",
-            closed=core == "closed",
+            closed=options.core == "closed",
             seed=seed,
             progress=progress,
         )
@@ -208,7 +182,7 @@ def exemplar_texture(
     full_labels = np.zeros(domain.inside.shape, np.int32)
     full_labels[back] = labels
     report = {
-        "quality": quality,
+        "quality": options.quality,
         "guide": kind,
         "exemplar_mask": everything[0].note,
         "exemplars": len({id(e) for e in everything}),
@@ -237,6 +211,7 @@ def _surface(
     alike = verdict["surface_like_interior"]
     if wanted != "auto":
         return verdict | {"why": f"surface: {wanted} was asked for"}, wanted
+    why, choice = "the surface does not look like the photograph: synthesised", "ignore"
     if verdict["copy_suffices"]:
         why = "the surface copied inwards has the photograph's colours and patches and no streaks"
         choice = "copy"
@@ -245,34 +220,8 @@ def _surface(
         choice = "keep"
     elif alike:
         why = "the surface looks like the photograph, but the inside follows a guide: synthesised"
-        choice = "ignore"
-    else:
-        why = "the surface does not look like the photograph: synthesised"
-        choice = "ignore"
     logger.info("texture: %s", why)
     return verdict | {"why": why}, choice
-
-
-def _check(quality: str, scale: float, guide: str | np.ndarray, depth_scale: float | None) -> None:
-    if quality not in QUALITIES:
-        raise InputError(
-            f"texture: quality must be one of {', '.join(QUALITIES)}, got {quality!r}",
-            hint="leave it at fast",
-        )
-    if isinstance(guide, str) and guide not in GUIDES:
-        raise InputError(
-            f"texture: guide must be one of {', '.join(GUIDES)}, got {guide!r}",
-            hint="leave it at auto",
-        )
-    for name, value in (("scale", scale), ("depth_scale", depth_scale)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"texture: {name} must be positive, got {value}", hint="1 is neutral")
-
-
-def _device(device: str | torch.device) -> torch.device:
-    if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(device)
 
 
 def _crop(domain: InteriorDomain) -> tuple[InteriorDomain, tuple[slice, ...]]:
@@ -306,12 +255,8 @@ def _prepare(
 ) -> tuple[dict[int, list[PlacedPhoto]], Blobs | None]:
     """Photographs without inclusions, placed in the object; and the richest set of inclusions.
 
-    Args:
-        photos: Photographs per axis.
-        place: Places one of them, given the axis it is a cut across.
-        home: That axis when every slice axis shares the photographs; None takes their own.
-        find: Look for inclusions.
-        parts: What shows the inclusions of the first photograph (:func:`.parts.read_parts`).
+    ``home`` is the axis that photographs shared by all slice axes are a cut across, None their own;
+    ``parts`` shows the inclusions of the first photograph (:func:`.parts.read_parts`).
     """
     made: dict[int, PlacedPhoto] = {}
     best: Blobs | None = None

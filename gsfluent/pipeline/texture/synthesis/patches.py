@@ -93,14 +93,9 @@ def synthesize_level(
     transport_last_only: bool = False,
     rng: np.random.Generator,
 ) -> float:
-    """Improve one level in place.
+    """Improve one level in place, in rounds of voting and of patch statistics.
 
-    Args:
-        level: Volume, masks, guide and patches.
-        schedule: Work settings.
-        rounds: Rounds of voting and of patch statistics.
-        transport_last_only: Transport colours only in the last round (unlayered materials).
-        rng: Random generator.
+    ``transport_last_only`` moves colours only in the last round (unlayered materials).
 
     Returns:
         Root mean square over voxels of the disagreement between the axes' proposals in the last
@@ -265,11 +260,9 @@ def project_slice(
     photo: tuple[np.ndarray, np.ndarray, np.ndarray],
     schedule: Schedule,
     iterations: int,
-    *,
-    turns: bool,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Patch synthesis in a single slice, by itself.
+    """Patch synthesis in a single slice, by itself; the photograph also turned and mirrored.
 
     Args:
         image: RGB in 0..1, [H, W, 3].
@@ -279,7 +272,6 @@ def project_slice(
         photo: Photograph at the same pitch: image [h, w, 3], mask [h, w], guide [h, w].
         schedule: Work settings.
         iterations: Rounds of voting.
-        turns: Use the photograph turned and mirrored.
         rng: Random generator.
 
     Returns:
@@ -294,7 +286,7 @@ def project_slice(
     )
     target = place[0][within][:, None]
     wanted = min(schedule.bank, max(512, int(inside.sum()) // schedule.stride**2))
-    bank = Bank([shown], wanted, schedule.patch, schedule.patch, turns, target, rng)
+    bank = Bank([shown], wanted, schedule.patch, schedule.patch, True, target, rng)
     lab = rgb_to_lab100(torch.from_numpy(image.astype(np.float32))).movedim(-1, 0)
     level = SynthesisLevel(
         lab[:, None], within, torch.from_numpy(fixed[None]), place, {0: bank}, None

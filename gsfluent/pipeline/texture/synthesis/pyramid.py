@@ -45,17 +45,10 @@ def synthesize_pyramid(
 ) -> tuple[Tensor, Lattice, dict[str, Any]]:
     """Synthesise an object's inside, coarse to fine.
 
-    Args:
-        fields: The object.
-        prepared: Photographs per slice axis, placed.
-        schedule: Work settings.
-        kind: Guide: ``depth``, ``axis``, ``height``, ``none`` or ``array``.
-        own: The user's coordinate on the solid's grid, for ``array``.
-        directional: Photographs are not turned, and only their own axes are matched.
-        keep: Hold the surface's colours fixed.
-        closed: The core of the section closes towards the poles (:class:`.sections.Section`).
-        seed: Seed.
-        progress: Optional callback.
+    The guide is of the ``kind`` ``depth``, ``axis``, ``height``, ``none`` or ``array`` (the user's
+    ``own`` coordinate on the solid's grid). ``directional`` photographs are not turned, and only
+    their own axes are matched; ``keep`` holds the surface's colours; the core of the section may be
+    ``closed`` (:class:`.sections.Section`).
 
     Returns:
         Lab / 100 [3, X, Y, Z] on the last lattice, that lattice, and figures for the report.

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto, explained
 from gsfluent.pipeline.texture.synthesis.levels import trilinear
 
@@ -43,8 +44,6 @@ class Section:
         device: torch.device,
         closed: bool = False,
     ) -> None:
-        from scipy import ndimage
-
         mask = placed.mask
         if placed.fitted:
             center = np.array(_pixel_of(placed, np.zeros(2)))
@@ -100,18 +99,11 @@ class Section:
         return near + 4.0 * relative if closed else near
 
     def polar(self, image: Tensor, whole: bool) -> Tensor:
-        """The structure of a picture that goes on along the axis, by azimuth and relative radius.
+        """What of a picture [C, U, V] goes on along the axis: [C, azimuth, relative radius].
 
         Lines that run outwards (membranes) and lines that run around (rings, rind) go on; grains
         and cells in between do not. So: the mean along the radius plus the mean around, less the
-        mean of both.
-
-        Args:
-            image: The photograph at any resolution [C, U, V].
-            whole: Everything goes on (fibres).
-
-        Returns:
-            [C, azimuth, radius].
+        mean of both. With ``whole`` everything goes on (fibres).
         """
         device = image.device
         height, width = self.placed.mask.shape

@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.nn import functional
 
 _KNOTS = 65
+_COLOR_PARTS, _PARTITIONS, _ROTATIONS = 12, 3, 2  # parts of the guide's space for colours
+_PATCH_PARTS, _FILTERS = 6, 8  # the same for patches; directions per round and axis
 _LEAST = 96  # samples a part of the guide's space must hold on both sides
 
 
@@ -80,31 +82,16 @@ def match_near(
     reference: Tensor,
     reference_guide: Tensor,
     rng: np.random.Generator,
-    *,
-    parts: int = 12,
-    repeats: int = 3,
-    rounds: int = 2,
 ) -> Tensor:
-    """Move colours to the photographs' distribution at like guide values.
+    """Move colours [n, 3] to the photographs' distribution [m, 3] at like guide values, [., G].
 
-    Args:
-        values: Colours [n, 3].
-        guide: Guide values [n, G].
-        reference: Colours of the photographs [m, 3].
-        reference_guide: Their guide values [m, G].
-        rng: Random generator.
-        parts: Parts of the guide's space.
-        repeats: Partitions whose results are averaged.
-        rounds: Rotations per partition.
-
-    Returns:
-        Colours [n, 3].
+    Mean over several partitions of the guide's space, of several rotations each.
     """
     total = torch.zeros_like(values)
     single = bool((reference_guide.std(0, unbiased=False) < 1e-6).all())
-    repeats = 1 if single or parts <= 1 else repeats
+    repeats = 1 if single else _PARTITIONS
     for _ in range(repeats):
-        cells = Cells(reference_guide, parts, rng)
+        cells = Cells(reference_guide, _COLOR_PARTS, rng)
         own, other = cells.of(guide), cells.of(reference_guide)
         moved = values.clone()
         for k in range(len(cells.centers)):
@@ -113,7 +100,7 @@ def match_near(
             if len(chosen) < _LEAST or len(source) < _LEAST:
                 continue
             part = moved[chosen]
-            for _ in range(rounds):
+            for _ in range(_ROTATIONS):
                 basis = torch.from_numpy(np.linalg.qr(rng.standard_normal((3, 3)))[0]).to(values)
                 turned = part @ basis
                 have = _quantiles(turned, rng, 16384)
@@ -133,10 +120,6 @@ def polish_patches(
     rng: np.random.Generator,
     *,
     rounds: int,
-    filters: int = 8,
-    step: float = 1.0,
-    share: int = 1,
-    parts: int = 6,
 ) -> Tensor:
     """Let the patches of all slices have the distribution of the photographs' patches.
 
@@ -153,15 +136,8 @@ def polish_patches(
         free: Cells that may change, bool [X, Y, Z].
         rng: Random generator.
         rounds: Rounds.
-        filters: Directions per round and axis.
-        step: Share of the estimated move that is made.
-        share: Every ``share``-th slice takes part in a round.
-        parts: Parts of the guide's space.
-
-    Returns:
-        Colours [3, X, Y, Z].
     """
-    volume = volume.clone()
+    volume, filters = volume.clone(), _FILTERS
     bases = {}
     for axis, (patches, _) in banks.items():
         centered = patches - patches.mean(0)
@@ -174,17 +150,16 @@ def polish_patches(
             mix = np.linalg.qr(rng.standard_normal((24, 24)))[0][:, :filters]
             kernel = bases[axis] @ torch.from_numpy(mix).to(patches)
             weight = kernel.T.reshape(filters, edge, edge, 3).permute(0, 3, 1, 2).contiguous()
-            start = int(rng.integers(0, share))
-            cells = Cells(patch_guide, parts, rng)
-            first = volume.movedim(axis + 1, 1)[:, start::share]
+            cells = Cells(patch_guide, _PATCH_PARTS, rng)
+            first = volume.movedim(axis + 1, 1)
             slices = first.permute(1, 0, 2, 3)
-            mask = whole[axis].movedim(axis, 0)[start::share]
+            mask = whole[axis].movedim(axis, 0)
             if not bool(mask.any()):
                 continue
             position = mask.reshape(-1).nonzero()[:, 0]
             responses = functional.conv2d(slices, weight, padding=half)
             flat = responses.permute(1, 0, 2, 3).reshape(filters, -1)[:, position].T
-            own_guide = guide.movedim(axis + 1, 1)[:, start::share].reshape(len(guide), -1)
+            own_guide = guide.movedim(axis + 1, 1).reshape(len(guide), -1)
             own = cells.of(own_guide[:, position].T.contiguous())
             other = cells.of(patch_guide)
             reference = patches @ kernel
@@ -201,7 +176,7 @@ def polish_patches(
             spread = spread.reshape(filters, *mask.shape).permute(1, 0, 2, 3)
             back = functional.conv2d(spread, weight.flip(2, 3).transpose(0, 1), padding=half)
             # the mean over the patches that hold a voxel, over directions not drawn this time
-            gain = step * 24.0 / filters / edge**2
-            allowed = free.movedim(axis, 0)[start::share]
+            gain = 24.0 / filters / edge**2
+            allowed = free.movedim(axis, 0)
             first += (gain * back * allowed[:, None]).permute(1, 0, 2, 3)
     return volume

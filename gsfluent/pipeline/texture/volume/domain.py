@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from gsfluent.data import Solid
+from gsfluent.data import Solid
+from gsfluent.errors import InputError
+from gsfluent.lazy import ndimage
+
+Options = TypeVar("Options")
 
 SHELL = 1.6
 """Depth [voxels] down to which the colour is that of the surface splats."""
@@ -51,8 +54,6 @@ class InteriorDomain:
             solid: The solid.
             axis: The object's own axis in world coordinates; None takes scene "up", else +z.
         """
-        from scipy import ndimage
-
         # brings the compiled renderer with it, which texturing itself does without
         from gsfluent.pipeline.solid.colors import skin_colors
 
@@ -64,10 +65,7 @@ class InteriorDomain:
         color = np.zeros((*inside.shape, 3), np.float32)
         points = origin + (index + 0.5) * solid.voxel
         color[shell] = skin_colors(solid, points)
-        nearest = ndimage.distance_transform_edt(
-            ~shell, return_distances=False, return_indices=True
-        )
-        skin = color[tuple(nearest)]
+        skin = color[nearest_in(shell)]
         if axis is None and solid.frame is not None:
             # rows of the rotation are the scene axes seen from the world
             axis = solid.frame.rotation.cpu().numpy()[2]
@@ -105,8 +103,7 @@ class InteriorTexture:
             share = share * inside[clipped]
             total += share[:, None] * self.rgb[clipped]
             weight += share
-        result: np.ndarray = (total / np.maximum(weight, 1e-9)[:, None]).astype(np.float32)
-        return result
+        return (total / np.maximum(weight, 1e-9)[:, None]).astype(np.float32)
 
 
 def axis_frame(axis: np.ndarray) -> np.ndarray:
@@ -116,6 +113,36 @@ def axis_frame(axis: np.ndarray) -> np.ndarray:
     x = helper - (helper @ z) * z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
+
+
+def options_of(kind: type[Options], name: str, value: Any) -> Options:
+    """Options of a stage from themselves, a mapping as a shot file gives it, or None: defaults.
+
+    Raises:
+        InputError: A name is unknown, or a value is wrong.
+    """
+    if isinstance(value, kind):
+        return value
+    known = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+    wrong = sorted(set(value or {}) - known)
+    if wrong:
+        hint = f"known are {', '.join(sorted(known))}"
+        raise InputError(f"texture: {name} knows no {', '.join(wrong)}", hint)
+    return kind(**(value or {}))
+
+
+def nearest_in(mask: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Index of the nearest cell of a mask for every cell; at least one must be in it."""
+    return tuple(ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True))
+
+
+def block_mean(field: np.ndarray, factor: int, dimensions: int) -> np.ndarray:
+    """Means, float32, over blocks of ``factor`` along the first axes; the rest is zero."""
+    pads = [(0, -s % factor) for s in field.shape[:dimensions]]
+    padded = np.pad(field.astype(np.float32), pads + [(0, 0)] * (field.ndim - dimensions))
+    split = [n for s in padded.shape[:dimensions] for n in (s // factor, factor)]
+    blocks = padded.reshape(*split, *padded.shape[dimensions:])
+    return np.asarray(blocks.mean(tuple(range(1, 2 * dimensions, 2))))
 
 
 def gradient(field: np.ndarray) -> np.ndarray:
@@ -130,8 +157,7 @@ def gradient(field: np.ndarray) -> np.ndarray:
 def smoothstep(x: np.ndarray) -> np.ndarray:
     """Cubic step from 0 at x <= 0 to 1 at x >= 1."""
     t = np.clip(x, 0.0, 1.0)
-    result: np.ndarray = t * t * (3.0 - 2.0 * t)
-    return result
+    return t * t * (3.0 - 2.0 * t)
 
 
 def blend_skin(domain: InteriorDomain, rgb: np.ndarray) -> np.ndarray:

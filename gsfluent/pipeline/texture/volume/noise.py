@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 
@@ -79,8 +81,7 @@ _TURN = np.array([[0.0, 0.8, 0.6], [-0.8, 0.36, -0.48], [-0.6, -0.48, 0.64]])
 
 def _shift(seed: int) -> np.ndarray:
     """Somewhere in a lattice cell [3], another place for every seed."""
-    place: np.ndarray = np.random.default_rng([abs(seed), 17]).random(3)
-    return place
+    return np.random.default_rng([abs(seed), 17]).random(3)
 
 
 def fractal(points: np.ndarray, frequency: float, seed: int, octaves: int = 3) -> np.ndarray:
@@ -93,14 +94,13 @@ def fractal(points: np.ndarray, frequency: float, seed: int, octaves: int = 3) -
         total += gain * gradient_noise(points, frequency * 2**octave, seed + 31 * octave)
         norm += gain
         gain *= 0.55
-    scaled: np.ndarray = total * (1.6 / norm)
-    return scaled
+    return total * (1.6 / norm)
 
 
 _TEN = np.uint32(1023)
 
 
-class Cells:
+class Cells(NamedTuple):
     """Nearest feature point of a jittered lattice (Worley 1996).
 
     Attributes:
@@ -110,10 +110,10 @@ class Cells:
         offset: Vector from the nearest feature to the point [n, 3], in cells.
     """
 
-    def __init__(
-        self, first: np.ndarray, second: np.ndarray, key: np.ndarray, offset: np.ndarray
-    ) -> None:
-        self.first, self.second, self.key, self.offset = first, second, key, offset
+    first: np.ndarray
+    second: np.ndarray
+    key: np.ndarray
+    offset: np.ndarray
 
     def random(self, salt: int) -> np.ndarray:
         """Uniform number in 0..1 per point, the same for all points of one cell."""
