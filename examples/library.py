@@ -38,7 +38,8 @@ def main() -> int:
     reconstruct = gf.pipeline.Reconstruct(
         iterations=options.iterations, max_gaussians=8000, device=options.device
     )
-    gaussians, report = reconstruct(capture)
+    gaussians = reconstruct(capture)
+    report = gaussians.report
     gaussians = gf.pipeline.Isolate()(gaussians, capture)
     solid = gf.pipeline.Fill()(gaussians.to(options.device), capture)
     texture = gf.pipeline.Texture(method="exemplar", exemplar=paths.cut, device=options.device)

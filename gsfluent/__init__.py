@@ -9,47 +9,19 @@ The public surface is lazy: importing gsfluent costs torch and nothing else.
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from gsfluent._lazy import lazy
 
 __version__ = "0.1.0"
 
-# name -> (module, attribute or None for the module itself)
-_PUBLIC: dict[str, tuple[str, str | None]] = {
-    "ops": ("gsfluent.ops", None),
-    "pipeline": ("gsfluent.pipeline", None),
-    "data": ("gsfluent.data", None),
-    "io": ("gsfluent.io", None),
-    "materials": ("gsfluent.materials", None),
-    "geometry": ("gsfluent.geometry", None),
-    "metrics": ("gsfluent.metrics", None),
-    "errors": ("gsfluent.errors", None),
-    "Gaussians": ("gsfluent.data", "Gaussians"),
-    "Camera": ("gsfluent.data", "Camera"),
-    "Capture": ("gsfluent.data", "Capture"),
-    "Frame": ("gsfluent.data", "Frame"),
-    "Solid": ("gsfluent.data", "Solid"),
-    "Particles": ("gsfluent.data", "Particles"),
-    "Scene": ("gsfluent.scene.scene", "Scene"),
-    "load": ("gsfluent.io", "load"),
-    "save": ("gsfluent.io", "save"),
-    "load_capture": ("gsfluent.io", "load_capture"),
-    "load_shot": ("gsfluent.config", "load_shot"),
-    "has_cuda": ("gsfluent._load", "has_cuda"),
-}
-
-__all__ = ["__version__", *_PUBLIC]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _PUBLIC:
-        raise AttributeError(f"module 'gsfluent' has no attribute {name!r}")
-    module_name, attribute = _PUBLIC[name]
-    module = importlib.import_module(module_name)
-    value = module if attribute is None else getattr(module, attribute)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = lazy(
+    __name__,
+    {
+        "gsfluent": ("ops", "pipeline", "data", "io", "materials", "geometry", "metrics", "errors"),
+        "gsfluent.data": ("Gaussians", "Camera", "Capture", "Frame", "Solid", "Particles"),
+        "gsfluent.scene.scene": ("Scene",),
+        "gsfluent.io": ("load", "save", "load_capture"),
+        "gsfluent.config": ("load_shot",),
+        "gsfluent._load": ("has_cuda",),
+    },
+)
+__all__ += ["__version__"]

@@ -149,20 +149,6 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack([columns[n, m] for n in range(degree + 1) for m in range(-n, n + 1)], dim=-1)
 
 
-def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colour max(0, SH(direction) + 0.5) as 3DGS defines it.
-
-    Args:
-        sh: Coefficients [N, K, 3].
-        directions: Directions from the camera to the splats [N, 3]; normalised here.
-
-    Returns:
-        Colours [N, 3], not negative.
-    """
-    basis = sh_basis(functional.normalize(directions, dim=-1), sh_degree(sh.shape[-2]))
-    return ((basis[..., None] * sh).sum(dim=-2) + 0.5).clamp_min(0.0)
-
-
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
     """Constant SH coefficient of a colour: ``(rgb - 0.5) / 0.28209``."""
     return (rgb - 0.5) / SH0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 
 import pytest
 import torch
@@ -57,6 +58,17 @@ def test_the_example_of_the_interface_page_runs(tmp_path) -> None:
 @pytest.mark.parametrize("name", gf.ops.__all__)
 def test_every_op_is_public(name: str) -> None:
     assert callable(getattr(gf.ops, name))
+
+
+@pytest.mark.parametrize("package", [gf, gf.ops, gf.pipeline])
+def test_a_package_lists_what_it_gives_and_refuses_the_rest(package: ModuleType) -> None:
+    assert set(package.__all__) <= set(dir(package))
+    for name in package.__all__:
+        assert getattr(package, name) is getattr(package, name)
+    with pytest.raises(
+        AttributeError, match=f"module '{package.__name__}' has no attribute 'teapot'"
+    ):
+        _ = package.teapot
 
 
 def test_nothing_below_the_floor_is_accepted_with_a_frame() -> None:

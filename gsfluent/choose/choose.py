@@ -82,37 +82,25 @@ QUICK = Probing(levels=(8, 10, 12), frames=6, seeds=2)
 
 @dataclasses.dataclass(frozen=True)
 class Growth:
-    """Factors from the window to the end of the shot, by observable.
+    """Factors from the window to the end of the shot, by observable."""
 
-    Attributes:
-        mean: On the error of the mean of many runs.
-        spread: On the scatter between runs.
-    """
-
-    mean: Mapping[str, float]
-    spread: Mapping[str, float]
+    mean: Mapping[str, float]  # On the error of the mean of many runs
+    spread: Mapping[str, float]  # On the scatter between runs
 
 
 @dataclasses.dataclass(frozen=True)
 class Probes:
-    """What was run.
+    """What was run."""
 
-    Attributes:
-        whole: Over the whole shot: the first runs of the two coarsest levels.
-        levels: All levels by seed, at least to the end of the window; the two coarsest to the end
-            where matter breaks, else their first seeds.
-        long: With the longer steps, Courant number to its runs on the middle level.
-        first: First frame of the window.
-        last: Last frame + 1.
-        fps: Frames per second.
-    """
-
-    whole: tuple[Probe, Probe]
+    whole: tuple[Probe, Probe]  # Over the whole shot: the first runs of the two coarsest levels
+    # All levels by seed, at least to the end of the window; the two coarsest to the end where
+    # matter breaks, else their first seeds.
     levels: tuple[tuple[Probe, ...], ...]
+    # With the longer steps, Courant number to its runs on the middle level.
     long: Mapping[float, tuple[Probe, ...]]
-    first: int
-    last: int
-    fps: float
+    first: int  # First frame of the window
+    last: int  # Last frame + 1
+    fps: float  # Frames per second
 
     @property
     def seconds(self) -> float:

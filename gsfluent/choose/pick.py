@@ -23,63 +23,40 @@ SURE = 0.9
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One setting with what is expected of it.
+    """One setting with what is expected of it."""
 
-    Attributes:
-        cells: Cells along the longest side of the largest solid.
-        cfl: Courant number.
-        seconds: Predicted wall time of the whole simulation [s].
-        error: Median of the drawn errors, of the observable that is worst.
-        low: 5th percentile.
-        high: 95th percentile.
-        sure: Share of the draws that meet the bound.
-        worst: Observable that is worst in most draws.
-        parts: Median error of each observable.
-        settled: Share of the draws in which the cells change nothing more than the bound, or than
-            two runs differ by chance.
-    """
-
-    cells: int
-    cfl: float
-    seconds: float
-    error: float
-    low: float
-    high: float
-    sure: float
-    worst: str
-    parts: Mapping[str, float]
+    cells: int  # Cells along the longest side of the largest solid
+    cfl: float  # Courant number
+    seconds: float  # Predicted wall time of the whole simulation [s]
+    error: float  # Median of the drawn errors, of the observable that is worst
+    low: float  # 5th percentile
+    high: float  # 95th percentile
+    sure: float  # Share of the draws that meet the bound
+    worst: str  # Observable that is worst in most draws
+    parts: Mapping[str, float]  # Median error of each observable
+    # Share of the draws in which the cells change nothing more than the bound, or than two runs
+    # differ by chance.
     settled: float
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What was chosen, and why.
+    """What was chosen, and why."""
 
-    Attributes:
-        bound: What was asked for.
-        settings: All that were weighed, cheapest first.
-        chosen: The one to take, or None when none meets the bound.
-        enough: The cheapest that in most draws differs from finer ones by no more than the bound
-            or the run-to-run band, whichever is larger; None when there is none.
-        sure: Share of the draws in which the chosen one meets the bound, 0 without one.
-        floor: Least error that any setting can claim: the run-to-run band of the observable with
-            the widest one.
-        floor_of: That observable, or empty.
-        reason: In words.
-        within: Least bound that can be met among the settings; infinite when none is known.
-        asymptotic: Whether every observable that matters follows a power of the cells.
-    """
-
-    bound: float
-    settings: Sequence[Setting]
-    chosen: Setting | None
+    bound: float  # What was asked for
+    settings: Sequence[Setting]  # All that were weighed, cheapest first
+    chosen: Setting | None  # The one to take, or None when none meets the bound
+    # The cheapest that in most draws differs from finer ones by no more than the bound or the run-
+    # to-run band, whichever is larger; None when there is none.
     enough: Setting | None
-    sure: float
+    sure: float  # Share of the draws in which the chosen one meets the bound, 0 without one
+    # Least error that any setting can claim: the run-to-run band of the observable with the widest
+    # one.
     floor: float
-    floor_of: str
-    reason: str
-    within: float
-    asymptotic: bool
+    floor_of: str  # That observable, or empty
+    reason: str  # In words
+    within: float  # Least bound that can be met among the settings; infinite when none is known
+    asymptotic: bool  # Whether every observable that matters follows a power of the cells
 
 
 def ranked(

@@ -35,29 +35,17 @@ ACTIVE = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What one run showed.
+    """What one run showed."""
 
-    Attributes:
-        tracks: Per body centre of mass and extents by frame [m], name to [T, 6].
-        kinetic: Kinetic energy of all matter [J], [T].
-        elastic: Stored energy [J], [T].
-        dissipated: Energy lost, beyond what gravity gave [J], [T].
-        momentum: [N s], [T, 3].
-        broken: Share of the mass that is broken, [T].
-        largest: Share of the mass in the largest piece, [T].
-        mass: Of all matter [kg].
-        length: Extent of the largest solid along its longest side [m].
-    """
-
-    tracks: dict[str, Array]
-    kinetic: Array
-    elastic: Array
-    dissipated: Array
-    momentum: Array
-    broken: Array
-    largest: Array
-    mass: float
-    length: float
+    tracks: dict[str, Array]  # Per body centre of mass and extents by frame [m], name to [T, 6]
+    kinetic: Array  # Kinetic energy of all matter [J], [T]
+    elastic: Array  # Stored energy [J], [T]
+    dissipated: Array  # Energy lost, beyond what gravity gave [J], [T]
+    momentum: Array  # [N s], [T, 3]
+    broken: Array  # Share of the mass that is broken, [T]
+    largest: Array  # Share of the mass in the largest piece, [T]
+    mass: float  # Of all matter [kg]
+    length: float  # Extent of the largest solid along its longest side [m]
 
     @property
     def frames(self) -> int:
@@ -67,35 +55,20 @@ class Seen:
 
 @dataclasses.dataclass(frozen=True)
 class Probe:
-    """One run at one setting.
+    """One run at one setting."""
 
-    Attributes:
-        cells: Cells along the largest solid.
-        cfl: Courant number.
-        seed: Of point positions and weakness.
-        seen: What it showed, from time 0.
-        seconds: Wall time of the steps [s].
-        points: Material points.
-        point_steps: Points moved on the grid, summed over steps, by frame, [T].
-        steps: Steps of the grid.
-        blocks: Blocks of the grid in use, mean over the steps.
-        fields: Most velocity fields.
-        composed: Steps of the composable operators.
-        failed: Why it broke off, or empty.
-    """
-
-    cells: int
-    cfl: float
-    seed: int
-    seen: Seen
-    seconds: float
-    points: int
-    point_steps: Array
-    steps: int
-    blocks: float
-    fields: int
-    composed: int
-    failed: str = ""
+    cells: int  # Cells along the largest solid
+    cfl: float  # Courant number
+    seed: int  # Of point positions and weakness
+    seen: Seen  # What it showed, from time 0
+    seconds: float  # Wall time of the steps [s]
+    points: int  # Material points
+    point_steps: Array  # Points moved on the grid, summed over steps, by frame, [T]
+    steps: int  # Steps of the grid
+    blocks: float  # Blocks of the grid in use, mean over the steps
+    fields: int  # Most velocity fields
+    composed: int  # Steps of the composable operators
+    failed: str = ""  # Why it broke off, or empty
 
 
 def probe(

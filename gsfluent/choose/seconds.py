@@ -22,19 +22,12 @@ Seconds = Callable[[int, float], float]
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """What a simulation does.
+    """What a simulation does."""
 
-    Attributes:
-        steps: Steps of the grid.
-        points: Points on it in the mean step.
-        blocks: Blocks in use in the mean step.
-        composed: Steps of the composable operators, among them.
-    """
-
-    steps: float
-    points: float
-    blocks: float
-    composed: float
+    steps: float  # Steps of the grid
+    points: float  # Points on it in the mean step
+    blocks: float  # Blocks in use in the mean step
+    composed: float  # Steps of the composable operators, among them
 
 
 def cost_of(

@@ -14,7 +14,7 @@ from gsfluent.choose.choose import Probing, choose
 from gsfluent.config import Shot
 from gsfluent.errors import InputError, MissingPackage
 from gsfluent.io import write_json
-from gsfluent.plan.stand_in import stand_in
+from gsfluent.plan.proxy import proxy
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import fingerprint, publish
 from gsfluent.scene.scene import Scene
@@ -44,7 +44,7 @@ def chart_shot(
         shot: The shot.
         bound: Largest error, a share.
         out: Folder for ``chart.json`` and ``chart.png``. If it is the folder of a run, the solids
-            of its finished stages are probed; else a stand-in of the right size.
+            of its finished stages are probed; else a proxy of the right size.
         probing: How to probe.
         device: Where to compute.
         seed: Seed of everything random.
@@ -88,7 +88,7 @@ def shot_scene(
         device: Where to compute.
         seed: Seed of everything random.
         reporter: Receives progress; log lines by default.
-        make: Do the stages up to the solids where they are not there, instead of a stand-in.
+        make: Do the stages up to the solids where they are not there, instead of a proxy.
 
     Raises:
         InputError: The shot is wrong.
@@ -99,10 +99,10 @@ def shot_scene(
         make_solids(context)
         return build_scene(shot, load_solids(context), context.frame), f"the stages in {out}"
     warnings: list[str] = []
-    standing = stand_in(shot, warnings)
+    found = proxy(shot, warnings)
     for warning in warnings:
         _log.warning("chart: %s", warning)
-    return build_scene(shot, dict(standing.solids), standing.frame), standing.assumed
+    return build_scene(shot, dict(found.solids), found.frame), found.assumed
 
 
 def _write(result: dict[str, Any], folder: Path) -> bool:

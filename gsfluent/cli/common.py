@@ -115,16 +115,3 @@ def parse_size(text: str) -> tuple[int, int]:
             f"--size {text}", "give even numbers of at least 16 (video needs even sides)"
         )
     return width, height
-
-
-def parse_vector(text: str, argument: str) -> tuple[float, float, float]:
-    """``1,-1,2`` to three numbers.
-
-    Raises:
-        InputError: Not three finite numbers.
-    """
-    try:
-        x, y, z = (float(p) for p in text.strip("[]() ").split(","))
-    except ValueError:
-        raise InputError(f"{argument} {text}", "give three numbers, for example 1,-1,2") from None
-    return x, y, z

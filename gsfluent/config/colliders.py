@@ -15,11 +15,10 @@ from gsfluent.config.read import (
     flag,
     key,
     number,
-    plain,
+    optional,
     read_direction,
     typed,
     vector,
-    without_none,
 )
 
 Vector = tuple[float, float, float]
@@ -29,33 +28,27 @@ Vector = tuple[float, float, float]
 class ColliderSettings:
     """What every collider has; :meth:`gsfluent.Scene.add_collider` says what the keys mean."""
 
-    at: Vector = key(
-        vector(3), default=(0.0, 0.0, 0.0), doc="Where its middle is [m].", example="[0, 0, 0.1]"
-    )
+    at: Vector = key(vector(3), "Where its middle is [m].", "[0, 0, 0.1]", default=(0.0, 0.0, 0.0))
     mode: str = key(
         choice("separate", "slip", "sticky"),
+        "Whether matter may leave it, may only slide, or sticks.",
+        "sticky",
         default="separate",
-        doc="Whether matter may leave it, may only slide, or sticks.",
-        example="sticky",
     )
-    friction: float = key(number(0.0), default=0.4, doc="Coulomb friction.", example="0.4")
-    velocity: Vector = key(
-        vector(3), default=(0.0, 0.0, 0.0), doc="Velocity [m/s].", example="[0.1, 0, 0]"
-    )
-    spin: Vector = key(
-        vector(3), default=(0.0, 0.0, 0.0), doc="Angular velocity [rad/s].", example="[0, 0, 3]"
-    )
+    friction: float = key(number(0.0), "Coulomb friction.", "0.4", default=0.4)
+    velocity: Vector = key(vector(3), "Velocity [m/s].", "[0.1, 0, 0]", default=(0.0, 0.0, 0.0))
+    spin: Vector = key(vector(3), "Angular velocity [rad/s].", "[0, 0, 3]", default=(0.0, 0.0, 0.0))
     appears: float = key(
-        number(0.0), default=0.0,
-        doc="When it comes to be, and begins to move [s]; nothing touches it before.",
-        example="0.5",
-    )  # fmt: skip
-    vanishes: float | None = key(
-        number(above=0.0), default=None,
-        doc="When it is gone [s]; never when absent.", example="1.5",
-    )  # fmt: skip
+        number(0.0),
+        "When it comes to be, and begins to move [s]; nothing touches it before.",
+        "0.5",
+        default=0.0,
+    )
+    vanishes: float | None = optional(
+        number(above=0.0), "When it is gone [s]; never when absent.", "1.5"
+    )
     shown: bool = key(
-        flag, default=True, doc="Whether it is drawn (an endless plane never is).", example="false"
+        flag, "Whether it is drawn (an endless plane never is).", "false", default=True
     )
 
 
@@ -65,15 +58,12 @@ class FreeColliderSettings(ColliderSettings):
 
     turn: Vector = key(
         vector(3),
+        "How it is turned: degrees about the axis that the numbers point along.",
+        "[0, 0, 45]",
         default=(0.0, 0.0, 0.0),
-        doc="How it is turned: degrees about the axis that the numbers point along.",
-        example="[0, 0, 45]",
     )
-    mass: float | None = key(
-        number(above=0.0),
-        default=None,
-        doc="Mass of one that what it hits can move [kg]; fixed when absent.",
-        example="2.0",
+    mass: float | None = optional(
+        number(above=0.0), "Mass of one that what it hits can move [kg]; fixed when absent.", "2.0"
     )
 
 
@@ -83,45 +73,41 @@ class PlaneCollider(ColliderSettings):
 
     normal: Vector = key(
         read_direction,
+        "Normal out of it; matter stays on that side.",
+        "[0, 0, 1]",
         default=(0.0, 0.0, 1.0),
-        doc="Normal out of it; matter stays on that side.",
-        example="[0, 0, 1]",
     )
-    radius: float = key(
-        number(0.0), default=0.0, doc="Radius of its disc [m]; 0 is endless.", example="0.2"
-    )
+    radius: float = key(number(0.0), "Radius of its disc [m]; 0 is endless.", "0.2", default=0.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SphereCollider(FreeColliderSettings):
     """``type: sphere``."""
 
-    radius: float = key(number(above=0.0), doc="Radius [m].", example="0.1")
+    radius: float = key(number(above=0.0), "Radius [m].", "0.1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BoxCollider(FreeColliderSettings):
     """``type: box``."""
 
-    size: Vector = key(vector(3, 1e-9), doc="Its edges [m].", example="[0.2, 0.3, 0.1]")
+    size: Vector = key(vector(3, 1e-9), "Its edges [m].", "[0.2, 0.3, 0.1]")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CapsuleCollider(FreeColliderSettings):
     """``type: capsule``."""
 
-    radius: float = key(number(above=0.0), doc="Radius [m].", example="0.05")
-    length: float = key(
-        number(0.0), doc="Between the centres of its caps, along its own z [m].", example="0.2"
-    )
+    radius: float = key(number(above=0.0), "Radius [m].", "0.05")
+    length: float = key(number(0.0), "Between the centres of its caps, along its own z [m].", "0.2")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CylinderCollider(FreeColliderSettings):
     """``type: cylinder``."""
 
-    radius: float = key(number(above=0.0), doc="Radius [m].", example="0.05")
-    length: float = key(number(above=0.0), doc="Along its own z [m].", example="0.2")
+    radius: float = key(number(above=0.0), "Radius [m].", "0.05")
+    length: float = key(number(above=0.0), "Along its own z [m].", "0.2")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,12 +115,9 @@ class MeshCollider(FreeColliderSettings):
     """``type: mesh``."""
 
     mesh: Path = key(
-        existing_path, doc="Closed mesh that trimesh reads; its origin goes to `at`.",
-        example="bowl.obj",
-    )  # fmt: skip
-    scale: float = key(
-        number(above=0.0), default=1.0, doc="Metres per unit of the file.", example="0.001"
+        existing_path, "Closed mesh that trimesh reads; its origin goes to `at`.", "bowl.obj"
     )
+    scale: float = key(number(above=0.0), "Metres per unit of the file.", "0.001", default=1.0)
 
 
 COLLIDERS: dict[str, type[ColliderSettings]] = {
@@ -145,12 +128,6 @@ COLLIDERS: dict[str, type[ColliderSettings]] = {
     "cylinder": CylinderCollider,
     "mesh": MeshCollider,
 }
-
-
-def collider_dict(settings: ColliderSettings) -> dict[str, Any]:
-    """Return a collider as the shot file has it."""
-    kind = next(name for name, cls in COLLIDERS.items() if type(settings) is cls)
-    return without_none({"type": kind, **plain(settings)})
 
 
 def read_colliders(value: Any, place: Place) -> tuple[ColliderSettings, ...]:

@@ -11,12 +11,11 @@ from typing import Any
 
 from gsfluent.config.read import (
     Place,
-    Reader,
+    Section,
     existing_path,
-    given,
-    key,
     mapping,
     number,
+    optional,
     plain,
     refuse_unknown,
     section,
@@ -67,69 +66,49 @@ def read_label_image(value: Any, place: Place) -> Path | dict[str, Path]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Where:
+class Where(Section):
     """``where:`` - which matter a part is made of; all conditions given must hold."""
 
-    depth_below: float | None = key(
-        number(above=0.0), default=None, doc="Closer to the surface than this [m].", example="0.012"
+    depth_below: float | None = optional(
+        number(above=0.0), "Closer to the surface than this [m].", "0.012"
     )
-    depth_above: float | None = key(
-        number(0.0), default=None, doc="Deeper than this [m].", example="0.012"
+    depth_above: float | None = optional(number(0.0), "Deeper than this [m].", "0.012")
+    color_near: Vector | None = optional(
+        vector(3, 0.0, 1.0), "Coloured like this, RGB in 0..1.", "[0.1, 0.07, 0.05]"
     )
-    color_near: Vector | None = key(
-        vector(3, 0.0, 1.0),
-        default=None,
-        doc="Coloured like this, RGB in 0..1.",
-        example="[0.1, 0.07, 0.05]",
+    tolerance: float | None = optional(
+        number(0.0, 2.0), "Largest RGB distance from color_near (0.15 if absent).", "0.15"
     )
-    tolerance: float | None = key(
-        number(0.0, 2.0),
-        default=None,
-        doc="Largest RGB distance from color_near (0.15 if absent).",
-        example="0.15",
+    box: tuple[Vector, Vector] | None = optional(
+        read_box,
+        "Inside this box, scene metres: two corners.",
+        "[[-0.1, -0.1, 0], [0.1, 0.1, 0.05]]",
     )
-    box: tuple[Vector, Vector] | None = key(
-        read_box, default=None, doc="Inside this box, scene metres: two corners.",
-        example="[[-0.1, -0.1, 0], [0.1, 0.1, 0.05]]",
-    )  # fmt: skip
-    sphere: tuple[float, ...] | None = key(
-        read_sphere, default=None, doc="Inside this sphere, scene metres: x, y, z, radius.",
-        example="[0, 0, 0.1, 0.05]",
-    )  # fmt: skip
-    mask: Path | None = key(
+    sphere: tuple[float, ...] | None = optional(
+        read_sphere, "Inside this sphere, scene metres: x, y, z, radius.", "[0, 0, 0.1, 0.05]"
+    )
+    mask: Path | None = optional(
+        existing_path, "Folder with a mask per photograph: white is this part.", "parts/stem"
+    )
+    labels: Path | None = optional(
         existing_path,
-        default=None,
-        doc="Folder with a mask per photograph: white is this part.",
-        example="parts/stem",
-    )
-    labels: Path | None = key(
-        existing_path,
-        default=None,
-        doc="Segmentation of the photographs: label images, a folder of masks per label, "
+        "Segmentation of the photographs: label images, a folder of masks per label, "
         "Segment Anything's folders or JSON, NumPy maps; picks label.",
-        example="segmentation",
+        "segmentation",
     )
-    label_image: Path | dict[str, Path] | None = key(
+    label_image: Path | dict[str, Path] | None = optional(
         read_label_image,
-        default=None,
-        doc="Picture of labels projected along an axis (x, y, z) of the scene, or, without an "
+        "Picture of labels projected along an axis (x, y, z) of the scene, or, without an "
         "axis, of a cut whose labels follow depth; picks label.",
-        example="{x: side.png}",
+        "{x: side.png}",
     )
-    label: str | int | None = key(
+    label: str | int | None = optional(
         read_label,
-        default=None,
-        doc="Label in labels or label_image, by name, number or colour (any label if absent); "
+        "Label in labels or label_image, by name, number or colour (any label if absent); "
         "alone: a region that the solid has already (inclusion).",
-        example="leaf",
+        "leaf",
     )
-    region: int | None = key(
-        whole(0, 2**31 - 1), default=None, doc="Part number in the solid's voxels.", example="1"
-    )
-
-    def given(self) -> dict[str, Any]:
-        """Return the conditions that are set."""
-        return given(self)
+    region: int | None = optional(whole(0, 2**31 - 1), "Part number in the solid's voxels.", "1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,46 +125,32 @@ class Part:
 
 
 @dataclasses.dataclass(frozen=True)
-class Select:
+class Select(Section):
     """``select:`` - which splats belong to an object; ``all`` when nothing is set. Scene metres."""
 
-    box: tuple[Vector, Vector] | None = key(
-        read_box, default=None, doc="Centres inside this box [m].",
-        example="[[-0.1, -0.1, 0], [0.1, 0.1, 0.2]]",
-    )  # fmt: skip
-    sphere: tuple[float, ...] | None = key(
-        read_sphere, default=None, doc="Centres inside this sphere [m]: x, y, z, radius.",
-        example="[0, 0, 0.1, 0.15]",
-    )  # fmt: skip
-    color_near: Vector | None = key(
-        vector(3, 0.0, 1.0),
-        default=None,
-        doc="Coloured like this, RGB in 0..1.",
-        example="[0.6, 0.1, 0.1]",
+    box: tuple[Vector, Vector] | None = optional(
+        read_box, "Centres inside this box [m].", "[[-0.1, -0.1, 0], [0.1, 0.1, 0.2]]"
     )
-    tolerance: float | None = key(
-        number(0.0, 2.0),
-        default=None,
-        doc="Largest RGB distance from color_near (0.15 if absent).",
-        example="0.2",
+    sphere: tuple[float, ...] | None = optional(
+        read_sphere, "Centres inside this sphere [m]: x, y, z, radius.", "[0, 0, 0.1, 0.15]"
     )
-    labels: Path | None = key(
-        existing_path,
-        default=None,
-        doc="NumPy file with one number per splat; picks label.",
-        example="labels.npy",
+    color_near: Vector | None = optional(
+        vector(3, 0.0, 1.0), "Coloured like this, RGB in 0..1.", "[0.6, 0.1, 0.1]"
     )
-    label: int | None = key(
-        whole(-(2**31), 2**31 - 1),
-        default=None,
-        doc="Number in the label file (1 if absent).",
-        example="1",
+    tolerance: float | None = optional(
+        number(0.0, 2.0), "Largest RGB distance from color_near (0.15 if absent).", "0.2"
+    )
+    labels: Path | None = optional(
+        existing_path, "NumPy file with one number per splat; picks label.", "labels.npy"
+    )
+    label: int | None = optional(
+        whole(-(2**31), 2**31 - 1), "Number in the label file (1 if absent).", "1"
     )
 
     @property
     def everything(self) -> bool:
         """Whether nothing is left out."""
-        return not given(self)
+        return not self.given()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,7 +166,7 @@ class ObjectSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for run.json."""
         parts = None if self.parts is None else [plain(part.to_dict()) for part in self.parts]
-        select = "all" if self.select.everything else plain(given(self.select))
+        select = "all" if self.select.everything else plain(self.select.given())
         return {
             "select": select,
             "material": self.material,
@@ -320,9 +285,8 @@ def _parameters(
     """Read material parameters and try them on the preset, so that a bad number is refused here."""
     from gsfluent import materials
 
-    parameter: Reader = number()
     read = {
-        name: (text if name == "law" else parameter)(value, place.inside(name))
+        name: (text if name == "law" else number())(value, place.inside(name))
         for name, value in settings.items()
     }
     try:

@@ -40,9 +40,9 @@ Reader = Callable[[Any, Place], Any]
 
 def key(
     read: Reader,
-    *,
     doc: str,
     example: str,
+    *,
     default: Any = dataclasses.MISSING,
     name: str = "",
     old: str = "",
@@ -61,6 +61,11 @@ def key(
     if default is not dataclasses.MISSING and default.__class__.__hash__ is None:
         return dataclasses.field(default_factory=lambda: dict(default), metadata=facts)
     return dataclasses.field(default=default, metadata=facts)
+
+
+def optional(read: Reader, doc: str, example: str, *, name: str = "") -> Any:
+    """Declare a setting that is None when its key is absent."""
+    return key(read, doc, example, default=None, name=name)
 
 
 def key_name(field: dataclasses.Field[Any]) -> str:
@@ -90,14 +95,12 @@ def mapping(value: Any, place: Place) -> dict[str, Any]:
 def section(cls: type[_Section], value: Any, place: Place) -> _Section:
     """Read a mapping into the dataclass ``cls`` whose fields were declared with :func:`key`.
 
-    A class attribute ``LATER`` (key -> what it belongs to) names keys that a later issue brings.
-
     Raises:
-        InputError: An unknown, later or missing key, or a value that its reader refuses.
+        InputError: An unknown or missing key, or a value that its reader refuses.
     """
     fields = {key_name(field): field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     given = _renamed(mapping(value, place), fields, place)
-    refuse_unknown(given, fields, place, getattr(cls, "LATER", {}))
+    refuse_unknown(given, fields, place)
     values = {}
     for name, field in fields.items():
         if name in given:
@@ -127,15 +130,10 @@ def _renamed(
     return given
 
 
-def refuse_unknown(
-    given: Iterable[str], known: Iterable[str], place: Place, later: Mapping[str, str] | None = None
-) -> None:
-    """Raise for the first key that is not known, or that a later issue brings."""
+def refuse_unknown(given: Iterable[str], known: Iterable[str], place: Place) -> None:
+    """Raise for the first key that is not known."""
     known = list(known)
     for name in given:
-        if later and name in later:
-            where = place.inside(name).path
-            raise InputError(f"{where}: {later[name]} arrives with a later issue", "remove the key")
         if name not in known:
             raise InputError(f"{place.inside(name).path}: unknown key", nearest(name, known))
 
@@ -186,16 +184,12 @@ def flag(value: Any, place: Place) -> bool:
     return value
 
 
-def choice(*known: str, later: Iterable[str] = ()) -> Reader:
-    """Reader of one of ``known``; words in ``later`` are refused as coming with a later issue."""
+def choice(*known: str) -> Reader:
+    """Reader of one of ``known``."""
 
     def read(value: Any, place: Place) -> str:
         if value is None or value is False:
             value = "no" if value is False else "none"
-        if value in later:
-            raise InputError(
-                f"{place.path}: {value} arrives with a later issue", nearest("", known)
-            )
         if value not in known:
             raise place.error(f"be one of {', '.join(known)}", value, nearest(value, known))
         return str(value)
@@ -257,14 +251,21 @@ def typed(value: Any, place: Place, known: Mapping[str, type[Any]], noun: str) -
     return tuple(found)
 
 
-def either_of(settings: Any, names: tuple[str, str], place: Place) -> None:
+def typed_dict(settings: Any, known: Mapping[str, type[Any]]) -> dict[str, Any]:
+    """Turn a section that :func:`typed` has read back into what the shot file has."""
+    kind = next(name for name, cls in known.items() if type(settings) is cls)
+    return without_none({"type": kind, **plain(settings)})
+
+
+def either_of(
+    settings: Any, names: tuple[str, str], place: Place, hint: str = "keep one of them"
+) -> None:
     """Refuse a section that has both or neither of two keys."""
     first, second = (getattr(settings, name) is not None for name in names)
     if first == second:
         got = "both" if first else "neither"
         raise InputError(
-            f"{place.path} must have either {names[0]!r} or {names[1]!r}, got {got}",
-            "keep one of them",
+            f"{place.path} must have either {names[0]!r} or {names[1]!r}, got {got}", hint
         )
 
 
@@ -329,10 +330,14 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def given(settings: Any) -> dict[str, Any]:
-    """Return the fields of a section that are set (not None), by field name."""
-    pairs = ((field.name, getattr(settings, field.name)) for field in dataclasses.fields(settings))
-    return {name: value for name, value in pairs if value is not None}
+class Section:
+    """Base of sections whose settings are passed on as far as they are set."""
+
+    def given(self) -> dict[str, Any]:
+        """Return the fields that are set (not None), by field name."""
+        names = (field.name for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        pairs = ((name, getattr(self, name)) for name in names)
+        return {name: value for name, value in pairs if value is not None}
 
 
 def without_none(value: Any) -> Any:

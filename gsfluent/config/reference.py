@@ -64,13 +64,8 @@ def tables() -> str:
 def parameters() -> str:
     """Markdown: the material parameters that an object or part may override."""
     laws = ", ".join(f"`{law}`" for law in materials.LAWS)
-    return (
-        f"`law` ({laws}), "
-        + ", ".join(
-            f"`{name}`" for name in (*materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS)
-        )
-        + ".\n"
-    )
+    names = (*materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS)
+    return f"`law` ({laws}), " + ", ".join(f"`{name}`" for name in names) + ".\n"
 
 
 def _keys(cls: type[Any]) -> Iterator[tuple[str, str, str, str]]:

@@ -10,14 +10,15 @@ from typing import Any
 
 from gsfluent.config.read import (
     Place,
+    Section,
     choice,
     either,
     existing_path,
     flag,
-    given,
     key,
     nested,
     number,
+    optional,
     section,
     several,
     text,
@@ -68,84 +69,62 @@ _TEXTURE_METHODS = (
 
 
 @dataclasses.dataclass(frozen=True)
-class ReconstructSettings:
+class ReconstructSettings(Section):
     """``reconstruct:`` - photographs to splats. None leaves the choice to the stage."""
 
-    iterations: int | None = key(
-        whole(1, 1_000_000), default=None, doc="Optimisation steps.", example="7000"
+    iterations: int | None = optional(whole(1, 1_000_000), "Optimisation steps.", "7000")
+    max_gaussians: int | None = optional(
+        whole(10, 50_000_000), "Upper limit of the number of splats.", "300000"
     )
-    max_gaussians: int | None = key(
-        whole(10, 50_000_000),
-        default=None,
-        doc="Upper limit of the number of splats.",
-        example="300000",
+    kernel: str | None = optional(
+        choice("isotropic", "anisotropic"), "Shape of the splats.", "anisotropic"
     )
-    kernel: str | None = key(
-        choice("isotropic", "anisotropic"),
-        default=None,
-        doc="Shape of the splats.",
-        example="anisotropic",
+    scale_regularization: float | None = optional(
+        number(0.0, 1e6), "Weight of the penalty on large splats.", "1.0"
     )
-    scale_regularization: float | None = key(
-        number(0.0, 1e6), default=None, doc="Weight of the penalty on large splats.", example="1.0"
+    image_size: int | None = optional(
+        whole(24, 8192), "Longest side of the photographs while fitting [pixels].", "800"
     )
-    image_size: int | None = key(
-        whole(24, 8192),
-        default=None,
-        doc="Longest side of the photographs while fitting [pixels].",
-        example="800",
-    )
-    sh_degree: int | None = key(
-        whole(0, 3), default=None, doc="Degree of the view-dependent colours.", example="0"
-    )
-    recipe: str | None = key(
+    sh_degree: int | None = optional(whole(0, 3), "Degree of the view-dependent colours.", "0")
+    recipe: str | None = optional(
         choice("auto", "quick", "long", "classic"),
-        default=None,
-        doc="Schedule; auto follows the number of steps.",
-        example="long",
+        "Schedule; auto follows the number of steps.",
+        "long",
     )
-    densify: str | None = key(
+    densify: str | None = optional(
         choice("adc", "mcmc"),
-        default=None,
-        doc="How splats are added: where photographs pull, or towards a budget.",
-        example="mcmc",
+        "How splats are added: where photographs pull, or towards a budget.",
+        "mcmc",
     )
-    target_psnr: float | None = key(
+    target_psnr: float | None = optional(
         number(1.0, 100.0),
-        default=None,
-        doc="PSNR on the photographs that is enough [dB]; splats are added only below it.",
-        example="32",
+        "PSNR on the photographs that is enough [dB]; splats are added only below it.",
+        "32",
     )
-    exposure: bool | None = key(
-        flag, default=None, doc="Learn an affine colour change per photograph.", example="true"
-    )
-
-    def given(self) -> dict[str, Any]:
-        """Return the settings that are set, as keyword arguments of the stage."""
-        return given(self)
+    exposure: bool | None = optional(flag, "Learn an affine colour change per photograph.", "true")
 
 
 @dataclasses.dataclass(frozen=True)
-class FillSettings:
+class FillSettings(Section):
     """``fill:`` - a shell of splats to a solid."""
 
     method: str = key(
-        choice("auto", "vote", "density", "hull", "tsdf"), default="auto",
-        doc="How the inside is found: rays (vote), with masks (hull, density), depths (tsdf).",
-        example="auto",
-    )  # fmt: skip
+        choice("auto", "vote", "density", "hull", "tsdf"),
+        "How the inside is found: rays (vote), with masks (hull, density), depths (tsdf).",
+        "auto",
+        default="auto",
+    )
     hollow: str | float = key(
         either(choice("auto", "none"), number(above=0.0)),
+        "auto: seen cavities stay empty; none: solid through; or a wall thickness [m].",
+        "auto",
         default="auto",
-        doc="auto: seen cavities stay empty; none: solid through; or a wall thickness [m].",
-        example="auto",
     )
-    resolution: int | None = key(
+    resolution: int | None = optional(
         whole(8, 512),
-        default=None,
-        doc="Voxels along the longest side; by default two per cell of the simulation, at least 96 "
+        "Voxels along the longest side; by default two per cell of the simulation, at least 96 "
         "for the largest object.",
-        example="96",
+        "96",
     )
 
     def given(self, scale: float = 1.0) -> dict[str, Any]:
@@ -154,7 +133,7 @@ class FillSettings:
         Args:
             scale: Metres per world unit: the stage works in world units, the shot file in metres.
         """
-        values = given(self)
+        values = super().given()
         if not isinstance(self.hollow, str):
             values["hollow"] = self.hollow / scale
         return values
@@ -169,133 +148,93 @@ def _white(value: Any, place: Place) -> str | float | tuple[float, ...]:
 
 
 @dataclasses.dataclass(frozen=True)
-class PhotoSettings:
+class PhotoSettings(Section):
     """``texture: photo:`` - what is done to exemplar photographs before their material is used."""
 
-    cutout: str | None = key(
+    cutout: str | None = optional(
         choice("auto", "ground", "grabcut", "none"),
-        default=None,
-        doc="How the object is told from its ground; none takes the whole picture as material.",
-        example="auto",
+        "How the object is told from its ground; none takes the whole picture as material.",
+        "auto",
     )
-    rim: bool | None = key(
-        flag, default=None, doc="Take leftovers of the surroundings off the rim.", example="true"
-    )
-    holes: bool | None = key(
-        flag, default=None, doc="Paint open cavities in the colour of their walls.", example="true"
-    )
-    glints: bool | None = key(flag, default=None, doc="Paint over specular spots.", example="true")
-    shading: bool | None = key(
-        flag, default=None, doc="Even out a gradient of the light.", example="true"
-    )
-    white: str | float | tuple[float, ...] | None = key(
+    rim: bool | None = optional(flag, "Take leftovers of the surroundings off the rim.", "true")
+    holes: bool | None = optional(flag, "Paint open cavities in the colour of their walls.", "true")
+    glints: bool | None = optional(flag, "Paint over specular spots.", "true")
+    shading: bool | None = optional(flag, "Even out a gradient of the light.", "true")
+    white: str | float | tuple[float, ...] | None = optional(
         _white,
-        default=None,
-        doc="White balance: auto, none, skin (as the object's), kelvin, or [r, g, b] of a white.",
-        example="auto",
+        "White balance: auto, none, skin (as the object's), kelvin, or [r, g, b] of a white.",
+        "auto",
     )
-    stain: bool | None = key(
-        flag,
-        default=None,
-        doc="Give stained (grey) parts the colour of the unstained ones.",
-        example="true",
+    stain: bool | None = optional(
+        flag, "Give stained (grey) parts the colour of the unstained ones.", "true"
     )
-    palette: str | None = key(
-        text, default=None, doc="Take the colours of this preset instead.", example="apple"
-    )
+    palette: str | None = optional(text, "Take the colours of this preset instead.", "apple")
 
 
 @dataclasses.dataclass(frozen=True)
-class TextureSettings:
+class TextureSettings(Section):
     """``texture:`` - colours for the inside."""
 
-    method: str | None = key(
+    method: str | None = optional(
         choice("auto", *_TEXTURE_METHODS),
-        default=None,
-        doc="How the inside gets its colours; by default from the exemplar if there is one.",
-        example="exemplar",
+        "How the inside gets its colours; by default from the exemplar if there is one.",
+        "exemplar",
     )
-    exemplar: Path | None = key(
+    exemplar: Path | None = optional(
         existing_path,
-        default=None,
-        doc="Photograph of a cut through such an object; other methods compare with it.",
-        example="cut.jpg",
+        "Photograph of a cut through such an object; other methods compare with it.",
+        "cut.jpg",
     )
-    preset: str | None = key(
-        text, default=None, doc="Procedural recipe (method procedural).", example="watermelon"
+    preset: str | None = optional(text, "Procedural recipe (method procedural).", "watermelon")
+    prompt: str | None = optional(
+        text, "What the inside looks like (method diffusion).", "ripe watermelon flesh"
     )
-    prompt: str | None = key(
+    model: str | None = optional(
         text,
-        default=None,
-        doc="What the inside looks like (method diffusion).",
-        example="ripe watermelon flesh",
+        "Folder or hub id of a diffusers inpainting model (method diffusion).",
+        "models/sdxl-inpainting",
     )
-    model: str | None = key(
-        text,
-        default=None,
-        doc="Folder or hub id of a diffusers inpainting model (method diffusion).",
-        example="models/sdxl-inpainting",
+    quality: str | None = optional(
+        choice("preview", "fast", "full"), "Effort (method exemplar).", "fast"
     )
-    quality: str | None = key(
-        choice("preview", "fast", "full"),
-        default=None,
-        doc="Effort (method exemplar).",
-        example="fast",
-    )
-    scale: float | None = key(
+    scale: float | None = optional(
         number(0.01, 100.0),
-        default=None,
-        doc="Size of the exemplar's structure relative to the automatic choice.",
-        example="1.0",
+        "Size of the exemplar's structure relative to the automatic choice.",
+        "1.0",
     )
-    guide: str | None = key(
+    guide: str | None = optional(
         choice("auto", "depth", "axis", "none"),
-        default=None,
-        doc="What patches are matched by: depth, or a cut across the axis (method exemplar).",
-        example="auto",
+        "What patches are matched by: depth, or a cut across the axis (method exemplar).",
+        "auto",
     )
-    directional: bool | None = key(
-        flag,
-        default=None,
-        doc="Grained: the exemplar is not turned (method exemplar).",
-        example="true",
+    directional: bool | None = optional(
+        flag, "Grained: the exemplar is not turned (method exemplar).", "true"
     )
-    inclusions: bool | None = key(
-        flag,
-        default=None,
-        doc="Find seeds and stones in the exemplar and place them (method exemplar).",
-        example="true",
+    inclusions: bool | None = optional(
+        flag, "Find seeds and stones in the exemplar and place them (method exemplar).", "true"
     )
-    cut: str | None = key(
+    cut: str | None = optional(
         choice("across", "along"),
-        default=None,
-        doc="The photograph was cut across or along the object's axis: sweep its structure.",
-        example="across",
+        "The photograph was cut across or along the object's axis: sweep its structure.",
+        "across",
     )
-    photo: PhotoSettings | None = key(
-        nested(PhotoSettings),
-        default=None,
-        doc="Preparation of photographs (method exemplar).",
-        example="{stain: true}",
+    photo: PhotoSettings | None = optional(
+        nested(PhotoSettings), "Preparation of photographs (method exemplar).", "{stain: true}"
     )
-    inpaint: InpaintSettings | None = key(
+    inpaint: InpaintSettings | None = optional(
         nested(InpaintSettings),
-        default=None,
-        doc="How slices are inpainted (methods diffusion and inpaint).",
-        example="{tile: 2, memory: balanced}",
+        "How slices are inpainted (methods diffusion and inpaint).",
+        "{tile: 2, memory: balanced}",
     )
-    polish: bool | None = key(
-        flag,
-        default=None,
-        doc="Fit interior splats coarser than the voxels to slices of the colours.",
-        example="true",
+    polish: bool | None = optional(
+        flag, "Fit interior splats coarser than the voxels to slices of the colours.", "true"
     )
 
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
-        values = given(self)
+        values = super().given()
         if self.photo is not None:
-            values["photo"] = given(self.photo)
+            values["photo"] = self.photo.given()
         if self.inpaint is not None:
             values["inpaint"] = self.inpaint.given()
         return values
@@ -348,44 +287,40 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
 class OutputSettings:
     """``output:`` - what is made of the simulation."""
 
-    fps: float = key(
-        number(1.0, 10000.0), default=30.0, doc="Frames per simulated second.", example="30"
-    )
-    seconds: float = key(
-        number(0.0, 3600.0, above=0.0), default=2.0, doc="Simulated time [s].", example="2"
-    )
+    fps: float = key(number(1.0, 10000.0), "Frames per simulated second.", "30", default=30.0)
+    seconds: float = key(number(0.0, 3600.0, above=0.0), "Simulated time [s].", "2", default=2.0)
     slow: float = key(
         number(0.01, 1000.0),
+        "How many times slower than it happened the video plays: 10 shows 0.2 s in 2 s.",
+        "10",
         default=1.0,
-        doc="How many times slower than it happened the video plays: 10 shows 0.2 s in 2 s.",
-        example="10",
     )
     size: tuple[int, int] = key(
-        _size, default=(1280, 720), doc="Width and height of the video [pixels].",
-        example="[1280, 720]",
-    )  # fmt: skip
+        _size, "Width and height of the video [pixels].", "[1280, 720]", default=(1280, 720)
+    )
     camera: str | int | Path = key(
-        _camera, default="orbit",
-        doc="orbit, turntable, dolly, the number of a photograph (0 is the first), or a path: "
+        _camera,
+        "orbit, turntable, dolly, the number of a photograph (0 is the first), or a path: "
         "a JSON file, a transforms.json or a COLMAP folder.",
-        example="orbit",
-    )  # fmt: skip
+        "orbit",
+        default="orbit",
+    )
     backdrop: str = key(
-        choice("studio", "captured"), default="studio",
-        doc="What stands behind: the studio, or the surroundings that the capture shows.",
-        example="captured",
-    )  # fmt: skip
+        choice("studio", "captured"),
+        "What stands behind: the studio, or the surroundings that the capture shows.",
+        "captured",
+        default="studio",
+    )
     cracks: str = key(
-        choice("gap", "mvee", "none"), default="gap",
-        doc="How crack faces are drawn: splats born on the faces that open, transition splats from "
+        choice("gap", "mvee", "none"),
+        "How crack faces are drawn: splats born on the faces that open, transition splats from "
         "overlapping ellipsoids (for comparison), or nothing added.",
-        example="none",
-    )  # fmt: skip
+        "none",
+        default="gap",
+    )
     what: tuple[str, ...] = key(
-        several(choice("mp4", *EXPORTS)),
-        default=("mp4",),
-        doc="What to write.", example="[mp4, ply-seq]",
-    )  # fmt: skip
+        several(choice("mp4", *EXPORTS)), "What to write.", "[mp4, ply-seq]", default=("mp4",)
+    )
 
     @property
     def video_fps(self) -> float:

@@ -9,11 +9,11 @@ from typing import Any
 
 from gsfluent.config.read import (
     Place,
+    Section,
     choice,
     flag,
-    given,
-    key,
     number,
+    optional,
     section,
     several,
     text,
@@ -25,116 +25,78 @@ __all__ = ["InpaintSettings", "read_inpaint"]
 
 
 @dataclasses.dataclass(frozen=True)
-class InpaintSettings:
+class InpaintSettings(Section):
     """``texture.inpaint:``. None leaves the choice to the stage."""
 
-    backend: str | None = key(
+    backend: str | None = optional(
         choice("diffusers", "command", "exemplar", "telea", "color"),
-        default=None,
-        doc="Who fills the slices; diffusers unless set.",
-        example="diffusers",
+        "Who fills the slices; diffusers unless set.",
+        "diffusers",
     )
-    coarse: str | None = key(
+    coarse: str | None = optional(
         choice("diffusers", "command", "exemplar", "telea", "color"),
-        default=None,
-        doc="Who does the first pass along X, when another one.",
-        example="command",
+        "Who does the first pass along X, when another one.",
+        "command",
     )
-    command: str | None = key(
+    command: str | None = optional(
         text,
-        default=None,
-        doc="Program of the backend command; {folder} is where its slices lie.",
-        example="python infer.py --folder {folder}",
+        "Program of the backend command; {folder} is where its slices lie.",
+        "python infer.py --folder {folder}",
     )
-    schedule: str | None = key(
+    schedule: str | None = optional(
         choice("paper", "coupled"),
-        default=None,
-        doc="X first, then X, Y and Z; or all axes together from the coarsest level on.",
-        example="coupled",
+        "X first, then X, Y and Z; or all axes together from the coarsest level on.",
+        "coupled",
     )
-    slices: int | None = key(whole(1, 2048), default=None, doc="Slices per axis.", example="40")
-    strength: float | None = key(
-        number(0.0, 1.0, above=0.0),
-        default=None,
-        doc="Denoising strength of the first pass.",
-        example="0.99",
+    slices: int | None = optional(whole(1, 2048), "Slices per axis.", "40")
+    strength: float | None = optional(
+        number(0.0, 1.0, above=0.0), "Denoising strength of the first pass.", "0.99"
     )
-    refine: tuple[float, ...] | None = key(
+    refine: tuple[float, ...] | None = optional(
         several(number(0.0, 1.0, above=0.0)),
-        default=None,
-        doc="Strengths of the rounds over X, Y and Z that follow.",
-        example="[0.3, 0.2]",
+        "Strengths of the rounds over X, Y and Z that follow.",
+        "[0.3, 0.2]",
     )
-    tile: int | None = key(
-        whole(1, 4),
-        default=None,
-        doc="Neighbouring slices along an edge of one picture: 1, 2 or 4.",
-        example="2",
+    tile: int | None = optional(
+        whole(1, 4), "Neighbouring slices along an edge of one picture: 1, 2 or 4.", "2"
     )
-    match_colors: bool | None = key(
-        flag,
-        default=None,
-        doc="Bring the colours of every slice back to the exemplar's before fusion.",
-        example="true",
+    match_colors: bool | None = optional(
+        flag, "Bring the colours of every slice back to the exemplar's before fusion.", "true"
     )
-    steps: int | None = key(whole(1, 1000), default=None, doc="Denoising steps.", example="30")
-    guidance: float | None = key(
-        number(0.0, 100.0), default=None, doc="Classifier-free guidance scale.", example="7.5"
+    steps: int | None = optional(whole(1, 1000), "Denoising steps.", "30")
+    guidance: float | None = optional(number(0.0, 100.0), "Classifier-free guidance scale.", "7.5")
+    size: int | None = optional(whole(16, 4096), "Edge of the model's pictures [pixels].", "1024")
+    batch: int | None = optional(whole(1, 256), "Pictures per call.", "4")
+    memory: str | None = optional(
+        choice("high", "balanced", "low"), "All on the GPU, or part by part.", "balanced"
     )
-    size: int | None = key(
-        whole(16, 4096), default=None, doc="Edge of the model's pictures [pixels].", example="1024"
-    )
-    batch: int | None = key(whole(1, 256), default=None, doc="Pictures per call.", example="4")
-    memory: str | None = key(
-        choice("high", "balanced", "low"),
-        default=None,
-        doc="All on the GPU, or part by part.",
-        example="balanced",
-    )
-    dtype: str | None = key(
+    dtype: str | None = optional(
         choice("auto", "float32", "bfloat16", "float16"),
-        default=None,
-        doc="Precision; auto is bfloat16 on a GPU.",
-        example="bfloat16",
+        "Precision; auto is bfloat16 on a GPU.",
+        "bfloat16",
     )
-    variant: str | None = key(text, default=None, doc="File variant.", example="fp16")
-    revision: str | None = key(
-        text, default=None, doc="Commit or tag of a hub model.", example="115134f"
-    )
-    offline: bool | None = key(
-        flag, default=None, doc="Look only in the local cache.", example="true"
-    )
-    safety_checker: bool | None = key(
-        flag, default=None, doc="Keep the model's safety checker.", example="false"
-    )
-    ip_adapter: str | None = key(
+    variant: str | None = optional(text, "File variant.", "fp16")
+    revision: str | None = optional(text, "Commit or tag of a hub model.", "115134f")
+    offline: bool | None = optional(flag, "Look only in the local cache.", "true")
+    safety_checker: bool | None = optional(flag, "Keep the model's safety checker.", "false")
+    ip_adapter: str | None = optional(
         text,
-        default=None,
-        doc="Folder or hub id of an IP-adapter, which shows the exemplar to the model.",
-        example="models/ip-adapter",
+        "Folder or hub id of an IP-adapter, which shows the exemplar to the model.",
+        "models/ip-adapter",
     )
-    ip_adapter_subfolder: str | None = key(
-        text, default=None, doc="Folder of its weights within it.", example="sdxl_models"
+    ip_adapter_subfolder: str | None = optional(
+        text, "Folder of its weights within it.", "sdxl_models"
     )
-    ip_adapter_weights: str | None = key(
-        text,
-        default=None,
-        doc="File of its weights.",
-        example="ip-adapter_sdxl_vit-h.safetensors",
+    ip_adapter_weights: str | None = optional(
+        text, "File of its weights.", "ip-adapter_sdxl_vit-h.safetensors"
     )
-    ip_adapter_scale: float | None = key(
-        number(0.0, 2.0), default=None, doc="How much the exemplar counts.", example="0.5"
+    ip_adapter_scale: float | None = optional(
+        number(0.0, 2.0), "How much the exemplar counts.", "0.5"
     )
-    controlnet: str | None = key(
-        text, default=None, doc="Folder or hub id of a depth ControlNet.", example="models/depth"
+    controlnet: str | None = optional(
+        text, "Folder or hub id of a depth ControlNet.", "models/depth"
     )
-    allow_slow: bool | None = key(
-        flag, default=None, doc="Run a full-size model on the CPU.", example="false"
-    )
-
-    def given(self) -> dict[str, Any]:
-        """Return the settings that are set, as a mapping for the stage."""
-        return given(self)
+    allow_slow: bool | None = optional(flag, "Run a full-size model on the CPU.", "false")
 
 
 def read_inpaint(words: Sequence[str]) -> dict[str, Any]:

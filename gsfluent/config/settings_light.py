@@ -10,12 +10,15 @@ from typing import Any
 
 from gsfluent.config.read import (
     Place,
+    Section,
+    either_of,
     existing_path,
     flag,
     key,
     mapping,
     nested,
     number,
+    optional,
     read_direction,
     section,
     several,
@@ -29,127 +32,91 @@ Vector = tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True)
-class KeyLight:
+class KeyLight(Section):
     """``light.key:`` - the directional light."""
 
     direction: Vector = key(
-        read_direction, default=(1.0, -1.0, 2.0),
-        doc="From the scene towards the light; +z is up.", example="[1, -1, 2]",
-    )  # fmt: skip
+        read_direction,
+        "From the scene towards the light; +z is up.",
+        "[1, -1, 2]",
+        default=(1.0, -1.0, 2.0),
+    )
     shadow: bool = key(
-        flag, default=True, doc="Whether the object shadows itself and the floor.", example="true"
+        flag, "Whether the object shadows itself and the floor.", "true", default=True
     )
-    intensity: float | None = key(number(0.0, 1e3), default=None, doc="Strength.", example="0.6")
-    color: Vector | None = key(
-        vector(3, 0.0, 1e3), default=None, doc="Linear colour.", example="[1, 0.9, 0.8]"
+    intensity: float | None = optional(number(0.0, 1e3), "Strength.", "0.6")
+    color: Vector | None = optional(vector(3, 0.0, 1e3), "Linear colour.", "[1, 0.9, 0.8]")
+    size: float | None = optional(
+        number(0.0, 119.0), "Apparent width [degrees], for soft shadows; the sun has 0.53.", "4"
     )
-    size: float | None = key(
-        number(0.0, 119.0),
-        default=None,
-        doc="Apparent width [degrees], for soft shadows; the sun has 0.53.",
-        example="4",
-    )
-    samples: int | None = key(
+    samples: int | None = optional(
         whole(1, 64),
-        default=None,
-        doc="Parts it is drawn in, each with a shadow map: better wide penumbrae, slower.",
-        example="1",
+        "Parts it is drawn in, each with a shadow map: better wide penumbrae, slower.",
+        "1",
     )
-    spin: float | None = key(
-        number(), default=None, doc="Turn about the vertical [degrees per second].", example="90"
-    )
+    spin: float | None = optional(number(), "Turn about the vertical [degrees per second].", "90")
 
 
 @dataclasses.dataclass(frozen=True)
-class LampSettings:
+class LampSettings(Section):
     """``light.lights[]`` - one more lamp, directional or point."""
 
-    direction: Vector | None = key(
+    direction: Vector | None = optional(
         read_direction,
-        default=None,
-        doc="From the scene towards a directional lamp (this or position).",
-        example="[-1, 1, 1]",
+        "From the scene towards a directional lamp (this or position).",
+        "[-1, 1, 1]",
     )
-    position: Vector | None = key(
-        vector(3), default=None, doc="Where a point lamp is [m].", example="[0.3, -0.3, 0.6]"
+    position: Vector | None = optional(vector(3), "Where a point lamp is [m].", "[0.3, -0.3, 0.6]")
+    color: Vector | None = optional(vector(3, 0.0, 1e3), "Linear colour.", "[0.6, 0.8, 1]")
+    intensity: float | None = optional(
+        number(0.0, 1e6), "Strength; of a point lamp, at its distance.", "0.3"
     )
-    color: Vector | None = key(
-        vector(3, 0.0, 1e3), default=None, doc="Linear colour.", example="[0.6, 0.8, 1]"
+    distance: float | None = optional(
+        number(above=0.0), "Distance [m] at which a point lamp has its intensity.", "0.5"
     )
-    intensity: float | None = key(
-        number(0.0, 1e6),
-        default=None,
-        doc="Strength; of a point lamp, at its distance.",
-        example="0.3",
+    falloff: float | None = optional(
+        number(0.0, 10.0), "Exponent of a point lamp's falloff with distance; 0 for none.", "2"
     )
-    distance: float | None = key(
-        number(above=0.0),
-        default=None,
-        doc="Distance [m] at which a point lamp has its intensity.",
-        example="0.5",
-    )
-    falloff: float | None = key(
-        number(0.0, 10.0),
-        default=None,
-        doc="Exponent of a point lamp's falloff with distance; 0 for none.",
-        example="2",
-    )
-    size: float | None = key(
+    size: float | None = optional(
         number(0.0, 1e3),
-        default=None,
-        doc="Apparent width [degrees] of a directional lamp, diameter [m] of a point lamp.",
-        example="0.05",
+        "Apparent width [degrees] of a directional lamp, diameter [m] of a point lamp.",
+        "0.05",
     )
-    shadow: bool | None = key(flag, default=None, doc="Whether matter blocks it.", example="false")
-    samples: int | None = key(
-        whole(1, 64), default=None, doc="Parts it is drawn in, each with a shadow map.", example="4"
+    shadow: bool | None = optional(flag, "Whether matter blocks it.", "false")
+    samples: int | None = optional(
+        whole(1, 64), "Parts it is drawn in, each with a shadow map.", "4"
     )
-    spin: float | None = key(
-        number(), default=None, doc="Turn about the vertical [degrees per second].", example="90"
-    )
+    spin: float | None = optional(number(), "Turn about the vertical [degrees per second].", "90")
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentSettings:
     """``light.environment:`` - light from everywhere that differs by direction."""
 
-    sky: Vector | None = key(
-        vector(3, 0.0, 1e3),
-        default=None,
-        doc="Linear radiance of an even sky (with ground).",
-        example="[0.5, 0.6, 0.8]",
+    sky: Vector | None = optional(
+        vector(3, 0.0, 1e3), "Linear radiance of an even sky (with ground).", "[0.5, 0.6, 0.8]"
     )
-    ground: Vector | None = key(
-        vector(3, 0.0, 1e3),
-        default=None,
-        doc="Linear radiance of the ground.",
-        example="[0.3, 0.25, 0.2]",
+    ground: Vector | None = optional(
+        vector(3, 0.0, 1e3), "Linear radiance of the ground.", "[0.3, 0.25, 0.2]"
     )
-    image: Path | None = key(
+    image: Path | None = optional(
         existing_path,
-        default=None,
-        doc="Equirectangular picture (.hdr, or a display picture); up is +z, its middle +y.",
-        example="room.hdr",
+        "Equirectangular picture (.hdr, or a display picture); up is +z, its middle +y.",
+        "room.hdr",
     )
-    coefficients: tuple[Vector, ...] | None = key(
+    coefficients: tuple[Vector, ...] | None = optional(
         several_of(vector(3), 9, 9),
-        default=None,
-        doc="Irradiance over pi in spherical harmonics of degree 2, nine colours.",
-        example="[[2, 2, 2], [0, 0, 0], [1, 1, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], "
+        "Irradiance over pi in spherical harmonics of degree 2, nine colours.",
+        "[[2, 2, 2], [0, 0, 0], [1, 1, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], "
         "[0, 0, 0], [0, 0, 0]]",
     )
-    intensity: float = key(number(0.0, 1e3), default=1.0, doc="Factor on it.", example="0.6")
-    turn: float = key(number(), default=0.0, doc="Turn about the vertical [degrees].", example="90")
+    intensity: float = key(number(0.0, 1e3), "Factor on it.", "0.6", default=1.0)
+    turn: float = key(number(), "Turn about the vertical [degrees].", "90", default=0.0)
 
 
 def _lamp(value: Any, place: Place) -> LampSettings:
     settings = section(LampSettings, value, place)
-    if (settings.direction is None) == (settings.position is None):
-        got = "neither" if settings.direction is None else "both"
-        raise InputError(
-            f"{place.path} must have either 'direction' or 'position', got {got}",
-            "give one of them",
-        )
+    either_of(settings, ("direction", "position"), place, "give one of them")
     if settings.direction is not None:
         for name in ("distance", "falloff"):
             if getattr(settings, name) is not None:
@@ -177,60 +144,47 @@ def _environment(value: Any, place: Place) -> EnvironmentSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class LightSettings:
+class LightSettings(Section):
     """``light:``."""
 
-    ambient: float | None = key(
-        number(0.0, 1e3), default=None, doc="Light from everywhere, even.", example="0.4"
-    )
-    specular: float | None = key(
+    ambient: float | None = optional(number(0.0, 1e3), "Light from everywhere, even.", "0.4")
+    specular: float | None = optional(
         number(0.0, 1e3),
-        default=None,
-        doc="Strength of highlights on everything; each material's own when absent.",
-        example="0.1",
+        "Strength of highlights on everything; each material's own when absent.",
+        "0.1",
     )
-    shininess: float | None = key(
+    shininess: float | None = optional(
         number(1.0, 1e4),
-        default=None,
-        doc="Narrowness of highlights on everything; each material's own when absent.",
-        example="40",
+        "Narrowness of highlights on everything; each material's own when absent.",
+        "40",
     )
-    occlusion: float | None = key(
+    occlusion: float | None = optional(
+        number(0.0, 1.0), "How much of the light from everywhere matter hides, 0 for none.", "0.8"
+    )
+    delight: float | None = optional(
         number(0.0, 1.0),
-        default=None,
-        doc="How much of the light from everywhere matter hides, 0 for none.",
-        example="0.8",
+        "Share of the captured shading that is divided out first; 0 by default.",
+        "0.8",
     )
-    delight: float | None = key(
-        number(0.0, 1.0),
-        default=None,
-        doc="Share of the captured shading that is divided out first; 0 by default.",
-        example="0.8",
-    )
-    resolution: int | None = key(
+    resolution: int | None = optional(
         whole(16, 8192),
-        default=None,
-        doc="Texels along the side of a shadow map; from the picture's size when absent.",
-        example="1024",
+        "Texels along the side of a shadow map; from the picture's size when absent.",
+        "1024",
     )
     lights: tuple[LampSettings, ...] = key(
         several(_lamp),
+        "More lamps beside the key light.",
+        "[{position: [0.3, -0.3, 0.6], intensity: 0.3}]",
         default=(),
-        doc="More lamps beside the key light.",
-        example="[{position: [0.3, -0.3, 0.6], intensity: 0.3}]",
     )
-    environment: EnvironmentSettings | None = key(
+    environment: EnvironmentSettings | None = optional(
         _environment,
-        default=None,
-        doc="Light from everywhere by direction, beside ambient.",
-        example="{sky: [0.5, 0.6, 0.8], ground: [0.3, 0.25, 0.2]}",
+        "Light from everywhere by direction, beside ambient.",
+        "{sky: [0.5, 0.6, 0.8], ground: [0.3, 0.25, 0.2]}",
     )
     # Last, because from here on ``key`` names this field.
     key: KeyLight = key(
-        nested(KeyLight),
-        default=KeyLight(),
-        doc="The directional light.",
-        example="{direction: [1, -1, 2]}",
+        nested(KeyLight), "The directional light.", "{direction: [1, -1, 2]}", default=KeyLight()
     )
 
 

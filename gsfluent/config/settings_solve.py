@@ -6,7 +6,18 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from gsfluent.config.read import Place, Reader, choice, flag, key, mapping, number, section, whole
+from gsfluent.config.read import (
+    Place,
+    Reader,
+    choice,
+    flag,
+    key,
+    mapping,
+    number,
+    optional,
+    section,
+    whole,
+)
 from gsfluent.errors import InputError
 
 
@@ -47,57 +58,51 @@ class SolveSettings:
 
     quality: str = key(
         choice("preview", "shot", "hero"),
+        "Size of the cells of the grid.",
+        "preview",
         default="shot",
-        doc="Size of the cells of the grid.",
-        example="preview",
     )
-    cells: int | None = key(
+    cells: int | None = optional(
         whole(8, 1024),
-        default=None,
-        doc="Cells along the longest side of the largest solid, instead of those of `quality`.",
-        example="32",
+        "Cells along the longest side of the largest solid, instead of those of `quality`.",
+        "32",
     )
     cfl: float = key(
-        number(0.05, 0.9),
-        default=0.5,
-        doc="Courant number of the automatic time step.",
-        example="0.7",
+        number(0.05, 0.9), "Courant number of the automatic time step.", "0.7", default=0.5
     )
-    error: float | None = key(
+    error: float | None = optional(
         _ERROR,
-        default=None,
-        doc="Largest error, instead of `quality` and `cells`: the cheapest cells and cfl that "
+        "Largest error, instead of `quality` and `cells`: the cheapest cells and cfl that "
         "short probes of the shot promise to meet it with.",
-        example="3%",
+        "3%",
     )
-    seconds_per_frame: float | None = key(
+    seconds_per_frame: float | None = optional(
         number(above=0.0),
-        default=None,
-        doc="Wall time that simulating a frame may take on this machine [s], instead of `quality` "
+        "Wall time that simulating a frame may take on this machine [s], instead of `quality` "
         "and `cells`: as many cells as that allows, by the cost model of `gsfluent plan`.",
-        example="0.5",
+        "0.5",
     )
     standing: bool = key(
         flag,
-        default=False,
-        doc="What stands still on the floor sleeps from the start, without a strain, until "
+        "What stands still on the floor sleeps from the start, without a strain, until "
         "something comes near; else its weight begins to act at the start.",
-        example="true",
+        "true",
+        default=False,
     )
     loose_debris: bool = key(
         flag,
-        default=False,
-        doc="Broken matter with next to nothing around it falls freely and stays where it meets "
+        "Broken matter with next to nothing around it falls freely and stays where it meets "
         "the floor: much faster where an object goes to dust.",
-        example="true",
+        "true",
+        default=False,
         old="loose_crumbs",
     )
     deterministic: bool = key(
         flag,
-        default=False,
-        doc="Insist on the same bits from the same input on the same device. The solver gives them "
+        "Insist on the same bits from the same input on the same device. The solver gives them "
         "anyway; a blade at work on a GPU does not, and is refused then.",
-        example="true",
+        "true",
+        default=False,
     )
 
 

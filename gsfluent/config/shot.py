@@ -9,21 +9,24 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsfluent.config.colliders import ColliderSettings, collider_dict, read_colliders
-from gsfluent.config.events import Event, event_dict, read_events
+from gsfluent.config.colliders import COLLIDERS, ColliderSettings, read_colliders
+from gsfluent.config.events import EVENTS, Event, read_events
 from gsfluent.config.objects import ObjectSettings, read_objects
 from gsfluent.config.read import (
     Place,
     choice,
     either,
+    either_of,
     existing_path,
     key,
     nearest,
     nested,
     number,
+    optional,
     plain,
     read_direction,
     section,
+    typed_dict,
     vector,
     without_none,
 )
@@ -58,105 +61,85 @@ def _up(value: Any, place: Place) -> str | tuple[float, ...]:
 class Shot:
     """One shot: what is read, what happens to it, what is written. Paths are absolute."""
 
-    capture: Path | None = key(
-        existing_path, default=None,
-        doc="Folder with a COLMAP model or transforms.json (this or splats).",
-        example="captures/apple",
-    )  # fmt: skip
-    splats: Path | None = key(
+    capture: Path | None = optional(
         existing_path,
-        default=None,
-        doc="Trained 3DGS .ply (this or capture).",
-        example="melon.ply",
+        "Folder with a COLMAP model or transforms.json (this or splats).",
+        "captures/apple",
     )
-    scale: float | None = key(
-        number(above=0.0),
-        default=None,
-        doc="Metres per world unit; from size when absent.",
-        example="0.08",
+    splats: Path | None = optional(
+        existing_path, "Trained 3DGS .ply (this or capture).", "melon.ply"
     )
-    size: float | None = key(
-        number(above=0.0),
-        default=None,
-        doc="Largest extent of the object [m], instead of scale.",
-        example="0.08",
+    scale: float | None = optional(
+        number(above=0.0), "Metres per world unit; from size when absent.", "0.08"
+    )
+    size: float | None = optional(
+        number(above=0.0), "Largest extent of the object [m], instead of scale.", "0.08"
     )
     up: str | Vector = key(
-        _up, default="auto", doc="Up axis of the input: auto, +x to -z, or [x, y, z].",
-        example="-y",
-    )  # fmt: skip
-    floor: str | float = key(
-        either(choice("auto", "none", "plane"), number()), default="auto",
-        doc="Floor: auto (below the object), plane (what it stood on in the capture), none, or its "
-        "height along up: input coordinate times scale [m].",
-        example="auto",
-    )  # fmt: skip
-    floor_mode: str = key(
-        choice("separate", "slip", "sticky"), default="separate",
-        doc="Whether matter may leave the floor, may only slide on it, or sticks.",
-        example="sticky",
-    )  # fmt: skip
-    floor_friction: float = key(
-        number(0.0), default=0.4, doc="Coulomb friction of the floor.", example="0.6"
+        _up, "Up axis of the input: auto, +x to -z, or [x, y, z].", "-y", default="auto"
     )
+    floor: str | float = key(
+        either(choice("auto", "none", "plane"), number()),
+        "Floor: auto (below the object), plane (what it stood on in the capture), none, or its "
+        "height along up: input coordinate times scale [m].",
+        "auto",
+        default="auto",
+    )
+    floor_mode: str = key(
+        choice("separate", "slip", "sticky"),
+        "Whether matter may leave the floor, may only slide on it, or sticks.",
+        "sticky",
+        default="separate",
+    )
+    floor_friction: float = key(number(0.0), "Coulomb friction of the floor.", "0.6", default=0.4)
     origin: str = key(
-        choice("auto", "input"), default="auto",
-        doc="Where the scene's z axis stands: auto (in the middle of the object) or input (where "
+        choice("auto", "input"),
+        "Where the scene's z axis stands: auto (in the middle of the object) or input (where "
         "the input has its own origin).",
-        example="input",
-    )  # fmt: skip
+        "input",
+        default="auto",
+    )
     gravity: Vector = key(
         vector(3),
+        "Acceleration that pulls everything [m/s^2].",
+        "[0, 0, -1.62]",
         default=(0.0, 0.0, -9.81),
-        doc="Acceleration that pulls everything [m/s^2].",
-        example="[0, 0, -1.62]",
     )
     reconstruct: ReconstructSettings = key(
         nested(ReconstructSettings),
+        "Photographs to splats.",
+        "{iterations: 7000}",
         default=ReconstructSettings(),
-        doc="Photographs to splats.",
-        example="{iterations: 7000}",
     )
     fill: FillSettings = key(
-        nested(FillSettings),
-        default=FillSettings(),
-        doc="Splats to a solid.",
-        example="{hollow: none}",
+        nested(FillSettings), "Splats to a solid.", "{hollow: none}", default=FillSettings()
     )
     texture: TextureSettings = key(
-        read_texture,
-        default=TextureSettings(),
-        doc="Colours for the inside.",
-        example="{method: color_copy}",
+        read_texture, "Colours for the inside.", "{method: color_copy}", default=TextureSettings()
     )
     objects: Mapping[str, ObjectSettings] = key(
-        read_objects, default={},
-        doc="What the objects are made of, by name; one object named `object` when absent.",
-        example="{melon: {material: fruit.watermelon}}",
-    )  # fmt: skip
+        read_objects,
+        "What the objects are made of, by name; one object named `object` when absent.",
+        "{melon: {material: fruit.watermelon}}",
+        default={},
+    )
     events: tuple[Event, ...] = key(
-        read_events, default=(), doc="What happens.", example="[{type: drop, height: 1.0}]"
+        read_events, "What happens.", "[{type: drop, height: 1.0}]", default=()
     )
     colliders: tuple[ColliderSettings, ...] = key(
         read_colliders,
+        "Rigid things that matter cannot enter.",
+        "[{type: sphere, at: [0, 0, 0.1], radius: 0.1}]",
         default=(),
-        doc="Rigid things that matter cannot enter.",
-        example="[{type: sphere, at: [0, 0, 0.1], radius: 0.1}]",
     )
     solve: SolveSettings = key(
-        read_solve,
-        default=SolveSettings(),
-        doc="How accurately.",
-        example="{quality: preview}",
+        read_solve, "How accurately.", "{quality: preview}", default=SolveSettings()
     )
     light: LightSettings = key(
-        nested(LightSettings), default=LightSettings(), doc="The light.", example="{ambient: 0.4}"
+        nested(LightSettings), "The light.", "{ambient: 0.4}", default=LightSettings()
     )
     output: OutputSettings = key(
-        nested(OutputSettings),
-        default=OutputSettings(),
-        doc="What is written.",
-        example="{seconds: 2}",
+        nested(OutputSettings), "What is written.", "{seconds: 2}", default=OutputSettings()
     )
 
     @staticmethod
@@ -168,15 +151,11 @@ class Shot:
             folder: Where relative paths start.
 
         Raises:
-            InputError: An unknown, missing or later key, or a value out of range; the message names
+            InputError: An unknown or missing key, or a value out of range; the message names
                 its path.
         """
         shot = section(Shot, values, Place("", Path(folder)))
-        if (shot.capture is None) == (shot.splats is None):
-            got = "neither" if shot.capture is None else "both"
-            raise InputError(
-                f"the shot must have either 'capture' or 'splats', got {got}", "name one input"
-            )
+        either_of(shot, ("capture", "splats"), Place("the shot", Path()), "name one input")
         if shot.scale is not None and shot.size is not None:
             raise InputError(
                 "'scale' and 'size' both set the size of the object", "keep one of them"
@@ -211,8 +190,8 @@ class Shot:
         """Return every setting as plain values, defaults filled in; reads back as the same."""
         values: dict[str, Any] = plain(self)
         values["objects"] = {name: item.to_dict() for name, item in self.objects.items()}
-        values["events"] = [event_dict(event) for event in self.events]
-        values["colliders"] = [collider_dict(settings) for settings in self.colliders]
+        values["events"] = [typed_dict(event, EVENTS) for event in self.events]
+        values["colliders"] = [typed_dict(settings, COLLIDERS) for settings in self.colliders]
         return without_none(values)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -32,6 +32,7 @@ class Gaussians(TensorContainer):
         labels: ``SURFACE``, ``INTERIOR``, ``TRANSITION`` or ``BACKGROUND`` per splat, int32 [N], or
             None.
         normals: Unit surface normals [N, 3], or None.
+        report: What the stage that made them measured, JSON values; files do not hold it.
 
     Raises:
         TypeError: A field is not a tensor or has the wrong dtype.
@@ -45,6 +46,7 @@ class Gaussians(TensorContainer):
     sh: Annotated[Tensor, shape("N", "K", 3)]
     labels: Annotated[Tensor, shape("N", kind="int")] | None = None
     normals: Annotated[Tensor, shape("N", 3)] | None = None
+    report: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check shapes and the number of SH coefficients."""
@@ -120,9 +122,7 @@ class Gaussians(TensorContainer):
             opacities = torch.full(
                 (count,), float(opacities), dtype=means.dtype, device=means.device
             )
-        labels = None
-        if label is not None:
-            labels = torch.full((count,), label, dtype=torch.int32, device=means.device)
+        labels = None if label is None else _filled(None, means, label)
         return Gaussians(
             means, quats, scales, opacities, geometry.rgb_to_sh0(colors)[:, None], labels
         )
@@ -132,6 +132,10 @@ class Gaussians(TensorContainer):
         sh = torch.zeros_like(self.sh)
         sh[:, 0] = geometry.rgb_to_sh0(colors)
         return self.replace(sh=sh)
+
+    def labelled(self, label: int) -> Gaussians:
+        """Return a copy with one label for all rows."""
+        return self.replace(labels=_filled(None, self.means, label))
 
     def with_sh_degree(self, degree: int) -> Gaussians:
         """Return a copy padded with zero coefficients, or cut, to SH ``degree``."""

@@ -108,7 +108,7 @@ def require_labels(solid: Solid, where: Mapping[str, Any], part: str) -> None:
         files = ", ".join(map(str, source_paths(where).values()))
         raise InputError(
             f"part {part!r}: the labels of {files} were not projected onto this solid",
-            "solid = gf.pipeline.label_regions(solid, [part['where'] for part in parts], capture)",
+            "solid = gf.pipeline.Regions(parts)(solid, capture)",
         )
 
 

@@ -31,18 +31,14 @@ UPS = tuple(_TURNS)
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """One frame for export.
+    """One frame for export."""
 
-    Attributes:
-        saved: The frame; its splats are turned, relit and cut to the wanted SH degree, and its
-            points and velocities are turned.
-        fragment: Fragment of each splat (that of the point it follows), int32 [N], -1 for none.
-        material: Row of each splat in the scene's table of materials, int32 [N], -1 for none.
-    """
-
+    # The frame; its splats are turned, relit and cut to the wanted SH degree, and its points and
+    # velocities are turned.
     saved: SavedFrame
+    # Fragment of each splat (that of the point it follows), int32 [N], -1 for none.
     fragment: Tensor
-    material: Tensor
+    material: Tensor  # Row of each splat in the scene's table of materials, int32 [N], -1 for none
 
     @property
     def gaussians(self) -> Gaussians:

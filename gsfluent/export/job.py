@@ -17,74 +17,45 @@ from gsfluent.results.store import content_digest, fingerprint
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """How the formats are written; each reads what concerns it.
+    """How the formats are written; each reads what concerns it."""
 
-    Attributes:
-        frames: Which frames, as in Python (``12``, ``10:40``, ``::2``); all by default.
-        sh: Highest SH degree to keep.
-        up: Axis that points up where the format leaves it open: ``z``, ``y`` or ``-y``.
-        constant: The same number and order of splats in every frame.
-        compressed: SuperSplat's compressed layout for PLY.
-        attributes: Properties ``fragment`` and ``material`` in PLY.
-        spz_version: 2 or 3.
-        usd_ending: ``usdc``, ``usda`` or ``usdz``.
-        usd_parts: Some of ``splats``, ``particles``, ``meshes``.
-        mesh_ending: ``ply``, ``obj`` or ``glb``.
-        mesh_blur: Point spacings over which fragments' surfaces are smoothed.
-        key_every: Frames from one key frame to the next of a delta file.
-        camera: Camera or camera path of pictures; the shot's own by default.
-        size: (width, height) of pictures [px]; the shot's own by default.
-        fps: Pictures or time codes per second; the shot's own by default.
-        alpha: Pictures with a transparent background instead of the studio.
-        relit: Bake the light into the colours of splats and meshes.
-        light: Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
-        lamps: More lamps.
-        environment: An equirectangular picture, ``sky`` or ``none``.
-    """
-
+    # Which frames, as in Python (``12``, ``10:40``, ``::2``); all by default.
     frames: str | None = None
-    sh: int = 0
-    up: str = "z"
-    constant: bool = False
-    compressed: bool = False
-    attributes: bool = False
-    spz_version: int = 3
-    usd_ending: str = "usdc"
+    sh: int = 0  # Highest SH degree to keep
+    up: str = "z"  # Axis that points up where the format leaves it open: ``z``, ``y`` or ``-y``
+    constant: bool = False  # The same number and order of splats in every frame
+    compressed: bool = False  # SuperSplat's compressed layout for PLY
+    attributes: bool = False  # Properties ``fragment`` and ``material`` in PLY
+    spz_version: int = 3  # 2 or 3
+    usd_ending: str = "usdc"  # ``usdc``, ``usda`` or ``usdz``
+    # Some of ``splats``, ``particles``, ``meshes``.
     usd_parts: tuple[str, ...] = ("splats", "particles")
-    mesh_ending: str = "ply"
-    mesh_blur: float = 1.0
-    key_every: int = 30
-    camera: str | None = None
+    mesh_ending: str = "ply"  # ``ply``, ``obj`` or ``glb``
+    mesh_blur: float = 1.0  # Point spacings over which fragments' surfaces are smoothed
+    key_every: int = 30  # Frames from one key frame to the next of a delta file
+    camera: str | None = None  # Camera or camera path of pictures; the shot's own by default
+    # (width, height) of pictures [px]; the shot's own by default.
     size: tuple[int, int] | None = None
-    fps: float | None = None
-    alpha: bool = False
-    relit: bool = False
+    fps: float | None = None  # Pictures or time codes per second; the shot's own by default
+    alpha: bool = False  # Pictures with a transparent background instead of the studio
+    relit: bool = False  # Bake the light into the colours of splats and meshes
+    # Toward the key light (``x,y,z``), or a YAML file with a ``light:`` section.
     light: str | None = None
-    lamps: tuple[str, ...] = ()
-    environment: str | None = None
+    lamps: tuple[str, ...] = ()  # More lamps
+    environment: str | None = None  # An equirectangular picture, ``sky`` or ``none``
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One export.
+    """One export."""
 
-    Attributes:
-        out: Folder of the run.
-        folder: Where the files go.
-        sequence: The chosen frames.
-        options: How.
-        fps: Frames per second of the simulation's frames.
-        device: Where pictures are rendered.
-        progress: Called per frame.
-    """
-
-    out: Path
-    folder: Path
-    sequence: FrameSequence
-    options: ExportOptions
-    fps: float
-    device: torch.device
-    progress: Progress | None = None
+    out: Path  # Folder of the run
+    folder: Path  # Where the files go
+    sequence: FrameSequence  # The chosen frames
+    options: ExportOptions  # How
+    fps: float  # Frames per second of the simulation's frames
+    device: torch.device  # Where pictures are rendered
+    progress: Progress | None = None  # Called per frame
 
     def report(self, done: int, total: int, note: str) -> None:
         """Tell whoever listens."""

@@ -47,21 +47,13 @@ _TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The surface of one fragment in one frame.
+    """The surface of one fragment in one frame."""
 
-    Attributes:
-        fragment: Its number, -1 for all debris together.
-        vertices: [V, 3] in metres.
-        faces: [F, 3], normals out.
-        colors: [V, 3] in 0..1, display values.
-        volume: Volume of the points that make it up [m^3].
-    """
-
-    fragment: int
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    colors: NDArray[np.float32]
-    volume: float
+    fragment: int  # Its number, -1 for all debris together
+    vertices: NDArray[np.float64]  # [V, 3] in metres
+    faces: NDArray[np.int64]  # [F, 3], normals out
+    colors: NDArray[np.float32]  # [V, 3] in 0..1, display values
+    volume: float  # Volume of the points that make it up [m^3]
 
     @property
     def name(self) -> str:

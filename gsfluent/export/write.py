@@ -19,23 +19,14 @@ from gsfluent.progress import Progress
 
 @dataclass(frozen=True)
 class Format:
-    """One thing that can be written.
+    """One thing that can be written."""
 
-    Attributes:
-        what: Files and who reads them, in one line.
-        module: Module of the writer, beside this one.
-        function: The writer: takes a :class:`Job`, returns what was written.
-        pictures: Rendered; needs the shot's camera and light.
-        splats_only: Needs splats and nothing else, so it can be made of a ``.gsd`` file.
-        key: Name in the report.
-    """
-
-    what: str
-    module: str
-    function: str
-    pictures: bool = False
-    splats_only: bool = False
-    key: str = ""
+    what: str  # Files and who reads them, in one line
+    module: str  # Module of the writer, beside this one
+    function: str  # The writer: takes a :class:`Job`, returns what was written
+    pictures: bool = False  # Rendered; needs the shot's camera and light
+    splats_only: bool = False  # Needs splats and nothing else, so it can be made of a ``.gsd`` file
+    key: str = ""  # Name in the report
 
 
 FORMATS: dict[str, Format] = {

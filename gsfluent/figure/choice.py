@@ -8,8 +8,6 @@ from typing import Any
 
 from gsfluent.figure.style import COLORS, FAILED, INK, OURS, new_figure, save_png
 
-__all__ = ["draw_choice"]
-
 
 def draw_choice(result: Mapping[str, Any], path: str | Path) -> Path:
     """Draw predicted error against predicted seconds, both logarithmic.

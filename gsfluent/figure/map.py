@@ -11,8 +11,6 @@ from typing import Any
 
 from gsfluent.figure.style import INK, new_figure, save_png
 
-__all__ = ["Cell", "Mark", "Plane", "draw_planes", "place_of"]
-
 HOLDS = "#cfe9dc"
 NOT_RUN = "#f4f4f4"
 Value = float | str
@@ -20,59 +18,35 @@ Value = float | str
 
 @dataclass(frozen=True)
 class Cell:
-    """One point of a map.
+    """One point of a map."""
 
-    Attributes:
-        step: Steps to the first violation, None where it held.
-        letter: Of the kind of violation.
-    """
-
-    step: int | None
-    letter: str = ""
+    step: int | None  # steps to the first violation, None where it held
+    letter: str = ""  # of the kind of violation
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A named point, such as where another program stands.
+    """A named point, such as where another program stands."""
 
-    Attributes:
-        x: Value of the horizontal axis, a number between two of its values too.
-        y: Of the vertical one.
-        name: Its words.
-    """
-
-    x: Value
-    y: Value
-    name: str
+    x: Value  # value of the horizontal axis, a number between two of its values too
+    y: Value  # of the vertical one
+    name: str  # its words
 
 
 @dataclass(frozen=True)
 class Plane:
-    """One panel.
+    """One panel."""
 
-    Attributes:
-        title: Over it.
-        subtitle: Under the title: the variant.
-        x_label: Words of the horizontal axis.
-        y_label: Words of the vertical axis.
-        xs: Values along x, [X]: rising numbers, or words.
-        ys: Values along y, [Y].
-        cells: (column, row) -> cell; what is missing was not run.
-        limit: Steps that a run had at most.
-        star: Column and row of the default, or None.
-        marks: Named points.
-    """
-
-    title: str
-    subtitle: str
-    x_label: str
-    y_label: str
-    xs: Sequence[Value]
-    ys: Sequence[Value]
-    cells: Mapping[tuple[int, int], Cell]
-    limit: int
-    star: tuple[int, int] | None = None
-    marks: Sequence[Mark] = ()
+    title: str  # over it
+    subtitle: str  # under the title: the variant
+    x_label: str  # words of the horizontal axis
+    y_label: str  # words of the vertical axis
+    xs: Sequence[Value]  # values along x, [X]: rising numbers, or words
+    ys: Sequence[Value]  # values along y, [Y]
+    cells: Mapping[tuple[int, int], Cell]  # (column, row) -> cell; what is missing was not run
+    limit: int  # steps that a run had at most
+    star: tuple[int, int] | None = None  # column and row of the default, or None
+    marks: Sequence[Mark] = ()  # named points
 
 
 def place_of(values: Sequence[Value], value: Value) -> float | None:
@@ -109,7 +83,6 @@ def draw_planes(
     *,
     kinds: Mapping[str, str],
     columns: int = 2,
-    title: str = "",
     dpi: int = 110,
     cell: tuple[float, float] = (0.36, 0.24),
 ) -> Path:
@@ -123,7 +96,6 @@ def draw_planes(
         path: Of the PNG.
         kinds: Letter -> words, for the line below; those that occur are named.
         columns: Panels side by side.
-        title: Over all.
         dpi: Of the PNG.
         cell: Least width and height of a cell [inches].
 
@@ -140,7 +112,7 @@ def draw_planes(
     tall = max(len(p.ys) for p in drawn)
     width = min(1.7 + cell[0] * wide, 6.6)
     height = 1.35 + cell[1] * tall
-    with new_figure(width * columns, height * lines + 0.35 + 0.3 * bool(title)) as figure:
+    with new_figure(width * columns, height * lines + 0.35) as figure:
         grid = figure.subplots(lines, columns, squeeze=False).ravel()
         for axes, plane in zip(grid, planes, strict=False):
             if plane is None:
@@ -154,8 +126,6 @@ def draw_planes(
         if any(p.star for p in drawn):
             words.append("★ default")
         figure.supxlabel("   ".join(words), fontsize=7.5, color=INK)
-        if title:
-            figure.suptitle(title, fontsize=11, fontweight="bold", x=0.01, ha="left")
         return save_png(figure, path, dpi=dpi)
 
 

@@ -11,8 +11,6 @@ from pathlib import Path
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
 
-__all__ = ["Page", "shown"]
-
 _CSS = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --paper: #ffffff; --line: #d9d9d9;
   --soft: #f4f5f3; --good: #0b6e4f; --bad: #b00020; --warn: #8a6100; }

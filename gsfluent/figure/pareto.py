@@ -14,70 +14,43 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Dot", "Panel", "Rates", "colors_of", "draw"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Dot:
-    """One run.
+    """One run."""
 
-    Attributes:
-        method: Whose.
-        cost: Where it stands on the x axis; NaN or infinite for none.
-        error: Where it stands on the y axis; NaN or infinite for none.
-        label: What distinguishes it, shown where it lies on its front.
-        failed: It broke off.
-        free: It differs from another run in time only.
-    """
-
-    method: str
-    cost: float
-    error: float
-    label: str = ""
-    failed: bool = False
-    free: bool = False
+    method: str  # whose
+    cost: float  # where it stands on the x axis; NaN or infinite for none
+    error: float  # where it stands on the y axis; NaN or infinite for none
+    label: str = ""  # what distinguishes it, shown where it lies on its front
+    failed: bool = False  # it broke off
+    free: bool = False  # it differs from another run in time only
 
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """One case.
+    """One case."""
 
-    Attributes:
-        title: Its heading.
-        dots: All runs.
-        fronts: Of each method the dots that no other one beats, from cheap to dear.
-        band: Run-to-run spread: errors below mean nothing; None for none.
-        xlabel: Of the x axis; empty for the figure's own.
-        ylabel: Likewise.
-        highest: Errors of this and more are drawn on a rail, with a triangle.
-        note: What its error is, in small letters under the heading.
-    """
-
-    title: str
-    dots: Sequence[Dot]
+    title: str  # its heading
+    dots: Sequence[Dot]  # all runs
+    # of each method the dots that no other one beats, from cheap to dear
     fronts: Mapping[str, Sequence[Dot]]
-    band: float | None = None
-    xlabel: str = ""
-    ylabel: str = ""
-    highest: float = 1.0
-    note: str = ""
+    band: float | None = None  # run-to-run spread: errors below mean nothing; None for none
+    xlabel: str = ""  # of the x axis; empty for the figure's own
+    ylabel: str = ""  # likewise
+    highest: float = 1.0  # errors of this and more are drawn on a rail, with a triangle
+    note: str = ""  # what its error is, in small letters under the heading
 
 
 @dataclasses.dataclass(frozen=True)
 class Rates:
-    """Cost of a point and a step against the number of points.
+    """Cost of a point and a step against the number of points."""
 
-    Attributes:
-        points: Per method: points of each run.
-        ns: Per method: nanoseconds per point and step of each run.
-        floor: Nanoseconds that the bytes of a point take at the machine's bandwidth; None for none.
-        floor_label: What the floor is.
-    """
-
-    points: Mapping[str, Sequence[float]]
-    ns: Mapping[str, Sequence[float]]
+    points: Mapping[str, Sequence[float]]  # per method: points of each run
+    ns: Mapping[str, Sequence[float]]  # per method: nanoseconds per point and step of each run
+    # nanoseconds that the bytes of a point take at the machine's bandwidth; None for none
     floor: float | None = None
-    floor_label: str = ""
+    floor_label: str = ""  # what the floor is
 
 
 def colors_of(methods: Sequence[str], ours: str = "gsfluent") -> dict[str, str]:

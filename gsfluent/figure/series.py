@@ -8,30 +8,20 @@ from dataclasses import dataclass, field
 
 from gsfluent.figure.style import COLORS, FAILED, INK, OURS, new_figure, to_svg
 
-__all__ = ["Panel", "curves"]
-
 Values = Sequence[float | int | None]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One set of axes.
+    """One set of axes."""
 
-    Attributes:
-        title: Over it.
-        unit: Along its vertical axis.
-        series: Name -> values over the common axis; None and NaN are gaps.
-        bar: A level to draw, such as a limit, or None.
-        whole: Whether values are counts: no fractions along the axis.
-        log: Logarithmic values; zeros are gaps then.
-    """
-
-    title: str
-    unit: str
+    title: str  # over it
+    unit: str  # along its vertical axis
+    # name -> values over the common axis; None and NaN are gaps
     series: Mapping[str, Values] = field(default_factory=dict)
-    bar: float | None = None
-    whole: bool = False
-    log: bool = False
+    bar: float | None = None  # A level to draw, such as a limit, or None
+    whole: bool = False  # whether values are counts: no fractions along the axis
+    log: bool = False  # logarithmic values; zeros are gaps then
 
 
 def _numbers(values: Values, log: bool) -> list[float]:
@@ -39,14 +29,13 @@ def _numbers(values: Values, log: bool) -> list[float]:
     return [v if not log or v > 0.0 else math.nan for v in plain]
 
 
-def curves(along: Sequence[float], label: str, panels: Sequence[Panel], *, columns: int = 2) -> str:
+def curves(along: Sequence[float], label: str, panels: Sequence[Panel]) -> str:
     """Draw panels below and beside each other.
 
     Args:
         along: Common horizontal axis, [N].
         label: Its name and unit.
         panels: What to draw; a panel without any number is left out.
-        columns: Panels side by side.
 
     Returns:
         An ``<svg>`` element; empty when nothing is left to draw.
@@ -54,6 +43,7 @@ def curves(along: Sequence[float], label: str, panels: Sequence[Panel], *, colum
     Raises:
         ValueError: A series has another length than ``along``.
     """
+    columns = 2
     for panel in panels:
         for name, values in panel.series.items():
             if len(values) != len(along):

@@ -14,8 +14,6 @@ from gsfluent.io.atomic import atomic_path
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "FAILED", "GRID", "INK", "OURS", "new_figure", "save_png", "to_svg"]
-
 OURS = "#0b6e4f"
 """Colour of gsfluent wherever it stands beside others."""
 COLORS = ("#c1440e", "#31579c", "#8a5fb0", "#111111", "#b58900", "#2a9db0", "#a83264")

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from .scene import Floats, SceneError
 
-__all__ = ["REACH", "STRETCH", "components", "neighbours", "parted", "piece_masses"]
-
 REACH = 1.5
 """Points closer than this many spacings at rest are neighbours (edges and face diagonals of a
 cubic lattice, not its space diagonals)."""

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from .run import Measure, Run
 from .scene import Scene, SceneError
 
-__all__ = ["Case", "case", "cases", "find", "judge"]
-
 MODULES = (
     "contact",
     "elastic",

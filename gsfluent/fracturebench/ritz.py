@@ -20,8 +20,6 @@ from numpy.polynomial import legendre
 
 from .scene import Floats
 
-__all__ = ["Modes", "ball_rule", "box_rule", "modes"]
-
 Rule = tuple[Floats, Floats]
 
 
@@ -52,20 +50,15 @@ def ball_rule(radius: float, count: int) -> Rule:
 
 @dataclasses.dataclass(frozen=True)
 class Modes:
-    """Vibrations of a body about the origin, by rising frequency; rigid motions come first.
+    """Vibrations of a body about the origin, by rising frequency; rigid motions come first."""
 
-    Attributes:
-        omega: Angular frequencies [1/s], [K].
-        coefficients: Of the terms, normed so that the integral of density times the square of a
-            mode is 1, [terms, K].
-        terms: Component of the displacement and degree on each axis of each term.
-        scale: Lengths that make the coordinates dimensionless [m].
-    """
-
-    omega: Floats
+    omega: Floats  # angular frequencies [1/s], [K]
+    # of the terms, normed so that the integral of density times the square of a mode is 1, [terms,
+    # K]
     coefficients: Floats
+    # component of the displacement and degree on each axis of each term
     terms: tuple[tuple[int, int, int, int], ...]
-    scale: tuple[float, float, float]
+    scale: tuple[float, float, float]  # lengths that make the coordinates dimensionless [m]
 
     def at(self, points: Floats, mode: int) -> tuple[Floats, Floats]:
         """Return a mode [N, 3] and its gradient [N, 3, 3] at points [m]."""

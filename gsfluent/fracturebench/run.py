@@ -12,8 +12,6 @@ import numpy as np
 
 from .scene import BROKEN, Floats, Scene, SceneError
 
-__all__ = ["Measure", "Run"]
-
 _MUST, _MAY = ("scene", "method", "wall_seconds", "steps"), ("settings", "device", "failed")
 _OPTIONAL = ("damage", "stress", "impulse", "deformation")
 

@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BROKEN", "FORMAT", "Scene", "SceneError", "quantised"]
-
 FORMAT = 1
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -13,38 +13,23 @@ from .registry import judge
 from .run import Measure, Run
 from .scene import Scene, SceneError
 
-__all__ = ["Score", "markdown", "plain", "read_scenes", "score"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """What a method reached on a case.
+    """What a method reached on a case."""
 
-    Attributes:
-        case: Name of the case.
-        method: Who computed it.
-        measures: All measures, the first of which is the error of the charts; none if ``invalid``.
-        wall_seconds: Of the steps [s].
-        simulated_seconds: [s].
-        points: Material points.
-        steps: Steps taken.
-        device: On what.
-        failed: Why the run broke off, or empty.
-        invalid: Why the file could not be judged, or empty.
-        settings: What the method chose.
-    """
-
-    case: str
-    method: str
+    case: str  # name of the case
+    method: str  # who computed it
+    # all measures, the first of which is the error of the charts; none if invalid
     measures: tuple[Measure, ...] = ()
-    wall_seconds: float = math.nan
-    simulated_seconds: float = math.nan
-    points: int = 0
-    steps: int = 0
-    device: str = ""
-    failed: str = ""
-    invalid: str = ""
-    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+    wall_seconds: float = math.nan  # of the steps [s]
+    simulated_seconds: float = math.nan  # [s]
+    points: int = 0  # material points
+    steps: int = 0  # steps taken
+    device: str = ""  # on what
+    failed: str = ""  # why the run broke off, or empty
+    invalid: str = ""  # why the file could not be judged, or empty
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)  # what the method chose
 
     @property
     def passed(self) -> bool:

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .scene import Floats, Scene, wave_speed
-
-__all__ = ["ball", "box", "elastic", "free", "spacing", "wave_speed"]
+from .scene import Floats, Scene
 
 
 def spacing(dx: float, per_cell: int) -> float:

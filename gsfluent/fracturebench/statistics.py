@@ -21,21 +21,6 @@ from .registry import Case
 from .run import Run
 from .scene import Floats, Scene, SceneError
 
-__all__ = [
-    "MEASURES",
-    "Distance",
-    "Figures",
-    "Member",
-    "distance",
-    "ensemble",
-    "figures",
-    "jitter",
-    "lost_energy",
-    "mass_ks",
-    "spacing",
-    "stored_energy",
-]
-
 MEASURES = (
     "momentum history",
     "dissipated energy",
@@ -112,19 +97,12 @@ def lost_energy(scene: Scene, run: Run) -> Floats:
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """What is compared of one run; no figure depends on the number of points.
+    """What is compared of one run; no figure depends on the number of points."""
 
-    Attributes:
-        momentum: Total momentum over that of the start, [T, 3].
-        lost: Lost energy over the kinetic energy of the start, [T].
-        pieces: Masses of the pieces at the end as shares of the whole, rising, [F].
-        parted: Share of the neighbour pairs at rest that have parted for good.
-    """
-
-    momentum: Floats
-    lost: Floats
-    pieces: Floats
-    parted: float
+    momentum: Floats  # total momentum over that of the start, [T, 3]
+    lost: Floats  # lost energy over the kinetic energy of the start, [T]
+    pieces: Floats  # masses of the pieces at the end as shares of the whole, rising, [F]
+    parted: float  # share of the neighbour pairs at rest that have parted for good
 
     def plain(self) -> dict[str, Any]:
         """As plain values for JSON, with six digits; pieces of equal mass are counted."""
@@ -254,15 +232,11 @@ def _apart(one: Figures, others: Sequence[Figures]) -> Floats:
 
 @dataclasses.dataclass(frozen=True)
 class Distance:
-    """How far a method is from the reference in one measure.
+    """How far a method is from the reference in one measure."""
 
-    Attributes:
-        value: Median over the runs of the method of the distance to the reference's mean.
-        band: Run-to-run band: the largest distance of a run of the reference from the mean of its
-            other runs.
-    """
-
-    value: float
+    value: float  # median over the runs of the method of the distance to the reference's mean
+    # run-to-run band: the largest distance of a run of the reference from the mean of its other
+    # runs
     band: float
 
     @property

@@ -1,8 +1,7 @@
 """A prepared object one can poke while it is simulated: throw it, shoot at it, cut it.
 
 Each poke is an event of a shot with ``at`` = now, entered into the running simulation
-(:mod:`gsfluent.pipeline.simulate.grow`), so there is one physics for both, and what happened
-here
+(:mod:`gsfluent.pipeline.simulate.grow`), so there is one physics for both, and what happened here
 can be written down as a shot. A session is driven frame by frame from one thread;
 :class:`gsfluent.live.player.LivePlayer` drives it beside a viewer.
 """

@@ -2,8 +2,8 @@
 
 ``gsfluent.materials.fruit.watermelon``, ``gsfluent.materials.glass`` and so on are
 :class:`Material` objects; :func:`get` finds them by name and :meth:`Material.override` changes
-single parameters. Each preset says of every number whether it is measured, derived or chosen by
-eye (:meth:`Material.source`, docs/measured/materials.md).
+single parameters. They stand in ``presets.toml``. Each preset says of every number whether it is
+measured, derived or chosen by eye (:meth:`Material.source`, docs/measured/materials.md).
 
 Strength of ``nacc`` material is set by strain, not by stress: the compressive yield pressure is
 ``kappa * sinh(hardening * max(-alpha, 0))`` and tension fails at ``cohesion * p0``. ``alpha`` is
@@ -14,14 +14,12 @@ lands faster than about ``wave_speed * failure_strain``.
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 from gsfluent.errors import InputError
-from gsfluent.materials.brittle import BRITTLE
-from gsfluent.materials.flows import GRAINS, LIQUIDS, METALS
-from gsfluent.materials.hard import HARD
 from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, RANGES, READS
-from gsfluent.materials.looks import LOOK
 from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, Field, Material, nearest
 
 __all__ = [
@@ -41,8 +39,10 @@ __all__ = [
 ]
 
 _PRESETS: dict[str, Material] = {
-    m.name: m.override(**dict(zip(LOOKS, LOOK[m.name], strict=True))) if m.name in LOOK else m
-    for m in (*BRITTLE, *HARD, *GRAINS, *METALS, *LIQUIDS)
+    name: Material(name, **(keys | {"parts": tuple(keys.get("parts", ()))}))
+    for name, keys in tomllib.loads(
+        Path(__file__).with_name("presets.toml").read_text(encoding="utf-8")
+    ).items()
 }
 
 fruit = SimpleNamespace(

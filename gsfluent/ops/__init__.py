@@ -5,61 +5,30 @@ Every operator is registered with the PyTorch dispatcher as ``torch.ops.gsfluent
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
-
 from gsfluent import _load  # noqa: F401  (loads the compiled libraries)
+from gsfluent._lazy import lazy
 
-_PUBLIC: dict[str, str] = {
-    "Blocks": "gsfluent.ops.mpm",
-    "build_blocks": "gsfluent.ops.mpm",
-    "p2g": "gsfluent.ops.mpm",
-    "grid_update": "gsfluent.ops.mpm",
-    "g2p": "gsfluent.ops.mpm",
-    "collider_row": "gsfluent.ops.collider",
-    "collider_distance": "gsfluent.ops.collider",
-    "advance_colliders": "gsfluent.ops.collider",
-    "blade_rows": "gsfluent.ops.blade",
-    "blade_sides": "gsfluent.ops.blade",
-    "merged_fields": "gsfluent.ops.blade",
-    "return_mapping": "gsfluent.ops.plasticity",
-    "elastic_energy": "gsfluent.ops.plasticity",
-    "wave_speed": "gsfluent.ops.plasticity",
-    "MpmState": "gsfluent.ops.differentiable",
-    "material_params": "gsfluent.ops.differentiable",
-    "mpm_state": "gsfluent.ops.differentiable",
-    "mpm_step": "gsfluent.ops.differentiable",
-    "rollout": "gsfluent.ops.differentiable",
-    "Solver": "gsfluent.ops.solver",
-    "SolverError": "gsfluent.ops.solver",
-    "polar_clamped": "gsfluent.ops.deform",
-    "covariance_axes": "gsfluent.ops.deform",
-    "carry_axes": "gsfluent.ops.deform",
-    "carry_place": "gsfluent.ops.deform",
-    "mvee": "gsfluent.ops.mvee",
-    "mvee_lens": "gsfluent.ops.mvee",
-    "Rendered": "gsfluent.ops.raster",
-    "rasterize": "gsfluent.ops.raster",
-    "Bulk": "gsfluent.ops.density",
-    "splat_bulk": "gsfluent.ops.density",
-    "occupancy": "gsfluent.ops.density",
-    "density_normals": "gsfluent.ops.density",
-    "shade": "gsfluent.ops.shade",
-    "Photometric": "gsfluent.ops.losses",
-    "photometric_loss": "gsfluent.ops.losses",
-    "ssim": "gsfluent.ops.losses",
-    "adam_step": "gsfluent.ops.adam",
-}
-
-__all__ = list(_PUBLIC)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _PUBLIC:
-        raise AttributeError(f"module 'gsfluent.ops' has no attribute {name!r}")
-    module = importlib.import_module(_PUBLIC[name])
-    # all names of the module at once: importing gsfluent.ops.mvee has just put the module under the
-    # name of its function
-    siblings = [n for n, home in _PUBLIC.items() if home == _PUBLIC[name]]
-    globals().update({n: getattr(module, n) for n in siblings})
-    return globals()[name]
+__getattr__, __dir__, __all__ = lazy(
+    __name__,
+    {
+        "gsfluent.ops.mpm": ("Blocks", "build_blocks", "p2g", "grid_update", "g2p"),
+        "gsfluent.ops.collider": ("collider_row", "collider_distance", "advance_colliders"),
+        "gsfluent.ops.blade": ("blade_rows", "blade_sides", "merged_fields"),
+        "gsfluent.ops.plasticity": ("return_mapping", "elastic_energy", "wave_speed"),
+        "gsfluent.ops.differentiable": (
+            "MpmState",
+            "material_params",
+            "mpm_state",
+            "mpm_step",
+            "rollout",
+        ),
+        "gsfluent.ops.solver": ("Solver", "SolverError"),
+        "gsfluent.ops.deform": ("polar_clamped", "covariance_axes", "carry_axes", "carry_place"),
+        "gsfluent.ops.mvee": ("mvee", "mvee_lens"),
+        "gsfluent.ops.raster": ("Rendered", "rasterize"),
+        "gsfluent.ops.density": ("Bulk", "splat_bulk", "occupancy", "density_normals"),
+        "gsfluent.ops.shade": ("shade",),
+        "gsfluent.ops.losses": ("Photometric", "photometric_loss", "ssim"),
+        "gsfluent.ops.adam": ("adam_step",),
+    },
+)

@@ -236,25 +236,9 @@ def _return_mapping_backward(
     return g_strain, g_alpha, g_increment.contiguous(), g_params
 
 
-@_return_mapping_backward.register_fake
-def _return_mapping_backward_fake(
-    grad_strain: Tensor,
-    grad_alpha: Tensor,
-    grad_stress: Tensor,
-    new_alpha: Tensor,
-    strain: Tensor,
-    alpha: Tensor,
-    increment: Tensor,
-    law: Tensor,
-    params: Tensor,
-    *rest: Any,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        torch.empty_like(strain),
-        torch.empty_like(alpha),
-        torch.empty_like(increment),
-        torch.empty_like(params),
-    )
+_return_mapping_backward.register_fake(
+    lambda *inputs: tuple(torch.empty_like(inputs[k]) for k in (4, 5, 6, 8))
+)
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes
 
 _OP = "adam_step"
 
@@ -129,17 +130,4 @@ def _check_numbers(
         raise ValueError(f"{_OP}: eps must be finite and at least 0, got {eps}")
 
 
-@torch.library.register_fake("gsfluent::adam_step")
-def _adam_fake(
-    parameters: list[Tensor],
-    gradients: list[Tensor],
-    first: list[Tensor],
-    second: list[Tensor],
-    rates: list[float],
-    beta1: float,
-    beta2: float,
-    epsilon: float,
-    step: int,
-    visible: Tensor | None,
-) -> None:
-    return None
+fakes(adam_step=lambda *inputs: None)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes
 
 __all__ = ["blade_rows", "blade_sides", "merged_fields"]
 
@@ -126,6 +127,4 @@ def cut_apart(a: Tensor, b: Tensor) -> Tensor:
     return (((a << 1) & b) | ((b << 1) & a)) & 0x2AAAAAAA != 0
 
 
-@torch.library.register_fake("gsfluent::blade_sides")
-def _sides_fake(position: Tensor, blades: Tensor, cut: Tensor, reach: float) -> Tensor:
-    return torch.empty_like(cut)
+fakes(blade_sides=lambda position, blades, cut, reach: torch.empty_like(cut))

@@ -6,12 +6,14 @@ Node ``(i, j, k)`` of block ``b`` sits at ``(coords[b] * 4 + (i, j, k)) * dx`` a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes
 
 MAX_BLOCKS = 2**24
 
@@ -34,6 +36,18 @@ class Blocks(NamedTuple):
     order: Tensor
     start: Tensor
     margin: int = 1
+
+    def parts(self, dx: float) -> tuple[Tensor | Sequence[int] | float, ...]:
+        """What the operators are given of it: six fields in the order of their schemas, then dx."""
+        return self.table, self.coords, self.order, self.start, self.origin, self.margin, dx
+
+    @staticmethod
+    def of(
+        table: Tensor, coords: Tensor, order: Tensor, start: Tensor, origin: Sequence[int],
+        margin: int,
+    ) -> Blocks:  # fmt: skip
+        """The inverse of :meth:`parts`, without dx."""
+        return Blocks(table, (origin[0], origin[1], origin[2]), coords, order, start, margin)
 
     @property
     def block_count(self) -> int:
@@ -194,15 +208,12 @@ def build_blocks_on_device(
 torch.library.register_kernel("gsfluent::build_blocks", "cuda")(build_blocks_on_device)
 
 
-@torch.library.register_fake("gsfluent::build_blocks")
-def _build_blocks_fake(
-    position: Tensor, dx: float, margin: int, max_table: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    ctx = torch.library.get_ctx()
-    size = [ctx.new_dynamic_size() for _ in range(3)]
-    count = ctx.new_dynamic_size()
-    table = position.new_empty(size, dtype=torch.int32)
-    coords = position.new_empty((count, 3), dtype=torch.int32)
-    order = position.new_empty((position.shape[0],), dtype=torch.int32)
-    start = position.new_empty((count + 1,), dtype=torch.int32)
-    return table, coords, order, start, torch.empty(5, dtype=torch.int64)
+def _block_shapes(position: Tensor, *rest: object) -> tuple[Tensor, ...]:
+    unknown = torch.library.get_ctx().new_dynamic_size
+    size, count = [unknown() for _ in range(3)], unknown()
+    shapes = (size, (count, 3), (position.shape[0],), (count + 1,))
+    whole = [position.new_empty(shape, dtype=torch.int32) for shape in shapes]
+    return *whole, torch.empty(5, dtype=torch.int64)
+
+
+fakes(build_blocks=_block_shapes)

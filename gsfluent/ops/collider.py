@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes
 
 __all__ = [
     "COLLIDER_COLUMNS",
@@ -66,9 +67,8 @@ def collider_row(
         point: Plane point or centre [m]; the collider turns about it.
         normal: Plane: normal out of it. ``sdf``: position of the first value in the body frame [m].
         radius: Of sphere, capsule, cylinder, disc [m]; ``sdf``: distance between values [m].
-        extent: Box, face: half edges (of a face the third is its depth); capsule and cylinder:
-            half length as third number [m]; ``sdf``: number of values along x, y, z, each 2 to
-            4096.
+        extent: Box, face: half edges (of a face the third is its depth); capsule and cylinder: half
+            length as third number [m]; ``sdf``: number of values along x, y, z, each 2 to 4096.
         mode: ``sticky``, ``slip`` (no normal motion) or ``separate`` (may leave; friction and
             restitution on approach).
         friction: Coulomb coefficient, >= 0.
@@ -258,14 +258,10 @@ def advance_colliders(
     )
 
 
-@torch.library.register_fake("gsfluent::collider_distance")
-def _distance_fake(
-    position: Tensor, colliders: Tensor, sdf: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    shape = (position.shape[0], colliders.shape[0])
-    return position.new_empty(shape), position.new_empty((*shape, 3))
-
-
-@torch.library.register_fake("gsfluent::advance_colliders")
-def _advance_fake(colliders: Tensor, impulse: Tensor, dt: float, *gravity: float) -> Tensor:
-    return torch.empty_like(colliders)
+fakes(
+    collider_distance=lambda x, rows, sdf: (
+        x.new_empty((len(x), len(rows))),
+        x.new_empty((len(x), len(rows), 3)),
+    ),
+    advance_colliders=lambda colliders, *rest: torch.empty_like(colliders),
+)

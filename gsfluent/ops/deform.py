@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes, no_gradient
 
 
 def polar_clamped(deformation: Tensor, lo: float = 0.3, hi: float = 2.0) -> tuple[Tensor, Tensor]:
@@ -38,19 +39,6 @@ def polar_clamped(deformation: Tensor, lo: float = 0.3, hi: float = 2.0) -> tupl
         raise ValueError(f"polar_clamped: bounds must satisfy 0 < lo <= hi, got lo={lo}, hi={hi}")
     rotation, clamped = torch.ops.gsfluent.polar_clamped.default(deformation, float(lo), float(hi))
     return rotation, clamped
-
-
-@torch.library.register_fake("gsfluent::polar_clamped")
-def _polar_clamped_fake(deformation: Tensor, lo: float, hi: float) -> tuple[Tensor, Tensor]:
-    shape = (deformation.shape[0], 3, 3)
-    return deformation.new_empty(shape), deformation.new_empty(shape)
-
-
-def _polar_no_gradient(ctx: torch.autograd.function.FunctionCtx, *grads: Tensor) -> None:
-    raise NotImplementedError("polar_clamped: no gradient with respect to deformation")
-
-
-torch.library.register_autograd("gsfluent::polar_clamped", _polar_no_gradient)
 
 
 def covariance_axes(covariance: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,28 +155,15 @@ def carry_place(
     return means, blend
 
 
-@torch.library.register_fake("gsfluent::carry_place")
-def _carry_place_fake(places: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
-    return places.new_empty(places.shape), places.new_empty((places.shape[0], 3, 3))
+def _like_both(a: Tensor, b: Tensor, *rest: object) -> tuple[Tensor, Tensor]:
+    return a.new_empty(a.shape), b.new_empty(b.shape)
 
 
-@torch.library.register_fake("gsfluent::covariance_axes")
-def _covariance_axes_fake(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    n = covariance.shape[0]
-    return covariance.new_empty((n, 4)), covariance.new_empty((n, 3))
-
-
-@torch.library.register_fake("gsfluent::carry_axes")
-def _carry_axes_fake(
-    quats: Tensor, scales: Tensor, map: Tensor, rotation: Tensor, rigid: float
-) -> tuple[Tensor, Tensor]:
-    return quats.new_empty(quats.shape), scales.new_empty(scales.shape)
-
-
-def _axes_no_gradient(ctx: torch.autograd.function.FunctionCtx, *grads: Tensor) -> None:
-    raise NotImplementedError("axes of Gaussians: no gradient")
-
-
-torch.library.register_autograd("gsfluent::carry_place", _axes_no_gradient)
-torch.library.register_autograd("gsfluent::covariance_axes", _axes_no_gradient)
-torch.library.register_autograd("gsfluent::carry_axes", _axes_no_gradient)
+fakes(
+    polar_clamped=lambda f, lo, hi: _like_both(f, f),
+    covariance_axes=lambda c: (c.new_empty((len(c), 4)), c.new_empty((len(c), 3))),
+    carry_axes=_like_both,
+    carry_place=lambda p, *rest: (p.new_empty(p.shape), p.new_empty((len(p), 3, 3))),
+)
+no_gradient("polar_clamped: no gradient with respect to deformation", "polar_clamped")
+no_gradient("axes of Gaussians: no gradient", "carry_place", "covariance_axes", "carry_axes")

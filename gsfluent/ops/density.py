@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsfluent import _load  # noqa: F401  (loads the compiled operators)
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes, no_gradient
 
 LEVELS = 5
 _MOST_NODES = 1024
@@ -119,11 +120,10 @@ def density_normals(
     check_tensor(op, "means", means, shape=("N", 3))
     n = means.shape[0]
     _check_nodes(op, nodes)
-    cells = sum((nodes >> level) ** 3 for level in range(LEVELS))
     for name, value, shape in (
         ("quats", quats, (n, 4)),
         ("scales", scales, (n, 3)),
-        ("values", values, (cells,)),
+        ("values", values, (_cells(nodes),)),
         ("frame", frame, (4,)),
         ("eye", eye, (3,)),
     ):
@@ -140,25 +140,13 @@ def _check_nodes(op: str, nodes: int) -> None:
         raise ValueError(f"{op}: nodes must be a multiple of 16 up to {_MOST_NODES}, got {nodes}")
 
 
-@torch.library.register_fake("gsfluent::splat_bulk")
-def _bulk_fake(means: Tensor, scales: Tensor) -> Tensor:
-    return means.new_empty(6, dtype=torch.float64)
+def _cells(nodes: int) -> int:
+    return sum((nodes >> level) ** 3 for level in range(LEVELS))
 
 
-@torch.library.register_fake("gsfluent::occupancy")
-def _occupancy_fake(means: Tensor, frame: Tensor, nodes: int, full: float) -> Tensor:
-    return means.new_empty(sum((nodes >> level) ** 3 for level in range(LEVELS)))
-
-
-@torch.library.register_fake("gsfluent::density_normals")
-def _normals_fake(means: Tensor, *rest: object) -> Tensor:
-    return means.new_empty(means.shape)
-
-
-def _no_gradient(ctx: object, *grads: Tensor) -> None:
-    raise NotImplementedError("density: no gradient")
-
-
-torch.library.register_autograd("gsfluent::splat_bulk", _no_gradient)
-torch.library.register_autograd("gsfluent::occupancy", _no_gradient)
-torch.library.register_autograd("gsfluent::density_normals", _no_gradient)
+fakes(
+    splat_bulk=lambda means, scales: means.new_empty(6, dtype=torch.float64),
+    occupancy=lambda means, frame, nodes, full: means.new_empty(_cells(nodes)),
+    density_normals=lambda means, *rest: means.new_empty(means.shape),
+)
+no_gradient("density: no gradient", "splat_bulk", "occupancy", "density_normals")

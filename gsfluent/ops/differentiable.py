@@ -193,8 +193,7 @@ def mpm_step(
             finite.
 
     Gradient: every floating tensor but ``colliders``, see docs/theory/gradients.md. Deterministic
-    on the
-    CPU.
+    on the CPU.
     """
     contact = fields > 1
     blocks = build_blocks(state.position, dx)

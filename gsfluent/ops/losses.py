@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes, no_gradient
 
 WINDOW = 11
 """Side of the Gaussian window [px]; its sigma is 1.5."""
@@ -199,34 +200,11 @@ def _map_shape(image: Tensor, inside: bool) -> tuple[int, ...]:
     return height - cut, width - cut, channels
 
 
-@torch.library.register_fake("gsfluent::ssim")
-def _ssim_fake(image: Tensor, target: Tensor, inside: bool) -> Tensor:
-    return image.new_empty(_map_shape(image, inside))
-
-
-@torch.library.register_fake("gsfluent::ssim_backward")
-def _ssim_backward_fake(grad: Tensor, image: Tensor, target: Tensor, inside: bool) -> Tensor:
-    return image.new_empty(image.shape)
-
-
-@torch.library.register_fake("gsfluent::photometric_loss")
-def _loss_fake(
-    image: Tensor,
-    target: Tensor,
-    valid: Tensor | None,
-    alpha: Tensor | None,
-    mask: Tensor | None,
-    backdrop: Tensor | None,
-    constant: float,
-    l1: float,
-    ssim: float,
-    excess: float,
-    inside: bool,
-    pixels: bool,
-    gradient: bool,
+def _loss_shapes(
+    image: Tensor, target: Tensor, valid: Tensor | None, alpha: Tensor | None, *rest: Any
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     height, width, channels = image.shape
-    rows = height if gradient else 0
+    rows = height if rest[-1] else 0  # gradient
     return (
         image.new_empty(()),
         image.new_empty((4,)),
@@ -276,12 +254,13 @@ def _loss_gradient(ctx: Any, grad: Tensor | None, *_: Any) -> tuple[Tensor | Non
     return (*first, grad * grad_alpha if of_alpha else None, *none[4:])
 
 
-def _not_twice(ctx: Any, *grads: Tensor) -> None:
-    raise NotImplementedError("ssim: differentiable once, not twice")
-
-
 torch.library.register_autograd("gsfluent::ssim", _ssim_gradient, setup_context=_ssim_context)
-torch.library.register_autograd("gsfluent::ssim_backward", _not_twice)
 torch.library.register_autograd(
     "gsfluent::photometric_loss", _loss_gradient, setup_context=_loss_context
 )
+fakes(
+    ssim=lambda image, target, inside: image.new_empty(_map_shape(image, inside)),
+    ssim_backward=lambda grad, image, target, inside: image.new_empty(image.shape),
+    photometric_loss=_loss_shapes,
+)
+no_gradient("ssim: differentiable once, not twice", "ssim_backward")

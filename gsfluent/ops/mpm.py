@@ -2,8 +2,7 @@
 
 MLS-MPM with quadratic B-splines and APIC transfer (Jiang et al. 2015; Hu et al. 2018). The formulas
 with their sources are in ``docs/theory/mpm.md``. Sparse grid: :mod:`gsfluent.ops.blocks`; shape
-functions
-and gradients: :mod:`gsfluent.ops._mpm_grad`.
+functions and gradients: :mod:`gsfluent.ops._mpm_grad`.
 """
 
 from __future__ import annotations
@@ -81,9 +80,8 @@ def p2g(
     A particle that is not finite, not covered by ``blocks`` or not in a field gives nothing;
     :func:`g2p` counts the same particles. Gradient: every floating tensor, ``position`` included,
     through ``grid`` and ``moments`` (docs/theory/gradients.md). Determinism: on the CPU the result
-    does
-    not depend on the number of threads; on CUDA
-    sums are reordered by atomics. Source: Jiang et al. 2015; Hu et al. 2018; docs/theory/mpm.md.
+    does not depend on the number of threads; on CUDA sums are reordered by atomics.
+    Source: Jiang et al. 2015; Hu et al. 2018; docs/theory/mpm.md.
     """
     op = "p2g"
     check_tensor(op, "position", position, shape=(None, 3))
@@ -101,25 +99,9 @@ def p2g(
         raise ValueError(f"{op}: fields must be 1 to {MAX_FIELDS}, got {fields}")
     check_blocks(op, blocks, position)
     check_order(op, blocks, n)
-    grid, moments, _ = torch.ops.gsfluent.p2g(
-        position,
-        velocity,
-        affine,
-        mass,
-        stress,
-        volume,
-        body,
-        blocks.table,
-        blocks.coords,
-        blocks.order,
-        blocks.start,
-        blocks.origin,
-        blocks.margin,
-        check_dx(op, dx),
-        _check_dt(op, dt),
-        fields,
-        contact,
-    )
+    points = (position, velocity, affine, mass, stress, volume, body)
+    where = blocks.parts(check_dx(op, dx))
+    grid, moments, _ = torch.ops.gsfluent.p2g(*points, *where, _check_dt(op, dt), fields, contact)
     return grid, moments if contact else None
 
 
@@ -128,46 +110,6 @@ def _pair_bits(merged: Tensor) -> Tensor:
     bit = torch.ones(len(merged), dtype=torch.int64, device=merged.device)
     bit = bit << torch.arange(len(merged), device=merged.device)
     return torch.where(merged | merged.mT, bit, 0).sum(1)
-
-
-@overload
-def grid_update(
-    grid: Tensor,
-    *,
-    dx: float,
-    dt: float,
-    blocks: Blocks,
-    gravity: Sequence[float] = ...,
-    colliders: Tensor | None = ...,
-    sdf: Tensor | None = ...,
-    moments: Tensor | None = ...,
-    merged: Tensor | None = ...,
-    cut: Tensor | None = ...,
-    friction: float = ...,
-    restitution: float = ...,
-    contact_gap: float = ...,
-    return_torque: Literal[False] = ...,
-) -> tuple[Tensor, Tensor, Tensor]: ...
-
-
-@overload
-def grid_update(
-    grid: Tensor,
-    *,
-    dx: float,
-    dt: float,
-    blocks: Blocks,
-    gravity: Sequence[float] = ...,
-    colliders: Tensor | None = ...,
-    sdf: Tensor | None = ...,
-    moments: Tensor | None = ...,
-    merged: Tensor | None = ...,
-    cut: Tensor | None = ...,
-    friction: float = ...,
-    restitution: float = ...,
-    contact_gap: float = ...,
-    return_torque: Literal[True],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]: ...
 
 
 def grid_update(
@@ -191,11 +133,10 @@ def grid_update(
 
     Contact between every pair of fields that meet at a node uses the corrected Collision-MPM
     impulse: normal from the moments of the node and its neighbours (docs/theory/contact.md),
-    active only
-    while the centroids of the two masses overlap within ``contact_gap * dx`` and the bodies
-    approach, Coulomb friction.
-    Momentum is exchanged exactly. Colliders act afterwards, in row order. A collider with mass
-    changes velocities as a plastic impact of its mass with that of the nodes it touches would.
+    active only while the centroids of the two masses overlap within ``contact_gap * dx`` and the
+    bodies approach, Coulomb friction. Momentum is exchanged exactly. Colliders act afterwards, in
+    row order. A collider with mass changes velocities as a plastic impact of its mass with that of
+    the nodes it touches would.
 
     Args:
         grid: Momentum and mass from :func:`p2g`, shape [K, B, 64, 4].
@@ -260,22 +201,11 @@ def grid_update(
         raise ValueError(
             f"{op}: restitution must be in [0, 1] (more creates energy), got {restitution}"
         )
+    things = (grid, moments, rows, sdf, merged, cut)
+    where = (blocks.table, blocks.coords, blocks.origin, check_dx(op, dx), _check_dt(op, dt))
+    numbers = (*gravity, friction, restitution, contact_gap)
     velocity, impulse, _, contact_nodes = torch.ops.gsfluent.grid_update(
-        grid,
-        moments,
-        rows,
-        sdf,
-        merged,
-        cut,
-        blocks.table,
-        blocks.coords,
-        blocks.origin,
-        check_dx(op, dx),
-        _check_dt(op, dt),
-        *(float(g) for g in gravity),
-        float(friction),
-        float(restitution),
-        float(contact_gap),
+        *things, *where, *(float(v) for v in numbers)
     )
     push, torque = impulse[:, :3].contiguous(), impulse[:, 3:].contiguous()
     if return_torque:
@@ -372,20 +302,7 @@ def g2p(
         check_tensor(op, "deformation", deformation, shape=(n, 3, 3), like=position)
     if velocity is not None:
         check_tensor(op, "velocity", velocity, shape=(n, 3), like=position)
-    x, v, c, f, skipped = torch.ops.gsfluent.g2p(
-        velocity_grid,
-        position,
-        velocity,
-        deformation,
-        body,
-        blocks.table,
-        blocks.coords,
-        blocks.order,
-        blocks.start,
-        blocks.origin,
-        blocks.margin,
-        check_dx(op, dx),
-        _check_dt(op, dt),
-    )
+    points, where = (position, velocity, deformation, body), blocks.parts(check_dx(op, dx))
+    x, v, c, f, skipped = torch.ops.gsfluent.g2p(velocity_grid, *points, *where, _check_dt(op, dt))
     moved = (x, v, c, f if deformation is not None else None)
     return (*moved, skipped) if return_skipped else moved

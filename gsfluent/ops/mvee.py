@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes, no_gradient
 
 
 def _check_finite(op: str, name: str, value: Tensor) -> None:
@@ -57,18 +57,6 @@ def mvee(
     center, shape = torch.ops.gsfluent.mvee.default(points, float(tolerance), int(max_iterations))
     return center, shape
 
-
-@torch.library.register_fake("gsfluent::mvee")
-def _mvee_fake(points: Tensor, tolerance: float, max_iterations: int) -> tuple[Tensor, Tensor]:
-    batch = points.shape[0]
-    return points.new_empty((batch, 3)), points.new_empty((batch, 3, 3))
-
-
-def _mvee_no_gradient(ctx: Any, *grads: Tensor) -> None:
-    raise NotImplementedError("mvee: no gradient with respect to points")
-
-
-torch.library.register_autograd("gsfluent::mvee", _mvee_no_gradient)
 
 _ORDER = (0, 4, 8, 1, 2, 5)
 # In the order of LensFault (csrc/core/mvee/lens.h), of the first Gaussian and of the second.
@@ -161,26 +149,17 @@ def mvee_lens(
     return mean, cov, overlap
 
 
-@torch.library.register_fake("gsfluent::mvee_lens")
-def _mvee_lens_fake(
-    mean_a: Tensor,
-    covariance_a: Tensor,
-    mean_b: Tensor,
-    covariance_b: Tensor,
-    radius: float,
-    flat: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    batch = mean_a.shape[0]
-    return (
-        mean_a.new_empty((batch, 3)),
-        mean_a.new_empty((batch, 6)),
-        mean_a.new_empty((batch,), dtype=torch.bool),
-        mean_a.new_empty((6,), dtype=torch.int64),
-    )
-
-
-def _lens_no_gradient(ctx: Any, *grads: Tensor) -> None:
-    raise NotImplementedError("mvee_lens: no gradient")
-
-
-torch.library.register_autograd("gsfluent::mvee_lens", _lens_no_gradient)
+fakes(
+    mvee=lambda points, *rest: (
+        points.new_empty((len(points), 3)),
+        points.new_empty((len(points), 3, 3)),
+    ),
+    mvee_lens=lambda mean, *rest: (
+        mean.new_empty((len(mean), 3)),
+        mean.new_empty((len(mean), 6)),
+        mean.new_empty((len(mean),), dtype=torch.bool),
+        mean.new_empty((6,), dtype=torch.int64),
+    ),
+)
+no_gradient("mvee: no gradient with respect to points", "mvee")
+no_gradient("mvee_lens: no gradient", "mvee_lens")

@@ -9,19 +9,10 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsfluent._check import check_tensor
+from gsfluent.materials.laws import LAWS
 from gsfluent.ops import _plasticity_grad  # noqa: F401  (registers the gradient)
+from gsfluent.ops._register import fakes
 from gsfluent.ops.reference import plasticity as reference
-
-LAWS = {
-    "elastic": 0,
-    "nacc": 1,
-    "drucker_prager": 2,
-    "von_mises": 3,
-    "fluid": 4,
-    "rigid": 5,
-    "corotated": 6,
-}
-"""Constitutive laws and their numbers."""
 
 WEAKENING = 0.02
 """Range of alpha past zero over which a broken point (NACC) loses its cohesion (``kWeakening``)."""
@@ -243,26 +234,14 @@ def return_mapping(
     return result[0], result[1], result[2], result[3]
 
 
-@torch.library.register_fake("gsfluent::return_mapping")
-def _return_mapping_fake(
-    strain: Tensor,
-    alpha: Tensor,
-    increment: Tensor,
-    law: Tensor,
-    params: Tensor,
-    material: Tensor | None,
-    k: float,
-    epsilon: float,
-    implicit: bool,
-    dt: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    n = strain.shape[0]
-    return (
-        strain.new_empty((n, 6)),
-        strain.new_empty((n,)),
-        strain.new_empty((n, 6)),
+fakes(
+    return_mapping=lambda strain, alpha, *rest: (
+        strain.new_empty(strain.shape),
+        strain.new_empty(alpha.shape),
+        strain.new_empty(strain.shape),
         strain.new_empty((4,), dtype=torch.int32),
     )
+)
 
 
 def elastic_energy(

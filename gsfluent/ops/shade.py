@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsfluent import _load  # noqa: F401  (loads the compiled operators)
 from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes, no_gradient
 
 _LAMP, _MAP, _STUDIO = 12, 15, 13
 
@@ -35,9 +36,8 @@ def shade(
     Blinn-Phong by any number of lamps with percentage-closer soft shadows (Fernando 2005), light
     from everywhere as spherical harmonics of degree 2 (Ramamoorthi and Hanrahan 2001) less what
     matter hides, a floor and a backdrop. Pixels more opaque than 0.999 do not ask what is behind.
-    The formulas and how the tables are packed: :mod:`gsfluent.pipeline.light.shade`; the
-    whole picture
-    in plain PyTorch, which the kernels are tested against: ``tests/ops/shade_model.py``.
+    The formulas and how the tables are packed: :mod:`gsfluent.pipeline.light.shade`; the whole
+    picture in plain PyTorch, which the kernels are tested against: ``tests/ops/shade_model.py``.
 
     Args:
         image: Colours times opacity, display values, shape [H, W, 3], float32 or float64.
@@ -124,13 +124,5 @@ def shade(
     )
 
 
-@torch.library.register_fake("gsfluent::shade")
-def _shade_fake(image: Tensor, *rest: object) -> Tensor:
-    return image.new_empty((*image.shape[:2], 3))
-
-
-def _shade_no_gradient(ctx: object, *grads: Tensor) -> None:
-    raise NotImplementedError("shade: no gradient")
-
-
-torch.library.register_autograd("gsfluent::shade", _shade_no_gradient)
+fakes(shade=lambda image, *rest: image.new_empty((*image.shape[:2], 3)))
+no_gradient("shade: no gradient", "shade")

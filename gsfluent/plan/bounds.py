@@ -30,21 +30,13 @@ CELLS = (8, 512)
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """One limit of the grid spacing.
+    """One limit of the grid spacing."""
 
-    Attributes:
-        name: ``thinnest part``, ``fragment size``, ``damage length`` or ``time budget``.
-        dx: The spacing [m]: the coarsest, or with ``least`` the finest.
-        least: Whether it limits from below.
-        why: In words.
-        kept: Whether the plan keeps to it.
-    """
-
-    name: str
-    dx: float
-    least: bool
-    why: str
-    kept: bool
+    name: str  # ``thinnest part``, ``fragment size``, ``damage length`` or ``time budget``
+    dx: float  # The spacing [m]: the coarsest, or with ``least`` the finest
+    least: bool  # Whether it limits from below
+    why: str  # In words
+    kept: bool  # Whether the plan keeps to it
 
     def row(self) -> dict[str, Any]:
         """Plain values."""

@@ -50,15 +50,11 @@ Features = Mapping[str, float]
 
 
 class Cost(NamedTuple):
-    """What work costs.
+    """What work costs."""
 
-    Attributes:
-        seconds: Wall time [s].
-        bytes: Most memory at once: resident memory of the process on the CPU, allocated memory of
-            the device on a GPU.
-    """
-
-    seconds: float
+    seconds: float  # Wall time [s]
+    # Most memory at once: resident memory of the process on the CPU, allocated memory of the device
+    # on a GPU.
     bytes: int
 
 
@@ -102,27 +98,20 @@ def cache_folder() -> Path:
 
 @dataclasses.dataclass
 class CostModel:
-    """Costs per unit of work, by stage.
+    """Costs per unit of work, by stage."""
 
-    Attributes:
-        machine: See :func:`machine_key`.
-        seconds: Stage, feature: seconds per unit of the feature.
-        made: When the probe was made, ISO 8601.
-        probe_seconds: How long it took.
-        errors: Stage: largest relative error of the fit at the sizes that were measured.
-        ratios: Stage: actual over predicted seconds of the last runs, without correction.
-        memory_ratios: The same for memory.
-        memory: Stage, feature: bytes per unit, where the probe could measure them (on a GPU, whose
-            allocator counts exactly).
-    """
-
-    machine: dict[str, Any]
-    seconds: dict[str, dict[str, float]]
-    made: str = ""
-    probe_seconds: float = 0.0
+    machine: dict[str, Any]  # See :func:`machine_key`
+    seconds: dict[str, dict[str, float]]  # Stage, feature: seconds per unit of the feature
+    made: str = ""  # When the probe was made, ISO 8601
+    probe_seconds: float = 0.0  # How long it took
+    # Stage: largest relative error of the fit at the sizes that were measured.
     errors: dict[str, float] = dataclasses.field(default_factory=dict)
+    # Stage: actual over predicted seconds of the last runs, without correction.
     ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    # The same for memory.
     memory_ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    # Stage, feature: bytes per unit, where the probe could measure them (on a GPU, whose allocator
+    # counts exactly).
     memory: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
 
     # --- asking ---

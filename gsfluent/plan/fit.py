@@ -11,17 +11,11 @@ __all__ = ["Sample", "fit"]
 
 
 class Sample(NamedTuple):
-    """One measurement.
+    """One measurement."""
 
-    Attributes:
-        stage: Stage it belongs to.
-        features: Amounts of work.
-        seconds: What it took [s].
-    """
-
-    stage: str
-    features: Mapping[str, float]
-    seconds: float
+    stage: str  # Stage it belongs to
+    features: Mapping[str, float]  # Amounts of work
+    seconds: float  # What it took [s]
 
 
 def fit(

@@ -24,15 +24,10 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Foresight:
-    """A plan, and the model it was made with.
+    """A plan, and the model it was made with."""
 
-    Attributes:
-        plan: From :func:`gsfluent.plan.plan.plan_shot`.
-        model: None when this machine is not calibrated.
-    """
-
-    plan: dict[str, Any]
-    model: CostModel | None
+    plan: dict[str, Any]  # From :func:`gsfluent.plan.plan.plan_shot`
+    model: CostModel | None  # None when this machine is not calibrated
 
 
 def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:

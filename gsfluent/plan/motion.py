@@ -37,45 +37,25 @@ share of momentum."""
 
 @dataclasses.dataclass
 class Mover:
-    """A body, or a rigid thing, as a box that flies.
+    """A body, or a rigid thing, as a box that flies."""
 
-    Attributes:
-        name: Its name.
-        low: Lowest corner at ``start`` [m], float64 [3].
-        high: Highest corner.
-        velocity: From ``start`` on [m/s], float64 [3].
-        falls: Whether gravity acts on it.
-        start: When it begins to move [s].
-        held: Whether it waits in its place before that; else it comes flying.
-        body: Number of its body; None for a rigid thing.
-        since: When it is there at all [s].
-        until: Until when.
-        lands: Time at which it touches something; infinite when it does not.
-        strikes: Time of its first strike; infinite without one.
-        speed: With which it strikes, relative to what it meets [m/s].
-        parts: Whether it is an edge, which parts what it passes and pushes nothing.
-        told: Whether it moves as told, and nothing stops it.
-        driven: Whether something that nothing stops has touched it.
-        size: Cube root of its volume [m].
-    """
-
-    name: str
-    low: Tensor
-    high: Tensor
-    velocity: Tensor
-    falls: bool
-    start: float = 0.0
-    held: bool = False
-    body: int | None = None
-    since: float = 0.0
-    until: float = math.inf
-    lands: float = math.inf
-    strikes: float = math.inf
-    speed: float = 0.0
-    parts: bool = False
-    told: bool = False
-    driven: bool = False
-    size: float = 0.0
+    name: str  # Its name
+    low: Tensor  # Lowest corner at ``start`` [m], float64 [3]
+    high: Tensor  # Highest corner
+    velocity: Tensor  # From ``start`` on [m/s], float64 [3]
+    falls: bool  # Whether gravity acts on it
+    start: float = 0.0  # When it begins to move [s]
+    held: bool = False  # Whether it waits in its place before that; else it comes flying
+    body: int | None = None  # Number of its body; None for a rigid thing
+    since: float = 0.0  # When it is there at all [s]
+    until: float = math.inf  # Until when
+    lands: float = math.inf  # Time at which it touches something; infinite when it does not
+    strikes: float = math.inf  # Time of its first strike; infinite without one
+    speed: float = 0.0  # With which it strikes, relative to what it meets [m/s]
+    parts: bool = False  # Whether it is an edge, which parts what it passes and pushes nothing
+    told: bool = False  # Whether it moves as told, and nothing stops it
+    driven: bool = False  # Whether something that nothing stops has touched it
+    size: float = 0.0  # Cube root of its volume [m]
 
     def box(self, time: float, gravity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Corners [m] and velocity [m/s] at a time."""
@@ -90,39 +70,22 @@ class Mover:
 
 @dataclasses.dataclass(frozen=True)
 class Outlook:
-    """What is to come.
+    """What is to come."""
 
-    Attributes:
-        movers: Bodies and rigid things.
-        grid_from: When the grid is needed first [s]; the end when never.
-        grid_seconds: Simulated time in which it is needed [s].
-        points: Material points on it, mean over that time.
-        blocks: Active blocks, mean over that time.
-        blocks_most: Most of them.
-        substeps: Steps.
-        dt: Time step with everything intact [s].
-        wave: Fastest wave [m/s].
-        speed: Speed of what moves fastest on the grid [m/s], mean.
-        struck: Time of the first strike [s].
-        strike_speed: Fastest closing speed [m/s].
-        composed_seconds: Time in which a blade is at work [s].
-        shatters: Whether something strikes fast enough to break what it strikes, or cuts or tears
-            it.
-    """
-
-    movers: tuple[Mover, ...]
-    grid_from: float
-    grid_seconds: float
-    points: float
-    blocks: float
-    blocks_most: float
-    substeps: int
-    dt: float
-    wave: float
-    speed: float
-    struck: float
-    strike_speed: float
-    composed_seconds: float
+    movers: tuple[Mover, ...]  # Bodies and rigid things
+    grid_from: float  # When the grid is needed first [s]; the end when never
+    grid_seconds: float  # Simulated time in which it is needed [s]
+    points: float  # Material points on it, mean over that time
+    blocks: float  # Active blocks, mean over that time
+    blocks_most: float  # Most of them
+    substeps: int  # Steps
+    dt: float  # Time step with everything intact [s]
+    wave: float  # Fastest wave [m/s]
+    speed: float  # Speed of what moves fastest on the grid [m/s], mean
+    struck: float  # Time of the first strike [s]
+    strike_speed: float  # Fastest closing speed [m/s]
+    composed_seconds: float  # Time in which a blade is at work [s]
+    # Whether something strikes fast enough to break what it strikes, or cuts or tears it.
     shatters: bool
 
 

@@ -1,8 +1,8 @@
 """What a shot will cost, before it is paid: ``gsfluent plan``.
 
-Nothing is simulated. A stand-in solid (the splat coarsely filled, the hull that masks carve, or an
-ellipsoid in the box of sparse points) says how much matter there is; what happens to it is foreseen
-in closed form (:mod:`gsfluent.plan.motion`); a cost model measured on this machine
+Nothing is simulated. A proxy of the solid (the splat coarsely filled, the hull that masks carve,
+or an ellipsoid in the box of sparse points) says how much matter there is; what happens to it is
+foreseen in closed form (:mod:`gsfluent.plan.motion`); a cost model measured on this machine
 (:mod:`gsfluent.plan.cost`) says what that takes.
 """
 
@@ -22,7 +22,7 @@ from gsfluent.plan.bounds import THIN_CELLS, bounds_of, budget_spacing, choose_c
 from gsfluent.plan.cost import Cost, CostModel, memory_of
 from gsfluent.plan.fact import STAGES
 from gsfluent.plan.motion import Outlook, foresee
-from gsfluent.plan.stand_in import StandIn, stand_in
+from gsfluent.plan.proxy import Proxy, proxy
 from gsfluent.plan.work import (
     NOT_PREDICTED,
     born_splats,
@@ -75,21 +75,13 @@ def cost_model(
 
 @dataclasses.dataclass(frozen=True)
 class Prospect:
-    """A shot with stand-ins: everything that does not hang on the size of the cells.
+    """A shot with a proxy of its solids: everything that does not hang on the size of the cells."""
 
-    Attributes:
-        shot: The shot.
-        standing: Stand-ins of its objects.
-        scene: Its scene with them.
-        frames: Frames.
-        warnings: What was not known.
-    """
-
-    shot: Shot
-    standing: StandIn
-    scene: Scene
-    frames: int
-    warnings: tuple[str, ...]
+    shot: Shot  # The shot
+    proxy: Proxy  # Proxies of its objects
+    scene: Scene  # Its scene with them
+    frames: int  # Frames
+    warnings: tuple[str, ...]  # What was not known
 
     @classmethod
     def of(cls, shot: Shot) -> Prospect:
@@ -99,10 +91,10 @@ class Prospect:
             InputError: The input cannot be read, or a material or event cannot be.
         """
         warnings: list[str] = []
-        standing = stand_in(shot, warnings)
-        scene = build_scene(shot, dict(standing.solids), standing.frame)
+        found = proxy(shot, warnings)
+        scene = build_scene(shot, dict(found.solids), found.frame)
         frames = max(1, round(shot.output.fps * shot.output.seconds))
-        return cls(shot, standing, scene, frames, tuple(warnings))
+        return cls(shot, found, scene, frames, tuple(warnings))
 
     def counts(self, dx: float) -> list[int]:
         """Material points of each body."""
@@ -117,9 +109,7 @@ class Prospect:
 
     def splats(self, cells: int) -> tuple[float, dict[str, float]]:
         """Splats of the solids, and the features of filling them."""
-        fill, inside = fill_work(
-            self.shot, self.standing, splat_count(self.shot, self.standing), cells
-        )
+        fill, inside = fill_work(self.shot, self.proxy, splat_count(self.shot, self.proxy), cells)
         return fill["splats"] + sum(inside.values()), fill
 
     def simulation(self, dx: float, cells: int) -> tuple[Outlook, dict[str, float]]:
@@ -193,7 +183,7 @@ def plan_shot(
         "model": None if model is None else _about(model),
         "passes": passes_of(shot, prospect.scene, outlook),
         "size_m": (high - low).tolist(),
-        "assumed": prospect.standing.assumed,
+        "assumed": prospect.proxy.assumed,
         "frames": prospect.frames,
         "cells": chosen,
         "dx": dx,
@@ -267,11 +257,11 @@ def _work(
     prospect: Prospect, quality: int, simulated: dict[str, float]
 ) -> dict[str, dict[str, float]]:
     """Features of every stage that the shot has."""
-    shot, standing, frames = prospect.shot, prospect.standing, prospect.frames
+    shot, proxy, frames = prospect.shot, prospect.proxy, prospect.frames
     splats, fill = prospect.splats(quality)
     work = {}
-    if standing.photographs is not None:
-        work["reconstruct"] = reconstruct_work(standing.photographs, shot)
+    if proxy.photographs is not None:
+        work["reconstruct"] = reconstruct_work(proxy.photographs, shot)
     work["isolate"] = isolate_work(fill["splats"])
     work["fill"] = fill
     work["texture"] = texture_work(texture_method(shot), fill)

@@ -30,7 +30,7 @@ from gsfluent.pipeline.render.cuts import save_cut_views
 from gsfluent.plan.cost import BYTES, CostModel, machine_key
 from gsfluent.plan.fact import actual_work
 from gsfluent.plan.fit import Sample, fit
-from gsfluent.plan.stand_in import look_at_photographs
+from gsfluent.plan.proxy import look_at_photographs
 from gsfluent.plan.work import isolate_work, reconstruct_work, render_work
 from gsfluent.progress import Progress, quiet_logs, report_progress
 from gsfluent.stages.chain import run_stages
@@ -254,7 +254,7 @@ def training_samples(folder: Path, device: torch.device) -> list[Sample]:
         capture = load_capture(shot.capture)
         start = time.perf_counter()
         stage = Reconstruct(steps, splats, image_size=side, device=device)
-        gaussians, _ = stage(capture)
+        gaussians = stage(capture)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         seconds = time.perf_counter() - start

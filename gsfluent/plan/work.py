@@ -20,7 +20,7 @@ from gsfluent.pipeline.light.from_shot import light_of
 from gsfluent.pipeline.reconstruct.recipe import recipe_for
 from gsfluent.plan.cost import framing, law_set, stepping
 from gsfluent.plan.motion import Outlook
-from gsfluent.plan.stand_in import Photographs, StandIn
+from gsfluent.plan.proxy import Photographs, Proxy
 from gsfluent.scene.scene import Scene
 
 __all__ = [
@@ -101,10 +101,10 @@ def splat_growth(most: float, start: float) -> float:
     return 0.25 * 0.5 * (begin + most) + 0.75 * most * _FULL
 
 
-def splat_count(shot: Shot, standing: StandIn) -> float:
+def splat_count(shot: Shot, proxy: Proxy) -> float:
     """Splats of the object after the reconstruction."""
-    if standing.splats is not None:
-        return float(standing.splats)
+    if proxy.splats is not None:
+        return float(proxy.splats)
     wanted = shot.reconstruct
     recipe = recipe_for(wanted.recipe or "auto", wanted.iterations or _ITERATIONS)
     return _FULL * (wanted.max_gaussians or recipe.max_gaussians)
@@ -116,17 +116,17 @@ def isolate_work(splats: float) -> Features:
 
 
 def fill_work(
-    shot: Shot, standing: StandIn, splats: float, cells: int
+    shot: Shot, proxy: Proxy, splats: float, cells: int
 ) -> tuple[Features, dict[str, float]]:
     """Filling: voxels, and splats put inside.
 
     Returns:
         The features, and splats of the inside by object.
     """
-    solids = standing.solids
+    solids = proxy.solids
     extents = {name: _extent(solid) for name, solid in solids.items()}
     largest = max(extents.values())
-    given = shot.fill.given(standing.frame.scale).get("resolution")
+    given = shot.fill.given(proxy.frame.scale).get("resolution")
     voxels = matter = most = 0.0
     inside, placed = {}, []
     for name, solid in solids.items():
@@ -139,7 +139,7 @@ def fill_work(
         matter += own
         placed.append(min(_MOST_INTERIOR, own / _SPACING**3))
         inside[name] = (1.0 - _PRUNED) * placed[-1]
-    photographs = standing.photographs
+    photographs = proxy.photographs
     return {
         "start": 1.0,
         "objects": float(len(solids)),

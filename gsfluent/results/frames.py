@@ -28,44 +28,28 @@ _POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "m
 
 @dataclass(frozen=True, eq=False)
 class SavedFrame:
-    """One moment of a finished simulation.
+    """One moment of a finished simulation."""
 
-    Attributes:
-        index: Number of the frame, from 0.
-        time: Simulated time [s].
-        gaussians: Scene frame, repaired.
-        groups: Siblings for nearest-only compositing, int32 [N], -1 for none.
-        carried: How many of them came from the solids; the rest, at the end, are transition splats
-            of the repair.
-        ids: Number of each splat that it keeps from frame to frame as long as it lives, int64 [N]:
-            0 and up for those of the solids and the repair, negative for those of bullets, liquids
-            and rigid things.
-        anchor: Material point each splat follows, int32 [N], -1 for splats of rigid things.
-        positions: Material points [m], [P, 3].
-        volumes: Their volumes [m^3], [P].
-        damage: 0 intact to 1 broken, [P].
-        fragments: Fragment number per point, int32 [P].
-        velocity: Velocity of each point [m/s], [P, 3].
-        body: Number of each point's body in the scene, int32 [P].
-        material: Row of each point in the scene's table of materials, int32 [P].
-        facts: Plain figures of the frame (energies, counts).
-    """
-
-    index: int
-    time: float
-    gaussians: Gaussians
-    groups: Tensor
+    index: int  # Number of the frame, from 0
+    time: float  # Simulated time [s]
+    gaussians: Gaussians  # Scene frame, repaired
+    groups: Tensor  # Siblings for nearest-only compositing, int32 [N], -1 for none
+    # How many of them came from the solids; the rest, at the end, are transition splats of the
+    # repair.
     carried: int
+    # Number of each splat that it keeps from frame to frame as long as it lives, int64 [N]: 0 and
+    # up for those of the solids and the repair, negative for those of bullets, liquids and rigid
+    # things.
     ids: Tensor
-    anchor: Tensor
-    positions: Tensor
-    volumes: Tensor
-    damage: Tensor
-    fragments: Tensor
-    velocity: Tensor
-    body: Tensor
-    material: Tensor
-    facts: dict[str, Any]
+    anchor: Tensor  # Material point each splat follows, int32 [N], -1 for splats of rigid things
+    positions: Tensor  # Material points [m], [P, 3]
+    volumes: Tensor  # Their volumes [m^3], [P]
+    damage: Tensor  # 0 intact to 1 broken, [P]
+    fragments: Tensor  # Fragment number per point, int32 [P]
+    velocity: Tensor  # Velocity of each point [m/s], [P, 3]
+    body: Tensor  # Number of each point's body in the scene, int32 [P]
+    material: Tensor  # Row of each point in the scene's table of materials, int32 [P]
+    facts: dict[str, Any]  # Plain figures of the frame (energies, counts)
 
     def to(self, device: torch.device) -> SavedFrame:
         """The same frame on another device."""

@@ -55,29 +55,19 @@ def content_digest(path: Path) -> str:
 
 @dataclass
 class StageResult:
-    """What one stage left behind.
+    """What one stage left behind."""
 
-    Attributes:
-        name: Stage name.
-        folder: Where its files are.
-        fingerprint: Of everything that went in.
-        report: Figures for ``run.json``.
-        seconds: Work time, also of earlier, interrupted tries.
-        cpu_seconds: Processor time of all threads, likewise: on a busy machine the steadier figure.
-        peak_memory_bytes: Highest resident memory of the process during the stage.
-        peak_device_memory_bytes: Highest memory allocated on the GPU during the stage (0 on CPU).
-        resumed: The whole result was found finished.
-    """
-
-    name: str
-    folder: Path
-    fingerprint: str
-    report: dict[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0
+    name: str  # Stage name
+    folder: Path  # Where its files are
+    fingerprint: str  # Of everything that went in
+    report: dict[str, Any] = field(default_factory=dict)  # Figures for ``run.json``
+    seconds: float = 0.0  # Work time, also of earlier, interrupted tries
+    # Processor time of all threads, likewise: on a busy machine the steadier figure.
     cpu_seconds: float = 0.0
-    peak_memory_bytes: int = 0
+    peak_memory_bytes: int = 0  # Highest resident memory of the process during the stage
+    # Highest memory allocated on the GPU during the stage (0 on CPU).
     peak_device_memory_bytes: int = 0
-    resumed: bool = False
+    resumed: bool = False  # The whole result was found finished
 
     def summary(self) -> dict[str, Any]:
         """The stage's line in ``run.json``."""

@@ -52,11 +52,11 @@ def reconstruct_to(
     """
     photographs = load_capture(capture)
     stage = Reconstruct(**options, device=device, seed=seed)
-    gaussians, report = stage(photographs, progress=progress)
+    gaussians = stage(photographs, progress=progress)
     kept = gaussians if keep_background else Isolate(seed=seed)(gaussians, photographs)
     save_splats(kept, out)
-    values = dict(report) | {"gaussians_saved": kept.count, "output": str(out)}
-    write_report(out.parent, gaussians, photographs, values)
+    values = gaussians.report | {"gaussians_saved": kept.count, "output": str(out)}
+    write_report(out.parent, gaussians.replace(report=values), photographs)
     return values
 
 

@@ -20,30 +20,18 @@ class RunContext:
     """Settings of a run and what its stages hand on.
 
     They hand on files and fingerprints, not tensors, so that any of them may be skipped.
-
-    Attributes:
-        shot: What to do.
-        out: Result folder.
-        device: Where to compute.
-        seed: Seed of everything random.
-        store: Finished stages.
-        record: ``run.json``.
-        reporter: Progress.
-        capture: The photographs, when the shot has any.
-        frame: World to scene; set by the isolate stage.
-        source_key: Fingerprint of the last stage, which the next one builds on.
     """
 
-    shot: Shot
-    out: Path
-    device: torch.device
-    seed: int
-    store: StageStore
-    record: RunRecord
-    reporter: Reporter
-    capture: Capture | None = None
-    frame: Frame = field(default_factory=Frame.identity)
-    source_key: str = ""
+    shot: Shot  # What to do
+    out: Path  # Result folder
+    device: torch.device  # Where to compute
+    seed: int  # Seed of everything random
+    store: StageStore  # Finished stages
+    record: RunRecord  # ``run.json``
+    reporter: Reporter  # Progress
+    capture: Capture | None = None  # The photographs, when the shot has any
+    frame: Frame = field(default_factory=Frame.identity)  # World to scene; set by the isolate stage
+    source_key: str = ""  # Fingerprint of the last stage, which the next one builds on
 
     def key(self, *parts: Any) -> list[Any]:
         """Fingerprint parts every stage shares."""

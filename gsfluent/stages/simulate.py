@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials
-from gsfluent.config import ColliderSettings, ObjectSettings, Shot, collider_dict, event_dict
+from gsfluent.config import COLLIDERS, EVENTS, ColliderSettings, ObjectSettings, Shot, typed_dict
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
@@ -53,10 +53,10 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     if shot.floor == "auto":
         _lift(scene)
     for collider in shot.colliders:
-        keys = collider_dict(collider)
+        keys = typed_dict(collider, COLLIDERS)
         scene.add_collider(keys.pop("type"), **keys)
     for event in shot.events:
-        scene.add_event(event_dict(event))
+        scene.add_event(typed_dict(event, EVENTS))
     return scene
 
 
@@ -69,7 +69,7 @@ def _lift(scene: Scene) -> None:
 
 def _collider_key(collider: ColliderSettings) -> dict[str, Any]:
     """What a collider depends on: its settings, and the content of its mesh instead of its path."""
-    keys = collider_dict(collider)
+    keys = typed_dict(collider, COLLIDERS)
     if "mesh" in keys:
         keys["mesh"] = content_digest(Path(keys["mesh"]))
     return keys
@@ -93,7 +93,7 @@ def moving_settings(shot: Shot) -> list[Any]:
     }
     return [
         objects,
-        [event_dict(event) for event in shot.events],
+        [typed_dict(event, EVENTS) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
         [shot.solve.standing, shot.solve.loose_debris],

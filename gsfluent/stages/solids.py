@@ -22,7 +22,7 @@ from gsfluent.pipeline.fill.stage import Fill, fill_resolution, visible_extent
 from gsfluent.pipeline.reconstruct.evaluate import write_report
 from gsfluent.pipeline.reconstruct.isolate import Isolate
 from gsfluent.pipeline.reconstruct.stage import Reconstruct
-from gsfluent.pipeline.regions.project import label_regions
+from gsfluent.pipeline.regions.stage import Regions
 from gsfluent.pipeline.render.backdrop import no_background
 from gsfluent.pipeline.render.cuts import save_cut_views
 from gsfluent.pipeline.simulate.stage import QUALITY
@@ -53,10 +53,10 @@ def reconstruct_stage(context: RunContext) -> None:
             device=context.device,
             seed=context.seed,
         )
-        gaussians, report = stage(capture, progress=context.reporter.task("reconstruct"))
+        gaussians = stage(capture, progress=context.reporter.task("reconstruct"))
         save_splats(gaussians, folder / "model.ply")
-        write_report(folder, gaussians, capture, report)
-        return dict(report)
+        write_report(folder, gaussians, capture)
+        return dict(gaussians.report)
 
     result = context.store.run("reconstruct", key, work)
     context.record.values["reconstruction"] = result.report
@@ -78,8 +78,7 @@ def isolate_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load_splats(source).validated(source.name)
-        stage = Isolate(seed=context.seed)
-        whole, background = stage.split(gaussians, context.capture)
+        whole, background = Isolate(seed=context.seed).split(gaussians, context.capture)
         stance = orient(whole, context.capture, shot.up)
         frame = make_frame(whole, context.capture, shot)
         save_splats(whole, folder / "object.ply")
@@ -88,7 +87,7 @@ def isolate_stage(context: RunContext) -> None:
         elif captured:
             raise no_background()
         write_json(folder / "frame.json", frame.to_dict())
-        return dict(stage.report) | {
+        return dict(whole.report) | {
             "gaussians_kept": whole.count,
             "gaussians_removed": background.count,
             "up": stance.up.tolist(),
@@ -236,13 +235,8 @@ def regions_stage(context: RunContext) -> None:
         reports = {}
         for name, sources in wanted.items():
             solid = load_solid(context.store.root / "texture" / f"{name}.ply").to(context.device)
-            labelled = label_regions(
-                solid,
-                sources,
-                context.capture,
-                frame=context.frame,
-                progress=context.reporter.task("regions"),
-            )
+            progress = context.reporter.task("regions")
+            labelled = Regions(sources)(solid, context.capture, progress, frame=context.frame)
             assert labelled.regions is not None
             with (
                 atomic_path(folder / f"{name}.npz") as temporary,

@@ -24,7 +24,7 @@ from gsfluent.inspection.parts import solid_regions
 from gsfluent.inspection.parts_picture import save_parts_picture
 from gsfluent.io import load_capture, load_splats
 from gsfluent.io.segmentation.masks import LabelView, Segmentation, load_segmentation
-from gsfluent.pipeline import Fill, Isolate, Reconstruct, label_regions
+from gsfluent.pipeline import Fill, Isolate, Reconstruct, Regions
 from gsfluent.pipeline.capture.orient import orient, upright_rotation
 from gsfluent.pipeline.regions.project import SkinLabels, project_labels
 
@@ -110,7 +110,7 @@ def sheet(solid: Solid, whole: Segmentation, capture: Capture) -> None:
 
 def apple(capture: Capture, path: Path | None) -> Solid:
     if path is None:
-        splats, _ = Reconstruct(3000, 60_000, image_size=800)(capture)
+        splats = Reconstruct(3000, 60_000, image_size=800)(capture)
     else:
         splats = load_splats(path)
     return Fill(resolution=96)(Isolate()(splats, capture), capture)
@@ -130,7 +130,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as masks:
         write_masks(capture, Path(masks))
         whole = load_segmentation(masks, capture)
-        labelled = label_regions(solid, [{"labels": masks}], capture)
+        labelled = Regions([{"labels": masks}])(solid, capture)
     table = "\n".join(held_out(solid, whole))
     sys.stdout.write(table + "\n")
     if given.write:

@@ -98,7 +98,7 @@ def trained(name: str, resolution: int) -> Solid:
     with tempfile.TemporaryDirectory() as folder:
         demo.make_capture(name, folder, views=30, size=192)
         capture = load_capture(folder)
-        splats, _ = Reconstruct(600, 15_000, image_size=192)(capture)
+        splats = Reconstruct(600, 15_000, image_size=192)(capture)
         return Fill(resolution=resolution)(splats, capture)
 
 

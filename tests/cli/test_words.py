@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gsfluent.cli import main
-from gsfluent.cli.common import parse_size, parse_vector
+from gsfluent.cli.common import parse_size
 from gsfluent.cli.parse import VERBS
 from gsfluent.cli.show import to_json
 from gsfluent.errors import InputError
@@ -166,11 +166,8 @@ def test_wrong_sizes_are_refused(text: str) -> None:
         parse_size(text)
 
 
-def test_sizes_and_vectors_are_read() -> None:
+def test_sizes_are_read() -> None:
     assert parse_size("1280x720") == (1280, 720)
-    assert parse_vector("1,-1,2", "--light") == (1.0, -1.0, 2.0)
-    with pytest.raises(InputError, match="--light"):
-        parse_vector("1,2", "--light")
 
 
 def test_json_has_no_nan() -> None:

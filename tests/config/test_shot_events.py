@@ -9,7 +9,7 @@ import pytest
 import torch
 from simulation_shapes import ellipsoid
 
-from gsfluent.config import COLLIDERS, EVENTS, Shot, collider_dict, event_dict
+from gsfluent.config import COLLIDERS, EVENTS, Shot, typed_dict
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.stages.simulate import build_scene
@@ -47,7 +47,7 @@ def test_events_reach_the_scene(folder: Path, event: dict[str, Any]) -> None:
     shot = read(folder, events=[event])
     again = Shot.from_dict(shot.resolved(), folder)
     assert again.events == shot.events
-    shown = event_dict(shot.events[0])
+    shown = typed_dict(shot.events[0], EVENTS)
     solids = dict.fromkeys(("a", "b"), ellipsoid())
     frame = Frame(torch.eye(3), torch.tensor([0.0, 0.0, 0.1]), 1.0)
     scene = build_scene(shot, solids, frame)
@@ -83,7 +83,7 @@ def test_colliders_reach_the_scene(folder: Path, kind: str) -> None:
     shot = read(folder, colliders=[keys], floor_mode="slip")
     again = Shot.from_dict(shot.resolved(), folder)
     assert again.colliders == shot.colliders
-    assert collider_dict(shot.colliders[0])["type"] == kind
+    assert typed_dict(shot.colliders[0], COLLIDERS)["type"] == kind
     scene = build_scene(shot, dict.fromkeys(("a", "b"), ellipsoid()), Frame.identity())
     (made,) = scene.colliders
     assert made.kind == kind and made.mode == "sticky" and made.point == (0, 0, 0.4)

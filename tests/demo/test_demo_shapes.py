@@ -138,7 +138,7 @@ def test_both_of_two_melons_are_rebuilt(tmp_path: Path) -> None:
     from gsfluent.pipeline import Reconstruct
 
     paths = demo.make_capture("melons", tmp_path, views=14, size=48)
-    splats, _ = Reconstruct(iterations=5, max_gaussians=2000)(load_capture(paths.root))
+    splats = Reconstruct(iterations=5, max_gaussians=2000)(load_capture(paths.root))
     x = splats.means[:, 0]
     assert 0.3 < float((x > 0).float().mean()) < 0.7
     low, high = (float(torch.quantile(x, q)) for q in (0.02, 0.98))

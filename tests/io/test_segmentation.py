@@ -15,7 +15,7 @@ from PIL import Image
 from gsfluent.data import Camera, Capture
 from gsfluent.errors import InputError
 from gsfluent.io.segmentation.masks import load_masks, load_segmentation
-from gsfluent.io.segmentation.sam import decode_rle, encode_rle
+from gsfluent.io.segmentation.sam import decode_rle
 
 H, W = 12, 16
 
@@ -171,6 +171,29 @@ def test_undistorted_maps_keep_whole_labels_and_tell_what_is_not_covered(tmp_pat
 # Run-length codes: the text of a 9 x 10 mask that pycocotools documents, and its lengths.
 KNOWN = {"size": [9, 10], "counts": "61X13mN000`0"}
 LENGTHS = [6, 1, 40, 4, 5, 4, 5, 4, 21]
+
+
+def encode_rle(mask: np.ndarray, *, compressed: bool = True) -> dict[str, Any]:
+    """A mask [H, W] as pycocotools writes it."""
+    flat = np.asarray(mask, bool).T.reshape(-1)
+    change = np.flatnonzero(np.diff(flat.astype(np.int8))) + 1
+    edges = np.concatenate([[0], change, [flat.size]])
+    lengths = np.diff(edges).tolist()
+    if flat.size and flat[0]:
+        lengths = [0, *lengths]
+    size = [int(n) for n in mask.shape]
+    if not compressed:
+        return {"size": size, "counts": [int(n) for n in lengths]}
+    text = []
+    for index, length in enumerate(lengths):
+        rest = int(length) - (int(lengths[index - 2]) if index > 2 else 0)
+        more = True
+        while more:
+            digit = rest & 31
+            rest >>= 5
+            more = rest != (-1 if digit & 16 else 0)
+            text.append(chr(48 + (digit | (32 if more else 0))))
+    return {"size": size, "counts": "".join(text)}
 
 
 def test_known_run_lengths_are_read_and_written() -> None:

@@ -15,13 +15,13 @@ import torch
 
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
-from gsfluent.fracturebench.scene import Scene, SceneError
+from gsfluent.fracturebench.scene import Scene, SceneError, wave_speed
 from gsfluent.fracturebench.scenes import bars as fracture_bars
 from gsfluent.fracturebench.scenes import cantilever as fracture_cantilever
 from gsfluent.fracturebench.scenes import plane as fracture_plane
 from gsfluent.fracturebench.scenes import rock as fracture_rock
 from gsfluent.fracturebench.scenes.rows import levels, moduli, shape_noise
-from gsfluent.fracturebench.shapes import box, elastic, free, wave_speed
+from gsfluent.fracturebench.shapes import box, elastic, free
 from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.problems.fracture import crack_band
 from gsfluent.lab.problems.fracture.spall import spall_strength

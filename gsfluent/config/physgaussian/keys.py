@@ -101,17 +101,11 @@ MATERIALS = ("jelly", "metal", "sand", "foam", "snow", "plasticine")
 
 @dataclasses.dataclass(frozen=True)
 class Note:
-    """What became of one key.
+    """What became of one key."""
 
-    Attributes:
-        key: Its path in the config.
-        status: ``mapped``, ``near``, ``unsupported``, ``inert`` or ``unknown``.
-        text: What it became, or why it became nothing.
-    """
-
-    key: str
-    status: str
-    text: str
+    key: str  # Its path in the config
+    status: str  # ``mapped``, ``near``, ``unsupported``, ``inert`` or ``unknown``
+    text: str  # What it became, or why it became nothing
 
 
 def read_config(path: Path) -> tuple[dict[str, Any], list[Note]]:

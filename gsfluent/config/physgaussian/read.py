@@ -51,17 +51,11 @@ _FRICTION_ANGLE = 25.0  # degrees, where a config for sand names none
 
 @dataclasses.dataclass(frozen=True)
 class Conversion:
-    """A shot made of a config, and what became of every key.
+    """A shot made of a config, and what became of every key."""
 
-    Attributes:
-        shot: Keys and values as in a shot file.
-        notes: One or more per key of the config.
-        space: How their box lies in the scene.
-    """
-
-    shot: dict[str, Any]
-    notes: tuple[Note, ...]
-    space: Space
+    shot: dict[str, Any]  # Keys and values as in a shot file
+    notes: tuple[Note, ...]  # One or more per key of the config
+    space: Space  # How their box lies in the scene
 
     def report(self) -> dict[str, Any]:
         """For run.json: notes by status, and world to scene."""

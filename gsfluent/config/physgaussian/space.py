@@ -43,21 +43,13 @@ _LEVEL = math.radians(2.0)
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """From their world and their box to the scene.
+    """From their world and their box to the scene."""
 
-    Attributes:
-        turn: World to box axes, [3, 3].
-        middle: What goes to (1, 1, 1), in turned world coordinates, [3].
-        scale: Box units (metres here) per world unit.
-        upright: Box to scene axes, [3, 3].
-        floor: Height of z = 0 above (1, 1, 1) [m].
-    """
-
-    turn: Array
-    middle: Array
-    scale: float
-    upright: Array
-    floor: float = 0.0
+    turn: Array  # World to box axes, [3, 3]
+    middle: Array  # What goes to (1, 1, 1), in turned world coordinates, [3]
+    scale: float  # Box units (metres here) per world unit
+    upright: Array  # Box to scene axes, [3, 3]
+    floor: float = 0.0  # Height of z = 0 above (1, 1, 1) [m]
 
     @property
     def aligned(self) -> bool:

@@ -9,12 +9,10 @@ import numpy as np
 
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene
+from ..scene import Floats, Scene, wave_speed
 from ..scenes.rows import BROKEN, brittle, damage_of, levels
 from ..scenes.slabs import walls
-from ..shapes import box, free, wave_speed
-
-__all__ = ["expected_size", "spall", "stretched_bar"]
+from ..shapes import box, free
 
 _FLYER, _OVER = 0.4, 1.25
 

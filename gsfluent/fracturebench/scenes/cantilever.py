@@ -9,13 +9,11 @@ import numpy as np
 
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene, SceneError
+from ..scene import Floats, Scene, SceneError, wave_speed
 from ..scenes.rows import BROKEN, brittle, damage_of
 from ..scenes.slabs import heavy, sheet, slab_volume, walls
-from ..shapes import elastic, free, wave_speed
+from ..shapes import elastic, free
 from ..statistics import stored_energy
-
-__all__ = ["cantilever", "crack_tip", "double_cantilever", "energy_beyond"]
 
 _HEIGHT, _NOTCH = 0.375, 0.25
 _SECTION = (0.125, 0.1875)

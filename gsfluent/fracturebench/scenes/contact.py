@@ -13,10 +13,8 @@ import numpy as np
 
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene
-from ..shapes import ball, box, elastic, free, wave_speed
-
-__all__ = ["collide", "drop", "oblique", "pull_apart"]
+from ..scene import Floats, Scene, wave_speed
+from ..shapes import ball, box, elastic, free
 
 
 @functools.cache

@@ -14,8 +14,6 @@ from ..run import Measure, Run
 from ..scene import Floats, Scene
 from ..shapes import ball, box, elastic, free
 
-__all__ = ["bar", "beam", "box", "spin", "two_material_bar"]
-
 
 def _rms(seen: Floats, exact: Floats) -> float:
     return float(np.sqrt(np.mean((seen - exact) ** 2) / np.mean(exact**2)))

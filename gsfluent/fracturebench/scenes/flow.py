@@ -12,8 +12,6 @@ from ..run import Measure, Run
 from ..scene import Floats, Scene
 from ..shapes import box, elastic, free
 
-__all__ = ["bar_wave", "covariance_transport"]
-
 _BAR = elastic(5e5, 0.0, 1000.0)
 _LENGTH, _WIDTH, _STRAIN = 1.0, 0.25, 1e-3
 

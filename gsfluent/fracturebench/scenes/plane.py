@@ -10,12 +10,10 @@ import numpy as np
 
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene, SceneError
+from ..scene import Floats, Scene, SceneError, wave_speed
 from ..scenes.rows import BROKEN, brittle, damage_of
 from ..scenes.slabs import HEAVY, heavy, sheet, slab_volume, walls
-from ..shapes import elastic, free, wave_speed
-
-__all__ = ["brazilian_disc", "front_speed", "kalthoff", "notch", "notch_tension", "rayleigh_speed"]
+from ..shapes import elastic, free
 
 _PLAIN = elastic(1e9, 0.2, 1000.0)
 

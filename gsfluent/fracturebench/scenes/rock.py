@@ -18,13 +18,10 @@ import numpy as np
 from ..pieces import REACH, components, neighbours, parted
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene, SceneError
+from ..scene import Floats, Scene, SceneError, wave_speed
 from ..scenes.rows import brittle, levels, shape_noise
-from ..shapes import box, free, wave_speed
+from ..shapes import box, free
 from ..statistics import spacing
-
-__all__ = ["EXPERIMENT", "Piece", "experiment", "pieces_of", "rock_press", "rosin_rammler",
-           "struck_rock"]  # fmt: skip
 
 EXPERIMENT = Path(__file__).parents[1] / "data" / "rock.json"
 SMALLEST = 12

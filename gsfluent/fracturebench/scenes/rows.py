@@ -36,17 +36,6 @@ from ..run import Run
 from ..scene import Floats, Ints, Scene, SceneError
 from ..shapes import elastic
 
-__all__ = [
-    "BAND_CELLS",
-    "BROKEN",
-    "brittle",
-    "damage_of",
-    "levels",
-    "moduli",
-    "scattered",
-    "shape_noise",
-]
-
 BAND_CELLS = 2.0
 """Width of the narrowest crack that a grid of quadratic splines can show [dx]."""
 BROKEN = 0.999

@@ -11,12 +11,10 @@ import numpy as np
 
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene, SceneError
+from ..scene import Floats, Scene, SceneError, wave_speed
 from ..scenes.rows import brittle, levels, shape_noise
-from ..shapes import box, free, wave_speed
+from ..shapes import box, free
 from ..statistics import MEASURES, Figures, distance, figures
-
-__all__ = ["RADIUS", "RECORD", "SEEDS", "lattice_ball", "reference", "shatter"]
 
 RADIUS = 0.05
 SEEDS = tuple(range(8))

@@ -10,8 +10,6 @@ import numpy as np
 from ..scene import Floats
 from ..shapes import elastic
 
-__all__ = ["HEAVY", "edge_points", "heavy", "sheet", "slab_volume", "walls"]
-
 HEAVY = 30.0
 """Density and stiffness of grips over those of what they hold."""
 

@@ -64,29 +64,6 @@ def decode_rle(code: Any, where: str = "segmentation") -> Mask:
     return np.repeat(value, lengths).reshape(width, height).T
 
 
-def encode_rle(mask: Mask, *, compressed: bool = True) -> dict[str, Any]:
-    """Encode a mask [H, W] as :func:`decode_rle` reads it."""
-    flat = np.asarray(mask, bool).T.reshape(-1)
-    change = np.flatnonzero(np.diff(flat.astype(np.int8))) + 1
-    edges = np.concatenate([[0], change, [flat.size]])
-    lengths = np.diff(edges).tolist()
-    if flat.size and flat[0]:
-        lengths = [0, *lengths]
-    size = [int(n) for n in mask.shape]
-    if not compressed:
-        return {"size": size, "counts": [int(n) for n in lengths]}
-    text = []
-    for index, length in enumerate(lengths):
-        rest = int(length) - (int(lengths[index - 2]) if index > 2 else 0)
-        more = True
-        while more:
-            digit = rest & 31
-            rest >>= 5
-            more = rest != (-1 if digit & 16 else 0)
-            text.append(chr(48 + (digit | (32 if more else 0))))
-    return {"size": size, "counts": "".join(text)}
-
-
 def _unpacked(text: str | bytes, where: str) -> NDArray[np.int64]:
     """Lengths out of COCO's compressed text."""
     raw = text.encode("ascii", "replace") if isinstance(text, str) else bytes(text)

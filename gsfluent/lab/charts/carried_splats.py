@@ -22,17 +22,9 @@ from gsfluent.pipeline.matter.carry import BLEND
 from gsfluent.pipeline.matter.links import NEIGHBOURS
 from gsfluent.spatial.neighbours import nearest_rows
 
-__all__ = ["CarriedSplats"]
-
 
 class CarriedSplats:
-    """The points of a dense scene on those of a sparse one.
-
-    Args:
-        dense: Scene whose points are carried.
-        sparse: The same body with fewer points.
-        device: Where.
-    """
+    """The points of a dense scene on those of a sparse one."""
 
     def __init__(self, dense: Scene, sparse: Scene, device: str) -> None:
         self.dense, self.sparse, self.device = dense, sparse, torch.device(device)

@@ -15,8 +15,6 @@ from gsfluent.lab.charts.record import Record, append, commit, machine, now, rea
 from gsfluent.lab.charts.run_case import measure
 from gsfluent.progress import Progress, report_progress
 
-__all__ = ["BYTES", "Done", "bandwidth", "run"]
-
 BYTES = 208.0
 """What the two passes of the solver read and write of a float32 point in a step
 (docs/measured/benchmarks.md); of a NACC point 224."""
@@ -24,33 +22,21 @@ BYTES = 208.0
 
 @dataclasses.dataclass(frozen=True)
 class Done:
-    """What came of a ladder.
+    """What came of a ladder."""
 
-    Attributes:
-        records: Of all settings that have one, in the order of the ladder, and the machine's.
-        fresh: How many of them were run now.
-        left_out: Settings that did not fit into the budget.
-        seconds: What it took [s].
-    """
-
+    # of all settings that have one, in the order of the ladder, and the machine's
     records: list[Record]
-    fresh: int
-    left_out: list[Setting]
-    seconds: float
+    fresh: int  # how many of them were run now
+    left_out: list[Setting]  # settings that did not fit into the budget
+    seconds: float  # what it took [s]
 
 
-def bandwidth(device: str, mebibytes: int = 256, repeat: int = 5) -> Record:
-    """Measure what a plain copy moves, and the floor it sets for a point and a step.
-
-    Args:
-        device: Where.
-        mebibytes: Size of the array, far beyond the caches.
-        repeat: The best of so many copies counts: a floor is what nothing goes under.
-    """
-    source = torch.ones(mebibytes << 18, dtype=torch.float32, device=device)
+def bandwidth(device: str) -> Record:
+    """Measure what a plain copy moves, and the floor it sets for a point and a step."""
+    source = torch.ones(256 << 18, dtype=torch.float32, device=device)
     target = torch.empty_like(source)
     seconds = []
-    for _ in range(repeat + 1):
+    for _ in range(6):  # the first one warms up
         start = time.perf_counter()
         target.copy_(source)
         if device.startswith("cuda"):

@@ -17,8 +17,6 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.front import Verdict, cases, counted, front, methods, verdict
 from gsfluent.lab.charts.record import Record, read
 
-__all__ = ["Chart", "gathered", "of_records"]
-
 OURS = "gsfluent"
 _BASES = ("dx", "textbook", "adaptive")
 """Knobs whose runs are a method's base."""
@@ -27,17 +25,11 @@ _XLABEL = "wall ms per simulated ms"
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """Records of one device, ready to be drawn.
+    """Records of one device, ready to be drawn."""
 
-    Attributes:
-        records: All of them.
-        device: ``cpu`` or ``cuda``.
-        verdict: Our front against every peer's.
-    """
-
-    records: tuple[Record, ...]
-    device: str
-    verdict: Verdict
+    records: tuple[Record, ...]  # all of them
+    device: str  # cpu or cuda
+    verdict: Verdict  # our front against every peer's
 
     @property
     def machine(self) -> str:
@@ -52,10 +44,10 @@ class Chart:
         """All machines, ours first; more than one and times cannot be compared."""
         return list(dict.fromkeys([self.machine, *(r.machine for r in self.records)]))
 
-    def figure(self, path: Path, *, dpi: int = 110) -> Path:
+    def figure(self, path: Path) -> Path:
         """Write the PNG."""
         with draw(self._panels(), self._rates(), title=self.title, xlabel=_XLABEL) as figure:
-            return save_png(figure, path, dpi=dpi)
+            return save_png(figure, path)
 
     @property
     def title(self) -> str:

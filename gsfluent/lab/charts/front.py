@@ -7,11 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 
 from gsfluent.lab.charts.record import Record
 
-__all__ = [
-    "NO_ANSWER", "ROUND_OFF", "Verdict", "Versus", "cases", "compare", "counted", "front",
-    "methods", "verdict",
-]  # fmt: skip
-
 NO_ANSWER = 1.0
 """Errors of the cases are relative: at 1 a run knows as much as one that says nothing, and such a
 level is not reached."""
@@ -21,19 +16,13 @@ ROUND_OFF = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Versus:
-    """One error level of a peer's front against our cheapest run that is at least as good.
+    """One error level of a peer's front against our cheapest run that is at least as good."""
 
-    Attributes:
-        case: The case.
-        peer: The peer's run.
-        ours: Our cheapest run of at most the peer's error; None where we reach no such error.
-        ratio: Peer's time over ours; None likewise.
-    """
-
-    case: str
-    peer: Record
+    case: str  # the case
+    peer: Record  # the peer's run
+    # our cheapest run of at most the peer's error; None where we reach no such error
     ours: Record | None
-    ratio: float | None
+    ratio: float | None  # peer's time over ours; None likewise
 
     @property
     def below_left(self) -> bool:
@@ -43,14 +32,10 @@ class Versus:
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What all levels say together.
+    """What all levels say together."""
 
-    Attributes:
-        rows: By case and peer; a peer without any level has none.
-        absent: Pairs (case, peer) that were run and reach no level, with the reason.
-    """
-
-    rows: tuple[Versus, ...]
+    rows: tuple[Versus, ...]  # by case and peer; a peer without any level has none
+    # pairs (case, peer) that were run and reach no level, with the reason
     absent: tuple[tuple[str, str, str], ...]
 
     @property
@@ -127,11 +112,6 @@ def cheapest(records: Iterable[Record], error: float) -> Record | None:
 
 def compare(records: Sequence[Record], ours: str, peer: str) -> dict[str, list[Versus]]:
     """At every error level that a peer reaches: our cheapest time, and the ratio.
-
-    Args:
-        records: Runs of both, on one device.
-        ours: Name of our method.
-        peer: Name of the other.
 
     Returns:
         By case that both ran; an empty list where the peer reaches no level.

@@ -15,11 +15,6 @@ from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import Case, cases
 from gsfluent.fracturebench.scene import Scene
 
-__all__ = [
-    "CASES", "DEMO_COURANT", "KNOBS", "OFF_GRID", "OURS", "TEXTBOOK", "Setting", "ladder", "rungs",
-    "work",
-]  # fmt: skip
-
 CASES = (
     "bar", "bar_wave", "beam", "spin", "two_material_bar", "drop", "collide", "oblique",
     "pull_apart", "shatter",
@@ -65,27 +60,16 @@ _MOST_NUMBERS = 1.2e7
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One point of the chart before it is run.
+    """One point of the chart before it is run."""
 
-    Attributes:
-        case: Name of the case.
-        dx: Node spacing [m].
-        ppc: Points per cell of the scene that is judged.
-        method: ``gsfluent`` or ``textbook``.
-        knob: What was turned, of :data:`KNOBS`.
-        variant: How, in words; empty for the base.
-        options: Of :mod:`gsfluent.lab.charts.run_case`.
-        trades: Whether the knob may move the error.
-    """
-
-    case: str
-    dx: float
-    ppc: int = 8
-    method: str = OURS
-    knob: str = "dx"
-    variant: str = ""
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    trades: bool = True
+    case: str  # name of the case
+    dx: float  # node spacing [m]
+    ppc: int = 8  # points per cell of the scene that is judged
+    method: str = OURS  # gsfluent or textbook
+    knob: str = "dx"  # what was turned, of KNOBS
+    variant: str = ""  # how, in words; empty for the base
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of run_case
+    trades: bool = True  # whether the knob may move the error
 
     def key(self, device: str) -> str:
         """As :attr:`gsfluent.lab.charts.record.Record.key`."""

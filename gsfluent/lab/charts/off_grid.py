@@ -25,8 +25,6 @@ from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.progress import quiet_logs
 from gsfluent.scene.scene import Scene
 
-__all__ = ["measure_off_grid"]
-
 _RADIUS, _SPIN, _VELOCITY = 0.05, 3.0, (0.5, 0.2, 1.5)
 _SECONDS = {"flight": 0.3, "rest": 4.0}
 _FPS = 20.0
@@ -34,11 +32,6 @@ _FPS = 20.0
 
 def measure_off_grid(setting: Setting, device: str, repeat: int) -> Record:
     """Run ``flight`` or ``rest``; the time is that of all frames, with checks and figures.
-
-    Args:
-        setting: Of :data:`gsfluent.lab.charts.ladder.OFF_GRID`; its options go to Simulate.
-        device: Where.
-        repeat: Timed runs.
 
     Returns:
         The record; a run that raises is one that failed.

@@ -28,48 +28,32 @@ from gsfluent.lab.charts.front import cases, counted, front
 from gsfluent.lab.charts.record import Record, append, commit, machine, now, read
 from gsfluent.progress import Progress, report_progress
 
-__all__ = ["KINDS", "Job", "Outcome", "chart_quality", "gathered", "markdown", "run_jobs", "timed"]
-
 KINDS = ("rendering", "reconstruction", "texturing")
 _METHOD = "gsfluent"
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a job found.
+    """What a job found."""
 
-    Attributes:
-        error: Below 1; 1 is as wrong as no answer.
-        wall_seconds: Of every repeat [s].
-        count: Gaussians or voxels.
-        measures: More figures.
-        band: What another, equally good truth would have as its error; None for none.
-        settings: What was found out about the setting.
-    """
-
-    error: float
-    wall_seconds: Sequence[float]
-    count: int
-    measures: Mapping[str, float]
+    error: float  # below 1; 1 is as wrong as no answer
+    wall_seconds: Sequence[float]  # of every repeat [s]
+    count: int  # gaussians or voxels
+    measures: Mapping[str, float]  # more figures
+    # what another, equally good truth would have as its error; None for none
     band: float | None = None
+    # what was found out about the setting
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One setting of one case.
+    """One setting of one case."""
 
-    Attributes:
-        case: What is rendered, learned or textured.
-        variant: The setting in words; empty for the default.
-        settings: The setting in values.
-        work: Does it, with so many timed repeats.
-    """
-
-    case: str
-    variant: str
-    settings: Mapping[str, Any]
-    work: Callable[[int], Outcome]
+    case: str  # what is rendered, learned or textured
+    variant: str  # the setting in words; empty for the default
+    settings: Mapping[str, Any]  # the setting in values
+    work: Callable[[int], Outcome]  # does it, with so many timed repeats
 
     def key(self, device: str) -> str:
         """As :attr:`Record.key`."""
@@ -105,14 +89,6 @@ def run_jobs(
     progress: Progress | None = None,
 ) -> list[Record]:
     """Do what has no line yet, in order.
-
-    Args:
-        kind: One of :data:`KINDS`.
-        jobs: The settings.
-        lines: File of records; each is on disk when the next one starts.
-        device: Where to compute.
-        repeat: Timed repeats.
-        progress: Told after every job.
 
     Returns:
         The records of these jobs.

@@ -21,8 +21,6 @@ from gsfluent.lab.charts.quality import Job, Outcome
 from gsfluent.pipeline.reconstruct.evaluate import HOLD_OUT, evaluate
 from gsfluent.pipeline.reconstruct.stage import Reconstruct
 
-__all__ = ["XLABEL", "YLABEL", "jobs"]
-
 XLABEL = "seconds of training"
 YLABEL = "rms error on held-out photographs"
 
@@ -44,12 +42,12 @@ class _Case:
         del repeat  # a training is long, and the same seed gives the same splats
         keys = {"iterations": 200, **options}
         stage = Reconstruct(**keys, device=self.device)
-        splats, report = stage(self.capture)
+        splats = stage(self.capture)
         _, held = self.capture.split(HOLD_OUT)
         judged = evaluate(splats, held, self.size)
         psnr = float(judged["psnr"])
         return Outcome(
-            10.0 ** (-psnr / 20.0), [float(report["train_seconds"])], splats.count,
+            10.0 ** (-psnr / 20.0), [float(splats.report["train_seconds"])], splats.count,
             {"PSNR [dB]": psnr, "SSIM": float(judged["ssim"]),
              "PSNR inside [dB]": float(judged["psnr_inside"])},
             settings={"steps": stage.iterations, "image_size": stage.image_size,

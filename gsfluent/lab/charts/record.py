@@ -20,52 +20,29 @@ from gsfluent.fracturebench.run import Measure, Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.hardware import processor
 
-__all__ = ["Record", "append", "commit", "machine", "now", "of_run", "read"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """A run of one case by one method at one setting, repeated.
+    """A run of one case by one method at one setting, repeated."""
 
-    Attributes:
-        case: Name of the case.
-        kind: ``elastic``, ``contact`` or ``fracture``; other charts have kinds of their own.
-        method: Who computed it, such as ``gsfluent``, ``textbook`` or ``physgaussian``.
-        variant: What differs from the method's defaults, in words; part of the key.
-        settings: ``dx``, ``cfl``, ``dt``, ``ppc``, ``dtype``, ``engine``, ``fields``, ...
-        device: ``cpu`` or ``cuda``.
-        machine: Processor and cores, or the GPU.
-        points: Material points.
-        steps: Steps taken.
-        simulated_seconds: [s].
-        wall_seconds: Of every repeat, the steps only [s].
-        wall_per_simulated: Median wall time over simulated time.
-        ns_per_point_step: Median wall time over points and steps [ns].
-        error: First measure of the case; infinite for a run that broke off.
-        measures: All measures, as plain values.
-        failed: Why it broke off, or empty.
-        commit: Of gsfluent, or version of the method.
-        date: ISO 8601, UTC.
-    """
-
-    case: str
-    kind: str
-    method: str
-    variant: str
-    settings: Mapping[str, Any]
-    device: str
-    machine: str
-    points: int
-    steps: int
-    simulated_seconds: float
-    wall_seconds: Sequence[float]
-    wall_per_simulated: float
-    ns_per_point_step: float
-    error: float
-    measures: Sequence[Mapping[str, Any]] = ()
-    failed: str = ""
-    commit: str = ""
-    date: str = ""
+    case: str  # name of the case
+    kind: str  # elastic, contact or fracture; other charts have kinds of their own
+    method: str  # who computed it, such as gsfluent, textbook or physgaussian
+    variant: str  # what differs from the method's defaults, in words; part of the key
+    settings: Mapping[str, Any]  # dx, cfl, dt, ppc, dtype, engine, fields, ...
+    device: str  # cpu or cuda
+    machine: str  # processor and cores, or the GPU
+    points: int  # material points
+    steps: int  # steps taken
+    simulated_seconds: float  # [s]
+    wall_seconds: Sequence[float]  # of every repeat, the steps only [s]
+    wall_per_simulated: float  # median wall time over simulated time
+    ns_per_point_step: float  # median wall time over points and steps [ns]
+    error: float  # first measure of the case; infinite for a run that broke off
+    measures: Sequence[Mapping[str, Any]] = ()  # all measures, as plain values
+    failed: str = ""  # why it broke off, or empty
+    commit: str = ""  # of gsfluent, or version of the method
+    date: str = ""  # ISO 8601, UTC
 
     @property
     def ok(self) -> bool:

@@ -21,8 +21,6 @@ from gsfluent import geometry, ops
 from gsfluent.demo import make_object
 from gsfluent.lab.charts.quality import Job, Outcome, timed
 
-__all__ = ["XLABEL", "YLABEL", "Splats", "View", "glossy_melon", "jobs", "merged", "thinned"]
-
 XLABEL = "seconds per picture"
 YLABEL = "rms error of display values"
 FINE = 3
@@ -33,19 +31,12 @@ _KEY = (0.45, -0.35, 0.82)
 
 @dataclasses.dataclass(frozen=True)
 class Splats:
-    """Splats as the rasterizer takes them.
+    """Splats as the rasterizer takes them."""
 
-    Attributes:
-        means: [N, 3] in metres.
-        covars: xx, yy, zz, xy, xz, yz [N, 6] in square metres.
-        opacities: [N].
-        sh: Spherical harmonics of degree 3 [N, 16, 3].
-    """
-
-    means: Tensor
-    covars: Tensor
-    opacities: Tensor
-    sh: Tensor
+    means: Tensor  # [N, 3] in metres
+    covars: Tensor  # xx, yy, zz, xy, xz, yz [N, 6] in square metres
+    opacities: Tensor  # [N]
+    sh: Tensor  # spherical harmonics of degree 3 [N, 16, 3]
 
     def to(self, *args: Any) -> Splats:
         """On another device or in another precision."""
@@ -54,17 +45,11 @@ class Splats:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A camera.
+    """A camera."""
 
-    Attributes:
-        viewmat: World to camera [4, 4].
-        size: Width and height [px].
-        focal: [px].
-    """
-
-    viewmat: Tensor
-    size: int
-    focal: float
+    viewmat: Tensor  # world to camera [4, 4]
+    size: int  # width and height [px]
+    focal: float  # [px]
 
     def picture(self, splats: Splats, *, degree: int = 3, antialiased: bool = False,
                 scale: int = 1) -> Tensor:  # fmt: skip
@@ -182,15 +167,7 @@ def _views(size: int, count: int, distance: float) -> list[View]:
 
 
 class _Case:
-    """Views, truth and splats of one distance; the truth is made when first asked for.
-
-    Args:
-        grid: See :func:`glossy_melon`.
-        size: Pixels along an edge.
-        distance: Of the camera, in radii of the melon.
-        fine: Pixels of the truth per pixel, each way.
-        device: Where to render.
-    """
+    """Views, truth and splats of one distance; the truth is made when first asked for."""
 
     def __init__(
         self, grid: int, size: int, distance: float, fine: int, device: torch.device

@@ -22,8 +22,6 @@ from gsfluent.lab.charts.record import Record, commit, machine, now, of_run
 from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.world.driver import World
 
-__all__ = ["broken", "even_dt", "measure", "shuffled", "stepwise"]
-
 MASS = "mass over pieces, KS"
 _SEEDS = 3
 """Runs of a fracture case, moved on the grid; their median error counts."""
@@ -38,11 +36,6 @@ def measure(setting: Setting, device: str, repeat: int = 3) -> Record:
     The error is that of a run that stops at every time the case asks for. The times are those of
     runs that go straight to the last one: what a stop costs is the reader's, not the method's. (The
     textbook solver's own steps cost as much as a stop: its time is that of the judged run.)
-
-    Args:
-        setting: What to run.
-        device: Where.
-        repeat: Timed runs; fewer once they have taken 6 s.
 
     Returns:
         The record; a run that raises or runs out of memory is one that failed.
@@ -212,17 +205,7 @@ def broken(
     seconds: float,
     **facts: Any,
 ) -> Record:
-    """The record of a setting that raised.
-
-    Args:
-        setting: What was to be run.
-        device: Where.
-        error: What it raised.
-        kind: Of the case.
-        points: Material points.
-        seconds: To be simulated [s].
-        **facts: Further settings.
-    """
+    """The record of a setting that raised."""
     words = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
     return Record(
         case=setting.case, kind=kind, method=setting.method, variant=setting.variant,

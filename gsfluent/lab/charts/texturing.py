@@ -25,8 +25,6 @@ from gsfluent.pipeline.texture.photo.exemplar import load_exemplars
 from gsfluent.pipeline.texture.photo.profile import depth_profile, profile_volume
 from gsfluent.pipeline.texture.volume.domain import blend_skin
 
-__all__ = ["XLABEL", "YLABEL", "jobs", "texture", "used"]
-
 XLABEL = "seconds"
 YLABEL = "distance of patches over that of the surface's colours"
 METHODS = ("color_copy", "telea", "profile", "preview", "default", "full")

@@ -19,8 +19,6 @@ from gsfluent.lab.world.shapes import parameters
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
 
-__all__ = ["clock", "rows", "run_case"]
-
 
 def rows(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Laws int32 [M], parameters float64 [M, 8] and alpha at the start [N] of a scene."""

@@ -15,43 +15,28 @@ from typing import Any
 
 from gsfluent.lab.peers import measured as measured
 
-__all__ = ["POINTS", "Known", "courant", "find"]
-
 Switches = Mapping[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """A failure of a released solver.
+    """A failure of a released solver."""
 
-    Attributes:
-        name: Of the point.
-        peer: Whose it is.
-        failure: What fails, in a few words.
-        source: Where it is read.
-        variant: Switches of the textbook solver that have the fault.
-        sound: The same without it.
-        parameters: Numbers of the point, such as ``courant`` = c dt / dx.
-        quantity: What is measured.
-        measure: ``measure(switches, parameters)``.
-        fails: Interval of the measured value in which the failure is there; what is not a number
-            is a failure too.
-        reported: Their own or the specification's figure, where the quantity is the same.
-        shown: Whether the variant shows it; False: it does not, and the test says so.
-    """
-
-    name: str
-    peer: str
-    failure: str
-    source: str
-    variant: Switches
-    sound: Switches
-    parameters: Mapping[str, float]
-    quantity: str
-    measure: Callable[[Switches, Mapping[str, float]], float]
+    name: str  # of the point
+    peer: str  # whose it is
+    failure: str  # what fails, in a few words
+    source: str  # where it is read
+    variant: Switches  # switches of the textbook solver that have the fault
+    sound: Switches  # the same without it
+    parameters: Mapping[str, float]  # numbers of the point, such as courant = c dt / dx
+    quantity: str  # what is measured
+    measure: Callable[[Switches, Mapping[str, float]], float]  # measure(switches, parameters)
+    # interval of the measured value in which the failure is there; what is not a number is a
+    # failure too
     fails: tuple[float, float]
+    # their own or the specification's figure, where the quantity is the same
     reported: float | None = None
-    shown: bool = True
+    shown: bool = True  # whether the variant shows it; False: it does not, and the test says so
 
     def failing(self, value: float) -> bool:
         """Whether a measured value is the failure."""

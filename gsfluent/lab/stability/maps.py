@@ -17,8 +17,6 @@ from typing import Any
 from gsfluent.errors import InputError
 from gsfluent.lab.world.invariants import KINDS, Violation
 
-__all__ = ["LETTERS", "Axis", "Map", "Outcome", "Place", "Point", "Value", "read"]
-
 Value = float | str
 KIND_WORDS = {**KINDS, "order": "two numberings of the same points parted by 1e-4 dx"}
 LETTERS = {
@@ -30,25 +28,16 @@ LETTERS = {
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One axis of a map.
+    """One axis of a map."""
 
-    Attributes:
-        name: Short name, a key of the tables.
-        label: Words with the unit.
-        values: Numbers in rising order, or words.
-        default: Where gsfluent stands by default, or the ordinary scene; one of ``values``.
-        setting: Whether it is a choice of the method; False for a property of the scene.
-        span: Smallest and largest value for which the default is meant to hold; None: all.
-        log: Whether numbers are spaced by factors.
-    """
-
-    name: str
-    label: str
-    values: tuple[Value, ...]
-    default: Value
-    setting: bool = True
+    name: str  # short name, a key of the tables
+    label: str  # words with the unit
+    values: tuple[Value, ...]  # numbers in rising order, or words
+    default: Value  # where gsfluent stands by default, or the ordinary scene; one of values
+    setting: bool = True  # whether it is a choice of the method; False for a property of the scene
+    # smallest and largest value for which the default is meant to hold; None: all
     span: tuple[float, float] | None = None
-    log: bool = True
+    log: bool = True  # whether numbers are spaced by factors
 
     def __post_init__(self) -> None:
         if self.default not in self.values:
@@ -89,85 +78,49 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What one point gave.
+    """What one point gave."""
 
-    Attributes:
-        steps: Steps it was run for at most.
-        violation: The first one; None when it held.
-        points: Material points.
-    """
-
-    steps: int
-    violation: Violation | None
-    points: int
+    steps: int  # steps it was run for at most
+    violation: Violation | None  # the first one; None when it held
+    points: int  # material points
 
 
 @dataclasses.dataclass(frozen=True)
 class Map:
-    """A plane of two settings.
+    """A plane of two settings."""
 
-    Attributes:
-        name: Of the map, its lines and its picture.
-        title: What is drawn.
-        x: Horizontal axis.
-        y: Vertical axis.
-        variants: One panel each; the first is gsfluent as it comes.
-        run: ``run(x, y, variant, place)`` -> outcome.
-        test: Name of the test of its boundary.
-        note: What to see.
-        gpu: Whether it belongs to the subset that is run on a GPU.
-        x_labels: Words of the horizontal axis of variants for which it is another quantity.
-    """
-
-    name: str
-    title: str
-    x: Axis
-    y: Axis
-    variants: tuple[str, ...]
-    run: Callable[[Any, Any, str, Place], Outcome]
-    test: str
-    note: str = ""
-    gpu: bool = False
+    name: str  # of the map, its lines and its picture
+    title: str  # what is drawn
+    x: Axis  # horizontal axis
+    y: Axis  # vertical axis
+    variants: tuple[str, ...]  # one panel each; the first is gsfluent as it comes
+    run: Callable[[Any, Any, str, Place], Outcome]  # run(x, y, variant, place) -> outcome
+    test: str  # name of the test of its boundary
+    note: str = ""  # what to see
+    gpu: bool = False  # whether it belongs to the subset that is run on a GPU
+    # words of the horizontal axis of variants for which it is another quantity
     x_labels: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """One point of one map, run: a line of ``stability.jsonl``.
+    """One point of one map, run: a line of ``stability.jsonl``."""
 
-    Attributes:
-        map: Name of the map.
-        variant: Panel.
-        x: Where.
-        y: Where.
-        limit: Steps it was run for at most.
-        points: Material points.
-        seconds: Wall time.
-        device: ``cpu`` or ``cuda``.
-        machine: Processor and cores, or the GPU.
-        commit: Of gsfluent.
-        date: ISO 8601, UTC.
-        step: Steps to the first violation; None when it held.
-        kind: Of the violation, or empty.
-        value: What was found, None where that is not a number.
-        note: Why a solver stopped.
-    """
-
-    map: str
-    variant: str
-    x: Value
-    y: Value
-    limit: int
-    points: int
-    seconds: float
-    device: str
-    machine: str
-    commit: str
-    date: str
-    step: int | None = None
-    kind: str = ""
-    value: float | None = None
-    note: str = ""
+    map: str  # name of the map
+    variant: str  # panel
+    x: Value  # where
+    y: Value  # where
+    limit: int  # steps it was run for at most
+    points: int  # material points
+    seconds: float  # wall time
+    device: str  # cpu or cuda
+    machine: str  # processor and cores, or the GPU
+    commit: str  # of gsfluent
+    date: str  # ISO 8601, UTC
+    step: int | None = None  # steps to the first violation; None when it held
+    kind: str = ""  # of the violation, or empty
+    value: float | None = None  # what was found, None where that is not a number
+    note: str = ""  # why a solver stopped
 
     @property
     def holds(self) -> bool:

@@ -65,11 +65,11 @@ class Twins:
         return None
 
 
-def twins(make: Callable[[int | None], World], place: Place, steps: int = STEPS) -> Outcome:
+def twins(make: Callable[[int | None], World], place: Place) -> Outcome:
     """Run both numberings until a law is broken or they part."""
     pair = Twins(make)
-    found = search(pair, pair.judge, steps, every=place.every)
-    return Outcome(steps, found, len(pair.back))
+    found = search(pair, pair.judge, STEPS, every=place.every)
+    return Outcome(STEPS, found, len(pair.back))
 
 
 # --- the map itself ---

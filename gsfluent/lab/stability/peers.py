@@ -20,8 +20,6 @@ from gsfluent.figure.map import Mark
 from gsfluent.lab.peers.known import find
 from gsfluent.lab.stability.maps import Map
 
-__all__ = ["KNOWN", "Measured", "marks", "measured"]
-
 _GS = "PhysGaussian, GaussianFluent, Taichi"
 # map -> (variant whose panel shows it, x, y, name)
 KNOWN: dict[str, tuple[tuple[str, float | str, float | str, str], ...]] = {
@@ -63,29 +61,17 @@ KNOWN: dict[str, tuple[tuple[str, float | str, float | str, str], ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """A failure looked for in a program itself, by ``scripts/peers/failures.py``.
+    """A failure looked for in a program itself, by ``scripts/peers/failures.py``."""
 
-    Attributes:
-        map: The map it belongs to.
-        name: Of the experiment.
-        peer: The program and its version.
-        what: What was measured.
-        seen: The figure; NaN where there is none.
-        right: What it should be.
-        failed: Whether the failure was there.
-        note: More.
-        mark: Panel and point of the map, where it has one.
-    """
-
-    map: str
-    name: str
-    peer: str
-    what: str
-    seen: float
-    right: float
-    failed: bool
-    note: str
-    mark: tuple[str, Mark] | None = None
+    map: str  # the map it belongs to
+    name: str  # of the experiment
+    peer: str  # the program and its version
+    what: str  # what was measured
+    seen: float  # the figure; NaN where there is none
+    right: float  # what it should be
+    failed: bool  # whether the failure was there
+    note: str  # more
+    mark: tuple[str, Mark] | None = None  # panel and point of the map, where it has one
 
 
 # name of the experiment -> map, panel, and the keys of "axes" that are its coordinates

@@ -11,34 +11,21 @@ from gsfluent.figure.map import Cell, Mark, Plane, draw_planes, place_of
 from gsfluent.figure.page import Page
 from gsfluent.lab.stability.maps import KIND_WORDS, LETTERS, Axis, Map, Point, Value
 
-__all__ = ["Boundary", "boundaries", "others", "planes", "table", "worst", "write_all"]
-
 LETTER_WORDS = {letter: KIND_WORDS[kind] for kind, letter in LETTERS.items()}
 
 
 @dataclasses.dataclass(frozen=True)
 class Boundary:
-    """How far the default of one map is from failing along one axis.
+    """How far the default of one map is from failing along one axis."""
 
-    Attributes:
-        map: Name of the map.
-        axis: The axis that is walked along.
-        default: Where the walk starts.
-        at: What the other axis stands at.
-        holds: The last value that held; None when the default itself fails.
-        fails: The first value that failed; None when none did.
-        kind: What failed there.
-        step: After how many steps.
-    """
-
-    map: Map
-    axis: Axis
-    default: Value
-    at: Value
-    holds: Value | None
-    fails: Value | None
-    kind: str = ""
-    step: int | None = None
+    map: Map  # name of the map
+    axis: Axis  # the axis that is walked along
+    default: Value  # where the walk starts
+    at: Value  # what the other axis stands at
+    holds: Value | None  # the last value that held; None when the default itself fails
+    fails: Value | None  # the first value that failed; None when none did
+    kind: str = ""  # what failed there
+    step: int | None = None  # after how many steps
 
     def factor(self, value: Value | None) -> float | None:
         """How many times the default a value is, or the default is of it; None without a ratio."""

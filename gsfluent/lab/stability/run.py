@@ -75,14 +75,6 @@ def run_maps(
 ) -> list[Point]:
     """Run what is missing of these maps; every point is written as soon as it is done.
 
-    Args:
-        wanted: The maps.
-        path: The file of lines; points that it has (of this device) are not run again.
-        device: ``cpu`` or ``cuda``.
-        quick: Three by three points of each map.
-        jobs: Processes.
-        progress: Called with (done, all, what).
-
     Returns:
         The points of these maps, those of the file included.
 

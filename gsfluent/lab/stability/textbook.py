@@ -16,8 +16,6 @@ from gsfluent.lab.stability.scenes import DX
 from gsfluent.lab.textbook.solver import Textbook, Variant
 from gsfluent.lab.world.invariants import Limits, State, first_violation, observe
 
-__all__ = ["OfTextbook", "scene_of", "watched_textbook"]
-
 
 def scene_of(
     points: Tensor,
@@ -26,8 +24,6 @@ def scene_of(
     material: Mapping[str, Any],
     *,
     dx: float = DX,
-    body: Tensor | None = None,
-    affine: Tensor | None = None,
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     colliders: Sequence[Mapping[str, Any]] = (),
 ) -> Scene:
@@ -36,8 +32,8 @@ def scene_of(
     return Scene(
         name="stability", dx=dx, x=points.double().numpy(), v=velocity.double().numpy(),
         volume=np.full(n, volume), material=np.zeros(n, np.int32),
-        body=np.zeros(n, np.int32) if body is None else body.int().numpy(),
-        affine=np.zeros((n, 3, 3)) if affine is None else affine.double().numpy(),
+        body=np.zeros(n, np.int32),
+        affine=np.zeros((n, 3, 3)),
         times=np.array([1.0]), materials=(dict(material),), gravity=gravity,
         colliders=tuple(colliders),
     )  # fmt: skip
@@ -49,8 +45,8 @@ class OfTextbook:
     It does not say what colliders gave, so that with colliders its momentum cannot be judged.
     """
 
-    def __init__(self, solver: Textbook, group: Tensor | None = None) -> None:
-        self.solver, self.group = solver, group
+    def __init__(self, solver: Textbook) -> None:
+        self.solver = solver
         rows = []
         for m in solver.scene.materials:
             young, nu = float(m["young_modulus"]), float(m["poisson_ratio"])
@@ -74,7 +70,7 @@ class OfTextbook:
         return observe(
             step=s.steps, time=s.time, dx=s.scene.dx, position=s.position, velocity=s.velocity,
             affine=s.affine, mass=s.mass, volume=s.volume, law=self._law, params=self._params,
-            material=s.material.int(), strain=s.strain, group=self.group, gravity=s.scene.gravity,
+            material=s.material.int(), strain=s.strain, gravity=s.scene.gravity,
             start=self._start, pulled_back=inside_out,
         )  # fmt: skip
 
@@ -102,15 +98,12 @@ def watched_textbook(
     place: Place,
     *,
     dt: float | None = None,
-    cfl: float = 0.5,
-    dtype: torch.dtype = torch.float32,
     limits: Limits | None = None,
-    group: Tensor | None = None,
     **options: Any,
 ) -> Outcome:
     """Run a scene by a variant of the textbook solver under watch."""
     solver = Textbook(
-        scene, Variant(**options), device=place.device, dtype=dtype, dt=dt, cfl=cfl
+        scene, Variant(**options), device=place.device, dtype=torch.float32, dt=dt, cfl=0.5
     )  # fmt: skip
-    found = first_violation(OfTextbook(solver, group), steps, limits=limits, every=place.every)
+    found = first_violation(OfTextbook(solver), steps, limits=limits, every=place.every)
     return Outcome(steps, found, scene.count)

@@ -13,16 +13,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = [
-    "Stencil",
-    "collide",
-    "contact",
-    "deterministic",
-    "node_positions",
-    "scatter",
-    "stencil",
-]
-
 DENSE_NODES, DENSE_SHARE = 2**16, 8
 """Nodes, and nodes per node of a point, beyond which the box around the points is compacted to the
 nodes that are used: points that fly apart make a box of air."""
@@ -31,25 +21,15 @@ _BITS = 40
 
 
 class Stencil(NamedTuple):
-    """Nodes of every point.
+    """Nodes of every point."""
 
-    Attributes:
-        node: Index of each node of a point, int64 [N, S].
-        weight: Its weight, [N, S].
-        slope: Gradient of the weight with respect to the point [1/m], [N, S, 3].
-        place: Of the point from its first node [dx], [N, 3].
-        corner: Of each node from the first [dx], [S, 3].
-        size: Nodes in all.
-        lattice: Integer coordinates of every node, int64 [size, 3].
-    """
-
-    node: Tensor
-    weight: Tensor
-    slope: Tensor
-    place: Tensor
-    corner: Tensor
-    size: int
-    lattice: Tensor
+    node: Tensor  # index of each node of a point, int64 [N, S]
+    weight: Tensor  # its weight, [N, S]
+    slope: Tensor  # gradient of the weight with respect to the point [1/m], [N, S, 3]
+    place: Tensor  # of the point from its first node [dx], [N, 3]
+    corner: Tensor  # of each node from the first [dx], [S, 3]
+    size: int  # nodes in all
+    lattice: Tensor  # integer coordinates of every node, int64 [size, 3]
 
 
 def stencil(cell: Tensor, offset: Tensor, dx: float, kernel: str) -> Stencil:
@@ -148,14 +128,7 @@ def scatter(node: Tensor, values: Tensor, size: int, sums: str, order: Tensor | 
 
 
 def collide(velocity: Tensor, x: Tensor, planes: Sequence[Mapping[str, Any]], dx: float) -> Tensor:
-    """Velocities of nodes after planes (a node at or behind one is in it): equations.md 8.
-
-    Args:
-        velocity: [m/s], [G, 3].
-        x: Positions of the nodes [m], [G, 3].
-        planes: ``point``, ``normal``, ``kind`` (sticky, slip, separate) and ``friction``.
-        dx: Node spacing [m].
-    """
+    """Velocities of nodes after planes (a node at or behind one is in it): equations.md 8."""
     for plane in planes:
         n = torch.tensor([float(c) for c in plane["normal"]], dtype=x.dtype, device=x.device)
         n = n / n.norm()

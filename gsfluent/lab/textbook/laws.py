@@ -11,23 +11,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Elastic", "advance", "clamped", "corotated", "measure", "neo_hookean", "with_stretch"]
-
 
 class Elastic(NamedTuple):
-    """What the laws read of a state.
+    """What the laws read of a state."""
 
-    Attributes:
-        e: b - I, [N, 3, 3].
-        j: Volume ratio, with its sign where F is stored, [N].
-        j2m1: J^2 - 1, [N].
-        log_j: ln J, [N].
-    """
-
-    e: Tensor
-    j: Tensor
-    j2m1: Tensor
-    log_j: Tensor
+    e: Tensor  # b - I, [N, 3, 3]
+    j: Tensor  # volume ratio, with its sign where F is stored, [N]
+    j2m1: Tensor  # J^2 - 1, [N]
+    log_j: Tensor  # ln J, [N]
 
 
 def trace(m: Tensor) -> Tensor:
@@ -50,13 +41,7 @@ def _one(m: Tensor) -> Tensor:
 
 
 def advance(state: Tensor, increment: Tensor, storage: str) -> Tensor:
-    """Push F or e = b - I forward by I + A.
-
-    Args:
-        state: [N, 3, 3].
-        increment: A = dt grad v, [N, 3, 3].
-        storage: ``F`` or ``strain``.
-    """
+    """Push F or e = b - I forward by I + A."""
     if storage == "F":
         return (_one(increment) + increment) @ state  # as codes write it
     h = increment + increment @ state
@@ -87,15 +72,7 @@ def _svd(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def clamped(state: Tensor, storage: str, low: float, high: float, inverted: Tensor) -> Tensor:
-    """State with its volume ratio in [low, high], by an even stretch; what is turned gets ``low``.
-
-    Args:
-        state: F or e, [N, 3, 3].
-        storage: ``F`` or ``strain``.
-        low: Smallest volume ratio.
-        high: Largest.
-        inverted: Points that the step turned inside out, [N]; F knows by itself.
-    """
+    """State with J in [low, high], by an even stretch; what is inverted gets ``low``."""
     m = measure(state, storage)
     turned = inverted | ~(m.j > 0)
     outside = turned | (m.j < low) | (m.j > high)

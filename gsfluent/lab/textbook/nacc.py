@@ -17,8 +17,6 @@ from torch import Tensor
 
 from gsfluent.lab.textbook.laws import Elastic, det, deviator, trace
 
-__all__ = ["MAPS", "Nacc", "Trial", "return_map"]
-
 MAPS = (
     "fixed_explicit",
     "fixed_implicit",

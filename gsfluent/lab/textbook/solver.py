@@ -34,8 +34,6 @@ from gsfluent.lab.textbook.nacc import Nacc, return_map
 from gsfluent.lab.textbook.variant import Birth, Variant
 from gsfluent.lab.world.drives import Drives, damage
 
-__all__ = ["Birth", "Textbook", "Variant", "run_textbook"]
-
 
 def six(m: Tensor) -> Tensor:
     """Entries xx, yy, zz, xy, xz, yz of symmetric matrices, [N, 6]."""
@@ -44,14 +42,6 @@ def six(m: Tensor) -> Tensor:
 
 class Textbook:
     """A scene run by a variant.
-
-    Args:
-        scene: Points, materials (``elastic``, ``nacc``), planes, drives.
-        variant: What to do.
-        device: Where.
-        dtype: Precision of everything.
-        dt: Fixed time step [s]; None: ``cfl dx / (c + |v|)`` with the wave speed c at rest.
-        cfl: Courant number of the automatic step.
 
     Raises:
         ValueError: A law or drive that this solver does not have.
@@ -387,21 +377,10 @@ def run_textbook(
     *,
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
-    cfl: float = 0.5,
     dt: float | None = None,
-    method: str = "textbook",
     **options: Any,
 ) -> Run:
     """Run a scene by the textbook solver.
-
-    Args:
-        scene: The scene.
-        device: Where.
-        dtype: Precision.
-        cfl: Courant number of the automatic time step.
-        dt: Fixed time step [s] instead.
-        method: Name in the record.
-        **options: Fields of :class:`Variant`.
 
     Returns:
         The run; one that broke off says why in ``failed``. Impulses are not kept.
@@ -411,7 +390,7 @@ def run_textbook(
         TypeError: An option that there is not.
     """
     variant = Variant(**options)
-    solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt, cfl=cfl)
+    solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt, cfl=0.5)
     count = scene.times.shape[0]
     x, v = np.full((count, scene.count, 3), math.nan), np.full((count, scene.count, 3), math.nan)
     intact = solver.alpha
@@ -438,10 +417,10 @@ def run_textbook(
         if solver.deformation is not None:
             kept["deformation"][i] = solver.deformation.double().cpu().numpy()
     settings = {
-        "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
+        "dx": scene.dx, "cfl": 0.5, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         **dataclasses.asdict(variant),
     }  # fmt: skip
     return Run(
-        scene.name, method, scene.times, x, v, wall, solver.steps, settings, str(device), failed,
-        **kept,
+        scene.name, "textbook", scene.times, x, v, wall, solver.steps, settings, str(device),
+        failed, **kept,
     )  # fmt: skip

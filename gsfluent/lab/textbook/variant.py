@@ -7,8 +7,6 @@ from typing import Literal, NamedTuple
 
 from gsfluent.lab.textbook.nacc import MAPS
 
-__all__ = ["Birth", "Variant"]
-
 _CHOICES: dict[str, tuple[str, ...]] = {
     "transfer": ("apic", "pic", "flip"),
     "kernel": ("quadratic", "linear"),
@@ -24,49 +22,38 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 class Variant:
     """What others differ by.
 
-    Attributes:
-        transfer: ``apic``, ``pic`` or ``flip``.
-        flip: Share of FLIP in ``flip``.
-        kernel: ``quadratic`` or ``linear`` B-splines.
-        force: ``mls`` (weights times distance), ``gradient`` (of the weights) or ``twice``
-            (gradient times weight: GaussianFluent's released FLIP path).
-        storage: ``F`` or ``strain`` (e = b - I).
-        law: Of elastic rows: ``neo_hookean`` (Borden's) or ``corotated``.
-        return_map: Of NACC rows: one of :data:`gsfluent.lab.textbook.nacc.MAPS`.
-        absolute: Tolerances of 1e-4 Pa in the fixed-centre maps, as ziran and claymore have them.
-        energy_as_pressure: claymore's stress: the energy where its derivative belongs.
-        clamp: Smallest and largest volume ratio that a step may leave, or None.
-        sums: Sums at nodes: ``plain`` in the order of the points, ``sorted`` by cell and number
-            (on a GPU deterministic as well), ``float64``, or ``fixed`` (64-bit integers).
-        shuffle: Seed of a new order of the points in every step, which is how atomic additions
-            behave; None keeps their order.
-        guarded: Divide by a node's mass only where it is more than ``mass_floor``. False divides
-            everywhere, so that a node without mass is 0 / 0; FLIP then does so in the gather of the
-            old velocity only, as GaussianFluent's does.
-        mass_floor: [kg].
-        local_positions: Keep cell and offset in place of absolute coordinates.
-        fields: A velocity field per body, with the contact of equations.md 11.3.
-
     Raises:
         ValueError: A value is none of these.
     """
 
-    transfer: Literal["apic", "pic", "flip"] = "apic"
-    flip: float = 0.99
-    kernel: Literal["quadratic", "linear"] = "quadratic"
+    transfer: Literal["apic", "pic", "flip"] = "apic"  # apic, pic or flip
+    flip: float = 0.99  # share of FLIP in flip
+    kernel: Literal["quadratic", "linear"] = "quadratic"  # quadratic or linear B-splines
+    # mls (weights times distance), gradient (of the weights) or twice (gradient times weight:
+    # GaussianFluent's released FLIP path)
     force: Literal["mls", "gradient", "twice"] = "mls"
-    storage: Literal["F", "strain"] = "F"
+    storage: Literal["F", "strain"] = "F"  # F or strain (e = b - I)
+    # of elastic rows: neo_hookean (Borden's) or corotated
     law: Literal["neo_hookean", "corotated"] = "neo_hookean"
-    return_map: str = "fixed_explicit"
+    return_map: str = "fixed_explicit"  # of NACC rows: one of MAPS
+    # tolerances of 1e-4 Pa in the fixed-centre maps, as ziran and claymore have them
     absolute: bool = False
-    energy_as_pressure: bool = False
+    energy_as_pressure: bool = False  # claymore's stress: the energy where its derivative belongs
+    # smallest and largest volume ratio that a step may leave, or None
     clamp: tuple[float, float] | None = None
+    # sums at nodes: plain in the order of the points, sorted by cell and number (on a GPU
+    # deterministic as well), float64, or fixed (64-bit integers)
     sums: Literal["plain", "sorted", "float64", "fixed"] = "plain"
+    # seed of a new order of the points in every step, which is how atomic additions behave; None
+    # keeps their order
     shuffle: int | None = None
+    # divide by a node's mass only where it is more than mass_floor. False divides everywhere, so
+    # that a node without mass is 0 / 0; FLIP then does so in the gather of the old velocity only,
+    # as GaussianFluent's does
     guarded: bool = True
-    mass_floor: float = 0.0
-    local_positions: bool = False
-    fields: bool = False
+    mass_floor: float = 0.0  # [kg]
+    local_positions: bool = False  # keep cell and offset in place of absolute coordinates
+    fields: bool = False  # A velocity field per body, with the contact of equations.md 11.3
 
     def __post_init__(self) -> None:
         for name, known in _CHOICES.items():
@@ -84,23 +71,14 @@ class Variant:
 
 
 class Birth(NamedTuple):
-    """Where the first number that is none came from.
+    """Where the first number that is none came from."""
 
-    Attributes:
-        stage: ``grid``, ``g2p``, ``return map`` or ``position``.
-        step: Number of the step, from 0.
-        points: How many points it hit.
-        point: The first of them, or -1.
-        alone: No other point shares a node with it.
-        massless: A node of its stencil has no mass.
-    """
-
-    stage: str
-    step: int
-    points: int
-    point: int
-    alone: bool
-    massless: bool
+    stage: str  # grid, g2p, return map or position
+    step: int  # number of the step, from 0
+    points: int  # how many points it hit
+    point: int  # the first of them, or -1
+    alone: bool  # no other point shares a node with it
+    massless: bool  # A node of its stencil has no mass
 
     def __str__(self) -> str:
         where = f"not finite after {self.step} steps, born in the {self.stage}: "

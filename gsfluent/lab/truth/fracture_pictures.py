@@ -25,8 +25,6 @@ from gsfluent import ops
 from gsfluent.data import Camera
 from gsfluent.spatial.zbuffer import nearest_points
 
-__all__ = ["ExposedVoxels", "TrueCloud", "TruePicture"]
-
 _NEIGHBOURS = 16
 """Material points whose motions are blended: all within two spacings."""
 _SIGMA = 0.6
@@ -44,32 +42,20 @@ PARTED = 1.5
 
 @dataclass(frozen=True)
 class ExposedVoxels:
-    """The voxels of one moment that a camera could see.
+    """The voxels of one moment that a camera could see."""
 
-    Attributes:
-        rest: Where they were at rest [m], float32 [M, 3].
-        position: Where they are [m], float32 [M, 3].
-        owner: Material point of each, int64 [M].
-    """
-
-    rest: Tensor
-    position: Tensor
-    owner: Tensor
+    rest: Tensor  # where they were at rest [m], float32 [M, 3]
+    position: Tensor  # where they are [m], float32 [M, 3]
+    owner: Tensor  # material point of each, int64 [M]
 
 
 @dataclass(frozen=True)
 class TruePicture:
-    """What a camera sees of the cloud.
+    """What a camera sees of the cloud."""
 
-    Attributes:
-        image: Display colours over the background, float32 [H, W, 3].
-        alpha: Share of each pixel that is covered, float32 [H, W].
-        depth: Camera z of the matter [m], mean over the covered part, 0 where none, [H, W].
-    """
-
-    image: Tensor
-    alpha: Tensor
-    depth: Tensor
+    image: Tensor  # display colours over the background, float32 [H, W, 3]
+    alpha: Tensor  # share of each pixel that is covered, float32 [H, W]
+    depth: Tensor  # camera z of the matter [m], mean over the covered part, 0 where none, [H, W]
 
 
 class TrueCloud:

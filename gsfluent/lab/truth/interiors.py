@@ -20,33 +20,23 @@ from gsfluent.pipeline.texture.volume.domain import SHELL, InteriorDomain
 if TYPE_CHECKING:
     from gsfluent.data import Solid
 
-__all__ = ["KNOWN_INTERIORS", "KnownInterior", "known_interior", "upright"]
-
 MARGIN = 2.0
 """Empty voxels between the solid and the edge of its cube."""
 
 
 @dataclass(frozen=True)
 class KnownInterior:
-    """One object of a class, with its true inside.
+    """One object of a class, with its true inside."""
 
-    Attributes:
-        name: Class.
-        seed: Which object of the class.
-        domain: What a method is given: voxels, depth, and the colours of the surface.
-        rgb: True colours, float32 [X, Y, Z, 3] in 0..1; zero outside.
-        labels: True inclusions (seeds), int32 [X, Y, Z].
-        settings: Keyword arguments of :func:`exemplar_texture` that a user would choose for this
-            material (guide, directional).
-        cuts: Slice axis ("x", "y", "z") to index of the photographed slice.
-    """
-
-    name: str
-    seed: int
-    domain: InteriorDomain
-    rgb: np.ndarray
-    labels: np.ndarray
+    name: str  # class
+    seed: int  # which object of the class
+    domain: InteriorDomain  # what a method is given: voxels, depth, and the colours of the surface
+    rgb: np.ndarray  # true colours, float32 [X, Y, Z, 3] in 0..1; zero outside
+    labels: np.ndarray  # true inclusions (seeds), int32 [X, Y, Z]
+    # keyword arguments of exemplar_texture that a user would choose for this material (guide,
+    # directional)
     settings: dict[str, Any] = field(default_factory=dict)
+    # slice axis ("x", "y", "z") to index of the photographed slice
     cuts: dict[str, int] = field(default_factory=dict)
 
     def exemplars(self) -> dict[str, np.ndarray]:

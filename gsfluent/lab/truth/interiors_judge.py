@@ -16,8 +16,6 @@ from gsfluent.lab.truth.interiors import KnownInterior
 from gsfluent.pipeline.texture.photo import metrics
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
-__all__ = ["Judge", "Plane", "crossing_error", "held_out_planes", "judge", "sample_plane"]
-
 Plane = tuple[np.ndarray, np.ndarray, np.ndarray]
 """A point on the plane and two unit vectors in it (columns, rows), voxel units."""
 
@@ -31,12 +29,7 @@ _KEEP_OFF = 3.0
 
 
 def held_out_planes(known: KnownInterior, seed: int = 0) -> list[Plane]:
-    """Twelve planes: two off-centre ones across each axis, and six at random angles.
-
-    Args:
-        known: The solid; its photographed slices are avoided.
-        seed: Seed of the random angles.
-    """
+    """Twelve planes: two off-centre ones across each axis, and six at random angles."""
     index = np.argwhere(known.domain.inside)
     low, high = index.min(0), index.max(0) + 1.0
     middle, extent = 0.5 * (low + high), high - low
@@ -88,12 +81,7 @@ def sample_plane(domain: InteriorDomain, rgb: np.ndarray, plane: Plane) -> metri
 
 
 class Judge:
-    """Figures of textures of one known interior, each beside the floor.
-
-    Args:
-        known: The solid with its truth.
-        others: Other draws of the class; the floor is their mean.
-    """
+    """Figures of textures of one known interior, each beside the floor."""
 
     def __init__(self, known: KnownInterior, others: Sequence[KnownInterior]) -> None:
         self.known = known

@@ -15,19 +15,6 @@ from torch import Tensor
 from gsfluent.data import Camera, Gaussians
 from gsfluent.geometry import matrix_to_quaternion
 
-__all__ = [
-    "Ball",
-    "Box",
-    "TrueLamp",
-    "environment_irradiance",
-    "radiance",
-    "rays_of",
-    "sky_share",
-    "solid_splats",
-    "surface_splats",
-    "unblocked",
-]
-
 _GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 
 
@@ -78,21 +65,14 @@ class Box:
 
 @dataclass(frozen=True)
 class TrueLamp:
-    """A disc that shines evenly and faces the scene.
+    """A disc that shines evenly and faces the scene."""
 
-    Attributes:
-        direction: Toward a lamp at infinity, or None.
-        position: Where a lamp is [m], or None.
-        color: Colour times intensity (of a near lamp, at ``distance``).
-        distance: Distance of that intensity [m].
-        spread: Tangent of half the angle of a lamp at infinity, radius [m] of a near one.
-    """
-
-    direction: tuple[float, float, float] | None = None
-    position: tuple[float, float, float] | None = None
+    direction: tuple[float, float, float] | None = None  # toward a lamp at infinity, or None
+    position: tuple[float, float, float] | None = None  # where a lamp is [m], or None
+    # colour times intensity (of a near lamp, at distance)
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    distance: float = 1.0
-    spread: float = 0.0
+    distance: float = 1.0  # distance of that intensity [m]
+    spread: float = 0.0  # tangent of half the angle of a lamp at infinity, radius [m] of a near one
 
     def toward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Unit vectors [..., 3] from points to its middle, and its strength [...] there."""

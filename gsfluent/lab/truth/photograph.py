@@ -16,8 +16,6 @@ from torch.nn import functional
 
 from gsfluent.data import Camera
 
-__all__ = ["Mesh", "around", "marbled", "photograph", "textured", "visible_faces"]
-
 _TILE = 8  # pixels; a triangle is tested in the tiles of its box
 _PAIRS = 100_000  # tiles at a time
 _AMBIENT = 0.45
@@ -26,17 +24,11 @@ _LIGHT = (0.4, 0.75, 0.55)
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles to be photographed.
+    """Triangles to be photographed."""
 
-    Attributes:
-        corners: float32 [F, 3, 3].
-        normals: Unit normals at the corners, float32 [F, 3, 3].
-        color: Colour of surface points: (points [N, 3], face [N], weights [N, 3]) to [N, 3] in
-            0..1.
-    """
-
-    corners: Tensor
-    normals: Tensor
+    corners: Tensor  # float32 [F, 3, 3]
+    normals: Tensor  # unit normals at the corners, float32 [F, 3, 3]
+    # colour of surface points: (points [N, 3], face [N], weights [N, 3]) to [N, 3] in 0..1
     color: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -56,10 +48,10 @@ def textured(image: Tensor, uv: Tensor) -> Callable[[Tensor, Tensor, Tensor], Te
 
 
 def marbled(
-    extent: float, *, seed: int = 0, device: torch.device | str = "cpu"
+    extent: float, *, device: torch.device | str = "cpu"
 ) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
     """A solid colour with detail at many sizes, from sums of waves: something to learn from."""
-    source = torch.Generator().manual_seed(seed)
+    source = torch.Generator().manual_seed(0)
     waves = []
     for octave in range(4):
         way = functional.normalize(torch.randn(6, 3, generator=source), dim=1)
@@ -77,13 +69,13 @@ def marbled(
     return color
 
 
-def around(mesh: Mesh, count: int, size: int, *, fov: float = 35.0) -> list[Camera]:
+def around(mesh: Mesh, count: int, size: int) -> list[Camera]:
     """Cameras on a Fibonacci sphere around a mesh, which fills their pictures [size, size]."""
     points = mesh.corners.reshape(-1, 3).double().cpu()
     low, high = points.amin(0), points.amax(0)
     middle = 0.5 * (low + high)
     radius = float((points - middle).norm(dim=1).max())
-    far = 1.03 * radius / math.sin(math.radians(0.5 * fov))
+    far = 1.03 * radius / math.sin(math.radians(0.5 * 35.0))
     cameras = []
     for index in range(count):
         y = 1.0 - (2.0 * index + 1.0) / count
@@ -93,7 +85,7 @@ def around(mesh: Mesh, count: int, size: int, *, fov: float = 35.0) -> list[Came
         up = (0.0, 1.0, 0.0) if abs(y) < 0.95 else (1.0, 0.0, 0.0)
         cameras.append(
             Camera.look_at(
-                middle + far * away, middle, width=size, height=size, fov=fov, up=up,
+                middle + far * away, middle, width=size, height=size, fov=35.0, up=up,
                 name=f"{index:03d}.webp",
             )
         )  # fmt: skip
@@ -170,14 +162,9 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def photograph(mesh: Mesh, camera: Camera, *, supersample: int = 3) -> Tensor:
-    """One photograph with Lambert shading, RGBA float32 [H, W, 4], straight alpha.
-
-    Args:
-        mesh: What is photographed.
-        camera: A pinhole camera.
-        supersample: Samples per pixel and axis.
-    """
+def photograph(mesh: Mesh, camera: Camera) -> Tensor:
+    """One photograph with Lambert shading, RGBA float32 [H, W, 4], straight alpha."""
+    supersample = 3
     fine = camera.resized(camera.width * supersample, camera.height * supersample)
     face, weight, _ = visible_faces(mesh.corners, fine)
     seen = (face >= 0).flatten()

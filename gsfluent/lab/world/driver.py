@@ -14,8 +14,6 @@ from gsfluent import ops
 from gsfluent.lab.world.resident import Resident, why_not
 from gsfluent.lab.world.stepper import Scene, Stepper, automatic_dt
 
-__all__ = ["World", "running_on"]
-
 Force = Callable[["World", float], None]
 
 _place: list[torch.device] = []
@@ -79,6 +77,17 @@ class World:
     Raises:
         ValueError: A shape, range, law or parameter is wrong.
     """
+
+    time: float  # simulated [s]; these are read from the stepper
+    steps: int  # taken
+    position: Tensor  # [m], [N, 3]
+    strain: Tensor  # elastic strain e = b - I, [N, 6]
+    alpha: Tensor  # log plastic volume ratio (NACC) or the scalar state of the law, [N]
+    peak: Tensor  # largest alpha so far, [N]
+    stress: Tensor  # Kirchhoff stress [Pa], [N, 6]
+    deformation: Tensor | None  # gradient since the start, [N, 3, 3], if tracked
+    impulse: Tensor  # given to the bodies by each collider so far [N s], float64 [K, 3]
+    info: Tensor  # sums over the steps: plastic, guarded, inverted, invalid points, int64 [4]
 
     def __init__(
         self,
@@ -238,6 +247,11 @@ class World:
 
         return tell
 
+    def __getattr__(self, name: str) -> Any:
+        if name == "stepper":  # not made yet
+            raise AttributeError(name)
+        return getattr(self.stepper, name)
+
     def _stepwise(self, what: str) -> Stepper:
         if isinstance(self.stepper, Resident):
             raise ValueError(
@@ -245,21 +259,6 @@ class World:
                 "set it in a force, or build the world with engine='ops'"
             )
         return self.stepper
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self.stepper.time
-
-    @property
-    def steps(self) -> int:
-        """Steps taken."""
-        return self.stepper.steps
-
-    @property
-    def position(self) -> Tensor:
-        """Positions [m], [N, 3]."""
-        return self.stepper.position
 
     @property
     def velocity(self) -> Tensor:
@@ -278,41 +277,6 @@ class World:
     @affine.setter
     def affine(self, value: Tensor) -> None:
         self._stepwise("affine").affine = value
-
-    @property
-    def strain(self) -> Tensor:
-        """Elastic strain e = b - I, [N, 6]."""
-        return self.stepper.strain
-
-    @property
-    def alpha(self) -> Tensor:
-        """Log plastic volume ratio (NACC) or the scalar state of the law, [N]."""
-        return self.stepper.alpha
-
-    @property
-    def peak(self) -> Tensor:
-        """Largest alpha so far, [N]."""
-        return self.stepper.peak
-
-    @property
-    def stress(self) -> Tensor:
-        """Kirchhoff stress [Pa], [N, 6]."""
-        return self.stepper.stress
-
-    @property
-    def deformation(self) -> Tensor | None:
-        """Deformation gradient since the start, [N, 3, 3], if tracked."""
-        return self.stepper.deformation
-
-    @property
-    def impulse(self) -> Tensor:
-        """Given to the bodies by each collider so far [N s], float64 [K, 3]."""
-        return self.stepper.impulse
-
-    @property
-    def info(self) -> Tensor:
-        """Sums over the steps: plastic, guarded, inverted, invalid points, int64 [4]."""
-        return self.stepper.info
 
     def kinetic(self, of: Tensor | None = None) -> float:
         """Kinetic energy [J] with the part in the affine velocities, of all points or a mask."""

@@ -12,8 +12,6 @@ from torch import Tensor
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.world.driver import World
 
-__all__ = ["Drives", "damage"]
-
 
 class _Drive:
     """One drive on a device (keys: :class:`gsfluent.fracturebench.scene.Scene`)."""
@@ -58,13 +56,7 @@ class _Drive:
 
 
 class Drives:
-    """What the drives of a scene do before every step: a force of :class:`World`.
-
-    Args:
-        scene: The scene.
-        dtype: Precision of the velocities.
-        device: Where they are.
-    """
+    """What the drives of a scene do before every step: a force of :class:`World`."""
 
     def __init__(self, scene: Scene, dtype: torch.dtype, device: str | torch.device):
         self._items = [_Drive(scene, item, dtype, torch.device(device)) for item in scene.drives]

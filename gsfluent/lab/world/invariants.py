@@ -20,11 +20,6 @@ from gsfluent import ops
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.resident import Resident
 
-__all__ = [
-    "KINDS", "Limits", "Moving", "OfWorld", "State", "Violation", "check", "first_violation",
-    "observe", "search", "volume_ratio",
-]  # fmt: skip
-
 KINDS = {
     "finite": "a number is not finite",
     "energy": "K + U above 1.05 of the start + work",
@@ -38,77 +33,50 @@ KINDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """How far a run may go.
+    """How far a run may go."""
 
-    Attributes:
-        energy: Largest (K + U - work) over that of the start.
-        momentum: Largest change of momentum that nothing gave, of sqrt(2 M (E0 + work)), the
-            momentum that a body of that mass and energy can have at most.
-        volume: Range of J.
-        path: Largest share of its way by which the centre of mass of a free body may lag behind
-            momentum times time; infinity: not looked at.
-    """
-
-    energy: float = 1.05
+    energy: float = 1.05  # largest (K + U - work) over that of the start
+    # largest change of momentum that nothing gave, of sqrt(2 M (E0 + work)), the momentum that a
+    # body of that mass and energy can have at most
     momentum: float = 1e-5
-    volume: tuple[float, float] = (0.05, 20.0)
+    volume: tuple[float, float] = (0.05, 20.0)  # range of J
+    # largest share of its way by which the centre of mass of a free body may lag behind momentum
+    # times time; infinity: not looked at
     path: float = math.inf
 
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """Sums of one moment of a run; momenta and centres per group of points.
+    """Sums of one moment of a run; momenta and centres per group of points."""
 
-    Attributes:
-        step: Steps so far.
-        time: Simulated time [s].
-        finite: Whether positions, velocities, affine velocities and strains are numbers.
-        kinetic: [J], with the part in the affine velocities.
-        elastic: [J].
-        momentum: [kg m/s], one row per group.
-        moment: Sum of mass times position [kg m], one row per group.
-        volume: Smallest and largest J.
-        given: Impulse from outside since the start [N s], one row per group.
-        work: Work done from outside since the start [J].
-        mass: Mass of each group [kg].
-        pulled_back: Points that the law has pulled back into its range so far, if it counts them.
-        reset: Points that the law has reset because they were not finite, if it counts them.
-        floor: Velocity that is rounding [m/s]: epsilon of the precision times the wave speed.
-    """
-
-    step: int
-    time: float
-    finite: bool
-    kinetic: float
-    elastic: float
-    momentum: tuple[tuple[float, ...], ...]
-    moment: tuple[tuple[float, ...], ...]
-    volume: tuple[float, float]
+    step: int  # steps so far
+    time: float  # simulated time [s]
+    finite: bool  # whether positions, velocities, affine velocities and strains are numbers
+    kinetic: float  # [J], with the part in the affine velocities
+    elastic: float  # [J]
+    momentum: tuple[tuple[float, ...], ...]  # [kg m/s], one row per group
+    moment: tuple[tuple[float, ...], ...]  # sum of mass times position [kg m], one row per group
+    volume: tuple[float, float]  # smallest and largest J
+    # impulse from outside since the start [N s], one row per group
     given: tuple[tuple[float, ...], ...]
-    work: float
-    mass: tuple[float, ...]
+    work: float  # work done from outside since the start [J]
+    mass: tuple[float, ...]  # mass of each group [kg]
+    # points that the law has pulled back into its range so far, if it counts them
     pulled_back: int = 0
-    reset: int = 0
+    reset: int = 0  # points that the law has reset because they were not finite, if it counts them
+    # velocity that is rounding [m/s]: epsilon of the precision times the wave speed
     floor: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Violation:
-    """The first law that a run broke.
+    """The first law that a run broke."""
 
-    Attributes:
-        step: Steps done when it was broken.
-        kind: One of :data:`KINDS`.
-        value: What was found, in units of its limit's quantity.
-        limit: What was allowed.
-        note: More, such as why a solver stopped.
-    """
-
-    step: int
-    kind: str
-    value: float
-    limit: float
-    note: str = ""
+    step: int  # steps done when it was broken
+    kind: str  # one of KINDS
+    value: float  # what was found, in units of its limit's quantity
+    limit: float  # what was allowed
+    note: str = ""  # more, such as why a solver stopped
 
 
 class Moving(Protocol):
@@ -185,7 +153,6 @@ def first_violation(
     *,
     limits: Limits | None = None,
     every: int = 8,
-    start: State | None = None,
     seen: Callable[[State], None] | None = None,
 ) -> Violation | None:
     """Run on until a law is broken, or for a number of steps.
@@ -199,7 +166,6 @@ def first_violation(
         steps: Steps to go at most.
         limits: What is allowed.
         every: Steps between two looks.
-        start: State that it is judged against; default: the present one.
         seen: Called with the state at every good look, those of the halving included.
 
     Returns:
@@ -208,7 +174,7 @@ def first_violation(
     Raises:
         ValueError: ``every`` is not positive.
     """
-    first = start or moving.look()
+    first = moving.look()
 
     def judge() -> Violation | None:
         now = moving.look()

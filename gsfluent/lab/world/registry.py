@@ -10,38 +10,23 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
-__all__ = ["Problem", "Result", "compare", "discover", "problem", "problems", "run"]
-
 Tier = Literal["fast", "slow"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """One figure beside its reference.
+    """One figure beside its reference."""
 
-    Attributes:
-        name: Problem it belongs to.
-        quantity: What was measured.
-        value: The measured figure.
-        reference: What it should be.
-        error: Distance of the two in the measure ``tolerance`` is given in.
-        tolerance: Largest accepted error.
-        unit: Unit of ``value`` and ``reference``.
-        source: Where the reference (or the tolerance) comes from.
-        seconds: CPU time of the whole problem; filled in by :func:`run`.
-        note: Settings or findings worth a column.
-    """
-
-    name: str
-    quantity: str
-    value: float
-    reference: float
-    error: float
-    tolerance: float
-    unit: str = ""
-    source: str = ""
-    seconds: float = 0.0
-    note: str = ""
+    name: str  # problem it belongs to
+    quantity: str  # what was measured
+    value: float  # the measured figure
+    reference: float  # what it should be
+    error: float  # distance of the two in the measure tolerance is given in
+    tolerance: float  # largest accepted error
+    unit: str = ""  # unit of value and reference
+    source: str = ""  # where the reference (or the tolerance) comes from
+    seconds: float = 0.0  # CPU time of the whole problem; filled in by run
+    note: str = ""  # settings or findings worth a column
 
     @property
     def passed(self) -> bool:
@@ -100,10 +85,6 @@ def discover() -> None:
 
 def problems(tier: str = "all", only: str | None = None) -> list[Problem]:
     """Return registered problems in the order of their names.
-
-    Args:
-        tier: ``"fast"``, ``"slow"`` or ``"all"``.
-        only: Keep problems whose name contains this.
 
     Raises:
         ValueError: An unknown tier.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.lab.world.stepper import Scene
-
-__all__ = ["Resident", "why_not"]
 
 
 def why_not(scene: Scene, forced: bool) -> str:
@@ -31,6 +30,16 @@ class Resident:
     Position and strain keep the digits they have there: positions are float64 whatever the
     precision of the rest, since the solver keeps them relative to their cell.
     """
+
+    time: float  # these are read from the solver, as in World
+    steps: int
+    position: Tensor
+    velocity: Tensor
+    affine: Tensor
+    strain: Tensor
+    alpha: Tensor
+    peak: Tensor
+    deformation: Tensor | None
 
     def __init__(
         self,
@@ -53,6 +62,11 @@ class Resident:
         )  # fmt: skip
         rows = 0 if scene.colliders is None else scene.colliders.shape[0]
         self._none = torch.zeros(rows, 3, dtype=torch.float64, device=velocity.device)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "solver":  # not made yet
+            raise AttributeError(name)
+        return getattr(self.solver, name)
 
     def run(
         self, end: float | None, steps: int | None, each: Callable[[float], None] | None
@@ -80,46 +94,6 @@ class Resident:
             raise FloatingPointError(str(error)) from error
 
     @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self.solver.time
-
-    @property
-    def steps(self) -> int:
-        """Steps taken."""
-        return self.solver.steps
-
-    @property
-    def position(self) -> Tensor:
-        """Positions [m], float64 [N, 3]."""
-        return self.solver.position
-
-    @property
-    def velocity(self) -> Tensor:
-        """Velocities [m/s], [N, 3]."""
-        return self.solver.velocity
-
-    @property
-    def affine(self) -> Tensor:
-        """APIC matrices C [1/s], [N, 3, 3]."""
-        return self.solver.affine
-
-    @property
-    def strain(self) -> Tensor:
-        """Elastic strain e = b - I, [N, 6]."""
-        return self.solver.strain
-
-    @property
-    def alpha(self) -> Tensor:
-        """Scalar state of the law, [N]."""
-        return self.solver.alpha
-
-    @property
-    def peak(self) -> Tensor:
-        """Largest alpha so far, [N]."""
-        return self.solver.peak
-
-    @property
     def stress(self) -> Tensor:
         """Kirchhoff stress of the strain [Pa], without viscosity, [N, 6]."""
         scene, strain = self.scene, self.solver.strain
@@ -128,11 +102,6 @@ class Resident:
             params=scene.params, material=scene.material, dt=1.0, **scene.return_map,
         )  # fmt: skip
         return result[2]
-
-    @property
-    def deformation(self) -> Tensor | None:
-        """Deformation gradient since the start, [N, 3, 3]."""
-        return self.solver.deformation
 
     @property
     def impulse(self) -> Tensor:

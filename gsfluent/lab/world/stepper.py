@@ -19,8 +19,6 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.ops.plasticity import weakened
 
-__all__ = ["Scene", "Stepper", "automatic_dt", "wave_speed"]
-
 REACH = 3.0
 """Width of the layer that is repeated behind a periodic face [dx]: a point reads nodes up to 1.5
 away, and those receive from points up to 1.5 further."""

@@ -1,8 +1,7 @@
 """Contact between fields in plain PyTorch, every node at once: the definition, for tests.
 
 Written from docs/theory/contact.md, not from the kernels; run it in float64. Differentiable on the
-piece
-(touching or not, sticking or sliding, which normal) the forward pass is on.
+piece (touching or not, sticking or sliding, which normal) the forward pass is on.
 """
 
 from __future__ import annotations

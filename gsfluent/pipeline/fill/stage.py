@@ -187,11 +187,8 @@ class Fill(Stage):
         if float(depth.max()) < 1.5 * box.voxel:
             logger.warning("fill: nothing but thin parts at this resolution")
         report_progress(progress, 3, total, "interior Gaussians")
-        surface = gaussians.replace(
-            labels=torch.full((gaussians.count,), SURFACE, dtype=torch.int32, device=device)
-        )
         merged, inner, placed = populate(
-            surface,
+            gaussians.labelled(SURFACE),
             matter,
             spacing=self.spacing,
             max_interior=self.max_interior,

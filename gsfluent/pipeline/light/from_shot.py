@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsfluent import materials
 from gsfluent.config import Shot
-from gsfluent.config.read import Place, given
+from gsfluent.config.read import Place
 from gsfluent.config.settings_light import EnvironmentSettings, LightSettings, read_light
 from gsfluent.config.yaml_file import read_yaml
 from gsfluent.errors import InputError
@@ -32,8 +32,8 @@ def light_of(shot: Shot) -> Lighting:
 
 
 def _lighting(settings: LightSettings) -> Lighting:
-    lamps = [Lamp(**given(lamp)) for lamp in (settings.key, *settings.lights)]
-    shared = {name: value for name, value in given(settings).items() if name in _SHARED}
+    lamps = [Lamp(**lamp.given()) for lamp in (settings.key, *settings.lights)]
+    shared = {name: value for name, value in settings.given().items() if name in _SHARED}
     around = None if settings.environment is None else _environment(settings.environment)
     return Lighting(lamps=tuple(lamps), environment=around, **shared)
 

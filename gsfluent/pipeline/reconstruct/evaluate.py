@@ -114,9 +114,7 @@ _ERROR_GAIN = 4.0  # the error panel shows four times the error, grey
 _GAP = 4  # pixels between panels
 
 
-def write_report(
-    folder: str | Path, gaussians: Gaussians, capture: Capture, report: dict[str, Any]
-) -> list[Path]:
+def write_report(folder: str | Path, gaussians: Gaussians, capture: Capture) -> list[Path]:
     """Write ``reconstruct.json``, ``.md`` and, when photographs were held out, ``.png``.
 
     The picture has a row per held-out photograph: as photographed, as rendered, and four times the
@@ -124,9 +122,8 @@ def write_report(
 
     Args:
         folder: Where to; made when missing.
-        gaussians: The result.
+        gaussians: The result; its ``report`` is what stands in the file.
         capture: What it was made from.
-        report: What the stage returned, and what else shall stand in the file.
 
     Returns:
         The files written.
@@ -134,12 +131,12 @@ def write_report(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / "reconstruct.json", folder / "reconstruct.md"]
-    write_json(files[0], report)
-    files[1].write_text(markdown(report), encoding="utf-8")
+    write_json(files[0], gaussians.report)
+    files[1].write_text(markdown(gaussians.report), encoding="utf-8")
     held = capture.split(HOLD_OUT)[1]
     if held is not None:
         files.append(folder / "reconstruct.png")
-        save_image(sheet(gaussians, held, int(report["image_size"])), files[-1])
+        save_image(sheet(gaussians, held, int(gaussians.report["image_size"])), files[-1])
     return files
 
 

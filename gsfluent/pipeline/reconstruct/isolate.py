@@ -82,7 +82,6 @@ class Isolate(Stage):
         self.box = box
         self.radius = radius
         self.margin = float(margin)
-        self.report: dict[str, Any] = {}
 
     def forward(
         self,
@@ -90,7 +89,7 @@ class Isolate(Stage):
         capture: Capture | None = None,
         progress: Progress | None = None,
     ) -> Gaussians:
-        """The object alone; see :meth:`split`."""
+        """The object alone, its ``report`` as well; see :meth:`split`."""
         return self.split(gaussians, capture, progress)[0]
 
     def split(
@@ -107,8 +106,8 @@ class Isolate(Stage):
             progress: Progress callback.
 
         Returns:
-            The object (labels ``SURFACE``) and the background (``BACKGROUND``, may be empty).
-            ``self.report`` says what was found: method, counts, plane, radius.
+            The object (labels ``SURFACE``) and the background (``BACKGROUND``, may be empty);
+            ``report`` of the object says what was found: method, counts, plane, radius.
 
         Raises:
             InputError: Nothing is left, or the method needs a capture.
@@ -119,7 +118,7 @@ class Isolate(Stage):
                 f"isolate: method {method} needs the capture", "give it, or use box or all"
             )
         report_progress(progress, 0, 1, f"isolate by {method}")
-        self.report = {"method": method}
+        report: dict[str, Any] = {"method": method}
         if method == "all":
             keep = torch.ones(gaussians.count, dtype=torch.bool, device=gaussians.device)
         elif method == "labels":
@@ -136,19 +135,20 @@ class Isolate(Stage):
             keep = _in_masks(gaussians, capture)
         else:
             assert capture is not None
-            keep = self._standing(gaussians, capture)
+            keep, found_by = self._standing(gaussians, capture)
+            report |= found_by
         if not bool(keep.any()):
             raise InputError(
                 f"isolate: method {method} found no object among {gaussians.count} Gaussians",
                 "give masks, or a box around the object (isolate: {method: box})",
             )
         report_progress(progress, 1, 1, f"{int(keep.sum())} Gaussians are object")
-        self.report |= {"object": int(keep.sum()), "background": int((~keep).sum())}
-        rest = _labelled(gaussians.select(~keep), BACKGROUND)
-        found = gaussians.select(keep)
+        report |= {"object": int(keep.sum()), "background": int((~keep).sum())}
+        rest = gaussians.select(~keep).labelled(BACKGROUND)
+        found = gaussians.select(keep).replace(report=report)
         if method in ("all", "labels") and found.labels is not None:
             return found, rest  # they say more than this stage knows
-        return _labelled(found, SURFACE), rest
+        return found.labelled(SURFACE), rest
 
     def _method(self, gaussians: Gaussians, capture: Capture | None) -> str:
         if self.method != "auto":
@@ -159,8 +159,8 @@ class Isolate(Stage):
             return "all"
         return "masks" if capture.shows_masks() else "plane"
 
-    def _standing(self, gaussians: Gaussians, capture: Capture) -> Tensor:
-        """Splats above the support plane, in the focus region, connected to its middle."""
+    def _standing(self, gaussians: Gaussians, capture: Capture) -> tuple[Tensor, dict[str, Any]]:
+        """Splats above the support plane, in the focus region, connected to its middle; notes."""
         viewmats = torch.stack([camera.viewmat for camera in capture.cameras])
         middle = focus_point(viewmats)
         radius = self.radius or _focus_radius(capture, middle)
@@ -169,17 +169,20 @@ class Isolate(Stage):
         small = (gaussians.scales.amax(1) < 0.25 * radius).cpu()
         near = (means - middle).norm(dim=1) < radius
         plane = self._support(capture, means[solid & small], middle, radius)
-        self.report |= {"radius": radius, "focus": [round(float(v), 4) for v in middle]}
+        notes: dict[str, Any] = {
+            "radius": radius,
+            "focus": [round(float(v), 4) for v in middle],
+        }
         keep = near & small
         if plane is not None:
-            self.report["plane"] = {
+            notes["plane"] = {
                 "normal": [round(float(v), 4) for v in plane.normal],
                 "offset": round(plane.offset, 5),
                 "share": round(plane.share, 3),
             }
             keep &= plane.height(means) > self.margin * radius
         keep = _connected(gaussians, keep, solid, middle, radius)
-        return keep.to(gaussians.device)
+        return keep.to(gaussians.device), notes
 
     def _support(
         self, capture: Capture, means: Tensor, middle: Tensor, radius: float
@@ -321,8 +324,3 @@ def _connected(
     # Needles that stick out of the body have an end in the open.
     inside = torch.stack([in_body(points) for points in ends]).sum(0)
     return keep & in_body(means) & (inside >= 5)
-
-
-def _labelled(gaussians: Gaussians, label: int) -> Gaussians:
-    labels = torch.full((gaussians.count,), label, dtype=torch.int32, device=gaussians.device)
-    return gaussians.replace(labels=labels)

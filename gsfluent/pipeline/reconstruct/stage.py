@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +68,7 @@ class Reconstruct(Stage):
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
             what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
         clean: Take floaters out of the object at the end (:func:`clean_floaters`).
-        device: Where to train.
+        device: Where to train; where the points of the capture are when None.
         seed: Seed of everything random.
 
     Raises:
@@ -98,7 +97,7 @@ class Reconstruct(Stage):
         checkpoint_every: int | None = None,
         separate: bool = True,
         clean: bool = True,
-        device: str | torch.device = "cpu",
+        device: str | torch.device | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
@@ -148,11 +147,9 @@ class Reconstruct(Stage):
         self.checkpoint_every = int(checkpoint_every or max(250, self.iterations // 10))
         self.separate = bool(separate)
         self.clean = bool(clean)
-        self.device = torch.device(device)
+        self.device = None if device is None else torch.device(device)
 
-    def forward(
-        self, capture: Capture, progress: Progress | None = None
-    ) -> tuple[Gaussians, dict[str, Any]]:
+    def forward(self, capture: Capture, progress: Progress | None = None) -> Gaussians:
         """Train on a capture.
 
         Args:
@@ -160,7 +157,7 @@ class Reconstruct(Stage):
             progress: Called every 10 steps (50 off the CPU) as ``progress(step, total, note)``.
 
         Returns:
-            The Gaussians in the capture's world frame, and the report: ``images, held_out, psnr,
+            The Gaussians in the capture's world frame; ``report`` holds ``images, held_out, psnr,
             ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, train_seconds (without
             reading and judging), resumed_at, start, object_gaussians, history (rows of step, count,
             PSNR on the last training photographs), cleaned`` (see :func:`clean_floaters`; None when
@@ -172,13 +169,14 @@ class Reconstruct(Stage):
             RunError: Training diverged.
         """
         started = time.monotonic()
+        device = self.device or capture.points.device
         train_set, held = capture.split(HOLD_OUT)
-        views = read_views(train_set, self.image_size, self.device, crop=True)
+        views = read_views(train_set, self.image_size, device, crop=True)
         run = _Run(self, Checkpoint(self.checkpoint, self._identity()), progress)
         trained = time.monotonic()
         if views[0].mask is not None:
-            gaussians, start = run.object_of(views, 0, self.iterations), "visual hull"
-            gaussians = _labelled(gaussians, SURFACE)
+            start = "visual hull"
+            gaussians = run.object_of(views, 0, self.iterations).labelled(SURFACE)
         else:
             gaussians, start = run.scene_of(train_set, views), "sparse points"
         if gaussians.count == 0:
@@ -186,7 +184,7 @@ class Reconstruct(Stage):
                 "reconstruct: every Gaussian faded away in training",
                 hint="check that the poses belong to the photographs (gsfluent inspect)",
             )
-        trained = _now(self.device) - trained
+        trained = _now(device) - trained
         labels = gaussians.labels
         report = {
             "images": len(capture),
@@ -207,7 +205,7 @@ class Reconstruct(Stage):
             "train_seconds": round(trained, 2),
             "seconds": round(time.monotonic() - started, 2),
         }
-        return gaussians, report
+        return gaussians.replace(report=report)
 
     def _identity(self) -> dict[str, Any]:
         """What a checkpoint must agree on to be resumed."""
@@ -244,7 +242,7 @@ class _Run:
             steps = max(1, round(_SCENE_SHARE * steps))
         scene = None
         if self.saved is not None and int(self.saved["phase"]) == 1:
-            scene = Checkpoint.scene(self.saved, stage.device)
+            scene = Checkpoint.scene(self.saved, views[0].color.device)
         if scene is None:
             start, extent = point_gaussians(
                 capture,
@@ -272,7 +270,7 @@ class _Run:
             return scene
         found = self.object_of(masked, steps, stage.iterations - steps, scene, found)
         rest, _ = seen_background(found, rest, views)
-        return Gaussians.cat([_labelled(found, SURFACE), _labelled(rest, BACKGROUND)])
+        return Gaussians.cat([found.labelled(SURFACE), rest.labelled(BACKGROUND)])
 
     def object_of(
         self,
@@ -372,8 +370,3 @@ def _now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.monotonic()
-
-
-def _labelled(gaussians: Gaussians, label: int) -> Gaussians:
-    labels = torch.full((gaussians.count,), label, dtype=torch.int32, device=gaussians.device)
-    return replace(gaussians, labels=labels)

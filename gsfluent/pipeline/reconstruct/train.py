@@ -326,4 +326,7 @@ class Checkpoint:
         """The finished scene of a saved second phase."""
         if "scene.means" not in state:
             return None
-        return Gaussians(*(state[f"scene.{name}"].to(device) for name in _FIELDS))
+        means, quats, scales, opacities, sh = (
+            state[f"scene.{name}"].to(device) for name in _FIELDS
+        )
+        return Gaussians(means, quats, scales, opacities, sh)

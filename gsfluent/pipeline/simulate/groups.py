@@ -1,8 +1,7 @@
 """Groups of points that move without the grid: first flights, pieces in flight, sleepers.
 
-A group leaves the grid at a frame and comes back as soon as something that moves is close. What
-is decided here is who may leave; :mod:`gsfluent.pipeline.simulate.step` decides when to come
-back.
+A group leaves the grid at a frame and comes back as soon as something that moves is close. What is
+decided here is who may leave; :mod:`gsfluent.pipeline.simulate.step` decides when to come back.
 """
 
 from __future__ import annotations

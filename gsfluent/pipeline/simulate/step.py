@@ -1,9 +1,8 @@
 """Advances the state of a simulation: matter on the grid, and what may be left out of it.
 
-The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many steps
-per call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and loose
-debris.
-A call ends when something may come close to a group, which then joins the grid.
+The grid belongs to an engine (:mod:`gsfluent.pipeline.simulate.resident`) that takes many steps per
+call. Beside it move groups in closed form (:mod:`gsfluent.pipeline.simulate.groups`) and loose
+debris. A call ends when something may come close to a group, which then joins the grid.
 """
 
 from __future__ import annotations

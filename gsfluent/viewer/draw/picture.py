@@ -32,19 +32,12 @@ _BARE = (0.93, 0.93, 0.94)  # ground when there is no floor
 
 @dataclass(frozen=True)
 class Drawn:
-    """What of a frame is drawn.
+    """What of a frame is drawn."""
 
-    Attributes:
-        gaussians: Splats, coloured and cut.
-        groups: Siblings, int32 [N].
-        gloss: Highlights of each splat, [N, 2], or None.
-        legend: What the colours mean, or None.
-    """
-
-    gaussians: Gaussians
-    groups: Tensor
-    gloss: Tensor | None
-    legend: Legend | None
+    gaussians: Gaussians  # Splats, coloured and cut
+    groups: Tensor  # Siblings, int32 [N]
+    gloss: Tensor | None  # Highlights of each splat, [N, 2], or None
+    legend: Legend | None  # What the colours mean, or None
 
 
 class PictureMaker:

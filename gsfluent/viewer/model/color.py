@@ -40,18 +40,12 @@ _STOPS = 24  # of a scale in the page
 
 @dataclass(frozen=True)
 class Legend:
-    """What colours mean.
+    """What colours mean."""
 
-    Attributes:
-        title: Quantity and unit.
-        bar: Colours [B, 3] of a scale from left to right, or None.
-        ticks: Labels along the bar, evenly spaced.
-        entries: Colour and label each, for things that are counted.
-    """
-
-    title: str
-    bar: np.ndarray | None = None
-    ticks: tuple[str, ...] = ()
+    title: str  # Quantity and unit
+    bar: np.ndarray | None = None  # Colours [B, 3] of a scale from left to right, or None
+    ticks: tuple[str, ...] = ()  # Labels along the bar, evenly spaced
+    # Colour and label each, for things that are counted.
     entries: tuple[tuple[tuple[float, float, float], str], ...] = ()
 
     def html(self) -> str:

@@ -22,32 +22,21 @@ AXES: dict[str, tuple[float, float, float]] = {
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane that hides what lies in front of it.
+    """A plane that hides what lies in front of it."""
 
-    Attributes:
-        normal: Toward the hidden side, any length but zero.
-        offset: Distance [m] of the plane from the middle of the matter, along the normal.
-    """
-
-    normal: tuple[float, float, float] = AXES["y"]
-    offset: float = 0.0
+    normal: tuple[float, float, float] = AXES["y"]  # Toward the hidden side, any length but zero
+    offset: float = 0.0  # Distance [m] of the plane from the middle of the matter, along the normal
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a moment is drawn.
+    """How a moment is drawn."""
 
-    Attributes:
-        color_by: One of :data:`COLOR_BY`.
-        light: The lamps; None shows captured colours as they are.
-        cut: The cut plane, or None.
-        floor: Whether floor and backdrop are drawn.
-    """
-
-    color_by: str = APPEARANCE
+    color_by: str = APPEARANCE  # One of :data:`COLOR_BY`
+    # The lamps; None shows captured colours as they are.
     light: Lighting | None = field(default_factory=Lighting)
-    cut: Cut | None = None
-    floor: bool = True
+    cut: Cut | None = None  # The cut plane, or None
+    floor: bool = True  # Whether floor and backdrop are drawn
 
 
 def direction(azimuth: float, elevation: float) -> tuple[float, float, float]:

@@ -32,22 +32,14 @@ NOW = "#30343b"
 
 @dataclass(frozen=True)
 class Plot:
-    """One chart.
+    """One chart."""
 
-    Attributes:
-        name: What it shows.
-        title: Name and unit.
-        time: Times [s], [F].
-        labels: Names of the curves.
-        colors: Their CSS colours.
-        values: Their values in the unit of the title, [F] each; NaN where unknown.
-    """
-
-    name: str
-    title: str
-    time: np.ndarray
-    labels: tuple[str, ...]
-    colors: tuple[str, ...]
+    name: str  # What it shows
+    title: str  # Name and unit
+    time: np.ndarray  # Times [s], [F]
+    labels: tuple[str, ...]  # Names of the curves
+    colors: tuple[str, ...]  # Their CSS colours
+    # Their values in the unit of the title, [F] each; NaN where unknown.
     values: tuple[np.ndarray, ...]
 
     def columns(self, now: float) -> tuple[np.ndarray, ...]:

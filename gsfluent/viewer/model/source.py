@@ -28,14 +28,10 @@ _SOLIDS = ("texture", "fill")  # stages that leave solids, the best first
 
 
 class Source(Protocol):
-    """A growing list of frames.
+    """A growing list of frames."""
 
-    Attributes:
-        title: Short name for the page.
-        shot: The shot, where it is known: its light, floor and backdrop are the viewer's first.
-    """
-
-    title: str
+    title: str  # Short name for the page
+    # The shot, where it is known: its light, floor and backdrop are the viewer's first.
     shot: Shot | None
 
     def count(self) -> int:

@@ -26,17 +26,11 @@ _DEFAULT_FPS = 30.0
 
 @dataclass(frozen=True)
 class Survey:
-    """What one frame adds to the whole.
+    """What one frame adds to the whole."""
 
-    Attributes:
-        center: Robust centre of the matter [m].
-        radius: Distance from it that holds nine tenths of the matter [m].
-        speed: Speed that one point in a hundred exceeds [m/s].
-    """
-
-    center: tuple[float, float, float]
-    radius: float
-    speed: float
+    center: tuple[float, float, float]  # Robust centre of the matter [m]
+    radius: float  # Distance from it that holds nine tenths of the matter [m]
+    speed: float  # Speed that one point in a hundred exceeds [m/s]
 
     @classmethod
     def of(cls, frame: SavedFrame) -> Survey:

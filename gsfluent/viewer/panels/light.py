@@ -24,17 +24,11 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Handles:
-    """A lamp in the terms of the sliders.
+    """A lamp in the terms of the sliders."""
 
-    Attributes:
-        azimuth: Around the object [degrees].
-        elevation: Above the floor [degrees].
-        distance: From the object [m]; None for a lamp that is far away.
-    """
-
-    azimuth: float
-    elevation: float
-    distance: float | None
+    azimuth: float  # Around the object [degrees]
+    elevation: float  # Above the floor [degrees]
+    distance: float | None  # From the object [m]; None for a lamp that is far away
 
     @classmethod
     def of(cls, lamp: Lamp, pivot: Vector) -> Handles:

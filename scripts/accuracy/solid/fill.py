@@ -45,9 +45,9 @@ def reconstructed(
     path = cache / f"{name}.npz"
     if not path.is_file():
         stage = Reconstruct(given.steps, given.splats, image_size=given.size, device=given.device)
-        gaussians, report = stage(capture)
+        gaussians = stage(capture)
         save_splats(gaussians, path)
-        sys.stderr.write(f"{name}: {gaussians.count} splats, {report['psnr']:.2f} dB\n")
+        sys.stderr.write(f"{name}: {gaussians.count} splats, {gaussians.report['psnr']:.2f} dB\n")
     return load_splats(path), capture
 
 

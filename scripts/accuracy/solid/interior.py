@@ -205,7 +205,7 @@ def demos(cache: Path) -> Iterator[Case]:
         capture = load_capture(folder)
         path = folder / "object.ply"
         if not path.is_file():
-            whole, _ = Reconstruct(800, 30_000)(capture)
+            whole = Reconstruct(800, 30_000)(capture)
             save_splats(Isolate().split(whole, capture)[0], path)
         label = f"{name}, " + ("masks" if support == "none" else "on a table, no masks")
         texture = {"exemplar": str(folder / "cut.png"), "quality": "preview"}

@@ -113,7 +113,7 @@ def trained() -> tuple[Gaussians, SignedDistance, Any]:
     """A melon reconstructed from photographs, its true solid, and the folder of them."""
     folder = tempfile.TemporaryDirectory()
     demo.make_capture("watermelon", folder.name, views=42, size=160)
-    gaussians, _ = Reconstruct(400, 20_000, image_size=160)(load_capture(folder.name))
+    gaussians = Reconstruct(400, 20_000, image_size=160)(load_capture(folder.name))
     fruit = demo.make_object("watermelon", 0)
     low, high = fruit.bounds()
     voxel = float((high - low).max()) / 128

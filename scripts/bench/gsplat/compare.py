@@ -95,7 +95,7 @@ def run_ours(
     values = {k: v for k, v in WHOLE.items() if k in known}
     values |= {"iterations": options.iterations, "image_size": options.image_size}
     values |= {"device": options.device, "seed": options.seed} | given
-    _, report = gf.pipeline.Reconstruct(**values)(capture)
+    report = gf.pipeline.Reconstruct(**values)(capture).report
     keys = ("iterations", "gaussians", "psnr", "ssim", "image_size", "held_out", "start")
     line = {key: report[key] for key in keys}
     line["seconds"] = report.get("train_seconds", report["seconds"])

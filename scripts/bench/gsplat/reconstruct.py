@@ -119,9 +119,10 @@ def main(arguments: list[str]) -> int:
             if done % 500 == 0 or done == total:
                 sys.stderr.write(f"{done}/{total} {note}\n")
 
-        gaussians, report = stage(capture, progress=show)
+        gaussians = stage(capture, progress=show)
+        report = gaussians.report
         if options.report is not None:
-            write_report(options.report, gaussians, capture, report)
+            write_report(options.report, gaussians, capture)
     if options.out is not None:
         if options.isolate:
             gaussians = gf.pipeline.Isolate()(gaussians, capture)

@@ -77,9 +77,10 @@ def test_views_are_cropped_without_moving_the_projection(capture: Capture) -> No
 def test_small_reconstruction_reaches_its_bar_and_resumes(capture: Capture, tmp_path: Path) -> None:
     settings = {"iterations": 300, "image_size": 80, "start_gaussians": 4000, "seed": 1}
     seen: list[int] = []
-    gaussians, report = Reconstruct(**settings)(
+    gaussians = Reconstruct(**settings)(
         capture, progress=lambda done, total, note: seen.append(done)
     )
+    report = gaussians.report
     assert report["psnr"] > 25.0 and report["ssim"] > 0.85 and report["psnr_inside"] > 22.0
     assert report["held_out"] == 3 and report["images"] == 24
     assert report["gaussians"] == gaussians.count and seen[-1] == 300
@@ -94,7 +95,7 @@ def test_small_reconstruction_reaches_its_bar_and_resumes(capture: Capture, tmp_
     with pytest.raises(KeyboardInterrupt):
         stage(capture, progress=interrupt)
     assert file.is_file()
-    _, resumed = stage(capture)
+    resumed = stage(capture).report
     assert resumed["resumed_at"] == 100
     assert resumed["psnr"] == pytest.approx(report["psnr"], abs=0.5)
     file.write_bytes(b"not a checkpoint")
@@ -107,19 +108,20 @@ def test_count_stays_under_the_cap_and_isotropic_kernels_are_round(capture: Capt
         iterations=170, image_size=64, max_gaussians=700, start_gaussians=600,
         kernel="isotropic", gradient_threshold=1e-9,
     )  # fmt: skip
-    gaussians, report = stage(capture)
+    gaussians = stage(capture)
+    report = gaussians.report
     assert 600 < report["gaussians"] <= 700
     assert torch.equal(gaussians.scales[:, 0], gaussians.scales[:, 2])
 
 
 def test_a_capture_without_masks_is_learned_whole_and_the_object_isolated(table: Capture) -> None:
     stage = Reconstruct(iterations=200, image_size=64, start_gaussians=3000, separate=False)
-    gaussians, report = stage(table)
+    gaussians = stage(table)
+    report = gaussians.report
     assert report["start"] == "sparse points" and report["psnr_region"] == "whole image"
     assert report["psnr"] > 14.0
-    isolate = Isolate()
-    found, rest = isolate.split(gaussians, table)
-    assert isolate.report["plane"]["normal"][2] > 0.97
+    found, rest = Isolate().split(gaussians, table)
+    assert found.report["plane"]["normal"][2] > 0.97
     assert found.labels is not None and rest.labels is not None
     assert set(found.labels.tolist()) == {SURFACE} and set(rest.labels.tolist()) == {BACKGROUND}
     truth = demo.make_object("watermelon", 0)
@@ -142,7 +144,8 @@ def test_object_is_learned_again_from_its_silhouettes_and_resumes(
 
     with pytest.raises(KeyboardInterrupt):
         stage(table, progress=interrupt)
-    gaussians, report = stage(table)
+    gaussians = stage(table)
+    report = gaussians.report
     assert report["resumed_at"] == 190
     assert gaussians.labels is not None
     assert report["object_gaussians"] == int((gaussians.labels == SURFACE).sum()) > 500
@@ -181,6 +184,17 @@ def test_isolate_by_box_and_by_masks(capture: Capture) -> None:
         Isolate("box", box=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))(pair, None)
     with pytest.raises(InputError, match="needs a box"):
         Isolate("box")
+
+
+def test_a_stage_keeps_nothing_of_what_it_saw(capture: Capture) -> None:
+    means = demo.make_object("watermelon", 0).center[None].float()
+    one = Gaussians.from_colors(means, torch.full((1,), 0.01), torch.rand(1, 3))
+    isolate = Isolate()
+    before = dict(vars(isolate))
+    found = isolate(one, capture)
+    assert found.report == {"method": "masks", "object": 1, "background": 0}
+    assert vars(isolate) == before and one.report == {}
+    assert found.to("cpu").select(torch.tensor([0])).report == found.report
 
 
 def test_plane_is_found_among_outliers() -> None:

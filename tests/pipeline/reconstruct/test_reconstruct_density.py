@@ -188,7 +188,7 @@ def test_fewer_gaussians_for_a_lower_target(capture: Capture) -> None:
         stage = Reconstruct(
             300, image_size=64, start_gaussians=1500, target_psnr=wanted, gradient_threshold=2e-4
         )
-        _, report = stage(capture)
+        report = stage(capture).report
         counts[wanted] = report["gaussians"]
         if wanted is not None:
             assert report["history"][-1][2] > wanted
@@ -214,8 +214,8 @@ def test_exposure_is_the_identity_where_photographs_agree() -> None:
 
 def test_exposure_of_consistent_photographs_stays_small(capture: Capture) -> None:
     settings = {"iterations": 200, "image_size": 48, "start_gaussians": 1000}
-    _, plain = Reconstruct(**settings)(capture)
-    _, learned = Reconstruct(**settings, exposure=True)(capture)
+    plain = Reconstruct(**settings)(capture).report
+    learned = Reconstruct(**settings, exposure=True)(capture).report
     assert learned["psnr"] == pytest.approx(plain["psnr"], abs=0.4)
 
 
@@ -225,7 +225,8 @@ def test_resumed_run_is_the_whole_run(capture: Capture, tmp_path: Path, densify:
         "iterations": 130, "image_size": 48, "start_gaussians": 600, "densify": densify,
         "exposure": True, "recipe": "long", "sh_degree": 1, "target_psnr": 25.0, "seed": 3,
     }  # fmt: skip
-    whole, report = Reconstruct(**settings)(capture)
+    whole = Reconstruct(**settings)(capture)
+    report = whole.report
     stage = Reconstruct(**settings, checkpoint=tmp_path / "state.pt", checkpoint_every=45)
 
     def interrupt(done: int, total: int, note: str) -> None:
@@ -234,7 +235,8 @@ def test_resumed_run_is_the_whole_run(capture: Capture, tmp_path: Path, densify:
 
     with pytest.raises(KeyboardInterrupt):
         stage(capture, progress=interrupt)
-    resumed, again = stage(capture)
+    resumed = stage(capture)
+    again = resumed.report
     assert again["resumed_at"] == 90 and again["psnr"] == report["psnr"]
     assert again["history"] == report["history"]
     for name in ("means", "quats", "scales", "opacities", "sh"):
@@ -255,8 +257,9 @@ def test_recipe_follows_the_length_of_the_run() -> None:
 def test_report_shows_held_out_photographs_and_quality_against_count(
     capture: Capture, tmp_path: Path
 ) -> None:
-    gaussians, report = Reconstruct(110, image_size=48, start_gaussians=600)(capture)
-    files = write_report(tmp_path / "report", gaussians, capture, report)
+    gaussians = Reconstruct(110, image_size=48, start_gaussians=600)(capture)
+    report = gaussians.report
+    files = write_report(tmp_path / "report", gaussians, capture)
     assert [file.name for file in files] == [
         "reconstruct.json",
         "reconstruct.md",

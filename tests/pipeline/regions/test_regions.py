@@ -30,6 +30,7 @@ from gsfluent.pipeline.matter.points import build_matter, grid_spacing
 from gsfluent.pipeline.regions.associate import associate
 from gsfluent.pipeline.regions.image import image_labels
 from gsfluent.pipeline.regions.project import label_regions, project_labels
+from gsfluent.pipeline.regions.stage import Regions
 from gsfluent.pipeline.regions.vote import find_skin, label_votes
 from gsfluent.scene.scene import Scene
 
@@ -258,13 +259,30 @@ def test_a_cut_labels_by_depth(solid: Solid, tmp_path: Path) -> None:
     assert any("3" in note for note in notes)
 
 
+def test_the_stage_takes_parts_and_labels_as_the_function_does(
+    solid: Solid, tmp_path: Path
+) -> None:
+    cameras = ring(6)
+    where = {"mask": write_masks(tmp_path / "cap", cameras, 3)}
+    stage = Regions([{"name": "cap", "where": where, "cohesion": 2.0}])
+    before = dict(vars(stage))
+    labelled, same = (
+        stage(solid, capture_of(cameras)),
+        label_regions(solid, [where], capture_of(cameras)),
+    )
+    assert labelled.regions is not None and same.regions is not None
+    assert bool((labelled.regions > 0).any()) and torch.equal(labelled.regions, same.regions)
+    assert labelled.report["region_sources"] == same.report["region_sources"]
+    assert vars(stage) == before
+
+
 def test_what_is_missing_is_said(solid: Solid, tmp_path: Path) -> None:
     cameras = ring(6)
     folder = write_masks(tmp_path / "cap", cameras, 3)
     part = {"name": "cap", "where": {"mask": folder}, "cohesion": 2.0}
     with pytest.raises(InputError, match="need the photographs"):
         label_regions(solid, [part["where"]])
-    with pytest.raises(InputError, match=r"not projected onto this solid[\s\S]*label_regions"):
+    with pytest.raises(InputError, match=r"not projected onto this solid[\s\S]*Regions\(parts\)"):
         Scene().add(solid, parts=[part])
     with pytest.raises(InputError, match="no region called 'leaf'"):
         scene = Scene()

@@ -78,15 +78,15 @@ def smooth_ball(radius: float) -> tuple[Tensor, Tensor]:
 
 
 @problem(tier="fast")
-def pull_apart(speed: float = 0.01, gap: float = 0.0, one_field: bool = False) -> Result:
+def pull_apart(gap: float = 0.0, one_field: bool = False) -> Result:
     """Two touching blocks that leave each other keep their speed.
 
     Args:
-        speed: Of each block over the wave speed.
         gap: Between them at the start [dx].
         one_field: Both blocks in one velocity field: they stay glued, which is the failure the
             fields are there to cure.
     """
+    speed = 0.01
     size = (4.0, 4.0, 4.0)
     parts = [box((-4.0, 0.0, 0.0), size, SPACING), box((gap, 0.0, 0.0), size, SPACING)]
     away = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
@@ -125,16 +125,10 @@ TURNS = (None, ((1.0, 2.0, 3.0), 0.7), ((-2.0, 1.0, 0.5), 1.9))
 
 @problem(tier="slow")
 def oblique_spheres(
-    radius: float = 7.0, speed: float = 0.05, one_field: bool = False, turns: int = 3
+    radius: float = 7.0, one_field: bool = False, turns: int = 3
 ) -> Iterator[Result]:
-    """Frictionless balls that meet at 45 degrees leave without spin.
-
-    Args:
-        radius: [dx], a multiple of half a cell.
-        speed: Of each ball over the wave speed.
-        one_field: Both in one velocity field, for comparison.
-        turns: In how many directions through the grid.
-    """
+    """Frictionless balls that meet at 45 degrees leave without spin."""
+    speed = 0.05
     for number, turn in enumerate(TURNS[:turns]):
         q = torch.eye(3, dtype=torch.float64) if turn is None else rotation(*turn)
         world, balls, _ = _impact(radius, 45.0, speed, q, one_field=one_field)
@@ -150,18 +144,10 @@ def oblique_spheres(
 
 
 @problem(tier="slow")
-def hertz_spheres(
-    radius: float = 7.0, speed: float = 0.025, turn: int = 1, one_field: bool = False
-) -> list[Result]:
-    """Head-on elastic balls: largest force, time of contact and restitution.
-
-    Args:
-        radius: [dx], a multiple of half a cell.
-        speed: Of each ball over the wave speed.
-        turn: Direction through the grid.
-        one_field: Both in one velocity field: what the transfer alone loses.
-    """
-    chosen = TURNS[turn]
+def hertz_spheres(radius: float = 7.0, one_field: bool = False) -> list[Result]:
+    """Head-on elastic balls: largest force, time of contact and restitution."""
+    speed = 0.025
+    chosen = TURNS[1]
     q = torch.eye(3, dtype=torch.float64) if chosen is None else rotation(*chosen)
     world, balls, line = _impact(radius, 0.0, speed, q, one_field=one_field)
     mass = float(world.scene.mass[balls[0]].sum())
@@ -194,15 +180,13 @@ def hertz_spheres(
 
 
 @problem(tier="slow")
-def hertz_axis(radius: float = 7.2, speed: float = 0.05) -> Iterator[Result]:
+def hertz_axis() -> Iterator[Result]:
     """Head-on lattice balls along an axis of the grid: the setting of solver.md 0, finding 5.
 
     There contact of two fields acts wherever both have mass, 1.5 to 2.5 cells before they touch.
-
-    Args:
-        radius: [dx].
-        speed: Of each ball over the wave speed.
     """
+    speed = 0.05
+    radius = 7.2
     points = ball([0.0, 0.0, 0.0], radius, SPACING)
     along = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
     place = torch.tensor([radius + 0.5, 0.0, 0.0], dtype=torch.float64)
@@ -221,12 +205,9 @@ def hertz_axis(radius: float = 7.2, speed: float = 0.05) -> Iterator[Result]:
 
 
 @problem(tier="slow")
-def colliding_discs(dx: float = 0.025) -> list[Result]:
-    """Two elastic discs meet and part (Sulsky et al. 1994).
-
-    Args:
-        dx: Node spacing [m].
-    """
+def colliding_discs() -> list[Result]:
+    """Two elastic discs meet and part (Sulsky et al. 1994)."""
+    dx = 0.025
     spacing = dx / 2.0
     thick = 4.0 * dx  # as deep as the period: plane strain
     parts = [disc((c, c, 0.5 * thick), 0.2, thick, spacing) for c in (0.3, 0.7)]

@@ -18,10 +18,6 @@ SOURCE = "elastic; Sulsky et al. 1994, solver.md 3, row 7"
 def collide(cells: int, fields: int) -> tuple[float, float, float, float, str]:
     """Let two discs (r 0.2 m, E 1000, nu 0.3, rho 1000, 0.14 m/s each) meet head-on and part.
 
-    Args:
-        cells: Cells per radius.
-        fields: 1: they meet in one velocity field; 2: by contact of two.
-
     Returns:
         Kinetic and whole energy after over before, largest gain of energy, largest momentum over
         sum m |v|, and what else was seen.

@@ -52,13 +52,7 @@ def _block() -> Tensor:
 
 
 def slide(friction: float, angle: float = 45.0, dtype: torch.dtype = torch.float64) -> Result:
-    """Coefficient of friction seen in the acceleration of a sliding block.
-
-    Args:
-        friction: Below tan(angle). With 0 the acceleration itself is compared.
-        angle: Of the incline [degrees].
-        dtype: Precision.
-    """
+    """Coefficient of friction seen in the acceleration of a sliding block."""
     world, block = _on_slab(_block(), 22.0, 10.0, angle, friction, dtype=dtype)
     # Friction starts from nothing and a shear wave runs through the block: measured after that.
     world.run(40.0)
@@ -80,13 +74,9 @@ def slide(friction: float, angle: float = 45.0, dtype: torch.dtype = torch.float
 
 
 @problem(tier="fast")
-def block_on_incline(friction: float = 0.5) -> Result:
-    """A block slides down 45 degrees as Coulomb's law says.
-
-    Args:
-        friction: Below 1.
-    """
-    return slide(friction)
+def block_on_incline() -> Result:
+    """A block slides down 45 degrees as Coulomb's law says."""
+    return slide(0.5)
 
 
 @problem(tier="slow")
@@ -98,13 +88,10 @@ def block_on_inclines() -> Iterator[Result]:
 
 
 @problem(tier="fast")
-def block_stops(friction: float = 0.5, speed: float = 0.06) -> Result:
-    """A block thrown along a level surface stops after v^2 / (2 mu g).
-
-    Args:
-        friction: Coefficient.
-        speed: At the start over the wave speed.
-    """
+def block_stops() -> Result:
+    """A block thrown along a level surface stops after v^2 / (2 mu g)."""
+    speed = 0.06
+    friction = 0.5
     world, block = _on_slab(_block(), 16.0, 10.0, 0.0, friction, speed)
     start = float(world.center(block)[0])
     want = speed**2 / (2.0 * friction * PULL)
@@ -116,13 +103,9 @@ def block_stops(friction: float = 0.5, speed: float = 0.06) -> Result:
 
 
 @problem(tier="fast")
-def block_rests(friction: float = 1.5) -> list[Result]:
-    """A block on 45 degrees whose friction exceeds 1 stays where it is.
-
-    Args:
-        friction: Above 1.
-    """
-    world, block = _on_slab(_block(), 16.0, 10.0, 45.0, friction)
+def block_rests() -> list[Result]:
+    """A block on 45 degrees whose friction exceeds 1 stays where it is."""
+    world, block = _on_slab(_block(), 16.0, 10.0, 45.0, 1.5)
     world.run(60.0)
     window: list[Tensor] = []
     world.run(120.0, each=lambda now: window.append(now.center(block)))
@@ -139,19 +122,14 @@ def block_rests(friction: float = 1.5) -> list[Result]:
 
 
 @problem(tier="slow")
-def ball_rolls(radius: float = 6.0, angle: float = 20.0, friction: float = 0.5) -> list[Result]:
-    """A ball rolls down an incline with 5/7 g sin(angle) and does not slip.
-
-    Args:
-        radius: [dx], a multiple of half a cell.
-        angle: Of the incline [degrees], tan(angle) <= 3.5 friction.
-        friction: Coefficient.
-    """
+def ball_rolls() -> list[Result]:
+    """A ball rolls down an incline with 5/7 g sin(angle) and does not slip."""
+    radius = 6.0
     points, volume = smooth_ball(radius)
     points = points + torch.tensor([radius, 0.0, radius], dtype=torch.float64)
     slab = torch.full((round(24 / SPACING) * round(12 / SPACING) * round(3 / SPACING),), SPACING**3)
     volume = torch.cat([volume, slab.double()])
-    slope, calm = math.radians(angle), 150.0
+    slope, calm = math.radians(20.0), 150.0
     level = PULL * torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     tilted = PULL * torch.tensor([math.sin(slope), 0.0, -math.cos(slope)], dtype=torch.float64)
 
@@ -163,7 +141,7 @@ def ball_rolls(radius: float = 6.0, angle: float = 20.0, friction: float = 0.5) 
             now.velocity = now.velocity + dt * tilted.to(now.velocity)
 
     world, ball = _on_slab(
-        points, 24.0, 12.0, 0.0, friction, pull=0.0, force=gravity, volume=volume
+        points, 24.0, 12.0, 0.0, 0.5, pull=0.0, force=gravity, volume=volume
     )  # fmt: skip
     world.run(calm + 40.0)
     first = _speed(world, ball)

@@ -34,10 +34,6 @@ def swing(cells: int, periods: float) -> tuple[float, float, float, int]:
 
     It is held behind x = 0 by the grid; the face it is clamped at lies :data:`FACE` behind.
 
-    Args:
-        cells: Cells across its height.
-        periods: Time to run for, in periods of the reference.
-
     Returns:
         Frequency [Hz], its reference [Hz], damping ratio, steps.
     """
@@ -111,10 +107,6 @@ def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
     integrals); one of finite slenderness also shears and stretches (Reissner 1972; nu = 0, shear
     factor 5/6).
 
-    Args:
-        load: P L^2 / (E I).
-        slenderness: Length over height.
-
     Returns:
         Deflection across and shortening along, over the length.
     """
@@ -144,22 +136,14 @@ def elastica(load: float, slenderness: float = math.inf) -> tuple[float, float]:
     return y, 1.0 - x
 
 
-def bend(
-    load: float, cells: int = 4, slenderness: float = 12.0, per_cell: int = 6
-) -> tuple[float, float, int]:
+def bend(load: float) -> tuple[float, float, int]:
     """Bend a slab (nu = 0, plane) by a dead load on its end and let it come to rest.
-
-    Args:
-        load: P L^2 / (E I).
-        cells: Cells across its height.
-        slenderness: Length over height.
-        per_cell: Points per cell and axis.
 
     Returns:
         Deflection across and shortening along over the length, and the steps taken.
     """
-    dx, young, density = 1.0 / cells, 1.0, 1.0
-    spacing, length = dx / per_cell, slenderness
+    dx, young, density = 1.0 / 4, 1.0, 1.0
+    spacing, length = dx / 6, 12.0
     points = box([-1.5 * dx, 0.0, 0.0], [length + 1.5 * dx, 1.0, spacing], spacing)
     free = length + FACE * dx
     volume = spacing**3

@@ -12,8 +12,6 @@ from gsfluent import ops
 from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import nacc
 
-__all__ = ["PATHS", "breaking_step", "return_map_paths"]
-
 STRAIN, STEPS = 0.6, 600
 SLOPE = 6.0 * math.sin(math.pi / 4) / (3.0 - math.sin(math.pi / 4))
 """Friction M of 45 degrees."""
@@ -56,12 +54,6 @@ def breaking_step(
     path: str, *, cohesion: float = 0.6, shear_damage: float = 0.0, **return_map: Any
 ) -> tuple[int | None, float, float]:
     """Walk a point of watermelon flesh along a path in 600 steps of 0.001.
-
-    Args:
-        path: One of :data:`PATHS` or ``"uniaxial compression"``.
-        cohesion: beta.
-        shear_damage: eta.
-        return_map: Options of :func:`gsfluent.ops.return_mapping`.
 
     Returns:
         Number (from 0) of the step in which alpha reaches 0, or None; alpha at the end; and

@@ -72,12 +72,6 @@ def bar_strains(
 ) -> tuple[list[float], list[float]]:
     """Pull the bar of GaussianBench B1 (soft left half, stiff right half) by 1 %.
 
-    Args:
-        young: Young's modulus of the halves [Pa].
-        poisson: Of both.
-        laws: Of the halves.
-        mode: How the ends are held, ``slip`` or ``sticky``.
-
     Returns:
         Strain in the middle of each half, measured and by two springs in series, where the ends
         are the rows of points nearest to the faces.

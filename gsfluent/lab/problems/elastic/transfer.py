@@ -113,17 +113,11 @@ class Spin:
     """A ball turning about its centre, and how far its sums have drifted so far."""
 
     def __init__(
-        self,
-        dtype: torch.dtype,
-        *,
-        young: float = 1e5,
-        dx: float = 0.02,
-        cfl: float = 0.5,
-        omega: float = 4.0,
+        self, dtype: torch.dtype, *, young: float = 1e5, dx: float = 0.02, cfl: float = 0.5
     ):
         points = ball([0.0, 0.0, 0.0], 0.05, 0.01)
         turn = torch.zeros(3, 3, dtype=torch.float64)
-        turn[0, 1], turn[1, 0] = -omega, omega
+        turn[0, 1], turn[1, 0] = -4.0, 4.0
         velocity = points @ turn.T
         self.world = World(
             points, velocity, affine=turn.expand(points.shape[0], 3, 3), volume=1e-6,

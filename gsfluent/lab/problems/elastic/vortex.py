@@ -88,12 +88,6 @@ class Vortex:
     ) -> tuple[float, float]:
         """Run one layer of points with ``cells`` cells per metre to ``until``.
 
-        Args:
-            cells: Cells per metre.
-            until: Time [s].
-            per_cell: Points per cell and axis.
-            dtype: Precision.
-
         Returns:
             Root mean square and largest distance from the exact place [m], inside the vortex.
         """

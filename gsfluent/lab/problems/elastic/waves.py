@@ -33,11 +33,6 @@ def run_wave(cells: int, periods: float, cfl: float = 0.2) -> Wave:
     The bar is one cell wide with free faces: without Poisson's effect every point of a cross
     section moves alike, so that this is the problem of one dimension. The velocity of symplectic
     Euler belongs to the half step before.
-
-    Args:
-        cells: Cells per wavelength.
-        periods: Time to run for, in periods.
-        cfl: Time step over dx / c.
     """
     dx, k, amplitude = 1.0 / cells, 2.0 * math.pi, 1e-6
     points = box([0.0, 0.0, 0.0], [1.0, dx, dx], 0.5 * dx)
@@ -99,9 +94,6 @@ def standing_wave() -> Iterator[Result]:
 
 def push_bar(width: float) -> tuple[float, list[float], list[float]]:
     """Push the end of the bar of GaussianBench A3 by a half sine and watch the other end.
-
-    Args:
-        width: Duration of the push [s].
 
     Returns:
         Distance of the two ends [m], times [s] and mean displacement of the far end [m].

@@ -12,8 +12,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import parameters, sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
-__all__ = ["run_out", "sand_column"]
-
 DRUCKER_PRAGER = 2
 FRICTION_ANGLE = 26.0
 """Of the triaxial fit [degrees]; in plane strain that is sin(phi) = M / sqrt(3), 36 degrees. The
@@ -21,17 +19,8 @@ one number here that was chosen (to the three run-outs together); Lube et al. fo
 the grains."""
 
 
-def run_out(
-    aspect: float, cells: int = 16, seconds: float | None = None, dtype: torch.dtype = torch.float32
-) -> float:
-    """Run-out of a column of base 1 m beside a wall, over its base.
-
-    Args:
-        aspect: Height over base.
-        cells: Cells along the base.
-        seconds: Duration [s]; default is enough to come to rest.
-        dtype: Precision.
-    """
+def run_out(aspect: float, cells: int = 16) -> float:
+    """Run-out of a column of base 1 m beside a wall, over its base."""
     dx = 1.0 / cells
     sine = math.sin(math.radians(FRICTION_ANGLE))
     alpha_dp = math.sqrt(2.0 / 3.0) * 2.0 * sine / (3.0 - sine)
@@ -41,9 +30,9 @@ def run_out(
         points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=DRUCKER_PRAGER,
         params=parameters(2e6, 0.3, density, c2=alpha_dp), 
         colliders=[*between_planes(dx), wall(0), wall(1, mode="sticky")],
-        gravity=(0.0, -9.81, 0.0), dtype=dtype,
+        gravity=(0.0, -9.81, 0.0), dtype=torch.float32,
     )  # fmt: skip
-    world.run(seconds=seconds or 4.4 * math.sqrt(aspect / 9.81))
+    world.run(seconds=4.4 * math.sqrt(aspect / 9.81))
     return float(world.position[:, 0].max()) - 1.0
 
 
@@ -53,19 +42,11 @@ def law(aspect: float) -> float:
 
 
 @problem(tier="slow")
-def sand_column(
-    aspects: Sequence[float] = (1.0, 2.0, 4.0), cells: int = 16, dtype: torch.dtype = torch.float32
-) -> list[Result]:
-    """Sand column: run-out of a plane column follows 1.2 a, then 1.9 a^(2/3).
-
-    Args:
-        aspects: Heights over base.
-        cells: Cells along the base.
-        dtype: Precision.
-    """
+def sand_column(aspects: Sequence[float] = (1.0, 2.0, 4.0), cells: int = 16) -> list[Result]:
+    """Sand column: run-out of a plane column follows 1.2 a, then 1.9 a^(2/3)."""
     return [
         compare(
-            "sand_column", f"run-out over base, aspect {a:g}", run_out(a, cells, dtype=dtype),
+            "sand_column", f"run-out over base, aspect {a:g}", run_out(a, cells),
             law(a), tolerance=0.15, source="Lube et al. 2005, Phys. Rev. E 72, 041301",
             note="friction angle fitted to all aspects together",
         )

@@ -15,16 +15,14 @@ from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
-__all__ = ["dam_break", "dam_front", "liquid_at_rest", "water"]
-
 FLUID = 4
 GRAVITY = 9.81
 
 
-def water(sound: float, density: float = 1000.0, exponent: float = 7.0) -> Tensor:
+def water(sound: float) -> Tensor:
     """Row of an inviscid liquid whose speed of sound at rest is ``sound`` [m/s], [8]."""
     row = torch.zeros(8, dtype=torch.float64)
-    row[1], row[6], row[7] = density * sound**2, density, exponent
+    row[1], row[6], row[7] = 1000.0 * sound**2, 1000.0, 7.0
     return row
 
 
@@ -37,16 +35,8 @@ def hydrostatic(depth: Tensor, row: Tensor) -> Tensor:
     return strain
 
 
-def dam_front(
-    cells: int, *, until: float, bed: str, dtype: torch.dtype = torch.float32
-) -> list[tuple[float, float]]:
+def dam_front(cells: int, *, until: float, bed: str) -> list[tuple[float, float]]:
     """Front of a water column twice as high as wide after the gate is gone.
-
-    Args:
-        cells: Cells along the base a.
-        until: End, as ``t sqrt(2 g / a)``.
-        bed: Mode of the bed: ``sticky`` (no slip, as in the experiment) or ``slip``.
-        dtype: Precision.
 
     Returns:
         Pairs of ``t sqrt(2 g / a)`` and ``z / a``, one per step; the front is where the last two
@@ -60,7 +50,7 @@ def dam_front(
     world = World(
         points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=FLUID,
         params=row, colliders=[*between_planes(dx), wall(0), wall(1, mode=bed)],
-        gravity=(0.0, -GRAVITY, 0.0), dtype=dtype,
+        gravity=(0.0, -GRAVITY, 0.0), dtype=torch.float32,
         strain=hydrostatic(2.0 * base - points[:, 1], row),
     )  # fmt: skip
     scale = math.sqrt(2.0 * GRAVITY / base)
@@ -84,27 +74,19 @@ def martin_moyce(data: Path) -> list[tuple[float, float]]:
 
 
 @problem(tier="fast")
-def dam_break(
-    cells: int = 12,
-    until: float = 3.4,
-    data: Path | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> list[Result]:
+def dam_break(data: Path | None = None) -> list[Result]:
     """Dam break: front of a collapsing column against Martin and Moyce 1952.
 
     Args:
-        cells: Cells along the base.
-        until: Last ``t sqrt(2 g / a)`` that is compared.
         data: Folder with ``reference/dam_break``; default is the environment's GSFLUENT_DATA,
             else ``shared/data`` beside the checkout.
-        dtype: Precision.
 
     Raises:
         FileNotFoundError: The measured fronts are not there.
     """
     beside = Path(__file__).resolve().parents[5] / "shared" / "data"
     root = data or Path(os.environ.get("GSFLUENT_DATA", beside))
-    measured = [pair for pair in martin_moyce(root) if pair[0] <= until]
+    measured = [pair for pair in martin_moyce(root) if pair[0] <= 3.4]
     if not measured:
         raise FileNotFoundError(
             f"dam_break: no measured fronts under {root}; set GSFLUENT_DATA to the data folder"
@@ -112,7 +94,7 @@ def dam_break(
     source = "Martin and Moyce 1952, fig. 3, n^2 = 2, a = 1.125 and 2.25 in"
     results = []
     for bed, kind in (("sticky", "no-slip bed"), ("slip", "slip bed")):
-        trace = dam_front(cells, until=until, bed=bed, dtype=dtype)
+        trace = dam_front(12, until=3.4, bed=bed)
         errors = []
         for time, place in measured:
             front = next((z for t, z in trace if t >= time), math.nan)
@@ -128,16 +110,13 @@ def dam_break(
 
 
 @problem(tier="fast")
-def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[Result]:
+def liquid_at_rest() -> list[Result]:
     """Tank at rest: a step of water comes to a level surface with hydrostatic pressure under it.
 
     Half of a tank 1 m wide is filled to 0.625 m, half to 0.375 m; four seconds with damping, then
     means over 0.7 s without.
-
-    Args:
-        cells: Cells along the tank.
-        dtype: Precision.
     """
+    cells = 12
     dx, depth = 1.0 / cells, 0.5
     points = torch.cat([sheet([0.0, 0.0], [0.5, 0.625], dx), sheet([0.5, 0.0], [0.5, 0.375], dx)])
     row = water(8.0 * math.sqrt(GRAVITY * depth))
@@ -150,7 +129,7 @@ def liquid_at_rest(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     world = World(
         points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=FLUID,
         params=row, colliders=[*between_planes(dx), wall(0), wall(0, 1.0, -1), wall(1)],
-        gravity=(0.0, -GRAVITY, 0.0), dtype=dtype, force=damp,
+        gravity=(0.0, -GRAVITY, 0.0), dtype=torch.float32, force=damp,
     )  # fmt: skip
     world.run(seconds=4.0)
     damping[0] = 0.0

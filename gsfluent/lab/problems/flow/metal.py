@@ -11,25 +11,19 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
 from gsfluent.lab.world.walls import wall
 
-__all__ = ["taylor_bar"]
-
 VON_MISES = 3
 
 
 @problem(tier="fast")
-def taylor_bar(cells: int = 4, dtype: torch.dtype = torch.float32) -> list[Result]:
+def taylor_bar() -> list[Result]:
     """Taylor bar: final length and foot of a copper cylinder at 227 m/s after 80 microseconds.
 
     32.4 mm x 6.4 mm; E 117 GPa, nu 0.35, 8930 kg/m^3, yield stress 400 MPa, linear hardening 100
     MPa; a quarter between two planes of symmetry, frictionless wall. The end of a point's cell is
     its position plus its stretched half spacing.
-
-    Args:
-        cells: Cells along the radius.
-        dtype: Precision.
     """
     radius, length, density = 3.2e-3, 32.4e-3, 8930.0
-    dx = radius / cells
+    dx = radius / 4
     step = 0.5 * dx
     size = [radius + step, radius + step, round(length / step) * step]
     points = box([0.0, 0.0, 0.0], size, step)
@@ -40,7 +34,7 @@ def taylor_bar(cells: int = 4, dtype: torch.dtype = torch.float32) -> list[Resul
         points, [0.0, 0.0, -227.0], volume=volume, dx=dx, law=VON_MISES,
         params=parameters(117e9, 0.35, density, c2=400e6, c4=100e6),
         colliders=[wall(0), wall(1), wall(2, mode="separate")],
-        deformation=True, dtype=dtype,
+        deformation=True, dtype=torch.float32,
     )  # fmt: skip
     world.run(seconds=80e-6)
     assert world.deformation is not None

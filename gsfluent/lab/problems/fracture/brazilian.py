@@ -12,8 +12,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["brazilian_disc", "loaded_disc"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 DIAMETER = 1.0
 
@@ -27,7 +25,6 @@ def loaded_disc(
     row: Tensor,
     breakable: float = 0.0,
     alpha: float = 0.0,
-    dtype: torch.dtype = torch.float32,
 ) -> tuple[World, Tensor, float]:
     """A disc between two arcs of even radial pressure that grows linearly in time.
 
@@ -40,7 +37,6 @@ def loaded_disc(
         row: NACC row of the part that can break.
         breakable: Its height, in radii from the centre; outside the disc is elastic.
         alpha: Its alpha at the start.
-        dtype: Precision.
 
     Returns:
         The world, the points at rest [N, 3] with the centre at 0, and dx.
@@ -70,24 +66,21 @@ def loaded_disc(
         points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=torch.tensor([0, 1]),
         params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]),
         material=(points[:, 1].abs() < breakable * radius).int(),
-        alpha=torch.full_like(points[:, 0], alpha), colliders=between_planes(dx), dtype=dtype,
+        alpha=torch.full_like(points[:, 0], alpha), colliders=between_planes(dx),
+        dtype=torch.float32,
         force=press,
     )  # fmt: skip
     return world, points, dx
 
 
 @problem(tier="fast")
-def brazilian_disc(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[Result]:
+def brazilian_disc() -> list[Result]:
     """Brazilian disc: stress at the centre, first damage there, crack along the loaded diameter.
 
     The stress is that of an elastic disc under a load that hardly moves. The breaking disc has
     elastic caps (beyond three quarters of the radius), because NACC crushes where a load enters.
     NACC is no tension cut-off: the mean stress in the centre of a disc is compressive, and what
     breaks there is the combination of shear and little pressure.
-
-    Args:
-        cells: Cells along the radius.
-        dtype: Precision.
     """
     name, source = "brazilian_disc", "Hondros 1959; solver.md 3 row 17"
     half_angle, softening, strength = 0.1, 0.005, 0.005
@@ -97,7 +90,7 @@ def brazilian_disc(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     )  # fmt: skip
     c, tension = wave_speed(row), 5e-4 * YOUNG
     world, points, dx = loaded_disc(
-        cells, half_angle=half_angle, tension=tension, crossings=16.0, row=row, dtype=dtype
+        12, half_angle=half_angle, tension=tension, crossings=16.0, row=row
     )
     world.run(seconds=19.0 * DIAMETER / c)
     centre = points[:, :2].norm(dim=1) < 1.5 * dx
@@ -115,8 +108,8 @@ def brazilian_disc(cells: int = 12, dtype: torch.dtype = torch.float32) -> list[
     ]  # fmt: skip
 
     world, points, dx = loaded_disc(
-        cells, half_angle=0.15, tension=2.0 * strength * YOUNG, crossings=20.0, row=row,
-        breakable=0.75, alpha=-softening, dtype=dtype,
+        12, half_angle=0.15, tension=2.0 * strength * YOUNG, crossings=20.0, row=row,
+        breakable=0.75, alpha=-softening,
     )  # fmt: skip
     first: list[float] = []
 

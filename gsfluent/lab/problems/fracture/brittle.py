@@ -22,20 +22,6 @@ from gsfluent.lab.textbook.variant import Birth
 from gsfluent.lab.world.invariants import Limits, State, Violation, check, observe
 from gsfluent.lab.world.shapes import ball, box
 
-__all__ = [
-    "DX",
-    "FLESH",
-    "SPEED",
-    "Outcome",
-    "apart",
-    "debris",
-    "drop",
-    "exposure",
-    "hit_rate",
-    "run",
-    "step",
-]
-
 DX = 1.0 / 32.0
 """Node spacing of these scenes [m]; a power of two, so that x / dx rounds nothing."""
 SPEED = 6.0
@@ -90,13 +76,7 @@ def drop(
 
 
 def debris(edge: int = 12, *, away: float = 32.0, seed: int = 0) -> Scene:
-    """Broken points in free flight, none of which shares a node with another.
-
-    Args:
-        edge: Points along each axis.
-        away: Distance from the origin [dx].
-        seed: Of their places.
-    """
+    """Broken points in free flight, none of which shares a node with another."""
     random = np.random.default_rng(seed)
     points = box([away * DX] * 3, [4.0 * edge * DX] * 3, 4.0 * DX).numpy()
     points = points + DX * random.random(points.shape)
@@ -141,33 +121,20 @@ def step(scene: Scene, courant: float = 0.3) -> float:
 
 
 class Outcome(NamedTuple):
-    """What became of a run.
+    """What became of a run."""
 
-    Attributes:
-        position: [m], [N, 3], the last that were numbers.
-        alpha: [N].
-        steps: Taken.
-        birth: Where the first number that is none came from, or None.
-        broken: Share of points without strength.
-        kinetic: Kinetic energy over that at the start.
-        smallest: Smallest volume ratio met.
-        violation: The first law that it broke (:mod:`gsfluent.lab.world.invariants`; momentum is
-        not
-            judged, the floor takes it), if asked for.
-        exposure: Expected deaths by an unguarded division so far (:func:`exposure`), if asked for.
-        track: Positions after every ``every`` steps, float32 [T, N, 3], if asked for.
-    """
-
-    position: Floats
-    alpha: Floats
-    steps: int
-    birth: Birth | None
-    broken: float
-    kinetic: float
-    smallest: float
+    position: Floats  # [m], [N, 3], the last that were numbers
+    alpha: Floats  # [N]
+    steps: int  # taken
+    birth: Birth | None  # where the first number that is none came from, or None
+    broken: float  # share of points without strength
+    kinetic: float  # kinetic energy over that at the start
+    smallest: float  # smallest volume ratio met
+    # the first law that it broke (invariants; momentum is not judged, the floor takes it), if asked
+    # for
     violation: Violation | None
-    exposure: float
-    track: Floats | None
+    exposure: float  # expected deaths by an unguarded division so far (exposure), if asked for
+    track: Floats | None  # positions after every every steps, float32 [T, N, 3], if asked for
 
 
 def _state(s: Textbook, start: State | None) -> State:

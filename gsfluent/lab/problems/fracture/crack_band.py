@@ -17,8 +17,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["BAND_CELLS", "brittle_spacing", "crack_band", "fracture_energy", "softening_energy"]
-
 BAND_CELLS = 2.0
 """Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
 the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""
@@ -126,11 +124,6 @@ def fracture_energy(params: Tensor, alpha: float, *, dx: float) -> float:
 
     :func:`softening_energy` times a band of ``BAND_CELLS`` cells, so a lower bound: measured cracks
     are up to a half wider, depending on how they lie on the grid (docs/theory/fracture.md).
-
-    Args:
-        params: One NACC row, [8], as used on that grid (after :func:`crack_band` if any).
-        alpha: Log plastic volume ratio at the start.
-        dx: Node spacing [m].
 
     Raises:
         ValueError: As :func:`softening_energy`, or ``dx`` is not positive.

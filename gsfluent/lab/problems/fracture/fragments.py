@@ -15,8 +15,6 @@ from gsfluent.lab.world.registry import Result, problem
 from gsfluent.lab.world.shapes import box, nacc, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["expected_size", "fragment_size", "mean_size"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 ALPHA0, CELLS = -0.004, 240
 ROW = nacc(
@@ -31,9 +29,6 @@ def expected_size(rate: float) -> float:
 
     ``rho rate^2 s^3 / 24 + sigma^2 s / (2 M) = G`` (Glenn and Chudnovsky 1986; without the stored
     energy it is Grady's ``(24 G / (rho rate^2))^(1/3)``), solved by bisection.
-
-    Args:
-        rate: Strain rate [1/s].
     """
     energy = WIDE * fracture_energy(ROW, ALPHA0, dx=1.0 / CELLS)
     stored = spall_strength(ROW, ALPHA0) ** 2 / (2.0 * DENSITY * wave_speed(ROW) ** 2)
@@ -45,14 +40,8 @@ def expected_size(rate: float) -> float:
     return 0.5 * (low + high)
 
 
-def mean_size(rate: float, seed: int = 0, dtype: torch.dtype = torch.float32) -> float:
-    """Mean piece of a free bar of one metre whose strength scatters by a tenth [m].
-
-    Args:
-        rate: Strain rate [1/s].
-        seed: Of the scatter.
-        dtype: Precision.
-    """
+def mean_size(rate: float, seed: int = 0) -> float:
+    """Mean piece of a free bar of one metre whose strength scatters by a tenth [m]."""
     dx, c = 1.0 / CELLS, wave_speed(ROW)
     points = box([0.0, 0.0, 0.0], [1.0, dx, dx], 0.5 * dx)
     cell = (points[:, 0] / dx).long()
@@ -66,7 +55,7 @@ def mean_size(rate: float, seed: int = 0, dtype: torch.dtype = torch.float32) ->
     world = World(
         points, velocity, volume=volume, dx=dx, law=1, params=ROW,
         alpha=ALPHA0 * strength[cell], colliders=between_planes(dx, (1, 2)), affine=affine,
-        dtype=dtype,
+        dtype=torch.float32,
     )  # fmt: skip
     limit = spall_strength(ROW, ALPHA0) / (DENSITY * c * c)
     # to the elastic limit, and on until waves have crossed the longest pieces
@@ -84,9 +73,6 @@ def fragment_size(shares: Sequence[float] = (0.005, 0.01, 0.02, 0.05)) -> list[R
 
     A trend, not a law: strength scatters, and cracks that start at the same time do not share their
     energy evenly.
-
-    Args:
-        shares: Strain rates, as the speed of the ends over that of a pressure wave.
     """
     name, source = "fragment_size", "Glenn and Chudnovsky 1986; solver.md 3 row 24"
     results, sizes = [], []

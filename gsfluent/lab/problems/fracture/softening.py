@@ -20,8 +20,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["Opening", "double_cantilever", "open_cantilever", "pull_bar", "slope", "softening_bar"]
-
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 
 
@@ -39,14 +37,14 @@ def slope(spacing: Sequence[float], energy: Sequence[float]) -> float:
     return float((x * y).sum() / (x * x).sum())
 
 
-def pull_bar(cells: int, *, regularised: bool, softening: float = 0.05) -> float:
+def pull_bar(cells: int, *, regularised: bool) -> float:
     """Pull a bar of one metre apart; return the energy per area of its crack [J/m^2].
 
     Uniaxial strain; the strength is a fifth lower in the middle. ``softening`` holds on the grid of
     40 cells; ``regularised`` scales it for the others.
     """
     dx = 1.0 / cells
-    row, alpha0 = brittle(softening), torch.tensor(-softening, dtype=torch.float64)
+    row, alpha0 = brittle(0.05), torch.tensor(-0.05, dtype=torch.float64)
     if regularised:
         row, alpha0 = crack_band(row, alpha0, dx=dx, reference=1.0 / 40.0)
     c = wave_speed(row)
@@ -76,13 +74,14 @@ def pull_bar(cells: int, *, regularised: bool, softening: float = 0.05) -> float
 
 
 @problem(tier="fast")
-def softening_bar(cells: Sequence[int] = (20, 40)) -> list[Result]:
+def softening_bar() -> list[Result]:
     """Bar pulled apart: energy per area of its crack is the energy density times two cells.
 
     The reference is the one-point path of
     :func:`gsfluent.lab.problems.fracture.crack_band.softening_energy` at the
     strength of the middle (0.8), plus the stored energy that the shoulders of the crack lose.
     """
+    cells = (20, 40)
     results = []
     plain = [pull_bar(n, regularised=False) for n in cells]
     scaled = [pull_bar(n, regularised=True) for n in cells]
@@ -127,10 +126,8 @@ def open_cantilever(
     *,
     regularised: bool,
     shift: float = 0.0,
-    softening: float = 0.01,
     reference: int = 32,
     crossings: float = 10.0,
-    dtype: torch.dtype = torch.float32,
 ) -> Opening:
     """Wedge two arms of a notched slab apart, so that a crack runs between them.
 
@@ -142,13 +139,11 @@ def open_cantilever(
         cells: Cells per metre.
         regularised: Scale the softening, which is that of ``reference`` cells per metre.
         shift: Position of the slab relative to the nodes [dx].
-        softening: -alpha0 on the reference grid.
         reference: Cells per metre of the reference grid.
         crossings: Duration in travel times of a pressure wave along the slab.
-        dtype: Precision.
     """
     dx, height, notch = 1.0 / cells, 0.375, 0.25
-    row, alpha0 = brittle(softening), torch.tensor(-softening, dtype=torch.float64)
+    row, alpha0 = brittle(0.01), torch.tensor(-0.01, dtype=torch.float64)
     if regularised:
         row, alpha0 = crack_band(row, alpha0, dx=dx, reference=1.0 / reference)
     c = wave_speed(row)
@@ -159,7 +154,7 @@ def open_cantilever(
     x = points[:, 0]
     layer = from_middle.abs() < 0.0625
     ends = (x < 0.0626) & (from_middle.abs() > 0.5 * height - 0.0626)
-    opening = 0.004 * c * from_middle[ends].sign().to(dtype)
+    opening = 0.004 * c * from_middle[ends].sign().to(torch.float32)
 
     def wedge(world: World, _dt: float) -> None:
         v = world.velocity.clone()
@@ -171,7 +166,7 @@ def open_cantilever(
         points + torch.tensor([0.0, shift * dx, 0.0], dtype=torch.float64), [0.0, 0.0, 0.0],
         volume=volume, dx=dx, law=torch.tensor([0, 1]),
         params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]), material=layer.int(),
-        alpha=torch.full_like(x, float(alpha0)), colliders=between_planes(dx), dtype=dtype,
+        alpha=torch.full_like(x, float(alpha0)), colliders=between_planes(dx), dtype=torch.float32,
         force=wedge,
     )  # fmt: skip
     meter = Dissipation(world)
@@ -201,15 +196,10 @@ def mean_energy(cells: int, *, regularised: bool, shifts: Sequence[float]) -> fl
 
 
 @problem(tier="slow")
-def double_cantilever(
-    cells: Sequence[int] = (32, 48, 64), shifts: Sequence[float] = (0.0, 0.25, 0.5)
-) -> list[Result]:
-    """Double cantilever: energy per crack area does not depend on dx with crack-band scaling.
-
-    Args:
-        cells: Cells per metre.
-        shifts: Positions of the crack plane on the grid [dx], averaged.
-    """
+def double_cantilever() -> list[Result]:
+    """Double cantilever: energy per crack area does not depend on dx with crack-band scaling."""
+    shifts = (0.0, 0.25, 0.5)
+    cells = (32, 48, 64)
     spacing = [1.0 / n for n in cells]
     scaled = [mean_energy(n, regularised=True, shifts=shifts) for n in cells]
     plain = [scaled[0]] + [mean_energy(n, regularised=False, shifts=shifts) for n in cells[1:]]

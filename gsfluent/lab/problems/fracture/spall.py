@@ -12,8 +12,6 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
-__all__ = ["plate_impact_spall", "spall_strength"]
-
 
 def spall_strength(row: Tensor, alpha: float) -> float:
     """Axial stress at which uniaxial straining in tension leaves the elastic range [Pa].
@@ -30,28 +28,21 @@ def spall_strength(row: Tensor, alpha: float) -> float:
 
 
 @problem(tier="fast")
-def plate_impact_spall(
-    flyer: int = 20, target: int = 50, over: float = 1.25, dtype: torch.dtype = torch.float32
-) -> list[Result]:
+def plate_impact_spall(over: float = 1.25) -> list[Result]:
     """Plate impact: spall plane one flyer thickness behind the free face, and pull-back velocity.
 
     A plate of ``flyer`` cells hits one of ``target`` cells of the same NACC material at
     ``2 over spall_strength / (rho c)``. The release waves from the two free faces meet one flyer
     thickness inside the target; the free face slows by ``2 sigma_sp / (rho c)`` and is then pushed
     by the wave from the new surface. The impact is smoothed over 4 cells: a sharper one rings.
-
-    Args:
-        flyer: Thickness of the flyer [dx].
-        target: Thickness of the target [dx].
-        over: Impact stress over spall strength.
-        dtype: Precision.
     """
+    flyer = 20
     dx, alpha0 = 0.4 / flyer, -0.01
     row = nacc(1e9, 0.3, 1000.0, friction=2.0, cohesion=0.1, hardening=1.0)
     c, strength = wave_speed(row), spall_strength(row, alpha0)
     impedance = float(row[6]) * c
     speed = 2.0 * over * strength / impedance
-    length = (flyer + target) * dx
+    length = (flyer + 50) * dx
     points = box([0.0, 0.0, 0.0], [length, dx, dx], 0.5 * dx)
     x = points[:, 0]
     velocity = torch.zeros_like(points)
@@ -59,7 +50,7 @@ def plate_impact_spall(
     volume = (0.5 * dx) ** 3
     world = World(
         points, velocity, volume=volume, dx=dx, law=1, params=row,
-        alpha=torch.full_like(x, alpha0), colliders=between_planes(dx, (1, 2)), dtype=dtype,
+        alpha=torch.full_like(x, alpha0), colliders=between_planes(dx, (1, 2)), dtype=torch.float32,
     )  # fmt: skip
     face = x > length - dx
     trace: list[float] = []
@@ -71,7 +62,7 @@ def plate_impact_spall(
         if not first and bool(broken.any()):
             first.append((length - float(x[broken].mean())) / dx)
 
-    world.run(seconds=(target + 3 * flyer) * dx / c, each=watch)
+    world.run(seconds=(50 + 3 * flyer) * dx / c, each=watch)
     top = max(range(len(trace)), key=trace.__getitem__)
     drop = trace[top] - min(trace[top:])
     source = "linear waves: equal plates; Antoun et al. 2003, Spall Fracture"

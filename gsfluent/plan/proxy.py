@@ -1,7 +1,7 @@
 """Solids of about the right size, shape and place, before there is any reconstruction.
 
 Splats are filled coarsely. Photographs with masks are carved to their visual hull. Without masks
-the sparse points say how large the object is, and an ellipsoid stands in for it.
+the sparse points say how large the object is, and an ellipsoid is its proxy.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.config import Shot
-from gsfluent.data import INTERIOR, SURFACE, Capture, Frame, Gaussians, Solid, View
+from gsfluent.data import SURFACE, Capture, Frame, Gaussians, Solid, View
 from gsfluent.errors import InputError
 from gsfluent.inspection.capture import inspect
 from gsfluent.io import load_capture, load_splats
@@ -29,7 +29,7 @@ from gsfluent.stages.select import select_mask
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["Photographs", "StandIn", "look_at_photographs", "stand_in"]
+__all__ = ["Photographs", "Proxy", "look_at_photographs", "proxy"]
 
 _VOXELS = 48
 _MARGIN = 8
@@ -41,43 +41,27 @@ over the two of the gallery without masks (apple 0.81, skull 0.70)."""
 
 @dataclasses.dataclass(frozen=True)
 class Photographs:
-    """What training will look at.
+    """What training will look at."""
 
-    Attributes:
-        images: How many photographs.
-        source_pixels: Pixels of all their files.
-        pixels: Pixels of one at the size of training, mean.
-        object_pixels: Those of the part that shows the object, mean.
-        masked: Whether there are masks.
-    """
-
-    images: int
-    source_pixels: float
-    pixels: float
-    object_pixels: float
-    masked: bool
+    images: int  # How many photographs
+    source_pixels: float  # Pixels of all their files
+    pixels: float  # Pixels of one at the size of training, mean
+    object_pixels: float  # Those of the part that shows the object, mean
+    masked: bool  # Whether there are masks
 
 
 @dataclasses.dataclass(frozen=True)
-class StandIn:
-    """What a shot is planned with.
+class Proxy:
+    """What a shot is planned with before there is any reconstruction."""
 
-    Attributes:
-        solids: Solid of each object by name, in the coordinates of the input.
-        frame: From there to the scene.
-        assumed: Where they come from, in words.
-        photographs: None when the shot starts from splats.
-        splats: Splats of the object, when they are known.
-    """
-
-    solids: Mapping[str, Solid]
-    frame: Frame
-    assumed: str
-    photographs: Photographs | None = None
-    splats: int | None = None
+    solids: Mapping[str, Solid]  # Solid of each object by name, in the coordinates of the input
+    frame: Frame  # From there to the scene
+    assumed: str  # Where they come from, in words
+    photographs: Photographs | None = None  # None when the shot starts from splats
+    splats: int | None = None  # Splats of the object, when they are known
 
 
-def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
+def proxy(shot: Shot, warnings: list[str]) -> Proxy:
     """Solids to plan a shot with.
 
     Args:
@@ -98,7 +82,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
             taken |= mask
             solids[name] = _grey(Fill(**options, refine_views=0)(gaussians.select(mask)))
         what = f"the splat, filled at {_VOXELS} voxels"
-        return StandIn(solids, frame, what, splats=gaussians.count)
+        return Proxy(solids, frame, what, splats=gaussians.count)
     if shot.capture is None:
         raise InputError("the shot has neither capture nor splats", "name one input")
     # what is wrong with a capture is an error; what is not in it is a warning
@@ -132,7 +116,7 @@ def stand_in(shot: Shot, warnings: list[str]) -> StandIn:
                 "hint: add masks to the capture"
             )
     solids = dict.fromkeys(shot.objects, _ellipsoid(box, _SOLID_SHARE))
-    return StandIn(solids, Frame.identity(), what, photographs)
+    return Proxy(solids, Frame.identity(), what, photographs)
 
 
 def look_at_photographs(
@@ -185,8 +169,8 @@ def _carved(
     grid: np.ndarray,
     inside: np.ndarray,
     photographs: Photographs,
-) -> StandIn:
-    """Stand-ins from the voxels of a hull, selected as the splats of a run are."""
+) -> Proxy:
+    """Proxies from the voxels of a hull, selected as the splats of a run are."""
     occupied = torch.from_numpy(inside)
     points = torch.from_numpy(grid)[occupied].float()
     step = (grid[-1, -1, -1] - grid[0, 0, 0]) / (len(grid) - 1)
@@ -207,7 +191,7 @@ def _carved(
             )
         taken |= mask
         solids[name] = _solid_of(occupied, mask, grid, step)
-    return StandIn(solids, frame, "the visual hull of the photographs", photographs)
+    return Proxy(solids, frame, "the visual hull of the photographs", photographs)
 
 
 def _solid_of(occupied: Tensor, mask: Tensor, grid: np.ndarray, step: np.ndarray) -> Solid:
@@ -263,9 +247,3 @@ def _grey(solid: Solid) -> Solid:
     if solid.color is not None:
         return solid
     return dataclasses.replace(solid, color=torch.full((*solid.occupancy.shape, 3), 0.5))
-
-
-def visible_splats(solid: Solid) -> int:
-    """Splats of a solid that are not its inside."""
-    labels = solid.gaussians.labels
-    return solid.gaussians.count if labels is None else int((labels != INTERIOR).sum())
