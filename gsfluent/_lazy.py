@@ -1,7 +1,6 @@
-"""Names of a package, and modules that take a while to import, that cost nothing until used.
+"""Names of a package, and modules, that cost nothing until somebody takes one (PEP 562).
 
-:func:`lazy` makes the public names of a package (PEP 562). ``from gsfluent._lazy import cv2``
-stands at the top of a file like any other import, and ``import gsfluent`` still costs torch alone.
+``from gsfluent._lazy import cv2, ndimage`` stands at the top of a file like any other import.
 """
 
 from __future__ import annotations
@@ -38,7 +37,9 @@ def lazy(
     return get, lambda: sorted({*vars(sys.modules[package]), *home}), list(home)
 
 
-class _Lazy:
+class _Module:
+    """A module that is imported when something is first asked of it."""
+
     def __init__(self, name: str) -> None:
         self._name = name
 
@@ -46,5 +47,5 @@ class _Lazy:
         return getattr(importlib.import_module(self._name), key)
 
 
-cv2 = _Lazy("cv2")
-ndimage = _Lazy("scipy.ndimage")
+cv2 = _Module("cv2")
+ndimage = _Module("scipy.ndimage")
