@@ -101,8 +101,8 @@ def shortage(a: Arguments) -> str:
     cameras = a.viewmat.shape[0] if a.viewmat.dim() == 3 else 1
     need = required_bytes(a)
     return (
-        f"{_OP}: {a.means.shape[0]} Gaussians in {cameras} images of {a.width} x {a.height} px need "
-        f"at least {need} bytes ({need / 2**30:.1f} GiB) on {a.means.device}"
+        f"{_OP}: {a.means.shape[0]} Gaussians in {cameras} images of {a.width} x {a.height} px "
+        f"need at least {need} bytes ({need / 2**30:.1f} GiB) on {a.means.device}"
     )
 
 
