@@ -222,21 +222,19 @@ class Watch:
         other.reasons, other._ring = list(self.reasons), self._ring.copy()
         return other
 
+    _KEPT = (
+        "energy", "scale", "rollbacks", "in_a_row", "good_in_a_row", "trouble_time", "reasons",
+    )  # fmt: skip
+
     def state(self) -> dict[str, float | int | list[str]]:
         """Return what a resumed run needs."""
-        return {
-            "energy": self.energy, "scale": self.scale, "rollbacks": self.rollbacks,
-            "in_a_row": self.in_a_row, "good_in_a_row": self.good_in_a_row,
-            "trouble_time": self.trouble_time, "reasons": self.reasons,
-        }  # fmt: skip
+        return {name: getattr(self, name) for name in self._KEPT}
 
     def restore(self, values: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self.energy, self.scale = float(values["energy"]), float(values["scale"])
-        self.rollbacks = int(values["rollbacks"])
-        self.in_a_row, self.good_in_a_row = int(values["in_a_row"]), int(values["good_in_a_row"])
-        self.trouble_time = float(values["trouble_time"])
-        self.reasons = list(values["reasons"])
+        for name in self._KEPT:
+            setattr(self, name, values[name])
+        self.reasons = list(self.reasons)
 
 
 class Ledger:
