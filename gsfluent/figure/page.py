@@ -50,6 +50,13 @@ def shown(value: object) -> str:
     return str(value)
 
 
+def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown, a line a row."""
+    lines = (head, ["---"] * len(head), *rows)
+    cells = ([shown(cell).replace("|", "\\|") for cell in line] for line in lines)
+    return "".join(f"| {' | '.join(line)} |\n" for line in cells)
+
+
 class Page:
     """A page under construction; every method but :meth:`write` returns the page.
 

@@ -9,16 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from .run import Measure, Run
 from .scene import Scene, SceneError
 
-MODULES = (
-    "contact",
-    "elastic",
-    "flow",
-    "bars",
-    "cantilever",
-    "plane",
-    "rock",
-    "shatter",
-)
+MODULES = ("contact", "elastic", "flow", "bars", "cantilever", "plane", "rock", "shatter")
 """Modules of ``scenes`` that register cases."""
 
 Build = Callable[[float, int], Scene]
@@ -27,25 +18,15 @@ Judge = Callable[[Scene, Run], Iterable[Measure]]
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A problem.
+    """A problem."""
 
-    Attributes:
-        name: Its name.
-        kind: ``elastic``, ``contact`` or ``fracture``: what a method must be able to do.
-        summary: One line.
-        dx: Node spacing of the frozen scene [m].
-        build: ``build(dx, points_per_cell)`` -> Scene.
-        judge: ``judge(scene, run)`` -> measures; the first is the error of the charts.
-        ladder: Node spacings from coarse to fine that a chart runs [m].
-    """
-
-    name: str
-    kind: str
-    summary: str
-    dx: float
-    build: Build
-    judge: Judge
-    ladder: tuple[float, ...]
+    name: str  # its name
+    kind: str  # elastic, contact or fracture: what a method must be able to do
+    summary: str  # one line
+    dx: float  # node spacing of the frozen scene [m]
+    build: Build  # build(dx, points_per_cell) -> Scene
+    judge: Judge  # judge(scene, run) -> measures; the first is the error of the charts
+    ladder: tuple[float, ...]  # node spacings from coarse to fine that a chart runs [m]
 
 
 _CASES: dict[str, Case] = {}

@@ -18,25 +18,15 @@ _OPTIONAL = ("damage", "stress", "impulse", "deformation")
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """One figure of a run beside its reference.
+    """One figure of a run beside its reference."""
 
-    Attributes:
-        quantity: What was measured.
-        value: The figure.
-        reference: What it should be.
-        error: Distance of the two in the measure of ``tolerance``.
-        tolerance: Largest accepted error.
-        unit: Of ``value`` and ``reference``.
-        source: Where the reference comes from.
-    """
-
-    quantity: str
-    value: float
-    reference: float
-    error: float
-    tolerance: float
-    unit: str = ""
-    source: str = ""
+    quantity: str  # what was measured
+    value: float  # the figure
+    reference: float  # what it should be
+    error: float  # distance of the two in the measure of tolerance
+    tolerance: float  # largest accepted error
+    unit: str = ""  # of value and reference
+    source: str = ""  # where the reference comes from
 
     @property
     def passed(self) -> bool:
@@ -46,39 +36,26 @@ class Measure:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A simulator's answer to a :class:`~gsfluent.fracturebench.scene.Scene`.
+    """A simulator's answer to a :class:`~gsfluent.fracturebench.scene.Scene`."""
 
-    Attributes:
-        scene: Name of the case.
-        method: Who computed it, such as ``gsfluent`` or ``physgaussian``.
-        times: Times [s], those of the scene, [T].
-        x: Positions [m], [T, N, 3]; a run that broke off leaves NaN from there on.
-        v: Velocities [m/s], [T, N, 3].
-        wall_seconds: Time the steps took, without set-up, compilation and copying out [s].
-        steps: Steps taken.
-        settings: What was chosen: ``dx``, ``dt`` or ``cfl``, precision, ... plain values; with
-            ``sha256``, that of the scene, a run is never judged by another version of it.
-        device: On what.
-        failed: Why it broke off, or empty.
-        damage: 0 intact to 1 broken, [T, N], if the method knows.
-        stress: Cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept.
-        impulse: Given by each collider, and then by each drive, so far [N s], [T, K, 3], if kept.
-        deformation: Deformation gradient of each point since the start, [T, N, 3, 3], if kept.
-    """
-
-    scene: str
-    method: str
-    times: Floats
-    x: Floats
-    v: Floats
-    wall_seconds: float
-    steps: int
+    scene: str  # name of the case
+    method: str  # who computed it, such as gsfluent or physgaussian
+    times: Floats  # times [s], those of the scene, [T]
+    x: Floats  # positions [m], [T, N, 3]; a run that broke off leaves NaN from there on
+    v: Floats  # velocities [m/s], [T, N, 3]
+    wall_seconds: float  # time the steps took, without set-up, compilation and copying out [s]
+    steps: int  # steps taken
+    # what was chosen: dx, dt or cfl, precision, ... plain values; with sha256, that of the scene, a
+    # run is never judged by another version of it
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    device: str = ""
-    failed: str = ""
-    damage: Floats | None = None
+    device: str = ""  # on what
+    failed: str = ""  # why it broke off, or empty
+    damage: Floats | None = None  # 0 intact to 1 broken, [T, N], if the method knows
+    # Cauchy or Kirchhoff stress as xx, yy, zz, xy, xz, yz [Pa], [T, N, 6], if kept
     stress: Floats | None = None
+    # given by each collider, and then by each drive, so far [N s], [T, K, 3], if kept
     impulse: Floats | None = None
+    # deformation gradient of each point since the start, [T, N, 3, 3], if kept
     deformation: Floats | None = None
 
     @property

@@ -70,6 +70,15 @@ def elastic(young: float, poisson: float, density: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def plane(
+    axis: int, at: float = 0.0, side: float = 1.0, kind: str = "slip", friction: float = 0.0
+) -> dict[str, Any]:
+    """A collider: the half space below (``side`` 1) or above (-1) ``at`` [m] on an axis."""
+    point, normal = [0.0] * 3, [0.0] * 3
+    point[axis], normal[axis] = at, side
+    return {"point": point, "normal": normal, "kind": kind, "friction": friction}
+
+
 def free(
     name: str,
     points: Floats,
@@ -111,8 +120,7 @@ def free(
 
     return Scene(
         name=name, dx=float(dx), x=points, v=np.array(np.broadcast_to(velocity, (n, 3)), float),
-        volume=np.full(n, dx**3 / per_cell) if volume is None else volume,
-        material=index(material), body=index(body),
-        affine=np.zeros((n, 3, 3)) if affine is None else affine,
-        times=times, materials=rows, facts=dict(facts or {}), **more,
+        volume=np.full(n, dx**3 / per_cell) if volume is None else volume, material=index(material),
+        body=index(body), affine=np.zeros((n, 3, 3)) if affine is None else affine, times=times,
+        materials=rows, facts=dict(facts or {}), **more,
     )  # fmt: skip

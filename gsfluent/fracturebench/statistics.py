@@ -189,13 +189,6 @@ def ensemble(
 ) -> list[Member]:
     """Run a case once for every seed.
 
-    Args:
-        case: The case, such as ``find("shatter")``.
-        dx: Node spacing [m].
-        per_cell: Points per cell.
-        seeds: Seeds of :func:`jitter`.
-        run_case: Runs a scene.
-
     Raises:
         SceneError: A run broke off.
     """

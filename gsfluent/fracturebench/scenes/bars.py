@@ -67,13 +67,6 @@ def expected_size(rate: float, energy: float, strength: float, density: float, c
 
     ``rho rate^2 s^3 / 24 + sigma^2 s / (2 rho c^2) = G`` (Glenn and Chudnovsky 1986; without the
     stored energy it is Grady's ``(24 G / (rho rate^2))^(1/3)``), solved by bisection.
-
-    Args:
-        rate: Strain rate [1/s].
-        energy: G [J/m^2].
-        strength: sigma [Pa].
-        density: [kg/m^3].
-        c: Wave speed [m/s].
     """
     stored = strength**2 / (2.0 * density * c * c)
     low, high = 0.0, energy / stored

@@ -71,13 +71,9 @@ def _judge(scene: Scene, run: Run) -> Iterator[Measure]:
 
 
 def cantilever(dx: float, per_cell: int, speed: float, seconds: float) -> Scene:
-    """The scene of :func:`double_cantilever` at any speed.
+    """The scene of :func:`double_cantilever` at any speed of an arm over that of a pressure wave.
 
-    Args:
-        dx: Node spacing [m].
-        per_cell: Points per cell.
-        speed: Of each arm over that of a pressure wave.
-        seconds: Duration in travel times along the slab.
+    It lasts ``seconds`` travel times along the slab.
     """
     row = brittle(
         1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, strength=0.02, softening=0.01,

@@ -14,7 +14,7 @@ import numpy as np
 from ..registry import case
 from ..run import Measure, Run
 from ..scene import Floats, Scene, wave_speed
-from ..shapes import ball, box, elastic, free
+from ..shapes import ball, box, elastic, free, plane
 
 
 @functools.cache
@@ -60,16 +60,7 @@ _SIDE = np.array([1.0, -2.0, 0.0]) / math.sqrt(5.0)
 
 
 def _meeting(name: str, dx: float, per_cell: int, angle: float, last: float, asked: int) -> Scene:
-    """Two balls that fly against each other.
-
-    Args:
-        name: Of the case.
-        dx: Node spacing [m].
-        per_cell: Points per cell.
-        angle: Between the line of centres at contact and the flight [deg].
-        last: End, after they touch [radius / wave speed].
-        asked: Number of times.
-    """
+    """Two balls that meet at ``angle`` [deg] to their line of centres, ``last`` [R / c] more."""
     points, volume = ball(_RADIUS, dx, per_cell)
     slope = math.radians(angle)
     along = math.cos(slope) * _LINE + math.sin(slope) * _SIDE
@@ -252,6 +243,5 @@ def drop(dx: float, per_cell: int) -> Scene:
     return free(
         "drop", points, [0.0, 0.0, -float(stored["speed"]) * c], dx, per_cell,
         np.linspace(0.0, end, 21)[1:], _JELLY, gravity=(0.0, 0.0, -gravity),
-        colliders=({"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "kind": "sticky",
-                    "friction": 0.0},),
+        colliders=(plane(2, kind="sticky"),),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from ..run import Measure, Run
 from ..scene import Floats, Scene, SceneError, wave_speed
 from ..scenes.rows import BROKEN, brittle, damage_of
 from ..scenes.slabs import HEAVY, heavy, sheet, slab_volume, walls
-from ..shapes import elastic, free
+from ..shapes import elastic, free, plane
 
 _PLAIN = elastic(1e9, 0.2, 1000.0)
 
@@ -173,14 +173,7 @@ def _judge_notch(scene: Scene, run: Run) -> Iterator[Measure]:
 
 
 def notch(dx: float, per_cell: int, pull: float, weight: float) -> Scene:
-    """The scene of :func:`notch_tension` at any load.
-
-    Args:
-        dx: Node spacing [m].
-        per_cell: Points per cell.
-        pull: Speed of each grip over that of a pressure wave.
-        weight: Density and stiffness of the grips over those of the strip.
-    """
+    """The scene of :func:`notch_tension`, grips pulled at ``pull`` times the wave speed."""
     row = brittle(
         1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, strength=0.005, softening=0.001,
         energy=0.0887, dx=dx, reference=1.0 / 32.0,
@@ -269,12 +262,11 @@ def kalthoff(dx: float, per_cell: int) -> Scene:
     # what is crushed at the edge or lies on the plane of symmetry is no part of the question
     breakable = (points[:, 0] > 0.1 * _SIDE) & (points[:, 1] > 3.0 * dx)
     breakable[plate.shape[0] :] = False
-    symmetry = {"point": [0.0] * 3, "normal": [0.0, 1.0, 0.0], "kind": "slip", "friction": 0.0}
     shift = dx * round(0.05 / dx + 4.0)
     return free(
         "kalthoff", points + [shift, 0.0, 0.0], velocity, dx, per_cell,
         np.linspace(0.0, 80e-6, 9)[1:], (plain, row), material=breakable.astype(np.int32),
         volume=np.full(points.shape[0], slab_volume(dx, per_cell)),
-        colliders=(*walls(dx), symmetry), asks=("damage",),
+        colliders=(*walls(dx), plane(1)), asks=("damage",),
         facts={"tip": [shift + _SLOT, _SLOT_HEIGHT]},
     )  # fmt: skip

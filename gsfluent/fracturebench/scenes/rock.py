@@ -18,9 +18,9 @@ import numpy as np
 from ..pieces import REACH, components, neighbours, parted
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene, SceneError, wave_speed
-from ..scenes.rows import brittle, levels, shape_noise
-from ..shapes import box, free
+from ..scene import Floats, Scene, SceneError
+from ..scenes.rows import brittle, levels, shape_noise, uneven
+from ..shapes import box, elastic, free, plane
 from ..statistics import spacing
 
 EXPERIMENT = Path(__file__).parents[1] / "data" / "rock.json"
@@ -131,8 +131,7 @@ def rock_press(dx: float, per_cell: int) -> Scene:
         young, nu, density, friction=2.4, cohesion=0.02, strength=0.0161, softening=0.0012,
         energy=0.0317, dx=dx, reference=_SIZE / 10.0,
     )  # fmt: skip
-    plate = {"law": "elastic", "young_modulus": 30.0 * young, "poisson_ratio": nu,
-             "density": 30.0 * density}  # fmt: skip
+    plate = elastic(30.0 * young, nu, 30.0 * density)
     half = 0.5 * _SIZE
     rock = box([-half] * 3, [_SIZE] * 3, dx, per_cell)
     rock = rock[np.hypot(rock[:, 0], rock[:, 1]) <= half]
@@ -208,17 +207,9 @@ def struck_rock(dx: float, per_cell: int) -> Scene:
     half = 0.5 * _SIZE
     points = box([-half] * 3, [_SIZE] * 3, dx, per_cell)
     points = points[np.hypot(points[:, 0], points[:, 1]) <= half]
-    row = brittle(
-        1e6, 0.2, 1000.0, friction=2.4, cohesion=0.1, strength=0.49, softening=0.05,
-        energy=0.088, shear_damage=0.025, dx=dx, reference=_SIZE / 8.0,
-    )  # fmt: skip
-    noise = shape_noise(points, 0.4 * _SIZE, 3)
-    rows, index = levels(row, np.clip(1.0 + 0.5 * noise, 0.3, 1.7))
-    c = wave_speed(row)
+    rows, index, c = uneven(points, 0.4 * _SIZE, dx, _SIZE / 8.0)
     times = np.linspace(0.0, 30.0 * half / c, 11)[1:]
-    floor = {"point": [0.0, 0.0, -half], "normal": [0.0, 0.0, 1.0], "kind": "separate",
-             "friction": 0.3}  # fmt: skip
     return free(
         "struck_rock", points, [0.0, 0.0, -0.4 * c], dx, per_cell, times, rows, material=index,
-        colliders=(floor,),
+        colliders=(plane(2, -half, kind="separate", friction=0.3),),
     )  # fmt: skip

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from ..run import Run
-from ..scene import Floats, Ints, Scene, SceneError
+from ..scene import Floats, Ints, Scene, SceneError, wave_speed
 from ..shapes import elastic
 
 BAND_CELLS = 2.0
@@ -139,18 +139,31 @@ def shape_noise(x: Floats, length: float, seed: int, waves: int = 24) -> Floats:
     """Smooth noise fixed to the body, of mean 0 and variance 1 in the large, [N].
 
     A sum of plane waves of random direction, so that it is the same at every resolution.
-
-    Args:
-        x: Places in the body [m], [N, 3].
-        length: Wave length [m].
-        seed: Of directions and phases.
-        waves: How many.
     """
     generator = np.random.default_rng(seed)
     k = generator.normal(size=(waves, 3))
     k *= 2.0 * math.pi / length / np.linalg.norm(k, axis=1, keepdims=True)
     phase = generator.random(waves) * 2.0 * math.pi
     return math.sqrt(2.0 / waves) * np.cos(x @ k.T + phase).sum(axis=1)
+
+
+def uneven(
+    x: Floats, length: float, dx: float, reference: float
+) -> tuple[tuple[dict[str, Any], ...], Ints, float]:
+    """Rows of a soft brittle solid whose strength varies by a half, of each point, and its speed.
+
+    Args:
+        x: Places in the body [m], [N, 3].
+        length: Over which strength varies [m].
+        dx: Node spacing of the scene [m].
+        reference: Node spacing that its softening belongs to [m].
+    """
+    row = brittle(
+        1e6, 0.2, 1000.0, friction=2.4, cohesion=0.1, strength=0.49, softening=0.05,
+        energy=0.088, shear_damage=0.025, dx=dx, reference=reference,
+    )  # fmt: skip
+    factor = np.clip(1.0 + 0.5 * shape_noise(x, length, 3), 0.3, 1.7)
+    return *levels(row, factor), wave_speed(row)
 
 
 def damage_of(scene: Scene, run: Run) -> Floats:

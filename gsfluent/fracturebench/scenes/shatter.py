@@ -11,9 +11,9 @@ import numpy as np
 
 from ..registry import case
 from ..run import Measure, Run
-from ..scene import Floats, Scene, SceneError, wave_speed
-from ..scenes.rows import brittle, levels, shape_noise
-from ..shapes import box, free
+from ..scene import Floats, Scene, SceneError
+from ..scenes.rows import uneven
+from ..shapes import box, free, plane
 from ..statistics import MEASURES, Figures, distance, figures
 
 RADIUS = 0.05
@@ -76,21 +76,9 @@ def shatter(dx: float, per_cell: int) -> Scene:
     Its strength varies by a half over four fifths of the radius, the same at every resolution.
     """
     points = lattice_ball(RADIUS, dx, per_cell)
-    row = brittle(
-        1e6, 0.2, 1000.0, friction=2.4, cohesion=0.1, strength=0.49, softening=0.05,
-        energy=0.088, shear_damage=0.025, dx=dx, reference=RADIUS / 4.0,
-    )  # fmt: skip
-    noise = shape_noise(points, 0.8 * RADIUS, 3)
-    rows, index = levels(row, np.clip(1.0 + 0.5 * noise, 0.3, 1.7))
-    c = wave_speed(row)
+    rows, index, c = uneven(points, 0.8 * RADIUS, dx, RADIUS / 4.0)
     times = np.linspace(0.0, _END * RADIUS / c, _SAMPLES + 1)[1:]
     return free(
         "shatter", points, [0.0, 0.0, -_SPEED * c], dx, per_cell, times, rows, material=index,
-        asks=("damage", "stress"),
-        colliders=(
-            {
-                "point": [0.0, 0.0, -RADIUS], "normal": [0.0, 0.0, 1.0], "kind": "separate",
-                "friction": 0.3,
-            },
-        ),
+        asks=("damage", "stress"), colliders=(plane(2, -RADIUS, kind="separate", friction=0.3),),
     )  # fmt: skip

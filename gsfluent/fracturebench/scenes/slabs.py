@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..scene import Floats
-from ..shapes import elastic
+from ..shapes import elastic, plane
 
 HEAVY = 30.0
 """Density and stiffness of grips over those of what they hold."""
@@ -44,13 +44,7 @@ def slab_volume(dx: float, per_cell: int) -> float:
 
 def walls(dx: float, axes: Sequence[int] = (2,)) -> tuple[dict[str, Any], ...]:
     """Frictionless planes at 0 and ``dx`` on each axis: a slab, or with two axes a bar."""
-    rows = []
-    for axis in axes:
-        for at, sign in ((0.0, 1.0), (dx, -1.0)):
-            point, normal = [0.0] * 3, [0.0] * 3
-            point[axis], normal[axis] = at, sign
-            rows.append({"point": point, "normal": normal, "kind": "slip", "friction": 0.0})
-    return tuple(rows)
+    return tuple(plane(axis, at, n) for axis in axes for at, n in ((0.0, 1.0), (dx, -1.0)))
 
 
 def heavy(row: Mapping[str, Any], weight: float = HEAVY) -> dict[str, Any]:
@@ -59,10 +53,6 @@ def heavy(row: Mapping[str, Any], weight: float = HEAVY) -> dict[str, Any]:
     A method that sets the velocity of points before a step, and not that of nodes, moves what is
     held with a force of at most about ``density dx speed / dt`` per area: the grip gives way, and
     more so with long steps. A heavy grip raises that bound.
-
-    Args:
-        row: Elastic row.
-        weight: Factor.
     """
     young, density = float(row["young_modulus"]), float(row["density"])
     return elastic(weight * young, float(row["poisson_ratio"]), weight * density)

@@ -46,10 +46,9 @@ def bandwidth(device: str) -> Record:
     rate = moved / min(seconds[1:])
     return Record(
         case="copy", kind="machine", method="torch copy", variant="",
-        settings={"gigabytes_per_second": rate / 1e9, "bytes_per_point_step": BYTES},
-        device=device, machine=machine(device), points=0, steps=0, simulated_seconds=0.0,
-        wall_seconds=seconds[1:], wall_per_simulated=0.0, ns_per_point_step=1e9 * BYTES / rate,
-        error=0.0, commit=commit(),
+        settings={"gigabytes_per_second": rate / 1e9, "bytes_per_point_step": BYTES}, device=device,
+        machine=machine(device), points=0, steps=0, simulated_seconds=0.0, wall_seconds=seconds[1:],
+        wall_per_simulated=0.0, ns_per_point_step=1e9 * BYTES / rate, error=0.0, commit=commit(),
         date=now(),
     )  # fmt: skip
 
@@ -65,14 +64,8 @@ def run(
 ) -> Done:
     """Run what a file does not hold yet; a line is added as soon as its run is done.
 
-    Args:
-        settings: The ladder.
-        path: Of the records.
-        device: Where.
-        repeat: Timed runs of each.
-        budget: Seconds in all; what is expected to pass them is left out. A run's time is expected
-            to go with points times steps of the last similar one.
-        progress: Told before every run.
+    What is expected to pass the budget [s] is left out: time goes with points times steps of
+    the last similar one.
     """
     begun = time.monotonic()
     have = {r.key: r for r in read(path)} if path.exists() else {}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent.errors import InputError
-from gsfluent.figure.page import Page
+from gsfluent.figure.page import Page, markdown_table
 from gsfluent.figure.pareto import Dot, Panel, Rates, draw
 from gsfluent.figure.style import save_png, to_svg
 from gsfluent.io.atomic import atomic_path
@@ -80,8 +80,7 @@ class Chart:
         for heading, head, rows in self.tables():
             if chosen and heading not in chosen:
                 continue
-            lines = [f"**{heading}**", "", _row(head), _row(["---"] * len(head))]
-            parts.append("\n".join([*lines, *(_row(r) for r in rows)]))
+            parts.append(f"**{heading}**\n\n{markdown_table(head, rows).rstrip()}")
         return "\n\n".join(parts)
 
     def warnings(self) -> list[str]:
@@ -292,9 +291,3 @@ def _base(records: Iterable[Record], record: Record) -> Record | None:
     return next(
         (r for r in same if r.settings.get("knob") in _BASES and r.settings.get("dx") == dx), None
     )
-
-
-def _row(cells: Sequence[Any]) -> str:
-    from gsfluent.figure.page import shown
-
-    return "| " + " | ".join(shown(c).replace("|", "\\|") for c in cells) + " |"

@@ -116,12 +116,7 @@ def ladder(
 ) -> list[Setting]:
     """All settings, ladders over all rungs first, so that a budget cuts knobs and not cases.
 
-    Args:
-        names: Cases; default: all.
-        device: ``cpu`` or ``cuda``.
-        only: Knobs of :data:`KNOBS`; default: all. The base ladder is that of ``dx``.
-        quick: Two cases, their coarse rungs, few knobs: seconds.
-        textbook: With the textbook solver's runs.
+    Without names all cases and all knobs of :data:`KNOBS`; the base ladder is that of ``dx``.
 
     Raises:
         InputError: An unknown case or knob.

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from gsfluent.errors import GsfluentError, InputError
-from gsfluent.figure.page import Page, shown
+from gsfluent.figure.page import Page, markdown_table
 from gsfluent.figure.pareto import Dot, Panel, draw
 from gsfluent.figure.style import save_png, to_svg
 from gsfluent.io.atomic import atomic_path
@@ -123,8 +123,7 @@ def _record(kind: str, job: Job, repeat: int, device: str, where: str, version: 
         simulated_seconds=1.0, wall_seconds=list(out.wall_seconds), wall_per_simulated=wall,
         ns_per_point_step=1e9 * wall / max(1, out.count), error=out.error,
         measures=[{"quantity": name, "value": value} for name, value in out.measures.items()],
-        failed=failed, commit=version,
-        date=now(),
+        failed=failed, commit=version, date=now(),
     )  # fmt: skip
 
 
@@ -138,14 +137,6 @@ def chart_quality(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Chart rendering, reconstruction or texturing.
-
-    Args:
-        of: One of :data:`KINDS`.
-        out: Folder; ``<of>.jsonl``, ``.png``, ``.html`` and ``.md`` are written there.
-        device: Where to compute.
-        quick: A small ladder.
-        repeat: Timed repeats.
-        progress: Told after every setting.
 
     Raises:
         InputError: An unknown kind.
@@ -242,6 +233,4 @@ def table(records: Sequence[Record]) -> tuple[list[str], list[list[Any]]]:
 
 def markdown(records: Sequence[Record]) -> str:
     """The table in Markdown."""
-    head, rows = table(records)
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(shown(c).replace('|', '/') for c in row)} |\n" for row in lines)
+    return markdown_table(*table(records))

@@ -199,13 +199,12 @@ def of_run(
     return Record(
         case=case.name, kind=case.kind, method=first.method, variant=variant, settings=known,
         device=first.device, machine=_machine(first.device) if machine is None else machine,
-        points=points, steps=steps, simulated_seconds=scene.seconds,
-        wall_seconds=wall, wall_per_simulated=middle / scene.seconds,
+        points=points, steps=steps, simulated_seconds=scene.seconds, wall_seconds=wall,
+        wall_per_simulated=middle / scene.seconds,
         ns_per_point_step=1e9 * middle / (points * max(1, steps)),
         error=math.inf if broken else float(measures[0].error),
         measures=[dataclasses.asdict(m) for m in measures], failed=failed,
-        commit=_commit() if commit is None else commit,
-        date=now(),
+        commit=_commit() if commit is None else commit, date=now(),
     )  # fmt: skip
 
 

@@ -94,12 +94,7 @@ def even_dt(scene: Scene, courant: float) -> float:
 
 
 def _runs(
-    setting: Setting,
-    scene: Scene,
-    device: str,
-    options: dict[str, Any],
-    repeat: int,
-    seeds: int,
+    setting: Setting, scene: Scene, device: str, options: dict[str, Any], repeat: int, seeds: int
 ) -> tuple[list[Run], list[float], int, dict[str, Any]]:
     """The judged runs, the times, the steps of a timed run, and facts."""
     below = scene
@@ -210,8 +205,7 @@ def broken(
     return Record(
         case=setting.case, kind=kind, method=setting.method, variant=setting.variant,
         settings={"dx": setting.dx, "ppc": setting.ppc, **facts}, device=device,
-        machine=machine(device), points=points, steps=0, simulated_seconds=seconds,
-        wall_seconds=[], wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
-        failed=words.rstrip(": "), commit=commit(),
-        date=now(),
+        machine=machine(device), points=points, steps=0, simulated_seconds=seconds, wall_seconds=[],
+        wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
+        failed=words.rstrip(": "), commit=commit(), date=now(),
     )  # fmt: skip

@@ -60,11 +60,7 @@ def texture(known: KnownInterior, method: str, device: str, model: str | None) -
 
 
 def stage(
-    known: KnownInterior,
-    method: str,
-    photos: dict[str, np.ndarray],
-    model: str | None,
-    device: str,
+    known: KnownInterior, method: str, photos: dict[str, np.ndarray], model: str | None, device: str
 ) -> Texture:
     """The texture stage as a user would set it for this class."""
     if method == "procedural":

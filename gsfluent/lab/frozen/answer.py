@@ -110,9 +110,8 @@ def run_case(
     several = fields and int(scene.body.max()) > 0
     drives = Drives(scene, dtype, device) if scene.drives else None
     world = World(
-        torch.from_numpy(scene.x), torch.from_numpy(scene.v),
-        volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
-        material=torch.from_numpy(scene.material), alpha=alpha,
+        torch.from_numpy(scene.x), torch.from_numpy(scene.v), volume=torch.from_numpy(scene.volume),
+        dx=scene.dx, law=law, params=params, material=torch.from_numpy(scene.material), alpha=alpha,
         body=torch.from_numpy(scene.body) if several else None,
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,

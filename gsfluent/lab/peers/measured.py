@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsfluent.fracturebench.scene import Floats, Scene
+from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.problems.fracture import brittle
+from gsfluent.lab.problems.fracture.brittle import plain
 from gsfluent.lab.textbook.laws import advance, measure
 from gsfluent.lab.textbook.nacc import Nacc, return_map
 from gsfluent.lab.textbook.solver import Textbook, Variant
@@ -30,18 +31,6 @@ SOFT: dict[str, Any] = {
 }  # fmt: skip
 
 
-def _scene(
-    points: Floats, velocity: Floats, volume: float, material: Mapping[str, Any], **more: Any
-) -> Scene:
-    n = points.shape[0]
-    zero = np.zeros(n, np.int32)
-    return Scene(
-        "point", DX, points, np.array(np.broadcast_to(velocity, (n, 3))), np.full(n, volume), zero,
-        more.pop("body", zero), more.pop("affine", np.zeros((n, 3, 3))), np.array([1.0]),
-        (material,), **more,
-    )  # fmt: skip
-
-
 def _bar(cells: int) -> tuple[Scene, float]:
     """A free bar in its first mode, and the angular frequency of it [1/s]."""
     length = cells * DX
@@ -51,7 +40,7 @@ def _bar(cells: int) -> tuple[Scene, float]:
     velocity, affine = np.zeros_like(points), np.zeros((points.shape[0], 3, 3))
     velocity[:, 0] = 1e-2 * np.cos(phase)
     affine[:, 0, 0] = -1e-2 * k * np.sin(phase)
-    scene = _scene(points, velocity, (0.5 * DX) ** 3, SOFT, affine=affine)
+    scene = plain(points, velocity, SOFT, affine=affine)
     return scene, k * scene.wave_speed
 
 
@@ -94,9 +83,9 @@ def cluster_growth(switches: Switches, numbers: Numbers) -> float:
     ]
     points = np.concatenate(clouds)
     material = {**SOFT, "poisson_ratio": 0.4}
-    scene = _scene(points, np.zeros(3), (0.5 * DX) ** 3, material)
+    scene = plain(points, np.zeros(3), material)
     speed = 1e-3 * scene.wave_speed * random.standard_normal(points.shape)
-    scene = _scene(points, speed, (0.5 * DX) ** 3, material)
+    scene = plain(points, speed, material)
     dt = numbers["courant"] * DX / scene.wave_speed
     solver = Textbook(scene, Variant(**switches), dtype=DOUBLE, dt=dt).run(steps=1)
     first, largest = solver.kinetic() + solver.elastic(), 0.0
@@ -156,8 +145,8 @@ def units(switches: Switches, numbers: Numbers) -> float:
 
 def lone_point(switches: Switches, numbers: Numbers) -> float:
     """Speed of a point that flies alone, after one step over before."""
-    scene = _scene(
-        np.full((1, 3), (5.0 + numbers["place"]) * DX), np.array([1.0, 0.0, 0.0]), DX**3, SOFT
+    scene = plain(
+        np.full((1, 3), (5.0 + numbers["place"]) * DX), np.array([1.0, 0.0, 0.0]), SOFT, 1
     )
     solver = Textbook(scene, Variant(**switches), dt=1e-9)
     try:
@@ -171,8 +160,8 @@ def spin_left(switches: Switches, numbers: Numbers) -> float:
     """Angular momentum of a free ball after 100 steps over that before, affine part included."""
     points = ball([8.0 * DX] * 3, 2.0 * DX, 0.5 * DX).numpy()
     turn = np.array([[0.0, -4.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    scene = _scene(
-        points, (points - points.mean(0)) @ turn.T, (0.5 * DX) ** 3, SOFT,
+    scene = plain(
+        points, (points - points.mean(0)) @ turn.T, SOFT,
         affine=np.tile(turn, (points.shape[0], 1, 1)),
     )  # fmt: skip
     solver = Textbook(scene, Variant(**switches), dtype=DOUBLE, dt=0.5 * DX / scene.wave_speed)
@@ -259,9 +248,7 @@ def rotation_strain(switches: Switches, numbers: Numbers) -> float:
 
 def creep(switches: Switches, numbers: Numbers) -> float:
     """Distance that a point moves in 200 steps over v t, float32."""
-    scene = _scene(
-        np.full((1, 3), numbers["x"]), np.array([numbers["speed"], 0.0, 0.0]), DX**3, SOFT
-    )
+    scene = plain(np.full((1, 3), numbers["x"]), np.array([numbers["speed"], 0.0, 0.0]), SOFT, 1)
     solver = Textbook(scene, Variant(**switches), dt=numbers["dt"]).run(steps=200)
     moved = float(solver.position[0, 0]) - numbers["x"]
     return moved / (200.0 * numbers["dt"] * numbers["speed"])
@@ -273,10 +260,10 @@ def speed_kept(switches: Switches, numbers: Numbers) -> float:
     points = np.concatenate([left, left + [4.0 * DX, 0.0, 0.0]])
     body = np.repeat(np.array([0, 1], np.int32), left.shape[0])
     material = {**SOFT, "poisson_ratio": 0.2}
-    speed = numbers["share"] * _scene(left, np.zeros(3), 1.0, material).wave_speed
+    speed = numbers["share"] * plain(left, np.zeros(3), material).wave_speed
     velocity = np.zeros_like(points)
     velocity[:, 0] = np.where(body == 1, speed, -speed)
-    scene = _scene(points, velocity, (0.5 * DX) ** 3, material, body=body)
+    scene = plain(points, velocity, material, body=body)
     solver = Textbook(scene, Variant(**switches), dt=0.5 * DX / scene.wave_speed)
     solver.run(seconds=12.0 * 8.0 * DX / scene.wave_speed)
     return float(solver.velocity[torch.from_numpy(body == 1), 0].mean()) / speed

@@ -20,6 +20,11 @@ from gsfluent.figure.map import Mark
 from gsfluent.lab.peers.known import find
 from gsfluent.lab.stability.maps import Map
 
+
+def _courant(demo: str) -> float:
+    return find(f"PhysGaussian {demo}").parameters["courant"]
+
+
 _GS = "PhysGaussian, GaussianFluent, Taichi"
 # map -> (variant whose panel shows it, x, y, name)
 KNOWN: dict[str, tuple[tuple[str, float | str, float | str, str], ...]] = {
@@ -34,18 +39,13 @@ KNOWN: dict[str, tuple[tuple[str, float | str, float | str, str], ...]] = {
     "creep": (("absolute positions", 1e3, 1e-3, _GS),),
     "storage": (("gsfluent", 1e-5, "F, float32", _GS),),
     "speed": tuple(
-        (
-            "fixed step",
-            find(f"PhysGaussian {name}").parameters["courant"],
-            mach,
-            f"{name}, its demo",
-        )
+        ("fixed step", _courant(name), mach, f"{name}, its demo")
         for name, mach in (("ficus", 0.1), ("vasedeck", 0.3))
     ),
     "loose": (
         (
             "force by gradients, F (PhysGaussian)",
-            find("PhysGaussian ficus, leaves").parameters["courant"],
+            _courant("ficus, leaves"),
             0.4,
             "ficus, its leaves",
         ),

@@ -261,10 +261,7 @@ def verdict(maps: Sequence[Map], points: Sequence[Point]) -> list[str]:
 
 
 def write_all(
-    maps: Sequence[Map],
-    points: Sequence[Point],
-    out: Path,
-    marks: Marks | None = None,
+    maps: Sequence[Map], points: Sequence[Point], out: Path, marks: Marks | None = None
 ) -> Path:
     """Draw every map into ``out`` and put all on one page.
 

@@ -59,8 +59,7 @@ def run_point(task: tuple[str, str, Value, Value, str]) -> Point:
         map=name, variant=variant, x=x, y=y, limit=outcome.steps,
         step=None if bad is None else bad.step, kind="" if bad is None else bad.kind, value=value,
         note="" if bad is None else bad.note, points=outcome.points, seconds=round(seconds, 4),
-        device=device, machine=machine(device), commit="",
-        date=now(),
+        device=device, machine=machine(device), commit="", date=now(),
     )  # fmt: skip
 
 

@@ -76,9 +76,8 @@ def thrown(
     stretch = Courant(0.5 if courant is None else courant)
     volume = (0.5 * DX) ** 3
     world = World(
-        points, [0.0, 0.0, -speed], volume=volume, dx=DX, law=0, params=row,
-        colliders=FLOOR, cfl=stretch.cfl, dt=dt, dtype=torch.float32, device=place.device,
-        **options,
+        points, [0.0, 0.0, -speed], volume=volume, dx=DX, law=0, params=row, colliders=FLOOR,
+        cfl=stretch.cfl, dt=dt, dtype=torch.float32, device=place.device, **options,
     )  # fmt: skip
     return stretch.apply(world) if dt is None and world.engine == "solver" else world
 
@@ -102,7 +101,10 @@ def brittle(
     place: Place,
     **options: Any,
 ) -> World:
-    """A NACC ball that breaks on a floor (equations.md, the drop of row 8), at a fixed step."""
+    """A NACC ball that breaks on a floor (equations.md, the drop of row 8), (c + v) dt / dx fixed.
+
+    ``order`` is the seed of another numbering of its points.
+    """
     row = nacc(
         BRITTLE["young_modulus"], BRITTLE["poisson_ratio"], BRITTLE["density"],
         friction=BRITTLE["friction"], cohesion=BRITTLE["cohesion"], hardening=hardening,

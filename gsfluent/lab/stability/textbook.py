@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.fracturebench.scene import Scene
+from gsfluent.fracturebench.shapes import free
 from gsfluent.lab.stability.maps import Outcome, Place
 from gsfluent.lab.stability.scenes import DX
 from gsfluent.lab.textbook.solver import Textbook, Variant
@@ -22,21 +23,12 @@ def scene_of(
     velocity: Tensor,
     volume: float,
     material: Mapping[str, Any],
-    *,
     dx: float = DX,
-    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    colliders: Sequence[Mapping[str, Any]] = (),
+    **more: Any,
 ) -> Scene:
-    """A scene of one material; times are not used here."""
-    n = len(points)
-    return Scene(
-        name="stability", dx=dx, x=points.double().numpy(), v=velocity.double().numpy(),
-        volume=np.full(n, volume), material=np.zeros(n, np.int32),
-        body=np.zeros(n, np.int32),
-        affine=np.zeros((n, 3, 3)),
-        times=np.array([1.0]), materials=(dict(material),), gravity=gravity,
-        colliders=tuple(colliders),
-    )  # fmt: skip
+    """A scene of one material that is run by steps: its times are not used."""
+    x, v, each = points.double().numpy(), velocity.double().numpy(), np.full(len(points), volume)
+    return free("stability", x, v, dx, 8, np.array([1.0]), material, volume=each, **more)
 
 
 class OfTextbook:

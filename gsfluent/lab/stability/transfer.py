@@ -105,9 +105,8 @@ def lone_point(away: float, which: str, variant: str, place: Place) -> Outcome:
     still = torch.zeros(1, 3, dtype=torch.float64)
     if which == "gsfluent":
         world = World(
-            at, still, volume=DX**3, dx=DX, law=0,
-            params=parameters(YOUNG, 0.3, DENSITY), dt=1e-4, dtype=torch.float32,
-            device=place.device,
+            at, still, volume=DX**3, dx=DX, law=0, params=parameters(YOUNG, 0.3, DENSITY), dt=1e-4,
+            dtype=torch.float32, device=place.device,
         )  # fmt: skip
         return watched(world, steps, place)
     return watched_textbook(
@@ -204,7 +203,7 @@ def released_point(courant: float, which: str, variant: str, place: Place) -> Ou
     }  # fmt: skip
     scene = scene_of(
         points, velocity, (0.5 * SPACING) ** 3, material, dx=SPACING, gravity=(0.0, 0.0, -9.81),
-        colliders=[floor],
+        colliders=(floor,),
     )  # fmt: skip
     return watched_textbook(
         scene, STEPS, place, dt=courant * SPACING / (c * (1.0 + IMPACT)),

@@ -166,11 +166,6 @@ class Textbook:
     ) -> Textbook:
         """Advance by a time, to the end of it exactly, or by a number of steps.
 
-        Args:
-            seconds: Time to advance by [s].
-            steps: Steps to advance by.
-            each: Called after every step.
-
         Raises:
             ValueError: Not exactly one of ``seconds`` and ``steps``.
             FloatingPointError: A number is not finite; :attr:`birth` says where it came from.

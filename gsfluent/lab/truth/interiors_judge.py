@@ -22,6 +22,7 @@ Plane = tuple[np.ndarray, np.ndarray, np.ndarray]
 _PLACES = ((0.34, 0.60), (0.34, 0.60), (0.22, 0.56))
 """Where the slices lie along x, y and z. Level ones pass through the same sponge in every cake: one
 that met the cream in some draws only would make the floor a matter of luck."""
+_DISTANCES = ("patch", "patch_coarse", "hist", "profile", "coherence", "coverage")
 _PATCHES = 40000
 """With fewer the draw of patches costs more than another object of the class."""
 _KEEP_OFF = 3.0
@@ -113,9 +114,11 @@ class Judge:
             The figures named in :func:`judge`, ``floor`` (the same of another draw) and ``ratio``
             (figure over floor, where less is better and the floor is not 0).
         """
-        figures = self._figures(self.known, rgb)
-        distances = ("patch", "patch_coarse", "hist", "profile", "coherence", "coverage")
-        ratio = {key: figures[key] / max(self.floor[key], 1e-9) for key in distances}
+        return self._beside_the_floor(self._figures(self.known, rgb))
+
+    def _beside_the_floor(self, figures: dict[str, Any]) -> dict[str, Any]:
+        keys = [key for key in _DISTANCES if figures[key] is not None]
+        ratio = {key: figures[key] / max(self.floor[key], 1e-9) for key in keys}
         return {**figures, "floor": self.floor, "ratio": ratio}
 
     def photograph(self) -> dict[str, Any]:
@@ -129,7 +132,7 @@ class Judge:
         own = [(p[..., :3], p[..., 3] > 0.5) for p in self.known.exemplars().values()]
         coherence, coverage = metrics.patch_neighbours(own, truth)
         halves = metrics.half_size(own), metrics.half_size(truth)
-        figures: dict[str, Any] = {
+        return self._beside_the_floor({
             "patch": metrics.patch_distance(own, truth, samples=_PATCHES),
             "patch_coarse": metrics.patch_distance(*halves, samples=_PATCHES),
             "hist": metrics.lab_histogram_distance(_colors(own), _colors(truth)),
@@ -139,10 +142,7 @@ class Judge:
             "radial": None,
             "coherence": coherence,
             "coverage": coverage,
-        }
-        distances = ("patch", "patch_coarse", "hist", "coherence", "coverage")
-        ratio = {key: figures[key] / max(self.floor[key], 1e-9) for key in distances}
-        return {**figures, "floor": self.floor, "ratio": ratio}
+        })  # fmt: skip
 
     def _figures(self, known: KnownInterior, rgb: np.ndarray) -> dict[str, Any]:
         domain, truth = known.domain, self.truth

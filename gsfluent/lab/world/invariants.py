@@ -98,11 +98,6 @@ class Moving(Protocol):
 def check(first: State, now: State, limits: Limits | None = None) -> Violation | None:
     """Judge a moment of a run against its start.
 
-    Args:
-        first: The start.
-        now: The moment.
-        limits: What is allowed.
-
     Returns:
         What is broken, the most telling first: finite, volume, energy, momentum, path; or None.
     """
@@ -195,13 +190,6 @@ def search(
     begin: int = 0,
 ) -> Violation | None:
     """Run on until a judge finds fault, and find the first step at which it does by halving.
-
-    Args:
-        moving: The run.
-        judge: Says what is wrong at present.
-        steps: Steps to go at most.
-        every: Steps between two looks.
-        begin: Number of the present step.
 
     Returns:
         The violation, with its step; None when there is none within ``steps``.

@@ -101,38 +101,38 @@ def run(item: Problem, **options: Any) -> list[Result]:
     found = item.function(**options)
     results = [found] if isinstance(found, Result) else list(found)
     seconds = time.process_time() - start
-    return [dataclasses.replace(result, seconds=seconds) for result in results]
+    return [dataclasses.replace(r, name=r.name or item.name, seconds=seconds) for r in results]
 
 
 def compare(
-    name: str,
     quantity: str,
     value: float,
-    reference: float,
+    reference: float | None = None,
     *,
     tolerance: float,
+    error: float | None = None,
     unit: str = "",
     source: str = "",
-    relative: bool = True,
     note: str = "",
+    name: str = "",
 ) -> Result:
     """Return the Result of a figure that should equal its reference.
 
     Args:
-        name: Problem.
         quantity: What was measured.
         value: Measured figure.
-        reference: What it should be.
-        tolerance: Largest accepted error: a share of ``reference``, or in ``unit`` if not
-            ``relative``.
+        reference: What it should be; None: nothing at all.
+        tolerance: Largest accepted error, in the measure of it.
+        error: Default: the difference as a share of ``reference``, or ``value`` in its unit.
         unit: Unit of value and reference.
         source: Where the reference comes from.
-        relative: Divide the difference by the size of the reference.
         note: Settings or findings.
+        name: Of the problem; default: :func:`run` fills it in.
     """
-    error = abs(value - reference)
-    if relative:
-        error = error / abs(reference) if reference != 0.0 else math.inf
-    return Result(
-        name, quantity, value, reference, error, tolerance, unit, source, note=note
-    )  # fmt: skip
+    if error is None and reference is None:
+        error = abs(value)
+    elif error is None:
+        off = abs(value - float(reference or 0.0))
+        error = off / abs(reference) if reference else math.inf
+    target = 0.0 if reference is None else reference
+    return Result(name, quantity, value, target, error, tolerance, unit, source, note=note)

@@ -31,16 +31,6 @@ class Resident:
     precision of the rest, since the solver keeps them relative to their cell.
     """
 
-    time: float  # these are read from the solver, as in World
-    steps: int
-    position: Tensor
-    velocity: Tensor
-    affine: Tensor
-    strain: Tensor
-    alpha: Tensor
-    peak: Tensor
-    deformation: Tensor | None
-
     def __init__(
         self,
         scene: Scene,

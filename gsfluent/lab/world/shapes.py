@@ -38,9 +38,7 @@ def ball(center: Sequence[float], radius: float, spacing: float) -> Tensor:
 def disc(center: Sequence[float], radius: float, thickness: float, spacing: float) -> Tensor:
     """Points inside a flat cylinder around the z axis through ``center`` (its middle)."""
     half = math.ceil(radius / spacing) * spacing
-    points = box(
-        [-half, -half, -0.5 * thickness], [2 * half, 2 * half, thickness], spacing
-    )  # fmt: skip
+    points = box([-half, -half, -0.5 * thickness], [2 * half, 2 * half, thickness], spacing)
     inside = points[points[:, :2].norm(dim=1) <= radius]
     return inside + torch.tensor([float(c) for c in center], dtype=torch.float64)
 

@@ -57,11 +57,6 @@ def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
     Solids: acoustic modulus of the neo-Hookean law in a uniaxial state (equations.md 2.1),
     ``kappa (1 + J^2) / 2 + (2 mu / 9) (J^(4/3) + 5 J^(-2/3))``; fluids: ``K J^(-gamma-1)``, at
     least its value at rest.
-
-    Args:
-        strain: e = b - I, [N, 6].
-        law: int32 [N].
-        params: [N, 8].
     """
     xx, yy, zz, xy, xz, yz = strain.unbind(-1)
     xx, yy, zz = xx + 1.0, yy + 1.0, zz + 1.0

@@ -33,12 +33,9 @@ def bodies(
     volume = SPACING**3
     options = {"volume": volume, "dx": 1.0, "law": 0, **options}
     return World(
-        torch.cat(parts),
-        speed,
-        params=options.pop("params", parameters(YOUNG, POISSON, 1.0)),
-        body=None if one_field else body,
-        **options,
-    )
+        torch.cat(parts), speed, params=options.pop("params", parameters(YOUNG, POISSON, 1.0)),
+        body=None if one_field else body, **options,
+    )  # fmt: skip
 
 
 def turning(world: World, of: Tensor) -> Tensor:
@@ -96,7 +93,7 @@ def pull_apart(gap: float = 0.0, one_field: bool = False) -> Result:
     mass = float(world.scene.mass[second].sum())
     kept = float(world.momentum(second)[0]) / mass / speed
     return compare(
-        "pull_apart", "v_end / v_0", kept, 1.0, tolerance=1e-3, source="free flight",
+        "v_end / v_0", kept, 1.0, tolerance=1e-3, source="free flight",
         note="one velocity field" if one_field else "a field per body",
     )  # fmt: skip
 
@@ -113,9 +110,7 @@ def _impact(
     points, volume = smooth_ball(radius)
     parts = [points + sign * place + shift for sign in (-1.0, 1.0)]
     volume = torch.cat([volume, volume])
-    world = bodies(
-        parts, [speed * along, -speed * along], volume=volume, **options
-    )  # fmt: skip
+    world = bodies(parts, [speed * along, -speed * along], volume=volume, **options)
     first = torch.arange(len(world.position)) < len(parts[0])
     return world, [first, ~first], line
 
@@ -137,9 +132,8 @@ def oblique_spheres(
         spin = [float(turning(world, of).cpu() @ axis) * radius / speed for of in balls]
         worst = max(spin, key=abs)
         yield compare(
-            "oblique_spheres", f"omega R / v_0, direction {number}", worst, 0.0, tolerance=0.02,
-            relative=False, source="no friction, no torque",
-            note=f"both balls {spin[0]:+.4f} {spin[1]:+.4f}",
+            f"omega R / v_0, direction {number}", worst, tolerance=0.02,
+            source="no friction, no torque", note=f"both balls {spin[0]:+.4f} {spin[1]:+.4f}",
         )  # fmt: skip
 
 
@@ -170,12 +164,18 @@ def hertz_spheres(radius: float = 7.0, one_field: bool = False) -> list[Result]:
     source = "Hertz (Johnson 1985)"
     note = f"R = {radius:g} dx, v = {speed:g} c each, deepest {depth:.2f} dx"
     return [
-        compare("hertz_spheres", "largest force / Hertz", max(f for _, f in pushes) / force, 1.0,
-                tolerance=0.1, source=source, note=note),
-        compare("hertz_spheres", "contact time / Hertz", (touching[-1] - touching[0]) / time, 1.0,
-                tolerance=0.1, source=source, note=note),
-        compare("hertz_spheres", "restitution", after, 1.0, tolerance=0.05,
-                source="elastic impact", note="damping of the transfer (docs/theory/contact.md)"),
+        compare(
+            "largest force / Hertz", max(f for _, f in pushes) / force, 1.0, tolerance=0.1,
+            source=source, note=note,
+        ),
+        compare(
+            "contact time / Hertz", (touching[-1] - touching[0]) / time, 1.0, tolerance=0.1,
+            source=source, note=note,
+        ),
+        compare(
+            "restitution", after, 1.0, tolerance=0.05, source="elastic impact",
+            note="damping of the transfer (docs/theory/contact.md)",
+        ),
     ]  # fmt: skip
 
 
@@ -198,8 +198,8 @@ def hertz_axis() -> Iterator[Result]:
         world.run(0.5 / speed + 20.0 * radius * (2.0 * speed) ** -0.2)
         after = -float(world.momentum(first)[0] / world.scene.mass[first].sum()) / speed
         yield compare(
-            "hertz_axis", f"restitution, {'one field' if one_field else 'two fields, no gate'}",
-            after, 1.0, tolerance=0.05, source="solver.md 0, finding 5: 0.953 to 0.972",
+            f"restitution, {'one field' if one_field else 'two fields, no gate'}", after, 1.0,
+            tolerance=0.05, source="solver.md 0, finding 5: 0.953 to 0.972",
             note=f"R = {radius:g} dx, v = {speed:g} c each, {len(points)} points each",
         )  # fmt: skip
 
@@ -227,10 +227,13 @@ def colliding_discs() -> list[Result]:
     source = "Sulsky, Chen & Schreyer 1994"
     drift = float(world.momentum().norm()) / (0.1 * float(world.scene.mass.sum()))
     return [
-        compare("colliding_discs", "kinetic energy after / before", world.kinetic() / start, 1.0,
-                tolerance=0.1, source=source, note=f"lowest share {lowest[0] / start:.2f}"),
-        compare("colliding_discs", "largest energy / first", total[0] / start, 1.0,
-                tolerance=1e-3, source="energy never rises"),
-        compare("colliding_discs", "momentum", drift, 0.0, tolerance=1e-6, relative=False,
-                source="conservation"),
+        compare(
+            "kinetic energy after / before", world.kinetic() / start, 1.0, tolerance=0.1,
+            source=source, note=f"lowest share {lowest[0] / start:.2f}",
+        ),
+        compare(
+            "largest energy / first", total[0] / start, 1.0, tolerance=1e-3,
+            source="energy never rises",
+        ),
+        compare("momentum", drift, tolerance=1e-6, source="conservation"),
     ]  # fmt: skip

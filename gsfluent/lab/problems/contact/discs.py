@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import disc, parameters
 from gsfluent.lab.world.walls import PLANE_STRAIN
 
@@ -59,17 +59,12 @@ def collide(cells: int, fields: int) -> tuple[float, float, float, float, str]:
 def discs_one_field() -> Iterator[Result]:
     """Two elastic discs in a head-on collision, in one field: energy returned and momentum."""
     back, _, gain, drift, note = collide(16, 1)
-    yield Result(
-        "discs_one_field", "kinetic energy after over before, one field", back, 1.0, 1.0 - back,
-        0.1, "", SOURCE, note=note,
+    yield compare(
+        "kinetic energy after over before, one field", back, 1.0, error=1.0 - back, tolerance=0.1,
+        source=SOURCE, note=note,
     )  # fmt: skip
-    yield Result(
-        "discs_one_field", "largest energy gained", gain, 0.0, gain, 1e-3, "", "no work is done"
-    )
-    yield Result(
-        "discs_one_field", "momentum over sum m |v|", drift, 0.0, drift, 1e-12, "",
-        "equal and opposite",
-    )  # fmt: skip
+    yield compare("largest energy gained", gain, tolerance=1e-3, source="no work is done")
+    yield compare("momentum over sum m |v|", drift, tolerance=1e-12, source="equal and opposite")
 
 
 @problem(tier="slow")
@@ -83,16 +78,16 @@ def discs_two_fields() -> Iterator[Result]:
     for cells in (12, 24):
         back, kept, gain, drift, note = collide(cells, 2)
         lost.append(1.0 - kept)
-    yield Result(
-        "discs_two_fields", "kinetic energy after over before, two fields", back, 1.0, 1.0 - back,
-        0.1, "", SOURCE, note=f"{note}; energy lost {lost[1]:.3f}",
+    yield compare(
+        "kinetic energy after over before, two fields", back, 1.0, error=1.0 - back, tolerance=0.1,
+        source=SOURCE, note=f"{note}; energy lost {lost[1]:.3f}",
     )  # fmt: skip
-    yield Result(
-        "discs_two_fields", "largest energy gained, two fields", gain, 0.0, gain, 1e-3, "",
-        "no work is done", note=f"momentum over sum m |v| {drift:.1e}",
+    yield compare(
+        "largest energy gained, two fields", gain, tolerance=1e-3, source="no work is done",
+        note=f"momentum over sum m |v| {drift:.1e}",
     )  # fmt: skip
     order = math.log2(lost[0] / lost[1])
-    yield Result(
-        "discs_two_fields", "order of the energy lost, r / 12 to r / 24", order, 1.0,
-        max(0.0, 1.0 - order), 0.2, "", "order 1; solver.md 3, row 7",
+    yield compare(
+        "order of the energy lost, r / 12 to r / 24", order, 1.0, error=max(0.0, 1.0 - order),
+        tolerance=0.2, source="order 1; solver.md 3, row 7",
     )  # fmt: skip

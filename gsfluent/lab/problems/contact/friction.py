@@ -64,12 +64,12 @@ def slide(friction: float, angle: float = 45.0, dtype: torch.dtype = torch.float
     note = f"{angle:g} degrees, {str(dtype).removeprefix('torch.')}"
     if friction == 0.0:
         return compare(
-            "block_on_incline", "acceleration / (g sin)", gained / math.sin(slope), 1.0,
-            tolerance=0.03, source="no friction", note=note,
+            "acceleration / (g sin)", gained / math.sin(slope), 1.0, tolerance=0.03,
+            source="no friction", note=note, name="block_on_incline",
         )  # fmt: skip
     return compare(
-        "block_on_incline", "friction seen", seen, friction, tolerance=0.03, source="Coulomb",
-        note=note,
+        "friction seen", seen, friction, tolerance=0.03, source="Coulomb", note=note,
+        name="block_on_incline",
     )  # fmt: skip
 
 
@@ -97,8 +97,8 @@ def block_stops() -> Result:
     want = speed**2 / (2.0 * friction * PULL)
     world.run(1.5 * speed / (friction * PULL))
     return compare(
-        "block_stops", "distance", float(world.center(block)[0]) - start, want, tolerance=0.05,
-        unit="dx", source="Coulomb", note=f"left of its speed {_speed(world, block) / speed:.4f}",
+        "distance", float(world.center(block)[0]) - start, want, tolerance=0.05, unit="dx",
+        source="Coulomb", note=f"left of its speed {_speed(world, block) / speed:.4f}",
     )  # fmt: skip
 
 
@@ -114,10 +114,13 @@ def block_rests() -> list[Result]:
     moved = (places[1] - places[0]) / 60.0
     free = PULL * math.sin(math.radians(45.0)) * 60.0  # what gravity gives in that time
     return [
-        compare("block_rests", "creep / speed of free slip", float(moved[0]) / free, 0.0,
-                tolerance=0.03, relative=False, source="Coulomb"),
-        compare("block_rests", "sinking", -float(moved[2]), 0.0, tolerance=0.1 * PULL * 60.0,
-                relative=False, unit="dx/s", source="equations.md 11.4"),
+        compare(
+            "creep / speed of free slip", float(moved[0]) / free, tolerance=0.03, source="Coulomb",
+        ),
+        compare(
+            "sinking", -float(moved[2]), tolerance=0.1 * PULL * 60.0, unit="dx/s",
+            source="equations.md 11.4",
+        ),
     ]  # fmt: skip
 
 
@@ -140,9 +143,7 @@ def ball_rolls() -> list[Result]:
         else:
             now.velocity = now.velocity + dt * tilted.to(now.velocity)
 
-    world, ball = _on_slab(
-        points, 24.0, 12.0, 0.0, 0.5, pull=0.0, force=gravity, volume=volume
-    )  # fmt: skip
+    world, ball = _on_slab(points, 24.0, 12.0, 0.0, 0.5, pull=0.0, force=gravity, volume=volume)
     world.run(calm + 40.0)
     first = _speed(world, ball)
     world.run(60.0)
@@ -150,8 +151,9 @@ def ball_rolls() -> list[Result]:
     want = 5.0 / 7.0 * PULL * math.sin(slope)
     spin = float(turning(world, ball)[1])
     return [
-        compare("ball_rolls", "acceleration / (5/7 g sin)", (last - first) / 60.0 / want, 1.0,
-                tolerance=0.08, source="rigid ball", note="both ball and ground are soft"),
-        compare("ball_rolls", "omega R / v", spin * radius / last, 1.0, tolerance=0.05,
-                source="no slip"),
+        compare(
+            "acceleration / (5/7 g sin)", (last - first) / 60.0 / want, 1.0, tolerance=0.08,
+            source="rigid ball", note="both ball and ground are soft",
+        ),
+        compare("omega R / v", spin * radius / last, 1.0, tolerance=0.05, source="no slip"),
     ]  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, moduli, parameters
 
 YOUNG, POISSON, DENSITY = 1.0, 0.3, 1.0
@@ -87,14 +87,15 @@ class Axes:
         return float(far.square().sum(dim=1).mean().sqrt())
 
 
-def results(name: str, amplitude: float, sizes: tuple[int, int], until: float) -> Iterator[Result]:
+def results(amplitude: float, sizes: tuple[int, int], until: float) -> Iterator[Result]:
     """Order and size of the error."""
     scene = Axes(amplitude)
     errors = [scene.run(n, until) / amplitude for n in sizes]
     order = math.log(errors[0] / errors[1]) / math.log(sizes[1] / sizes[0])
-    yield Result(
-        name, f"order, {sizes[0]} to {sizes[1]} cells, amplitude {amplitude:g}", order, 2.0,
-        max(0.0, 2.0 - order), 0.3, "", "Wallstedt and Guilkey 2008; solver.md 3, row 4",
+    yield compare(
+        f"order, {sizes[0]} to {sizes[1]} cells, amplitude {amplitude:g}", order, 2.0,
+        error=max(0.0, 2.0 - order), tolerance=0.3,
+        source="Wallstedt and Guilkey 2008; solver.md 3, row 4",
         note=f"rms error over amplitude {errors[0]:.4f}, {errors[1]:.4f}; points move up to "
         f"{amplitude * sizes[1]:.2f} cells; t = {until:g}",
     )  # fmt: skip
@@ -103,10 +104,10 @@ def results(name: str, amplitude: float, sizes: tuple[int, int], until: float) -
 @problem(tier="fast")
 def axis_aligned() -> Iterator[Result]:
     """Axis-aligned manufactured motion within a cell: order in three dimensions."""
-    return results("axis_aligned", 0.01, (8, 12), 0.5)
+    return results(0.01, (8, 12), 0.5)
 
 
 @problem(tier="slow")
 def axis_aligned_large() -> Iterator[Result]:
     """Axis-aligned manufactured motion through cells, stretches 0.7 to 1.3."""
-    return results("axis_aligned_large", 0.05, (8, 16), 0.5)
+    return results(0.05, (8, 16), 0.5)

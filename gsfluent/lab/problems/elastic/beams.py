@@ -82,12 +82,10 @@ def cantilever() -> Iterator[Result]:
     """Small swings of a cantilever 4 cells thick (GaussianBench A2): frequency and damping."""
     frequency, exact, ratio, steps = swing(4, 2.6)
     yield compare(
-        "cantilever", "frequency, 4 cells thick", frequency, exact, tolerance=0.05, unit="Hz",
+        "frequency, 4 cells thick", frequency, exact, tolerance=0.05, unit="Hz",
         source="Euler-Bernoulli; GaussianBench A2 allows 10 %", note=f"{steps} steps",
     )  # fmt: skip
-    yield Result(
-        "cantilever", "damping ratio", ratio, 0.0, abs(ratio), 0.01, "", "no damping (solver.md 12)"
-    )
+    yield compare("damping ratio", ratio, tolerance=0.01, source="no damping (solver.md 12)")
 
 
 @problem(tier="fast")
@@ -95,8 +93,8 @@ def cantilever_coarse() -> Result:
     """Half a swing of the cantilever, 3 cells thick: frequency."""
     frequency, exact, _, steps = swing(3, 0.6)
     return compare(
-        "cantilever_coarse", "frequency, 3 cells thick, by half a period", frequency, exact,
-        tolerance=0.05, unit="Hz", source="Euler-Bernoulli", note=f"{steps} steps",
+        "frequency, 3 cells thick, by half a period", frequency, exact, tolerance=0.05, unit="Hz",
+        source="Euler-Bernoulli", note=f"{steps} steps",
     )  # fmt: skip
 
 
@@ -184,8 +182,8 @@ def cantilever_large() -> Iterator[Result]:
         across, along = elastica(load, 12.0)
         got, shortened, steps = bend(load)
         yield compare(
-            "cantilever_large", f"deflection over length, P L^2 / E I = {load:g}", got, across,
-            tolerance=0.03, source="elastica with shear (Reissner 1972)",
+            f"deflection over length, P L^2 / E I = {load:g}", got, across, tolerance=0.03,
+            source="elastica with shear (Reissner 1972)",
             note=f"thin elastica {elastica(load)[0]:.4f}; 4 cells thick, L / h 12, 6 points per "
             f"cell and axis, {steps} steps; shortening {shortened:.3f} against {along:.3f}",
         )  # fmt: skip

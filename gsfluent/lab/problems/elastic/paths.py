@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import nacc
 
 STRAIN, STEPS = 0.6, 600
@@ -80,38 +81,29 @@ def breaking_step(
 
 
 @problem(tier="fast")
-def return_map_paths() -> list[Result]:
+def return_map_paths() -> Iterator[Result]:
     """Step at which one point breaks on five paths."""
-    results = []
     for path, expected in _EXPECTED.items():
         for eta, step in zip((0.0, 0.3), expected, strict=True):
             if step is None:
                 continue
             found, _, _ = breaking_step(path, shear_damage=eta, implicit=False)
             value = math.nan if found is None else float(found)
-            results.append(
-                Result(
-                    "return_map_paths", f"breaking step, {path}, eta {eta:g}", value, step,
-                    abs(value - step), 1.0, "steps", _SOURCE,
-                )
+            yield compare(
+                f"breaking step, {path}, eta {eta:g}", value, step, error=abs(value - step),
+                tolerance=1.0, unit="steps", source=_SOURCE,
             )  # fmt: skip
     # without shear damage a deviatoric stretch ends at the edge of breaking, whatever side
     _, alpha, _ = breaking_step("deviatoric stretch", implicit=False)
-    results.append(
-        Result(
-            "return_map_paths", "alpha after a deviatoric stretch", alpha, -0.001,
-            abs(alpha + 0.001), 0.003, "", _SOURCE,
-        )
+    yield compare(
+        "alpha after a deviatoric stretch", alpha, -0.001, error=abs(alpha + 0.001),
+        tolerance=0.003, source=_SOURCE,
     )  # fmt: skip
     _, alpha, shear = breaking_step("uniaxial compression", implicit=False)
     for quantity, value, reference, bar in (
         ("alpha after uniaxial compression", alpha, -0.119, 0.001),
         ("q / mu after uniaxial compression", shear, 0.70, 0.01),
     ):
-        results.append(
-            Result(
-                "return_map_paths", quantity, value, reference, abs(value - reference), bar, "",
-                _SOURCE,
-            )
+        yield compare(
+            quantity, value, reference, error=abs(value - reference), tolerance=bar, source=_SOURCE,
         )  # fmt: skip
-    return results

@@ -39,24 +39,15 @@ def settle(
     rate: float,
     **given: Any,
 ) -> World:
-    """Move the colliders for ``ramp`` seconds, stop them, and let the body come to rest.
+    """Move the colliders for ``ramp`` seconds, hold them for ``hold``, damped at ``rate`` [1/s].
 
-    Args:
-        position: [m], [N, 3].
-        load: Collider rows for a share of full speed: 1 while they move, 0 while they hold.
-        ramp: Time of motion [s].
-        hold: Time at rest afterwards [s].
-        rate: Damping [1/s] in both.
-        given: Further arguments of World.
+    ``load`` gives their rows at a share of full speed: 1 while they move, 0 while they hold.
     """
     force = damping(rate)
-    world = World(
-        position, [0.0, 0.0, 0.0], colliders=load(1.0), force=force, **given
-    ).run(ramp)  # fmt: skip
+    world = World(position, [0.0, 0.0, 0.0], colliders=load(1.0), force=force, **given).run(ramp)
     moved = {"affine": world.affine, "strain": world.strain}
     again = World(
-        world.position, world.velocity, colliders=load(0.0), force=force,
-        **{**given, **moved},
+        world.position, world.velocity, colliders=load(0.0), force=force, **{**given, **moved},
     )  # fmt: skip
     return again.run(hold)
 
@@ -121,14 +112,13 @@ def two_material_bar() -> Iterator[Result]:
         measured, wanted = bar_strains(young, poisson, laws, mode)
         for half, got, want in zip(("soft", "stiff"), measured, wanted, strict=True):
             yield compare(
-                "two_material_bar", f"strain of the {half} half, {name}", got, want,
-                tolerance=0.03, source=f"springs in series; {source}",
+                f"strain of the {half} half, {name}", got, want, tolerance=0.03,
+                source=f"springs in series; {source}",
             )  # fmt: skip
         traction = [e * s for e, s in zip(young, measured, strict=True)]
         jump = abs(traction[0] - traction[1]) / (0.5 * sum(traction))
-        yield Result(
-            "two_material_bar", f"jump of traction, {name}", jump, 0.0, jump, 0.03, "",
-            f"equilibrium; {source}",
+        yield compare(
+            f"jump of traction, {name}", jump, tolerance=0.03, source=f"equilibrium; {source}",
         )  # fmt: skip
 
 
@@ -170,8 +160,8 @@ def poisson_contraction() -> Iterator[Result]:
         sides = [slope(points[middle, i], end[middle, i]) - 1.0 for i in (1, 2)]
         want = lateral_stretch(young, poisson, axial) - 1.0
         yield compare(
-            "poisson_contraction", f"lateral strain, pulled by {pull:.0%}", 0.5 * sum(sides), want,
-            tolerance=0.03, source="uniaxial stress of the law; GaussianBench A5 allows 10 %",
+            f"lateral strain, pulled by {pull:.0%}", 0.5 * sum(sides), want, tolerance=0.03,
+            source="uniaxial stress of the law; GaussianBench A5 allows 10 %",
             note=f"axial strain {axial - 1.0:.4f}, {-want / (axial - 1.0):.3f} of it sideways",
         )  # fmt: skip
 
@@ -205,13 +195,12 @@ def shear_and_back() -> Iterator[Result]:
     exact[0, 1] = shear
     middle = out.deformation.double().cpu()[inner]
     error = torch.linalg.matrix_norm(middle - exact) / torch.linalg.matrix_norm(exact)
-    yield Result(
-        "shear_and_back", "median error of F inside at the peak", float(error.median()), 0.0,
-        float(error.median()), 0.05, "", "simple shear; GaussianBench C2",
-        note=f"shear of the middle {shear:.3f}",
+    yield compare(
+        "median error of F inside at the peak", float(error.median()), tolerance=0.05,
+        source="simple shear; GaussianBench C2", note=f"shear of the middle {shear:.3f}",
     )  # fmt: skip
     yield compare(
-        "shear_and_back", "shear of the middle at the peak", shear, 1.0, tolerance=0.05,
+        "shear of the middle at the peak", shear, 1.0, tolerance=0.05,
         source="simple shear; GaussianBench C2",
     )  # fmt: skip
     again = World(
@@ -219,9 +208,9 @@ def shear_and_back() -> Iterator[Result]:
         **given,
     ).run(seconds)  # fmt: skip
     left = slope_of_shear(again, inner)
-    yield Result(
-        "shear_and_back", "shear left in the middle after the way back", left, 0.0, abs(left), 0.05,
-        "", "elastic", note=f"{out.steps + again.steps} steps",
+    yield compare(
+        "shear left in the middle after the way back", left, tolerance=0.05, source="elastic",
+        note=f"{out.steps + again.steps} steps",
     )  # fmt: skip
 
 

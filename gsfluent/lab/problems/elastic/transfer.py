@@ -30,16 +30,16 @@ def projectile() -> Iterator[Result]:
     v, g = torch.tensor(speed, dtype=torch.float64), torch.tensor(gravity, dtype=torch.float64)
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
         world = World(
-            points, speed, volume=1e-6, dx=0.02, law=0,
-            params=parameters(1e5, 0.3, 1000.0), gravity=gravity, dt=5e-4, dtype=dtype,
+            points, speed, volume=1e-6, dx=0.02, law=0, params=parameters(1e5, 0.3, 1000.0),
+            gravity=gravity, dt=5e-4, dtype=dtype,
         ).run(steps=100)  # fmt: skip
         t = world.time
         flight = v * t + 0.5 * g * t * (t + world.dt)
         error = largest(world.position.double().cpu() - points - flight) / float(v.norm() * t)
         name = str(dtype).removeprefix("torch.")
-        yield Result(
-            "projectile", f"largest distance from the path over the distance flown, {name}", error,
-            0.0, error, tolerance, "", "x0 + v t + g t (t + dt) / 2, exact for symplectic Euler",
+        yield compare(
+            f"largest distance from the path over the distance flown, {name}", error,
+            tolerance=tolerance, source="x0 + v t + g t (t + dt) / 2, exact for symplectic Euler",
             note=f"{world.steps} steps",
         )  # fmt: skip
 
@@ -59,21 +59,21 @@ def patch_test() -> Iterator[Result]:
         name = str(dtype).removeprefix("torch.")
         world = World(
             points, drift + points @ rate.T, affine=affine, params=soft, dtype=dtype, **given
-        ).run(steps=1)  # fmt: skip
+        ).run(steps=1)
         fastest = largest(drift + points @ rate.T)
         error = largest(world.affine.double().cpu() - rate) * 0.02 / fastest
-        yield Result(
-            "patch_test", f"affine velocity: C - L over |v| / dx, {name}", error, 0.0, error,
-            tolerance, "", "v = v0 + L x gives C = L", note="all points, one step",
+        yield compare(
+            f"affine velocity: C - L over |v| / dx, {name}", error, tolerance=tolerance,
+            source="v = v0 + L x gives C = L", note="all points, one step",
         )  # fmt: skip
         strain = torch.tensor([0.01, -0.02, 0.015, 0.01, -0.005, 0.02], dtype=torch.float64)
         world = World(points, drift, strain=strain, params=stiff, dtype=dtype, **given)
         scale = 4.0 * largest(world.stress) / (1000.0 * 0.02) * 1e-3  # of the summands
         world.run(steps=1)
         error = largest(world.velocity.double().cpu()[inner] - drift) / scale
-        yield Result(
-            "patch_test", f"uniform stress: push on inner points, {name}", error, 0.0, error,
-            tolerance, "", "div tau = 0; over 4 dt |tau| / (rho dx)", note="lattice off the nodes",
+        yield compare(
+            f"uniform stress: push on inner points, {name}", error, tolerance=tolerance,
+            source="div tau = 0; over 4 dt |tau| / (rho dx)", note="lattice off the nodes",
         )  # fmt: skip
 
 
@@ -102,9 +102,9 @@ def covariance_transport() -> Iterator[Result]:
         f = world.deformation.double().cpu()
         error = largest(f @ spread @ f.mT - wanted) / largest(wanted)
         name = str(dtype).removeprefix("torch.")
-        yield Result(
-            "covariance_transport", f"F S F^T over its size, {name}", error, 0.0, error, tolerance,
-            "", f"(I + dt L)^{steps}, affine flow; GaussianBench C1 allows 1e-3",
+        yield compare(
+            f"F S F^T over its size, {name}", error, tolerance=tolerance,
+            source=f"(I + dt L)^{steps}, affine flow; GaussianBench C1 allows 1e-3",
             note=f"stretch up to {float(torch.linalg.matrix_norm(exact, ord=2)):.2f}",
         )  # fmt: skip
 
@@ -151,21 +151,20 @@ class Spin:
         return self.world.elastic() / self.kinetic
 
 
-def spin_results(name: str, seconds: float, young: float) -> Iterator[Result]:
+def spin_results(seconds: float, young: float) -> Iterator[Result]:
     """Angular momentum of a turning ball in both precisions, and the energy rounding puts in."""
     runs = {}
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
         spin = runs[dtype] = Spin(dtype, young=young, dx=2.0**-6).run(seconds, 20)
         kind = str(dtype).removeprefix("torch.")
-        yield Result(
-            name, f"drift of angular momentum, {kind}", spin.angular_drift, 0.0,
-            spin.angular_drift, tolerance, "", "free body",
-            note=f"E {young:g}, {seconds:g} s, {spin.world.steps} steps",
+        yield compare(
+            f"drift of angular momentum, {kind}", spin.angular_drift, tolerance=tolerance,
+            source="free body", note=f"E {young:g}, {seconds:g} s, {spin.world.steps} steps",
         )  # fmt: skip
     ratio = runs[torch.float32].energy() / runs[torch.float64].energy()
-    yield Result(
-        name, "elastic energy, float32 over float64", ratio, 1.0, max(0.0, ratio - 1.0), 0.1, "",
-        "rounding must not strain the body (solver.md 3, row 6)",
+    yield compare(
+        "elastic energy, float32 over float64", ratio, 1.0, error=max(0.0, ratio - 1.0),
+        tolerance=0.1, source="rounding must not strain the body (solver.md 3, row 6)",
         note=f"U / K {runs[torch.float64].energy():.1e} by rotation itself",
     )  # fmt: skip
 
@@ -173,40 +172,40 @@ def spin_results(name: str, seconds: float, young: float) -> Iterator[Result]:
 @problem(tier="fast")
 def spinning_ball() -> Iterator[Result]:
     """Stiff ball in rotation for 0.3 s (1100 steps): angular momentum and spurious energy."""
-    return spin_results("spinning_ball", 0.3, 1e6)
+    return spin_results(0.3, 1e6)
 
 
 @problem(tier="fast")
 def spinning_ball_long() -> Iterator[Result]:
     """Ball of GaussianBench A1a in rotation for 10 s (15 000 steps)."""
-    return spin_results("spinning_ball_long", 10.0, 1e5)
+    return spin_results(10.0, 1e5)
 
 
 @problem(tier="slow")
 def spinning_ball_stiff() -> Iterator[Result]:
     """Stiff ball in rotation for 10 s (47 000 steps): rounding goes by the step."""
-    return spin_results("spinning_ball_stiff", 10.0, 1e6)
+    return spin_results(10.0, 1e6)
 
 
-def free_results(name: str, dtype: torch.dtype, dx: float, cfl: float) -> Iterator[Result]:
+def free_results(dtype: torch.dtype, dx: float, cfl: float) -> Iterator[Result]:
     """Drifts of the free ball over 10 s, looked at 200 times."""
     spin = Spin(dtype, dx=dx, cfl=cfl).run(10.0, 200)
     kind = str(dtype).removeprefix("torch.")
     note = f"{spin.world.steps} steps, dx {dx:g}, CFL {cfl:g}, e = b - I, {spin.world.engine}"
-    yield Result(
-        name, f"drift of linear momentum over sum m |v|, {kind}", spin.linear_drift, 0.0,
-        spin.linear_drift, 1e-6, "", BENCH, note=note,
+    yield compare(
+        f"drift of linear momentum over sum m |v|, {kind}", spin.linear_drift, tolerance=1e-6,
+        source=BENCH, note=note,
     )  # fmt: skip
-    yield Result(
-        name, f"drift of spin without affine part, {kind}", spin.orbit_drift, 0.0,
-        spin.orbit_drift, 1e-3, "", BENCH, note=note,
+    yield compare(
+        f"drift of spin without affine part, {kind}", spin.orbit_drift, tolerance=1e-3,
+        source=BENCH, note=note,
     )  # fmt: skip
 
 
 @problem(tier="fast")
 def free_ball() -> Iterator[Result]:
     """Free ball turning for 10 s (GaussianBench A1a) in float64: both drifts."""
-    return free_results("free_ball", torch.float64, 0.02, 0.5)
+    return free_results(torch.float64, 0.02, 0.5)
 
 
 @problem(tier="slow")
@@ -218,7 +217,7 @@ def free_ball_single() -> Iterator[Result]:
     two. What is left is a random walk of the roundings of velocities, at nodes and points: over
     552 points and 10 000 steps 5e-7, root mean square over nine step lengths.
     """
-    return free_results("free_ball_single", torch.float32, 2.0**-6, 0.8)
+    return free_results(torch.float32, 2.0**-6, 0.8)
 
 
 @problem(tier="fast")
@@ -230,14 +229,14 @@ def far_from_origin() -> Iterator[Result]:
     ends = []
     for dtype, shift in ((torch.float64, 0.0), (torch.float32, away)):
         world = World(
-            points + shift, points @ turn.T, affine=turn.expand(points.shape[0], 3, 3), 
-            volume=1e-6, dx=0.02, law=0, params=parameters(1e5, 0.3, 1000.0), dt=4e-4, dtype=dtype,
+            points + shift, points @ turn.T, affine=turn.expand(points.shape[0], 3, 3), volume=1e-6,
+            dx=0.02, law=0, params=parameters(1e5, 0.3, 1000.0), dt=4e-4, dtype=dtype,
         ).run(steps=200)  # fmt: skip
         ends.append(world.position.double().cpu() - shift)
     error = largest(ends[1] - ends[0]) / 0.02
-    yield Result(
-        "far_from_origin", "largest distance from the float64 run at the origin [dx]", error, 0.0,
-        error, 1e-3, "dx", "solver.md 4, rows 20 and 21",
+    yield compare(
+        "largest distance from the float64 run at the origin [dx]", error, tolerance=1e-3,
+        unit="dx", source="solver.md 4, rows 20 and 21",
         note=f"{away / 0.1:g} extents away, 200 steps, turned by {20.0 * 0.08:.1f} rad",
     )  # fmt: skip
     # points that creep: less than half a unit in the last place per step
@@ -248,8 +247,8 @@ def far_from_origin() -> Iterator[Result]:
     ).run(steps=200)  # fmt: skip
     moved = float(world.center()[0]) - away
     yield compare(
-        "far_from_origin", "distance crept at a quarter of a rounding per step", moved,
-        speed * 200 * 4e-4, tolerance=0.01, unit="m", source="solver.md 4, row 21",
+        "distance crept at a quarter of a rounding per step", moved, speed * 200 * 4e-4,
+        tolerance=0.01, unit="m", source="solver.md 4, row 21",
     )  # fmt: skip
 
 
@@ -264,15 +263,15 @@ def turned_frame() -> Result:
         rate = turn @ pull @ turn.T
         x = points @ turn.T
         world = World(
-            x, x @ rate.T, affine=rate.expand(x.shape[0], 3, 3), volume=1.25e-7,
-            dx=0.01, law=0, params=parameters(1e5, 0.3, 1000.0),
+            x, x @ rate.T, affine=rate.expand(x.shape[0], 3, 3), volume=1.25e-7, dx=0.01, law=0,
+            params=parameters(1e5, 0.3, 1000.0),
         ).run(0.02)  # fmt: skip
         energies.append((world.kinetic(), world.elastic()))
     whole = sum(energies[0])
     error = max(abs(a - b) for a, b in zip(*energies, strict=True)) / whole
     share = energies[0][1] / whole
-    return Result(
-        "turned_frame", "difference of kinetic and elastic energy, turned by 0.7 rad", error, 0.0,
-        error, 0.02, "", "space has no direction; the grid has",
+    return compare(
+        "difference of kinetic and elastic energy, turned by 0.7 rad", error, tolerance=0.02,
+        source="space has no direction; the grid has",
         note=f"elastic share {share:.2f}, {math.ceil(0.1 / 0.01)} cells across",
     )  # fmt: skip

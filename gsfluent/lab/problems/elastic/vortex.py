@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
 from gsfluent.lab.world.walls import PLANE_STRAIN
 
@@ -117,7 +117,7 @@ class Vortex:
         return float(far.square().mean().sqrt()), float(far.max())
 
 
-def results(name: str, amplitude: float, sizes: tuple[int, int], per_cell: int) -> Iterator[Result]:
+def results(amplitude: float, sizes: tuple[int, int], per_cell: int) -> Iterator[Result]:
     """Order and size of the error after the whole swing out and back."""
     errors = [Vortex(amplitude, 1.0).run(n, 1.0, per_cell)[0] / amplitude for n in sizes]
     order = math.log(errors[0] / errors[1]) / math.log(sizes[1] / sizes[0])
@@ -127,23 +127,24 @@ def results(name: str, amplitude: float, sizes: tuple[int, int], per_cell: int) 
         f"shear up to {shear:.2f}, {per_cell} points per cell and axis: stretched spacing at most "
         f"{stretch:.2f} dx; above dx the body tears (numerical fracture)"
     )
-    yield Result(
-        name, f"order after a swing, {sizes[0]} to {sizes[1]} cells/m", order, 2.0,
-        max(0.0, 2.0 - order), 0.3, "", "generalised vortex (solver.md 3, row 5)", note=note,
+    yield compare(
+        f"order after a swing, {sizes[0]} to {sizes[1]} cells/m", order, 2.0,
+        error=max(0.0, 2.0 - order), tolerance=0.3,
+        source="generalised vortex (solver.md 3, row 5)", note=note,
     )  # fmt: skip
-    yield Result(
-        name, f"rms distance over the swing, {sizes[1]} cells/m", errors[1], 0.0, errors[1], 0.05,
-        "", "exact motion", note=f"{errors[0]:.4f} at {sizes[0]} cells/m",
+    yield compare(
+        f"rms distance over the swing, {sizes[1]} cells/m", errors[1], tolerance=0.05,
+        source="exact motion", note=f"{errors[0]:.4f} at {sizes[0]} cells/m",
     )  # fmt: skip
 
 
 @problem(tier="fast")
 def vortex() -> Iterator[Result]:
     """Generalised vortex, shear up to 1.2: order of convergence."""
-    return results("vortex", 0.2, (16, 32), 2)
+    return results(0.2, (16, 32), 2)
 
 
 @problem(tier="slow")
 def vortex_large() -> Iterator[Result]:
     """Generalised vortex of the literature, shear up to 6: order of convergence."""
-    return results("vortex_large", 1.0, (12, 20), 8)
+    return results(1.0, (12, 20), 8)

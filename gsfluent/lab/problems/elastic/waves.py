@@ -79,15 +79,14 @@ def standing_wave() -> Iterator[Result]:
     errors = [math.hypot(w.displacement, w.velocity) for w in waves]
     order = math.log(errors[0] / errors[-1]) / math.log(sizes[-1] / sizes[0])
     listed = ", ".join(f"{e:.4f}" for e in errors)
-    yield Result(
-        "standing_wave", "order of (u, v) after a period, n = 16 to 64", order, 2.0,
-        max(0.0, 2.0 - order), 0.3, "", "u = A sin(kx) sin(ckt)",
+    yield compare(
+        "order of (u, v) after a period, n = 16 to 64", order, 2.0, error=max(0.0, 2.0 - order),
+        tolerance=0.3, source="u = A sin(kx) sin(ckt)",
         note=f"relative L2 errors {listed}; CFL 0.2",
     )  # fmt: skip
     wave = run_wave(16, 5.0)
     yield compare(
-        "standing_wave", "amplitude lost per step / (k dx)^4, n = 16",
-        wave.loss / (2.0 * math.pi / 16) ** 4, LOSS,
+        "amplitude lost per step / (k dx)^4, n = 16", wave.loss / (2.0 * math.pi / 16) ** 4, LOSS,
         tolerance=0.3, source="solver.md 0.3 (measured, plain C++)", note=f"{wave.steps} steps",
     )  # fmt: skip
 
@@ -145,9 +144,8 @@ def bar_wave() -> Iterator[Result]:
     exact = math.sqrt(BAR_YOUNG / BAR_DENSITY)
     travel, times, moved = push_bar(0.002)
     yield compare(
-        "bar_wave", "speed of the first arrival, push of 2 ms",
-        travel / crossing(times, moved, 1e-5), exact, tolerance=0.15, unit="m/s",
-        source="sqrt(E / rho); GaussianBench A3 and its measure",
+        "speed of the first arrival, push of 2 ms", travel / crossing(times, moved, 1e-5), exact,
+        tolerance=0.15, unit="m/s", source="sqrt(E / rho); GaussianBench A3 and its measure",
         note="1 % of the push; a forerunner at 25.9 m/s, the wave of the bulk, is physical",
     )  # fmt: skip
     width = 0.01
@@ -155,6 +153,6 @@ def bar_wave() -> Iterator[Result]:
     # a half sine has half its height after a sixth of its width
     arrival = crossing(times, moved, 0.5 * max(moved)) - width / 6.0
     yield compare(
-        "bar_wave", "speed at half height, push of 10 ms", travel / arrival, exact, tolerance=0.03,
-        unit="m/s", source="sqrt(E / rho)",
+        "speed at half height, push of 10 ms", travel / arrival, exact, tolerance=0.03, unit="m/s",
+        source="sqrt(E / rho)",
     )  # fmt: skip

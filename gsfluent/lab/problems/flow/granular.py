@@ -46,8 +46,8 @@ def sand_column(aspects: Sequence[float] = (1.0, 2.0, 4.0), cells: int = 16) -> 
     """Sand column: run-out of a plane column follows 1.2 a, then 1.9 a^(2/3)."""
     return [
         compare(
-            "sand_column", f"run-out over base, aspect {a:g}", run_out(a, cells),
-            law(a), tolerance=0.15, source="Lube et al. 2005, Phys. Rev. E 72, 041301",
+            f"run-out over base, aspect {a:g}", run_out(a, cells), law(a), tolerance=0.15,
+            source="Lube et al. 2005, Phys. Rev. E 72, 041301",
             note="friction angle fitted to all aspects together",
         )
         for a in aspects

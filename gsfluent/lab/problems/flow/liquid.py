@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
@@ -48,10 +49,9 @@ def dam_front(cells: int, *, until: float, bed: str) -> list[tuple[float, float]
     row = water(10.0 * math.sqrt(2.0 * GRAVITY * base))
     volume = 0.25 * dx**3
     world = World(
-        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=FLUID,
-        params=row, colliders=[*between_planes(dx), wall(0), wall(1, mode=bed)],
-        gravity=(0.0, -GRAVITY, 0.0), dtype=torch.float32,
-        strain=hydrostatic(2.0 * base - points[:, 1], row),
+        points, [0.0, 0.0, 0.0], volume=volume, dx=dx, law=FLUID, params=row,
+        colliders=[*between_planes(dx), wall(0), wall(1, mode=bed)], gravity=(0.0, -GRAVITY, 0.0),
+        dtype=torch.float32, strain=hydrostatic(2.0 * base - points[:, 1], row),
     )  # fmt: skip
     scale = math.sqrt(2.0 * GRAVITY / base)
     trace: list[tuple[float, float]] = []
@@ -74,7 +74,7 @@ def martin_moyce(data: Path) -> list[tuple[float, float]]:
 
 
 @problem(tier="fast")
-def dam_break(data: Path | None = None) -> list[Result]:
+def dam_break(data: Path | None = None) -> Iterator[Result]:
     """Dam break: front of a collapsing column against Martin and Moyce 1952.
 
     Args:
@@ -92,7 +92,6 @@ def dam_break(data: Path | None = None) -> list[Result]:
             f"dam_break: no measured fronts under {root}; set GSFLUENT_DATA to the data folder"
         )
     source = "Martin and Moyce 1952, fig. 3, n^2 = 2, a = 1.125 and 2.25 in"
-    results = []
     for bed, kind in (("sticky", "no-slip bed"), ("slip", "slip bed")):
         trace = dam_front(12, until=3.4, bed=bed)
         errors = []
@@ -100,13 +99,10 @@ def dam_break(data: Path | None = None) -> list[Result]:
             front = next((z for t, z in trace if t >= time), math.nan)
             errors.append(front / place - 1.0)
         worst = max(errors, key=abs)
-        results.append(
-            Result(
-                "dam_break", f"front, {kind}: largest relative error", worst, 0.0, abs(worst),
-                0.1, "", source, note=f"mean {sum(errors) / len(errors):+.3f}",
-            )
+        yield compare(
+            f"front, {kind}: largest relative error", worst, tolerance=0.1, source=source,
+            note=f"mean {sum(errors) / len(errors):+.3f}",
         )  # fmt: skip
-    return results
 
 
 @problem(tier="fast")
@@ -154,13 +150,13 @@ def liquid_at_rest() -> list[Result]:
     level = float((top - top.mean()).abs().max()) / dx
     inside, beside = float(off[2:].abs().max()), float(off[:2].abs().max())
     surface = float(top.mean()) + 0.25 * dx
-    name, source = "liquid_at_rest", "hydrostatics"
+    source = "hydrostatics"
     return [
-        Result(name, "unevenness of the surface", level, 0.0, level, 1.0, "dx", source),
-        Result(
-            name, "height of the surface", surface, depth, abs(surface - depth) / depth, 0.02, "m",
-            "volume is kept",
+        compare("unevenness of the surface", level, tolerance=1.0, unit="dx", source=source),
+        compare(
+            "height of the surface", surface, depth, error=abs(surface - depth) / depth,
+            tolerance=0.02, unit="m", source="volume is kept",
         ),
-        Result(name, "pressure over rho g H, two cells up", inside, 0.0, inside, 0.05, "", source),
-        Result(name, "pressure over rho g H at the floor", beside, 0.0, beside, 0.1, "", source),
+        compare("pressure over rho g H, two cells up", inside, tolerance=0.05, source=source),
+        compare("pressure over rho g H at the floor", beside, tolerance=0.1, source=source),
     ]  # fmt: skip

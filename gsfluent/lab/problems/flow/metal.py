@@ -48,11 +48,8 @@ def taylor_bar() -> list[Result]:
     source = "solver.md 3 row 14: 21.4 mm, 7.0 to 7.2 mm; Wilkins and Guinan 1973"
     return [
         compare(
-            "taylor_bar", "final length", end * 1e3, 21.4 * start / length, tolerance=0.03,
-            unit="mm", source=source, note=f"{points.shape[0]} points in a quarter",
+            "final length", end * 1e3, 21.4 * start / length, tolerance=0.03, unit="mm",
+            source=source, note=f"{points.shape[0]} points in a quarter",
         ),
-        compare(
-            "taylor_bar", "radius of the foot", foot * 1e3, 7.1, tolerance=0.07, unit="mm",
-            source=source,
-        ),
+        compare("radius of the foot", foot * 1e3, 7.1, tolerance=0.07, unit="mm", source=source),
     ]  # fmt: skip

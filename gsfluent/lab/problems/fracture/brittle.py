@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from gsfluent.fracturebench.scene import Floats, Scene
+from gsfluent.fracturebench.shapes import free
 from gsfluent.lab.textbook.grid import stencil
 from gsfluent.lab.textbook.solver import Textbook, Variant
 from gsfluent.lab.textbook.variant import Birth
@@ -34,16 +35,11 @@ FLESH: dict[str, Any] = {
 _FLOOR = 3.0 * DX
 
 
-def _scene(
-    name: str, points: Floats, velocity: Floats, volume: float, material: Mapping[str, Any],
-    **more: Any,
-) -> Scene:  # fmt: skip
-    n = points.shape[0]
-    zero = np.zeros(n, np.int32)
-    return Scene(
-        name, DX, points, np.array(np.broadcast_to(velocity, (n, 3))), np.full(n, volume),
-        zero, zero, np.zeros((n, 3, 3)), np.array([1.0]), (material,), **more,
-    )  # fmt: skip
+def plain(
+    points: Floats, velocity: Floats, material: Mapping[str, Any], per_cell: int = 8, **more: Any
+) -> Scene:
+    """A scene of one material that is run by steps: its times are not used."""
+    return free("brittle", points, velocity, DX, per_cell, np.array([1.0]), material, **more)
 
 
 def drop(
@@ -67,8 +63,8 @@ def drop(
     up = math.ceil(radius / DX) * DX + _FLOOR  # whole cells: the lattice keeps its place
     centre = [16.0 * DX + shift * DX, 16.0 * DX + 0.6 * shift * DX, up + 0.3 * shift * DX]
     points = ball(centre, radius, DX / round(per_cell ** (1.0 / 3.0))).numpy()
-    return _scene(
-        "drop", points, np.array([0.0, 0.0, -speed]), DX**3 / per_cell, material,
+    return plain(
+        points, np.array([0.0, 0.0, -speed]), material, per_cell,
         gravity=(0.0, 0.0, -9.81),
         colliders=({"point": [0.0, 0.0, _FLOOR], "normal": [0.0, 0.0, 1.0], "kind": "separate",
                     "friction": 0.3},),
@@ -81,7 +77,7 @@ def debris(edge: int = 12, *, away: float = 32.0, seed: int = 0) -> Scene:
     points = box([away * DX] * 3, [4.0 * edge * DX] * 3, 4.0 * DX).numpy()
     points = points + DX * random.random(points.shape)
     broken = {**FLESH, "alpha": 0.1}
-    return _scene("debris", points, np.array([1.7, -0.9, 0.6]), DX**3 / 8.0, broken)
+    return plain(points, np.array([1.7, -0.9, 0.6]), broken)
 
 
 def hit_rate(scene: Scene, dtype: torch.dtype, *, local: bool = False) -> float:
@@ -165,16 +161,8 @@ def run(
 ) -> Outcome:
     """Run a scene by the textbook solver for a number of steps, or until a number is none.
 
-    Args:
-        scene: The scene.
-        variant: What to do.
-        steps: How many steps.
-        dt: Time step [s].
-        dtype: Precision.
-        device: Where.
-        every: Keep the positions of every so manieth step; 0 keeps none.
-        exposed: Look at :func:`exposure` every so manieth step; 0 never.
-        judged: Judge energy and volume every so manieth step; 0 never.
+    Positions are kept (``every``), :func:`exposure` looked at (``exposed``), energy and volume
+    judged (``judged``) every so manieth step; 0 is never.
     """
     solver = Textbook(scene, variant, device=device, dtype=dtype, dt=dt)
     start = solver.kinetic()
@@ -200,9 +188,8 @@ def run(
         pass
     broken = float((solver.brittle & (solver.alpha >= 0.0)).double().mean())
     return Outcome(
-        last.cpu().numpy(), solver.alpha.double().cpu().numpy(), solver.steps, solver.birth,
-        broken, solver.kinetic() / start, smallest, violation, expected,
-        np.stack(track) if track else None,
+        last.cpu().numpy(), solver.alpha.double().cpu().numpy(), solver.steps, solver.birth, broken,
+        solver.kinetic() / start, smallest, violation, expected, np.stack(track) if track else None,
     )  # fmt: skip
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 
 from gsfluent.lab.problems.fracture.crack_band import fracture_energy
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.driver import World
-from gsfluent.lab.world.registry import Result, problem
+from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, wave_speed
 from gsfluent.lab.world.walls import between_planes
 
@@ -53,9 +53,8 @@ def mean_size(rate: float, seed: int = 0) -> float:
     affine[:, 0, 0] = rate
     volume = (0.5 * dx) ** 3
     world = World(
-        points, velocity, volume=volume, dx=dx, law=1, params=ROW,
-        alpha=ALPHA0 * strength[cell], colliders=between_planes(dx, (1, 2)), affine=affine,
-        dtype=torch.float32,
+        points, velocity, volume=volume, dx=dx, law=1, params=ROW, alpha=ALPHA0 * strength[cell],
+        colliders=between_planes(dx, (1, 2)), affine=affine, dtype=torch.float32,
     )  # fmt: skip
     limit = spall_strength(ROW, ALPHA0) / (DENSITY * c * c)
     # to the elastic limit, and on until waves have crossed the longest pieces
@@ -68,28 +67,23 @@ def mean_size(rate: float, seed: int = 0) -> float:
 
 
 @problem(tier="slow")
-def fragment_size(shares: Sequence[float] = (0.005, 0.01, 0.02, 0.05)) -> list[Result]:
+def fragment_size(shares: Sequence[float] = (0.005, 0.01, 0.02, 0.05)) -> Iterator[Result]:
     """Fragment size against the rate: within a factor of two of the energy balance.
 
     A trend, not a law: strength scatters, and cracks that start at the same time do not share their
     energy evenly.
     """
-    name, source = "fragment_size", "Glenn and Chudnovsky 1986; solver.md 3 row 24"
-    results, sizes = [], []
+    source = "Glenn and Chudnovsky 1986; solver.md 3 row 24"
+    sizes = []
     for share in shares:
         rate = share * wave_speed(ROW)
         size = sum(mean_size(rate, seed) for seed in (0, 1)) / 2.0
         expected = expected_size(rate)
         sizes.append(size)
-        results.append(
-            Result(
-                name, f"mean piece at {share:g} c per metre", size, expected,
-                abs(math.log(size / expected)), math.log(2.0), "m", source,
-                note="error and tolerance are logarithms of the ratio",
-            )
+        yield compare(
+            f"mean piece at {share:g} c per metre", size, expected,
+            error=abs(math.log(size / expected)), tolerance=math.log(2.0), unit="m",
+            source=source, note="error and tolerance are logarithms of the ratio",
         )  # fmt: skip
     rises = sum(b > a for a, b in itertools.pairwise(sizes))
-    results.append(
-        Result(name, "rates at which faster made larger pieces", rises, 0.0, rises, 0.0, "", source)
-    )
-    return results
+    yield compare("rates at which faster made larger pieces", rises, tolerance=0.0, source=source)

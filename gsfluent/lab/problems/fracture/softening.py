@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -74,7 +74,7 @@ def pull_bar(cells: int, *, regularised: bool) -> float:
 
 
 @problem(tier="fast")
-def softening_bar() -> list[Result]:
+def softening_bar() -> Iterator[Result]:
     """Bar pulled apart: energy per area of its crack is the energy density times two cells.
 
     The reference is the one-point path of
@@ -82,33 +82,25 @@ def softening_bar() -> list[Result]:
     strength of the middle (0.8), plus the stored energy that the shoulders of the crack lose.
     """
     cells = (20, 40)
-    results = []
     plain = [pull_bar(n, regularised=False) for n in cells]
     scaled = [pull_bar(n, regularised=True) for n in cells]
     spacing = [1.0 / n for n in cells]
     local = softening_energy(brittle(0.05), -0.04)
-    results.append(
-        compare(
-            "softening_bar", "energy per area at dx = 1/40, over two cells of one-point energy",
-            scaled[cells.index(40)] / (2.0 / 40.0 * local), 1.0, tolerance=0.3,
-            source="crack-band theory, Bazant and Oh 1983",
-            note="more than 1: the cells beside the band soften too before they unload",
-        )
+    yield compare(
+        "energy per area at dx = 1/40, over two cells of one-point energy",
+        scaled[cells.index(40)] / (2.0 / 40.0 * local), 1.0, tolerance=0.3,
+        source="crack-band theory, Bazant and Oh 1983",
+        note="more than 1: the cells beside the band soften too before they unload",
     )  # fmt: skip
-    results.append(
-        compare(
-            "softening_bar", "exponent of energy over dx, as it is", slope(spacing, plain), 1.0,
-            tolerance=0.1, source="a local softening law: band width ~ dx",
-        )
+    yield compare(
+        "exponent of energy over dx, as it is", slope(spacing, plain), 1.0, tolerance=0.1,
+        source="a local softening law: band width ~ dx",
     )  # fmt: skip
     value = slope(spacing, scaled)
-    results.append(
-        Result(
-            "softening_bar", "exponent of energy over dx, crack band", value, 0.0, abs(value),
-            0.3, "", "crack-band theory, Bazant and Oh 1983",
-        )
+    yield compare(
+        "exponent of energy over dx, crack band", value, tolerance=0.3,
+        source="crack-band theory, Bazant and Oh 1983",
     )  # fmt: skip
-    return results
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,17 +200,14 @@ def double_cantilever() -> list[Result]:
     source = "Bazant and Oh 1983; solver.md 3 row 19"
     energies = "energies " + ", ".join(f"{g:.0f}" for g in scaled)
     return [
-        Result(
-            "double_cantilever", "spread of energy per area over dx", spread, 0.0, spread, 0.1,
-            "", source, note=energies + " J/m^2",
-        ),
-        Result(
-            "double_cantilever", "exponent of energy over dx, crack band", value, 0.0, abs(value),
-            0.1, "", source,
-        ),
         compare(
-            "double_cantilever", "exponent of energy over dx, as it is", slope(spacing, plain), 1.0,
-            tolerance=0.15, source="a local softening law: band width ~ dx",
+            "spread of energy per area over dx", spread, tolerance=0.1, source=source,
+            note=energies + " J/m^2",
+        ),
+        compare("exponent of energy over dx, crack band", value, tolerance=0.1, source=source),
+        compare(
+            "exponent of energy over dx, as it is", slope(spacing, plain), 1.0, tolerance=0.15,
+            source="a local softening law: band width ~ dx",
             note="energies " + ", ".join(f"{g:.0f}" for g in plain) + " J/m^2",
         ),
     ]  # fmt: skip

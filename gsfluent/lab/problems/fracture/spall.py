@@ -68,12 +68,12 @@ def plate_impact_spall(over: float = 1.25) -> list[Result]:
     source = "linear waves: equal plates; Antoun et al. 2003, Spall Fracture"
     plane = first[0] if first else math.nan
     return [
-        Result(
-            "plate_impact_spall", "depth of the spall plane", plane, flyer, abs(plane - flyer),
-            1.0, "dx", source,
+        compare(
+            "depth of the spall plane", plane, flyer, error=abs(plane - flyer), tolerance=1.0,
+            unit="dx", source=source,
         ),
         compare(
-            "plate_impact_spall", "spall strength from the pull-back velocity",
-            0.5 * impedance * drop, strength, tolerance=0.1, unit="Pa", source=source,
+            "spall strength from the pull-back velocity", 0.5 * impedance * drop, strength,
+            tolerance=0.1, unit="Pa", source=source,
         ),
     ]  # fmt: skip
