@@ -1,4 +1,7 @@
-"""Names of a package that cost nothing until somebody takes one (PEP 562)."""
+"""Names of a package, and modules, that cost nothing until somebody takes one (PEP 562).
+
+``from gsfluent._lazy import cv2, ndimage`` stands at the top of a file like any other import.
+"""
 
 from __future__ import annotations
 
@@ -32,3 +35,17 @@ def lazy(
         return found[name]
 
     return get, lambda: sorted({*vars(sys.modules[package]), *home}), list(home)
+
+
+class _Module:
+    """A module that is imported when something is first asked of it."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, key: str) -> Any:
+        return getattr(importlib.import_module(self._name), key)
+
+
+cv2 = _Module("cv2")
+ndimage = _Module("scipy.ndimage")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.lazy import cv2
+from gsfluent._lazy import cv2
 
 # sRGB primaries over the D65 white point (IEC 61966-2-1)
 _TO_XYZ = (

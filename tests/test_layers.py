@@ -22,8 +22,8 @@ CORE = [p for p in CSRC if ROOT / "csrc" / "core" in p.parents]
 # Rooms, lowest first: a file imports from its own room or from one further up this list. A folder
 # stands for what is in it and below it, as far as that has no line of its own.
 ORDER = (
-    "_lazy.py __init__.py errors.py geometry.py colors.py progress.py hardware.py _load.py "
-    "_check.py data materials ops metrics.py draw.py spatial demo io scene figure "
+    "_lazy.py __init__.py lazy.py errors.py geometry.py colors.py progress.py hardware.py "
+    "_load.py _check.py data materials ops metrics.py draw.py spatial demo io scene figure "
     "config/yaml_file.py config config/physgaussian results "
     "pipeline/__init__.py pipeline/stage.py pipeline/capture pipeline/matter pipeline/colliders "
     "pipeline/light pipeline/solid pipeline/reconstruct pipeline/regions pipeline/fill "
@@ -113,6 +113,40 @@ def test_a_folder_can_be_overlooked(folder: Path) -> None:
     files = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
     if str(folder.relative_to(PACKAGE)) not in MANY_FILES:
         assert len(files) <= FILES_LIMIT, f"{folder.relative_to(ROOT)}: {len(files)} files"
+
+
+# libraries: all that has no underscore may be taken; the other rooms name it in their __init__
+LIBRARIES = (
+    ". ops ops/reference data io materials config pipeline pipeline/texture cli demo figure "
+    "fracturebench fracturebench/scenes"
+).split()
+
+
+def face(folder: Path) -> dict[str, set[str]]:
+    """What the table in a room's ``__init__.py`` says that others may take, by module."""
+    tree = ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
+    tables = [ast.literal_eval(c.args[1]) for c in calls if getattr(c.func, "id", "") == "lazy"]
+    return {module: set(names) for table in tables for module, names in table.items()}
+
+
+def test_a_room_names_what_others_take() -> None:
+    taken: dict[Path, dict[str, set[str]]] = {}
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or node.level or node.module not in MODULES:
+                continue
+            home = MODULES[node.module]
+            if path.is_relative_to(home.parent):
+                continue
+            for alias in node.names:
+                whole = home.name == "__init__.py"  # a module is taken, or a name of the room
+                if not whole or f"{node.module}.{alias.name}" in MODULES:
+                    rows = taken.setdefault(home.parent, {})
+                    rows.setdefault(node.module, set()).add(alias.name)
+    for folder in sorted({path.parent for path in SOURCES}):
+        if str(folder.relative_to(PACKAGE)) not in LIBRARIES:
+            assert face(folder) == taken.get(folder, {}), folder.relative_to(ROOT)
 
 
 def test_only_ops_call_the_dispatcher() -> None:

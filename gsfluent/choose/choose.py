@@ -156,13 +156,7 @@ def choose_setting(
     *,
     cells: Sequence[int] = CELLS,
 ) -> tuple[Choice, list[Fit], Growth]:
-    """Fit, extrapolate and choose.
-
-    Args:
-        probes: The runs.
-        bound: Largest error.
-        seconds: Wall time of the whole simulation by cells and Courant number [s].
-        cells: Settings offered.
+    """Fit, extrapolate and choose; ``seconds``: of the whole simulation by cells and CFL [s].
 
     Returns:
         The choice, the fits, and the growth from the window to the whole shot.
@@ -243,15 +237,6 @@ def choose(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Probe a scene and choose.
-
-    Args:
-        scene: The scene of the shot.
-        shot: The shot.
-        bound: Largest error, a share.
-        probing: How to probe.
-        device: Where to compute.
-        seed: Seed of the runs.
-        progress: Told after every run.
 
     Returns:
         ``chart.json``: see docs/theory/plan.md.

@@ -16,7 +16,7 @@ from gsfluent.errors import InputError, MissingPackage
 from gsfluent.io import write_json
 from gsfluent.plan.proxy import proxy
 from gsfluent.progress import LineReporter, Reporter
-from gsfluent.results.store import fingerprint, publish
+from gsfluent.results.store import publish
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.context import RunContext
 from gsfluent.stages.simulate import build_scene, moving_settings
@@ -194,7 +194,6 @@ def choose_stage(context: RunContext) -> bool:
     if shot.solve.error is None:
         return False
     bound = shot.solve.error
-    key = fingerprint("choose", context.key(context.source_key, moving_settings(shot), bound))
 
     def work(folder: Path) -> dict[str, Any]:
         scene = build_scene(shot, load_solids(context), context.frame)
@@ -205,7 +204,7 @@ def choose_stage(context: RunContext) -> bool:
         _write(result, folder)
         return result
 
-    result = context.store.run("choose", key, work)
+    result = context.do("choose", work, moving_settings(shot), bound, hands_on=False)
     publish(result.folder / FILE, context.out / FILE)
     if (result.folder / PICTURE).is_file():
         publish(result.folder / PICTURE, context.out / PICTURE)

@@ -44,11 +44,7 @@ _log = logging.getLogger("gsfluent")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command line and return its exit code.
-
-    Args:
-        argv: Arguments without the program's name; the process's own by default.
-    """
+    """Run one command line and return its exit code."""
     try:
         code = _command(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()

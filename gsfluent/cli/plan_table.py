@@ -11,11 +11,7 @@ from rich.text import Text
 
 
 def plan_text(plan: Mapping[str, Any]) -> str:
-    """The plan as lines of text.
-
-    Args:
-        plan: From :func:`gsfluent.plan.plan.plan_shot`.
-    """
+    """The plan as lines of text."""
     calibrated = plan["calibrated"]
     size = " x ".join(f"{100 * side:.3g}" for side in plan["size_m"])
     total = _seconds(plan["seconds"]) if calibrated else "not calibrated"

@@ -10,30 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
+from gsfluent.data import Solid
 from gsfluent.errors import InputError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gsfluent.data import Solid
-
-__all__ = [
-    "FIRST_LABEL",
-    "INCLUSION",
-    "SOURCES",
-    "region_entry",
-    "region_mask",
-    "require_labels",
-    "source_key",
-    "source_paths",
-    "source_volume",
-    "with_inclusions",
-]
 
 FIRST_LABEL = 100_001
 """Numbers from here on are labels; inclusions are below."""

@@ -6,15 +6,11 @@ import torch
 from torch import Tensor
 
 from gsfluent.demo.fruit import Watermelon
-from gsfluent.demo.noise import mix, smoothstep
+from gsfluent.demo.noise import mix, rgb, smoothstep
 from gsfluent.demo.shapes import DistanceObject, Several
 
 CRUST, UNDER, CRUMB = 1, 2, 3
 ICING, SPONGE, CREAM, JAM = 1, 3, 4, 5
-
-
-def _rgb(*value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float32)
 
 
 def _rounded_box(local: Tensor, half: Tensor, radius: float) -> Tensor:
@@ -49,16 +45,12 @@ class Bread(DistanceObject):
         p = self._local(points).to(torch.float32)
         broad = self.noise.fractal(p, 25.0, 2)
         fine = self.noise.fractal(p, 160.0, 3)
-        side = mix(
-            _rgb(0.80, 0.58, 0.30), _rgb(0.72, 0.46, 0.20), smoothstep(-0.5, 0.5, broad[:, 0])
-        )
-        top = mix(
-            _rgb(0.64, 0.34, 0.12), _rgb(0.45, 0.21, 0.07), smoothstep(-0.4, 0.6, broad[:, 1])
-        )
+        side = mix(rgb(0.80, 0.58, 0.30), rgb(0.72, 0.46, 0.20), smoothstep(-0.5, 0.5, broad[:, 0]))
+        top = mix(rgb(0.64, 0.34, 0.12), rgb(0.45, 0.21, 0.07), smoothstep(-0.4, 0.6, broad[:, 1]))
         color = mix(side, top, smoothstep(0.0, 0.03, p[:, 2] + 0.006 * broad[:, 2]))
         color = color + 0.05 * fine[:, :1]
         flour = smoothstep(0.35, 0.7, fine[:, 1]) * smoothstep(0.02, 0.045, p[:, 2])
-        return mix(color, _rgb(0.90, 0.82, 0.68), 0.35 * flour).clamp(0.0, 1.0)
+        return mix(color, rgb(0.90, 0.82, 0.68), 0.35 * flour).clamp(0.0, 1.0)
 
     def interior(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.interior`."""
@@ -68,13 +60,13 @@ class Bread(DistanceObject):
         drawn = p * torch.tensor([0.7, 1.0, 1.15])
         large = self.noise(drawn, 150.0)[:, 0]
         small = self.noise.fractal(drawn + 3.0, 330.0, 2)
-        wall = _rgb(0.96, 0.90, 0.78) + 0.03 * small[:, 1:2]
+        wall = rgb(0.96, 0.90, 0.78) + 0.03 * small[:, 1:2]
         hollow = torch.maximum(
             smoothstep(0.22, 0.48, large) * smoothstep(0.006, 0.014, depth),
             0.7 * smoothstep(0.30, 0.62, small[:, 0]),
         )
-        crumb = mix(wall, _rgb(0.70, 0.57, 0.38), 0.85 * hollow)
-        under = mix(_rgb(0.80, 0.58, 0.32), crumb, smoothstep(0.0020, 0.0055, depth))
+        crumb = mix(wall, rgb(0.70, 0.57, 0.38), 0.85 * hollow)
+        under = mix(rgb(0.80, 0.58, 0.32), crumb, smoothstep(0.0020, 0.0055, depth))
         return mix(self.surface_color(points), under, smoothstep(0.0008, 0.0026, depth)).clamp(0, 1)
 
 
@@ -102,15 +94,15 @@ class Cake(DistanceObject):
         angle = torch.atan2(p[:, 1], p[:, 0])
         radius = p[:, :2].norm(dim=1)
         color = mix(
-            _rgb(0.95, 0.90, 0.84), _rgb(0.90, 0.82, 0.76), smoothstep(-0.5, 0.5, broad[:, 0])
+            rgb(0.95, 0.90, 0.84), rgb(0.90, 0.82, 0.76), smoothstep(-0.5, 0.5, broad[:, 0])
         )
         # strawberry glaze on top with drips over the side, and a ring of chocolate curls
         drip = 0.030 - 0.020 * (0.5 + 0.5 * torch.sin(9.0 * angle + 2.0 * broad[:, 1])) ** 2
         glaze = smoothstep(-0.001, 0.001, p[:, 2] - drip)
-        color = mix(color, _rgb(0.80, 0.20, 0.26) + 0.04 * broad[:, 2:3], glaze)
+        color = mix(color, rgb(0.80, 0.20, 0.26) + 0.04 * broad[:, 2:3], glaze)
         ring = smoothstep(0.006, 0.004, (radius - 0.070).abs()) * smoothstep(0.036, 0.0385, p[:, 2])
         curl = smoothstep(-0.1, 0.2, self.noise.fractal(p, 190.0, 2)[:, 0])
-        return mix(color, _rgb(0.28, 0.15, 0.08), ring * curl).clamp(0.0, 1.0)
+        return mix(color, rgb(0.28, 0.15, 0.08), ring * curl).clamp(0.0, 1.0)
 
     def _sheet(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance into the cream and the jam sheet [m], [N] each; positive inside."""
@@ -139,14 +131,14 @@ class Cake(DistanceObject):
         depth = self.depth(points).to(torch.float32)
         pore = self.noise.fractal(p, 260.0, 2)
         sponge = mix(
-            _rgb(0.92, 0.76, 0.42), _rgb(0.72, 0.50, 0.22), smoothstep(0.15, 0.55, pore[:, 0])
+            rgb(0.92, 0.76, 0.42), rgb(0.72, 0.50, 0.22), smoothstep(0.15, 0.55, pore[:, 0])
         )
         sponge = sponge + 0.03 * pore[:, 1:2]
         jam, cream = self._sheet(p)
-        color = mix(sponge, _rgb(0.97, 0.94, 0.87), smoothstep(-0.0005, 0.0005, cream))
-        red = mix(_rgb(0.70, 0.08, 0.12), _rgb(0.52, 0.04, 0.08), smoothstep(-0.3, 0.4, pore[:, 2]))
+        color = mix(sponge, rgb(0.97, 0.94, 0.87), smoothstep(-0.0005, 0.0005, cream))
+        red = mix(rgb(0.70, 0.08, 0.12), rgb(0.52, 0.04, 0.08), smoothstep(-0.3, 0.4, pore[:, 2]))
         color = mix(color, red, smoothstep(-0.0005, 0.0005, jam))
-        white = mix(self.surface_color(points), _rgb(0.95, 0.91, 0.86),
+        white = mix(self.surface_color(points), rgb(0.95, 0.91, 0.86),
                     smoothstep(0.0006, 0.0018, depth))  # fmt: skip
         return mix(white, color, smoothstep(0.0044, 0.0054, depth)).clamp(0.0, 1.0)
 

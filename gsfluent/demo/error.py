@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsfluent.data import SURFACE, Solid
 from gsfluent.demo.objects import DemoObject
+from gsfluent.demo.truth import grid_points
 from gsfluent.errors import InputError
 
 _PATCH = 7
@@ -84,7 +85,6 @@ def surface_copy(solid: Solid, points: Tensor) -> Tensor:
 
 
 def _true_count(truth: DemoObject, voxel: float) -> int:
-    from gsfluent.demo.truth import grid_points
 
     lower, upper = truth.bounds()
     shape = [int(n) for n in ((upper - lower) / voxel).ceil()]

@@ -9,13 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.demo.noise import mix, smoothstep
+from gsfluent.demo.noise import mix, rgb, smoothstep
 from gsfluent.demo.objects import DemoObject
-
-
-def _rgb(*value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float32)
-
 
 Draw = Callable[[np.random.Generator], np.ndarray]
 
@@ -86,21 +81,17 @@ class Watermelon(DemoObject):
         angle = torch.atan2(s[:, 2], s[:, 1]) + 0.13 * broad[:, 0] + 0.06 * fine[:, 0]
         wave = torch.cos(11.0 * angle) + 0.35 * broad[:, 1] + 0.38 * fine[:, 1]
         dark = smoothstep(0.05, 0.35, wave)
-        light = mix(
-            _rgb(0.55, 0.66, 0.34), _rgb(0.42, 0.55, 0.25), smoothstep(-0.3, 0.5, fine[:, 2])
-        )
+        light = mix(rgb(0.55, 0.66, 0.34), rgb(0.42, 0.55, 0.25), smoothstep(-0.3, 0.5, fine[:, 2]))
         # The net of thin green veins between the stripes.
         net = smoothstep(0.16, 0.02, (self.noise(s, 21.0)[:, 0] + 0.4 * fine[:, 2]).abs())
-        light = mix(light, _rgb(0.27, 0.42, 0.17), 0.55 * net)
-        deep = mix(
-            _rgb(0.07, 0.21, 0.09), _rgb(0.14, 0.31, 0.12), smoothstep(-0.5, 0.6, fine[:, 0])
-        )
+        light = mix(light, rgb(0.27, 0.42, 0.17), 0.55 * net)
+        deep = mix(rgb(0.07, 0.21, 0.09), rgb(0.14, 0.31, 0.12), smoothstep(-0.5, 0.6, fine[:, 0]))
         color = mix(light, deep, dark)
         off_axis = s[:, 1:].norm(dim=1) + 0.02 * fine[:, 1]
         scar = smoothstep(0.105, 0.075, off_axis) * (s[:, 0] > 0) + smoothstep(
             0.06, 0.035, off_axis
         ) * (s[:, 0] <= 0)
-        color = mix(color, _rgb(0.45, 0.36, 0.22), 0.9 * scar)
+        color = mix(color, rgb(0.45, 0.36, 0.22), 0.9 * scar)
         return color.clamp(0.0, 1.0)
 
     def interior(self, points: Tensor) -> Tensor:
@@ -112,24 +103,22 @@ class Watermelon(DemoObject):
         wavy = depth + 0.0012 * broad[:, 0]
         skin = self.surface_color(points)
         pale_green = mix(
-            _rgb(0.62, 0.76, 0.46), _rgb(0.93, 0.95, 0.82), smoothstep(0.0025, 0.0070, wavy)
+            rgb(0.62, 0.76, 0.46), rgb(0.93, 0.95, 0.82), smoothstep(0.0025, 0.0070, wavy)
         )
         color = mix(skin, pale_green, smoothstep(0.0012, 0.0030, depth))
-        red = mix(_rgb(0.90, 0.24, 0.23), _rgb(0.78, 0.10, 0.13), smoothstep(0.02, 0.09, depth))
-        flesh = red + 0.055 * fine[:, :1] + 0.045 * broad[:, 1:2] * _rgb(0.6, 1.0, 0.9)
-        flesh = mix(flesh, _rgb(0.96, 0.62, 0.56), self._veins(p, depth, broad))
+        red = mix(rgb(0.90, 0.24, 0.23), rgb(0.78, 0.10, 0.13), smoothstep(0.02, 0.09, depth))
+        flesh = red + 0.055 * fine[:, :1] + 0.045 * broad[:, 1:2] * rgb(0.6, 1.0, 0.9)
+        flesh = mix(flesh, rgb(0.96, 0.62, 0.56), self._veins(p, depth, broad))
         color = mix(
             color,
-            mix(_rgb(0.96, 0.70, 0.60), flesh, smoothstep(0.013, 0.020, wavy)),
+            mix(rgb(0.96, 0.70, 0.60), flesh, smoothstep(0.013, 0.020, wavy)),
             smoothstep(0.0095, 0.0145, wavy),
         )
         _, to_seed = self.seed_distance(points)
         to_seed = to_seed.to(torch.float32)
         in_flesh = (depth > self.pith_depth).float()
-        color = mix(color, _rgb(0.95, 0.50, 0.45), 0.6 * smoothstep(1.45, 1.1, to_seed) * in_flesh)
-        coat = mix(
-            _rgb(0.13, 0.08, 0.05), _rgb(0.05, 0.035, 0.03), smoothstep(-0.4, 0.4, fine[:, 1])
-        )
+        color = mix(color, rgb(0.95, 0.50, 0.45), 0.6 * smoothstep(1.45, 1.1, to_seed) * in_flesh)
+        coat = mix(rgb(0.13, 0.08, 0.05), rgb(0.05, 0.035, 0.03), smoothstep(-0.4, 0.4, fine[:, 1]))
         color = mix(color, coat, smoothstep(1.08, 0.96, to_seed) * in_flesh)
         return color.clamp(0.0, 1.0)
 
@@ -187,11 +176,11 @@ class Orange(DemoObject):
         broad = self.noise.fractal(s, 2.0, 3)
         pores = smoothstep(0.25, 0.75, self.noise(s, 34.0)[:, 0])
         color = mix(
-            _rgb(0.93, 0.52, 0.08), _rgb(0.96, 0.65, 0.14), smoothstep(-0.6, 0.6, broad[:, 0])
+            rgb(0.93, 0.52, 0.08), rgb(0.96, 0.65, 0.14), smoothstep(-0.6, 0.6, broad[:, 0])
         )
-        color = mix(color, _rgb(0.78, 0.42, 0.05), 0.45 * pores)
+        color = mix(color, rgb(0.78, 0.42, 0.05), 0.45 * pores)
         stem = smoothstep(0.13, 0.09, s[:, :2].norm(dim=1)) * (s[:, 2] > 0)
-        color = mix(color, _rgb(0.36, 0.42, 0.16), stem)
+        color = mix(color, rgb(0.36, 0.42, 0.16), stem)
         return color.clamp(0.0, 1.0)
 
     def interior(self, points: Tensor) -> Tensor:
@@ -207,8 +196,8 @@ class Orange(DemoObject):
         outward = p / radius.clamp_min(1e-4)[:, None]
         drawn = torch.stack([outward[:, 0] * 9.0, outward[:, 1] * 9.0, p[:, 2] * 420.0], 1)
         vesicle = self.noise(drawn + radius[:, None] * 130.0, 1.0)[:, 1] + 0.3 * broad[:, 2]
-        pulp = mix(_rgb(0.93, 0.52, 0.07), _rgb(0.98, 0.72, 0.22), smoothstep(-0.5, 0.5, vesicle))
-        white = _rgb(0.97, 0.92, 0.78) + 0.03 * broad[:, 1:2]
+        pulp = mix(rgb(0.93, 0.52, 0.07), rgb(0.98, 0.72, 0.22), smoothstep(-0.5, 0.5, vesicle))
+        white = rgb(0.97, 0.92, 0.78) + 0.03 * broad[:, 1:2]
         color = mix(
             pulp,
             white,
@@ -218,4 +207,4 @@ class Orange(DemoObject):
         color = mix(self.surface_color(points), color, smoothstep(0.0008, 0.0020, depth))
         _, to_seed = self.seed_distance(points)
         seed = smoothstep(1.08, 0.96, to_seed.to(torch.float32)) * (depth > self.pith_depth).float()
-        return mix(color, _rgb(0.90, 0.84, 0.62), seed).clamp(0.0, 1.0)
+        return mix(color, rgb(0.90, 0.84, 0.62), seed).clamp(0.0, 1.0)

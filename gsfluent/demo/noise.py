@@ -66,3 +66,8 @@ def mix(first: Tensor, second: Tensor, weight: Tensor) -> Tensor:
     """Linear blend of colours [N, 3] (or [3]) by ``weight`` [N]."""
     w = weight[:, None]
     return first * (1.0 - w) + second * w
+
+
+def rgb(*value: float) -> Tensor:
+    """A colour, float32 [3]."""
+    return torch.tensor(value, dtype=torch.float32)

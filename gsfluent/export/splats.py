@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,12 +28,16 @@ _USD_PARTS = ("splats", "particles", "meshes")
 
 
 def _sequence(
-    job: Job, kind: str, name: str, write: Callable[[Path, Moment], None], up: str | None = None
+    job: Job, kind: str, name: str, save: Callable[[Gaussians, Path], Any], up: str | None = None
 ) -> str:
     """One file per frame, in a folder called like the format."""
     if up is not None:
         job = replace(job, sequence=job.sequence.turned(up))
     frames = Constant(job.sequence, job.progress) if job.options.constant else None
+
+    def write(path: Path, moment: Moment) -> None:
+        save(moment.gaussians, path)
+
     return span(kind, job.write_each(kind, kind, name, write, frames=frames))
 
 
@@ -68,30 +74,18 @@ def bare(gaussians: Gaussians) -> Gaussians:
 
 def spz_sequence(job: Job) -> str:
     """``spz/frame_0001.spz``, +y up as the format has it."""
-    version = job.options.spz_version
-
-    def write(path: Path, moment: Moment) -> None:
-        save_spz(moment.gaussians, path, version=version)
-
-    return _sequence(job, "spz", "frame_{:04d}.spz", write, up="y")
+    save = functools.partial(save_spz, version=job.options.spz_version)
+    return _sequence(job, "spz", "frame_{:04d}.spz", save, up="y")
 
 
 def splat_sequence(job: Job) -> str:
     """``splat/frame_0001.splat``."""
-
-    def write(path: Path, moment: Moment) -> None:
-        save_splat(moment.gaussians, path)
-
-    return _sequence(job, "splat", "frame_{:04d}.splat", write)
+    return _sequence(job, "splat", "frame_{:04d}.splat", save_splat)
 
 
 def glb_sequence(job: Job) -> str:
     """``glb/frame_0001.glb``, +y up as the format has it."""
-
-    def write(path: Path, moment: Moment) -> None:
-        save_glb(moment.gaussians, path)
-
-    return _sequence(job, "glb", "frame_{:04d}.glb", write, up="y")
+    return _sequence(job, "glb", "frame_{:04d}.glb", save_glb, up="y")
 
 
 def usd(job: Job) -> str:
@@ -142,10 +136,6 @@ class Constant:
 
     Iterating gives :class:`Moment`; rows are sorted by id. Axes keep their names and quaternions
     their sign from frame to frame, so that a player may interpolate.
-
-    Args:
-        sequence: The chosen frames; read twice.
-        progress: Called per frame of the first reading.
     """
 
     def __init__(self, sequence: FrameSequence, progress: Progress | None = None) -> None:

@@ -22,44 +22,38 @@ class Format:
     """One thing that can be written."""
 
     what: str  # Files and who reads them, in one line
-    module: str  # Module of the writer, beside this one
-    function: str  # The writer: takes a :class:`Job`, returns what was written
-    pictures: bool = False  # Rendered; needs the shot's camera and light
+    writer: str  # ``module.function`` beside this: takes a :class:`Job`, says what was written
     splats_only: bool = False  # Needs splats and nothing else, so it can be made of a ``.gsd`` file
     key: str = ""  # Name in the report
 
 
 FORMATS: dict[str, Format] = {
-    "mp4": Format("H.264 video", "pictures", "mp4", pictures=True, key="video"),
-    "gif": Format("animated GIF", "pictures", "gif", pictures=True),
-    "webp": Format("animated WebP, also with alpha", "pictures", "webp", pictures=True),
-    "png": Format("PNG sequence, also with alpha", "pictures", "png", pictures=True),
+    "mp4": Format("H.264 video", "pictures.mp4", key="video"),
+    "gif": Format("animated GIF", "pictures.gif"),
+    "webp": Format("animated WebP, also with alpha", "pictures.webp"),
+    "png": Format("PNG sequence, also with alpha", "pictures.png"),
     "ply-seq": Format(
         "3DGS .ply per frame: SuperSplat, Blender, Houdini, Unity",
-        "splats",
-        "ply_sequence",
+        "splats.ply_sequence",
         splats_only=True,
     ),
-    "spz": Format(
-        ".spz per frame: phones, web viewers", "splats", "spz_sequence", splats_only=True
-    ),
+    "spz": Format(".spz per frame: phones, web viewers", "splats.spz_sequence", splats_only=True),
     "splat": Format(
-        ".splat per frame: the first web viewers", "splats", "splat_sequence", splats_only=True
+        ".splat per frame: the first web viewers", "splats.splat_sequence", splats_only=True
     ),
     "glb": Format(
-        "glTF with KHR_gaussian_splatting per frame", "splats", "glb_sequence", splats_only=True
+        "glTF with KHR_gaussian_splatting per frame", "splats.glb_sequence", splats_only=True
     ),
     "delta": Format(
         "one small .gsd file: gsfluent.io.DeltaReader, gsfluent export",
-        "delta",
-        "delta",
+        "delta.delta",
         splats_only=True,
     ),
-    "usd": Format("one USD file with time samples: Houdini, usdview", "splats", "usd"),
-    "vtk": Format("material points per frame: ParaView, VisIt", "points", "vtk"),
-    "points": Format("material points as .ply: Houdini, Blender", "points", "points"),
-    "meshes": Format("a closed surface per fragment: Houdini, Blender, games", "meshes", "meshes"),
-    "vti": Format("density and damage volume per frame: ParaView", "points", "vti"),
+    "usd": Format("one USD file with time samples: Houdini, usdview", "splats.usd"),
+    "vtk": Format("material points per frame: ParaView, VisIt", "points.vtk"),
+    "points": Format("material points as .ply: Houdini, Blender", "points.points"),
+    "meshes": Format("a closed surface per fragment: Houdini, Blender, games", "meshes.meshes"),
+    "vti": Format("density and damage volume per frame: ParaView", "points.vti"),
 }
 
 
@@ -71,7 +65,7 @@ _OTHERS: dict[tuple[str, ...], str] = {
     ("gltf",): "use glb",
     ("ply",): "use ply-seq for splats, points for material points, meshes for fragments",
     ("avi", "mov", "mkv", "video"): "use mp4",
-    ("jpg", "jpeg", "pictures", "frames"): "use png",
+    ("jpg", "jpeg", "pictures.frames"): "use png",
 }
 
 
@@ -150,6 +144,7 @@ def _write(job: Job, kinds: list[str]) -> dict[str, Any]:
     job.folder.mkdir(parents=True, exist_ok=True)
     written: dict[str, Any] = {}
     for kind in kinds:
-        module = importlib.import_module(f"gsfluent.export.{FORMATS[kind].module}")
-        written[FORMATS[kind].key or kind] = getattr(module, FORMATS[kind].function)(job)
+        module, _, function = FORMATS[kind].writer.partition(".")
+        write = getattr(importlib.import_module(f"gsfluent.export.{module}"), function)
+        written[FORMATS[kind].key or kind] = write(job)
     return written

@@ -23,8 +23,6 @@ from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.texture.photo import metrics
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar, load_exemplar
 
-__all__ = ["Pictures", "compare", "load_pictures"]
-
 logger = logging.getLogger(__name__)
 
 SLICES = 4
@@ -33,16 +31,11 @@ SLICES = 4
 
 @dataclass(frozen=True)
 class Pictures:
-    """What stands on one side.
+    """What stands on one side."""
 
-    Attributes:
-        names: Of the pictures.
-        slices: Images [H, W, 3] in 0..1 with the masks of what counts.
-        figures: What only this side has (a solid's ``neighbour_slice_ratio``).
-    """
-
-    names: list[str]
-    slices: list[metrics.Slice]
+    names: list[str]  # of the pictures
+    slices: list[metrics.Slice]  # images [H, W, 3] in 0..1 with the masks of what counts
+    # what only this side has (a solid's ``neighbour_slice_ratio``).
     figures: dict[str, Any] = field(default_factory=dict)
 
     def extent(self) -> int:

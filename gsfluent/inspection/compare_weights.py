@@ -16,14 +16,6 @@ from torch.nn import functional
 
 from gsfluent.errors import InputError, need
 
-__all__ = [
-    "Lpips",
-    "clip_scores",
-    "frechet_distance",
-    "inception_features",
-    "kernel_distance",
-]
-
 _BATCH = 16
 
 

@@ -14,28 +14,20 @@ from gsfluent.data.regions import FIRST_LABEL, INCLUSION, region_entry, source_k
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, sample_points, select
 from gsfluent.scene.scene import Body, Part
 
-__all__ = ["PartMap", "body_parts", "solid_regions"]
-
 
 @dataclasses.dataclass(frozen=True)
 class PartMap:
-    """The parts of one solid.
+    """The parts of one solid."""
 
-    Attributes:
-        solid: The solid.
-        frame: World to scene.
-        label: Row of the table per voxel, int32 [X, Y, Z]; row 0 is the rest, -1 outside.
-        rows: One per part: ``part``, ``number``, ``material``, ``volume`` [m^3], ``share``,
-            ``particles``, ``mean_depth`` [m] and ``agreement`` (share of the votes of the
-            photographs); None for what does not apply.
-        warnings: What a user should look at.
-    """
-
-    solid: Solid
-    frame: Frame
+    solid: Solid  # the solid
+    frame: Frame  # world to scene
+    # row of the table per voxel, int32 [X, Y, Z]; row 0 is the rest, -1 outside.
     label: NDArray[np.int32]
+    # one per part: ``part``, ``number``, ``material``, ``volume`` [m^3], ``share``, ``particles``,
+    # ``mean_depth`` [m] and ``agreement`` (share of the votes of the photographs); None for what
+    # does not apply.
     rows: list[dict[str, Any]]
-    warnings: list[str]
+    warnings: list[str]  # what a user should look at
 
 
 def body_parts(body: Body, dx: float | None = None) -> PartMap:

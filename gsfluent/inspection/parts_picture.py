@@ -16,8 +16,6 @@ from gsfluent.inspection.parts import PartMap
 from gsfluent.io import save_image
 from gsfluent.pipeline.regions.vote import Skin, find_skin
 
-__all__ = ["part_colors", "save_parts_picture"]
-
 _SIDE = 230
 _GAP = 10
 _PAPER = (250, 250, 248)

@@ -29,30 +29,18 @@ _AXES = ((210, 40, 40), (30, 150, 60), (40, 80, 230))
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """What is drawn, all in scene metres.
+    """What is drawn, all in scene metres."""
 
-    Attributes:
-        points: Points [N, 3].
-        colors: Their colours in 0..1 [N, 3].
-        radii: Their radii [m], [N].
-        marked: Points drawn as floaters, bool [N].
-        low: Lower corner of the object's box [3].
-        high: Upper corner [3].
-        floor: Height of the floor.
-        cameras: Camera positions [C, 3]; may be empty.
-        lines: Text under the views.
-        photograph: A photograph with the frame that the points are in, or None.
-    """
-
-    points: Array
-    colors: Array
-    radii: Array
-    marked: NDArray[np.bool_]
-    low: Array
-    high: Array
-    floor: float
-    cameras: Array
-    lines: list[str]
+    points: Array  # points [N, 3]
+    colors: Array  # their colours in 0..1 [N, 3]
+    radii: Array  # their radii [m], [N]
+    marked: NDArray[np.bool_]  # points drawn as floaters, bool [N]
+    low: Array  # lower corner of the object's box [3]
+    high: Array  # upper corner [3]
+    floor: float  # height of the floor
+    cameras: Array  # camera positions [C, 3]; may be empty
+    lines: list[str]  # text under the views
+    # A photograph with the frame that the points are in, or None.
     photograph: tuple[View, Frame] | None = None
 
 

@@ -19,8 +19,6 @@ from gsfluent.progress import Reporter
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.solids import context_of, load_solids, make_solids
 
-__all__ = ["inspect_shot", "inspect_solid"]
-
 
 def inspect_shot(
     shot: Shot,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,6 +16,9 @@ from gsfluent.data.camera import Camera
 from gsfluent.data.capture import View
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 
@@ -30,36 +35,20 @@ def read_array(path: str | Path) -> NDArray[np.float32]:
     Raises:
         InputError: The file is missing, truncated, or not an image.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    path = Path(path)
-    try:
-        with Image.open(path) as opened:
-            opened.load()
-            image: Image.Image = opened
-            if image.mode.startswith("I") or image.mode == "F":
-                deep = np.asarray(image, dtype=np.float32)
-                top = 65535.0 if image.mode.startswith("I") else 1.0
-                return (deep / top).clip(0, 1)[..., None]
-            if image.mode == "P" or image.mode == "LA":
-                image = image.convert("RGBA")
-            elif image.mode == "1":
-                image = image.convert("L")
-            elif image.mode not in ("L", "RGB", "RGBA"):
-                image = image.convert("RGB")
-            values = np.asarray(image, dtype=np.float32) / 255.0
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no such image", "restore the file or remove it from the capture"
-        ) from error
-    except UnidentifiedImageError as error:
-        raise InputError(
-            f"{path}: not an image that Pillow can read", "convert it to PNG or JPEG"
-        ) from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{path}: the image is damaged ({error})", "copy it again or remove it from the capture"
-        ) from error
+    with _opened(path) as opened:
+        opened.load()
+        image: Image.Image = opened
+        if image.mode.startswith("I") or image.mode == "F":
+            deep = np.asarray(image, dtype=np.float32)
+            top = 65535.0 if image.mode.startswith("I") else 1.0
+            return (deep / top).clip(0, 1)[..., None]
+        if image.mode == "P" or image.mode == "LA":
+            image = image.convert("RGBA")
+        elif image.mode == "1":
+            image = image.convert("L")
+        elif image.mode not in ("L", "RGB", "RGBA"):
+            image = image.convert("RGB")
+        values = np.asarray(image, dtype=np.float32) / 255.0
     return values[..., None] if values.ndim == 2 else values
 
 
@@ -83,20 +72,31 @@ def image_size(path: str | Path) -> tuple[int, int]:
     Raises:
         InputError: The file is missing or not an image.
     """
+    with _opened(path) as image:
+        width, height = image.size
+    return int(width), int(height)
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path) -> Iterator[Image.Image]:
+    """An image of a capture, so that what goes wrong with it names the file."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as image:
-            width, height = image.size
+            yield image
     except FileNotFoundError as error:
         raise InputError(
             f"{path}: no such image", "restore the file or remove it from the capture"
         ) from error
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except UnidentifiedImageError as error:
         raise InputError(
             f"{path}: not an image that Pillow can read", "convert it to PNG or JPEG"
         ) from error
-    return int(width), int(height)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(
+            f"{path}: the image is damaged ({error})", "copy it again or remove it from the capture"
+        ) from error
 
 
 def save_image(image: Tensor, path: str | Path) -> None:

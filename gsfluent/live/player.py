@@ -126,12 +126,6 @@ class LivePlayer:
         """What it is doing."""
         return self._status
 
-    @property
-    def newest(self) -> SavedFrame:
-        """The newest frame."""
-        with self._wake:
-            return next(reversed(self._frames.values()))
-
     def frame(self, number: int) -> SavedFrame:
         """Frame ``number`` since the last reset.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,6 +13,33 @@ _SMALL = 1 << 28
 # Per (camera, Gaussian) beside its row: radius, list of tiles, depth, box, sort keys.
 _PER_SPLAT = 40
 _ROW_HEADER = 10
+
+
+class Arguments(NamedTuple):
+    """The arguments of the operator in the order of its schema."""
+
+    means: Tensor
+    opacities: Tensor
+    viewmat: Tensor
+    K: Tensor
+    quats: Tensor | None
+    scales: Tensor | None
+    covars: Tensor | None
+    sh: Tensor | None
+    colors: Tensor | None
+    background: Tensor | None
+    normals: Tensor | None
+    groups: Tensor | None
+    means2d_offset: Tensor | None
+    means2d_absgrad: Tensor | None
+    width: int
+    height: int
+    antialiased: bool
+    contribution: bool
+    depth: bool
+    median_depth: bool
+    near: float
+    far: float
 
 
 def available_memory() -> int | None:
@@ -27,40 +54,33 @@ def available_memory() -> int | None:
     return None
 
 
-def required_bytes(arguments: tuple[Any, ...]) -> int:
+def required_bytes(a: Arguments) -> int:
     """Least memory that a call of the operator takes beside its inputs, with their gradients.
 
     The (splat, tile) pairs, whose number is only known later, are not in it.
-
-    Args:
-        arguments: The operator's arguments in the order of its schema.
     """
-    means, viewmat, colors, normals = (arguments[k] for k in (0, 2, 8, 10))
-    width, height, _, _, depth, median_depth = arguments[14:20]
-    cameras = viewmat.shape[0] if viewmat.dim() == 3 else 1
-    splats = cameras * means.shape[0]
-    channels = colors.shape[1] if colors is not None else 3
-    features = channels + (3 if normals is not None else 0) + int(depth)
-    size = means.element_size()
-    pixels = cameras * width * height * size * (features + 1 + int(median_depth))
+    cameras = a.viewmat.shape[0] if a.viewmat.dim() == 3 else 1
+    splats = cameras * a.means.shape[0]
+    channels = a.colors.shape[1] if a.colors is not None else 3
+    features = channels + (3 if a.normals is not None else 0) + int(a.depth)
+    size = a.means.element_size()
+    pixels = cameras * a.width * a.height * size * (features + 1 + int(a.median_depth))
     gradients = 0
     if torch.is_grad_enabled():
         gradients = sum(
-            t.numel() * t.element_size()
-            for t in arguments
-            if isinstance(t, Tensor) and t.requires_grad
+            t.numel() * t.element_size() for t in a if isinstance(t, Tensor) and t.requires_grad
         )
     return int(splats * ((_ROW_HEADER + features) * size + _PER_SPLAT) + pixels + gradients)
 
 
-def refuse_if_too_large(arguments: tuple[Any, ...]) -> None:
+def refuse_if_too_large(a: Arguments) -> None:
     """Raise MemoryError, before anything is allocated, for a scene that main memory cannot hold."""
-    need = required_bytes(arguments)
+    need = required_bytes(a)
     if need < _SMALL:
         return
     there = available_memory()
     if there is not None and need > there:
-        raise MemoryError(f"{shortage(arguments)}, {there} bytes are available")
+        raise MemoryError(f"{shortage(a)}, {there} bytes are available")
 
 
 def refuse_pairs(pairs: int, numbers: int, size: int) -> None:
@@ -76,14 +96,13 @@ def refuse_pairs(pairs: int, numbers: int, size: int) -> None:
         )
 
 
-def shortage(arguments: tuple[Any, ...]) -> str:
+def shortage(a: Arguments) -> str:
     """The sentence that says what a call needs."""
-    means, viewmat, width, height = (arguments[k] for k in (0, 2, 14, 15))
-    cameras = viewmat.shape[0] if viewmat.dim() == 3 else 1
-    need = required_bytes(arguments)
+    cameras = a.viewmat.shape[0] if a.viewmat.dim() == 3 else 1
+    need = required_bytes(a)
     return (
-        f"{_OP}: {means.shape[0]} Gaussians in {cameras} images of {width} x {height} px need at "
-        f"least {need} bytes ({need / 2**30:.1f} GiB) on {means.device}"
+        f"{_OP}: {a.means.shape[0]} Gaussians in {cameras} images of {a.width} x {a.height} px "
+        f"need at least {need} bytes ({need / 2**30:.1f} GiB) on {a.means.device}"
     )
 
 

@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsfluent.ops import _mpm_fake, _mpm_slope  # noqa: F401  (register shape functions, slopes)
+from gsfluent.ops import _mpm_slope  # noqa: F401  (registers slopes)
+from gsfluent.ops._register import fakes
 from gsfluent.ops.blocks import Blocks
 
 MASS_FLOOR = 1e-30  # core/mpm/contact.h mass_floor
@@ -108,19 +109,8 @@ def _g2p_backward(
     g_grid = g_x = g_kept = None
     where = (*index, ctx.origin, ctx.margin, ctx.dx)
     if ctx.needs_input_grad[0]:
-        scattered, _, _ = torch.ops.gsfluent.p2g(
-            position,
-            vector,
-            matrix,
-            position.new_ones(n),
-            None,
-            None,
-            body,
-            *where,
-            0.0,
-            ctx.fields,
-            False,
-        )
+        points = (position, vector, matrix, position.new_ones(n), None, None, body)
+        scattered, _, _ = torch.ops.gsfluent.p2g(*points, *where, 0.0, ctx.fields, False)
         g_grid = scattered[..., :3].contiguous()
     if ctx.needs_input_grad[1]:
         g_x = torch.ops.gsfluent.transfer_slope(
@@ -137,20 +127,20 @@ def _g2p_backward(
 
 
 def _grid_update_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    grid, moments, colliders, sdf, merged, cut, table, coords = inputs[:8]
-    if colliders is not None and ctx.needs_input_grad[2]:
+    if inputs[2] is not None and ctx.needs_input_grad[2]:
         raise NotImplementedError(
             "grid_update: no gradient with respect to colliders; detach the rows"
         )
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(grid, moments, colliders, sdf, merged, cut, table, coords)
+    ctx.save_for_backward(*inputs[:8])
     ctx.options = inputs[8:]
 
 
 def _grid_update_backward(
     ctx: Any, g_velocity: Tensor | None, g_impulse: Tensor | None, *_: Tensor | None
 ) -> tuple[Tensor | None, ...]:
-    grid, moments, colliders, sdf, merged, cut, table, coords = ctx.saved_tensors
+    saved = ctx.saved_tensors  # a checkpoint hands them out once
+    grid, moments, colliders, _, merged, *_ = saved
     rest: tuple[None, ...] = (None,) * 15
     if g_velocity is None and g_impulse is None:
         return None, None, *rest
@@ -158,17 +148,7 @@ def _grid_update_backward(
     if free and (colliders is None or colliders.shape[0] == 0):
         return None if g_velocity is None else _divided(g_velocity, grid), None, *rest
     g_grid, g_moments = torch.ops.gsfluent.grid_update_backward(
-        g_velocity,
-        g_impulse,
-        grid,
-        moments,
-        colliders,
-        sdf,
-        merged,
-        cut,
-        table,
-        coords,
-        *ctx.options,
+        g_velocity, g_impulse, *saved, *ctx.options
     )
     return g_grid, g_moments if moments is not None else None, *rest
 
@@ -197,7 +177,14 @@ def _touched(rows: Tensor, sdf: Tensor | None, blocks: Blocks, dx: float) -> Ten
     return found
 
 
-@torch.library.custom_op("gsfluent::grid_update_backward", mutates_args=())
+@torch.library.custom_op(
+    "gsfluent::grid_update_backward",
+    mutates_args=(),
+    schema="(Tensor? g_velocity, Tensor? g_impulse, Tensor grid, Tensor? moments, "
+    "Tensor? colliders, Tensor? sdf, Tensor? merged, Tensor? cut, Tensor table, Tensor coords, "
+    "int[] origin, float dx, float dt, float gravity_x, float gravity_y, float gravity_z, "
+    "float friction, float restitution, float contact_gap) -> (Tensor, Tensor)",
+)
 def _grid_update_by_reference(
     g_velocity: Tensor | None,
     g_impulse: Tensor | None,
@@ -212,34 +199,24 @@ def _grid_update_by_reference(
     origin: Sequence[int],
     dx: float,
     dt: float,
-    gravity_x: float,
-    gravity_y: float,
-    gravity_z: float,
-    friction: float,
-    restitution: float,
-    contact_gap: float,
+    *numbers: float,
 ) -> tuple[Tensor, Tensor]:
     from gsfluent.ops.reference import mpm as reference
     from gsfluent.ops.reference.contact import pairs
 
     none = coords.new_empty(0)
-    blocks = Blocks(table, (origin[0], origin[1], origin[2]), coords, none, none)
+    blocks = Blocks.of(table, coords, none, none, origin, 1)
+    friction, restitution, contact_gap = numbers[3:]
+    options: dict[str, Any] = {
+        "dx": dx, "dt": dt, "gravity": numbers[:3], "sdf": sdf, "cut": cut,
+        "colliders": None if colliders is None else colliders.double(),
+        "merged": None if merged is None else pairs(merged),
+        "friction": friction, "restitution": restitution, "contact_gap": contact_gap,
+    }  # fmt: skip
 
     def forward(grid: Tensor, moments: Tensor | None) -> tuple[Tensor, Tensor]:
         velocity, impulse, torque, _ = reference.grid_update(
-            grid,
-            dx=dx,
-            dt=dt,
-            blocks=blocks,
-            gravity=(gravity_x, gravity_y, gravity_z),
-            colliders=None if colliders is None else colliders.double(),
-            sdf=sdf,
-            moments=moments,
-            merged=None if merged is None else pairs(merged),
-            cut=cut,
-            friction=friction,
-            restitution=restitution,
-            contact_gap=contact_gap,
+            grid, blocks=blocks, moments=moments, **options
         )
         return velocity, torch.cat([impulse, torque], dim=1)
 
@@ -266,19 +243,43 @@ def _grid_update_by_reference(
     return g_grid.to(grid.dtype), g_moments.to(grid.dtype)
 
 
-@_grid_update_by_reference.register_fake
-def _grid_update_by_reference_fake(
-    g_velocity: Tensor | None,
-    g_impulse: Tensor | None,
-    grid: Tensor,
-    moments: Tensor | None,
-    *rest: Any,
-) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(grid), (
-        grid.new_empty(0) if moments is None else torch.empty_like(moments)
+def _p2g_shapes(position: Tensor, *rest: Any) -> tuple[Tensor, Tensor, Tensor]:
+    coords, (fields, contact) = rest[7], rest[-2:]
+    grid = position.new_empty((fields, len(coords), 64, 4))
+    moments = position.new_empty((fields if contact else 0, len(coords), 64, 3))
+    return grid, moments, position.new_empty((), dtype=torch.int64)
+
+
+def _g2p_shapes(
+    grid: Tensor, position: Tensor, velocity: Tensor | None, deformation: Tensor | None, *rest: Any
+) -> tuple[Tensor, ...]:
+    n = len(position)
+    shapes = ((n, 3), (n, 3), (n, 3, 3), (0 if deformation is None else n, 3, 3))
+    return *map(position.new_empty, shapes), position.new_empty((), dtype=torch.int64)
+
+
+def _grid_update_shapes(
+    grid: Tensor, moments: Tensor | None, colliders: Tensor | None, *rest: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    rows, wide = 0 if colliders is None else len(colliders), torch.float64
+    impulse, mass = (grid.new_empty(shape, dtype=wide) for shape in ((rows, 6), (rows,)))
+    velocity = grid.new_empty((*grid.shape[:2], 64, 3))
+    return velocity, impulse, mass, grid.new_empty((), dtype=torch.int64)
+
+
+fakes(
+    p2g=_p2g_shapes,
+    g2p=_g2p_shapes,
+    grid_update=_grid_update_shapes,
+    p2g_adjoint=lambda grid, x, *rest: (x.new_empty((len(x), 4)), x.new_empty((len(x), 3, 3))),
+    transfer_slope=lambda grid, constant, linear, x, *rest: x.new_empty((len(x), 3)),
+)
+_grid_update_by_reference.register_fake(
+    lambda gv, gi, grid, moments, *rest: (
+        torch.empty_like(grid),
+        grid.new_empty(0) if moments is None else torch.empty_like(moments),
     )
-
-
+)
 torch.library.register_autograd("gsfluent::p2g", _p2g_backward, setup_context=_p2g_setup)
 torch.library.register_autograd("gsfluent::g2p", _g2p_backward, setup_context=_g2p_setup)
 torch.library.register_autograd(

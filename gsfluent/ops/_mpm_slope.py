@@ -8,7 +8,8 @@ is the gradient of the contact moments of p2g.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,13 +51,7 @@ def transfer_slope(
     linear: Tensor,
     position: Tensor,
     body: Tensor | None,
-    table: Tensor,
-    coords: Tensor,
-    order: Tensor,
-    start: Tensor,
-    origin: Sequence[int],
-    margin: int,
-    dx: float,
+    *where: Any,
 ) -> Tensor:
     """Derivative of ``sum_i w_i g_i . (c + S (x_i - x_p))`` with respect to ``x_p``.
 
@@ -66,18 +61,12 @@ def transfer_slope(
         linear: S of the first three channels, [N, 3, 3].
         position: Particle positions [m], [N, 3].
         body: Field of each particle, int32 [N] or None.
-        table: With the next five: the fields of :class:`gsfluent.ops.Blocks`.
-        coords: See ``table``.
-        order: See ``table``.
-        start: See ``table``.
-        origin: See ``table``.
-        margin: See ``table``.
-        dx: Node spacing [m].
+        where: :meth:`gsfluent.ops.Blocks.parts`.
 
     Returns:
         [N, 3]; zero for particles the blocks do not cover.
     """
-    blocks = Blocks(table, (origin[0], origin[1], origin[2]), coords, order, start, margin)
+    blocks, dx = Blocks.of(*where[:-1]), where[-1]
     slope = torch.zeros_like(position)
     for rows, x, g in _gathered(grid, position, body, blocks, dx):
         c, s = constant[rows], linear[rows]
@@ -94,22 +83,18 @@ def transfer_slope(
 torch.library.register_kernel("gsfluent::transfer_slope", "cuda")(transfer_slope)
 
 
-@torch.library.custom_op("gsfluent::moments_backward", mutates_args=())
+@torch.library.custom_op(
+    "gsfluent::moments_backward",
+    mutates_args=(),
+    schema="(Tensor g_moments, Tensor position, Tensor mass, Tensor? body, Tensor table, "
+    "Tensor coords, Tensor order, Tensor start, int[] origin, int margin, float dx) "
+    "-> (Tensor, Tensor)",
+)
 def _moments_backward(
-    g_moments: Tensor,
-    position: Tensor,
-    mass: Tensor,
-    body: Tensor | None,
-    table: Tensor,
-    coords: Tensor,
-    order: Tensor,
-    start: Tensor,
-    origin: Sequence[int],
-    margin: int,
-    dx: float,
+    g_moments: Tensor, position: Tensor, mass: Tensor, body: Tensor | None, *where: Any
 ) -> tuple[Tensor, Tensor]:
     """Gradients of position and mass through the contact moments of p2g."""
-    blocks = Blocks(table, (origin[0], origin[1], origin[2]), coords, order, start, margin)
+    blocks, dx = Blocks.of(*where[:-1]), where[-1]
     g_position, g_mass = torch.zeros_like(position), torch.zeros_like(mass)
     for rows, x, h in _gathered(g_moments, position, body, blocks, dx):
 
@@ -123,8 +108,6 @@ def _moments_backward(
     return g_position, g_mass
 
 
-@_moments_backward.register_fake
-def _moments_backward_fake(
-    g_moments: Tensor, position: Tensor, mass: Tensor, *rest: object
-) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(position), torch.empty_like(mass)
+_moments_backward.register_fake(
+    lambda h, position, mass, *rest: (torch.empty_like(position), torch.empty_like(mass))
+)

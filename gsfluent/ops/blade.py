@@ -17,8 +17,6 @@ from torch import Tensor
 from gsfluent._check import check_tensor
 from gsfluent.ops._register import fakes
 
-__all__ = ["blade_rows", "blade_sides", "merged_fields"]
-
 BLADE_COLUMNS = 16
 MAX_BLADES = 15
 START, EDGE, WAY, LENGTH, HALF_WIDTH, FROM, TO, NUMBER, JOINTS = 0, 3, 6, 9, 10, 11, 12, 13, 14

@@ -15,14 +15,6 @@ from torch import Tensor
 from gsfluent._check import check_tensor
 from gsfluent.ops._register import fakes
 
-__all__ = [
-    "COLLIDER_COLUMNS",
-    "advance_colliders",
-    "collider_distance",
-    "collider_row",
-    "pad_colliders",
-]
-
 COLLIDER_COLUMNS = 32
 COLUMNS_BEFORE = 16
 SDF_ALIGN = 64

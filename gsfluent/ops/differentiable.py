@@ -19,8 +19,6 @@ from gsfluent._check import check_tensor
 from gsfluent.ops.mpm import build_blocks, g2p, grid_update, p2g
 from gsfluent.ops.plasticity import LAWS, return_mapping
 
-__all__ = ["MpmState", "material_params", "mpm_state", "mpm_step", "rollout"]
-
 
 class MpmState(NamedTuple):
     """What a step changes, from :func:`mpm_state`.

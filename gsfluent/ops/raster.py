@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch import Tensor
 from gsfluent import _load  # noqa: F401  (loads the compiled operators)
 from gsfluent._check import check_tensor
 from gsfluent.ops._memory import (
+    Arguments,
     is_shortage,
     refuse_if_too_large,
     shortage,
@@ -139,7 +140,7 @@ def rasterize(
         (Mip-Splatting, the antialiased mode), Ye et al. 2024 (AbsGS, the absolute gradients);
         conventions in docs/theory/rasterizer.md.
     """
-    arguments = (
+    arguments = Arguments(
         means,
         opacities,
         viewmat,
@@ -164,7 +165,7 @@ def rasterize(
         far,
     )
     if torch.compiler.is_compiling():
-        outputs = torch.ops.gsfluent.rasterize(*_checked(*arguments))
+        outputs = torch.ops.gsfluent.rasterize(*_checked(arguments))
     else:
         outputs = _run(arguments)
     image, alpha, depths, median, normal, weight, radii = outputs[:7]
@@ -179,31 +180,30 @@ def rasterize(
     )
 
 
-def _run(arguments: tuple[Any, ...]) -> tuple[Tensor, ...]:
+def _run(arguments: Arguments) -> tuple[Tensor, ...]:
     """Call the operator.
 
     A frame takes half a millisecond on a GPU, so arguments that the operator accepts as they are
     (it checks shapes, dtypes and devices itself) are not checked twice.
     """
-    viewmat, K, near, far = arguments[2], arguments[3], arguments[-2], arguments[-1]
+    a, means, viewmat, K = arguments, arguments.means, arguments.viewmat, arguments.K
     try:
-        means = arguments[0]
-        ready = viewmat.dtype == means.dtype == K.dtype and type(arguments[14]) is int
-        ready = ready and viewmat.device == means.device == K.device and type(arguments[15]) is int
-        ready = ready and 0.0 < near < far and not (viewmat.requires_grad or K.requires_grad)
+        ready = viewmat.dtype == means.dtype == K.dtype and type(a.width) is int
+        ready = ready and viewmat.device == means.device == K.device and type(a.height) is int
+        ready = ready and 0.0 < a.near < a.far and not (viewmat.requires_grad or K.requires_grad)
         if not ready:
-            arguments = _checked(*arguments)
-        many = means.shape[0] > _MANY or arguments[14] * arguments[15] > _MANY
+            arguments = _checked(arguments)
+        many = means.shape[0] > _MANY or a.width * a.height > _MANY
         if many and means.device.type == "cpu":
             refuse_if_too_large(arguments)
         if torch.is_grad_enabled() and any(
-            t is not None and t.requires_grad for t in arguments[:_TENSORS]
+            isinstance(t, Tensor) and t.requires_grad for t in arguments[:_TENSORS]
         ):
             outputs: tuple[Tensor, ...] = Rasterize.apply(*arguments)
         else:
             outputs = torch.ops.gsfluent.rasterize.default(*arguments)
     except (RuntimeError, TypeError, AttributeError) as error:
-        _checked(*arguments)  # names the argument at fault
+        _checked(arguments)  # names the argument at fault
         if not is_shortage(error):
             raise
         text = f"{shortage(arguments)}, which could not be allocated"
@@ -211,50 +211,28 @@ def _run(arguments: tuple[Any, ...]) -> tuple[Tensor, ...]:
     return outputs
 
 
-def _checked(
-    means: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    covars: Tensor | None,
-    sh: Tensor | None,
-    colors: Tensor | None,
-    background: Tensor | None,
-    normals: Tensor | None,
-    groups: Tensor | None,
-    means2d_offset: Tensor | None,
-    means2d_absgrad: Tensor | None,
-    width: int,
-    height: int,
-    antialiased: bool,
-    contribution: bool,
-    depth: bool,
-    median_depth: bool,
-    near: float,
-    far: float,
-) -> tuple[Any, ...]:
+def _checked(a: Arguments) -> Arguments:
     """The operator's arguments, the cameras moved to the Gaussians; raises what is wrong."""
+    means, viewmat, K, normals = a.means, a.viewmat, a.K, a.normals
     check_tensor(_OP, "means", means, shape=("N", 3))
     n = means.shape[0]
-    check_tensor(_OP, "opacities", opacities, shape=(n,), like=means)
+    check_tensor(_OP, "opacities", a.opacities, shape=(n,), like=means)
     batched = isinstance(viewmat, Tensor) and viewmat.dim() == 3
     leading: tuple[int, ...] = (viewmat.shape[0],) if batched else ()
     check_tensor(_OP, "viewmat", viewmat, shape=(*leading, 4, 4))
     check_tensor(_OP, "K", K, shape=(*leading, 3, 3))
     if leading == (0,):
         raise ValueError(f"{_OP}: viewmat must hold at least one camera, got [0, 4, 4]")
-    _check_size("width", width)
-    _check_size("height", height)
-    _check_shape_arguments(means, quats, scales, covars)
-    channels = _check_color_arguments(means, sh, colors)
-    per_camera = isinstance(background, Tensor) and background.dim() == 2
+    _check_size("width", a.width)
+    _check_size("height", a.height)
+    _check_shape_arguments(means, a.quats, a.scales, a.covars)
+    channels = _check_color_arguments(means, a.sh, a.colors)
+    per_camera = isinstance(a.background, Tensor) and a.background.dim() == 2
     optional: tuple[tuple[str, Tensor | None, tuple[int | str, ...]], ...] = (
-        ("background", background, (*leading, channels) if per_camera else (channels,)),
+        ("background", a.background, (*leading, channels) if per_camera else (channels,)),
         ("normals", normals, (n, "K")),
-        ("means2d_offset", means2d_offset, (*leading, n, 2)),
-        ("means2d_absgrad", means2d_absgrad, (*leading, n, 2)),
+        ("means2d_offset", a.means2d_offset, (*leading, n, 2)),
+        ("means2d_absgrad", a.means2d_absgrad, (*leading, n, 2)),
     )
     for name, value, shape in optional:
         if value is not None:
@@ -264,38 +242,26 @@ def _checked(
             f"{_OP}: normals must have 3 to {_MAX_VALUES - channels} columns beside {channels} "
             f"channels, got {list(normals.shape)}"
         )
-    if groups is not None:
-        check_tensor(_OP, "groups", groups, shape=(n,), dtype=torch.int32, like=means)
-    if not 0.0 < near < far:
-        raise ValueError(f"{_OP}: near and far must satisfy 0 < near < far, got {near} and {far}")
+    if a.groups is not None:
+        check_tensor(_OP, "groups", a.groups, shape=(n,), dtype=torch.int32, like=means)
+    if not 0.0 < a.near < a.far:
+        raise ValueError(
+            f"{_OP}: near and far must satisfy 0 < near < far, got {a.near} and {a.far}"
+        )
     for name, camera in (("viewmat", viewmat), ("K", K)):
         if camera.requires_grad:
             raise NotImplementedError(
                 f"{_OP}: no gradient with respect to {name}; pass {name}.detach()"
             )
-    return (
-        means,
-        opacities,
-        viewmat.to(device=means.device, dtype=means.dtype),
-        K.to(device=means.device, dtype=means.dtype),
-        quats,
-        scales,
-        covars,
-        sh,
-        colors,
-        background,
-        normals,
-        groups,
-        means2d_offset,
-        means2d_absgrad,
-        width,
-        height,
-        bool(antialiased),
-        bool(contribution),
-        bool(depth),
-        bool(median_depth),
-        float(near),
-        float(far),
+    return a._replace(
+        viewmat=viewmat.to(device=means.device, dtype=means.dtype),
+        K=K.to(device=means.device, dtype=means.dtype),
+        antialiased=bool(a.antialiased),
+        contribution=bool(a.contribution),
+        depth=bool(a.depth),
+        median_depth=bool(a.median_depth),
+        near=float(a.near),
+        far=float(a.far),
     )
 
 

@@ -295,17 +295,9 @@ class Solver(SolverState):
             until = None
         if steps == 0 or (until is not None and until <= now["time"]):
             return
-        left = -1 if steps is None else steps
+        left, goal = -1 if steps is None else steps, 1e300 if until is None else until
         # Every call starts from new blocks, so that nothing depends on what was built before it.
-        self._write(
-            until=1e300 if until is None else until,
-            steps_left=left,
-            done=0,
-            reason=0,
-            lost=0,
-            leaving=0,
-            rebuild=1,
-        )
+        self._write(until=goal, steps_left=left, done=0, reason=0, lost=0, leaving=0, rebuild=1)
         ints, floats = self._settings()
         with torch.no_grad():
             torch.ops.gsfluent.solver_prime(self._buffers.listed(), ints, floats)

@@ -58,45 +58,29 @@ def bounds_of(
         asks for finer cells than it allows, else that bound; ``none`` without any.
     """
     found: list[Bound] = []
+
+    def need(name: str, length: float, cells: float, why: str) -> None:
+        found.append(Bound(name, length / cells, False, why, dx <= length / cells))
+
     for body in bodies:
         if body.solid is None:
             continue
         thin = thickness(body)
-        found.append(
-            Bound(
-                "thinnest part", thin / THIN_CELLS, False,
-                f"{body.name}: {_length(thin)} thick at its thinnest, {THIN_CELLS:g} cells",
-                dx <= thin / THIN_CELLS,
-            )
-        )  # fmt: skip
+        why = f"{body.name}: {_length(thin)} thick at its thinnest, {THIN_CELLS:g} cells"
+        need("thinnest part", thin, THIN_CELLS, why)
         piece = fragment_size(body, strike)
         if piece is not None:
-            found.append(
-                Bound(
-                    "fragment size", piece / PIECE_CELLS, False,
-                    f"{body.name}: pieces of about {_length(piece)}, {PIECE_CELLS:g} cells each",
-                    dx <= piece / PIECE_CELLS,
-                )
-            )  # fmt: skip
-        grain = max((m.grain for m in [body.material] if m.variation > 0.0), default=0.0)
-        if grain > 0.0 and body.material.law == "nacc":
-            found.append(
-                Bound(
-                    "damage length", grain / PIECE_CELLS, False,
-                    f"{body.name}: strength varies over {_length(grain)}, {PIECE_CELLS:g} cells",
-                    dx <= grain / PIECE_CELLS,
-                )
-            )  # fmt: skip
+            why = f"{body.name}: pieces of about {_length(piece)}, {PIECE_CELLS:g} cells each"
+            need("fragment size", piece, PIECE_CELLS, why)
+        material = body.material
+        if material.variation > 0.0 and material.grain > 0.0 and material.law == "nacc":
+            why = f"{body.name}: strength varies over {_length(material.grain)}, "
+            need("damage length", material.grain, PIECE_CELLS, f"{why}{PIECE_CELLS:g} cells")
     found.sort(key=lambda bound: bound.dx)
     binding = found[0].name if found else "none"
     if budget is not None:
-        found.insert(
-            0,
-            Bound(
-                "time budget", budget, True, f"finer cells than {_length(budget)} take longer",
-                dx >= budget * (1.0 - 1e-9),
-            ),
-        )  # fmt: skip
+        why = f"finer cells than {_length(budget)} take longer"
+        found.insert(0, Bound("time budget", budget, True, why, dx >= budget * (1.0 - 1e-9)))
         if binding == "none" or found[1].dx < budget:
             binding = "time budget"
     return found, binding
@@ -170,11 +154,7 @@ def budget_spacing(
 
 
 def choose_cells(cost: Callable[[int], float], budget: float) -> int:
-    """Most cells along the largest body whose frames keep to a budget.
-
-    Args:
-        cost: Seconds of a frame at so many cells; grows with them.
-        budget: Seconds there are.
+    """Most cells along the largest body whose frames keep to a budget [s]; cost grows with them.
 
     Raises:
         InputError: Not even the coarsest grid keeps to it.

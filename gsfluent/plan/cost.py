@@ -122,11 +122,6 @@ class CostModel:
     def stage(self, name: str, features: Features, *, corrected: bool = True) -> Cost:
         """What a stage costs.
 
-        Args:
-            name: Stage, as in ``run.json``.
-            features: Amounts of work, see :mod:`gsfluent.plan.work`.
-            corrected: Whether finished runs are heeded.
-
         Raises:
             ValueError: The model does not know the stage.
         """
@@ -188,13 +183,7 @@ class CostModel:
     # --- learning ---
 
     def learn(self, name: str, predicted: Cost, actual: Cost) -> None:
-        """Take over what a finished stage has cost.
-
-        Args:
-            name: Stage.
-            predicted: What the model says to the work that was really done, without correction.
-            actual: What it took.
-        """
+        """Take over what a stage has cost, beside the prediction for that work, uncorrected."""
         for store, said, took in (
             (self.ratios, predicted.seconds, actual.seconds),
             (self.memory_ratios, float(predicted.bytes), float(actual.bytes)),
@@ -362,13 +351,6 @@ def memory_of(
     device: str,
     measured: Mapping[str, float] | None = None,
 ) -> int:
-    """Most memory of a stage [bytes].
-
-    Args:
-        stage: Stage, as in ``run.json``.
-        features: Amounts of work.
-        device: ``cpu`` or ``cuda``.
-        measured: Bytes per unit that were measured on this machine, instead of :data:`BYTES`.
-    """
+    """Most memory of a stage [bytes]; ``measured``: per unit on this machine, for BYTES."""
     rows = measured or BYTES[device].get(stage, {})
     return int(sum(value * features.get(name, 0.0) for name, value in rows.items()))

@@ -164,13 +164,9 @@ def compare(plan: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any
             known = bool(parts) and all(part is not None for part in parts)
             side[key] = total(parts) if known else None
     if "simulate" in done and simulation:
-        for key, planned, ran in (
-            ("dx", "dx", "dx"),
-            ("particles", "particles", "particles"),
-            ("substeps", "substeps", "substeps"),
-            ("active_blocks", "active_blocks", "active_blocks_mean"),
-        ):
-            predicted[key], actual[key] = plan[planned], simulation[ran]
+        for key in ("dx", "particles", "substeps", "active_blocks"):
+            predicted[key] = plan[key]
+            actual[key] = simulation["active_blocks_mean" if key == "active_blocks" else key]
     return {
         "calibrated": plan["calibrated"],
         "predicted": predicted,
@@ -199,13 +195,6 @@ def learn(
     folder: Path | None = None,
 ) -> CostModel:
     """Correct the stored model of a device by a finished run.
-
-    Args:
-        model: The model that the plan was made with, taken where none is stored any more.
-        plan: The plan.
-        values: ``run.json``.
-        device: Where it ran.
-        folder: Where the model is stored, if not in the user's cache.
 
     Returns:
         The corrected model, which has been stored.

@@ -92,7 +92,8 @@ def _chosen(context: RunContext) -> dict[str, Any]:
     shot = context.shot
     source = shot.capture or shot.splats
     digest = content_digest(Path(source)) if source is not None else ""
-    key = fingerprint("budget", context.key(shot.resolved(), digest))
+    # before any stage: the source of the first one is not known yet
+    key = fingerprint("budget", [context.seed, context.device.type, shot.resolved(), digest])
 
     def work(folder: Path) -> dict[str, Any]:
         from gsfluent.plan.plan import cost_model, plan_shot

@@ -52,12 +52,6 @@ def cost_model(
 ) -> CostModel:
     """The cost model of a device: the stored one, or a new one from the probe, which is stored.
 
-    Args:
-        device: Which.
-        recalibrate: Measure anew, and forget what runs have taught.
-        folder: Where models are stored; default: the user's cache.
-        progress: Told what is measured.
-
     Raises:
         RunError: The disk is full.
     """
@@ -131,12 +125,6 @@ def plan_shot(
     shot: Shot, *, device: torch.device | str = "cpu", seed: int = 0, model: CostModel | None = None
 ) -> dict[str, Any]:
     """Plan a shot.
-
-    Args:
-        shot: The shot.
-        device: Where it would run.
-        seed: Of the run; a plan has nothing random.
-        model: What work costs there; without one times are None.
 
     Returns:
         ``passes`` (name, needed, why), ``bounds``, ``binding`` and ``budget``, ``dx``, ``cells``,

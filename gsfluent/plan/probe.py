@@ -78,12 +78,7 @@ _TRAININGS = ((80, 3000, 90), (160, 3000, 30))
 
 
 def calibrate(device: torch.device | str, progress: Progress | None = None) -> CostModel:
-    """Measure what work costs on a device: 18 s on two quiet cores, 47 s on an H100.
-
-    Args:
-        device: Which.
-        progress: Told what is measured.
-    """
+    """Measure what work costs on a device: 18 s on two quiet cores, 47 s on an H100."""
     from gsfluent.plan.probe_parts import frame_samples, measure_solver
 
     device = torch.device(device)

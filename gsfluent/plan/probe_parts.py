@@ -154,10 +154,6 @@ _CELLS = 14
 def frame_samples(out: Path, device: torch.device) -> list[Sample]:
     """Time the frames of a melon that bounces (rubber) and of one that breaks.
 
-    Args:
-        out: Folder of a small run.
-        device: Where to simulate.
-
     Returns:
         What setting up costs, what frames in which nothing is broken cost, and what the breaking
         adds to them.

@@ -62,10 +62,6 @@ class Proxy:
 def proxy(shot: Shot, warnings: list[str]) -> Proxy:
     """Solids to plan a shot with.
 
-    Args:
-        shot: The shot.
-        warnings: Is told what was not known.
-
     Raises:
         InputError: The input cannot be read, or an object selects nothing of it.
     """

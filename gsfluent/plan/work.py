@@ -148,12 +148,7 @@ def texture_method(shot: Shot) -> str:
 
 
 def texture_work(method: str, fill: Mapping[str, float]) -> Features:
-    """Colouring: voxels by method.
-
-    Args:
-        method: From :func:`texture_method`.
-        fill: Features of the fill.
-    """
+    """Colouring: voxels by method."""
     kind = "exemplar" if method == "exemplar" else "procedural"
     return {
         "start": 1.0,
@@ -177,11 +172,7 @@ def simulate_work(
         cracks: Whether they are repaired along cracks.
         points: All material points.
     """
-    laws = {
-        material.law
-        for body in scene.bodies
-        for material in [body.material, *(part.material(body.material) for part in body.parts)]
-    }
+    laws = laws_of(scene)
     breaks = cracks and "nacc" in laws and outlook.shatters
     seconds = max(outlook.grid_from + outlook.grid_seconds, 1e-12)
     broken = max(0.0, 1.0 - outlook.struck / seconds) if math.isfinite(outlook.struck) else 0.0
@@ -255,13 +246,7 @@ def laws_of(scene: Scene) -> set[str]:
 
 
 def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]]:
-    """The passes: ``pass``, ``needed`` and ``why``.
-
-    Args:
-        shot: The shot.
-        scene: Its scene.
-        outlook: What will happen.
-    """
+    """The passes: ``pass``, ``needed`` and ``why``."""
     laws = laws_of(scene)
     breaks = "nacc" in laws
     several = len(scene.bodies) > 1

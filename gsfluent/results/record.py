@@ -19,14 +19,7 @@ CLEAN, FAILED = "clean", "failed"
 
 
 class RunRecord:
-    """Collects the figures and writes the file.
-
-    Args:
-        path: ``OUT/run.json``.
-        shot: The resolved shot as plain values.
-        device: Where the run computes.
-        seed: Its seed.
-    """
+    """Collects the figures and writes the file."""
 
     def __init__(self, path: Path, shot: dict[str, Any], device: torch.device, seed: int) -> None:
         self.path = path
@@ -38,11 +31,7 @@ class RunRecord:
             "seed": seed,
             "shot": shot,
             "stages": [],
-            "reconstruction": None,
-            "fill": None,
-            "texture": None,
-            "simulation": None,
-            "render": None,
+            **dict.fromkeys(("reconstruction", "fill", "texture", "simulation", "render")),
             "outputs": {},
         }
 

@@ -82,12 +82,7 @@ class StageResult:
 
 
 class StageStore:
-    """Runs stages or finds them finished.
-
-    Args:
-        root: Folder of the stages, ``OUT/stages``.
-        force: Redo every stage.
-    """
+    """Runs stages or finds them finished."""
 
     def __init__(self, root: Path, *, force: bool = False) -> None:
         self.root = root

@@ -73,13 +73,6 @@ def photograph_demo(
 
     What is known of the inside does not lie among the photographs that are reconstructed.
 
-    Args:
-        name: An object of the generator.
-        folder: Where they go; made when missing.
-        size: How many photographs, how large.
-        seed: Draws the object.
-        progress: Progress callback.
-
     Returns:
         ``folder`` and ``images``, their number.
 
@@ -110,14 +103,7 @@ def run_demo(
     Leaves ``capture/`` and ``shot.yaml`` in ``out`` beside what a run leaves, so the demo can be
     changed and run again like any shot.
 
-    Args:
-        name: One of :data:`SCENES`.
-        out: Folder for the results.
-        size: ``full`` or ``preview``.
-        device: Where the heavy work runs.
-        seed: Seed of the object and of everything random.
-        force: Redo finished stages.
-        reporter: Receives progress; log lines by default.
+    Arguments as the options of ``gsfluent demo``; ``reporter`` receives progress.
 
     Returns:
         ``run.json`` with ``demo``: interior error against the truth, held-out PSNR.

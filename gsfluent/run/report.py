@@ -44,10 +44,6 @@ def read_run(out: Path) -> dict[str, Any]:
 def write_report(out: Path, values: Values) -> Path:
     """Write the page of a run beside its video.
 
-    Args:
-        out: Folder of the run.
-        values: Content of its ``run.json``.
-
     Returns:
         ``OUT/report.html``.
 

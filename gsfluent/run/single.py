@@ -34,14 +34,7 @@ def reconstruct_to(
 ) -> dict[str, Any]:
     """Photographs to a splat file; ``reconstruct.json``, ``.md`` and ``.png`` beside it.
 
-    Args:
-        capture: Folder of posed photographs.
-        out: The .ply to write.
-        device: Where to compute.
-        seed: Seed of everything random.
-        keep_background: Do not isolate the object.
-        progress: Told of each step.
-        **options: Arguments of :class:`gsfluent.pipeline.Reconstruct`.
+    Arguments as the options of ``gsfluent reconstruct``; ``options`` go to the stage.
 
     Returns:
         What stands in ``reconstruct.json``.

@@ -81,18 +81,8 @@ class Part:
                 hint="keep one of them, or make two parts",
             )
         for key in rest:
-            known_key(
-                f"part {name!r}",
-                key,
-                [
-                    *materials.PARAMETERS,
-                    *materials.LOOKS,
-                    "variation",
-                    "grain",
-                    "material",
-                    "law",
-                ],
-            )
+            looks = (*materials.LOOKS, *materials.SCATTER)
+            known_key(f"part {name!r}", key, (*materials.PARAMETERS, *looks, "material", "law"))
         return Part(name, dict(where), rest)
 
     def material(self, base: Material) -> Material:

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from gsfluent.geometry import quaternion_to_matrix
 
-__all__ = ["GridBox", "choose_grid", "density_field"]
-
 _RADII = (2, 3, 4, 6, 8, 12, 16, 20)  # half-widths [voxels] that splats are grouped into
 _CUTOFF = 2.5  # standard deviations; exp(-3.1) = 0.044 of the peak is dropped
 _MIN_SIGMA = 0.5  # voxels: a surface sampled about once per voxel stays closed

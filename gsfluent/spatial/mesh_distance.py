@@ -24,25 +24,15 @@ _NEIGHBOURS = 12
 
 @dataclasses.dataclass(frozen=True)
 class MeshBody:
-    """A mesh as a collider: in a frame on its centre of mass, along its principal axes.
+    """A mesh as a collider: in a frame on its centre of mass, along its principal axes."""
 
-    Args:
-        values: Signed distances [m] at the nodes, float32 [X, Y, Z], negative inside.
-        spacing: Distance between nodes [m].
-        corner: Position of the first node in the body frame [m], [3].
-        center: Centre of mass in the frame of the file, times ``scale`` [m], [3].
-        axes: Rotation from the body frame to the frame of the file, [3, 3].
-        volume: Volume [m^3].
-        inertia: Principal moments at unit density [m^5], [3].
-    """
-
-    values: np.ndarray
-    spacing: float
-    corner: np.ndarray
-    center: np.ndarray
-    axes: np.ndarray
-    volume: float
-    inertia: np.ndarray
+    values: np.ndarray  # signed distances [m] at the nodes, float32 [X, Y, Z], negative inside
+    spacing: float  # distance between nodes [m]
+    corner: np.ndarray  # position of the first node in the body frame [m], [3]
+    center: np.ndarray  # centre of mass in the frame of the file, times ``scale`` [m], [3]
+    axes: np.ndarray  # rotation from the body frame to the frame of the file, [3, 3]
+    volume: float  # volume [m^3]
+    inertia: np.ndarray  # principal moments at unit density [m^5], [3]
 
 
 def mesh_body(path: str | Path, scale: float, spacing: float) -> MeshBody:

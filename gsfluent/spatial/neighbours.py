@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["nearest", "nearest_rows"]
-
 _CHUNK = 1 << 25  # candidate pairs at a time
 _SIDE = 1 << 20  # cells along an axis that a key can tell apart
 

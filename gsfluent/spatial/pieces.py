@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["hilbert_code", "sample", "signed_depth", "small_pieces"]
-
 _PER_SPACING = 1.7  # pieces per spacing and axis, at least
 _FINEST = 8  # pieces per voxel and axis, at most
 

@@ -32,17 +32,11 @@ def robust_box(points: Array) -> tuple[Array, Array]:
 
 @dataclasses.dataclass(frozen=True)
 class Clusters:
-    """Clusters of near points.
+    """Clusters of near points."""
 
-    Attributes:
-        index: Cluster of each point, int [N]; 0 is the largest.
-        pieces: Number of clusters that are pieces of the object; those after are floaters.
-        cell: Edge of the voxels that were joined.
-    """
-
-    index: NDArray[np.int64]
-    pieces: int
-    cell: float
+    index: NDArray[np.int64]  # cluster of each point, int [N]; 0 is the largest
+    pieces: int  # number of clusters that are pieces of the object; those after are floaters
+    cell: float  # edge of the voxels that were joined
 
     @property
     def floaters(self) -> NDArray[np.bool_]:

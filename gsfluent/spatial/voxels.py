@@ -6,8 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["distance_transform", "grown", "nearest_empty", "surface"]
-
 _FAR = 1 << 14  # voxels: farther than any grid is long; its square still fits in int32
 _CHUNK = 1 << 27  # sums of a parabola and a value at a time, int32
 

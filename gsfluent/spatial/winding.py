@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["winding_numbers"]
-
 _FAR = 2.5  # radii from a cluster's centre; the dipole alone is then good to a few per cent of it
 _CLUSTER = 256  # points
 _CHUNK = 4_000_000  # pairs at a time

@@ -13,8 +13,6 @@ from torch import Tensor
 
 from gsfluent.data import Camera
 
-__all__ = ["LARGEST", "nearest_points"]
-
 LARGEST = 24.0
 """Discs are drawn no larger than this radius [px], which bounds the time for points very near."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from gsfluent.config import Shot
 from gsfluent.data import Capture, Frame
 from gsfluent.progress import Reporter
 from gsfluent.results.record import RunRecord
-from gsfluent.results.store import StageStore
+from gsfluent.results.store import StageResult, StageStore, fingerprint
 
 
 @dataclass
@@ -33,6 +34,27 @@ class RunContext:
     frame: Frame = field(default_factory=Frame.identity)  # World to scene; set by the isolate stage
     source_key: str = ""  # Fingerprint of the last stage, which the next one builds on
 
-    def key(self, *parts: Any) -> list[Any]:
-        """Fingerprint parts every stage shares."""
-        return [self.seed, self.device.type, *parts]
+    def do(
+        self,
+        name: str,
+        work: Callable[[Path], dict[str, Any]],
+        *parts: Any,
+        section: str = "",
+        hands_on: bool = True,
+    ) -> StageResult:
+        """Do a stage, or find it done.
+
+        Args:
+            name: Its name.
+            work: See :meth:`gsfluent.results.store.StageStore.run`.
+            parts: What it depends on beside the stages before it.
+            section: Of ``run.json``, takes its report.
+            hands_on: Whether the next stages build on it.
+        """
+        key = fingerprint(name, [self.seed, self.device.type, self.source_key, *parts])
+        result = self.store.run(name, key, work)
+        if section:
+            self.record.values[section] = dict(result.report)
+        if hands_on:
+            self.source_key = result.fingerprint
+        return result

@@ -20,7 +20,7 @@ from gsfluent.pipeline.render.film import Film, poster_frame
 from gsfluent.pipeline.render.video import to_bytes, write_video
 from gsfluent.progress import Progress, report_progress
 from gsfluent.results.record import shot_of
-from gsfluent.results.store import content_digest, fingerprint, publish
+from gsfluent.results.store import content_digest, publish
 from gsfluent.stages.context import RunContext
 
 
@@ -33,7 +33,6 @@ def render_stage(context: RunContext) -> None:
     path = shot.output.camera
     camera_key = content_digest(path) if isinstance(path, Path) else None
     looks = [repr(light), repr(looks_of(shot))]
-    key = fingerprint("render", context.key(context.source_key, looks, output, camera_key))
 
     def work(folder: Path) -> dict[str, Any]:
         film = Film(context.out, shot, light, context.device)
@@ -66,11 +65,10 @@ def render_stage(context: RunContext) -> None:
         save_image(film.picture(best).image.cpu(), folder / "poster.png")
         return report
 
-    result = context.store.run("render", key, work)
+    result = context.do("render", work, looks, output, camera_key, section="render", hands_on=False)
     for name in ("video.mp4", "poster.png"):
         publish(result.folder / name, context.out / name)
         context.record.values["outputs"][name.split(".")[0]] = name
-    context.record.values["render"] = dict(result.report)
 
 
 def export_stage(context: RunContext) -> None:
@@ -78,13 +76,11 @@ def export_stage(context: RunContext) -> None:
     wanted = [kind for kind in context.shot.output.what if kind != "mp4"]
     if not wanted:
         return
-    key = fingerprint("export", context.key(context.source_key, wanted))
 
     def work(folder: Path) -> dict[str, Any]:
         return write_exports(context.out, wanted, progress=context.reporter.task("export"))
 
-    result = context.store.run("export", key, work)
-    context.record.values["outputs"] |= result.report
+    context.record.values["outputs"] |= context.do("export", work, wanted, hands_on=False).report
 
 
 def render_again(
@@ -100,16 +96,7 @@ def render_again(
 ) -> dict[str, Any]:
     """Render a finished simulation with another camera, light or size.
 
-    Args:
-        out: Folder of the run.
-        device: Where to render.
-        to: Video (.mp4) or picture (.png); ``render.mp4`` or ``render.png`` in ``out`` by default.
-        camera: ``orbit``, a photograph's index, or a JSON file; the shot's own by default.
-        size: (width, height) [px].
-        frame: Only this frame.
-        progress: Called per frame.
-        light: Changes to the light, as :func:`gsfluent.pipeline.light.from_shot.changed`
-        takes them.
+    Arguments as the options of ``gsfluent render`` (docs/guide/light-and-video.md).
 
     Returns:
         ``output``, ``frames`` and ``seconds_per_frame``.

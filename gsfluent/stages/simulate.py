@@ -20,7 +20,7 @@ from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.walls import thin_shells
 from gsfluent.results.frames import SavedFrame, count_frames, save_frame
-from gsfluent.results.store import content_digest, fingerprint
+from gsfluent.results.store import content_digest
 from gsfluent.scene.scene import Body, Scene
 from gsfluent.stages.context import RunContext
 from gsfluent.stages.solids import load_solids
@@ -32,11 +32,6 @@ _STEEL_ROWS = 2**40
 
 def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
     """The scene of a shot: its solids with their materials, the floor, and the events.
-
-    Args:
-        shot: The shot.
-        solids: Solid of each object by name.
-        frame: World to scene.
 
     Raises:
         InputError: A material, part or event that cannot be.
@@ -118,7 +113,6 @@ def simulate_stage(context: RunContext) -> None:
     shot = context.shot
     solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl]
     settings = [moving_settings(shot), solve, shot.output.cracks]
-    key = fingerprint("simulate", context.key(context.source_key, settings))
 
     def work(folder: Path) -> dict[str, Any]:
         scene = build_scene(shot, load_solids(context), context.frame)
@@ -146,15 +140,12 @@ def simulate_stage(context: RunContext) -> None:
             frames.save(state)
         return frames.report | {"thin": thin_walls(scene, frames.run.matter.dx)}
 
-    result = context.store.run("simulate", key, work)
-    report = dict(result.report)
+    report = context.do("simulate", work, settings, section="simulation").report
     fill = context.record.values["fill"]
     # the number of material points is known only once the grid is
     for name in ("particles", "particles_per_cell"):
         if name in report and name not in fill:
             fill[name] = report[name]
-    context.record.values["simulation"] = report
-    context.source_key = result.fingerprint
 
 
 def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:

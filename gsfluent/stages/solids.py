@@ -29,7 +29,7 @@ from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.pipeline.texture import Texture
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.record import RunRecord, read_frame
-from gsfluent.results.store import StageStore, content_digest, fingerprint, publish
+from gsfluent.results.store import StageStore, content_digest, publish
 from gsfluent.stages.context import RunContext
 from gsfluent.stages.select import select_mask
 
@@ -43,7 +43,6 @@ def reconstruct_stage(context: RunContext) -> None:
         return
     context.capture = load_capture(shot.capture)
     context.source_key = content_digest(shot.capture)
-    key = fingerprint("reconstruct", context.key(context.source_key, shot.reconstruct.given()))
     capture = context.capture
 
     def work(folder: Path) -> dict[str, Any]:
@@ -58,9 +57,7 @@ def reconstruct_stage(context: RunContext) -> None:
         write_report(folder, gaussians, capture)
         return dict(gaussians.report)
 
-    result = context.store.run("reconstruct", key, work)
-    context.record.values["reconstruction"] = result.report
-    context.source_key = result.fingerprint
+    context.do("reconstruct", work, shot.reconstruct.given(), section="reconstruction")
 
 
 def isolate_stage(context: RunContext) -> None:
@@ -74,7 +71,6 @@ def isolate_stage(context: RunContext) -> None:
     placing = {"scale": shot.scale, "size": shot.size, "up": shot.up, "floor": shot.floor}
     placing["origin"] = shot.origin
     captured = shot.output.backdrop == "captured"
-    key = fingerprint("isolate", context.key(context.source_key, placing))
 
     def work(folder: Path) -> dict[str, Any]:
         gaussians = load_splats(source).validated(source.name)
@@ -97,10 +93,7 @@ def isolate_stage(context: RunContext) -> None:
             "support_plane": _support_plane(stance, frame),
         }
 
-    result = context.store.run("isolate", key, work)
-    context.frame = read_frame(result.folder)
-    context.record.values["isolation"] = result.report
-    context.source_key = result.fingerprint
+    context.frame = read_frame(context.do("isolate", work, placing, section="isolation").folder)
 
 
 def _support_plane(stance: Orientation, frame: Frame) -> dict[str, Any] | None:
@@ -125,7 +118,6 @@ def fill_stage(context: RunContext) -> None:
     cells = QUALITY[shot.solve.quality]
     # a finer simulation asks for another solid only where it asks for finer voxels
     fine = options.get("resolution", fill_resolution(1.0, 1.0, cells))
-    key = fingerprint("fill", context.key(context.source_key, options, fine, selections, labels))
 
     def work(folder: Path) -> dict[str, Any]:
         everything = load_splats(context.store.root / "isolate" / "object.ply")
@@ -149,9 +141,7 @@ def fill_stage(context: RunContext) -> None:
             reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
         return _merged(reports)
 
-    result = context.store.run("fill", key, work)
-    context.record.values["fill"] = dict(result.report)
-    context.source_key = result.fingerprint
+    context.do("fill", work, options, fine, selections, labels, section="fill")
 
 
 def texture_stage(context: RunContext) -> None:
@@ -159,7 +149,6 @@ def texture_stage(context: RunContext) -> None:
     shot = context.shot
     options = shot.texture.given()
     exemplar = content_digest(shot.texture.exemplar) if shot.texture.exemplar else None
-    key = fingerprint("texture", context.key(context.source_key, options, exemplar))
 
     def work(folder: Path) -> dict[str, Any]:
         reports = []
@@ -178,12 +167,10 @@ def texture_stage(context: RunContext) -> None:
             reports.append({k: v for k, v in textured.report.items() if k != "fill"})
         return _merged(reports)
 
-    result = context.store.run("texture", key, work)
+    result = context.do("texture", work, options, exemplar, section="texture")
     first = next(iter(shot.objects))
     publish(result.folder / f"{first}.png", context.out / "interior.png")
-    context.record.values["texture"] = dict(result.report)
     context.record.values["outputs"]["interior"] = "interior.png"
-    context.source_key = result.fingerprint
 
 
 def _merged(reports: list[dict[str, Any]]) -> dict[str, Any]:
@@ -227,7 +214,6 @@ def regions_stage(context: RunContext) -> None:
         for name, sources in wanted.items()
     }
     placing = context.frame.to_dict()  # label images are taken along the scene's axes
-    key = fingerprint("regions", context.key(context.source_key, content, placing))
 
     def work(folder: Path) -> dict[str, Any]:
         reports = {}
@@ -242,9 +228,7 @@ def regions_stage(context: RunContext) -> None:
             reports[name] = labelled.report["region_sources"]
         return reports
 
-    result = context.store.run("regions", key, work)
-    context.record.values["regions"] = dict(result.report)
-    context.source_key = result.fingerprint
+    context.do("regions", work, content, placing, section="regions")
 
 
 def load_solids(context: RunContext) -> dict[str, Solid]:
@@ -277,15 +261,7 @@ def _with_labels(solid: Solid, path: Path) -> Solid:
 def context_of(
     shot: Shot, out: Path, device: torch.device | str, seed: int, reporter: Reporter | None = None
 ) -> RunContext:
-    """What stages need to take up, or to begin, a run in a folder; nothing is done or written yet.
-
-    Args:
-        shot: The shot.
-        out: Folder of the run.
-        device: Where the stages compute.
-        seed: Seed of everything random.
-        reporter: Receives progress; log lines by default.
-    """
+    """What stages need to take up, or to begin, a run in a folder; nothing is written yet."""
     device = torch.device(device)
     record = RunRecord(out / "run.json", shot.resolved(), device, seed)
     store = StageStore(out / "stages")

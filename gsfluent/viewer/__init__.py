@@ -7,3 +7,13 @@ session); :class:`~gsfluent.viewer.model.timeline.Timeline` keeps what they have
 :class:`~gsfluent.viewer.model.look.Look` into a picture without any browser; and
 :class:`~gsfluent.viewer.app.App` is the page.
 """
+
+from gsfluent._lazy import lazy
+
+__getattr__, __dir__, __all__ = lazy(
+    __name__,
+    {
+        "gsfluent.viewer.serve": ("view_run",),
+        "gsfluent.viewer.serve_live": ("view_live",),
+    },
+)

@@ -32,15 +32,7 @@ def view_run(
 ) -> dict[str, Any]:
     """Serve the viewer of a run.
 
-    Args:
-        out: Folder of the run.
-        device: Where pictures are drawn.
-        host: Address to listen on.
-        port: First port to try, 0 for any.
-        splats: Let the browser draw the splats.
-        check: Serve, draw one picture as a browser would get it, write it and stop.
-        to: Where that picture goes; ``view.png`` in ``out`` by default.
-        browser: Open the page where there is a desktop.
+    Arguments as the options of ``gsfluent view``.
 
     Returns:
         ``url`` and ``frames``; with ``check`` also ``output`` and ``frame``.

@@ -35,18 +35,7 @@ def view_live(
 ) -> dict[str, Any]:
     """Serve a live session.
 
-    Args:
-        source: Run folder, shot or filled solid.
-        device: Where to simulate and draw.
-        material: Preset for a solid.
-        run: Folder in which a shot's objects are prepared.
-        quality: ``live`` or one of the simulation's.
-        slow: Slow motion at first; None: as much as this machine needs.
-        cracks: How cracks get splats, see :class:`gsfluent.pipeline.Repair`.
-        seed: Seed of everything random.
-        host: Address to listen on.
-        port: First port to try, 0 for any.
-        browser: Open the page where there is a desktop.
+    Arguments as the options of ``gsfluent view --live``.
 
     Returns:
         ``url``, the session's figures, and ``recordings``, the folders that were recorded.

@@ -21,11 +21,6 @@ _BRAND = (47, 111, 196)
 def start_server(host: str, port: int, label: str) -> viser.ViserServer:
     """Start serving.
 
-    Args:
-        host: Address to listen on.
-        port: The first port to try; 0 takes any free one.
-        label: Head of the panel.
-
     Raises:
         InputError: viser is not installed, or host and port cannot be had.
     """

@@ -407,7 +407,9 @@ def test_bad_requests(run: Path, tmp_path: Path, kind: str, options: Any, said: 
 def test_shots_can_ask_for_every_format_without_pictures() -> None:
     from gsfluent.config.settings import EXPORTS
 
-    assert set(EXPORTS) == {name for name, kind in FORMATS.items() if not kind.pictures}
+    assert set(EXPORTS) == {
+        name for name, kind in FORMATS.items() if not kind.writer.startswith("pictures.")
+    }
 
 
 def test_turns_are_turns() -> None:

@@ -162,7 +162,7 @@ def test_memory_is_bounded(solid, monkeypatch) -> None:
         player.frame(0)
     player._one_frame()
     assert player.revision == 1 and player.count == 1 and len(player._facts) == 1
-    assert player.newest.time == player.session.time
+    assert player.frame(player.count - 1).time == player.session.time
 
 
 def test_a_take_is_a_run_and_its_shot_gives_the_same(solid, tmp_path) -> None:

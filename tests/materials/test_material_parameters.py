@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 import torch
+from loaded_scripts import load_script
 from torch import Tensor
 
 from gsfluent import materials, ops
 from gsfluent.errors import InputError
 from gsfluent.lab.world.driver import World
-from gsfluent.materials import LAWS, READS, Material, table
+from gsfluent.materials import LAWS, READS, Material
 
 DX = 0.05
 SOLID = {"young_modulus": 1e5, "poisson_ratio": 0.3, "density": 1000.0}
@@ -174,4 +175,4 @@ def test_the_page_holds_what_the_presets_are(block: str) -> None:
     found = re.search(
         rf"<!-- {block}: begin -->\n(.*?)<!-- {block}: end -->", page.read_text("utf-8"), re.DOTALL
     )
-    assert found is not None and found.group(1) == getattr(table, block)()
+    assert found is not None and found.group(1) == getattr(load_script("study/materials"), block)()

@@ -6,11 +6,11 @@ import functools
 
 import pytest
 import torch
+from plasticity_svd import return_mapping_svd
 from torch import Tensor
 
 from gsfluent.ops import return_mapping
 from gsfluent.ops.reference import plasticity as reference
-from gsfluent.ops.reference.plasticity_svd import return_mapping_svd
 from gsfluent.ops.reference.tensors import diagonal
 
 NACC = torch.tensor([1], dtype=torch.int32)

@@ -111,9 +111,6 @@ class Note:
 def read_config(path: Path) -> tuple[dict[str, Any], list[Note]]:
     """Read a config and name what nobody reads.
 
-    Args:
-        path: The JSON file.
-
     Returns:
         Its values, unknown keys left out, and a note for each of those.
 

@@ -31,24 +31,18 @@ _MANY_BLENDS = 8
 
 @dataclasses.dataclass(frozen=True)
 class RawLabels:
-    """What one file holds.
+    """What one file holds."""
 
-    Attributes:
-        path: The file.
-        values: Index or grey value per pixel, 0 where transparent, [H, W]; None for a picture whose
-            channels differ.
-        colors: ``r << 16 | g << 8 | b`` per pixel, 0 where transparent, [H, W]; None when the file
-            holds numbers only (arrays, 16 bit).
-        indexed: The values are indices of a palette.
-        palette: Colour of each index, when indexed.
-        opaque: Pixels that are not transparent, bool [H, W]; None when nothing is.
-    """
-
-    path: Path
+    path: Path  # the file
+    # index or grey value per pixel, 0 where transparent, [H, W]; None for a picture whose channels
+    # differ.
     values: Codes | None
+    # ``r << 16 | g << 8 | b`` per pixel, 0 where transparent, [H, W]; None when the file holds
+    # numbers only (arrays, 16 bit).
     colors: Codes | None
-    indexed: bool = False
-    palette: tuple[int, ...] = ()
+    indexed: bool = False  # the values are indices of a palette
+    palette: tuple[int, ...] = ()  # colour of each index, when indexed
+    # pixels that are not transparent, bool [H, W]; None when nothing is.
     opaque: NDArray[np.bool_] | None = None
 
 

@@ -31,8 +31,6 @@ from gsfluent.io.segmentation.files import (
 )
 from gsfluent.io.segmentation.match import ViewNames
 
-__all__ = ["LabelView", "Segmentation", "load_masks", "load_segmentation"]
-
 _NAMES_FILE = "labels.json"
 _ASPECT = 0.01
 _MASK_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
@@ -40,35 +38,24 @@ _MASK_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
 
 @dataclasses.dataclass(frozen=True)
 class LabelView:
-    """The labels of one photograph.
+    """The labels of one photograph."""
 
-    Attributes:
-        camera: Pinhole camera of the map.
-        labels: Label per pixel, int32 [H, W]: 0 for none, -1 where the photograph says nothing.
-    """
-
-    camera: Camera
+    camera: Camera  # pinhole camera of the map
+    # label per pixel, int32 [H, W]: 0 for none, -1 where the photograph says nothing.
     labels: NDArray[np.int32]
 
 
 @dataclasses.dataclass(frozen=True)
 class Segmentation:
-    """Label maps of some of a capture's photographs.
+    """Label maps of some of a capture's photographs."""
 
-    Attributes:
-        source: Where they are from, for messages.
-        views: Maps, in the order of the capture's cameras.
-        names: Name of every label number above 0.
-        linked: A number means the same part in all views. When False the numbers are instances of
-            one view (Segment Anything), and 0 means unknown, not "no part".
-        notes: What was noticed while reading.
-    """
-
-    source: str
-    views: tuple[LabelView, ...]
-    names: dict[int, str]
+    source: str  # where they are from, for messages
+    views: tuple[LabelView, ...]  # maps, in the order of the capture's cameras
+    names: dict[int, str]  # name of every label number above 0
+    # A number means the same part in all views. When False the numbers are instances of one view
+    # (Segment Anything), and 0 means unknown, not "no part".
     linked: bool = True
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what was noticed while reading
 
     def number(self, label: str | int) -> int:
         """Return the number of a label given by name or number.
@@ -82,6 +69,74 @@ class Segmentation:
             raise InputError(f"{self.source}: no label {label!r}", f"labels here: {known}")
         by_name = [n for n in found if self.names[n] == str(label)]
         return (by_name or found)[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Wanted:
+    """What is read, and for whom; see :func:`load_segmentation`."""
+
+    path: Path
+    capture: Capture
+    names: ViewNames
+    max_size: int | None
+    least: float = 0.0
+
+    def matched(self, files: list[Path]) -> dict[int, Path]:
+        """Files by view; two files for one view are refused."""
+        found: dict[int, Path] = {}
+        for file in files:
+            index = self.names.find(file.relative_to(self.path).as_posix())
+            if index is None:
+                continue
+            if index in found:
+                raise InputError(
+                    f"{file} and {found[index]} both mean the photograph {self.names.names[index]}",
+                    "keep one label file per photograph",
+                )
+            found[index] = file
+        if not found:
+            raise self.names.no_match(str(self.path), [file.name for file in files])
+        return found
+
+    def leftover(self, files: list[Path], found: dict[int, Path]) -> list[str]:
+        """A note on files that belong to no photograph."""
+        spare = len(files) - len(found)
+        return [f"{spare} files of {self.path.name} belong to no photograph"] if spare else []
+
+    def finished(
+        self,
+        maps: dict[int, NDArray[np.int64]],
+        labels: dict[int, str],
+        notes: list[str],
+        *,
+        linked: bool = True,
+    ) -> Segmentation:
+        """Bring the maps to the photographs' pinhole views."""
+        if linked and not any((value > 0).any() for value in maps.values()):
+            raise InputError(
+                f"{self.path}: nothing is labelled in any of {len(maps)} files",
+                "0 and black mean nothing; give the parts other values",
+            )
+        views, resized = [], 0
+        for index in sorted(maps):
+            camera, value = self.capture.cameras[index], maps[index].astype(np.int32)
+            height, width = value.shape
+            if (width, height) != (camera.width, camera.height):
+                if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT:
+                    raise InputError(
+                        f"{self.path}: the labels of {camera.name} are {width} x {height}, the "
+                        f"photograph is {camera.width} x {camera.height}",
+                        "segment the photographs that were posed, uncropped and not turned",
+                    )
+                resized += 1
+            pinhole, moved = pinhole_map(camera, value, self.max_size)
+            views.append(LabelView(pinhole, moved))
+        if resized:
+            notes = [*notes, f"{resized} maps have another size than their photograph: resized"]
+        without = len(self.capture) - len(views)
+        if without:
+            notes = [*notes, f"{without} of {len(self.capture)} photographs have no labels"]
+        return Segmentation(str(self.path), tuple(views), labels, linked, tuple(notes))
 
 
 def load_segmentation(
@@ -105,32 +160,34 @@ def load_segmentation(
         InputError: Nothing fits the photographs' names, or a file is damaged, of another shape than
             its photograph, or no segmentation.
     """
-    path, names = Path(path), ViewNames(capture)
+    path = Path(path)
+    wanted = _Wanted(path, capture, ViewNames(capture), max_size, least)
+    names = wanted.names
     if not path.exists():
         raise InputError(f"{path}: no such segmentation", "check the path")
     if path.is_file():
-        return _of_file(path, capture, names, max_size, least)
+        return _of_file(wanted)
     entries = sorted(path.iterdir())
     if not entries:
         raise InputError(f"{path}: the folder is empty", "put one label image per photograph there")
     folders = [entry for entry in entries if entry.is_dir()]
     tables = [e for e in entries if e.suffix.lower() == ".json" and e.name != _NAMES_FILE]
     if folders and any((f / "metadata.csv").is_file() for f in folders):
-        return _sam_folders(path, folders, capture, names, max_size, least)
+        return _sam_folders(wanted, folders)
     if folders and not any(e.suffix.lower() in LABEL_SUFFIXES for e in entries if e.is_file()):
         per_image = [f for f in folders if names.find(f.name) is not None]
         if per_image and not any(
             names.find(x.name) is not None for f in per_image for x in f.iterdir()
         ):
-            return _sam_folders(path, folders, capture, names, max_size, least)
+            return _sam_folders(wanted, folders)
         if not _mirrors(path, folders, names):
-            return _label_folders(path, folders, capture, names, max_size)
+            return _label_folders(wanted, folders)
     if tables:
         items: dict[str, Any] = {}
         for table in tables:
             items |= sam.read_json(table)
-        return _sam_items(str(path), items, capture, names, max_size, least)
-    return _label_images(path, capture, names, max_size)
+        return _sam_items(wanted, items)
+    return _label_images(wanted)
 
 
 def load_masks(path: str | Path, capture: Capture, *, max_size: int | None = 640) -> Segmentation:
@@ -147,36 +204,31 @@ def load_masks(path: str | Path, capture: Capture, *, max_size: int | None = 640
     Raises:
         InputError: As :func:`load_segmentation`.
     """
-    path, names = Path(path), ViewNames(capture)
+    path = Path(path)
+    wanted = _Wanted(path, capture, ViewNames(capture), max_size)
     if not path.is_dir():
         raise InputError(f"{path}: no such folder of masks", "name a folder, one mask per photo")
     files = [f for f in sorted(path.rglob("*")) if f.suffix.lower() in _MASK_SUFFIXES]
-    found = _matched(path, files, names)
+    found = wanted.matched(files)
     maps = {index: read_binary(file).astype(np.int64) for index, file in found.items()}
-    notes = _leftover(files, found, path)
-    return _finished(str(path), maps, capture, {1: path.name}, True, notes, max_size)
+    return wanted.finished(maps, {1: path.name}, wanted.leftover(files, found))
 
 
-def _label_images(
-    path: Path, capture: Capture, names: ViewNames, max_size: int | None
-) -> Segmentation:
+def _label_images(wanted: _Wanted) -> Segmentation:
+    path = wanted.path
     files = [
         f
         for f in sorted(path.rglob("*"))
         if f.suffix.lower() in (*LABEL_SUFFIXES, ".jpg", ".jpeg") and f.is_file()
     ]
-    found = _matched(path, files, names)
+    found = wanted.matched(files)
     maps, labels, notes = numbered([read_raw(file) for file in found.values()])
-    notes = [*notes, *_leftover(files, found, path)]
+    notes = [*notes, *wanted.leftover(files, found)]
     labels = _renamed(path / _NAMES_FILE, labels)
-    return _finished(
-        str(path), dict(zip(found, maps, strict=True)), capture, labels, True, notes, max_size
-    )
+    return wanted.finished(dict(zip(found, maps, strict=True)), labels, notes)
 
 
-def _label_folders(
-    path: Path, folders: list[Path], capture: Capture, names: ViewNames, max_size: int | None
-) -> Segmentation:
+def _label_folders(wanted: _Wanted, folders: list[Path]) -> Segmentation:
     """A folder per label, named after it; a pixel that several masks claim shows none of them."""
     maps: dict[int, NDArray[np.int64]] = {}
     claims: dict[int, NDArray[np.int64]] = {}
@@ -186,7 +238,7 @@ def _label_folders(
         inside = [f for f in sorted(folder.rglob("*")) if f.suffix.lower() in _MASK_SUFFIXES]
         files += [f"{folder.name}/{f.name}" for f in inside]
         for file in inside:
-            index = names.find(file.relative_to(folder).as_posix())
+            index = wanted.names.find(file.relative_to(folder).as_posix())
             if index is None:
                 continue
             mask = read_binary(file)
@@ -199,46 +251,33 @@ def _label_folders(
             maps.setdefault(index, np.zeros(mask.shape, np.int64))[mask] = number
             claims.setdefault(index, np.zeros(mask.shape, np.int64))[mask] += 1
     if not maps:
-        raise names.no_match(str(path), files)
+        raise wanted.names.no_match(str(wanted.path), files)
     twice = sum(int((count > 1).sum()) for count in claims.values())
     if twice:
         share = twice / max(sum(int((count > 0).sum()) for count in claims.values()), 1)
         notes.append(f"{100 * share:.1f} % of the masked pixels belong to several labels: no vote")
         for index, count in claims.items():
             maps[index][count > 1] = -1
-    return _finished(str(path), maps, capture, labels, True, notes, max_size)
+    return wanted.finished(maps, labels, notes)
 
 
-def _sam_folders(
-    path: Path,
-    folders: list[Path],
-    capture: Capture,
-    names: ViewNames,
-    max_size: int | None,
-    least: float,
-) -> Segmentation:
-    found = {names.find(folder.name): folder for folder in folders}
+def _sam_folders(wanted: _Wanted, folders: list[Path]) -> Segmentation:
+    found = {wanted.names.find(folder.name): folder for folder in folders}
     found.pop(None, None)
     if not found:
-        raise names.no_match(str(path), [folder.name for folder in folders])
-    maps = {i: sam.read_mask_folder(f, least) for i, f in found.items() if i is not None}
-    return _finished(str(path), maps, capture, {}, False, [], max_size)
+        raise wanted.names.no_match(str(wanted.path), [folder.name for folder in folders])
+    maps = {i: sam.read_mask_folder(f, wanted.least) for i, f in found.items() if i is not None}
+    return wanted.finished(maps, {}, [], linked=False)
 
 
-def _sam_items(
-    source: str,
-    items: dict[str, Any],
-    capture: Capture,
-    names: ViewNames,
-    max_size: int | None,
-    least: float,
-) -> Segmentation:
+def _sam_items(wanted: _Wanted, items: dict[str, Any]) -> Segmentation:
+    source, names = str(wanted.path), wanted.names
     maps, kinds = {}, {}
     for name, found in items.items():
         index = names.find(name)
         if index is None:
             continue
-        masks, labels = sam.json_masks(found, f"{source}: {name}", least)
+        masks, labels = sam.json_masks(found, f"{source}: {name}", wanted.least)
         if masks:
             maps[index] = sam.painted(masks, f"{source}: {name}")
             kinds[index] = labels
@@ -251,16 +290,15 @@ def _sam_items(
         for index, labels in kinds.items():
             maps[index] = np.array([0, *(number[str(label)] for label in labels)])[maps[index]]
         names_of = {k: label for label, k in number.items()}
-        return _finished(source, maps, capture, names_of, True, [], max_size)
-    return _finished(source, maps, capture, {}, False, [], max_size)
+        return wanted.finished(maps, names_of, [])
+    return wanted.finished(maps, {}, [], linked=False)
 
 
-def _of_file(
-    path: Path, capture: Capture, names: ViewNames, max_size: int | None, least: float
-) -> Segmentation:
+def _of_file(wanted: _Wanted) -> Segmentation:
+    path, capture, names = wanted.path, wanted.capture, wanted.names
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return _sam_items(str(path), sam.read_json(path), capture, names, max_size, least)
+        return _sam_items(wanted, sam.read_json(path))
     if suffix not in (".npy", ".npz"):
         raise InputError(
             f"{path}: a segmentation must be a folder, .json, .npy or .npz",
@@ -299,7 +337,7 @@ def _of_file(
             raise names.no_match(str(path), arrays)
     present = sorted({int(n) for value in maps.values() for n in np.unique(value)} - {0})
     labels = _renamed(path.with_suffix(".labels.json"), {n: str(n) for n in present})
-    return _finished(str(path), maps, capture, labels, True, [], max_size)
+    return wanted.finished(maps, labels, [])
 
 
 def _mirrors(path: Path, folders: list[Path], names: ViewNames) -> bool:
@@ -308,29 +346,6 @@ def _mirrors(path: Path, folders: list[Path], names: ViewNames) -> bool:
     relative = [f.relative_to(path).as_posix() for f in files]
     ours = {name.rsplit(".", 1)[0] for name in names.names}
     return any(r.rsplit(".", 1)[0] in ours for r in relative)
-
-
-def _matched(path: Path, files: list[Path], names: ViewNames) -> dict[int, Path]:
-    """Files by view; two files for one view are refused."""
-    found: dict[int, Path] = {}
-    for file in files:
-        index = names.find(file.relative_to(path).as_posix())
-        if index is None:
-            continue
-        if index in found:
-            raise InputError(
-                f"{file} and {found[index]} both mean the photograph {names.names[index]}",
-                "keep one label file per photograph",
-            )
-        found[index] = file
-    if not found:
-        raise names.no_match(str(path), [file.name for file in files])
-    return found
-
-
-def _leftover(files: list[Path], found: dict[int, Path], path: Path) -> list[str]:
-    spare = len(files) - len(found)
-    return [f"{spare} files of {path.name} belong to no photograph"] if spare else []
 
 
 def _renamed(table: Path, labels: dict[int, str]) -> dict[int, str]:
@@ -347,40 +362,3 @@ def _renamed(table: Path, labels: dict[int, str]) -> dict[int, str]:
             f'{table}: names must be a mapping like {{"1": "rind"}} ({error})', "mend the file"
         ) from error
     return {n: new.get(name.lower(), new.get(str(n), name)) for n, name in labels.items()}
-
-
-def _finished(
-    source: str,
-    maps: dict[int, NDArray[np.int64]],
-    capture: Capture,
-    labels: dict[int, str],
-    linked: bool,
-    notes: list[str],
-    max_size: int | None,
-) -> Segmentation:
-    """Bring the maps to the photographs' pinhole views."""
-    if linked and not any((value > 0).any() for value in maps.values()):
-        raise InputError(
-            f"{source}: nothing is labelled in any of {len(maps)} files",
-            "0 and black mean nothing; give the parts other values",
-        )
-    views, resized = [], 0
-    for index in sorted(maps):
-        camera, value = capture.cameras[index], maps[index].astype(np.int32)
-        height, width = value.shape
-        if (width, height) != (camera.width, camera.height):
-            if abs(width * camera.height / (height * camera.width) - 1) > _ASPECT:
-                raise InputError(
-                    f"{source}: the labels of {camera.name} are {width} x {height}, the photograph "
-                    f"is {camera.width} x {camera.height}",
-                    "segment the photographs that were posed, uncropped and not turned",
-                )
-            resized += 1
-        pinhole, moved = pinhole_map(camera, value, max_size)
-        views.append(LabelView(pinhole, moved))
-    if resized:
-        notes = [*notes, f"{resized} maps have another size than their photograph: resized"]
-    without = len(capture) - len(views)
-    if without:
-        notes = [*notes, f"{without} of {len(capture)} photographs have no labels"]
-    return Segmentation(source, tuple(views), labels, linked, tuple(notes))

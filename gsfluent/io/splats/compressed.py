@@ -63,15 +63,16 @@ def decode_compressed(path: Path, data: dict[str, NDArray[Any]]) -> Gaussians:
     if rest is not None:
         sh = np.concatenate([sh, _rest(path, rest)], axis=1)
     return Gaussians(
-        means=_tensor(_between(limits, ("x", "y", "z"), position)),
-        quats=_tensor(_unpack_rotation(vertex["packed_rotation"])),
-        scales=_tensor(np.exp(_between(limits, ("scale_x", "scale_y", "scale_z"), scale))),
-        opacities=_tensor(color[:, 3]),
-        sh=_tensor(sh),
+        means=float_tensor(_between(limits, ("x", "y", "z"), position)),
+        quats=float_tensor(_unpack_rotation(vertex["packed_rotation"])),
+        scales=float_tensor(np.exp(_between(limits, ("scale_x", "scale_y", "scale_z"), scale))),
+        opacities=float_tensor(color[:, 3]),
+        sh=float_tensor(sh),
     )
 
 
-def _tensor(values: NDArray[Any]) -> torch.Tensor:
+def float_tensor(values: NDArray[Any]) -> torch.Tensor:
+    """As a tensor, float32."""
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 

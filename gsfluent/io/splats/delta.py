@@ -83,23 +83,14 @@ class DeltaFrame:
 
 @dataclass(frozen=True)
 class State:
-    """What a decoder knows after a frame; one row per splat of the roster.
+    """What a decoder knows after a frame; one row per splat of the roster."""
 
-    Attributes:
-        alive: bool [M].
-        fragment: int64 [M].
-        means: [M, 3].
-        moved: Change of ``means`` since the frame before, [M, 3].
-        quats: ``wxyz`` [M, 4].
-        levels: Colour (3), opacity, log scale (3) in steps, int64 [M, 7].
-    """
-
-    alive: NDArray[np.bool_]
-    fragment: Ints
-    means: Floats
-    moved: Floats
-    quats: Floats
-    levels: Ints
+    alive: NDArray[np.bool_]  # bool [M]
+    fragment: Ints  # int64 [M]
+    means: Floats  # [M, 3]
+    moved: Floats  # change of ``means`` since the frame before, [M, 3]
+    quats: Floats  # ``wxyz`` [M, 4]
+    levels: Ints  # colour (3), opacity, log scale (3) in steps, int64 [M, 7]
 
 
 class DeltaReader:

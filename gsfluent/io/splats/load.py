@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io.splats.compressed import decode_compressed, encode_compressed, is_compressed
+from gsfluent.io.splats.compressed import (
+    decode_compressed,
+    encode_compressed,
+    float_tensor,
+    is_compressed,
+)
 from gsfluent.io.splats.ply import read_ply, write_ply
 
 logger = logging.getLogger(__name__)
@@ -72,11 +77,11 @@ def load_splats(path: str | Path) -> Gaussians:
     scales = np.exp(_columns(vertex, "scale_0", "scale_1", "scale_2"))
     opacity = _columns(vertex, "opacity")[:, 0]
     gaussians = Gaussians(
-        means=_tensor(_columns(vertex, "x", "y", "z")),
+        means=float_tensor(_columns(vertex, "x", "y", "z")),
         quats=_unit_quaternions(path, _columns(vertex, "rot_0", "rot_1", "rot_2", "rot_3")),
-        scales=_tensor(scales),
-        opacities=_tensor(_sigmoid(opacity)),
-        sh=_tensor(_harmonics(path, vertex)),
+        scales=float_tensor(scales),
+        opacities=float_tensor(_sigmoid(opacity)),
+        sh=float_tensor(_harmonics(path, vertex)),
         labels=_labels(path, vertex),
         normals=_normals(vertex),
     )
@@ -141,10 +146,6 @@ def _columns(rows: NDArray[Any], *names: str) -> NDArray[np.float64]:
     return np.stack([rows[name].astype(np.float64) for name in names], axis=1)
 
 
-def _tensor(values: NDArray[Any]) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
-
-
 def _sigmoid(logit: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sigmoid that does not overflow for the 400 that exporters write."""
     small = np.exp(-np.abs(logit))
@@ -202,4 +203,4 @@ def _normals(rows: NDArray[Any]) -> torch.Tensor | None:
     values = _columns(rows, "nx", "ny", "nz")
     if not np.isfinite(values).all() or not values.any():
         return None
-    return _tensor(values)
+    return float_tensor(values)

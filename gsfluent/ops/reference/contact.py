@@ -11,8 +11,6 @@ import itertools
 import torch
 from torch import Tensor
 
-__all__ = ["STEPS", "contact", "contact_normal", "groups", "merge", "pairs"]
-
 STEPS = list(itertools.product((-1, 0, 1), repeat=3))
 """The node itself (13th of 27) and its neighbours."""
 LIGHT = 1e-4  # of the heaviest neighbour: below it a centroid is not trusted

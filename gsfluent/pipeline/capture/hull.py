@@ -31,17 +31,11 @@ _AGREE = 0.9  # share of them that must agree on a voxel; one bad mask must not 
 
 @dataclass(frozen=True)
 class Hull:
-    """Voxels that every mask allows to be object.
+    """Voxels that every mask allows to be object."""
 
-    Attributes:
-        occupancy: bool [X, Y, Z].
-        origin: Corner of voxel (0, 0, 0), float32 [3].
-        voxel: Edge length, world units.
-    """
-
-    occupancy: Tensor
-    origin: Tensor
-    voxel: float
+    occupancy: Tensor  # bool [X, Y, Z]
+    origin: Tensor  # corner of voxel (0, 0, 0), float32 [3]
+    voxel: float  # edge length, world units
 
     def centers(self, index: Tensor) -> Tensor:
         """Centres of voxels ``index`` [M, 3]."""

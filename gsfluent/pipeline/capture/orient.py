@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsfluent import geometry
+from gsfluent.config import Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.spatial.shape import cluster, robust_box
-
-if TYPE_CHECKING:
-    from gsfluent.config import Shot
 
 Array = NDArray[np.float64]
 
@@ -38,22 +36,14 @@ _OPAQUE = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Orientation:
-    """How an input stands in its own coordinates.
+    """How an input stands in its own coordinates."""
 
-    Attributes:
-        up: Unit up axis [3], world.
-        up_from: What it was taken from: ``given``, ``support plane``, ``cameras`` or
-            ``convention``.
-        floor: Coordinate of the floor along ``up``, world units.
-        floor_from: ``given``, ``support plane`` or ``lowest point``.
-        focus: Point that the cameras look at [3], or the centre of the splats.
-    """
-
-    up: Array
+    up: Array  # unit up axis [3], world
+    # what it was taken from: ``given``, ``support plane``, ``cameras`` or ``convention``.
     up_from: str
-    floor: float
-    floor_from: str
-    focus: Array
+    floor: float  # coordinate of the floor along ``up``, world units
+    floor_from: str  # ``given``, ``support plane`` or ``lowest point``
+    focus: Array  # point that the cameras look at [3], or the centre of the splats
 
 
 def orient(

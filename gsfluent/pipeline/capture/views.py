@@ -20,23 +20,14 @@ _SMALLEST = 24  # pixels; a side of a crop is never shorter
 
 @dataclass(frozen=True)
 class TrainView:
-    """One photograph, or the part of it that shows the object.
+    """One photograph, or the part of it that shows the object."""
 
-    Attributes:
-        color: Colour times validity (times the mask once cropped), float32 [H, W, 3].
-        mask: Coverage of the object in [0, 1], [H, W]; None without masks.
-        valid: 1 where the photograph covers the pixel, [H, W]; None when everywhere.
-        viewmat: World to camera [4, 4], float32.
-        K: Intrinsics of this crop [3, 3], float32.
-        full_width: Width of the uncropped photograph at this size [px].
-    """
-
-    color: Tensor
-    mask: Tensor | None
-    valid: Tensor | None
-    viewmat: Tensor
-    K: Tensor
-    full_width: int
+    color: Tensor  # colour times validity (times the mask once cropped), float32 [H, W, 3]
+    mask: Tensor | None  # coverage of the object in [0, 1], [H, W]; None without masks
+    valid: Tensor | None  # 1 where the photograph covers the pixel, [H, W]; None when everywhere
+    viewmat: Tensor  # world to camera [4, 4], float32
+    K: Tensor  # intrinsics of this crop [3, 3], float32
+    full_width: int  # width of the uncropped photograph at this size [px]
 
     @property
     def size(self) -> tuple[int, int]:

@@ -172,49 +172,6 @@ class BladeSet:
         parent, sides = (found >> 32).to(torch.int32), (found & 0xFFFFFFFF).to(torch.int32)
         return Fields(field.to(torch.int32), parent, sides, ops.merged_fields(parent, sides))
 
-    def spread(self, position: Tensor, body: Tensor, cut: Tensor, number: int) -> Tensor:
-        """Give the rest of a body the side of the part it hangs on, once a blade is done.
-
-        Matter without a side is joined through cells of ``dx`` that touch. A piece that touches
-        matter of one side only belongs to that side: after a clean cut every particle has a side
-        and the two halves are separate bodies. A piece that touches both sides holds them
-        together and stays as it is.
-
-        Args:
-            position: Positions [m], [N, 3].
-            body: Body of each particle, [N].
-            cut: Sides, int32 [N].
-            number: Which blade.
-        """
-        import numpy as np
-        from scipy import ndimage
-
-        shift = 2 * number
-        side = (cut >> shift) & 3
-        result = cut.clone()
-        for name in torch.unique(body[side != 0]).tolist():
-            mine = body == name
-            rows = mine.nonzero()[:, 0]
-            cell = torch.floor(position[rows] / self.dx).to(torch.int64).cpu()
-            cell = cell - cell.amin(dim=0) + 1
-            size = (cell.amax(dim=0) + 2).tolist()
-            i, j, k = cell.numpy().T
-            own = side[rows].cpu().numpy()
-            full = np.ones((3, 3, 3))
-            occupied = [np.zeros(size, dtype=bool) for _ in range(3)]
-            for s in range(3):
-                occupied[s][i[own == s], j[own == s], k[own == s]] = True
-            label, pieces = ndimage.label(occupied[0], structure=full)
-            touches = [
-                np.isin(np.arange(pieces + 1), label[ndimage.binary_dilation(occupied[s], full)])
-                for s in (1, 2)
-            ]
-            given = np.where(touches[0] & ~touches[1], 1, np.where(touches[1] & ~touches[0], 2, 0))
-            new = np.where(own == 0, given[label[i, j, k]], own)
-            spread = torch.from_numpy(new).to(cut) << shift
-            result[rows] = (cut[rows] & ~(3 << shift)) | spread
-        return result
-
     def faces(self, time: float) -> Tensor:
         """Collider rows of the thick blades at a time, float64 [F, 32].
 

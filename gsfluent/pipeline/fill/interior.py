@@ -8,22 +8,18 @@ result depends on nothing but the seed, and the work is one sort.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsfluent.data import INTERIOR, SURFACE, Gaussians
 from gsfluent.pipeline.solid.colors import surface_colors
+from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.neighbours import nearest
 from gsfluent.spatial.pieces import hilbert_code, sample, signed_depth, small_pieces
 from gsfluent.spatial.voxels import grown
-
-if TYPE_CHECKING:
-    from gsfluent.data import Gaussians
-    from gsfluent.spatial.density import GridBox
-
-__all__ = ["Matter", "Placed", "interior_gaussians", "populate", "splat_sizes"]
 
 INTERIOR_OPACITY = 0.98
 _SIGMA_PER_SPACING = 0.45
@@ -166,8 +162,6 @@ def splat_sizes(gaussians: Gaussians, points: np.ndarray, cell: float) -> np.nda
         Geometric mean of the two larger scales, averaged over the eight nearest splats with their
         opacity, float64 [M], world units.
     """
-    from gsfluent.data import SURFACE
-
     if gaussians.labels is not None:
         gaussians = gaussians.select(gaussians.labels == SURFACE)
     scales = gaussians.scales.detach().double().sort(dim=1).values.cpu().numpy()
@@ -201,8 +195,6 @@ def populate(
         spacing_core`` (5 % and 95 % quantiles, voxels) and ``stray_splats``: how many splats of the
         shell hang two voxels or more outside the solid.
     """
-    from gsfluent.data import INTERIOR, Gaussians
-
     solid, depth, nearest, box = matter
     device, dtype = surface.means.device, surface.dtype
     index = np.argwhere(solid)

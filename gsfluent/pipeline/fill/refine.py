@@ -12,21 +12,16 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from gsfluent.data import Capture, Gaussians
+from gsfluent.data.capture import View
 from gsfluent.draw import draw
 from gsfluent.progress import Progress, report_progress
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from gsfluent.data import Capture, Gaussians
-    from gsfluent.data.capture import View
-
-__all__ = ["Testimony", "asked_views", "refine_opacity", "witness"]
 
 logger = logging.getLogger(__name__)
 
@@ -56,29 +51,18 @@ class Testimony(NamedTuple):
 
 
 def witness(
-    gaussians: Gaussians,
-    capture: Capture,
-    *,
-    views: int = 24,
-    image_size: int = 200,
-    photographs: Sequence[View] | None = None,
-    progress: Progress | None = None,
+    gaussians: Gaussians, photographs: Sequence[View], progress: Progress | None = None
 ) -> Testimony:
     """Ask photographs about Gaussians, in one forward and one backward pass per view.
 
     Args:
         gaussians: Everything that is drawn; colours are those without direction.
-        capture: Posed photographs; masks are used where there are any.
-        views: Number of photographs asked, evenly chosen.
-        image_size: Their longest side [pixels].
-        photographs: What :func:`asked_views` read, when there are several calls.
+        photographs: What :func:`asked_views` read; masks are used where there are any.
         progress: Optional callback.
 
     Returns:
         The sums, float64, on the device of the Gaussians.
     """
-    if photographs is None:
-        photographs = asked_views(capture, views, image_size)
     own = gaussians.colors().clamp(0.0, 1.0).double()
     total = torch.zeros(gaussians.count, 4, dtype=torch.float64, device=gaussians.device)
     for done, view in enumerate(photographs):
@@ -151,8 +135,9 @@ def refine_opacity(
         wrong colour, in the first and in the last pass.
     """
     report: dict[str, Any] = {"pruned": 0}
+    photographs = asked_views(capture, views, image_size)
     for round_ in range(_ROUNDS):
-        said = witness(gaussians, capture, views=views, image_size=image_size, progress=progress)
+        said = witness(gaussians, photographs, progress)
         wrong = interior & (said.contradiction > _CONTRADICTED)
         left = interior & ~wrong
         seen = float(said.seen[interior].sum()) / max(float(said.seen.sum()), 1e-12)

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.data import Gaussians
+from gsfluent.data import Capture, Gaussians
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.tsdf import depth_views
 from gsfluent.spatial.voxels import surface
-
-if TYPE_CHECKING:
-    from gsfluent.data import Capture
-
-__all__ = ["skin_gaussians"]
 
 _GREY = 0.6
 _FLAT = 0.2  # thickness of a splat over its radius

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from gsfluent.data import SURFACE, Gaussians, Solid
+from gsfluent.data import SURFACE, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.pipeline.fill.interior import Matter, populate
 from gsfluent.pipeline.fill.refine import refine_opacity
@@ -25,15 +26,10 @@ from gsfluent.progress import Progress, report_progress
 from gsfluent.spatial.voxels import nearest_empty
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import trimesh
-
-    from gsfluent.data import Capture
 
     Source = SignedDistance | trimesh.Trimesh | str | Path
 
-__all__ = ["Fill"]
 
 logger = logging.getLogger(__name__)
 
@@ -97,30 +93,19 @@ class Fill(Stage):
         seed: int = 0,
     ) -> None:
         super().__init__(seed=seed)
-        if not 8 <= int(resolution) <= 512:
-            raise InputError(
-                f"fill: resolution must be in 8..512 voxels, got {resolution}",
-                hint="96 to 160 is usual",
-            )
-        if method not in _METHODS:
-            raise InputError(
-                f"fill: method must be one of {', '.join(_METHODS)}, got {method!r}",
-                hint="leave it at auto",
-            )
-        if rays not in (6, 26):
-            raise InputError(
-                f"fill: rays must be 6 or 26, got {rays}", hint="26 keeps crevices open"
-            )
-        if not threshold > 0:
-            raise InputError(f"fill: threshold must be > 0, got {threshold}", hint="0.5 is usual")
-        if not 0.5 <= agreement <= 1.0:
-            raise InputError(
-                f"fill: agreement must be in 0.5..1, got {agreement}", hint="0.7 is usual"
-            )
-        if spacing is not None and not 0.5 <= spacing <= 16:
-            raise InputError(
-                f"fill: spacing must be in 0.5..16 voxels, got {spacing}", hint="leave it out"
-            )
+        wide = spacing is None or 0.5 <= spacing <= 16
+        for name, value, fine, must, hint in (
+            ("resolution", resolution, 8 <= int(resolution) <= 512, "in 8..512 voxels",
+             "96 to 160 is usual"),
+            ("method", repr(method), method in _METHODS, f"one of {', '.join(_METHODS)}",
+             "leave it at auto"),
+            ("rays", rays, rays in (6, 26), "6 or 26", "26 keeps crevices open"),
+            ("threshold", threshold, threshold > 0, "> 0", "0.5 is usual"),
+            ("agreement", agreement, 0.5 <= agreement <= 1.0, "in 0.5..1", "0.7 is usual"),
+            ("spacing", spacing, wide, "in 0.5..16 voxels", "leave it out"),
+        ):  # fmt: skip
+            if not fine:
+                raise InputError(f"fill: {name} must be {must}, got {value}", hint=hint)
         self.resolution = int(resolution)
         self.method = method
         self.hollow = _parse_hollow(hollow)

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsfluent._lazy import cv2
 from gsfluent.errors import InputError
-from gsfluent.lazy import cv2
 from gsfluent.pipeline.light.shade import harmonics, to_linear
 
 Coefficients = tuple[tuple[float, float, float], ...]

@@ -219,10 +219,6 @@ class Carry:
             normals=normals,
         )
 
-    def sample(self, values: Tensor) -> Tensor:
-        """Return per-point values [N] at each splat's nearest point, [M]."""
-        return values[self.owner]
-
 
 def nearest_points(places: Tensor, body: Tensor, matter: Matter) -> Tensor:
     """Nearest points of the own body of places at rest.

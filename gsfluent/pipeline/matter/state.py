@@ -29,6 +29,13 @@ def at_rows(values: Tensor, rows: Tensor | None) -> Tensor:
     return values if rows is None else values[rows]
 
 
+def kinetic_energy(mass: Tensor, velocity: Tensor, affine: Tensor, dx: float) -> Tensor:
+    """Kinetic energy of some points with its APIC part [J], float64 []; masses are [M]."""
+    squared = (velocity.double() ** 2).sum(dim=1)
+    squared = squared + 0.25 * dx * dx * (affine.double() ** 2).sum(dim=(1, 2))
+    return 0.5 * (mass.double() * squared).sum()
+
+
 class State(NamedTuple):
     """Everything that changes in a simulation. Tensors are never written in place.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -45,15 +44,10 @@ def draws(seed: int, purpose: int, step: int) -> torch.Generator:
 
 @dataclass(frozen=True)
 class Place:
-    """Where Gaussians may be.
+    """Where Gaussians may be."""
 
-    Attributes:
-        hull: Visual hull of the object; None for a whole scene.
-        eyes: Camera positions [V, 3].
-    """
-
-    hull: Hull | None
-    eyes: Tensor
+    hull: Hull | None  # visual hull of the object; None for a whole scene
+    eyes: Tensor  # camera positions [V, 3]
 
     @torch.no_grad()
     def misplaced(self, model: SplatModel) -> Tensor:
@@ -73,32 +67,28 @@ class Place:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the image error asks of the next change of the count.
+    """What the image error asks of the next change of the count."""
 
-    Attributes:
-        grow: Gaussians that may be multiplied, bool [N]; None for all.
-        drop: Gaussians that the images do not need, bool [N]; None for none.
-        stop: Add none at all.
-    """
-
-    grow: Tensor | None = None
-    drop: Tensor | None = None
-    stop: bool = False
+    grow: Tensor | None = None  # gaussians that may be multiplied, bool [N]; None for all
+    drop: Tensor | None = None  # gaussians that the images do not need, bool [N]; None for none
+    stop: bool = False  # add none at all
 
 
-class Density(Protocol):
-    """What the training loop asks of a density control."""
+class Density:
+    """What the training loop asks of a density control; what one leaves out does nothing."""
 
-    absgrad: bool
+    absgrad = False
 
     def probe(self, model: SplatModel) -> Tensor | None:
         """Zeros [N, 2] that shall receive the screen-space gradient, or None."""
+        return None
 
     def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
         """Take note of one view after its backward pass."""
 
     def penalty(self, model: SplatModel) -> Tensor | None:
         """A term of the loss."""
+        return None
 
     def after_step(self, model: SplatModel, done: int) -> None:
         """Called after every optimiser step."""
@@ -108,12 +98,13 @@ class Density(Protocol):
 
     def state(self) -> dict[str, Tensor]:
         """What must be saved."""
+        return {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Take over what :meth:`state` returned."""
 
 
-class Adc:
+class Adc(Density):
     """Adaptive density control.
 
     Args:
@@ -252,7 +243,7 @@ def densify(
     return room
 
 
-class Mcmc:
+class Mcmc(Density):
     """Relocation, growth to a budget, and noise on the centres.
 
     Args:
@@ -268,15 +259,7 @@ class Mcmc:
     ) -> None:
         self.recipe, self.iterations, self.limit = recipe, iterations, limit
         self.place, self.seed = place, seed
-        self.absgrad = False
         self.generator: torch.Generator | None = None
-
-    def probe(self, model: SplatModel) -> Tensor | None:
-        """None: no gradient is looked at."""
-        return None
-
-    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
-        """Nothing to note."""
 
     def penalty(self, model: SplatModel) -> Tensor | None:
         """Pull on opacities and scales, so that Gaussians that are not needed die."""
@@ -334,13 +317,6 @@ class Mcmc:
         added = min(self.limit, int(_GROWTH * model.count)) - model.count
         if added > 0:
             grow(model, added, model.opacities() if wanted.grow is None else weight, generator)
-
-    def state(self) -> dict[str, Tensor]:
-        """Nothing beside the model."""
-        return {}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Nothing beside the model."""
 
 
 def shared_out(opacity: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

@@ -29,17 +29,11 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 class Judged(NamedTuple):
-    """A held-out photograph and the render that is compared with it.
+    """A held-out photograph and the render that is compared with it."""
 
-    Attributes:
-        image: The render, [H, W, 3] in [0, 1], on the CPU; before white when there is a mask.
-        target: The photograph, likewise.
-        valid: 1 where the photograph covers the pixel, [H, W]; None when everywhere.
-    """
-
-    image: Tensor
-    target: Tensor
-    valid: Tensor | None
+    image: Tensor  # the render, [H, W, 3] in [0, 1], on the CPU; before white when there is a mask
+    target: Tensor  # the photograph, likewise
+    valid: Tensor | None  # 1 where the photograph covers the pixel, [H, W]; None when everywhere
 
 
 def judged(gaussians: Gaussians, view: View) -> Judged:
@@ -106,11 +100,7 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
 
 
 _MOST_ROWS = 8
-
-
 _ERROR_GAIN = 4.0  # the error panel shows four times the error, grey
-
-
 _GAP = 4  # pixels between panels
 
 

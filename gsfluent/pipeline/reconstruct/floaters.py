@@ -26,8 +26,6 @@ from gsfluent.pipeline.capture.views import TrainView
 from gsfluent.spatial.density import choose_grid, density_field
 from gsfluent.spatial.shape import robust_box
 
-__all__ = ["REASONS", "CleanLimits", "clean_floaters", "clean_views"]
-
 _log = logging.getLogger(__name__)
 
 REASONS = (

@@ -89,38 +89,18 @@ _log = logging.getLogger(__name__)
 
 
 _MANY = 24  # views that carry a hull even when some silhouettes are distrusted
-
-
 _FORGIVEN = 0.1  # share of many silhouettes that may be wrong about a voxel
-
-
 _FORGIVEN_MORE = 0.2  # the same where many are known to be wrong
-
-
 _CONTRADICTION = 0.02  # of the hull denied by a silhouette before it is distrusted
-
-
 _ALLOWED = 0.12  # the same after masks were made again
-
-
 _WORTH = 0.2  # share of distrusted silhouettes from which they are made again, not left out
-
-
 _INNER = 4.0  # a hull is too large rather than too small
-
-
 _AGAIN = 2
-
-
 _FORGIVEN_HULL = (0.05, 0.1)  # tried in turn where poses contradict masks
 
 
 _BARE = 0.03  # of the masks that a good hull may leave uncovered
-
-
 _LOOKS = 24  # views that tell which background shows
-
-
 _SHOWN = 0.1  # of its weight without the object: a splat that shows less is hidden
 
 

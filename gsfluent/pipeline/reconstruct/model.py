@@ -157,13 +157,6 @@ class SplatModel:
         self.second = {name: torch.cat([m, zeros[name]]) for name, m in self.second.items()}
 
     @torch.no_grad()
-    def put(self, index: Tensor, rows: Rows) -> None:
-        """Overwrite rows ``index`` [M] of every parameter and clear their moments."""
-        for name, value in rows.items():
-            self.parameters[name].detach()[index] = value
-        self.forget(index)
-
-    @torch.no_grad()
     def forget(self, index: Tensor) -> None:
         """Clear the moments of rows ``index`` [M]."""
         for moments in (self.first, self.second):
@@ -221,14 +214,8 @@ class SplatModel:
 
 
 _RATE = 1e-3
-
-
 _RATE_END = 0.02  # of the rate, at the end of the run
-
-
 _PULL = 1e-2  # weight of the squared distance from the identity
-
-
 _BETAS = (0.9, 0.99)
 
 

@@ -40,56 +40,36 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class Recipe:
-    """One schedule.
+    """One schedule."""
 
-    Attributes:
-        name: What the report calls it.
-        object_rates: Step sizes when the extent is that of one object.
-        scene_rates: Step sizes when the extent is the distance of the cameras.
-        densify_from: First step that may densify.
-        densify_until: Share of the run after which the count no longer grows.
-        densify_every: Steps between two looks at the density.
-        gradient_threshold: Mean screen-space gradient (units of half the image width) above which
-            a Gaussian is cloned or split, for photographs cropped to the object; half of it for
-            whole ones, whose mean weighs a pixel about half as much.
-        absgrad: Take the sum over the pixels of absolute gradients (Ye et al. 2024, AbsGS).
-        absgrad_threshold: Threshold for it, for photographs cropped to the object.
-        absgrad_whole: Share of that for whole photographs.
-        reset_every: Steps between opacity resets; 0 for none.
-        prune_opacity: Opacity below which a Gaussian goes.
-        opacity_pull: Weight of the mean opacity in the loss while the count may grow, so that
-            Gaussians that are not needed fade, are pruned and make room.
-        half_until: Share of the run at half size.
-        sh_every: Steps between two bands of view-dependent colour, at most a quarter of the run.
-        start_opacity: Opacity of Gaussians at sparse points.
-        start_scale: Their size in units of the mean distance of three neighbours.
-        shell: Add a far shell for plain walls.
-        max_gaussians: Cap when none is given.
-        start_gaussians: Start when none is given.
-        image_size: Longer side of the photographs when none is given [px].
-    """
-
-    name: str
-    object_rates: LearningRates
-    scene_rates: LearningRates
-    densify_from: int = 100
-    densify_until: float = 0.6
-    densify_every: int = 100
+    name: str  # what the report calls it
+    object_rates: LearningRates  # step sizes when the extent is that of one object
+    scene_rates: LearningRates  # step sizes when the extent is the distance of the cameras
+    densify_from: int = 100  # first step that may densify
+    densify_until: float = 0.6  # share of the run after which the count no longer grows
+    densify_every: int = 100  # steps between two looks at the density
+    # mean screen-space gradient (units of half the image width) above which a Gaussian is cloned or
+    # split, for photographs cropped to the object; half of it for whole ones, whose mean weighs a
+    # pixel about half as much.
     gradient_threshold: float = 4e-4
+    # take the sum over the pixels of absolute gradients (Ye et al. 2024, AbsGS).
     absgrad: bool = False
-    absgrad_threshold: float = 1.6e-3
-    absgrad_whole: float = 0.5
-    reset_every: int = 0
-    prune_opacity: float = 0.01
+    absgrad_threshold: float = 1.6e-3  # threshold for it, for photographs cropped to the object
+    absgrad_whole: float = 0.5  # share of that for whole photographs
+    reset_every: int = 0  # steps between opacity resets; 0 for none
+    prune_opacity: float = 0.01  # opacity below which a Gaussian goes
+    # weight of the mean opacity in the loss while the count may grow, so that Gaussians that are
+    # not needed fade, are pruned and make room.
     opacity_pull: float = 0.0
-    half_until: float = 0.35
+    half_until: float = 0.35  # share of the run at half size
+    # steps between two bands of view-dependent colour, at most a quarter of the run.
     sh_every: int = 1000
-    start_opacity: float = 0.3
-    start_scale: float = 0.7
-    shell: bool = True
-    max_gaussians: int = 60_000
-    start_gaussians: int = 12_000
-    image_size: int = 400
+    start_opacity: float = 0.3  # opacity of Gaussians at sparse points
+    start_scale: float = 0.7  # their size in units of the mean distance of three neighbours
+    shell: bool = True  # add a far shell for plain walls
+    max_gaussians: int = 60_000  # cap when none is given
+    start_gaussians: int = 12_000  # start when none is given
+    image_size: int = 400  # longer side of the photographs when none is given [px]
 
 
 QUICK = Recipe("quick", LearningRates(), LearningRates(means=8e-4))

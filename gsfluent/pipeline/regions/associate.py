@@ -11,19 +11,14 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsfluent.errors import InputError
+from gsfluent.io.segmentation.masks import Segmentation
 from gsfluent.pipeline.regions.vote import Skin, view_votes
 from gsfluent.progress import Progress
-
-if TYPE_CHECKING:
-    from gsfluent.io.segmentation.masks import Segmentation
-
-__all__ = ["associate"]
 
 _AGREE = 0.5  # share of the photographs that must put two clusters into one mask
 _COVER = 0.6  # share of a mask that must lie on one part for it to vote

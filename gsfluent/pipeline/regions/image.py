@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.data import Frame
+from gsfluent.data import Frame, Solid
 from gsfluent.errors import InputError
 from gsfluent.io.segmentation.files import RawLabels, numbered, read_raw
-
-if TYPE_CHECKING:
-    from gsfluent.data import Solid
-
-__all__ = ["image_labels"]
 
 _AXES = {"x": (1, 2), "y": (0, 2), "z": (0, 1)}
 """Scene axes that run right and up in a picture taken along each axis, as in ``interior.png``."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsfluent.data import Capture, Frame
+from gsfluent.data import Capture, Frame, Solid
 from gsfluent.data.regions import FIRST_LABEL, source_key, source_paths, source_volume
 from gsfluent.errors import InputError
 from gsfluent.io.segmentation.masks import Segmentation, load_masks, load_segmentation
@@ -27,31 +27,21 @@ from gsfluent.pipeline.regions.spread import (
 from gsfluent.pipeline.regions.vote import Skin, cast_votes, find_skin
 from gsfluent.progress import Progress
 
-if TYPE_CHECKING:
-    from gsfluent.data import Solid
-
-__all__ = ["SkinLabels", "label_regions", "project_labels"]
-
 _log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
 class SkinLabels:
-    """What the photographs say about a solid's skin.
+    """What the photographs say about a solid's skin."""
 
-    Attributes:
-        skin: The voxels.
-        label: Label per voxel, int64 [S]: 0 for none, -1 where no photograph shows it.
-        share: Share of the votes that the label got, float32 [S]; 0 where it got none.
-        field: What the inside is labelled from (:func:`label_field`), float32 [S, L + 2].
-        segmentation: The labels, linked between views.
-    """
-
-    skin: Skin
+    skin: Skin  # the voxels
+    # label per voxel, int64 [S]: 0 for none, -1 where no photograph shows it.
     label: NDArray[np.int64]
+    # share of the votes that the label got, float32 [S]; 0 where it got none.
     share: NDArray[np.float32]
+    # what the inside is labelled from (:func:`label_field`), float32 [S, L + 2].
     field: NDArray[np.float32]
-    segmentation: Segmentation
+    segmentation: Segmentation  # the labels, linked between views
 
     @property
     def numbers(self) -> NDArray[np.int64]:

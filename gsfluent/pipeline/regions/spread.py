@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
+from gsfluent.data import Solid
 from gsfluent.pipeline.regions.vote import Skin
-
-if TYPE_CHECKING:
-    from gsfluent.data import Solid
-
-__all__ = ["UNSEEN", "carry_inwards", "decide", "label_field", "nearest_skin"]
 
 UNSEEN = -1
 _POOL = 0.25  # weight of a neighbour's votes: single voxels are noise, rows of them are not

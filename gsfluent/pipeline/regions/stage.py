@@ -10,8 +10,6 @@ from gsfluent.pipeline.regions.project import label_regions
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress
 
-__all__ = ["Regions"]
-
 
 class Regions(Stage):
     """Write labels into ``Solid.regions``.

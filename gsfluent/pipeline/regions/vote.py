@@ -17,18 +17,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsfluent.data import Gaussians
+from gsfluent.data import Gaussians, Solid
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
+from gsfluent.io.segmentation.masks import LabelView, Segmentation
 from gsfluent.progress import Progress, report_progress
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-    from gsfluent.data import Solid
-    from gsfluent.io.segmentation.masks import LabelView, Segmentation
-
-__all__ = ["Skin", "cast_votes", "find_skin", "label_votes", "view_votes"]
 
 _CHANNELS = 32  # of one call of the rasterizer
 _SIGMA = 0.6  # of a splat [voxels]: neighbours overlap, two layers let under 1 % through
@@ -40,23 +37,15 @@ _FACING = 0.15  # cosine below which a voxel is seen edge-on and its pixels are 
 
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """Voxels of a solid that border the outside.
+    """Voxels of a solid that border the outside."""
 
-    Attributes:
-        index: Voxels, int64 [S, 3], in row-major order.
-        normals: Outward unit normals, float32 [S, 3].
-        centers: Centres, world units, float32 [S, 3].
-        surface: Where the surface passes by, found between voxels, world units, float32 [S, 3].
-        splats: What is drawn: the skin first, then the layer below it.
-        neighbours: Adjacency of the skin's voxels (26 neighbours), csr [S, S] of ones.
-    """
-
-    index: NDArray[np.int64]
-    normals: NDArray[np.float32]
-    centers: NDArray[np.float32]
+    index: NDArray[np.int64]  # voxels, int64 [S, 3], in row-major order
+    normals: NDArray[np.float32]  # outward unit normals, float32 [S, 3]
+    centers: NDArray[np.float32]  # centres, world units, float32 [S, 3]
+    # where the surface passes by, found between voxels, world units, float32 [S, 3].
     surface: NDArray[np.float32]
-    splats: Gaussians
-    neighbours: csr_matrix
+    splats: Gaussians  # what is drawn: the skin first, then the layer below it
+    neighbours: csr_matrix  # adjacency of the skin's voxels (26 neighbours), csr [S, S] of ones
 
     def __len__(self) -> int:
         """Return the number of voxels."""

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent._lazy import ndimage
 from gsfluent.data import SURFACE, Camera, Solid
 from gsfluent.draw import draw
 from gsfluent.io import save_image
-from gsfluent.lazy import ndimage
 from gsfluent.pipeline.solid.colors import skin_colors, skin_weights
 
 _GREY = 0.55  # of matter without colour

@@ -15,8 +15,9 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.pipeline.colliders.proximity import boxes, proximity_pairs, time_to_meet
 from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.matter.points import Matter
-from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.matter.state import State, kinetic_energy
 from gsfluent.pipeline.simulate.flight import Flight
 
 LANDING = 2.0
@@ -159,17 +160,9 @@ class Leaving:
 
         What lies close to a collider that moves (``driven``, bool per unit) stays awake.
         """
-        import numpy as np
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
-
-        count, dx = len(gaps), self.matter.dx
-        a, b = pairs.numpy().T if pairs.numel() else np.zeros((2, 0), dtype=np.int64)
-        graph = coo_matrix((np.ones(len(a), dtype=bool), (a, b)), shape=(count, count))
-        heaps, heap = connected_components(graph, directed=False)
-        heap = torch.from_numpy(heap.astype(np.int64))
-        held_up = torch.tensor([gap <= LANDING * dx for gap in gaps])
-        for number in range(heaps):
+        heap = components(pairs[:, 0], pairs[:, 1], len(gaps))
+        held_up = torch.tensor([gap <= LANDING * self.matter.dx for gap in gaps])
+        for number in torch.unique(heap).tolist():
             members = heap == number
             if not bool((calm & ~driven)[members].all()) or not bool(held_up[members].any()):
                 continue
@@ -181,7 +174,7 @@ class Leaving:
         mass = p.mass[rows].double()[:, None]
         # What little momentum was left goes to the floor, that the balance stays whole.
         left = (mass * p.velocity[rows].double()).sum(dim=0)
-        energy = _kinetic(state, rows, self.matter.dx)
+        energy = kinetic_energy(p.mass[rows], p.velocity[rows], p.affine[rows], self.matter.dx)
         self.naps += 1
         return state._replace(
             particles=p.replace(
@@ -207,7 +200,9 @@ class Leaving:
         density = ops.elastic_energy(
             points.strain, law=matter.law, params=matter.params, material=points.material
         )
-        lost = _kinetic(state, rows, matter.dx) - flight.kinetic
+        lost = (
+            kinetic_energy(points.mass, points.velocity, points.affine, matter.dx) - flight.kinetic
+        )
         stored = (density.double() * points.volume.double()).sum()
         if not float(lost + stored) <= VIBRATION * flight.kinetic:
             return state
@@ -231,11 +226,3 @@ def lay_down(state: State, matter: Matter, rigid: RigidSet, gravity: Tensor, uni
     calm = torch.where(still, CALM_FRAMES, state.calm).to(state.calm)
     leaving = Leaving(matter, rigid, gravity, sleep=True, fly=False)
     return leaving(state._replace(calm=calm), unit, math.inf)
-
-
-def _kinetic(state: State, rows: Tensor, dx: float) -> Tensor:
-    """Kinetic energy with the APIC part [J], float64 []."""
-    p = state.particles
-    v, c = p.velocity[rows].double(), p.affine[rows].double()
-    squared = (v**2).sum(dim=1) + 0.25 * dx * dx * (c**2).sum(dim=(1, 2))
-    return 0.5 * (p.mass[rows].double() * squared).sum()

@@ -65,12 +65,6 @@ CAUSES = {
 """Likely cause of each kind of trouble, and what to change."""
 
 
-def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]) -> Figures:
-    """Measure one state."""
-    p = state.particles
-    return measure(matter, state.position, p.velocity, p.affine, p.strain, state.peak, gravity)
-
-
 def region(matter: Matter, state: State, wrong: Tensor, names: Sequence[str]) -> str:
     """Say where points are: centre and box, and the body most of them belong to.
 
@@ -228,21 +222,19 @@ class Watch:
         other.reasons, other._ring = list(self.reasons), self._ring.copy()
         return other
 
+    _KEPT = (
+        "energy", "scale", "rollbacks", "in_a_row", "good_in_a_row", "trouble_time", "reasons",
+    )  # fmt: skip
+
     def state(self) -> dict[str, float | int | list[str]]:
         """Return what a resumed run needs."""
-        return {
-            "energy": self.energy, "scale": self.scale, "rollbacks": self.rollbacks,
-            "in_a_row": self.in_a_row, "good_in_a_row": self.good_in_a_row,
-            "trouble_time": self.trouble_time, "reasons": self.reasons,
-        }  # fmt: skip
+        return {name: getattr(self, name) for name in self._KEPT}
 
     def restore(self, values: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""
-        self.energy, self.scale = float(values["energy"]), float(values["scale"])
-        self.rollbacks = int(values["rollbacks"])
-        self.in_a_row, self.good_in_a_row = int(values["in_a_row"]), int(values["good_in_a_row"])
-        self.trouble_time = float(values["trouble_time"])
-        self.reasons = list(values["reasons"])
+        for name in self._KEPT:
+            setattr(self, name, values[name])
+        self.reasons = list(self.reasons)
 
 
 class Ledger:
@@ -347,14 +339,12 @@ class Figures:
         return self.kinetic + self.elastic + self.gravity
 
 
-def measure(
-    matter: Matter, position: Tensor, velocity: Tensor, affine: Tensor, strain: Tensor,
-    peak: Tensor, gravity: tuple[float, float, float],
-) -> Figures:  # fmt: skip
-    """Sum the figures of one state; see :class:`Figures`. Tensors are [N, ...] in SI units."""
+def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]) -> Figures:
+    """Measure one state; see :class:`Figures`."""
+    p, position, strain, peak = state.particles, state.position, state.particles.strain, state.peak
     particles = matter.particles
     wide = torch.float64
-    x, v, c = position.to(wide), velocity.to(wide), affine.to(wide)
+    x, v, c = position.to(wide), p.velocity.to(wide), p.affine.to(wide)
     mass, volume = particles.mass.to(wide), particles.volume.to(wide)
     second = 0.25 * matter.dx**2
     kinetic = 0.5 * (mass * ((v**2).sum(dim=1) + second * (c**2).sum(dim=(1, 2)))).sum()
@@ -378,13 +368,5 @@ def measure(
             torch.stack([damaged, peak.max().to(wide), (~finite).sum().to(wide)]),
         ]
     ).tolist()
-    return Figures(
-        kinetic=values[0],
-        elastic=values[1],
-        gravity=values[2],
-        momentum=(values[3], values[4], values[5]),
-        angular_momentum=(values[6], values[7], values[8]),
-        damaged_fraction=values[9],
-        alpha_max=values[10],
-        non_finite=int(values[11]),
-    )
+    kinetic, elastic, height, px, py, pz, lx, ly, lz, damaged, most, bad = values
+    return Figures(kinetic, elastic, height, (px, py, pz), (lx, ly, lz), damaged, most, int(bad))

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
 
 from gsfluent.pipeline.matter.points import Matter
-from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.matter.state import State, kinetic_energy
 from gsfluent.scene.parts import Impulse
 from gsfluent.scene.scene import Scene
 
@@ -60,8 +59,8 @@ def _pushed(state: State, matter: Matter, push: Impulse) -> State:
     velocity = p.velocity.index_add(0, rows, (gain + (place - center) @ turn.T).to(p.velocity))
     affine = p.affine.index_add(0, rows, turn.to(p.affine).expand(rows.shape[0], 3, 3).contiguous())
     given = mass * (velocity[rows].double() - p.velocity[rows].double())
-    gained = _kinetic(mass, velocity[rows], affine[rows], matter.dx)
-    gained = gained - _kinetic(mass, p.velocity[rows], p.affine[rows], matter.dx)
+    gained = kinetic_energy(mass[:, 0], velocity[rows], affine[rows], matter.dx)
+    gained = gained - kinetic_energy(mass[:, 0], p.velocity[rows], p.affine[rows], matter.dx)
     landed = list(state.landed)
     landed[push.body] = True
     return state._replace(
@@ -74,10 +73,3 @@ def _pushed(state: State, matter: Matter, push: Impulse) -> State:
         calm=state.calm.masked_fill(woken | mine, 0),
         pushed=state.pushed + 1,
     )
-
-
-def _kinetic(mass: Tensor, velocity: Tensor, affine: Tensor, dx: float) -> Tensor:
-    """Kinetic energy with the APIC part [J], float64 []; mass is [M, 1]."""
-    squared = (velocity.double() ** 2).sum(dim=1)
-    squared = squared + 0.25 * dx * dx * (affine.double() ** 2).sum(dim=(1, 2))
-    return 0.5 * (mass[:, 0] * squared).sum()

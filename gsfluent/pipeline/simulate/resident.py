@@ -37,6 +37,9 @@ OUTWEIGHS = 0.5
 what it strikes first lies on one side of it."""
 
 
+_COUNTED = {"step": "steps", "builds": "block_builds"}
+_SUMS = ("particle_steps", "contact_steps", "contact_nodes", "plastic", "guarded", "inverted")
+"""What the solver counts: under another name in :class:`Counters`, and under its own."""
 _KINDS = {1: "numbers", 2: "speed", CROWDED: "crowded", 4: "far", 5: "step"}
 
 
@@ -200,17 +203,9 @@ class Resident:
     def _count(self) -> None:
         c, old, new = self._counters, self._seen, self._solver.counters()
         self._seen = new
-        names = ("step", "particle_steps", "builds", "contact_steps", "contact_nodes", "plastic",
-                 "guarded", "inverted", "invalid")  # fmt: skip
-        gone = {name: int(new[name] - old[name]) for name in names}
-        c.steps += gone["step"]
-        c.particle_steps += gone["particle_steps"]
-        c.block_builds += gone["builds"]
-        c.contact_steps += gone["contact_steps"]
-        c.contact_nodes += gone["contact_nodes"]
-        c.plastic += gone["plastic"]
-        c.guarded += gone["guarded"]
-        c.inverted += gone["inverted"]
+        gone = {name: int(new[name] - old[name]) for name in ("invalid", *_COUNTED, *_SUMS)}
+        for name, total in (*_COUNTED.items(), *zip(_SUMS, _SUMS, strict=True)):
+            setattr(c, total, getattr(c, total) + gone[name])
         c.shared_sites = max(c.shared_sites, int(new["shared_sites"]))
         c.blocks_max = max(c.blocks_max, int(new["slots_max"]))
         if gone["step"]:

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 
+from gsfluent.data import INTERIOR, SURFACE, Gaussians, Solid
 from gsfluent.draw import draw
+from gsfluent.errors import InputError
+from gsfluent.geometry import rgb_to_sh0
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.tsdf import ring_of_cameras
 from gsfluent.spatial.neighbours import nearest
-
-if TYPE_CHECKING:
-    from gsfluent.data import Gaussians, Solid
-
-__all__ = [
-    "keep_skin",
-    "outer_weights",
-    "skin_colors",
-    "skin_weights",
-    "stray_splats",
-    "surface_colors",
-]
 
 _NEIGHBOURS = 12
 _FAINT = 0.1  # opacity below which a splat is fuzz
@@ -60,9 +51,6 @@ def surface_colors(
     Raises:
         InputError: There are no surface splats.
     """
-    from gsfluent.data import SURFACE
-    from gsfluent.errors import InputError
-
     if gaussians.labels is None:
         rows = np.arange(gaussians.count)
     else:
@@ -127,8 +115,6 @@ def outer_weights(gaussians: Gaussians) -> np.ndarray:
     Returns:
         Weights in 0..1, float64 [N].
     """
-    from gsfluent.pipeline.solid.tsdf import ring_of_cameras
-
     if gaussians.count == 0:
         return np.zeros(0)
     ranked = gaussians.means.double().sort(dim=0).values
@@ -161,9 +147,6 @@ def stray_splats(solid: Solid) -> np.ndarray:
     Returns:
         bool [N]: SURFACE splats more than 1.5 voxels outside the solid or 3 voxels below its skin.
     """
-    from gsfluent.data import SURFACE
-    from gsfluent.pipeline.solid.field import SignedDistance
-
     labels = solid.gaussians.labels
     assert labels is not None  # Solid checks it; narrows the type
     field = SignedDistance.of_solid(solid)
@@ -220,9 +203,6 @@ def keep_skin(solid: Solid, colored: Gaussians) -> Gaussians:
         The Gaussians; colours fade from the skin's, where three thousandths of the size show, to
         their own, where nothing does.
     """
-    from gsfluent.data import INTERIOR
-    from gsfluent.geometry import rgb_to_sh0
-
     if colored.labels is None or not bool((colored.labels == INTERIOR).any()):
         return colored
     shown = outer_weights(colored)

@@ -5,19 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from gsfluent.data import Camera, Capture, Gaussians
 from gsfluent.pipeline.solid.tsdf import SIZE, ring_of_cameras, zoomed
 from gsfluent.spatial.density import GridBox, choose_grid
 from gsfluent.spatial.shape import robust_box
-
-if TYPE_CHECKING:
-    from gsfluent.data import Camera, Capture, Gaussians
-
-__all__ = ["FEW", "MOST_CAMERAS", "Evidence", "SolidOptions"]
 
 FEW = 16  # splats
 MOST_CAMERAS = 48  # evenly chosen; more say the same again
@@ -56,19 +51,12 @@ class SolidOptions:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the solid of splats is decided from, gathered once.
+    """What the solid of splats is decided from, gathered once."""
 
-    Attributes:
-        splats: Those that can be part of a surface.
-        unusable: How many of the visible ones cannot.
-        capture: Their photographs, or None.
-        resolution: Voxels along the longest side of the object.
-    """
-
-    splats: Gaussians
-    unusable: int
-    capture: Capture | None
-    resolution: int
+    splats: Gaussians  # those that can be part of a surface
+    unusable: int  # how many of the visible ones cannot
+    capture: Capture | None  # their photographs, or None
+    resolution: int  # voxels along the longest side of the object
 
     @staticmethod
     def of(gaussians: Gaussians, capture: Capture | None, resolution: int) -> Evidence:

@@ -19,8 +19,6 @@ from gsfluent.geometry import trilinear
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.voxels import distance_transform
 
-__all__ = ["SignedDistance", "distances_of"]
-
 _RIM = 3  # empty voxels around the object, so that every surface closes inside the grid
 _SMOOTH = 1.0  # voxels; takes the steps off a surface that is known by whole voxels
 _MOST = 0.35  # voxels; more than half a step, less than would eat a wall two voxels thick

@@ -10,8 +10,6 @@ import torch
 
 from gsfluent.spatial.voxels import distance_transform, grown
 
-__all__ = ["cavity_volume", "hidden_cavity"]
-
 _log = logging.getLogger(__name__)
 
 _SKIN = 1.5  # voxels: less is a difference of opinion about the skin, no cavity

@@ -19,16 +19,6 @@ from torch import Tensor
 
 from gsfluent.spatial.voxels import distance_transform, grown
 
-__all__ = [
-    "DIRECTIONS",
-    "Vote",
-    "cast_votes",
-    "find_leaks",
-    "keep_components",
-    "smooth_boundary",
-    "trim_outer_flank",
-]
-
 logger = logging.getLogger(__name__)
 
 DIRECTIONS = np.array(
@@ -38,18 +28,12 @@ DIRECTIONS = np.array(
 
 @dataclass(frozen=True)
 class Vote:
-    """Result of :func:`cast_votes`.
+    """Result of :func:`cast_votes`."""
 
-    Attributes:
-        score: Fraction of the counted directions that hit the surface, float32 [X, Y, Z].
-        open_side: Unit vector of the side that was left out because nothing was seen there, or
-            None.
-        open_fraction: Fraction of the inner voxels that look out through that side.
-    """
-
-    score: np.ndarray
+    score: np.ndarray  # fraction of the counted directions that hit the surface, float32 [X, Y, Z]
+    # unit vector of the side that was left out because nothing was seen there, or None.
     open_side: tuple[float, float, float] | None
-    open_fraction: float
+    open_fraction: float  # fraction of the inner voxels that look out through that side
 
 
 def _blocked(hit: np.ndarray, direction: np.ndarray) -> np.ndarray:

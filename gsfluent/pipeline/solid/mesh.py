@@ -21,7 +21,6 @@ from gsfluent.pipeline.solid.source import find_solid
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["FORMATS", "closed_mesh", "is_mesh", "mesh_to", "save_mesh"]
 
 _log = logging.getLogger(__name__)
 

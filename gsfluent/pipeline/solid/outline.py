@@ -18,8 +18,6 @@ from gsfluent.data import Camera, Capture, Gaussians
 from gsfluent.draw import draw
 from gsfluent.pipeline.solid.field import SignedDistance
 
-__all__ = ["Outline", "drawn_outlines", "mask_outlines", "match_outline"]
-
 _SIZE = 400  # pixels of the pictures
 _CAMERAS = 8  # evenly chosen
 _BAND = 8  # pixels on both sides of an outline

@@ -25,7 +25,6 @@ from gsfluent.spatial.winding import winding_numbers
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["METHODS", "find_solid"]
 
 _log = logging.getLogger(__name__)
 

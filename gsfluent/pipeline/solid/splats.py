@@ -26,8 +26,6 @@ from gsfluent.pipeline.solid.walls import wall_thickness
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.voxels import distance_transform, grown, surface
 
-__all__ = ["solid_of_splats"]
-
 _log = logging.getLogger(__name__)
 
 _DRAWN = 0.5  # drawn outlines overhang edges; masks do not (docs/theory/solid.md)
@@ -284,12 +282,8 @@ def _finer(
     body[band] = values <= 0
     body, dropped = keep_components(body)
     body = _without_bubbles(body)
-    grids = []
-    for column, rest in ((values, 2.0), (found.near, 0.0)):
-        grid = np.full(box.shape, rest, dtype=np.float32)
-        grid[band] = column
-        grids.append(grid)
-    result = _field_of(body, Fused(grids[0], grids[1], grids[1], grids[1]), box, device)
+    fused = Fused(values, found.near, found.known).on_grid(band, 2.0)
+    result = _field_of(body, fused, box, device)
     report = field.report | {
         "components_dropped": field.report.get("components_dropped", 0) + dropped,
         "finer": round(factor, 2),

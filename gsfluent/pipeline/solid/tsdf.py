@@ -19,8 +19,6 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.spatial.density import GridBox
 
-__all__ = ["DepthView", "Fused", "depth_views", "fuse", "fuse_depths", "ring_of_cameras", "zoomed"]
-
 _TRUNCATION = 2.0  # voxels
 _OPAQUE = 0.5  # opacity from which a ray is stopped
 _FREE_SHARE = 0.04  # of the cameras that look: fewer saw through a gap, not past the object
@@ -33,36 +31,33 @@ _CHUNK = 1 << 18  # points at a time: their values stay in the caches of a CPU
 
 @dataclass(frozen=True)
 class Fused:
-    """What cameras say about points; arrays of the shape of the points or the grid.
+    """What cameras say about points; arrays of the shape of the points or the grid."""
 
-    Attributes:
-        values: Truncated signed distance [voxels], negative inside.
-        looks: Cameras whose picture holds the point.
-        near: Cameras that saw a surface there.
-        known: Cameras that saw it, free or near the surface.
-    """
+    values: np.ndarray  # truncated signed distance [voxels], negative inside
+    near: np.ndarray  # cameras that saw a surface there
+    known: np.ndarray  # cameras that saw it, free or near the surface
 
-    values: np.ndarray
-    looks: np.ndarray
-    near: np.ndarray
-    known: np.ndarray
+    def on_grid(self, chosen: np.ndarray, free: float) -> Fused:
+        """Values of points on the grid that they were chosen from, bool [X, Y, Z].
+
+        The others are seen by nobody and have the distance ``free``.
+        """
+        grids = []
+        for column, rest in ((self.values, free), (self.near, 0.0), (self.known, 0.0)):
+            grid = np.full(chosen.shape, rest, dtype=np.float32)
+            grid[chosen] = column
+            grids.append(grid)
+        return Fused(*grids)
 
 
 @dataclass(frozen=True)
 class DepthView:
-    """Depths as one camera sees them, [H, W] each.
+    """Depths as one camera sees them, [H, W] each."""
 
-    Attributes:
-        camera: The camera.
-        depth: Median depth [world units].
-        slant: Cosine between ray and surface.
-        state: 2 where the ray is stopped, 1 next to such a pixel, 0 where light passes.
-    """
-
-    camera: Camera
-    depth: Tensor
-    slant: Tensor
-    state: Tensor
+    camera: Camera  # the camera
+    depth: Tensor  # median depth [world units]
+    slant: Tensor  # cosine between ray and surface
+    state: Tensor  # 2 where the ray is stopped, 1 next to such a pixel, 0 where light passes
 
 
 @torch.no_grad()
@@ -135,7 +130,7 @@ def _fuse_part(
     mean = (total + spent * limit) / (weight + spent).clamp_min(1e-6)
     unknown = torch.where(looks > 0, -limit, limit)
     values = torch.where(weight + spent > 0, mean, unknown) / voxel
-    return values.float(), looks, near, near + free
+    return values.float(), near, near + free
 
 
 def _depth_at(view: DepthView, pixel: Tensor, place: Tensor) -> Tensor:
@@ -176,17 +171,7 @@ def fuse_depths(
     index = np.argwhere(chosen)
     points = torch.from_numpy(box.centers(index)).to(gaussians.means)
     found = fuse(points, depth_views(gaussians, cameras), box.voxel)
-    result = []
-    for column, rest in (
-        (found.values, _TRUNCATION),
-        (found.looks, 0.0),
-        (found.near, 0.0),
-        (found.known, 0.0),
-    ):
-        grid = np.full(box.shape, rest, dtype=np.float32)
-        grid[chosen] = column
-        result.append(grid)
-    return Fused(*result)
+    return found.on_grid(chosen, _TRUNCATION)
 
 
 def ring_of_cameras(

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from gsfluent.data import Capture
 from gsfluent.errors import InputError
 from gsfluent.pipeline.capture.hull import Ground, centre_hull
 from gsfluent.pipeline.capture.orient import orient
@@ -25,11 +26,6 @@ from gsfluent.pipeline.solid.inside import (
 from gsfluent.spatial.density import GridBox, density_field
 from gsfluent.spatial.voxels import distance_transform
 
-if TYPE_CHECKING:
-    from gsfluent.data import Capture
-
-__all__ = ["Closed", "vote_solid"]
-
 _log = logging.getLogger(__name__)
 
 _MASK_SIZE = 400  # pixels
@@ -38,23 +34,14 @@ _BURIED = 3.5  # voxels below the closed surface
 
 @dataclass(frozen=True)
 class Closed:
-    """Result of :func:`vote_solid`; voxels bool [X, Y, Z].
+    """Result of :func:`vote_solid`; voxels bool [X, Y, Z]."""
 
-    Attributes:
-        box: The grid.
-        shell: Where the density is that of a surface.
-        loose: Shell and everything that it encloses.
-        solid: The same with the outer flank of the shell peeled off.
-        hull: What the masks allow, or None without masks.
-        notes: What was noticed.
-    """
-
-    box: GridBox
-    shell: np.ndarray
-    loose: np.ndarray
-    solid: np.ndarray
-    hull: np.ndarray | None
-    notes: dict[str, Any]
+    box: GridBox  # the grid
+    shell: np.ndarray  # where the density is that of a surface
+    loose: np.ndarray  # shell and everything that it encloses
+    solid: np.ndarray  # the same with the outer flank of the shell peeled off
+    hull: np.ndarray | None  # what the masks allow, or None without masks
+    notes: dict[str, Any]  # what was noticed
 
 
 def vote_solid(known: Evidence, options: SolidOptions) -> Closed:

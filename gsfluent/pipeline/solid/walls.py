@@ -11,8 +11,6 @@ from torch import Tensor
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.spatial.voxels import distance_transform, surface
 
-__all__ = ["thin_shells", "wall_thickness", "walls"]
-
 _STEP = 0.25  # voxels of a march
 _FIRST = 0.75  # voxels below the surface where it starts: within a wall of one and a half
 _CELLS = 2.0  # cells a wall needs

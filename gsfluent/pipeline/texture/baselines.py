@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsfluent.lazy import cv2
+from gsfluent._lazy import cv2
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 
 

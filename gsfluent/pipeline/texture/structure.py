@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import lab_to_rgb, rgb_to_lab
 from gsfluent.errors import InputError
-from gsfluent.lazy import cv2, ndimage
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar, Exemplars, each
 from gsfluent.pipeline.texture.sweep import Sweep, outline
 from gsfluent.pipeline.texture.volume.domain import (

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsfluent._lazy import ndimage
 from gsfluent.errors import check_choice
-from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.volume.domain import axis_frame
 from gsfluent.pipeline.texture.volume.noise import value_noise
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsfluent._lazy import ndimage
 from gsfluent.colors import rgb_to_lab
-from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, nearest_in
 
 _DARK = 0.5  # lightness over that of the rest of the skin, below which an unseen place is shadow

@@ -41,11 +41,7 @@ class Drawn:
 
 
 class PictureMaker:
-    """Draws moments of a timeline.
-
-    Args:
-        timeline: The frames.
-    """
+    """Draws moments of a timeline."""
 
     def __init__(self, timeline: Timeline) -> None:
         self.timeline = timeline

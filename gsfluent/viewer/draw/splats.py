@@ -27,9 +27,6 @@ _ORDER = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # packed xx, yy, zz, xy, xz, yz to a full 
 class BrowserSplats:
     """Sends the splats of one frame at a time.
 
-    Args:
-        timeline: The frames.
-
     Raises:
         InputError: More splats than browsers draw.
     """

@@ -10,13 +10,7 @@ from gsfluent.results.frames import SavedFrame
 
 
 class LiveSource:
-    """Frames of a player since its last reset (see :class:`gsfluent.viewer.model.source.Source`).
-
-    Args:
-        player: The player.
-        title: Short name for the page.
-        shot: The shot of the scene: light and floor.
-    """
+    """Frames of a player since its last reset (a :class:`~gsfluent.viewer.model.source.Source`)."""
 
     running = True
 

@@ -11,9 +11,6 @@ class Playback:
 
     Frames are skipped rather than time stretched, so that the speed asked for is the speed seen,
     however slowly pictures come.
-
-    Args:
-        clock: Seconds; the machine's own by default.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

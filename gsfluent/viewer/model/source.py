@@ -74,9 +74,6 @@ class RunSource:
 
     While no frame is simulated yet, the solid of the fill or texture stage is the only frame.
 
-    Args:
-        out: The folder.
-
     Raises:
         InputError: It is not a run, or nothing in it can be seen yet.
     """

@@ -48,10 +48,6 @@ class Timeline:
 
     Safe to use from several threads.
 
-    Args:
-        source: Where the frames come from.
-        device: Where they are drawn.
-
     Raises:
         RunError: Not one frame can be read.
     """

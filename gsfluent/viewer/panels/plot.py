@@ -18,12 +18,7 @@ _EVERY = 0.1  # seconds between two moves of the line while playing
 
 
 class PlotPanel:
-    """Charts that follow the timeline.
-
-    Args:
-        server: The page.
-        timeline: Whose figures are drawn.
-    """
+    """Charts that follow the timeline."""
 
     def __init__(self, server: viser.ViserServer, timeline: Timeline) -> None:
         self._server, self._timeline = server, timeline

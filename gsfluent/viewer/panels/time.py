@@ -17,12 +17,7 @@ _HELD = 0.4  # seconds for which a slider counts as held after it was moved
 
 
 class TimePanel:
-    """The controls of time.
-
-    Args:
-        server: The page.
-        app: What they control.
-    """
+    """The controls of time."""
 
     def __init__(self, server: viser.ViserServer, app: Page) -> None:
         gui = server.gui

@@ -235,17 +235,6 @@ def test_a_thick_blade_opens_the_cut_by_its_thickness() -> None:
     assert block.cut.ne(0).any() and block.impulse.norm() > 0
 
 
-def test_spread_gives_each_half_its_side_and_joins_what_hangs_together() -> None:
-    blades = knife(1.0)
-    body = torch.zeros(len(Block().x), dtype=torch.int32)
-    block = cut_block(1.0)
-    whole = blades.spread(block.x, body, block.cut, 0)
-    assert torch.equal(whole == 1, block.left) and bool((whole != 0).all())
-    assert blades.fields(body, whole).total == 2
-    half = cut_block(0.5)
-    assert torch.equal(blades.spread(half.x, body, half.cut, 0), half.cut)
-
-
 # --- in a simulation ---
 
 

@@ -15,7 +15,7 @@ from gsfluent.draw import draw
 from gsfluent.io import load_capture
 from gsfluent.io.images import load_view
 from gsfluent.pipeline.fill.interior import INTERIOR_OPACITY, interior_gaussians
-from gsfluent.pipeline.fill.refine import refine_opacity, witness
+from gsfluent.pipeline.fill.refine import asked_views, refine_opacity, witness
 from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.render.cuts import cut_view
 from gsfluent.pipeline.solid.colors import keep_skin, skin_colors, stray_splats
@@ -221,7 +221,7 @@ def test_what_shows_through_a_hole_stays_when_its_colour_is_right(tmp_path: Path
 def test_weights_are_those_of_the_rasterizer(tmp_path: Path) -> None:
     capture = watched(tmp_path, 0.8)
     both = with_inner(shell(0.8, cap=True), HIDDEN, 0.8)
-    said = witness(both, capture, views=8, image_size=96)
+    said = witness(both, asked_views(capture, 8, 96))
     total = torch.zeros(both.count)
     for camera in capture.cameras:
         contribution = draw(both, camera, contribution=True).contribution
@@ -231,7 +231,7 @@ def test_weights_are_those_of_the_rasterizer(tmp_path: Path) -> None:
     assert bool((said.off <= said.seen + 1e-9).all())
     # nothing hides the only splat of a scene: what is seen of it is its size
     alone = with_inner(shell(0.8), [[0.0, 0.0, 0.0]], 0.8).select(torch.arange(1501) == 1500)
-    said = witness(alone, capture, views=8, image_size=96)
+    said = witness(alone, asked_views(capture, 8, 96))
     assert float(said.seen / said.size) == pytest.approx(1.0, abs=0.1)
 
 

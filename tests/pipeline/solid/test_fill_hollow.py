@@ -160,7 +160,7 @@ def _dimpled(depth: int, closed_side: list[float] | None) -> tuple[np.ndarray, s
     near[:, :, 57 - depth :] = True
     box = GridBox((0.0, 0.0, 0.0), 1.0, (40, 40, 60))
     notes = {"closed_side": closed_side}
-    fused = Fused(np.zeros(body.shape, np.float32), near, near, near)
+    fused = Fused(np.zeros(body.shape, np.float32), near, near)
     block = Closed(box, closed, closed, closed, None, notes)
     result, word = _hollowed(body, block, fused, torch.device("cpu"))
     return body & ~result, word

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsfluent._lazy import cv2
 from gsfluent.errors import InputError, RunError
-from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.inpaint.diffusers_load import (
     load_pipeline,
     lower_memory,

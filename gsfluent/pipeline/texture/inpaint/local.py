@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 
+from gsfluent._lazy import cv2
 from gsfluent.errors import InputError, check_choice
-from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.inpaint.inpainter import Job, MaskedInpainter
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.patches import Schedule, project_slice

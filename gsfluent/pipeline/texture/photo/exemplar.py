@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError, check_choice
-from gsfluent.lazy import cv2, ndimage
 from gsfluent.pipeline.texture.photo.light import (
     match_skin,
     remove_glints,

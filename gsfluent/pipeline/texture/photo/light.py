@@ -10,9 +10,9 @@ import itertools
 
 import numpy as np
 
+from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import linear_to_srgb, rgb_to_lab, srgb_to_linear
 from gsfluent.errors import InputError
-from gsfluent.lazy import cv2, ndimage
 
 _WORK = 160  # pixels along the longest side while the shading is fitted
 _LEAST_SHADING = 0.10  # range of log luminance below which shading is left alone

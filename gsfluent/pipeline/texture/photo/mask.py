@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import rgb_to_lab
-from gsfluent.lazy import cv2, ndimage
 
 CUTOUTS = ("auto", "ground", "grabcut", "none")
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsfluent._lazy import ndimage
 from gsfluent.colors import rgb_to_lab
-from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain
 

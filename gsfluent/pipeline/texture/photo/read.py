@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsfluent._lazy import cv2
 from gsfluent.errors import InputError
-from gsfluent.lazy import cv2
 
 _LARGEST = 1024  # pixels; exemplars are reduced to voxel pitch anyway
 _SMALLEST = 16

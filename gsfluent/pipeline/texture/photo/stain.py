@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import lab_to_rgb, rgb_to_lab
-from gsfluent.lazy import cv2, ndimage
 from gsfluent.pipeline.texture.volume.domain import smoothstep
 
 _GREY = 8.0  # Lab chroma below which a pixel counts as grey

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gsfluent._lazy import ndimage
 from gsfluent.colors import rgb_to_lab
-from gsfluent.lazy import ndimage
 from gsfluent.pipeline.texture.photo.metrics import lab_histogram_distance
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, gradient

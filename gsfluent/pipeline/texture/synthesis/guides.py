@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsfluent._lazy import cv2
 from gsfluent.colors import rgb_to_lab100
-from gsfluent.lazy import cv2
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 from gsfluent.pipeline.texture.synthesis.levels import Lattice, ObjectFields, trilinear
 

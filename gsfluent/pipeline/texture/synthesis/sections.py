@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsfluent.lazy import ndimage
+from gsfluent._lazy import ndimage
 from gsfluent.pipeline.texture.synthesis.guides import PlacedPhoto, explained
 from gsfluent.pipeline.texture.synthesis.levels import trilinear
 

@@ -7,9 +7,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from gsfluent._lazy import ndimage
 from gsfluent.data import Solid
 from gsfluent.errors import InputError
-from gsfluent.lazy import ndimage
 
 Options = TypeVar("Options")
 
