@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -74,7 +73,7 @@ def martin_moyce(data: Path) -> list[tuple[float, float]]:
 
 
 @problem(tier="fast")
-def dam_break(data: Path | None = None) -> Iterator[Result]:
+def dam_break(data: Path | None = None) -> list[Result]:
     """Dam break: front of a collapsing column against Martin and Moyce 1952.
 
     Args:
@@ -92,17 +91,17 @@ def dam_break(data: Path | None = None) -> Iterator[Result]:
             f"dam_break: no measured fronts under {root}; set GSFLUENT_DATA to the data folder"
         )
     source = "Martin and Moyce 1952, fig. 3, n^2 = 2, a = 1.125 and 2.25 in"
-    for bed, kind in (("sticky", "no-slip bed"), ("slip", "slip bed")):
+
+    def judged(bed: str, kind: str) -> Result:
         trace = dam_front(12, until=3.4, bed=bed)
-        errors = []
-        for time, place in measured:
-            front = next((z for t, z in trace if t >= time), math.nan)
-            errors.append(front / place - 1.0)
-        worst = max(errors, key=abs)
-        yield compare(
-            f"front, {kind}: largest relative error", worst, tolerance=0.1, source=source,
-            note=f"mean {sum(errors) / len(errors):+.3f}",
+        fronts = [next((z for t, z in trace if t >= time), math.nan) for time, _ in measured]
+        errors = [front / place - 1.0 for front, (_, place) in zip(fronts, measured, strict=True)]
+        return compare(
+            f"front, {kind}: largest relative error", max(errors, key=abs), tolerance=0.1,
+            source=source, note=f"mean {sum(errors) / len(errors):+.3f}",
         )  # fmt: skip
+
+    return [judged("sticky", "no-slip bed"), judged("slip", "slip bed")]
 
 
 @problem(tier="fast")

@@ -17,6 +17,8 @@ import math
 import torch
 from torch import Tensor
 
+from gsfluent import ops
+
 BAND_CELLS = 2.0
 """Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
 the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""
@@ -93,8 +95,6 @@ def softening_energy(params: Tensor, alpha: float, *, steps: int = 400) -> float
         ValueError: alpha is not negative, or the strength is not lost on the path (the row is not
             one of material that softens in tension).
     """
-    from gsfluent import ops
-
     if not alpha < 0.0:
         raise ValueError(f"softening_energy: alpha must be negative, got {alpha}")
     row = params.detach().double().cpu().reshape(1, 8)
