@@ -107,6 +107,16 @@ def test_limits_can_be_chosen_and_a_lag_is_looked_at_when_asked() -> None:
     bad = check(REST, now, Limits(path=0.05))
     assert bad is not None and bad.kind == "path" and bad.value == pytest.approx(0.1)
     assert check(REST, now, Limits(path=0.11)) is None
+
+
+def test_sums_in_another_order_are_no_path() -> None:
+    # two looks at one state, on a GPU: nothing has moved, and the last digits differ
+    far = dataclasses.replace(REST, moment=((2.5e5, 1.0, 1.0),) * len(REST.moment))
+    again = dataclasses.replace(far, moment=((2.5e5 * (1 + 4e-16), 1.0, 1.0),) * len(REST.moment))
+    assert far.moment != again.moment
+    assert check(far, again, Limits(path=0.05)) is None
+    off = dataclasses.replace(far, moment=((2.5e5 + 1e-6, 1.0, 1.0),) * len(REST.moment))
+    assert check(far, off, Limits(path=0.05)) is not None
     hot = dataclasses.replace(REST, kinetic=2.1)
     assert check(REST, hot) is None and check(REST, hot, Limits(energy=1.01)) is not None
 
