@@ -132,7 +132,7 @@ def check(first: State, now: State, limits: Limits | None = None) -> Violation |
         for before, after, p in zip(first.moment, now.moment, first.momentum, strict=True):
             way = [v * time for v in p]
             lag = math.dist(after, [a + b for a, b in zip(before, way, strict=True)])
-            # the order of a GPU's sums moves the last digits of the moment of one and the same state
+            # on a GPU the order of sums moves the last digits of one state's moment
             if lag > limits.path * math.hypot(*way) + 1e-14 * math.hypot(*before):
                 return broken("path", _ratio(lag, math.hypot(*way)), limits.path)
     return None
