@@ -37,6 +37,20 @@ def lazy(
     return get, lambda: sorted({*vars(sys.modules[package]), *home}), list(home)
 
 
+def room(
+    package: str, *modules: str, **names: str
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """The same for a room: what others may take of it, which ``tests/test_layers.py`` checks.
+
+    Args:
+        package: Its ``__name__``.
+        modules: Those that are taken whole.
+        names: By module, the names that others take of it.
+    """
+    homes = {f"{package}.{module}": tuple(given.split()) for module, given in names.items()}
+    return lazy(package, {package: modules, **homes})
+
+
 class _Module:
     """A module that is imported when something is first asked of it."""
 

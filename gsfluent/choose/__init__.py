@@ -1,11 +1,9 @@
 """The cheapest setting that meets an error."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.choose.choose": ("QUICK",),
-        "gsfluent.choose.shot": ("chart_shot", "choose_stage", "readable"),
-    },
+    choose="QUICK",
+    shot="chart_shot choose_stage readable",
 )

@@ -1,10 +1,8 @@
 """A finished simulation in other programs' formats."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.export.write": ("ExportOptions", "export", "write_exports"),
-    },
+    write="ExportOptions export write_exports",
 )

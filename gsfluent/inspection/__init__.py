@@ -1,13 +1,11 @@
 """Looking without computing: captures, parts, comparisons, doctor."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.inspection.capture": ("inspect",),
-        "gsfluent.inspection.compare": ("compare",),
-        "gsfluent.inspection.doctor": ("examine",),
-        "gsfluent.inspection.shot": ("inspect_shot", "inspect_solid"),
-    },
+    capture="inspect",
+    compare="compare",
+    doctor="examine",
+    shot="inspect_shot inspect_solid",
 )

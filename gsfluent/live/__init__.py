@@ -1,12 +1,10 @@
 """A session that one can poke while it runs."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.live.player": ("AT_REST", "FAILED", "LivePlayer", "PAUSED", "RUNNING", "Status"),
-        "gsfluent.live.scene": ("open_stage",),
-        "gsfluent.live.session": ("CRACKS", "LiveSession"),
-    },
+    player="AT_REST FAILED LivePlayer PAUSED RUNNING Status",
+    scene="open_stage",
+    session="CRACKS LiveSession",
 )

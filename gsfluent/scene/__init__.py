@@ -1,11 +1,9 @@
 """What is simulated: bodies, things that move by themselves, events."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.scene.parts": ("Impulse", "number", "quaternion_to", "turned", "unit", "vector"),
-        "gsfluent.scene.scene": ("Blade", "Body", "Collider", "Part", "Scene"),
-    },
+    parts="Impulse number quaternion_to turned unit vector",
+    scene="Blade Body Collider Part Scene",
 )

@@ -1,22 +1,15 @@
 """Neighbours, voxels, densities, distances, winding numbers."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.spatial.density": ("GridBox", "choose_grid", "density_field"),
-        "gsfluent.spatial.mesh_distance": (
-            "load_mesh",
-            "mesh_body",
-            "oriented_samples",
-            "signed_distances",
-        ),
-        "gsfluent.spatial.neighbours": ("nearest", "nearest_rows"),
-        "gsfluent.spatial.pieces": ("hilbert_code", "sample", "signed_depth", "small_pieces"),
-        "gsfluent.spatial.shape": ("cluster", "lone_points", "robust_box", "thin_parts"),
-        "gsfluent.spatial.voxels": ("distance_transform", "grown", "nearest_empty", "surface"),
-        "gsfluent.spatial.winding": ("winding_numbers",),
-        "gsfluent.spatial.zbuffer": ("nearest_points",),
-    },
+    density="GridBox choose_grid density_field",
+    mesh_distance="load_mesh mesh_body oriented_samples signed_distances",
+    neighbours="nearest nearest_rows",
+    pieces="hilbert_code sample signed_depth small_pieces",
+    shape="cluster lone_points robust_box thin_parts",
+    voxels="distance_transform grown nearest_empty surface",
+    winding="winding_numbers",
+    zbuffer="nearest_points",
 )

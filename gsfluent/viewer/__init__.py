@@ -8,12 +8,10 @@ session); :class:`~gsfluent.viewer.model.timeline.Timeline` keeps what they have
 :class:`~gsfluent.viewer.app.App` is the page.
 """
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.viewer.serve": ("view_run",),
-        "gsfluent.viewer.serve_live": ("view_live",),
-    },
+    serve="view_run",
+    serve_live="view_live",
 )

@@ -1,10 +1,8 @@
 """PhysGaussian's model folders and JSON configs."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.config.physgaussian.read": ("convert",),
-    },
+    read="convert",
 )

@@ -1,16 +1,9 @@
 """Label maps of photographs, read from any segmenter's files."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.io.segmentation.files": ("RawLabels", "numbered", "read_raw"),
-        "gsfluent.io.segmentation.masks": (
-            "LabelView",
-            "Segmentation",
-            "load_masks",
-            "load_segmentation",
-        ),
-    },
+    files="RawLabels numbered read_raw",
+    masks="LabelView Segmentation load_masks load_segmentation",
 )

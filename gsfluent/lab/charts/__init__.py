@@ -4,15 +4,13 @@
 writes.
 """
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.lab.charts.chart": ("run",),
-        "gsfluent.lab.charts.draw": ("gathered", "of_records"),
-        "gsfluent.lab.charts.ladder": ("ladder",),
-        "gsfluent.lab.charts.quality": ("chart_quality", "gathered"),
-        "gsfluent.lab.charts.record": ("commit", "machine", "now"),
-    },
+    chart="run",
+    draw="gathered of_records",
+    ladder="ladder",
+    quality="chart_quality gathered",
+    record="commit machine now",
 )

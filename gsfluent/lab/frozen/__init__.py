@@ -1,10 +1,8 @@
 """gsfluent's answers to FractureBench."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.lab.frozen.answer": ("run_case",),
-    },
+    answer="run_case",
 )

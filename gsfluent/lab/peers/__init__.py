@@ -1,10 +1,8 @@
 """What was measured of other programs."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.lab.peers.known": ("find",),
-    },
+    known="find",
 )

@@ -1,13 +1,11 @@
 """Maps of where a run first breaks a law."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.lab.stability.maps": ("read",),
-        "gsfluent.lab.stability.peers": ("marks", "measured"),
-        "gsfluent.lab.stability.report": ("verdict", "write_all"),
-        "gsfluent.lab.stability.run": ("chosen", "run_maps"),
-    },
+    maps="read",
+    peers="marks measured",
+    report="verdict write_all",
+    run="chosen run_maps",
 )

@@ -1,11 +1,9 @@
 """Objects whose inside, light and pictures are known."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.lab.truth.interiors": ("KnownInterior", "known_interior"),
-        "gsfluent.lab.truth.interiors_judge": ("Judge",),
-    },
+    interiors="KnownInterior known_interior",
+    interiors_judge="Judge",
 )

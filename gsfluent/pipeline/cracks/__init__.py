@@ -1,11 +1,9 @@
 """What a crack leaves of splats: sites, faces, cuts, gaps; the Repair stage."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.cracks.gaps": ("Cracks",),
-        "gsfluent.pipeline.cracks.stage": ("CrackHistory", "METHODS", "Repair", "Repaired"),
-    },
+    gaps="Cracks",
+    stage="CrackHistory METHODS Repair Repaired",
 )

@@ -1,10 +1,8 @@
 """Gaussians inside a solid; the Fill stage."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.fill.stage": ("Fill", "fill_resolution", "visible_extent"),
-    },
+    stage="Fill fill_resolution visible_extent",
 )

@@ -1,11 +1,9 @@
 """Labels of photographs -> parts of a solid."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.regions.stage": ("Regions",),
-        "gsfluent.pipeline.regions.vote": ("Skin", "find_skin"),
-    },
+    stage="Regions",
+    vote="Skin find_skin",
 )

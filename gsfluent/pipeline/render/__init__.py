@@ -1,18 +1,16 @@
 """Gaussians -> picture -> video; the Render stage."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.render.backdrop": ("Backdrop", "no_background"),
-        "gsfluent.pipeline.render.camera": ("Action", "orbit"),
-        "gsfluent.pipeline.render.cuts": ("save_cut_views",),
-        "gsfluent.pipeline.render.figures": ("FilmFigures",),
-        "gsfluent.pipeline.render.film": ("Film", "captured_backdrop", "poster_frame"),
-        "gsfluent.pipeline.render.path": ("Cut", "FREEZE_SECONDS", "freeze"),
-        "gsfluent.pipeline.render.stage": ("Render",),
-        "gsfluent.pipeline.render.studio": ("Studio",),
-        "gsfluent.pipeline.render.video": ("to_bytes", "write_animation", "write_video"),
-    },
+    backdrop="Backdrop no_background",
+    camera="Action orbit",
+    cuts="save_cut_views",
+    figures="FilmFigures",
+    film="Film captured_backdrop poster_frame",
+    path="Cut FREEZE_SECONDS freeze",
+    stage="Render",
+    studio="Studio",
+    video="to_bytes write_animation write_video",
 )

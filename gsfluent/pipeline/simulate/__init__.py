@@ -1,15 +1,13 @@
 """Scene -> frames: stage, run, step, health; the engines; what is off the grid."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.simulate.debris": ("reach_of",),
-        "gsfluent.pipeline.simulate.engine": ("CFL", "SolverOptions"),
-        "gsfluent.pipeline.simulate.groups": ("LANDING",),
-        "gsfluent.pipeline.simulate.grow": ("copy_of", "grow", "shrink"),
-        "gsfluent.pipeline.simulate.run": ("Run",),
-        "gsfluent.pipeline.simulate.stage": ("QUALITY", "Simulate", "SimulationFrame", "frame_of"),
-    },
+    debris="reach_of",
+    engine="CFL SolverOptions",
+    groups="LANDING",
+    grow="copy_of grow shrink",
+    run="Run",
+    stage="QUALITY Simulate SimulationFrame frame_of",
 )

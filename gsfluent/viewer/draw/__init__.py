@@ -1,12 +1,10 @@
 """How the viewer makes its pictures."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.viewer.draw.artist": ("Artist",),
-        "gsfluent.viewer.draw.picture": ("PictureMaker", "browser_camera"),
-        "gsfluent.viewer.draw.splats": ("BrowserSplats",),
-    },
+    artist="Artist",
+    picture="PictureMaker browser_camera",
+    splats="BrowserSplats",
 )

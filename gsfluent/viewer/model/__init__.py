@@ -1,18 +1,16 @@
 """What the viewer knows: sources of frames, the time line, what is looked at."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.viewer.model": ("look",),
-        "gsfluent.viewer.model.color": ("Legend", "splat_colors"),
-        "gsfluent.viewer.model.live_source": ("LiveSource", "factor"),
-        "gsfluent.viewer.model.look": ("Cut", "Look", "angles", "direction"),
-        "gsfluent.viewer.model.pace": ("Pace",),
-        "gsfluent.viewer.model.playback": ("Playback",),
-        "gsfluent.viewer.model.plots": ("NOW", "Plot", "plots_of"),
-        "gsfluent.viewer.model.source": ("RunSource", "Source"),
-        "gsfluent.viewer.model.timeline": ("Timeline",),
-    },
+    "look",
+    color="Legend splat_colors",
+    live_source="LiveSource factor",
+    look="Cut Look angles direction",
+    pace="Pace",
+    playback="Playback",
+    plots="NOW Plot plots_of",
+    source="RunSource Source",
+    timeline="Timeline",
 )

@@ -1,14 +1,12 @@
 """The controls of the page."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.viewer.panels.look": ("LookPanel",),
-        "gsfluent.viewer.panels.page": ("Page",),
-        "gsfluent.viewer.panels.plot": ("PlotPanel",),
-        "gsfluent.viewer.panels.poke": ("PokePanel",),
-        "gsfluent.viewer.panels.time": ("TimePanel",),
-    },
+    look="LookPanel",
+    page="Page",
+    plot="PlotPanel",
+    poke="PokePanel",
+    time="TimePanel",
 )

@@ -1,11 +1,9 @@
 """Fracture problems with known answers."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.lab.problems.fracture": ("brittle",),
-        "gsfluent.lab.problems.fracture.brittle": ("plain",),
-    },
+    "brittle",
+    brittle="plain",
 )

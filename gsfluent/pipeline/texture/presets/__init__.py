@@ -1,15 +1,8 @@
 """Insides that are drawn by rule."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.texture.presets.procedural": (
-            "PRESETS",
-            "check_preset",
-            "preset_names",
-            "procedural_texture",
-        ),
-    },
+    procedural="PRESETS check_preset preset_names procedural_texture",
 )

@@ -1,11 +1,9 @@
 """A volume grown from patches of exemplars."""
 
-from gsfluent._lazy import lazy
+from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = lazy(
+__getattr__, __dir__, __all__ = room(
     __name__,
-    {
-        "gsfluent.pipeline.texture.synthesis.method": ("SynthesisOptions", "exemplar_texture"),
-        "gsfluent.pipeline.texture.synthesis.patches": ("Schedule", "project_slice"),
-    },
+    method="SynthesisOptions exemplar_texture",
+    patches="Schedule project_slice",
 )
