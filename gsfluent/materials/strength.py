@@ -6,8 +6,6 @@ is at ``p = -s/3, q = s``, uniaxial compression at ``p = s/3, q = s``.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -23,43 +21,27 @@ def ellipse(
 ) -> tuple[Tensor, Tensor]:
     """Cohesion and strength p0 of the yield ellipse through two uniaxial stresses.
 
+    The difference of the two equations gives p0, what is left is quadratic in beta.
+
     Args:
         friction: M, [N].
-        tensile: Uniaxial tensile strength [Pa], [N].
-        compressive: Uniaxial compressive strength [Pa], [N]; at least the tensile one.
-        largest: Largest p0 [Pa], [N]; where the stresses ask for more, p0 is this, and the ellipse
+        tensile: Uniaxial tensile strength t [Pa], [N].
+        compressive: Uniaxial compressive strength c [Pa], [N], larger than the tensile one.
+        largest: Largest p0 [Pa], [N]; where the strengths ask for more, p0 is this, and the ellipse
             goes through the tensile one alone.
 
     Returns:
         ``(beta, p0)``, [N] each.
     """
-    compressive = compressive.maximum(1.001 * tensile)
-    low, high = torch.full_like(tensile, math.log(1e-6)), torch.full_like(tensile, math.log(1e3))
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        over = _compressive(friction, tensile, middle.exp()) > compressive
-        low, high = torch.where(over, middle, low), torch.where(over, high, middle)
-    beta = (0.5 * (low + high)).exp()
-    p0 = _tip(friction, tensile, beta)
-    m2, s = friction**2, tensile
-    capped = (s**2 / m2 + s / 3.0 * (largest + s / 3.0)) / (
-        largest * (largest + s / 3.0) - 2.0 * s**2 / m2
-    ).clamp(min=1e-12 * largest**2)
+    m2, t = friction**2, tensile
+    ratio = t / compressive.maximum(1.001 * t)
+    k = ratio * m2 / (1.0 - ratio) ** 2
+    # (18 - k) beta^2 + (9 + M^2 + 2 k) beta - k = 0; its small root without cancellation
+    linear = 9.0 + m2 + 2.0 * k
+    beta = 2.0 * k / (linear + (linear**2 + 4.0 * (18.0 - k) * k).sqrt())
+    p0 = 3.0 * (t / ratio - t) * (1.0 + 2.0 * beta + m2 / 9.0) / (m2 * (1.0 - beta))
+    alone = (t**2 / m2 + t / 3.0 * (largest + t / 3.0)) / (
+        largest * (largest + t / 3.0) - 2.0 * t**2 / m2
+    ).clamp(min=1e-12 * torch.ones_like(t))
     crowded = p0 > largest
-    return torch.where(crowded, capped, beta), torch.where(crowded, largest, p0)
-
-
-def _tip(friction: Tensor, tensile: Tensor, beta: Tensor) -> Tensor:
-    """p0 of the ellipse with this cohesion through uniaxial tension."""
-    m2, s = friction**2, tensile
-    half = (beta - 1.0) * s / 3.0  # beta p0^2 + half p0 - rest = 0
-    rest = s**2 / 9.0 + s**2 * (1.0 + 2.0 * beta) / m2
-    return (-half + (half**2 + 4.0 * beta * rest).sqrt()) / (2.0 * beta)
-
-
-def _compressive(friction: Tensor, tensile: Tensor, beta: Tensor) -> Tensor:
-    """Uniaxial compressive strength of that ellipse."""
-    m2, p0 = friction**2, _tip(friction, tensile, beta)
-    a = (1.0 + 2.0 * beta) / m2 + 1.0 / 9.0  # a s^2 - b s - beta p0^2 = 0
-    b = (1.0 - beta) * p0 / 3.0
-    return (b + (b**2 + 4.0 * a * beta * p0**2).sqrt()) / (2.0 * a)
+    return torch.where(crowded, alone, beta), torch.where(crowded, largest, p0)

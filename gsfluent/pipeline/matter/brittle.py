@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from gsfluent.materials import LARGEST, STEEPEST, Field, Material
-from gsfluent.pipeline.matter.crack_band import softening_energies
+from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, softening_energies
 
-BAND = 2.8
+BAND = 3.0
 """Cells in which a crack dissipates: the two it localises to and what its neighbours lose before
 they unload (measured, docs/measured/crack_energy.md)."""
 STEP = 0.04
@@ -98,4 +98,6 @@ def softened(
         before, found = alpha0, now
         closer = alpha0 + (target - now) / slope
         alpha0 = torch.where(slope < 0.0, closer.minimum(least), alpha0)  # NaN: nothing moved
+    # The return map keeps no smaller alpha: on very fine grids soft matter tears with less energy.
+    alpha0 = alpha0.clamp(min=ALPHA_MIN)
     return torch.asinh(strength / kappa) / alpha0.abs(), alpha0, kept

@@ -23,7 +23,7 @@ from gsfluent.materials import LAWS
 BAND_CELLS = 2.0
 """Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
 the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""
-_ALPHA_MIN = -10.0
+ALPHA_MIN = -10.0
 """Smallest alpha the return map keeps."""
 
 
@@ -50,9 +50,9 @@ def crack_band(
         raise ValueError(f"crack_band: dx and reference must be positive, got {dx} and {reference}")
     scale = reference / dx
     stretched = torch.where(alpha < 0, alpha * scale, alpha)
-    if bool((stretched < _ALPHA_MIN).any()):
+    if bool((stretched < ALPHA_MIN).any()):
         raise ValueError(
-            f"crack_band: alpha becomes {float(stretched.min()):.3g}, below {_ALPHA_MIN:g}: "
+            f"crack_band: alpha becomes {float(stretched.min()):.3g}, below {ALPHA_MIN:g}: "
             f"dx = {dx:g} m is too far below the reference of {reference:g} m"
         )
     rows = params.clone()
