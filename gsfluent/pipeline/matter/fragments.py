@@ -22,8 +22,8 @@ class Fragments:
     """The pieces of one moment.
 
     Args:
-        labels: Piece of each point, of broken ones, too, int32 [N]: the row of the first point of
-            its unbroken part, which a piece keeps for as long as it keeps that point; -1 for loose
+        labels: Piece of each point, of broken ones, too, int32 [N]: the row of its first
+            point that never broke, so that a piece keeps its label as long as it keeps that point; -1 for loose
             matter (chips, dust) and for what flows.
         ids: Labels of the pieces, largest mass first, int64 [F].
         mass_fractions: Share of the total mass of each piece, float64 [F].
@@ -110,7 +110,7 @@ def weigh(labels: Tensor, mass: Tensor) -> Fragments:
     there = torch.zeros_like(inside)
     there[labels[inside].long()] = True
     ids = there.nonzero()[:, 0].cpu()
-    fractions = weight.cpu()[ids].double() / _SHARES
+    fractions = weight.cpu()[ids].double() / int(share.sum())
     order = torch.argsort(fractions, descending=True, stable=True)
     fractions = fractions[order]
     return Fragments(labels.to(torch.int32), ids[order], fractions, float(1.0 - fractions.sum()))

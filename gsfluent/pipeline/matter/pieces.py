@@ -1,7 +1,7 @@
 """Pieces of broken bodies: each owns its half of the crack band.
 
-A crack is a band of broken points some two cells wide. What hangs together without a broken point
-is the *seed* of a piece, and every other point belongs to the seed that is nearest along links that
+A crack is a band of broken points some two cells wide. What hangs together without a broken point,
+with enough points that never broke, is the *seed* of a piece, and every other point belongs to the seed that is nearest along links that
 still hold, where a stretched link is a long way: so the border between two pieces runs where the
 band has opened most, and no point is left over in between. A link between two pieces is cut for
 good, also after the band has been welded (:mod:`gsfluent.pipeline.matter.weld`). What no seed
@@ -73,8 +73,8 @@ class Pieces(NamedTuple):
 
     Attributes:
         fragments: The pieces; of broken points, too. -1 for loose matter and for what flows.
-        unit: What each point moves with, int64 [N]: the label of its piece, the lowest row of its
-            chip, the first row of its body where that is whole; -1 for dust, and for what flows
+        unit: What each point moves with, int64 [N]: the label of its piece (the lowest row of its
+            seed that never broke), the lowest row of its chip, the first row of its body where that is whole; -1 for dust, and for what flows
             and lies on no piece.
         cut_links: Links that are cut for good, bool [L].
         dust: Points that belong to nothing, bool [N].
@@ -94,6 +94,7 @@ def find_pieces(
     broken: Tensor,
     cut_links: Tensor,
     *,
+    ever: Tensor | None = None,
     sides: Tensor | None = None,
     gone: Tensor | None = None,
     least: int = LEAST,
@@ -105,9 +106,11 @@ def find_pieces(
         position: Positions now [m], [N, 3].
         broken: Broken points, bool [N].
         cut_links: Links that were cut before, bool [L].
+        ever: Points that ever broke, bool [N]; those that are broken when absent. What was welded
+            is no seed alone: a weld near a crack must not part what lies behind it.
         sides: Sides of blades, int32 [N]; a link between opposite sides is cut.
         gone: Dust that left the grid before, bool [N]; nothing hangs on it.
-        least: Points of a seed; a body of less than twice as many needs half of its own.
+        least: Points of a seed that never broke; a body of less than twice as many needs half of its own.
 
     Returns:
         The pieces. A body in which nothing is broken or cut is whole, whatever its size.
@@ -149,8 +152,10 @@ def find_pieces(
     joined = ~cut & here[a] & whole[a] & whole[b]
     root = components(a[joined], b[joined], count)
     enough = torch.minimum(torch.full_like(size, least), (size + 1) // 2)[body]
-    seed = whole & (torch.bincount(root, minlength=count)[root] >= enough)
-    unit = torch.where(seed, root, torch.where(here, DEBRIS, unit))
+    fresh = whole if ever is None else whole & ~ever
+    seed = whole & (torch.bincount(root[fresh], minlength=count)[root] >= enough)
+    name = rows.new_full((count,), count).scatter_reduce(0, root[fresh], rows[fresh], "amin")
+    unit = torch.where(seed, name[root], torch.where(here, DEBRIS, unit))
     unit = _nearest_seed(web, unit, seed, here & ~seed, holds, ratio, length)
 
     # What no seed reaches: lumps of broken matter are pieces all the same, smaller things are not.

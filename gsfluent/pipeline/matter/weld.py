@@ -2,7 +2,7 @@
 
 Once the pieces on both sides of a crack have velocity fields of their own, these carry the crack,
 and the loose band between them is no longer needed. Points of it that have come to rest inside get
-``alpha = peak = w alpha0``; strain, velocity and place stay. Yield surfaces of NACC are nested in
+``alpha = peak = w alpha0`` (a lower alpha stays); strain, velocity and place stay. Yield surfaces of NACC are nested in
 alpha (``p0`` and the tip grow with ``-alpha``), so the old state lies inside the new surface, and
 stored energy is a function of the strain alone: stress, energy and momentum do not jump. Matter
 that breaks still, or that was crushed, is never welded.
@@ -111,9 +111,10 @@ def weld(matter: Matter, web: Web, state: State, pieces: Pieces) -> State:
         return state
     alpha = state.particles.alpha
     strong = (STRENGTH * matter.particles.alpha).to(alpha)
-    alpha = torch.where(at, strong, alpha)
+    # What was compacted again may hold more than the weld gives: nothing becomes weaker.
+    alpha = torch.where(at, torch.minimum(alpha, strong), alpha)
     return state._replace(
         particles=state.particles.replace(alpha=alpha),
         peak=torch.where(at, strong.to(state.peak), state.peak),
-        alpha_seen=torch.where(at, strong, state.alpha_seen),
+        alpha_seen=torch.where(at, alpha, state.alpha_seen),
     )

@@ -188,6 +188,7 @@ class Run:
                 state.position,
                 self.matter.brittle & (state.peak >= 0),
                 state.cut_links,
+                ever=state.ever,
                 sides=state.cut if self.scene.blades else None,
                 gone=state.loose & (state.unit < 0),
             )
