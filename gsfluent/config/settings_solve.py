@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from gsfluent.config.read import (
     whole,
 )
 from gsfluent.errors import InputError
+
+_log = logging.getLogger(__name__)
 
 
 def share(low: float, high: float) -> Reader:
@@ -91,8 +94,7 @@ class SolveSettings:
     )
     loose_debris: bool = key(
         flag,
-        "Broken matter with next to nothing around it falls freely and stays where it meets "
-        "the floor: much faster where an object goes to dust.",
+        "Does nothing any more: loose matter leaves the grid in every shot.",
         "true",
         default=False,
         old="loose_crumbs",
@@ -110,6 +112,8 @@ def read_solve(value: Any, place: Place) -> SolveSettings:
     """Read ``solve:``; what chooses the cells may be said only once."""
     solve: SolveSettings = section(SolveSettings, value, place)
     given = mapping(value, place)
+    if solve.loose_debris:
+        _log.warning("%s.loose_debris does nothing now: loose matter leaves the grid", place.path)
     # of a resolved shot every default is written out: those say nothing
     defaults = {"quality": "shot", "cfl": 0.5, "cells": None, "seconds_per_frame": None}
     for chooser, what, others in (

@@ -88,7 +88,6 @@ class Recording:
         values["solve"] = dict(values["solve"]) | {
             "cells": session.cells,
             "standing": True,
-            "loose_debris": True,
         }
         fps = session.fps * self._slow
         values["output"] = dict(values["output"]) | {

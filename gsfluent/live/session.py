@@ -106,7 +106,7 @@ class LiveSession:
             dx=self.dx,
             seed=seed,
             device=device,
-            **({"standing": True, "loose_debris": True} | options),
+            **({"standing": True} | options),
         )
         start = copy_of(scene)
         self._first = self._simulate.run_of(start, fps)

@@ -91,7 +91,7 @@ def moving_settings(shot: Shot) -> list[Any]:
         [typed_dict(event, EVENTS) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.standing, shot.solve.loose_debris],
+        [shot.solve.standing],
         shot.output.fps,
         shot.output.seconds,
     ]
@@ -103,7 +103,6 @@ def solver_options(shot: Shot) -> SolverOptions:
     return SolverOptions(
         cfl=solve.cfl,
         standing=solve.standing,
-        loose_debris=solve.loose_debris,
         deterministic=solve.deterministic,
     )
 

@@ -59,7 +59,9 @@ def test_a_key_is_read_under_its_old_name_with_a_warning(
     assert shot == read(folder, solve={"loose_debris": True, "quality": "preview"})
     assert shot.solve.loose_debris and "loose_crumbs" not in shot.resolved()["solve"]
     assert caplog.messages == [
-        "solve.loose_crumbs is called loose_debris now; the old name still works"
+        "solve.loose_crumbs is called loose_debris now; the old name still works",
+        "solve.loose_debris does nothing now: loose matter leaves the grid",
+        "solve.loose_debris does nothing now: loose matter leaves the grid",
     ]
     with pytest.raises(InputError, match="both are given"):
         read(folder, solve={"loose_crumbs": True, "loose_debris": True})

@@ -11,7 +11,6 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.errors import InputError
 from gsfluent.live.session import MOST_LOOSE, LiveSession
-from gsfluent.pipeline.simulate.debris import find_loose
 from gsfluent.pipeline.simulate.grow import copy_of, grow, shrink
 from gsfluent.pipeline.simulate.health import figures_of
 from gsfluent.pipeline.simulate.stage import Simulate
@@ -46,7 +45,7 @@ def test_a_poke_is_the_event_of_a_shot(event) -> None:
     frames = live.advance((count - 3 - 1) / 100.0)
     scene = standing()
     scene.add_event(event | {"at": at})
-    simulate = Simulate(dx=DX, standing=True, loose_debris=True)
+    simulate = Simulate(dx=DX, standing=True)
     simulation = simulate(scene, fps=100.0, seconds=count / 100.0)
     *_, last = simulation
     assert last.index == live.index and last.time == live.time
@@ -70,7 +69,7 @@ def test_with_many_frames_a_second_it_still_is_that_event() -> None:
     scene = standing()
     scene.add_event(BULLET | {"at": live.pokes[0]["at"]})
     scene.add_event(THROW | {"at": live.pokes[1]["at"]})
-    simulate = Simulate(dx=DX, standing=True, loose_debris=True)
+    simulate = Simulate(dx=DX, standing=True)
     *_, last = simulate(scene, fps=600.0, seconds=26 / 600)
     assert last.index == live.index == 25
     assert torch.equal(last.particles.position, frames[-1].positions)
@@ -249,7 +248,7 @@ def test_a_late_bullet_hits_as_an_early_one_does(rigid) -> None:
     for at in (0.0, 0.5):
         scene = standing()
         scene.add_event(BULLET | {"at": at, "rigid": rigid, "radius": 0.012})
-        simulate = Simulate(dx=DX, standing=True, loose_debris=True)
+        simulate = Simulate(dx=DX, standing=True)
         frames = list(simulate(scene, fps=50.0, seconds=at + 0.06))
         ends.append(frames[-1])
         seen = saved(frames[0], scene).gaussians
@@ -265,19 +264,6 @@ def test_a_late_bullet_hits_as_an_early_one_does(rigid) -> None:
 
 
 def test_loose_debris_leaves_the_grid_with_its_momentum() -> None:
-    generator = torch.Generator().manual_seed(0)
-    cloud = torch.rand(40, 3, generator=generator, dtype=torch.float64) * 0.1
-    clump = torch.rand(400, 3, generator=generator, dtype=torch.float64) * 0.04 + 0.5
-    single = torch.tensor([[0.6, 0.0, 0.0]], dtype=torch.float64)
-    position = torch.cat([cloud, clump, single, single + 0.02])
-    peak = torch.ones(len(position))
-    peak[-1] = -0.1  # an unbroken point near the single one keeps it
-    everyone = torch.ones(len(position), dtype=torch.bool)
-    lonely = find_loose(position, peak, everyone, 0.02)
-    assert lonely[:40].all() and not lonely[40:].any()
-    everyone[:20] = False
-    assert find_loose(position, peak, everyone, 0.02)[:40].tolist() == [False] * 20 + [True] * 20
-
     scene = Scene(floor=None, gravity=(0, 0, 0))
     scene.add(ellipsoid((0.05,) * 3, splats=200), name="ball")
     live = LiveSession(scene, dx=DX, fps=100.0)

@@ -29,7 +29,7 @@ def test_a_poke_is_the_event_of_a_shot_on_the_gpu() -> None:
     frames = live.advance(0.04)
     scene = standing()
     scene.add_event(BULLET | {"at": 0.03})
-    simulate = Simulate(dx=DX, standing=True, loose_debris=True, device="cuda")
+    simulate = Simulate(dx=DX, standing=True, device="cuda")
     *_, last = simulate(scene, fps=100.0, seconds=0.08)
     assert last.index == live.index
     assert torch.equal(last.particles.position, frames[-1].positions)

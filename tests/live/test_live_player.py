@@ -198,7 +198,7 @@ def test_a_take_is_a_run_and_its_shot_gives_the_same(solid, tmp_path) -> None:
     scene = build_scene(shot, solids, stage.scene.bodies[0].frame)
     assert scene.bodies[0].offset == pytest.approx(stage.scene.bodies[0].offset)
     solve = shot.solve
-    simulate = Simulate(dx=DX, standing=solve.standing, loose_debris=solve.loose_debris)
+    simulate = Simulate(dx=DX, standing=solve.standing)
     *_, end = simulate(scene, fps=shot.output.fps, seconds=shot.output.seconds)
     assert end.index == 6
     count = last.positions.shape[0]

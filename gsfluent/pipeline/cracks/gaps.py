@@ -98,7 +98,9 @@ class Gaps:
             points: Where the material points are now; points that joined the run later, to which no
                 splat is bound, come last.
         """
-        hanging = self.carry.links.look(points.position, points.fragments, self._before)
+        hanging = self.carry.links.look(
+            points.position, points.fragments, self._before, broken=points.broken
+        )
         self._before = hanging
         points = points._replace(hanging=hanging)
         debris = points.fragments[: hanging.opened.shape[0]] < 0

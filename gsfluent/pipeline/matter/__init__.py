@@ -6,12 +6,14 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     carry="BLEND Carry Motion Points STRETCH nearest_points",
     debris="REACH clinging",
-    fields="LIMIT MOST breakable cut_bodies number_fields units",
-    fragments="Fragments STRETCH_LIMIT components find_fragments rest_links",
+    fields="LIMIT MOST breakable cut_bodies number_fields",
+    fragments="Fragments components rest_links",
     links="BACK FULL Hanging NEIGHBOURS OPEN",
+    pieces="Pieces Web find_pieces",
     points=(
         "ALPHA_JITTER MAX_PARTICLES Matter POINTS_PER_CELL body_frame build_matter "
         "grid_spacing sample_points select"
     ),
     state="State at_rows kinetic_energy load_state save_state",
+    weld="seen weld",
 )

@@ -37,8 +37,8 @@ class Points(NamedTuple):
 
     Attributes:
         position: Positions [m], [N, 3].
-        map: Total deformation, stretches clamped; outside of pieces the rotation alone, since
-            debris has no shape to keep, [N, 3, 3].
+        map: Total deformation, stretches clamped; of what is broken or loose the rotation alone,
+            since it has no shape to keep, [N, 3, 3].
         rotation: Rotation of the deformation, [N, 3, 3].
         fragments: Piece of each point, int32 [N], -1 for none.
         broken: Broken points, bool [N].
@@ -56,7 +56,8 @@ class Points(NamedTuple):
     def of(position: Tensor, deformation: Tensor, fragments: Tensor, broken: Tensor) -> Points:
         """Split total deformation gradients [N, 3, 3] into rotation and clamped stretch."""
         rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
-        shown = torch.where((fragments < 0)[:, None, None], rotation, clamped)
+        shapeless = ((fragments < 0) | broken)[:, None, None]
+        shown = torch.where(shapeless, rotation, clamped)
         return Points(position, shown, rotation, fragments, broken)
 
 
@@ -138,7 +139,9 @@ class Carry:
             rest: Splats at rest, if not those that were bound but cut ones.
         """
         if points.hanging is None:
-            points = points._replace(hanging=self.links.look(points.position, points.fragments))
+            points = points._replace(
+                hanging=self.links.look(points.position, points.fragments, broken=points.broken)
+            )
         means, blend = self.place((rest or self.gaussians).means, self.owner, points)
         turn, blend = ops.polar_clamped(blend, *STRETCH)
         carried = points.fragments[self.owner] >= 0

@@ -12,11 +12,8 @@ import torch
 from torch import Tensor
 
 from gsfluent.ops.solver_buffers import SITE_FIELDS
-from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments
 from gsfluent.pipeline.matter.points import Matter
 
-_HOPS = 8
-"""How many links powder may lie from the piece it moves with."""
 MOST = 1024
 """Fields of a scene at most."""
 
@@ -32,46 +29,6 @@ def cut_bodies(matter: Matter, cut: Tensor) -> Tensor:
     return torch.stack([mark[a:b].any() for a, b in matter.ranges])
 
 
-def units(matter: Matter, links: Tensor, pieces: Fragments, may_break: Tensor) -> Tensor:
-    """What each point hangs together with: int64 [N], the first row of a body or piece.
-
-    Args:
-        matter: The points.
-        links: Links at rest whose ends are neighbours still, int64 [L, 2].
-        pieces: The pieces now.
-        may_break: From :func:`breakable`.
-    """
-    body = matter.particles.body.long()
-    starts = torch.tensor([a for a, _ in matter.ranges], device=body.device)
-    whole = starts[body]
-    ids = pieces.ids.to(body.device)
-    per_body = torch.bincount(body[ids], minlength=starts.shape[0])
-    split = (may_break & (per_body > 1))[body]
-    if not bool(split.any()):
-        return whole
-    label = torch.where(split, pieces.labels.long(), whole)
-    return torch.where(label == DEBRIS, _with_neighbours(label, links.to(body.device)), label)
-
-
-def _with_neighbours(label: Tensor, links: Tensor) -> Tensor:
-    """Labels spread along links at rest to points that have none; powder far from any keeps -1.
-
-    The largest of the labels at hand is taken, so that the result does not depend on any order.
-    """
-    # Only links with an open end spread anything, and no end opens again.
-    links = links[(label[links] < 0).any(dim=1)]
-    a, b = links.unbind(dim=1)
-    for _ in range(_HOPS):
-        open_a, open_b = label[a] < 0, label[b] < 0
-        if not bool((open_a ^ open_b).any()):
-            break
-        spread = label.clone()
-        spread.scatter_reduce_(0, a[open_a], label[b[open_a]], "amax")
-        spread.scatter_reduce_(0, b[open_b], label[a[open_b]], "amax")
-        label = spread
-    return label
-
-
 def number_fields(
     unit: Tensor,
     position: Tensor,
@@ -84,7 +41,8 @@ def number_fields(
     """Number the units as velocity fields, heaviest first, so that no block has too many.
 
     Args:
-        unit: From :func:`units`, [N]; -1 is a unit like any other.
+        unit: From :func:`gsfluent.pipeline.matter.pieces.find_pieces`, [N]; -1 is a unit like any
+            other.
         position: Positions [m], [N, 3].
         mass: Masses [kg], [N].
         on_grid: Points that matter for the room in blocks, bool [N].

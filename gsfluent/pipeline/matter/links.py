@@ -1,7 +1,7 @@
 """What hangs together: each material point and its nearest neighbours at rest, and who has parted.
 
-Two neighbours of one piece hang together; those of different pieces do not. Where matter is in no
-piece (broken points, debris), neighbours have parted once they are half as far again from each
+Two neighbours of one piece hang together; those of different pieces do not. Where matter is broken
+or loose, neighbours have parted once they are half as far again from each
 other as at rest, and hang together again only below a smaller ratio, so that nothing toggles from
 frame to frame. An *opening*, where faces show, is a pair that has parted and moved apart.
 """
@@ -20,7 +20,7 @@ from gsfluent.spatial.neighbours import nearest_rows
 NEIGHBOURS = 12
 """Points that are watched around each point, itself among them."""
 PARTED = 1.5
-"""Neighbours in no piece have parted at this many times their distance at rest."""
+"""Neighbours that are broken or loose have parted at this many times their distance at rest."""
 OPEN = 1.1
 """An opening begins at this many times the distance at rest."""
 BACK = 0.93
@@ -72,13 +72,21 @@ class Links:
         self._apart = (rest[self.near] - rest[:, None]).norm(dim=2)
         self._own = self.near == torch.arange(count, device=device)[:, None]
 
-    def look(self, position: Tensor, fragments: Tensor, before: Hanging | None = None) -> Hanging:
+    def look(
+        self,
+        position: Tensor,
+        fragments: Tensor,
+        before: Hanging | None = None,
+        *,
+        broken: Tensor | None = None,
+    ) -> Hanging:
         """See what hangs together now.
 
         Args:
             position: Points now [m], [N', 3] with N' >= N; those that joined later come last.
             fragments: Piece of each, int32 [N'], -1 for none.
             before: The last look, if there was one.
+            broken: Broken points, bool [N'].
         """
         count = self.near.shape[0]
         apart = (position[self.near] - position[:count, None]).norm(dim=2)
@@ -87,6 +95,9 @@ class Links:
         other = piece[self.near, 0]
         limit = torch.where(piece == other, STRETCH_LIMIT, PARTED)
         limit = torch.where((piece < 0) | (other < 0), PARTED, limit)
+        if broken is not None:
+            crack = broken[:count]
+            limit = torch.where(crack[:, None] | crack[self.near], PARTED, limit)
         opening = torch.full_like(ratio, OPEN)
         if before is not None:
             limit = torch.where(before.parted, BACK * limit, limit)

@@ -16,10 +16,13 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
-VERSION = 7
+VERSION = 8
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
-_POINTS = ("position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit")
-_WHOLE = ("impulse", "colliders", "work", "dissipated")
+_POINTS = (
+    "position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit", "ever",
+    "lowest", "alpha_seen", "time_seen",
+)  # fmt: skip
+_WHOLE = ("impulse", "colliders", "work", "dissipated", "cut_links")
 _SAVED = {"loose": "stray"}
 """Names in the file that are not those of the fields: files outlive names."""
 
@@ -42,16 +45,16 @@ class State(NamedTuple):
     Attributes:
         particles: All points as of ``time``; positions rounded to their dtype.
         position: Positions [m], float64 [N, 3]: what the next step starts from.
-        peak: Largest alpha each brittle point ever had, [N]; breaking cannot be undone.
-            :data:`gsfluent.ops.solver_state.UNBROKEN` for points of other laws.
+        peak: Largest alpha each brittle point had since it was welded last, [N]; nothing else
+            undoes a break. :data:`gsfluent.ops.solver_state.UNBROKEN` for points of other laws.
         time: Simulated time [s].
         step: Grid steps so far.
         landed: Which bodies have ended their first flight.
         impulse: Sum of collider impulses on the bodies [N s], float64 [3].
         colliders: Rows of the rigid colliders as of ``time``, float64 [M, 32].
         work: Most energy that colliders can have given to the bodies [J], float64 [].
-        loose: Debris that left the grid for good, bool [N] (see
-            :mod:`gsfluent.pipeline.simulate.debris`).
+        loose: Debris that left the grid, bool [N]: chips, whose ``unit`` is their lowest row, and
+            dust (see :mod:`gsfluent.pipeline.simulate.debris`).
         field: Velocity field of each point, int32 [N]: its body, or its piece of a broken one.
         cut: Sides of blades each point lies on, int32 [N] (:func:`gsfluent.ops.blade_sides`).
         group: First row of the group that moves without the grid and holds the point, int32 [N];
@@ -61,7 +64,14 @@ class State(NamedTuple):
         dissipated: Kinetic energy of vibration and of creep that went when groups left the grid
             [J], float64 [].
         unit: What each point hung together with when that was last looked at, int64 [N]: the first
-            row of its body or piece, -1 for powder.
+            row of its body, the label of its piece, the lowest row of its chip; -1 for powder.
+        ever: Points that ever broke, welded or not, bool [N].
+        lowest: Least alpha each point ever had, [N].
+        alpha_seen: Alpha when it was last noted to have moved, [N]; see
+            :mod:`gsfluent.pipeline.matter.weld`.
+        time_seen: When that was [s], float64 [N].
+        cut_links: Links at rest that are cut for good, bool [L], in the order of
+            :func:`gsfluent.pipeline.matter.fragments.rest_links`.
         pushed: How many of the scene's impulses have been given.
     """
 
@@ -82,11 +92,16 @@ class State(NamedTuple):
     calm: Tensor
     dissipated: Tensor
     unit: Tensor
+    ever: Tensor
+    lowest: Tensor
+    alpha_seen: Tensor
+    time_seen: Tensor
+    cut_links: Tensor
     pushed: int = 0
 
     @staticmethod
-    def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...]) -> State:
-        """The state at time 0."""
+    def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...], links: int = 0) -> State:
+        """The state at time 0, with so many links at rest."""
         p = matter.particles
         none = torch.zeros(p.count, dtype=torch.bool, device=p.device)
         zero = torch.zeros((), dtype=torch.float64, device=p.device)
@@ -108,6 +123,11 @@ class State(NamedTuple):
             calm=torch.zeros(p.count, dtype=torch.int16, device=p.device),
             dissipated=zero,
             unit=torch.tensor([a for a, _ in matter.ranges], device=p.device)[p.body.long()],
+            ever=matter.brittle & (p.alpha >= 0),
+            lowest=p.alpha,
+            alpha_seen=p.alpha,
+            time_seen=torch.zeros(p.count, dtype=torch.float64, device=p.device),
+            cut_links=torch.zeros(links, dtype=torch.bool, device=p.device),
         )
 
     def adopting(self, before: State) -> State:

@@ -101,6 +101,11 @@ class Composed:
             )
         return done
 
+    @property
+    def blocks(self) -> int:
+        """Blocks of the grid in use."""
+        return 0 if self._blocks is None else self._blocks.block_count
+
     def read(self) -> Points:
         """See :class:`gsfluent.pipeline.simulate.engine.Engine`."""
         p = self.points

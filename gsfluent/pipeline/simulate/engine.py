@@ -98,8 +98,6 @@ class SolverOptions:
             device: the composed operators on a GPU, whose sums have no order.
         standing: Let what stands still on the floor at time 0 sleep, without a strain, until
             something comes near; else its weight begins to act then.
-        loose_debris: Take broken points with next to nothing around them off the grid for good:
-            they fall freely and stay where they meet the floor.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
         max_rollbacks: Roll-backs in a row before the run is given up.
@@ -119,7 +117,6 @@ class SolverOptions:
     contact_proximity: bool = True
     deterministic: bool = False
     standing: bool = False
-    loose_debris: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
     max_rollbacks: int = 6
 
@@ -148,12 +145,17 @@ class Engine(Protocol):
         colliders: Rows of the colliders as of ``time``, float64 [M, 32].
         impulse: Impulse of all colliders on the points since the start [N s], float64 [3].
         work: Most energy that colliders can have given since the start [J], float64 [].
+        blocks: Blocks of the grid in use.
     """
 
     time: float
     colliders: Tensor
     impulse: Tensor
     work: Tensor
+
+    @property
+    def blocks(self) -> int:
+        """See above."""
 
     def advance(self, until: float, steps: int) -> int:
         """Advance to a time, but by no more than so many steps; return how many were taken."""

@@ -72,6 +72,8 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
             matter.spacing[len(old.bodies) :],
         )
         run.links = torch.cat([run.links, (links + start).to(run.links)])
+        cut = run.state.cut_links
+        run.state = run.state._replace(cut_links=torch.cat([cut, cut.new_zeros(len(links))]))
         rows = torch.arange(start, matter.particles.count, device=matter.particles.device)
         _account(run, rows, [body.start if body.held else 0.0 for body in fresh], sign=1.0)
 
@@ -130,9 +132,22 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
         landed=tuple(state.landed[n] for n in stay),
         group=torch.where(group == -1, group, named),
         unit=torch.where(unit >= 0, place[unit.clamp(min=0)], unit),
+        cut_links=state.cut_links[~out[run.links].any(dim=1)],
         **{
             key: getattr(state, key)[keep]
-            for key in ("position", "peak", "loose", "field", "cut", "asleep", "calm")
+            for key in (
+                "position",
+                "peak",
+                "loose",
+                "field",
+                "cut",
+                "asleep",
+                "calm",
+                "ever",
+                "lowest",
+                "alpha_seen",
+                "time_seen",
+            )
         },
     )
     scene = copy_of(run.scene)
@@ -212,6 +227,10 @@ def _joined_state(state: State, matter: Matter, bodies: int, *, landed: bool) ->
         asleep=more("asleep", False),
         calm=more("calm", 0),
         unit=torch.cat([state.unit, starts[new.body.long()]]),
+        ever=torch.cat([state.ever, brittle & (new.alpha >= 0)]),
+        lowest=torch.cat([state.lowest, new.alpha]),
+        alpha_seen=torch.cat([state.alpha_seen, new.alpha]),
+        time_seen=more("time_seen", 0),
     )
 
 
@@ -221,8 +240,9 @@ def _account(run: Run, rows: Tensor, held: list[float], *, sign: float) -> None:
     body = matter.particles.body[rows]
     part = dataclasses.replace(matter, particles=matter.particles.select(rows))
     there = state._replace(
-        particles=state.particles.select(rows), position=state.position[rows], peak=state.peak[rows]
-    )
+        particles=state.particles.select(rows), position=state.position[rows],
+        peak=state.peak[rows], ever=state.ever[rows],
+    )  # fmt: skip
     now = figures_of(part, there, run.scene.gravity)
     run.watch.energy += sign * now.total
     run.watch.scale = max(run.watch.scale, now.kinetic + now.elastic)

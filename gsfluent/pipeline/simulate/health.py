@@ -319,7 +319,7 @@ class Figures:
         gravity: Potential energy against height 0 along gravity.
         momentum: Linear momentum [N s].
         angular_momentum: Angular momentum about the origin [N m s].
-        damaged_fraction: Share of the mass that is broken.
+        damaged_fraction: Share of the mass that ever broke.
         alpha_max: Largest alpha so far.
         non_finite: Points with a value that is not finite.
     """
@@ -357,7 +357,7 @@ def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]
     momentum = (mass[:, None] * v).sum(dim=0)
     skew = torch.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]])
     turning = (mass[:, None] * (torch.linalg.cross(x, v) + second * skew.T)).sum(dim=0)
-    damaged = (mass * (peak >= 0)).sum() / mass.sum()
+    damaged = (mass * state.ever).sum() / mass.sum()
     finite = torch.isfinite(x).all(dim=1) & torch.isfinite(v).all(dim=1)
     finite &= torch.isfinite(strain).all(dim=1) & torch.isfinite(peak)
     values = torch.cat(

@@ -144,6 +144,11 @@ class Resident:
         counters.box_steps += taken * max(sites, _box(self._position(), self._matter.dx))
         return taken
 
+    @property
+    def blocks(self) -> int:
+        """Blocks of the grid in use."""
+        return int(self._seen["sites"])
+
     def _position(self) -> Tensor:
         """Where the points are; asked for twice between two advances, put in order once."""
         if self._where is None:

@@ -10,15 +10,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.ops.blade import cut_apart
 from gsfluent.pipeline.matter.carry import STRETCH
-from gsfluent.pipeline.matter.fields import breakable, cut_bodies, units
-from gsfluent.pipeline.matter.fragments import STRETCH_LIMIT, Fragments, find_fragments, rest_links
+from gsfluent.pipeline.matter.fields import breakable, cut_bodies
+from gsfluent.pipeline.matter.fragments import Fragments, rest_links
+from gsfluent.pipeline.matter.pieces import Pieces, Web, find_pieces
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State, load_state, save_state
+from gsfluent.pipeline.matter.weld import seen, weld
 from gsfluent.pipeline.simulate.engine import Counters, SolverOptions, Unhealthy
 from gsfluent.pipeline.simulate.health import CHECK_EVERY, Figures, Ledger, Watch, figures_of
 from gsfluent.pipeline.simulate.impulse import Impulses
@@ -27,10 +29,16 @@ from gsfluent.scene.scene import Scene
 
 MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
-REGROUP = 128
+REGROUP = 64
 """Grid steps between two looks for new pieces within a frame."""
 LOOKS = 240.0
 """Looks for new pieces, and for what may leave the grid, in a simulated second at most."""
+DUST = {
+    "glass": 1.0, "ceramic": 1.0, "bone": 0.5, "chocolate": 0.5, "bread": 0.5, "fruit": 0.15,
+}  # fmt: skip
+"""Share of a body that may be dust, by its material or the family of that; see
+:func:`gsfluent.pipeline.matter.pieces.dust_limit`. Chosen by eye."""
+DUST_ELSE = 0.5
 Hook = Callable[[State], State]
 
 
@@ -54,7 +62,9 @@ class Run:
         self.fps = fps
         self.stepper = Stepper(scene, matter, options)
         self._set(scene, matter)
-        self.state = self.stepper.initial()
+        device = matter.particles.device
+        self.links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
+        self.state = self.stepper.initial(self.links.shape[0])
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
         self.watch = Watch(
@@ -67,9 +77,7 @@ class Run:
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""
-        device = matter.particles.device
-        self.links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
-        self._pieces: tuple[State, Fragments] | None = None
+        self._pieces: tuple[State, Pieces] | None = None
 
     def _set(self, scene: Scene, matter: Matter) -> None:
         self.scene, self.matter = scene, matter
@@ -77,6 +85,11 @@ class Run:
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
+        device = matter.particles.device
+        names = [body.material.name.split(".") for body in scene.bodies]
+        shares = [DUST.get(name[-1], DUST.get(name[0], DUST_ELSE)) for name in names]
+        self._dust = torch.tensor(shares, dtype=torch.float64, device=device)
+        self._spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=device)
 
     def fit(self, scene: Scene, matter: Matter) -> None:
         """Go on with another scene and its matter; see :mod:`gsfluent.pipeline.simulate.grow`."""
@@ -146,8 +159,9 @@ class Run:
                 checked = grouped = state.step
             elif state.step - grouped >= REGROUP and checked == state.step:
                 grouped = state.step
-                if broken != (broken := self._broken(state)):
+                if broken != self._broken(state):
                     state = self._regroup(state, at_frame=False)
+                    broken = self._broken(state)  # some may have been welded
         self.state = state
         self.seconds += clock.perf_counter() - begun
         return True
@@ -155,37 +169,39 @@ class Run:
     def _broken(self, state: State) -> int:
         return int((state.peak >= 0).sum())
 
-    def _fragments(self, state: State) -> Fragments:
+    def _web(self, state: State) -> Web:
+        """What hangs together at rest, and which bodies can come apart."""
+        may_break = self._breakable
+        if self.scene.blades:
+            may_break = may_break | cut_bodies(self.matter, state.cut)
+        p = self.matter.particles
+        return Web(
+            self.links, self.matter.rest, p.body.long(), self._spacing, p.mass, self._flowing,
+            may_break, self._dust,
+        )  # fmt: skip
+
+    def _look(self, state: State) -> Pieces:
         """The pieces of a state; those of the last one asked for are kept."""
         if self._pieces is None or self._pieces[0] is not state:
-            found = find_fragments(
-                self.links,
-                self.matter.rest,
-                state.particles.position,
-                (state.peak >= 0) | self._flowing,
-                self.matter.particles.mass,
-                cut=state.cut if self.scene.blades else None,
+            found = find_pieces(
+                self._web(state),
+                state.position,
+                self.matter.brittle & (state.peak >= 0),
+                state.cut_links,
+                ever=state.ever,
+                sides=state.cut if self.scene.blades else None,
+                gone=state.loose & (state.unit < 0),
             )
             self._pieces = state, found
         return self._pieces[1]
 
     def _regroup(self, state: State, *, at_frame: bool = True) -> State:
-        """Let the stepper know what hangs together."""
-        may_break = self._breakable
-        if self.scene.blades:
-            may_break = may_break | cut_bodies(self.matter, state.cut)
-        unit = units(self.matter, self._holding(state), self._fragments(state), may_break)
-        return self.stepper.regroup(state, unit, 1.0 / self.fps, at_frame=at_frame)
-
-    def _holding(self, state: State) -> Tensor:
-        """Links whose ends are neighbours still, on one side of every cut: what powder follows."""
-        links = self.links
-        a, b = links.unbind(dim=1)
-        rest, now = ((x[a] - x[b]).norm(dim=1) for x in (self.matter.rest, state.position))
-        near = now <= STRETCH_LIMIT * rest
-        if self.scene.blades:
-            near = near & ~cut_apart(state.cut[a], state.cut[b])
-        return links[near]
+        """Let the stepper know what hangs together, and weld what need not be loose any more."""
+        pieces = self._look(state)
+        state = seen(state)
+        if self.stepper.options.separate_fragments:
+            state = weld(self.matter, self._web(state), state, pieces)
+        return self.stepper.regroup(state, pieces, 1.0 / self.fps, at_frame=at_frame)
 
     def record(
         self, index: int, time: float | None = None
@@ -194,7 +210,7 @@ class Run:
         state = self.state
         now = self.watch.figures(state)
         self.figures = now
-        pieces = self._fragments(state)
+        pieces = self._look(state).fragments
         stats = {
             "time": index / self.fps if time is None else time,
             "kinetic": now.kinetic,
@@ -204,7 +220,12 @@ class Run:
             "momentum": list(now.momentum),
             "angular_momentum": list(now.angular_momentum),
             "damaged_fraction": now.damaged_fraction,
+            "broken_fraction": now.damaged_fraction,
+            "loose_fraction": self._loose(pieces),
             "fragments": pieces.count,
+            "pieces": pieces.count,
+            "pieces_over_1_percent": int((pieces.mass_fractions > 0.01).sum()),
+            "active_blocks": self.stepper.blocks,
             "largest_fragment": pieces.largest,
             "fragments_over_3_percent": int((pieces.mass_fractions > 0.03).sum()),
             "alpha_max": now.alpha_max,
@@ -213,6 +234,14 @@ class Run:
         }
         self.per_frame.append(stats)
         return now, pieces, stats
+
+    def _loose(self, pieces: Fragments) -> float:
+        """Share of the mass of what can break that is in no piece."""
+        p = self.matter.particles
+        can = self._breakable[p.body.long()] & ~self._flowing
+        mass = p.mass.double()
+        whole = float((mass * can).sum())
+        return float((mass * (can & (pieces.labels < 0))).sum()) / whole if whole > 0.0 else 0.0
 
     def save(self, path: str | Path, repair: dict[str, Any]) -> None:
         """Write the state of the last frame, and that of the repair of cracks."""

@@ -43,8 +43,10 @@ _log = logging.getLogger(__name__)
 
 QUALITY = {"preview": 20, "shot": 40, "hero": 64}
 """Cells along the longest side of the largest solid."""
-RENAMED = {"loose_crumbs": "loose_debris", "contact_near": "contact_proximity"}
+RENAMED = {"contact_near": "contact_proximity"}
 """Options under their names of before, which :class:`Simulate` still takes."""
+DROPPED = ("loose_debris", "loose_crumbs")
+"""Options of before, which :class:`Simulate` still takes but which do nothing now."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,11 +58,12 @@ class SimulationFrame:
         time: Time [s], exactly ``index / fps``.
         particles: The material points.
         damage: Damage of each point, 0 intact to 1 broken, [N]; 0 where the law has no damage.
-        fragments: Piece of each point, int32 [N], -1 for debris (see :class:`Fragments`).
+        fragments: Piece of each point, of broken ones, too, int32 [N]; -1 for loose matter and for
+            what flows (see :class:`Fragments`).
         energy: ``kinetic``, ``elastic``, ``dissipated``, ``gravity`` [J].
         stats: The figures of run.json's ``per_frame`` for this frame.
         pieces: Sizes of the pieces.
-        broken: Broken points, bool [N].
+        broken: Points that ever broke, bool [N].
         rigid: The rigid colliders of the scene.
         colliders: Their rows now, float64 [M, 32].
     """
@@ -233,6 +236,10 @@ class Simulate(Stage):
             if old in changes:
                 _log.warning("simulate: %s is called %s now; the old name still works", old, new)
                 changes[new] = changes.pop(old)
+        for gone in DROPPED:
+            if gone in changes:
+                _log.warning("simulate: %s does nothing now: loose matter leaves the grid", gone)
+                del changes[gone]
         self.options = dataclasses.replace(options or SolverOptions(), **changes)
         self.repair = Repair(
             repair if isinstance(repair, str) else METHODS[0] if repair else "none"
@@ -300,10 +307,10 @@ def frame_of(
     """Measure the present state of a run and wrap it up as a frame (``time``: index / fps)."""
     time = index / run.fps if time is None else time
     now, pieces, stats = run.record(index, time)
-    peak, start = run.state.peak, run.matter.particles.alpha
+    peak, start, broken = run.state.peak, run.matter.particles.alpha, run.state.ever
     damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
-    damage = torch.where(run.matter.brittle, damage, 0.0)
-    particles, broken, points, cracks = run.state.particles, peak >= 0, None, None
+    damage = torch.where(broken, 1.0, torch.where(run.matter.brittle, damage, 0.0))
+    particles, points, cracks = run.state.particles, None, None
     if history is not None and particles.deformation is not None:
         points = Points.of(particles.position, particles.deformation, pieces.labels, broken)
         cracks = history.step(points)

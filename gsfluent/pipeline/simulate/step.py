@@ -18,6 +18,7 @@ from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.proximity import box_gaps, boxes, distance, time_to_meet
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.fields import LIMIT, MOST, number_fields
+from gsfluent.pipeline.matter.pieces import Pieces
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
 from gsfluent.pipeline.simulate import debris
@@ -105,37 +106,37 @@ class Stepper:
         other.field_limit, other.dt_scale = self.field_limit, self.dt_scale
         return other
 
-    def initial(self) -> State:
-        """Return the state at time 0."""
+    def initial(self, links: int = 0) -> State:
+        """Return the state at time 0, of matter with so many links at rest."""
         landed = (not self.options.free_flight,) * len(self.flights)
-        state = State.start(self.matter, self.rigid.start, landed)
+        state = State.start(self.matter, self.rigid.start, landed, links)
         self._take(state)
         state = self._land(state)[0]
         if not self.options.standing:
             return state
         return lay_down(state, self.matter, self.rigid, self._gravity, state.unit)
 
-    def regroup(self, state: State, unit: Tensor, frame: float, *, at_frame: bool = True) -> State:
-        """Give units fields of their own and let what may leave the grid do so.
+    def regroup(
+        self, state: State, pieces: Pieces, frame: float, *, at_frame: bool = True
+    ) -> State:
+        """Give pieces fields of their own and let what may leave the grid do so.
 
         Args:
             state: The state.
-            unit: What each point hangs together with, [N].
+            pieces: What hangs together.
             frame: Length of a frame [s].
             at_frame: Whether a frame begins here; groups leave only then.
         """
-        state = state._replace(unit=unit)
+        state = state._replace(unit=pieces.unit, cut_links=pieces.cut_links)
+        dust = pieces.dust & grid_mask(state, self.matter)
+        state = self._let_go(state, dust)
+        state = debris.settle_chips(state, self.matter, self.rigid, pieces.chip)
         on_grid = grid_mask(state, self.matter)
         state = self._renumber(state, on_grid)
         if not at_frame:
             return state
-        if self.options.loose_debris:
-            state = self._let_go(
-                state, debris.find_loose(state.position, state.peak, on_grid, self.matter.dx)
-            )
-            on_grid = grid_mask(state, self.matter)
         state = count_calm(state, on_grid, self._gravity, self.matter.dx)
-        state = self.leaving(state, unit, frame)
+        state = self.leaving(state, state.unit, frame)
         self.counters.naps, self.counters.piece_flights = self.leaving.naps, self.leaving.flights
         return state
 
@@ -187,6 +188,11 @@ class Stepper:
             state = self._on_grid(state, self._engine, min(until, clear), steps)
         self._last = state
         return state
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of the grid in use."""
+        return 0 if self._engine is None else self._engine.blocks
 
     def spread(self, wrong: Tensor, state: State) -> Tensor:
         """Marks of the engine's points as marks of all points, bool [N]."""
@@ -374,18 +380,47 @@ class Stepper:
                 if value is not None:
                     value[group.rows] = getattr(moved, name)
         self.counters.point_seconds += span * p.count
-        loose = state.loose.nonzero()[:, 0]
-        if loose.numel():
+        work = state.work
+        dust = (state.loose & (state.unit < 0)).nonzero()[:, 0]
+        if dust.numel():
             push = debris.drift(
-                position, values["velocity"], p.mass, loose, span, self.scene.gravity,
+                position, values["velocity"], p.mass, dust, span, self.scene.gravity,
                 self.scene.floor,
             )  # fmt: skip
-            values["affine"][loose] = 0.0
+            values["affine"][dust] = 0.0
             impulse = impulse + push
+        chips = (state.loose & (state.unit >= 0)).nonzero()[:, 0]
+        if chips.numel() and span > 0.0:
+            push, given = self._tumble(state, chips, span, position, values)
+            impulse, work = impulse + push, work + given
         particles = p.replace(position=position.to(p.dtype), **values)
         return state._replace(
-            particles=particles, position=position, peak=peak, time=time, impulse=impulse
-        )
+            particles=particles, position=position, peak=peak, time=time, impulse=impulse,
+            work=work, ever=state.ever | (self.matter.brittle & (peak >= 0)),
+            lowest=torch.minimum(state.lowest, values["alpha"]),
+        )  # fmt: skip
+
+    def _tumble(
+        self, state: State, rows: Tensor, span: float, position: Tensor,
+        values: dict[str, Tensor | None],
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Move chips, in place; the impulse and the work of colliders on them."""
+        p = state.particles
+        index = torch.unique(state.unit[rows], return_inverse=True)[1]
+        chips = debris.RigidChips(
+            p.mass[rows], state.position[rows], p.velocity[rows], p.affine[rows], index,
+            self.matter.dx,
+        )  # fmt: skip
+        now = debris.tumble(chips, span, self._gravity, state.colliders, self.rigid.sdf)
+        position[rows] = now.position
+        deformation = values["deformation"]
+        if deformation is not None and p.deformation is not None:
+            deformation[rows] = (now.turn.to(deformation) @ p.deformation[rows]).contiguous()
+        for name in ("velocity", "affine"):
+            value = values[name]
+            assert value is not None  # only a deformation may be missing
+            value[rows] = getattr(now, name).to(value)
+        return now.impulse, now.work
 
     def _retire(self, state: State) -> State:
         """Take broken points that are far away off the grid."""

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from gsfluent import materials
 from gsfluent.data import Frame
-from gsfluent.pipeline.matter.fields import breakable, number_fields, units
-from gsfluent.pipeline.matter.fragments import find_fragments, rest_links
+from gsfluent.pipeline.matter.fields import breakable, number_fields
+from gsfluent.pipeline.matter.fragments import rest_links
+from gsfluent.pipeline.matter.pieces import Pieces, Web, find_pieces
 from gsfluent.pipeline.matter.points import Matter, build_matter
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
@@ -75,33 +76,39 @@ def split_ball(material: materials.Material) -> tuple[Matter, Tensor, Tensor]:
     return matter, broken, position
 
 
-def units_of(matter: Matter, broken: Tensor, position: Tensor) -> Tensor:
+def pieces_of(matter: Matter, broken: Tensor, position: Tensor) -> Pieces:
     links = rest_links(matter.rest, matter.ranges, matter.spacing)
-    pieces = find_fragments(links, matter.rest, position, broken, matter.particles.mass)
-    a, b = links.unbind(dim=1)
-    rest = matter.rest.double()
-    near = (position[a] - position[b]).norm(dim=1) <= 2.0 * (rest[a] - rest[b]).norm(dim=1)
-    return units(matter, links[near], pieces, breakable(matter))
+    p = matter.particles
+    web = Web(
+        links, matter.rest, p.body.long(), torch.tensor(matter.spacing, dtype=torch.float64), p.mass,
+        matter.of_law("fluid", "drucker_prager"), breakable(matter), torch.tensor([0.5]).double(),
+    )  # fmt: skip
+    return find_pieces(web, position, broken, torch.zeros(len(links), dtype=torch.bool))
 
 
-def test_powder_moves_with_the_piece_it_lies_on() -> None:
+def test_powder_belongs_to_the_piece_it_lies_on() -> None:
     matter, broken, position = split_ball(APPLE)
-    unit = units_of(matter, broken, position)
+    found = pieces_of(matter, broken, position)
     right = matter.rest[:, 0] > 0
-    assert torch.unique(unit).shape[0] == 2 and int(unit.min()) >= 0
+    assert torch.unique(found.unit).shape[0] == 2 and int(found.unit.min()) >= 0
+    assert torch.equal(found.unit, found.fragments.labels.long())
     for half in (right, ~right):
-        assert torch.unique(unit[half]).shape[0] == 1
-    # What has flown off belongs to no piece.
+        assert torch.unique(found.unit[half]).shape[0] == 1
+    # What has flown off belongs to no piece: the layer hangs together, and is a lump of its own.
     away = position.clone()
     away[broken] += torch.tensor([0.0, 0.0, 0.5])
-    unit = units_of(matter, broken, away)
-    assert bool((unit[broken] == -1).all()) and torch.unique(unit[~broken]).shape[0] == 2
+    found = pieces_of(matter, broken, away)
+    assert torch.unique(found.unit[~broken]).shape[0] == 2
+    assert not bool(torch.isin(found.unit[broken], found.unit[~broken]).any())
 
 
 def test_what_cannot_break_stays_one_field() -> None:
     for material in (SOFT, materials.get("water"), materials.get("sand")):
         matter, broken, position = split_ball(material)
-        assert torch.unique(units_of(matter, torch.zeros_like(broken), position)).shape[0] == 1
+        found = pieces_of(matter, torch.zeros_like(broken), position)
+        assert torch.unique(found.unit).shape[0] == 1
+        flows = material is not SOFT
+        assert found.fragments.count == (0 if flows else 1)
 
 
 @pytest.mark.parametrize("separate", [True, False])
@@ -115,7 +122,7 @@ def test_pieces_that_were_pressed_together_come_apart_again(separate: bool) -> N
     right = rest[:, 0] > 0
     # A break without a layer of powder: the halves lie beside each other, the links are cut.
     a, b = run.links.unbind(dim=1)
-    run.links = run.links[right[a] == right[b]]
+    run.state = run.state._replace(cut_links=right[a] != right[b])
     speed = torch.where(right, 0.2, -0.2)
     velocity = speed[:, None] * torch.tensor([1.0, 0.0, 0.0])
     state = run.state

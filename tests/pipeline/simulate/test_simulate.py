@@ -247,9 +247,11 @@ def test_options_are_given_by_name_or_as_one_record():
 
 
 def test_options_are_taken_under_their_old_names(caplog):
-    options = Simulate(loose_crumbs=True, contact_near=False).options
-    assert options == SolverOptions(loose_debris=True, contact_proximity=False)
-    assert "loose_crumbs is called loose_debris now" in caplog.text
+    options = Simulate(loose_crumbs=True, loose_debris=True, contact_near=False).options
+    assert options == SolverOptions(contact_proximity=False)
+    assert "contact_near is called contact_proximity now" in caplog.text
+    for name in ("loose_crumbs", "loose_debris"):
+        assert f"{name} does nothing now" in caplog.text
     assert "contact_near is called contact_proximity now" in caplog.text
 
 
@@ -266,6 +268,7 @@ def test_names_in_a_saved_state_stay(tmp_path):
     assert sorted(values["particles"]) == ["affine", "alpha", "deformation", "strain", "velocity"]
     assert sorted(values["tensors"]) == sorted(
         ["position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit"]
+        + ["ever", "lowest", "alpha_seen", "time_seen", "cut_links"]
         + ["impulse", "colliders", "work", "dissipated"]
     )
     assert set(values["extra"]) >= {"counters", "watch", "ledger", "per_frame", "repair"}

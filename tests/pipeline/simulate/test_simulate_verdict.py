@@ -119,7 +119,10 @@ def test_too_many_pieces_in_one_place_share_fields(monkeypatch: pytest.MonkeyPat
     run = Run(scene, simulate.prepare(scene), FPS)
     unit = torch.arange(run.matter.particles.count) // 10
     assert int(unit.max()) > 2 * SITE_FIELDS
-    monkeypatch.setattr(simulate_run, "units", lambda *_: unit)
+    find = simulate_run.find_pieces
+    monkeypatch.setattr(
+        simulate_run, "find_pieces", lambda *a, **k: find(*a, **k)._replace(unit=unit)
+    )
     run.stepper.field_limit = 8 * SITE_FIELDS  # as if it did not know how much room there is
     for frame in range(1, 3):
         assert run.advance_to(frame, None), run.failure

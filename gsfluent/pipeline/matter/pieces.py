@@ -1,0 +1,367 @@
+"""Pieces of broken bodies: each owns its half of the crack band.
+
+A crack is a band of broken points some two cells wide. What hangs together without a broken point,
+with enough points that never broke, is the *seed* of a piece, and every other point belongs to the seed that is nearest along links that
+still hold, where a stretched link is a long way: so the border between two pieces runs where the
+band has opened most, and no point is left over in between. A link between two pieces is cut for
+good, also after the band has been welded (:mod:`gsfluent.pipeline.matter.weld`). What no seed
+reaches is loose: a chip, or dust.
+
+Costs are whole numbers and every sum is one of whole numbers, so that the pieces do not depend on
+the order of the points, on threads, or on the device.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent.ops.blade import cut_apart
+from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, components, weigh
+from gsfluent.spatial.neighbours import nearest_rows
+
+LEAST = 64
+"""Points of a seed: 8 cells, less has no node of the grid to itself."""
+CHIP = 3
+"""Points of the smallest chip."""
+OPEN = 1.5
+"""Ratio of a link's length to that at rest from which it is cut when an end of it is broken."""
+TORN = 2.0
+"""Ratio from which any link is cut."""
+_STEEP = 4.0
+_COST = 1024.0  # of a link as long as the spacing, unstretched
+_RANKS = 24  # bits of a key that hold the rank of a seed
+_FAR = (1 << 62) - 1
+NEAR = 1.5
+"""Point spacings from a piece's rigid motion within which a small bit belongs to it."""
+REACH = 3.0
+"""Point spacings from a piece's points within which dust beyond the bound joins it: the reach of
+the kernel."""
+_FINE = 2.0**20
+_SHARES = 2.0**40
+
+
+class Web(NamedTuple):
+    """What hangs together at rest; does not change.
+
+    Attributes:
+        links: Pairs of rows of one body, int64 [L, 2].
+        rest: Positions at rest [m], [N, 3].
+        body: Body of each point, int64 [N].
+        spacing: Mean distance between the points of each body [m], float64 [bodies].
+        mass: Masses [kg], [N].
+        flowing: Points that run apart and together, which have no pieces, bool [N].
+        may_break: Bodies that can break, or that a blade has touched, bool [bodies].
+        dust: Share of a body's mass that may be dust where a piece is one spacing large,
+            float64 [bodies]; see :func:`dust_limit`.
+    """
+
+    links: Tensor
+    rest: Tensor
+    body: Tensor
+    spacing: Tensor
+    mass: Tensor
+    flowing: Tensor
+    may_break: Tensor
+    dust: Tensor
+
+
+class Pieces(NamedTuple):
+    """What hangs together at one moment.
+
+    Attributes:
+        fragments: The pieces; of broken points, too. -1 for loose matter and for what flows.
+        unit: What each point moves with, int64 [N]: the label of its piece (the lowest row of its
+            seed that never broke), the lowest row of its chip, the first row of its body where that is whole; -1 for dust, and for what flows
+            and lies on no piece.
+        cut_links: Links that are cut for good, bool [L].
+        dust: Points that belong to nothing, bool [N].
+        chip: Points of chips, bool [N].
+    """
+
+    fragments: Fragments
+    unit: Tensor
+    cut_links: Tensor
+    dust: Tensor
+    chip: Tensor
+
+
+def find_pieces(
+    web: Web,
+    position: Tensor,
+    broken: Tensor,
+    cut_links: Tensor,
+    *,
+    ever: Tensor | None = None,
+    sides: Tensor | None = None,
+    gone: Tensor | None = None,
+    least: int = LEAST,
+) -> Pieces:
+    """Give every point its piece.
+
+    Args:
+        web: What hangs together at rest.
+        position: Positions now [m], [N, 3].
+        broken: Broken points, bool [N].
+        cut_links: Links that were cut before, bool [L].
+        ever: Points that ever broke, bool [N]; those that are broken when absent. What was welded
+            is no seed alone: a weld near a crack must not part what lies behind it.
+        sides: Sides of blades, int32 [N]; a link between opposite sides is cut.
+        gone: Dust that left the grid before, bool [N]; nothing hangs on it.
+        least: Points of a seed that never broke; a body of less than twice as many needs half of its own.
+
+    Returns:
+        The pieces. A body in which nothing is broken or cut is whole, whatever its size.
+
+    Raises:
+        ValueError: A shape does not match, or a link names a point that does not exist.
+    """
+    _check(web, position, broken, cut_links)
+    body, count = web.body, web.body.shape[0]
+    device = body.device
+    a, b = web.links.unbind(dim=1)
+    fixed = ~(web.flowing[a] | web.flowing[b])
+    length = _length(web.rest[a], web.rest[b])
+    ratio = _length(position[a], position[b]) / length.clamp(min=1e-30)
+    open_ = ratio > torch.where(broken[a] | broken[b], OPEN, TORN)
+    cut = cut_links | (open_ & fixed & web.may_break[body[a]])
+    if sides is not None:
+        cut = cut | (cut_apart(sides[a], sides[b]) & fixed)
+    if gone is not None:
+        cut = cut | gone[a] | gone[b]
+
+    bodies = web.may_break.shape[0]
+    rows = torch.arange(count, device=device)
+    first = torch.full((bodies,), count, device=device).scatter_reduce(0, body, rows, "amin")
+    size = torch.bincount(body, minlength=bodies)
+    hurt = torch.zeros(bodies, dtype=torch.bool, device=device)
+    hurt[body[broken]] = True
+    hurt[body[a[cut]]] = True
+    split = hurt & web.may_break
+    unit = first[body]
+    if not bool(split.any()):
+        labels = torch.where(web.flowing, DEBRIS, unit)
+        none = torch.zeros_like(broken)
+        return Pieces(weigh(labels, web.mass), unit, cut, none, none)
+
+    here = split[body]
+    holds = ~cut & here[a] & (ratio < TORN)
+    whole = here & ~broken & ~web.flowing
+    joined = ~cut & here[a] & whole[a] & whole[b]
+    root = components(a[joined], b[joined], count)
+    enough = torch.minimum(torch.full_like(size, least), (size + 1) // 2)[body]
+    fresh = whole if ever is None else whole & ~ever
+    seed = whole & (torch.bincount(root[fresh], minlength=count)[root] >= enough)
+    name = rows.new_full((count,), count).scatter_reduce(0, root[fresh], rows[fresh], "amin")
+    unit = torch.where(seed, name[root], torch.where(here, DEBRIS, unit))
+    unit = _nearest_seed(web, unit, seed, here & ~seed, holds, ratio, length)
+
+    # What no seed reaches: lumps of broken matter are pieces all the same, smaller things are not.
+    lost = here & (unit < 0) & ~web.flowing
+    chip = torch.zeros_like(lost)
+    bits = chip
+    if bool(lost.any()):
+        joined = holds & lost[a] & lost[b]
+        root = components(a[joined], b[joined], count)
+        members = torch.bincount(root, minlength=count)[root]
+        lump = lost & (members >= enough)
+        chip = lost & ~lump & (members >= CHIP)
+        bits = lost & ~lump & ~chip
+        unit = torch.where(lump | chip, root, unit)
+        if gone is not None:
+            bits = bits & ~gone
+    solid = (unit >= 0) & ~chip & ~web.flowing
+    if bool(bits.any()):
+        unit = _join(web, unit, position, solid, bits, gone, sides)
+        solid = (unit >= 0) & ~chip & ~web.flowing
+    cut = cut | ((unit[a] != unit[b]) & fixed & here[a])
+    labels = torch.where(solid, unit, DEBRIS)
+    return Pieces(weigh(labels, web.mass), unit, cut, lost & (unit < 0), chip)
+
+
+def dust_limit(share: Tensor, points: Tensor) -> Tensor:
+    """Largest share of a body's mass that may be dust.
+
+    ``share (h / L)^(4 - 3.5)``: fragments of a solid are as frequent as their size to the power
+    -3.5 (Villermaux, Phys. Rev. Lett. 135, 2025, 228201), L is the size of the largest.
+
+    Args:
+        share: Of the material, float64 [bodies].
+        points: Points of the largest piece, int64 [bodies]; 0 counts as one.
+
+    Returns:
+        float64 [bodies].
+    """
+    return share * points.clamp(min=1).double() ** (-0.5 / 3.0)
+
+
+def _check(web: Web, position: Tensor, broken: Tensor, cut_links: Tensor) -> None:
+    links, count = web.links, web.rest.shape[0]
+    if links.ndim != 2 or links.shape[1] != 2:
+        raise ValueError(f"find_pieces: links must have shape [L, 2], got {list(links.shape)}")
+    if links.numel() and not (int(links.min()) >= 0 and int(links.max()) < count):
+        raise ValueError(f"find_pieces: links must name rows 0 to {count - 1}")
+    for name, value in (("position", position), ("broken", broken), ("mass", web.mass)):
+        if value.shape[0] != count:
+            raise ValueError(
+                f"find_pieces: {name} must have {count} rows (from rest), got {value.shape[0]}"
+            )
+    if cut_links.shape[0] != links.shape[0]:
+        raise ValueError(
+            f"find_pieces: cut_links must have {links.shape[0]} rows (from links), "
+            f"got {cut_links.shape[0]}"
+        )
+
+
+def _length(a: Tensor, b: Tensor) -> Tensor:
+    """Distances [m], float64: one operation at a time, which rounds alike on every device."""
+    x, y, z = (a.double() - b.double()).unbind(dim=1)
+    return (x * x + y * y + z * z).sqrt()
+
+
+def _ranks(web: Web, unit: Tensor, seed: Tensor) -> tuple[Tensor, Tensor]:
+    """Seeds by size, then place: their labels int64 [S] in that order, and the rank of each [N]."""
+    ids, index = torch.unique(unit[seed], return_inverse=True)
+    keys = []
+    for axis in (2, 1, 0):
+        at = web.rest[seed, axis].double()
+        low = torch.full((ids.shape[0],), torch.inf, dtype=at.dtype, device=at.device)
+        keys.append(low.scatter_reduce(0, index, at, "amin"))
+    keys.append(-torch.bincount(index, minlength=ids.shape[0]).double())
+    order = torch.arange(ids.shape[0], device=ids.device)
+    for key in keys:  # the last counts most
+        order = order[torch.argsort(key[order], stable=True)]
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(ids.shape[0], device=ids.device)
+    of_point = torch.zeros_like(unit)
+    of_point[seed] = rank[index]
+    return ids[order], of_point
+
+
+def _nearest_seed(
+    web: Web, unit: Tensor, seed: Tensor, other: Tensor, holds: Tensor, ratio: Tensor,
+    length: Tensor,
+) -> Tensor:  # fmt: skip
+    """Units in which every other point that a seed reaches has that seed's; the rest as it was.
+
+    Shortest paths by relaxation until nothing changes (Bellman 1958). What costs the same goes to
+    the larger seed.
+    """
+    if not bool(seed.any()):
+        return unit
+    ids, rank = _ranks(web, unit, seed)
+    key = torch.where(seed, rank, _FAR)
+    a, b = web.links.unbind(dim=1)
+    # Nothing is shorter than nothing: no link leads into a seed.
+    there, back = holds & other[b], holds & other[a]
+    source, target = torch.cat([a[there], b[back]]), torch.cat([b[there], a[back]])
+    price = length / web.spacing[web.body[a]] * (1.0 + _STEEP * (ratio - 1.0).clamp(0.0, 2.0))
+    steps = (price * _COST).round().long().clamp(min=1) << _RANKS
+    step = torch.cat([steps[there], steps[back]])
+    fresh = seed
+    while True:
+        live = fresh[source]
+        before = key
+        key = before.scatter_reduce(
+            0, target[live], before[source[live]] + step[live], "amin", include_self=True
+        )
+        fresh = key != before
+        if not bool(fresh.any()):
+            break
+    reached = other & (key < _FAR)
+    return torch.where(reached, ids[(key & ((1 << _RANKS) - 1)).clamp(max=len(ids) - 1)], unit)
+
+
+def _join(
+    web: Web, unit: Tensor, position: Tensor, solid: Tensor, bits: Tensor, gone: Tensor | None,
+    sides: Tensor | None,
+) -> Tensor:  # fmt: skip
+    """Let bits join the piece beside them, where they have moved with it.
+
+    Of the others so many stay dust as the bound on its mass allows, the farthest from their piece
+    first; what is too much joins its piece as well, if it is within reach of it still: what has
+    flown off cannot.
+    """
+    rows, among = bits.nonzero()[:, 0], solid.nonzero()[:, 0]
+    beside = torch.full_like(rows, -1)
+    away = torch.full((rows.shape[0],), torch.inf, dtype=torch.float64, device=rows.device)
+    for body in torch.unique(web.body[rows]).tolist():
+        mine, its = web.body[rows] == body, among[web.body[among] == body]
+        if its.numel() == 0:
+            continue
+        cell = REACH * float(web.spacing[body])
+        found = nearest_rows(position[its], position[rows[mine]], 1, cell)[1]
+        beside[mine] = its[found[:, 0]]
+    known = beside >= 0
+    if sides is not None:
+        known = known & ~cut_apart(sides[rows], sides[beside.clamp(min=0)])
+    piece = torch.where(known, unit[beside.clamp(min=0)], -1)
+    for label in torch.unique(piece[known]).tolist():
+        its = piece == label
+        points = (unit == label).nonzero()[:, 0]
+        scale = float(web.spacing[web.body[points[0]]])
+        place = _moved(web.rest[points], position[points], web.rest[rows[its]], scale)
+        away[its] = _length(place, position[rows[its]])
+    spacing = web.spacing[web.body[rows]]
+    stays = known & (away <= NEAR * spacing)
+    apart = _length(position[beside.clamp(min=0)], position[rows])
+    surplus = _surplus(web, unit, solid, rows, stays, away, gone)
+    stays = stays | (surplus & known & (apart <= REACH * spacing))
+    return unit.index_copy(0, rows, torch.where(stays, piece, -1))
+
+
+def _surplus(
+    web: Web, unit: Tensor, solid: Tensor, rows: Tensor, stays: Tensor, away: Tensor,
+    gone: Tensor | None,
+) -> Tensor:  # fmt: skip
+    """Bits that are beyond the bound on dust, bool as ``rows``."""
+    bodies = web.may_break.shape[0]
+    whole = web.mass.double().sum()
+    share = (web.mass.double() / whole * _SHARES).round().long()
+    total = torch.zeros(bodies, dtype=torch.int64, device=rows.device)
+    total.index_add_(0, web.body, share)
+    members = torch.bincount(unit[solid], minlength=unit.shape[0])[unit.clamp(min=0)]
+    members = torch.where(solid, members, 0)
+    largest = torch.zeros_like(total).scatter_reduce(0, web.body, members, "amax")
+    left = (dust_limit(web.dust, largest) * total.double()).floor().long()
+    if gone is not None:
+        left = left.index_add(0, web.body[gone], -share[gone])
+    # By body, then the farthest first; bodies begin anew in the running sum.
+    order = torch.argsort(away, descending=True, stable=True)
+    order = order[~stays[order]]
+    order = order[torch.argsort(web.body[rows[order]], stable=True)]
+    owner, amount = web.body[rows[order]], share[rows[order]]
+    spent = torch.zeros_like(total).index_add(0, owner, amount)
+    running = torch.cumsum(amount, 0) - (torch.cumsum(spent, 0) - spent)[owner]
+    surplus = torch.zeros_like(stays)
+    surplus[order] = running > left[owner]
+    return surplus
+
+
+def _moved(rest: Tensor, now: Tensor, places: Tensor, scale: float) -> Tensor:
+    """Where places at rest [P, 3] would be, had they moved with points as a rigid body.
+
+    The best rotation by the covariance (Kabsch 1976), in whole numbers of ``scale / 2^20``.
+    """
+    count = rest.shape[0]
+
+    def whole(values: Tensor) -> Tensor:
+        return (values * (_FINE / scale)).round().long()
+
+    origin = [whole(x.double()).sum(dim=0).cpu().double() / count * (scale / _FINE)
+              for x in (rest, now)]  # fmt: skip
+    arms = [x.double() - o.to(x.device) for x, o in zip((rest, now), origin, strict=True)]
+    square = torch.stack(
+        [whole(arms[1][:, i] * arms[0][:, j] / scale).sum() for i in range(3) for j in range(3)]
+    )
+    u, _, vh = torch.linalg.svd(square.cpu().double().reshape(3, 3))
+    turn = torch.ones(3, dtype=torch.float64)
+    turn[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
+    rotation = ((u * turn) @ vh).tolist()
+    x, y, z = (places.double() - origin[0].to(places.device)).unbind(dim=1)
+    center = origin[1].tolist()
+    moved = [center[i] + (rotation[i][0] * x + rotation[i][1] * y + rotation[i][2] * z)
+             for i in range(3)]  # fmt: skip
+    return torch.stack(moved, dim=1)
