@@ -46,6 +46,8 @@ LOOKS: dict[str, tuple[float, float, str]] = {
     "shininess": (1.0, 10_000.0, "no unit"),
 }
 """What only a picture needs: range and unit. No part of a simulation."""
+SHEAR = 0.5
+"""Shear damage of what is given by strengths: crushed matter loses its tension too."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
 
@@ -161,7 +163,8 @@ class Material:
             if value is None and (field in HANDBOOK or (by_handbook and field in DERIVED)):
                 continue
             if value is None and field in defaults:
-                object.__setattr__(self, field, defaults[field])
+                shear = by_handbook and field == "shear_damage"
+                object.__setattr__(self, field, SHEAR if shear else defaults[field])
             elif value is None and field in reads:
                 raise InputError(
                     f"material {self.name!r}: law {self.law!r} needs {field}", hint=f"give {unit}"
