@@ -183,11 +183,8 @@ def intact_blocks(body: Body, dx: float) -> float:
 
 def limit_of(body: Body) -> float:
     """Least speed [m/s] of a strike that takes a body apart; infinite for what holds together."""
-    materials = [body.material, *(part.material(body.material) for part in body.parts)]
-    laws = {material.law for material in materials}
-    if laws & {"fluid", "drucker_prager"}:
-        return 0.0
-    return min(material.wave_speed * material.failure_strain for material in materials)
+    laws = {material.law for material in body.materials}
+    return 0.0 if laws & {"fluid", "drucker_prager"} else body.breaking_speed
 
 
 def _fastest(body: Body) -> float:
