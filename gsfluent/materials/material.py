@@ -186,9 +186,9 @@ class Material:
 
     @property
     def breaking_speed(self) -> float:
-        """Speed of the slowest strike that starts to break it, ``wave_speed * failure_strain`` [m/s].
+        """Speed of the slowest strike that starts to break it [m/s]; infinite when none does.
 
-        Infinite when it never breaks. A strike at v strains what it meets by v / c in one
+        ``wave_speed * failure_strain``: a strike at v strains what it meets by v / c in one
         dimension (docs/theory/fracture.md): right to an order of magnitude, since an edge or a
         corner gathers strain and a soft thing spreads it.
         """

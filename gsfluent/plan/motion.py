@@ -188,8 +188,7 @@ def limit_of(body: Body) -> float:
 
 
 def _fastest(body: Body) -> float:
-    parts = [part.material(body.material).wave_speed for part in body.parts]
-    return max([body.material.wave_speed, *parts])
+    return max(material.wave_speed for material in body.materials)
 
 
 def _body(number: int, body: Body, gravity: Tensor) -> Mover:

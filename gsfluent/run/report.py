@@ -57,7 +57,11 @@ def report_page(out: Path, values: Values) -> Page:
     """Make the page; sections of which the run says nothing are left out."""
     page = Page(out.resolve().name, f"gsfluent {values.get('version', '')} on {values['device']}")
     verdict = str(values["verdict"])
-    page.text(f"{verdict}: {values.get('reason', '')}", kind=_KINDS.get(verdict, ""))
+    simulation = values.get("simulation") or {}
+    notes = simulation.get("notes") or []  # the reason names them too
+    kind = "warn" if verdict == "clean" and notes else _KINDS.get(verdict, "")
+    page.text(f"{verdict}: {values.get('reason', '')}", kind=kind)
+    _unbroken(page, simulation.get("unbroken") or [])
     outputs = values.get("outputs") or {}
     if (video := outputs.get("video")) and (out / video).is_file():
         page.video(video, "the shot as it was asked for")
@@ -66,7 +70,6 @@ def report_page(out: Path, values: Values) -> Page:
     _summary(page, values)
     _choice(page, out, values)
     _plan(page, values.get("plan"))
-    simulation = values.get("simulation") or {}
     _motion(page, simulation.get("per_frame") or {}, simulation)
     _pictures(page, values)
     _stages(page, values.get("stages") or [])
@@ -97,6 +100,15 @@ def _summary(page: Page, values: Values) -> None:
     kept = [row for row in rows if row[1] not in (None, "")]
     if kept:
         page.heading("In short").table(["figure", "value"], kept)
+
+
+def _unbroken(page: Page, rows: Sequence[Values]) -> None:
+    """What was struck and stayed whole."""
+    if rows:
+        page.heading("Nothing broke")
+        names = ("body", "material", "met", "speed", "speed_needed")
+        head = ["struck", "weakest material", "by", "speed [m/s]", "breaks from about [m/s]"]
+        page.table(head, [[row.get(name) for name in names] for row in rows])
 
 
 def _last(frames: Values, *names: str) -> Any:
