@@ -80,7 +80,7 @@ def notes_of(
         pull: Strength of gravity [m/s^2].
     """
     notes = [
-        f"{name}: {report['warning']}, and such walls do not break as walls do; "
+        f"{name}: {report['warning']}, too few to break as walls do; "
         f"{setting(report['solve_cells'])} gives them {WALL_CELLS:g} cells"
         for name, report in thin.items()
         if report["warning"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,9 @@ def test_the_tables_say_what_binds_and_what_to_mend(
         assert f"\n{line}" in text or f"\n  {line}" in text, line
     assert "  +  damage variable" in text and "  -  blades" in text
     assert "breaks from about" in text and "hint: raise the drop" in text
-    assert "hint: a finer solve.quality, or solve.cells: " in text
+    # how many cells the thinnest part has, and how many make it bend
+    assert re.search(r"thinnest, [\d.]+ cells of [\d.]+ mm, under 4; hint: .*solve.cells: ", text)
+    assert " lets it bend" in text
 
 
 def test_wrong_words_and_shots_measure_nothing(

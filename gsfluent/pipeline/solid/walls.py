@@ -137,7 +137,8 @@ def thin_shells(
     report["cells"] = thinnest / cell
     report["warning"] = (
         f"{100 * share:.0f} % of the surface stands on walls under {WALL_CELLS:g} cells "
-        f"({limit:.3g}{unit}), the thinnest of {report['cells']:.2g} cells ({thinnest:.3g}{unit})"
+        f"({limit:.3g}{unit}), 5 % of the walls under {report['cells']:.2g} cells "
+        f"({thinnest:.3g}{unit})"
     )
     hint = f"a grid {report['cells_needed']:.2g} times finer"
     if gaussian_size is not None and thinnest < 2.0 * gaussian_size:
