@@ -112,10 +112,11 @@ class Strikes:
         for body, (start, end) in zip(self.scene.bodies, self.matter.ranges, strict=True):
             mass = p.mass[start:end].double()
             total = mass.sum()
-            velocity = (mass[:, None] * p.velocity[start:end].double()).sum(dim=0) / total
+            moved = p.velocity[start:end].double().nan_to_num()
+            velocity = (mass[:, None] * moved).sum(dim=0) / total
             if body.held and body.start > frame.time:  # it waits to be fired
                 velocity = velocity.new_tensor(body.velocity)
-            place = p.position[start:end].double()
+            place = p.position[start:end].double().nan_to_num()
             lows.append(place.amin(dim=0))
             highs.append(place.amax(dim=0))
             lost = (mass * (frame.broken & brittle)[start:end]).sum() / total
