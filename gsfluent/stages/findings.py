@@ -88,9 +88,9 @@ def notes_of(
     for row in unbroken:
         speed, needed = row["speed"], row["speed_needed"]
         fall = f" (a fall of {needed**2 / (2.0 * pull):.2g} m)" if pull > 0.0 else ""
-        although = "" if speed < needed else "although the estimate is exceeded: "
+        but = "" if speed < needed else "strike harder still, "
         notes.append(
-            f"{row['body']} met {row['met']} at {speed:.2g} m/s and nothing broke; {although}"
+            f"{row['body']} met {row['met']} at {speed:.2g} m/s and nothing broke; {but}"
             f"{row['material']} is estimated to break from about {needed:.2g} m/s{fall}, "
             "which is right to an order of magnitude only"
         )
