@@ -105,7 +105,7 @@ cudaError_t raster_blend(const RasterArgs<T>& a, int64_t* units, cudaStream_t st
   // A pixel gives a Gaussian a weight of one at most, so no sum over all pixels can overflow.
   const int64_t pixels = int64_t(a.width) * a.height * a.cameras;
   const double per_unit = double(int64_t(1) << (62 - bits_above(pixels)));
-  if (a.contribution) {
+  if (a.contribution && a.count > 0) {
     const size_t bytes = sizeof(int64_t) * static_cast<size_t>(a.count);
     const cudaError_t error = cudaMemsetAsync(units, 0, bytes, stream);
     if (error != cudaSuccess) return error;
