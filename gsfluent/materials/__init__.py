@@ -17,29 +17,50 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 from gsfluent.errors import InputError
 from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, RANGES, READS
-from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, Field, Material, nearest
+from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, WHOLE, Field, Material, nearest
+from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
 __all__ = [
     "DEFAULTS",
+    "LARGEST",
     "LAWS",
     "LOOKS",
     "PARAMETERS",
     "RANGES",
     "READS",
     "SCATTER",
+    "STEEPEST",
     "UNBROKEN",
+    "WHOLE",
     "Field",
     "Material",
+    "ellipse",
     "fruit",
     "get",
     "names",
 ]
 
+
+def _preset(name: str, keys: dict[str, Any]) -> Material:
+    """A preset, whose file has the stiffness of the real thing."""
+    softening = keys.get("softening", 1.0)
+    parts = [
+        part | {"young_modulus": part["young_modulus"] / softening}
+        if "young_modulus" in part
+        else part
+        for part in keys.get("parts", ())
+    ]
+    if "young_modulus" in keys:
+        keys = keys | {"young_modulus": keys["young_modulus"] / softening}
+    return Material(name, **(keys | {"parts": tuple(parts)}))
+
+
 _PRESETS: dict[str, Material] = {
-    name: Material(name, **(keys | {"parts": tuple(keys.get("parts", ()))}))
+    name: _preset(name, keys)
     for name, keys in tomllib.loads(
         Path(__file__).with_name("presets.toml").read_text(encoding="utf-8")
     ).items()

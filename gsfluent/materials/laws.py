@@ -34,11 +34,22 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "bulk_modulus": (0.0, math.inf, "Pa"),
     "viscosity": (0.0, math.inf, "Pa s"),
     "tait_exponent": (1.0, 20.0, "no unit"),
+    "tensile_strength": (0.0, math.inf, "Pa"),
+    "compressive_strength": (0.0, math.inf, "Pa"),
+    "fracture_energy": (0.0, math.inf, "J/m^2"),
 }
 """Parameter -> lowest value, highest value, unit."""
 
-POSITIVE = ("young_modulus", "density", "grain", "bulk_modulus")
+POSITIVE = (
+    "young_modulus", "density", "grain", "bulk_modulus", "reference_volume", "softening",
+    "tensile_strength", "compressive_strength", "fracture_energy",
+)  # fmt: skip
 """Parameters that must be above their lowest value."""
+
+HANDBOOK = ("tensile_strength", "compressive_strength", "fracture_energy")
+"""What fixes cohesion, hardening and alpha0 of nacc matter on a grid, all three together."""
+DERIVED = ("cohesion", "hardening", "alpha0")
+"""What they fix; given by hand, each takes the place of what would be derived."""
 
 PARAMETERS = tuple(RANGES)
 """The fields of a material that may vary in space."""
@@ -47,7 +58,15 @@ _SOLID = ("young_modulus", "poisson_ratio", "density")
 READS: dict[str, tuple[str, ...]] = {
     "elastic": _SOLID,
     "corotated": _SOLID,
-    "nacc": (*_SOLID, "cohesion", "hardening", "friction_angle", "alpha0", "shear_damage"),
+    "nacc": (
+        *_SOLID,
+        "cohesion",
+        "hardening",
+        "friction_angle",
+        "alpha0",
+        "shear_damage",
+        *HANDBOOK,
+    ),
     "drucker_prager": (*_SOLID, "friction_angle", "cohesion_pressure"),
     "von_mises": (*_SOLID, "yield_stress", "hardening_modulus"),
     "fluid": ("bulk_modulus", "density", "viscosity", "tait_exponent"),

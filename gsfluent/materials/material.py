@@ -14,7 +14,17 @@ from torch import Tensor
 
 from gsfluent.errors import InputError
 from gsfluent.materials import laws
-from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, POSITIVE, RANGES, READS
+from gsfluent.materials.laws import (
+    DEFAULTS,
+    DERIVED,
+    HANDBOOK,
+    LAWS,
+    PARAMETERS,
+    POSITIVE,
+    RANGES,
+    READS,
+)
+from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
 Field = float | Tensor
 """A parameter: one number, or a grid of numbers over the solid's voxels (shape [X, Y, Z])."""
@@ -22,12 +32,22 @@ Field = float | Tensor
 SCATTER: dict[str, tuple[float, float, str]] = {
     "variation": (0.0, 1.0, "no unit"),
     "grain": (0.0, math.inf, "m"),
+    "weibull_modulus": (0.0, 1e3, "no unit"),
+    "reference_volume": (0.0, math.inf, "m^3"),
 }
+WHOLE: dict[str, tuple[float, float, str]] = {
+    "softening": (0.0, 1e9, "no unit"),
+    "restitution": (0.0, 1.0, "no unit"),
+    "dust": (0.0, 1.0, "no unit"),
+}
+"""What holds for the whole of a body and is one number: range and unit."""
 LOOKS: dict[str, tuple[float, float, str]] = {
     "specular": (0.0, 10.0, "no unit"),
     "shininess": (1.0, 10_000.0, "no unit"),
 }
 """What only a picture needs: range and unit. No part of a simulation."""
+SHEAR = 0.5
+"""Shear damage of what is given by strengths: crushed matter loses its tension too."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
 
@@ -47,6 +67,12 @@ class Material:
         law: ``elastic`` (neo-Hookean) and ``corotated`` (fixed corotated) never break, ``nacc``
             breaks, ``drucker_prager`` is sand, ``von_mises`` is metal or clay, ``fluid`` pours,
             ``rigid`` does not deform.
+        tensile_strength: nacc: uniaxial strength of the real thing in tension [Pa].
+        compressive_strength: nacc: its uniaxial strength in compression [Pa].
+        fracture_energy: nacc: energy that a crack takes per area, G_c [J/m^2]. The three are given
+            together or not at all; cohesion, hardening and alpha0 then follow from them and the
+            grid (:mod:`gsfluent.pipeline.matter.brittle`), and one of those given by hand takes
+            the place of what would follow.
         cohesion: nacc: tensile over compressive strength, beta in CD-MPM.
         hardening: nacc: how fast strength grows with compaction, xi in CD-MPM.
         friction_angle: nacc, drucker_prager: internal friction [degrees].
@@ -62,6 +88,13 @@ class Material:
             random factor on ``alpha0``); natural solids have weak and strong places, and that
             decides where cracks run and how many pieces survive a harder landing.
         grain: Length over which the strength varies [m].
+        weibull_modulus: nacc: Weibull modulus of the strength, small for scattered; 0 for none.
+        reference_volume: Volume of the specimens whose median strength is given [m^3].
+        softening: How many times softer than the real thing ``young_modulus`` is, for the sake of
+            the time step. Strengths are divided by its root: the speed at which it breaks and the
+            number of pieces stay (Bazant's size number E G_c / s^2 L does not change).
+        restitution: Speed after over before of a body that lands on a hard floor and stays whole.
+        dust: How much of a break is dust, 0 to 1; sets the most mass that may come loose.
         specular: Strength of its highlights, k_s of Blinn-Phong.
         shininess: Narrowness of its highlights, n_s of Blinn-Phong.
         parts: Default parts (for :meth:`gsfluent.Scene.add`), e.g. the rind of a melon.
@@ -78,6 +111,9 @@ class Material:
     poisson_ratio: Field | None = None
     density: Field | None = None
     law: str = "nacc"
+    tensile_strength: Field | None = None
+    compressive_strength: Field | None = None
+    fracture_energy: Field | None = None
     cohesion: Field | None = None
     hardening: Field | None = None
     friction_angle: Field | None = None
@@ -91,6 +127,11 @@ class Material:
     tait_exponent: Field | None = None
     variation: float = 0.0
     grain: float = 0.025
+    weibull_modulus: float = 0.0
+    reference_volume: float = 1e-6
+    softening: float = 1.0
+    restitution: float = 1.0
+    dust: float = 0.5
     # not in the repr, from which a simulation is known again
     specular: float = dataclasses.field(default=0.03, repr=False)
     shininess: float = dataclasses.field(default=24.0, repr=False)
@@ -104,6 +145,14 @@ class Material:
                 f"material {self.name!r}: unknown law {self.law!r}", hint=nearest(self.law, LAWS)
             )
         reads, defaults = READS[self.law], DEFAULTS.get(self.law, {})
+        missing = [name for name in HANDBOOK if getattr(self, name) is None]
+        if missing and len(missing) < len(HANDBOOK):
+            raise InputError(
+                f"material {self.name!r}: {', '.join(HANDBOOK)} go together, but "
+                f"{', '.join(missing)} is missing",
+                hint="give all three, or none of them and alpha0, hardening and cohesion",
+            )
+        by_handbook = not missing
         for field, (low, high, unit) in RANGES.items():
             value = getattr(self, field)
             if value is not None and field not in reads:
@@ -111,25 +160,39 @@ class Material:
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
                     hint=f"remove it, or use law {_readers(field)}",
                 )
+            if value is None and (field in HANDBOOK or (by_handbook and field in DERIVED)):
+                continue
             if value is None and field in defaults:
-                object.__setattr__(self, field, defaults[field])
+                shear = by_handbook and field == "shear_damage"
+                object.__setattr__(self, field, SHEAR if shear else defaults[field])
             elif value is None and field in reads:
                 raise InputError(
                     f"material {self.name!r}: law {self.law!r} needs {field}", hint=f"give {unit}"
                 )
             if value is not None:
                 _check_number(self.name, field, value, low, high, unit)
-        for field, (low, high, unit) in (SCATTER | LOOKS).items():
+        for field, (low, high, unit) in (SCATTER | WHOLE | LOOKS).items():
             value = getattr(self, field)
             if isinstance(value, Tensor):
                 raise InputError(f"material {self.name!r}: {field} must be one number")
             _check_number(self.name, field, value, low, high, unit)
-        if self.variation > 0.0 and self.law != "nacc":
-            raise InputError(
-                f"material {self.name!r}: variation does nothing under law {self.law!r}",
-                hint="remove it, or use law nacc",
-            )
+        for field in ("variation", "weibull_modulus") if self.law != "nacc" else ():
+            if getattr(self, field) > 0.0:
+                raise InputError(
+                    f"material {self.name!r}: {field} does nothing under law {self.law!r}",
+                    hint="remove it, or use law nacc",
+                )
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
+
+    @property
+    def by_handbook(self) -> bool:
+        """Whether strengths and fracture energy are given, from which the grid derives the rest."""
+        return self.fracture_energy is not None
+
+    @property
+    def energy_by_hand(self) -> bool:
+        """Whether softening is as given: without a fracture energy, or with alpha0 or hardening."""
+        return not self.by_handbook or self.alpha0 is not None or self.hardening is not None
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -139,13 +202,15 @@ class Material:
     def override(self, **changes: Any) -> Material:
         """Return a copy with fields changed; an unknown one is an error naming the nearest.
 
-        A change of law drops the parameters of this material that the new law does not read.
+        A change of law drops the parameters of this material that the new law does not read. A
+        new ``young_modulus`` of a softened material is another softening of the same thing; a new
+        ``variation`` takes the place of the Weibull modulus.
 
         Raises:
             InputError: An unknown field, a number outside its range, a parameter the law does not
                 read, or one that it needs and this material does not have.
         """
-        known = [*PARAMETERS, *SCATTER, *LOOKS, "law", "name", "parts"]
+        known = [*PARAMETERS, *SCATTER, *WHOLE, *LOOKS, "law", "name", "parts"]
         for key in changes:
             if key not in known:
                 raise InputError(
@@ -156,13 +221,28 @@ class Material:
             dropped = [f for f in PARAMETERS if f not in READS[law] and f not in changes]
             changes = {**dict.fromkeys(dropped), **changes}
             if law != "nacc":
-                changes = {"variation": 0.0, "parts": (), **changes}
+                changes = {"variation": 0.0, "weibull_modulus": 0.0, "parts": (), **changes}
+        if "variation" in changes:
+            changes = {"weibull_modulus": 0.0, **changes}
+        changes = self._softened(changes)
         sources = {k: v for k, v in self.sources.items() if k not in changes}
         return dataclasses.replace(self, sources=sources, **changes)
 
+    def _softened(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Changes with stiffness and softening in step: they are those of one real thing."""
+        stiff, soft = changes.get("young_modulus"), changes.get("softening")
+        mine = self.young_modulus
+        if not isinstance(mine, int | float) or not self.by_handbook:
+            return changes
+        if soft is None and isinstance(stiff, int | float) and stiff > 0.0:
+            return {**changes, "softening": max(1.0, self.softening * mine / stiff)}
+        if stiff is None and isinstance(soft, int | float) and soft > 0.0:
+            return {**changes, "young_modulus": mine * self.softening / soft}
+        return changes
+
     def source(self, field: str) -> str:
         """Say where a number is from: ``measured: ...``, ``derived: ...`` or ``chosen by eye``."""
-        if field not in (*PARAMETERS, *SCATTER, *LOOKS):
+        if field not in (*PARAMETERS, *SCATTER, *WHOLE, *LOOKS):
             raise InputError(
                 f"material {self.name!r}: unknown parameter {field!r}",
                 hint=nearest(field, PARAMETERS),
@@ -180,16 +260,34 @@ class Material:
         """Smallest volumetric strain at which tension breaks it; infinite when it never breaks."""
         if self.law != "nacc":
             return math.inf
-        alpha, xi, beta = (self._at(f) for f in ("alpha0", "hardening", "cohesion"))
+        if self.by_handbook:
+            strength, young = self._at("tensile_strength"), self._at("young_modulus")
+            return float((strength / (self.softening**0.5 * young)).min())
+        alpha, xi, beta = (self._at(f) for f in DERIVED[::-1])
         ratio = torch.sinh((xi * (-alpha).clamp(min=0.0)).clamp(max=5.0)) + 1e-5
         return float((0.5 * torch.log1p(2.0 * beta * ratio.clamp(max=0.495))).min())
 
     @property
+    def breaking_speed(self) -> float:
+        """Speed of the slowest strike that starts to break it [m/s]; infinite when none does.
+
+        ``wave_speed * failure_strain``: a strike at v strains what it meets by v / c in one
+        dimension (docs/theory/fracture.md): right to an order of magnitude, since an edge or a
+        corner gathers strain and a soft thing spreads it.
+        """
+        return self.wave_speed * self.failure_strain if self.law == "nacc" else math.inf
+
+    @property
     def start_alpha(self) -> Field:
         """State ``alpha`` of a fresh point: ``alpha0`` for nacc, else 0 or, unused, -1."""
-        if self.law == "nacc" and self.alpha0 is not None:
-            return self.alpha0
-        return 0.0 if self.law in ("drucker_prager", "von_mises") else UNBROKEN
+        found = self.start_alphas(_tensor)
+        return float(found) if found.ndim == 0 else found
+
+    def start_alphas(self, sample: Callable[[Field], Tensor]) -> Tensor:
+        """:attr:`start_alpha` at chosen points; ``sample`` as in :meth:`parameters`."""
+        if self.law == "nacc":
+            return self._nacc(sample)["alpha0"]
+        return sample(0.0 if self.law in ("drucker_prager", "von_mises") else UNBROKEN)
 
     def parameters(self, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
         """Return rows for :func:`gsfluent.ops.return_mapping`, [8] or [..., 8], float64.
@@ -198,7 +296,40 @@ class Material:
             sample: Turns a parameter into its values at chosen points; default: the parameter as
                 it is.
         """
-        return laws.row(self.law, lambda field: self._at(field, sample))
+        at = sample or _tensor
+        values = self._nacc(at) if self.law == "nacc" else {}
+        return laws.row(
+            self.law, lambda field: values[field] if field in values else self._at(field, at)
+        )
+
+    def strengths(self, sample: Callable[[Field], Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """Uniaxial strengths of the softened material in tension and compression [Pa], float64.
+
+        Args:
+            sample: As in :meth:`parameters`.
+        """
+        root = self.softening**0.5
+        return self._at(HANDBOOK[0], sample) / root, self._at(HANDBOOK[1], sample) / root
+
+    def _nacc(self, at: Callable[[Field], Tensor]) -> dict[str, Tensor]:
+        """Cohesion, hardening and alpha0; of strengths, with the steepest softening.
+
+        What a grid makes of the fracture energy is softer: :mod:`gsfluent.pipeline.matter.brittle`.
+        """
+        given = {f: self._at(f, at) for f in DERIVED if getattr(self, f) is not None}
+        if len(given) == len(DERIVED):
+            return given
+        none = torch.zeros((), dtype=torch.float64)
+        plain = laws.row("nacc", lambda f: none if f in DERIVED else self._at(f, at))
+        kappa = plain[..., 1]
+        tensile, compressive = torch.broadcast_tensors(*self.strengths(at), kappa)[:2]
+        beta, p0 = ellipse(plain[..., 2], tensile, compressive, LARGEST * kappa)
+        beta = given.get("cohesion", beta)
+        size = torch.asinh(p0 / kappa)
+        hardening = given.get("hardening", STEEPEST / beta)
+        if "alpha0" in given and "hardening" not in given:
+            hardening = size / given["alpha0"].abs()
+        return {"cohesion": beta, "hardening": hardening, "alpha0": -size / hardening} | given
 
     def _at(self, field: str, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
         return (sample or _tensor)(getattr(self, field))

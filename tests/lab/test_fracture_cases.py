@@ -23,7 +23,7 @@ from gsfluent.fracturebench.scenes import rock as fracture_rock
 from gsfluent.fracturebench.scenes.rows import levels, moduli, shape_noise
 from gsfluent.fracturebench.shapes import box, elastic, free
 from gsfluent.lab.frozen.answer import run_case
-from gsfluent.lab.problems.fracture import crack_band
+from gsfluent.pipeline.matter import crack_band
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.shapes import nacc
 

@@ -21,6 +21,7 @@ from gsfluent.data import Frame, Particles, Solid
 from gsfluent.data.regions import SOURCES, region_mask
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
+from gsfluent.pipeline.matter.brittle import brittle_rows
 from gsfluent.scene.parts import quaternion_to, turned
 from gsfluent.scene.scene import Body, Part, Scene
 
@@ -170,11 +171,9 @@ def build_matter(
         points, volume = _sample_body(body, step, seed)
         points = points[_cell_order(points, dx / body.frame.scale)]
         count = points.shape[0]
-        params, law, alpha = _parameters(body, points, seed)
-        noise = torch.rand(
-            count, generator=torch.Generator().manual_seed(seed + 7919 * (number + 1))
-        )
-        alpha = torch.where(alpha < 0, alpha * (1 + jitter * (2 * noise - 1)), alpha)
+        generator = torch.Generator().manual_seed(seed + 7919 * (number + 1))
+        noise = jitter * (2.0 * torch.rand(count, generator=generator) - 1.0)
+        params, law, alpha = _parameters(body, points, seed, noise, dx)
         mass = params[:, 6] * (volume / count)
         position, velocity, affine = _start(body, scene, _placed(body, points), mass)
         tables.append(params)
@@ -267,8 +266,14 @@ def _placed(body: Body, points: Tensor) -> Tensor:
     return body.frame.apply(points) + torch.tensor(body.offset, dtype=torch.float64)
 
 
-def _parameters(body: Body, points: Tensor, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return per-point parameters [N, 8], law [N] (int32) and alpha0 [N] (float64)."""
+def _parameters(
+    body: Body, points: Tensor, seed: int, noise: Tensor, dx: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return per-point parameters [N, 8], law [N] (int32) and alpha0 [N] (float64).
+
+    What has a scatter of its own that does not hang on the grid (a Weibull modulus) is spared the
+    ``noise`` [N] from point to point.
+    """
     count = points.shape[0]
     solid = body.solid
 
@@ -300,25 +305,38 @@ def _parameters(body: Body, points: Tensor, seed: int) -> tuple[Tensor, Tensor, 
     for material, mask in layers:
         index = mask.nonzero()[:, 0]
         at = sampler(material, index)
-        params[index] = material.parameters(at)
         law[index] = materials.LAWS[material.law]
-        alpha[index] = at(material.start_alpha) * _weakness(material, points[index], body, seed)
+        if material.law == "nacc":
+            factor = _weakness(material, points[index] * body.frame.scale, seed, dx)
+            params[index], alpha[index] = brittle_rows(material, at, factor, dx)
+            if material.weibull_modulus == 0.0:
+                alpha[index] = alpha[index] * (1.0 + noise[index])
+        else:
+            params[index], alpha[index] = material.parameters(at), at(material.start_alpha)
     return params, law, alpha
 
 
-def _weakness(material: Material, points: Tensor, body: Body, seed: int) -> Tensor:
-    """Smooth random factor on strength at points in the body's own coordinates, [N].
+def _weakness(material: Material, points: Tensor, seed: int, dx: float) -> Tensor:
+    """Smooth random factor on strength at points in the body's own coordinates [m], [N].
 
     A sum of plane waves with random directions and phases is a Gaussian random field of unit
-    variance and correlation length ``grain``; it is fixed in object space.
+    variance and correlation length ``grain``; it is fixed in object space. With a Weibull modulus m
+    the strength of a volume V is ``(V_ref ln U / (V ln 1/2))^(1/m)`` of the median one of a volume
+    V_ref (Weibull 1939), U uniform: here the field's own probability, V a grain or, where the grid
+    is coarser, eight cells - so that the weakest place of a body is as weak on every grid.
     """
-    if material.variation == 0.0:
+    modulus = material.weibull_modulus
+    if material.variation == 0.0 and modulus == 0.0:
         return torch.ones(points.shape[0], dtype=torch.float64)
+    grain = max(material.grain, 2.0 * dx) if modulus else material.grain
     generator = torch.Generator().manual_seed(seed + 104729)
     waves = torch.randn(_WAVES, 3, generator=generator, dtype=torch.float64)
     phases = torch.rand(_WAVES, generator=generator, dtype=torch.float64) * (2.0 * math.pi)
-    angle = (points * body.frame.scale) @ (waves / material.grain).T + phases
+    angle = points @ (waves / grain).T + phases
     field = torch.cos(angle).sum(dim=1) * math.sqrt(2.0 / _WAVES)
+    if modulus:
+        survives = torch.special.log_ndtr(-field) / math.log(0.5)  # ln U / ln 1/2
+        return (material.reference_volume / grain**3 * survives) ** (1.0 / modulus)
     return (1.0 + material.variation * field.clamp(-2.0, 2.0)).clamp(min=0.05)
 
 

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
-from gsfluent.lab.problems.fracture.crack_band import fracture_energy
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, wave_speed
 from gsfluent.lab.world.walls import between_planes
+from gsfluent.pipeline.matter.crack_band import fracture_energy
 
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 ALPHA0, CELLS = -0.004, 240

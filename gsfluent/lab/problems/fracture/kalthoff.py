@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 import torch
 
-from gsfluent.lab.problems.fracture.crack_band import crack_band
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import nacc, parameters, sheet
 from gsfluent.lab.world.walls import between_planes, wall
+from gsfluent.pipeline.matter.crack_band import crack_band
 
 YOUNG, POISSON, DENSITY = 190e9, 0.3, 8000.0
 SIDE, NOTCH, HEIGHT = 0.1, 0.05, 0.025

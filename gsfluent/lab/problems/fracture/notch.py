@@ -9,11 +9,11 @@ from collections.abc import Iterator
 
 import torch
 
-from gsfluent.lab.problems.fracture.crack_band import crack_band
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
+from gsfluent.pipeline.matter.crack_band import crack_band
 
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 WIDTH, HEIGHT, NOTCH = 1.0, 0.5, 0.2
@@ -38,7 +38,7 @@ def run_crack(cells: int, *, pull: float = 1e-4, crossings: float = 7.0) -> Run:
 
     Args:
         cells: Cells per metre; softening follows
-        :func:`gsfluent.lab.problems.fracture.crack_band.crack_band`.
+        :func:`gsfluent.pipeline.matter.crack_band.crack_band`.
         pull: Speed of each grip over the speed of a pressure wave. Above about 2e-4 the whole strip
             reaches its strength before the crack has passed: that is no crack speed any more.
         crossings: Duration in travel times along the width.

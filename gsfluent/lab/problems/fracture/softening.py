@@ -1,7 +1,7 @@
 """Energy that a crack takes per area, against the grid: a bar pulled apart, and a cantilever pair.
 
 Both are run with the parameters as they are and with
-:func:`gsfluent.lab.problems.fracture.crack_band.crack_band`.
+:func:`gsfluent.pipeline.matter.crack_band.crack_band`.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from gsfluent.lab.problems.fracture.crack_band import crack_band, softening_energy
 from gsfluent.lab.problems.fracture.dissipation import Dissipation
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
+from gsfluent.pipeline.matter.crack_band import crack_band, softening_energy
 
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 
@@ -78,7 +78,7 @@ def softening_bar() -> Iterator[Result]:
     """Bar pulled apart: energy per area of its crack is the energy density times two cells.
 
     The reference is the one-point path of
-    :func:`gsfluent.lab.problems.fracture.crack_band.softening_energy` at the
+    :func:`gsfluent.pipeline.matter.crack_band.softening_energy` at the
     strength of the middle (0.8), plus the stored energy that the shoulders of the crack lose.
     """
     cells = (20, 40)

@@ -18,11 +18,12 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import LAWS
 
 BAND_CELLS = 2.0
 """Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
 the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""
-_ALPHA_MIN = -10.0
+ALPHA_MIN = -10.0
 """Smallest alpha the return map keeps."""
 
 
@@ -49,9 +50,9 @@ def crack_band(
         raise ValueError(f"crack_band: dx and reference must be positive, got {dx} and {reference}")
     scale = reference / dx
     stretched = torch.where(alpha < 0, alpha * scale, alpha)
-    if bool((stretched < _ALPHA_MIN).any()):
+    if bool((stretched < ALPHA_MIN).any()):
         raise ValueError(
-            f"crack_band: alpha becomes {float(stretched.min()):.3g}, below {_ALPHA_MIN:g}: "
+            f"crack_band: alpha becomes {float(stretched.min()):.3g}, below {ALPHA_MIN:g}: "
             f"dx = {dx:g} m is too far below the reference of {reference:g} m"
         )
     rows = params.clone()
@@ -79,13 +80,7 @@ def brittle_spacing(params: Tensor, *, reference: float) -> Tensor:
 def softening_energy(params: Tensor, alpha: float, *, steps: int = 400) -> float:
     """Energy per volume that uniaxial straining dissipates until the strength is gone [J/m^3].
 
-    The work of the stress along the path of one point, stretched along x with the other directions
-    held, less what is still stored at the end.
-
-    Args:
-        params: One NACC row, [8].
-        alpha: Log plastic volume ratio at the start, negative.
-        steps: Steps of the path up to a stretch of ``1.5 |alpha|`` beyond the elastic limit.
+    Arguments and path as :func:`softening_energies`, for one row [8].
 
     Returns:
         The energy density. For softening slow against elastic unloading it grows linearly with
@@ -98,25 +93,53 @@ def softening_energy(params: Tensor, alpha: float, *, steps: int = 400) -> float
     if not alpha < 0.0:
         raise ValueError(f"softening_energy: alpha must be negative, got {alpha}")
     row = params.detach().double().cpu().reshape(1, 8)
-    kappa, beta, xi = (float(row[0, i]) for i in (1, 3, 4))
-    elastic = max(1.0, beta) * math.sinh(min(-xi * alpha, 5.0))
-    stretch = 1.5 * -alpha + 3.0 * min(elastic, 0.5)
-    law = torch.ones(1, dtype=torch.int32)
-    strain, a = torch.zeros(1, 6, dtype=torch.float64), torch.tensor([alpha], dtype=torch.float64)
-    stress = torch.zeros_like(strain)
-    increment = torch.zeros(1, 3, 3, dtype=torch.float64)
-    increment[0, 0, 0] = math.expm1(stretch / steps)
-    work = 0.0
+    energy = softening_energies(row, torch.tensor([alpha], dtype=torch.float64), steps=steps)
+    if not math.isfinite(energy := float(energy)):
+        kappa, beta, xi = (float(row[0, i]) for i in (1, 3, 4))
+        raise ValueError(
+            f"softening_energy: the strength is not lost on a path of 1.5 |alpha| = "
+            f"{-1.5 * alpha:.3g} beyond the elastic limit (kappa {kappa:g}, cohesion {beta:g}, "
+            f"hardening {xi:g})"
+        )
+    return energy
+
+
+def softening_energies(params: Tensor, alpha: Tensor, *, steps: int = 400) -> Tensor:
+    """Energies per volume that uniaxial straining dissipates until the strength is gone [J/m^3].
+
+    The work of the stress along the path of one point, stretched along x with the other directions
+    held, less what is still stored at the end.
+
+    Args:
+        params: NACC rows, float64 [M, 8].
+        alpha: Log plastic volume ratios at the start, negative, float64 [M].
+        steps: Steps of each path, up to a stretch of ``1.5 |alpha|`` beyond the elastic limit.
+
+    Returns:
+        Float64 [M]; NaN where the strength is not lost on the path.
+    """
+    count = params.shape[0]
+    law = torch.full((count,), LAWS["nacc"], dtype=torch.int32)
+    beta, xi = params[:, 3], params[:, 4]
+    elastic = beta.clamp(min=1.0) * torch.sinh((-xi * alpha).clamp(max=5.0))
+    stretch = -1.5 * alpha + 3.0 * elastic.clamp(max=0.5)
+    strain, a = torch.zeros(count, 6, dtype=torch.float64), alpha.clone()
+    stress, work = torch.zeros_like(strain), torch.zeros_like(alpha)
+    energy = torch.full_like(alpha, math.nan)
+    increment = torch.zeros(count, 3, 3, dtype=torch.float64)
+    increment[:, 0, 0] = torch.expm1(stretch / steps)
     for _ in range(steps):
-        before = float(stress[0, 0])
-        strain, a, stress, _ = ops.return_mapping(strain, a, increment, law=law, params=row)
-        work += 0.5 * (before + float(stress[0, 0])) * stretch / steps
-        if float(a) >= 0.0:
-            return work - float(ops.elastic_energy(strain, law=law, params=row))
-    raise ValueError(
-        f"softening_energy: alpha is still {float(a):.3g} at a strain of {stretch:.3g} "
-        f"(kappa {kappa:g}, cohesion {beta:g}, hardening {xi:g})"
-    )
+        before = stress[:, 0]
+        strain, a, stress, _ = ops.return_mapping(strain, a, increment, law=law, params=params)
+        work = work + 0.5 * (before + stress[:, 0]) * stretch / steps
+        gone = (a >= 0.0) & energy.isnan()
+        if bool(gone.any()):
+            energy = torch.where(
+                gone, work - ops.elastic_energy(strain, law=law, params=params), energy
+            )
+            if not bool(energy.isnan().any()):
+                break
+    return energy
 
 
 def fracture_energy(params: Tensor, alpha: float, *, dx: float) -> float:

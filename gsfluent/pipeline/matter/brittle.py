@@ -1,0 +1,103 @@
+"""NACC parameters of brittle matter from what handbooks give, for one grid.
+
+Uniaxial strengths in tension and compression fix cohesion and strength of the yield ellipse; the
+fracture energy over the width of the band of cells in which a crack localises fixes how slowly the
+strength is lost (crack band theory, Bazant and Oh 1983). Where the grid is so coarse that the
+elastic energy of the band alone is more than the fracture energy, the strength is lowered until
+both agree, as they propose: what counts at that scale is the energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsfluent.materials import LARGEST, STEEPEST, Field, Material
+from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, softening_energies
+
+BAND = 3.0
+"""Cells in which a crack dissipates: the two it localises to and what its neighbours lose before
+they unload (measured, docs/measured/crack_energy.md)."""
+STEP = 0.04
+"""Steps of the logarithm of strength in which it varies from place to place."""
+
+
+def brittle_rows(
+    material: Material, sample: Callable[[Field], Tensor], weakness: Tensor, dx: float
+) -> tuple[Tensor, Tensor]:
+    """Rows and alpha0 of points of a material on a grid.
+
+    Args:
+        material: NACC material; one without a fracture energy, or with softening given by hand
+            (``alpha0``, ``hardening``), is taken as it is.
+        sample: Turns a parameter into its values at the points.
+        weakness: Factor on the strength of each point, [N].
+        dx: Node spacing [m].
+
+    Returns:
+        ``(rows, alpha0)``: float64 [N, 8] and [N].
+    """
+    rows, alpha0 = material.parameters(sample), material.start_alphas(sample)
+    if material.energy_by_hand:
+        return rows, alpha0 * weakness
+    step = (weakness.clamp(min=1e-3).log() / STEP).round()
+    energy = sample(material.fracture_energy)
+    key = torch.cat([rows, torch.stack([alpha0, energy, step], dim=1)], dim=1)
+    kinds, which = torch.unique(key, dim=0, return_inverse=True)
+    table, alpha0, energy, step = kinds[:, :8], *kinds[:, 8:].unbind(dim=1)
+    strength = table[:, 1] * torch.sinh(table[:, 4] * alpha0.abs())
+    hardening, alpha0, _ = softened(table, strength, energy, (STEP * step).exp(), dx)
+    table = table.clone()
+    table[:, 4] = hardening
+    return table[which], alpha0[which]
+
+
+def softened(
+    rows: Tensor, strength: Tensor, energy: Tensor, weakness: Tensor, dx: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Softening with a given fracture energy on a grid.
+
+    Args:
+        rows: NACC rows, of which all but the hardening are read, float64 [M, 8].
+        strength: p0 [Pa], [M].
+        energy: Fracture energy G_c [J/m^2], [M].
+        weakness: Factor on the strength, [M]. Where the grid has to lower the strength, what is
+            stronger than that has the lowered one.
+        dx: Node spacing [m].
+
+    Returns:
+        ``(hardening, alpha0, kept)``, [M] each; the last is the share of the strength that is left.
+    """
+    kappa, beta = rows[:, 1], rows[:, 3]
+    target = energy / (BAND * dx)
+
+    def dissipated(strength: Tensor, alpha0: Tensor) -> Tensor:
+        table = rows.clone()
+        table[:, 4] = torch.asinh(strength / kappa) / alpha0.abs()
+        return softening_energies(table, alpha0)
+
+    def steepest(strength: Tensor) -> Tensor:
+        return -torch.asinh(strength / kappa) * beta / STEEPEST
+
+    # The energy at the steepest softening goes as the strength squared.
+    limit = strength
+    for _ in range(4):
+        limit = limit * (target / dissipated(limit, steepest(limit))).sqrt()
+        limit = limit.minimum(LARGEST * kappa)
+    kept = (limit / strength).clamp(max=1.0)
+    strength = (kept * strength * weakness).minimum(limit)
+    # Beyond it the energy grows almost linearly with alpha0 at fixed strength: secant steps.
+    least = steepest(strength)
+    before, found = least, dissipated(strength, least)
+    alpha0 = least * (target / found).clamp(min=1.0)
+    for _ in range(6):
+        now = dissipated(strength, alpha0)
+        slope = (now - found) / (alpha0 - before)
+        before, found = alpha0, now
+        closer = alpha0 + (target - now) / slope
+        alpha0 = torch.where(slope < 0.0, closer.minimum(least), alpha0)  # NaN: nothing moved
+    # The return map keeps no smaller alpha: on very fine grids soft matter tears with less energy.
+    alpha0 = alpha0.clamp(min=ALPHA_MIN)
+    return torch.asinh(strength / kappa) / alpha0.abs(), alpha0, kept
