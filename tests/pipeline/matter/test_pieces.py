@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.pipeline.matter.fragments import rest_links
-from gsfluent.pipeline.matter.pieces import Pieces, Web, dust_limit, find_pieces
+from gsfluent.pipeline.matter.pieces import Pieces, Web, dust_limit, dust_share, find_pieces
 
 
 def web_of(
@@ -122,7 +122,7 @@ def test_what_nothing_reaches_is_chip_or_dust_by_its_size() -> None:
 
 
 def test_bits_that_move_with_their_piece_belong_to_it() -> None:
-    web, position, broken = block()
+    web, _, broken = block()
     alone = torch.zeros_like(broken)
     alone[len(alone) // 2] = True
     a, b = web.links.unbind(dim=1)
@@ -168,6 +168,14 @@ def test_dust_is_bounded_and_the_surplus_joins_its_piece() -> None:
     flown[powder] += 50.0
     none = web._replace(dust=torch.zeros(1, dtype=torch.float64))
     assert int(find_pieces(none, flown, broken, cut).dust.sum()) == len(powder)
+
+
+def test_the_bound_on_dust_goes_by_material_and_family() -> None:
+    names = ("glass", "fruit.apple", "bread", "my own")
+    assert [dust_share(name) for name in names] == [1.0, 0.15, 0.5, 0.5]
+    # An octave in size costs a factor of 2^(-1/2): eight times the points.
+    limits = dust_limit(torch.ones(2).double(), torch.tensor([1000, 8000]))
+    assert float(limits[0] / limits[1]) == pytest.approx(math.sqrt(2.0))
 
 
 def shuffled(
