@@ -23,9 +23,9 @@ from gsfluent.fracturebench.scenes import rock as fracture_rock
 from gsfluent.fracturebench.scenes.rows import levels, moduli, shape_noise
 from gsfluent.fracturebench.shapes import box, elastic, free
 from gsfluent.lab.frozen.answer import run_case
-from gsfluent.pipeline.matter import crack_band
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.shapes import nacc
+from gsfluent.pipeline.matter import crack_band
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {

@@ -11,9 +11,9 @@ import torch
 from gsfluent.lab.problems.elastic.paths import breaking_step
 from gsfluent.lab.problems.flow import granular, liquid
 from gsfluent.lab.problems.fracture import notch, spall
-from gsfluent.pipeline.matter import crack_band
 from gsfluent.lab.world import registry
 from gsfluent.lab.world.shapes import nacc
+from gsfluent.pipeline.matter import crack_band
 
 FAST = (
     "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",

@@ -39,12 +39,6 @@ NEAR = 1.5
 REACH = 3.0
 """Point spacings from a piece's points within which dust beyond the bound joins it: the reach of
 the kernel."""
-DUST = {
-    "glass": 1.0, "ceramic": 1.0, "bone": 0.5, "chocolate": 0.5, "bread": 0.5, "fruit": 0.15,
-}  # fmt: skip
-"""Share of a body that may be dust where its largest piece is one spacing large, by the name of its
-material or the family of that; by eye."""
-_DUST_ELSE = 0.5
 _FINE = 2.0**20
 _SHARES = 2.0**40
 
@@ -186,12 +180,6 @@ def find_pieces(
     cut = cut | ((unit[a] != unit[b]) & fixed & here[a])
     labels = torch.where(solid, unit, DEBRIS)
     return Pieces(weigh(labels, web.mass), unit, cut, lost & (unit < 0), chip)
-
-
-def dust_share(material: str) -> float:
-    """The entry of :data:`DUST` for a material, such as ``glass`` or ``fruit.apple``."""
-    family, _, kind = material.rpartition(".")
-    return DUST.get(kind, DUST.get(family, _DUST_ELSE))
 
 
 def dust_limit(share: Tensor, points: Tensor) -> Tensor:

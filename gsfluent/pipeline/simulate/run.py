@@ -17,7 +17,7 @@ from gsfluent import ops
 from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.matter.fields import breakable, cut_bodies
 from gsfluent.pipeline.matter.fragments import Fragments, rest_links
-from gsfluent.pipeline.matter.pieces import Pieces, Web, dust_share, find_pieces
+from gsfluent.pipeline.matter.pieces import Pieces, Web, find_pieces
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State, load_state, save_state
 from gsfluent.pipeline.matter.weld import seen, weld
@@ -80,7 +80,7 @@ class Run:
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
         device = matter.particles.device
-        shares = [dust_share(body.material.name) for body in scene.bodies]
+        shares = [body.material.dust for body in scene.bodies]
         self._dust = torch.tensor(shares, dtype=torch.float64, device=device)
         self._spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=device)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.pipeline.matter.fragments import rest_links
-from gsfluent.pipeline.matter.pieces import Pieces, Web, dust_limit, dust_share, find_pieces
+from gsfluent.pipeline.matter.pieces import Pieces, Web, dust_limit, find_pieces
 
 
 def web_of(
@@ -170,9 +170,7 @@ def test_dust_is_bounded_and_the_surplus_joins_its_piece() -> None:
     assert int(find_pieces(none, flown, broken, cut).dust.sum()) == len(powder)
 
 
-def test_the_bound_on_dust_goes_by_material_and_family() -> None:
-    names = ("glass", "fruit.apple", "bread", "my own")
-    assert [dust_share(name) for name in names] == [1.0, 0.15, 0.5, 0.5]
+def test_the_bound_on_dust_falls_with_the_size_of_the_pieces() -> None:
     # An octave in size costs a factor of 2^(-1/2): eight times the points.
     limits = dust_limit(torch.ones(2).double(), torch.tensor([1000, 8000]))
     assert float(limits[0] / limits[1]) == pytest.approx(math.sqrt(2.0))
