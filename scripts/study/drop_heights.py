@@ -44,6 +44,8 @@ HAIRLINE = 0.005
 """Share of an egg's shell that ever broke from which it is cracked."""
 SHELL = 4.0
 """How many times thicker the shell of the egg is made; see :func:`thicker`."""
+LEAST = 6
+"""Traversals that a fall lasts at least, and that a body has to lie still that does not rebound."""
 STIFFNESS = ("preset", "real")
 LADDER = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 FURTHER = 3
@@ -71,10 +73,9 @@ class Case:
     hairline: bool = False
 
     def spacing(self, coarse: bool) -> float:
-        """Node spacing [m]; ``coarse`` is half the cells of what is solid."""
-        if self.shape.wall is not None:
-            return self.shape.wall / self.cells
-        return 2.0 * max(self.shape.half) / (self.cells / 2 if coarse else self.cells)
+        """Node spacing [m]; ``coarse`` is half the cells."""
+        across = self.shape.wall or 2.0 * max(self.shape.half)
+        return across / (self.cells / 2 if coarse else self.cells)
 
 
 def case_of(name: str, given: dict[str, Any]) -> Case:
@@ -82,18 +83,18 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
     if name.startswith("egg"):
         shell = egg(given["length_m"], given["diameter_m"], SHELL * given["wall_m"])
         lies = turned(shell, "y", 90.0) if name == "egg_on_side" else shell
-        return Case(name, lies, 2.5, 30.0, hairline=True)
+        return Case(name, lies, 2.5, 40.0, hairline=True)
     if name == "glass_plate_flat":  # nothing falls quite flat
         return Case(name, turned(box(tuple(given["size_m"])), "y", 1.0), 3.0, 60.0)
     if name == "glass_tumbler":
         keys = ("diameter_m", "length_m", "wall_m", "base_m")
-        return Case(name, turned(tumbler(*(given[k] for k in keys)), "y", 85.0), 3.0, 40.0)
+        return Case(name, turned(tumbler(*(given[k] for k in keys)), "y", 85.0), 3.0, 50.0)
     if name == "ceramic_bowl":
         keys = ("diameter_m", "height_of_bowl_m", "wall_m")
         return Case(name, turned(bowl(*(given[k] for k in keys)), "y", 90.0), 3.0, 50.0)
     if name == "bread":
-        return Case(name, turned(box(tuple(given["size_m"])), "y", 5.0), 32.0, 16.0)
-    return Case(name, ball(given["diameter_m"]), 32.0, 16.0)
+        return Case(name, turned(box(tuple(given["size_m"])), "y", 5.0), 32.0, 40.0)
+    return Case(name, ball(given["diameter_m"]), 32.0, 40.0)
 
 
 def thicker(material: Material, factor: float, mass: float, volume: float) -> Material:
@@ -211,14 +212,16 @@ class Drop:
         total, landing = each(mass), torch.tensor(speeds, dtype=torch.float64, device=mass.device)
         before, left = -landing, torch.zeros(count, dtype=torch.bool, device=mass.device)
         rebound, frame = torch.zeros_like(landing), 0
+        still = torch.zeros(count, dtype=torch.int64, device=mass.device)
         while frame < self.case.limit and run.advance_to(frame, None):
             now = each(mass * run.state.particles.velocity[:, 2]) / total
             calm = (now - before + GRAVITY * self.traversal).abs() < 2e-3 * landing
             gone = calm & (now > 0.0) & (frame >= 2) & ~left
             rebound, left = torch.where(gone, now, rebound), left | gone
-            before, cracked = now, each(mass * run.state.ever) / total
+            slow = (now.abs() < 0.05 * landing) & ((now - before).abs() < 0.01 * landing)
+            before, still = now, torch.where(slow, still + 1, 0)
             frame += 1
-            if frame > 6 and bool((left | (cracked > 0.05)).all()):
+            if frame > LEAST and bool((left | (still >= LEAST)).all()):
                 break
         rebound = torch.where(left, rebound, before)
         state, pieces = run.state, run.record(frame, run.state.time)[1]
@@ -323,15 +326,17 @@ def study(
             drop.fall([(edge, s) for s in everyone], most)
     dense = [f for f in drop.falls if f.seed == 0] if middle is None else drop.falls
     middle, low, high = median(dense)
-    whole = [f for f in drop.falls if not f.broken and f.left]
+    gentle = min(start, middle or start) / 2.0
+    whole = [f for f in drop.falls if not f.broken and f.left and f.height <= 1.01 * gentle]
+    whole = [f for f in whole if f.height == max(g.height for g in whole)]
     row = {
         "object": case.name, "stiffness": how, "device": name_of(options.device),
         "quick": options.quick, "seeds": options.seeds, "height": middle, "low": low,
         "high": None if math.isinf(high) else high,
         "restitution": sum(f.restitution for f in whole) / len(whole) if whole else None,
-        "cells": round(2.0 * max(case.shape.half) / drop.dx), "across": case.cells, "dx": drop.dx,
-        "points": drop.points, "mass": drop.points * 0.0 + float(drop.material.density)
-        * drop.body.volume, "kept": kept(drop.material, drop.dx),
+        "cells": round(2.0 * max(case.shape.half) / drop.dx), "dx": drop.dx,
+        "points": drop.points, "mass": float(drop.material.density) * drop.body.volume,
+        "kept": kept(drop.material, drop.dx),
         "wave_speed": drop.material.wave_speed, "softening": drop.material.softening,
         "steps": drop.steps, "calls": drop.calls, "simulated": drop.simulated,
         "seconds": drop.seconds, "verdicts": drop.verdicts,
