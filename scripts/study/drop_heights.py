@@ -40,6 +40,8 @@ PAGE = ROOT / "docs" / "measured" / "drop_heights.md"
 GRAVITY = 9.81
 WHOLE = 0.95
 """Largest share of the mass in one piece of what counts as broken."""
+CRUSHED = 0.5
+"""Share of the mass that ever broke from which a specimen is broken, in however many pieces."""
 HAIRLINE = 0.005
 """Share of an egg's shell that ever broke from which it is cracked."""
 SHELL = 4.0
@@ -47,10 +49,10 @@ SHELL = 4.0
 LEAST = 6
 """Traversals that a fall lasts at least, and that a body has to lie still that does not rebound."""
 STIFFNESS = ("preset", "real")
-LADDER = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+LADDER = (0.25, 0.5, 1.0, 2.0, 4.0)
 FURTHER = 3
 """Times that a ladder is carried on where all of it, or nothing, broke."""
-STEP_POINTS = {"cpu": 5e5, "cuda": 1e9}
+STEP_POINTS = {"cpu": 5e5, "cuda": 2e9}
 """Points moved in a second, for the estimate of the work."""
 
 
@@ -88,7 +90,7 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
         return Case(name, turned(box(tuple(given["size_m"])), "y", 1.0), 3.0, 60.0)
     if name == "glass_tumbler":
         keys = ("diameter_m", "length_m", "wall_m", "base_m")
-        return Case(name, turned(tumbler(*(given[k] for k in keys)), "y", 85.0), 3.0, 50.0)
+        return Case(name, turned(tumbler(*(given[k] for k in keys)), "y", 85.0), 2.5, 50.0)
     if name == "ceramic_bowl":
         keys = ("diameter_m", "height_of_bowl_m", "wall_m")
         return Case(name, turned(bowl(*(given[k] for k in keys)), "y", 90.0), 3.0, 50.0)
@@ -140,6 +142,7 @@ class Fall:
     height: float
     seed: int
     broken: bool
+    parted: bool
     largest: float
     pieces: int
     ever: float
@@ -239,11 +242,11 @@ class Drop:
             shares = torch.zeros_like(mass).index_add_(0, pieces.labels[mine].long(), mass[mine])
             shares = shares / total[i]
             largest, large = float(shares.max()), int((shares > 0.01).sum())
-            broken = largest < WHOLE or large >= 2
-            if self.case.hairline:
-                broken = broken or float(ever[i]) > HAIRLINE
+            parted = largest < WHOLE or large >= 2
+            enough = HAIRLINE if self.case.hairline else CRUSHED
             self.falls.append(Fall(
-                height, seed, broken, largest, large, float(ever[i]), float(loose[i]),
+                height, seed, parted or float(ever[i]) > enough, parted, largest, large,
+                float(ever[i]), float(loose[i]),
                 float(rebound[i] / landing[i]), float(shaking[i] / energy[i]),
                 float(stored[i] / energy[i]), bool(left[i]),
             ))  # fmt: skip
@@ -282,58 +285,67 @@ def median(falls: list[Fall]) -> tuple[float | None, float, float]:
     return None, low, high
 
 
-def study(
-    case: Case, given: dict[str, Any], how: str, options: argparse.Namespace
-) -> dict[str, Any]:
-    """The record of one object with one stiffness."""
-    drop = Drop(case, given, how, options.device, options.quick)
-    start = given.get("height_m", given.get("survives_m"))
-    ladder = LADDER[1:-1:2] if options.quick else LADDER
-    most = options.points or (3e5 if options.device == "cpu" else 6e6)
-    estimate = drop.work(len(ladder)) + drop.work(4 * options.seeds)
-    sys.stdout.write(
-        f"{case.name}, {how} stiffness: dx {1e3 * drop.dx:.3g} mm, {drop.points} points each, "
-        f"wave {drop.material.wave_speed:.0f} m/s, about {estimate:.0f} s\n"
-    )
-    sys.stdout.flush()
+def search(drop: Drop, start: float, ladder: tuple[float, ...], seeds: int, most: float) -> None:
+    """Let specimens fall until those at two neighbouring heights are around one half.
+
+    Args:
+        drop: The object.
+        start: Height that the ladder is about [m].
+        ladder: Factors on it.
+        seeds: Specimens at each height of the second round.
+        most: Points in a call.
+    """
     factor = ladder[1] / ladder[0]
     drop.fall([(start * f, 0) for f in ladder], most)
     for _ in range(FURTHER):
         heights = sorted(f.height for f in drop.falls)
-        if not any(f.broken for f in drop.falls) and "height_m" in given:
+        if not any(f.broken for f in drop.falls):
             drop.fall([(heights[-1] * factor, 0)], most)
         elif all(f.broken for f in drop.falls):
             drop.fall([(heights[0] / factor, 0)], most)
         else:
             break
-    middle, *_ = median(drop.falls)
-    if middle is not None:
-        around = [middle * 2.0 ** (k / 2.0) for k in (-1.5, -0.5, 0.5, 1.5)]
-        everyone = range(options.seeds)
-        drop.fall([(h, s) for h in around for s in everyone], most)
-        for _ in range(FURTHER):
-            dense = [f for f in drop.falls if f.height in around]
-            middle, *_ = median(dense)
-            if middle is not None:
-                break
-            edge = (
-                min(around) / 2**0.5
-                if all(f.broken for f in dense if f.height == min(around))
-                or sum(f.broken for f in dense) * 2 >= len(dense)
-                else max(around) * 2**0.5
-            )
-            around.append(edge)
-            drop.fall([(edge, s) for s in everyone], most)
-    dense = [f for f in drop.falls if f.seed == 0] if middle is None else drop.falls
-    middle, low, high = median(dense)
-    gentle = min(start, middle or start) / 2.0
-    whole = [f for f in drop.falls if not f.broken and f.left and f.height <= 1.01 * gentle]
+    middle = median(drop.falls)[0]
+    if middle is None:
+        return
+    around = [middle * 2.0 ** (k / 2.0) for k in (-1.5, -0.5, 0.5, 1.5)]
+    for _ in range(1 + FURTHER):
+        drop.fall([(h, seed) for h in around for seed in range(seeds)], most)
+        dense = [f for f in drop.falls if f.height in around]
+        if median(dense)[0] is not None:
+            return
+        lowest = [f.broken for f in dense if f.height == min(around)]
+        down = 2 * sum(lowest) >= len(lowest)
+        around.append(min(around) / 2**0.5 if down else max(around) * 2**0.5)
+
+
+def study(
+    case: Case, given: dict[str, Any], how: str, options: argparse.Namespace
+) -> dict[str, Any] | None:
+    """The record of one object with one stiffness; None where only the work is asked for."""
+    drop = Drop(case, given, how, options.device, options.quick)
+    start = given.get("height_m", given.get("survives_m"))
+    ladder = LADDER[::2] if options.quick else LADDER
+    work = drop.work(len(ladder)) + drop.work(4 * options.seeds)
+    sys.stdout.write(
+        f"{case.name}, {how} stiffness: dx {1e3 * drop.dx:.3g} mm, {drop.points} points each, "
+        f"wave {drop.material.wave_speed:.0f} m/s, about {work:.0f} s\n"
+    )
+    sys.stdout.flush()
+    if options.estimate:
+        return None
+    most = options.points or (3e5 if options.device == "cpu" else 6e6)
+    search(drop, start, ladder, options.seeds, most)
+    middle, low, high = median(drop.falls)
+    gentle = 1.01 * min(start, middle or start) / 2.0
+    whole = [f for f in drop.falls if not f.broken and f.left and f.height <= gentle]
     whole = [f for f in whole if f.height == max(g.height for g in whole)]
-    row = {
+    return {
         "object": case.name, "stiffness": how, "device": name_of(options.device),
         "quick": options.quick, "seeds": options.seeds, "height": middle, "low": low,
         "high": None if math.isinf(high) else high,
         "restitution": sum(f.restitution for f in whole) / len(whole) if whole else None,
+        "restitution_at": whole[0].height if whole else None,
         "cells": round(2.0 * max(case.shape.half) / drop.dx), "dx": drop.dx,
         "points": drop.points, "mass": float(drop.material.density) * drop.body.volume,
         "kept": kept(drop.material, drop.dx),
@@ -342,7 +354,6 @@ def study(
         "seconds": drop.seconds, "verdicts": drop.verdicts,
         "falls": [dataclasses.asdict(f) for f in sorted(drop.falls, key=lambda f: f.height)],
     }  # fmt: skip
-    return row
 
 
 def name_of(device: str) -> str:
@@ -377,7 +388,7 @@ def ratio_cell(row: dict[str, Any], given: dict[str, Any]) -> str:
 def table(rows: list[dict[str, Any]], heights: dict[str, dict[str, Any]]) -> str:
     """Markdown: every object and stiffness."""
     head = ("object", "stiffness", "literature m (kind)", "ours m", "ratio", "restitution",
-            "literature", "broken mass below, above", "cells", "points", "kept", "steps",
+            "literature", "broken mass below, above", "parted", "cells", "points", "kept", "steps",
             "seconds")  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     order = {name: i for i, name in enumerate(heights)}
@@ -387,6 +398,7 @@ def table(rows: list[dict[str, Any]], heights: dict[str, dict[str, Any]]) -> str
         ever = [
             [f["ever"] for f in row["falls"] if f["broken"] == broken] for broken in (False, True)
         ]
+        parted = [f["parted"] for f in row["falls"] if f["broken"]]
         bounce = row["restitution"]
         soft = "real" if row["softening"] == 1.0 else f"1/{row['softening']:g}"
         cells = [
@@ -395,6 +407,7 @@ def table(rows: list[dict[str, Any]], heights: dict[str, dict[str, Any]]) -> str
             height_cell(row), ratio_cell(row, given), "-" if bounce is None else f"{bounce:.2f}",
             f"{given['restitution']:g}",
             ", ".join(f"{sum(e) / len(e):.1%}" if e else "-" for e in ever),
+            f"{sum(parted)} of {len(parted)}",
             str(row["cells"]), str(row["points"]), f"{row['kept']:.2f}", str(row["steps"]),
             f"{row['seconds']:.0f}",
         ]  # fmt: skip
@@ -420,6 +433,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--budget", type=float, help="begin no object after so many seconds")
     parser.add_argument("-o", "--output", type=Path, help="JSON lines; default: beside the page")
     parser.add_argument("--markdown", type=Path, default=PAGE, help="page to enter the table into")
+    parser.add_argument("--estimate", action="store_true", help="say the work, run nothing")
     parser.add_argument("--only-table", action="store_true", help="run nothing")
     options = parser.parse_args(arguments)
     if not 1 <= options.seeds <= 5:
@@ -444,11 +458,15 @@ def main(arguments: list[str] | None = None) -> int:
                 break
             report(i, len(todo), f"{name}, {how}")
             row = study(case_of(name, heights[name]), heights[name], how, options)
+            if row is None:
+                continue
             with output.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             sys.stdout.write(table([row], heights) + "\n")
             sys.stdout.flush()
         report(len(todo), len(todo), "")
+    if options.estimate:
+        return 0
     found = {(r["object"], r["stiffness"]): r for r in records(output)}
     page = options.markdown
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
