@@ -21,7 +21,7 @@ from gsfluent.data import Frame, Particles, Solid
 from gsfluent.data.regions import SOURCES, region_mask
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
-from gsfluent.pipeline.matter.brittle import brittle_rows
+from gsfluent.pipeline.matter.brittle import brittle_rows, distinct_rows
 from gsfluent.scene.parts import quaternion_to, turned
 from gsfluent.scene.scene import Body, Part, Scene
 
@@ -192,7 +192,7 @@ def build_matter(
         spacings.append((volume / count) ** (1 / 3))
         done += count
     everything = torch.cat([torch.cat(laws)[:, None].to(torch.float64), torch.cat(tables)], dim=1)
-    unique, row = torch.unique(everything, dim=0, return_inverse=True)
+    unique, row = distinct_rows(everything)
     particles = (
         Particles.cat(groups).replace(material=row.to(torch.int32)).validated("simulate").to(device)
     )
