@@ -494,11 +494,11 @@ def draw(rows: Sequence[Row]) -> None:
         save_png(figure, PICTURE)
 
 
-def page(lines: Path) -> int:
-    """Enter the tables into the page and draw the picture."""
-    rows = read(lines)
+def page(lines: Path, device: str) -> int:
+    """Enter the tables into the page and draw the picture, of the lines of a device."""
+    rows = [row for row in read(lines) if row["device"] == device]
     if not rows:
-        sys.stderr.write(f"{lines}: no lines; run without --page first\n")
+        sys.stderr.write(f"{lines}: no lines of {device}; run without --page first\n")
         return 1
 
     def of(*parts: str) -> list[Row]:
@@ -555,7 +555,7 @@ def main(argv: list[str] | None = None) -> int:
         args.cells = args.ball_cells = args.seed_cells = args.loose_cells = (12, 16)
         args.bench_cells, args.seeds, args.bench_seeds = (4, 5), 2, 3
     if args.page:
-        return page(args.out)
+        return page(args.out, args.device)
     todo = jobs(args)
     work = 0.0
     for job in todo:
@@ -570,7 +570,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.estimate:
         return 0
     run_all(todo, args.out, args.device)
-    return page(args.out) if args.out == LINES else 0
+    return page(args.out, args.device) if args.out == LINES else 0
 
 
 if __name__ == "__main__":

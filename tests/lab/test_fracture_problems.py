@@ -16,7 +16,7 @@ from gsfluent.lab.world import registry
 from gsfluent.lab.world.shapes import nacc
 
 FAST = (
-    "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",
+    "bar_energy", "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",
     "return_map_paths", "single_edge_notch", "softening_bar", "taylor_bar",
 )  # fmt: skip
 
