@@ -229,10 +229,14 @@ def thrown(name: str, radius: float, dx: float, per_cell: int) -> BenchScene:
         return torch.as_tensor(value, dtype=torch.float64).expand(_LEVELS)
 
     table, alpha = brittle_rows(preset, everywhere, weakness, dx)
+    young, poisson, density = (
+        float(torch.as_tensor(value).mean())
+        for value in (preset.young_modulus, preset.poisson_ratio, preset.density)
+    )
     rows = tuple(
         {
-            "law": "nacc", "young_modulus": float(preset.young_modulus),
-            "poisson_ratio": float(preset.poisson_ratio), "density": float(preset.density),
+            "law": "nacc", "young_modulus": young,
+            "poisson_ratio": poisson, "density": density,
             "friction": float(row[2]), "cohesion": float(row[3]), "hardening": float(row[4]),
             "shear_damage": float(row[5]), "alpha": float(start),
         }

@@ -93,8 +93,8 @@ def softening_energy(params: Tensor, alpha: float, *, steps: int = 400) -> float
     if not alpha < 0.0:
         raise ValueError(f"softening_energy: alpha must be negative, got {alpha}")
     row = params.detach().double().cpu().reshape(1, 8)
-    energy = softening_energies(row, torch.tensor([alpha], dtype=torch.float64), steps=steps)
-    if not math.isfinite(energy := float(energy)):
+    start = torch.tensor([alpha], dtype=torch.float64)
+    if not math.isfinite(energy := float(softening_energies(row, start, steps=steps))):
         kappa, beta, xi = (float(row[0, i]) for i in (1, 3, 4))
         raise ValueError(
             f"softening_energy: the strength is not lost on a path of 1.5 |alpha| = "
