@@ -11,6 +11,7 @@
 #include "core/material/return_mapping.h"
 #include "core/mvee/lens.h"
 #include "core/mvee/mvee.h"
+#include "core/raster/order_free.h"
 
 namespace py = pybind11;
 
@@ -135,6 +136,23 @@ void bind(py::module_ m) {
       },
       arg("points"), arg("tolerance") = 5e-4, arg("max_iterations") = 100,
       "(centre, shape) of the ellipsoid around one point set (core/mvee/mvee.h).");
+  m.def(
+      "order_free_sum",
+      [](const Array<T>& values, double bound, int64_t most) {
+        const T* v = expect(values, "values", {-1});
+        const OrderFreeUnits units = OrderFreeUnits::of(bound, most);
+        int64_t coarse = 0, fine = 0;
+        for (py::ssize_t i = 0; i < values.shape(0); ++i) {
+          int64_t c, f;
+          if (!units.split(double(v[i]), &c, &f))
+            throw std::invalid_argument("a value is not finite or above the bound");
+          coarse += c;
+          fine += f;
+        }
+        return units.value(coarse, fine);
+      },
+      arg("values"), arg("bound"), arg("most"),
+      "Sum of at most `most` values up to `bound`, in any order (core/raster/order_free.h).");
   m.def(
       "ball_lens",
       [](T r1, T r2, T distance) {

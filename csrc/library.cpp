@@ -78,14 +78,14 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
 
   // --- raster: Gaussian splatting ---
   // Returns image, alpha, depth, median depth, normal, contribution, radii, then what the adjoint
-  // needs: splats, order, tile_start, instances.
+  // needs: splats, order, tile_start, instances. `deterministic` is the adjoint's.
   m.def(
       "rasterize(Tensor means, Tensor opacities, Tensor viewmat, Tensor K, Tensor? quats, "
       "Tensor? scales, Tensor? covars, Tensor? sh, Tensor? colors, Tensor? background, "
       "Tensor? normals, Tensor? groups, Tensor? means2d_offset, Tensor? means2d_absgrad, "
       "int width, int height, bool antialiased, bool contribution, bool depth, "
-      "bool median_depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, "
-      "Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+      "bool median_depth, float near, float far, bool deterministic=False) -> (Tensor, Tensor, "
+      "Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   // Gradients of means, opacities, quats, scales, covars, sh, colors, background, normals,
   // means2d_offset, means2d_absgrad.
   m.def(
@@ -95,8 +95,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor opacities, Tensor viewmat, Tensor K, Tensor? quats, Tensor? scales, Tensor? covars, "
       "Tensor? sh, Tensor? colors, Tensor? background, Tensor? normals, Tensor? groups, "
       "Tensor? means2d_offset, Tensor? means2d_absgrad, int width, int height, bool antialiased, "
-      "bool depth, float near, float far) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, "
-      "Tensor, Tensor, Tensor, Tensor, Tensor)");
+      "bool depth, float near, float far, bool deterministic=False) -> (Tensor, Tensor, Tensor, "
+      "Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
 
   // --- density: occupancy of space by splats, and normals from its gradient ---
   m.def("splat_bulk(Tensor means, Tensor scales) -> Tensor");

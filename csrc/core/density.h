@@ -3,6 +3,7 @@
 // Cells are numbered z, y, x; values stand at cell centres and are zero outside the grid.
 #pragma once
 
+#include "core/raster/order_free.h"
 #include "core/raster/splat.h"
 
 namespace gsf {
@@ -27,6 +28,12 @@ struct DensityArgs {
   int nodes;       // cells along the finest level's side
   T full;          // splats in a cell that counts as full
   T* values;       // all levels, the finest first
+  int64_t* units;  // [nodes^3] zeros, for sums without an order (CUDA)
+
+  // Whole numbers that a weight of one is worth: `count` of them fit.
+  GSF_HOST_DEVICE double per_weight() const {
+    return double(int64_t(1) << (62 - bits_above(count)));
+  }
 };
 
 template <typename T>
@@ -47,7 +54,9 @@ struct BulkArgs {
   int64_t count;
   const T *means, *scales;  // [N, 3] each
   double* out;              // [kBulkSize]
+  double* shares;           // [kBulkShares, kBulkSums], for sums in one order (CUDA)
 };
+constexpr int kBulkShares = 512;  // blocks at most
 
 // Sums of a cloud of splats over those with finite numbers: how many, centre, squared distance from
 // the origin of the coordinates, the three scales. What comes out: centre x, y, z, root mean square

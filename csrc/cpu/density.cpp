@@ -10,6 +10,7 @@ namespace {
 
 struct DensityCpu {
   using Scope = CpuScope;
+  static constexpr bool kShares = false;
   template <typename T>
   static void occupancy(const DensityArgs<T>& a, const Scope&) {
     const int64_t n = a.nodes, layer = n * n;

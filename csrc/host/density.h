@@ -11,6 +11,7 @@ inline void check_density_nodes(const char* op, int64_t nodes) {
                   ": nodes must be a multiple of 16 up to 1024, got ", nodes);
 }
 
+// A backend says whether it needs room for `units` and `shares` (kShares).
 template <class Backend>
 struct DensityOps {
   static Tensor occupancy(Tensor means, Tensor frame, int64_t nodes, double full) {
@@ -22,10 +23,12 @@ struct DensityOps {
     const int side = static_cast<int>(nodes);
     Tensor values =
         gsf::new_zeros(means, {density_level(side, kDensityLevels)}, means.scalar_type());
+    const int64_t cells = Backend::kShares ? nodes * nodes * nodes : 0;
+    Tensor units = gsf::new_zeros(means, {cells}, ScalarType::Long);
     const typename Backend::Scope scope(means);
     dispatch_floating(op, means, [&]<typename T>() {
-      const DensityArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(frame),
-                                side,          T(full),        mptr<T>(values)};
+      const DensityArgs<T> args{means.size(0), cptr<T>(means),  cptr<T>(frame),      side,
+                                T(full),       mptr<T>(values), mptr<int64_t>(units)};
       Backend::occupancy(args, scope);
     });
     return values;
@@ -36,9 +39,12 @@ struct DensityOps {
     means = ready(op, "means", means, means, {-1, 3});
     scales = ready(op, "scales", scales, means, {means.size(0), 3});
     Tensor out = gsf::new_zeros(means, {kBulkSize}, ScalarType::Double);
+    Tensor shares =
+        gsf::new_empty(means, {Backend::kShares ? kBulkShares * kBulkSums : 0}, ScalarType::Double);
     const typename Backend::Scope scope(means);
     dispatch_floating(op, means, [&]<typename T>() {
-      const BulkArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(scales), mptr<double>(out)};
+      const BulkArgs<T> args{means.size(0), cptr<T>(means), cptr<T>(scales), mptr<double>(out),
+                             mptr<double>(shares)};
       Backend::splat_bulk(args, scope);
     });
     return out;

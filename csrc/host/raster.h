@@ -143,7 +143,7 @@ struct RasterOps {
                            OptTensor colors, OptTensor background, OptTensor normals,
                            OptTensor groups, OptTensor offset, OptTensor absolute, int64_t width,
                            int64_t height, bool antialiased, bool contribution, bool depth,
-                           bool median_depth, double near, double far) {
+                           bool median_depth, double near, double far, bool) {
     RasterInputs in{means, opacities, viewmat,    intrinsics, quats,  scales, covars,
                     sh,    colors,    background, normals,    groups, offset, absolute};
     prepare_raster_inputs(in);
@@ -202,7 +202,7 @@ struct RasterOps {
       Tensor intrinsics, OptTensor quats, OptTensor scales, OptTensor covars, OptTensor sh,
       OptTensor colors, OptTensor background, OptTensor normals, OptTensor groups, OptTensor offset,
       OptTensor absolute, int64_t width, int64_t height, bool antialiased, bool has_depth,
-      double near, double far) {
+      double near, double far, bool deterministic) {
     RasterInputs in{means, opacities, viewmat,    intrinsics, quats,  scales, covars,
                     sh,    colors,    background, normals,    groups, offset, absolute};
     prepare_raster_inputs(in);
@@ -281,6 +281,7 @@ struct RasterOps {
       b.grad_normals = in.normals ? mptr<T>(std::get<8>(out)) : nullptr;
       b.grad_offset = in.offset ? mptr<T>(std::get<9>(out)) : nullptr;
       b.grad_absolute = in.absolute ? mptr<T>(std::get<10>(out)) : nullptr;
+      b.deterministic = deterministic;
       Backend::template backward<T>(b, like, scope);
       return out;
     });

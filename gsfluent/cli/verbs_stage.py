@@ -58,6 +58,8 @@ class Reconstruct(Verb):
     """PSNR in dB on the photographs that is enough; Gaussians are added only below it."""
     exposure: bool | None = None
     """Learn an affine colour change per photograph."""
+    deterministic: bool | None = None
+    """The same bits from the same photographs on the same GPU, for some time."""
     keep_background: bool = False
     """Keep what does not belong to the object."""
 
@@ -76,7 +78,7 @@ class Reconstruct(Verb):
                 progress=progress,
                 **self.given("iterations", "max_gaussians", "kernel", "scale_regularization"),
                 **self.given("image_size", "sh_degree", "recipe", "densify", "target_psnr"),
-                **self.given("exposure"),
+                **self.given("exposure", "deterministic"),
             )
 
 

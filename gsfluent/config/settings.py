@@ -102,6 +102,12 @@ class ReconstructSettings(Section):
         "32",
     )
     exposure: bool | None = optional(flag, "Learn an affine colour change per photograph.", "true")
+    deterministic: bool | None = optional(
+        flag,
+        "The same bits from the same photographs on the same GPU, for some time; a CPU gives them "
+        "anyway.",
+        "true",
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -112,6 +112,7 @@ def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
     if law == "nacc":
         strength, cohesion = slope, at("cohesion")
         hardening, damage = at("hardening"), at("shear_damage")
+        exponent = 1.0 - at("restitution") ** 2  # of the energy, csrc/core/material/loss.h
     elif law == "drucker_prager":
         # |dev tau| = sqrt(2/3) q = 3 alpha_DP p
         strength, cohesion = math.sqrt(2.0 / 27.0) * slope, at("cohesion_pressure")

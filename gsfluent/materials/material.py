@@ -268,6 +268,16 @@ class Material:
         return float((0.5 * torch.log1p(2.0 * beta * ratio.clamp(max=0.495))).min())
 
     @property
+    def breaking_speed(self) -> float:
+        """Speed of the slowest strike that starts to break it [m/s]; infinite when none does.
+
+        ``wave_speed * failure_strain``: a strike at v strains what it meets by v / c in one
+        dimension (docs/theory/fracture.md): right to an order of magnitude, since an edge or a
+        corner gathers strain and a soft thing spreads it.
+        """
+        return self.wave_speed * self.failure_strain if self.law == "nacc" else math.inf
+
+    @property
     def start_alpha(self) -> Field:
         """State ``alpha`` of a fresh point: ``alpha0`` for nacc, else 0 or, unused, -1."""
         found = self.start_alphas(_tensor)

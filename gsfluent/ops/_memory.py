@@ -40,6 +40,7 @@ class Arguments(NamedTuple):
     median_depth: bool
     near: float
     far: float
+    deterministic: bool
 
 
 def available_memory() -> int | None:

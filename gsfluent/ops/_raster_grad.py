@@ -21,6 +21,7 @@ _NUMBERS = (
     "median_depth",
     "near",
     "far",
+    "deterministic",
 )
 # Outputs with a gradient; the adjoint wants them, and the last four, back.
 _IMAGE, _ALPHA, _DEPTH, _NORMAL = 0, 1, 2, 4
@@ -32,8 +33,8 @@ _WITH_GRADIENT = (0, 1, 4, 5, 6, 7, 8, 9, 10, 12, 13)
 def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     """Keep what the adjoint needs."""
     ctx.save_for_backward(*[output[k] for k in _DIFFERENTIABLE], *output[7:], *inputs[:_TENSORS])
-    width, height, antialiased, _, depth, _, near, far = inputs[_TENSORS:]
-    ctx.numbers = (width, height, antialiased, depth, near, far)
+    width, height, antialiased, _, depth, _, near, far, deterministic = inputs[_TENSORS:]
+    ctx.numbers = (width, height, antialiased, depth, near, far, deterministic)
     ctx.mark_non_differentiable(*[t for k, t in enumerate(output) if k not in _DIFFERENTIABLE])
     ctx.set_materialize_grads(False)
 

@@ -57,11 +57,13 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
         wrong = ~torch.isfinite(params) | (params < 0)
         # Without bulk stiffness there is no pressure; a rigid body needs none.
         wrong[:, 1] |= (params[:, 1] == 0) & (law != LAWS["rigid"])
-        wrong[:, 7] |= (params[:, 7] > 0) & (params[:, 7] < 1)  # the energy needs gamma >= 1
+        fluid, nacc = law == LAWS["fluid"], law == LAWS["nacc"]
+        wrong[:, 7] |= fluid & (params[:, 7] > 0) & (params[:, 7] < 1)  # energy needs gamma >= 1
+        wrong[:, 7] |= nacc & (params[:, 7] > 1)  # a loss
         if bool(wrong.any()):
             _checked.pop(given, None)
             row, column = (int(i) for i in wrong.nonzero()[0])
-            need = {1: "positive and finite", 7: "0 or at least 1"}
+            need = {1: "positive and finite", 7: "0 or at least 1 (fluid), 0 to 1 (nacc)"}
             raise ValueError(
                 f"{op}: params[{row}] {PARAM_COLUMNS[column]} must be "
                 f"{need.get(column, 'finite and not negative')}, got {float(params[row, column]):g}"
@@ -96,6 +98,38 @@ def check_params(op: str, law: Tensor, params: Tensor) -> None:
         ValueError: An unknown law, or a parameter out of its range.
     """
     _check_values(op, law, params, None)
+
+
+SLOW_UNLOADING = 60.0
+"""Cells that a wave crosses while slow unloading begins to lose (``kSlowUnloading``)."""
+
+
+def unloading_share(
+    stress: Tensor, affine: Tensor, *, law: Tensor, params: Tensor, material: Tensor, dx: float
+) -> Tensor:
+    """Share of the stress of points that acts while they give back what they stored, [N].
+
+    What ``csrc/core/material/loss.h`` does in the resident solver, for the composed operators.
+
+    Args:
+        stress: Kirchhoff stress [Pa], [N, 6].
+        affine: Velocity gradient [1/s], [N, 3, 3].
+        law: Law of each row, int32 [M].
+        params: Parameters of each row, [M, 8]; column 7 of NACC is the loss, 1 - e^2.
+        material: Row of each point, int32 [N].
+        dx: Node spacing [m].
+    """
+    row = material.long()
+    loss = torch.where(law == LAWS["nacc"], params[:, 7], 0.0)[row]
+    modulus = params[:, 1] + 4.0 / 3.0 * params[:, 0]
+    pace = (SLOW_UNLOADING * dx * (params[:, 6] * modulus).sqrt())[row]
+    xx, yy, zz, xy, xz, yz = stress.unbind(dim=1)
+    size = xx**2 + yy**2 + zz**2 + 2.0 * (xy**2 + xz**2 + yz**2) + 1e-30
+    rate = affine + affine.transpose(1, 2)
+    power = 0.5 * (xx * rate[:, 0, 0] + yy * rate[:, 1, 1] + zz * rate[:, 2, 2])
+    power = power + xy * rate[:, 0, 1] + xz * rate[:, 0, 2] + yz * rate[:, 1, 2]
+    pressed = (-(xx + yy + zz) / size.sqrt()).clamp(0.0, 1.0)
+    return 1.0 - loss * pressed * (-pace * power / size).clamp(0.0, 1.0)
 
 
 def weakened(law: Tensor, params: Tensor, material: Tensor, peak: Tensor) -> tuple[Tensor, Tensor]:

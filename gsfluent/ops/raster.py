@@ -78,6 +78,7 @@ def rasterize(
     median_depth: bool = False,
     near: float = 0.01,
     far: float = 1e6,
+    deterministic: bool = False,
 ) -> Rendered:
     """Render 3D Gaussians by depth-sorted EWA splatting.
 
@@ -121,6 +122,9 @@ def rasterize(
         median_depth: Also return the median depth.
         near: Nearest camera z that is drawn [world units], positive.
         far: Farthest camera z that is drawn [world units].
+        deterministic: Give the same bits of the gradients in every run on a GPU too, for some time
+            and 16 bytes per splat and sum (docs/measured/deterministic.md). Also on while
+            ``torch.use_deterministic_algorithms`` is.
 
     Returns:
         The images and per-Gaussian figures, see :class:`Rendered`.
@@ -134,8 +138,8 @@ def rasterize(
 
     Gradient: with respect to means, opacities, quats, scales, covars, sh, colors, background,
         normals, means2d_offset and means2d_absgrad, from image, alpha, depth and normal.
-    Determinism: bit-identical on the CPU for any number of threads; on CUDA the gradients' sums are
-        reordered by atomics.
+    Determinism: bit-identical on the CPU for any number of threads; on CUDA everything but the
+        gradients, whose sums are reordered by atomics unless ``deterministic``.
     Source: Kerbl et al. 2023 (3D Gaussian Splatting), Zwicker et al. 2001 (EWA), Yu et al. 2024
         (Mip-Splatting, the antialiased mode), Ye et al. 2024 (AbsGS, the absolute gradients);
         conventions in docs/theory/rasterizer.md.
@@ -163,6 +167,7 @@ def rasterize(
         median_depth,
         near,
         far,
+        deterministic or torch.are_deterministic_algorithms_enabled(),
     )
     if torch.compiler.is_compiling():
         outputs = torch.ops.gsfluent.rasterize(*_checked(arguments))
@@ -262,6 +267,7 @@ def _checked(a: Arguments) -> Arguments:
         median_depth=bool(a.median_depth),
         near=float(a.near),
         far=float(a.far),
+        deterministic=bool(a.deterministic),
     )
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsfluent._check import check_tensor
 from gsfluent.ops import solver_buffers as layout
-from gsfluent.ops.plasticity import return_mapping, weakened
+from gsfluent.ops.plasticity import SLOW_UNLOADING, return_mapping, weakened
 from gsfluent.ops.solver_buffers import INDEX
 
 UNBROKEN = -1.0
@@ -54,7 +54,10 @@ class SolverState:
     def _rows(
         self, material: Tensor | None, mass: Tensor, volume: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows of (parameters, mass, volume) that occur, and the row of each point."""
+        """Rows of (parameters, mass, volume) that occur, and the row of each point.
+
+        Columns after the parameters: ``csrc/core/solver/state.h``.
+        """
         n, count = self.count, self._law.shape[0]
         if material is None:
             material = torch.zeros(n, dtype=torch.int32, device=self.device)
@@ -70,8 +73,10 @@ class SolverState:
             )
         which = unique[:, 0].long()
         density = self._params[which, 6:7].double().clamp(min=1e-30)
+        mu, kappa = self._params[which, 0].double(), self._params[which, 1].double()
+        pace = SLOW_UNLOADING * (density[:, 0] * (kappa + 4.0 / 3.0 * mu)).sqrt() * self.dx
         derived = torch.cat([1.0 / density, 4.0 * unique[:, 2:] / self.dx**2], dim=1)
-        numbers = torch.cat([unique[:, 1:], derived], dim=1)
+        numbers = torch.cat([unique[:, 1:2], pace[:, None], derived], dim=1)
         rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
         return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
 

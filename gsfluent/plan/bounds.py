@@ -112,7 +112,7 @@ def fragment_size(body: Body, strike: float) -> float | None:
     material = body.material
     if material.law != "nacc" or strike <= 0.0:
         return None
-    limit = material.wave_speed * material.failure_strain
+    limit = material.breaking_speed
     if not math.isfinite(limit) or strike <= limit:
         return None
     return float(body.volume ** (1 / 3) * (limit / strike) ** (2 / 3))

@@ -183,16 +183,12 @@ def intact_blocks(body: Body, dx: float) -> float:
 
 def limit_of(body: Body) -> float:
     """Least speed [m/s] of a strike that takes a body apart; infinite for what holds together."""
-    materials = [body.material, *(part.material(body.material) for part in body.parts)]
-    laws = {material.law for material in materials}
-    if laws & {"fluid", "drucker_prager"}:
-        return 0.0
-    return min(material.wave_speed * material.failure_strain for material in materials)
+    laws = {material.law for material in body.materials}
+    return 0.0 if laws & {"fluid", "drucker_prager"} else body.breaking_speed
 
 
 def _fastest(body: Body) -> float:
-    parts = [part.material(body.material).wave_speed for part in body.parts]
-    return max([body.material.wave_speed, *parts])
+    return max(material.wave_speed for material in body.materials)
 
 
 def _body(number: int, body: Body, gravity: Tensor) -> Mover:

@@ -18,6 +18,7 @@ import torch
 from gsfluent.config import Shot
 from gsfluent.pipeline.matter.points import MAX_PARTICLES, POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
+from gsfluent.pipeline.solid.walls import WALL_CELLS
 from gsfluent.plan.bounds import THIN_CELLS, bounds_of, budget_spacing, choose_cells, thickness
 from gsfluent.plan.cost import Cost, CostModel, memory_of
 from gsfluent.plan.fact import STAGES
@@ -40,6 +41,7 @@ from gsfluent.plan.work import (
 )
 from gsfluent.progress import Progress
 from gsfluent.scene.scene import Scene
+from gsfluent.stages.findings import cells_for, setting
 from gsfluent.stages.simulate import build_scene
 
 
@@ -287,19 +289,22 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
         if body.solid is None:
             continue
         mover = movers[number]
-        limit = body.material.wave_speed * body.material.failure_strain
+        limit = body.breaking_speed
         if math.isfinite(limit) and 0.0 < mover.speed < limit and not mover.driven:
+            weakest = min(body.materials, key=lambda material: material.breaking_speed)
             found.append(
-                f"{body.name}: meets something at {mover.speed:.2g} m/s, but {body.material.name} "
+                f"{body.name}: meets something at {mover.speed:.2g} m/s, but {weakest.name} "
                 f"breaks from about {limit:.2g} m/s; hint: raise the drop or lower cohesion"
             )
         thin = thickness(body)
         if thin < THIN_CELLS * dx:
-            cells = math.ceil(QUALITY["preview"] * THIN_CELLS * dx / thin)
+            wall = cells_for(scene, thin / WALL_CELLS)
+            breaks = f"{setting(wall)} lets it break as a wall ({WALL_CELLS:g} cells), "
             found.append(
-                f"{body.name}: {1000 * thin:.3g} mm at its thinnest, under {THIN_CELLS:g} cells of "
-                f"{1000 * dx:.3g} mm; hint: a finer solve.quality, or solve.cells: "
-                f"{math.ceil(cells * _cells(scene, dx) / QUALITY['preview'])}"
+                f"{body.name}: {1000 * thin:.3g} mm at its thinnest, {thin / dx:.2g} cells of "
+                f"{1000 * dx:.3g} mm, under {THIN_CELLS:g}; hint: "
+                f"{breaks if thin < WALL_CELLS * dx else ''}"
+                f"{setting(cells_for(scene, thin / THIN_CELLS))} lets it bend"
             )
     if outlook.grid_seconds <= 0.0:
         found.append(
@@ -308,8 +313,3 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
     if "nacc" not in laws_of(scene) and any(e.__class__.__name__ == "Bullet" for e in shot.events):
         found.append("nothing is brittle, so the bullet breaks nothing; hint: another material")
     return found
-
-
-def _cells(scene: Scene, dx: float) -> float:
-    """Cells along the largest body at a spacing."""
-    return grid_spacing(scene, 1) / dx

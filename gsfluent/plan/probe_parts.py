@@ -25,7 +25,8 @@ from gsfluent.plan.cost import LAW_SETS, framing, law_set, stepping
 from gsfluent.plan.fit import Sample, fit
 from gsfluent.results.frames import save_frame
 from gsfluent.scene.scene import Scene
-from gsfluent.stages.simulate import saved, thin_walls
+from gsfluent.stages.findings import thin_walls
+from gsfluent.stages.simulate import saved
 
 _STEPS = 48
 _WARM = 8

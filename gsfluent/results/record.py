@@ -40,6 +40,8 @@ class RunRecord:
         simulation = self.values["simulation"] or {}
         verdict = simulation.get("verdict", CLEAN)
         reason = simulation.get("reason") or "every stage finished, nothing had to be healed"
+        # sound, and still not what was wanted: whoever reads the verdict reads that too
+        reason = "; ".join([reason, *(simulation.get("notes") or [])])
         return self._write(verdict, reason, stages)
 
     def fail(self, error: BaseException, stages: list[StageResult]) -> dict[str, Any]:

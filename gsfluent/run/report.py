@@ -57,7 +57,11 @@ def report_page(out: Path, values: Values) -> Page:
     """Make the page; sections of which the run says nothing are left out."""
     page = Page(out.resolve().name, f"gsfluent {values.get('version', '')} on {values['device']}")
     verdict = str(values["verdict"])
-    page.text(f"{verdict}: {values.get('reason', '')}", kind=_KINDS.get(verdict, ""))
+    simulation = values.get("simulation") or {}
+    notes = simulation.get("notes") or []  # the reason names them too
+    kind = "warn" if verdict == "clean" and notes else _KINDS.get(verdict, "")
+    page.text(f"{verdict}: {values.get('reason', '')}", kind=kind)
+    _unbroken(page, simulation.get("unbroken") or [])
     outputs = values.get("outputs") or {}
     if (video := outputs.get("video")) and (out / video).is_file():
         page.video(video, "the shot as it was asked for")
@@ -66,7 +70,6 @@ def report_page(out: Path, values: Values) -> Page:
     _summary(page, values)
     _choice(page, out, values)
     _plan(page, values.get("plan"))
-    simulation = values.get("simulation") or {}
     _motion(page, simulation.get("per_frame") or {}, simulation)
     _pictures(page, values)
     _stages(page, values.get("stages") or [])
@@ -77,7 +80,7 @@ def report_page(out: Path, values: Values) -> Page:
 def _summary(page: Page, values: Values) -> None:
     simulation, render = values.get("simulation") or {}, values.get("render") or {}
     reconstruction = values.get("reconstruction") or {}
-    fragments = (simulation.get("per_frame") or {}).get("fragments") or []
+    frames = simulation.get("per_frame") or {}
     rows = [
         ("held-out PSNR of the photographs [dB]", reconstruction.get("psnr")),
         ("Gaussians", reconstruction.get("gaussians")),
@@ -85,7 +88,10 @@ def _summary(page: Page, values: Values) -> None:
         ("cell of the grid [m]", simulation.get("dx")),
         ("time steps", simulation.get("substeps")),
         ("shortest and longest step [s]", _pair(simulation, "dt_min", "dt_max")),
-        ("pieces at the end", fragments[-1] if fragments else None),
+        ("pieces at the end", _last(frames, "pieces", "fragments")),
+        ("pieces over 1 % of the mass", _last(frames, "pieces_over_1_percent")),
+        ("share of the mass ever broken", _last(frames, "broken_fraction")),
+        ("share of the mass loose at the end", _last(frames, "loose_fraction")),
         ("rollbacks", simulation.get("rollbacks")),
         ("largest error of momentum", simulation.get("momentum_error")),
         ("rendered frames", render.get("frames")),
@@ -94,6 +100,20 @@ def _summary(page: Page, values: Values) -> None:
     kept = [row for row in rows if row[1] not in (None, "")]
     if kept:
         page.heading("In short").table(["figure", "value"], kept)
+
+
+def _unbroken(page: Page, rows: Sequence[Values]) -> None:
+    """What was struck and stayed whole."""
+    if rows:
+        page.heading("Nothing broke")
+        names = ("body", "material", "met", "speed", "speed_needed")
+        head = ["struck", "weakest material", "by", "speed [m/s]", "breaks from about [m/s]"]
+        page.table(head, [[row.get(name) for name in names] for row in rows])
+
+
+def _last(frames: Values, *names: str) -> Any:
+    """The value of the last frame under the first of these names that the run has kept."""
+    return next((frames[name][-1] for name in names if frames.get(name)), None)
 
 
 def _pair(values: Values, first: str, second: str) -> str:
@@ -183,14 +203,18 @@ def _motion(page: Page, frames: Values, simulation: Values) -> None:
         Panel(
             "Damage", "share of the matter",
             {"broken": frames.get("damaged_fraction", []),
+             "ever broken": frames.get("broken_fraction", []),
+             "loose": frames.get("loose_fraction", []),
              "largest piece": frames.get("largest_fragment", [])},
         ),
         Panel(
             "Pieces", "count",
-            {"all": frames.get("fragments", []),
+            {"all": frames.get("pieces") or frames.get("fragments", []),
+             "over 1 % of the matter": frames.get("pieces_over_1_percent", []),
              "over 3 % of the matter": frames.get("fragments_over_3_percent", [])},
             whole=True,
         ),
+        Panel("Grid", "blocks in use", {"blocks": frames.get("active_blocks", [])}, whole=True),
     ]  # fmt: skip
     _curves(page, "Motion", time, "time [s]", panels, "dashed: the largest value that passes")
 

@@ -137,6 +137,16 @@ class Body:
             return math.pi * self.radius**2 * self.length
         return 4.0 / 3.0 * math.pi * self.radius**3
 
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """Its material and those of its parts."""
+        return (self.material, *(part.material(self.material) for part in self.parts))
+
+    @property
+    def breaking_speed(self) -> float:
+        """Speed of the slowest strike that starts to break its weakest part [m/s], or infinity."""
+        return min(material.breaking_speed for material in self.materials)
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Return the lowest and highest scene coordinates of the matter [m], each float64 [3]."""
         offset = torch.tensor(self.offset, dtype=torch.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,20 @@ from torch import Tensor
 
 from gsfluent import materials
 from gsfluent.config import COLLIDERS, EVENTS, ColliderSettings, ObjectSettings, Shot, typed_dict
-from gsfluent.data import SURFACE, Frame, Gaussians, Solid
+from gsfluent.data import Frame, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
-from gsfluent.pipeline.solid.field import SignedDistance
-from gsfluent.pipeline.solid.walls import thin_shells
 from gsfluent.results.frames import SavedFrame, count_frames, save_frame
 from gsfluent.results.store import content_digest
 from gsfluent.scene.scene import Body, Scene
 from gsfluent.stages.context import RunContext
+from gsfluent.stages.findings import notes_of, summary, thin_walls
 from gsfluent.stages.solids import load_solids
+from gsfluent.stages.strikes import FILE as STRIKES
+from gsfluent.stages.strikes import Strikes
 
 _log = logging.getLogger(__name__)
 _STATE = "state.pt"
@@ -133,11 +135,22 @@ def simulate_stage(context: RunContext) -> None:
             progress=context.reporter.task("simulate"),
             resume=resume,
         )
+        # before the work: who must take a finer grid learns it while there is something to save
+        thin = thin_walls(scene, frames.run.matter.dx)
+        if resume is None:
+            (folder / STRIKES).unlink(missing_ok=True)  # of other settings
+        strikes = Strikes(scene, frames.run.matter, folder)
         for frame in frames:
             save_frame(folder, saved(frame, scene))
+            strikes.see(frame)
             # after the frame: a state on disk always has its picture
             frames.save(state)
-        return frames.report | {"thin": thin_walls(scene, frames.run.matter.dx)}
+        unbroken, report = strikes.unbroken(), frames.report
+        notes = notes_of(thin, unbroken, math.hypot(*scene.gravity))
+        for note in notes[-len(unbroken) :] if unbroken else ():
+            _log.warning("%s", note)
+        _log.info("simulate: %s", summary(report["per_frame"]))
+        return report | {"thin": thin, "unbroken": unbroken, "notes": notes}
 
     report = context.do("simulate", work, settings, section="simulation").report
     fill = context.record.values["fill"]
@@ -145,32 +158,6 @@ def simulate_stage(context: RunContext) -> None:
     for name in ("particles", "particles_per_cell"):
         if name in report and name not in fill:
             fill[name] = report[name]
-
-
-def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
-    """Walls that the grid cannot carry, by body, in scene metres; a warning for each with some."""
-    found = {}
-    for body in scene.bodies:
-        if body.solid is None:
-            continue
-        scale, splats = body.frame.scale, body.solid.gaussians
-        assert splats.labels is not None  # a solid has labels
-        skin = splats.select(splats.labels.eq(SURFACE))
-        field = SignedDistance.of_solid(body.solid)
-        report = thin_shells(
-            field.replace(values=field.values * scale, voxel=field.voxel * scale),
-            dx,
-            gaussian_size=scale * float(skin.scales.amax(1).median()) if skin.count else None,
-            unit=" m",
-        )
-        if report["middle"] is not None:
-            # measured from the corner of the grid, in metres
-            local = torch.tensor(report["middle"]) - field.origin
-            report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
-        if report["warning"]:
-            _log.warning("%s: %s; hint: %s", body.name, report["warning"], report["hint"])
-        found[body.name] = report
-    return found
 
 
 def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:

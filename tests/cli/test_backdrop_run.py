@@ -56,7 +56,7 @@ def test_the_table_stays_in_the_picture(ball_on_table: Path, tmp_path: Path) -> 
     }  # fmt: skip
     assert record["isolation"]["gaussians_removed"] > 1000
     thin = record["simulation"]["thin"]["ball"]
-    assert thin["limit"] == pytest.approx(2 * record["simulation"]["dx"]) and thin["share"] < 0.2
+    assert thin["limit"] == pytest.approx(3 * record["simulation"]["dx"]) and thin["share"] < 0.2
 
 
 def test_a_backdrop_that_is_not_there_is_refused(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -66,13 +67,17 @@ def test_it_measures_once_and_on_request(
 def test_the_tables_say_what_binds_and_what_to_mend(
     shot: Path, measured: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
+    # too slow for the rind too, which is the weakest part: 0.28 m/s would do, 0.24 is what it gets
+    shot.write_text(shot.read_text().replace("height: 0.01", "height: 0.003"))
     assert main(["plan", str(shot), "--device", "cpu"]) == 0
     text = capsys.readouterr().out
     for line in ("passes", "bounds of dx: ", "stages", "warnings", "in all"):
         assert f"\n{line}" in text or f"\n  {line}" in text, line
     assert "  +  damage variable" in text and "  -  blades" in text
-    assert "breaks from about" in text and "hint: raise the drop" in text
-    assert "hint: a finer solve.quality, or solve.cells: " in text
+    assert "watermelon/rind breaks from about 0.28 m/s" in text and "hint: raise the drop" in text
+    # how many cells the thinnest part has, and how many make it bend
+    assert re.search(r"thinnest, [\d.]+ cells of [\d.]+ mm, under 4; hint: .*solve.cells: ", text)
+    assert " lets it bend" in text
 
 
 def test_wrong_words_and_shots_measure_nothing(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 
 import numpy as np
@@ -106,3 +107,34 @@ def test_errors_name_the_argument() -> None:
         )
     with pytest.raises(ValueError, match="at least one point"):
         core.float64.mvee(np.zeros((0, 3)))
+
+
+def test_sums_have_no_order() -> None:
+    """The same bits in any order, as near the exact sum as doubles are, far below the bound too."""
+    rng = np.random.default_rng(2)
+    values = rng.standard_normal(5000) * 10.0 ** rng.uniform(-16, 0, 5000)
+    values = values.astype(np.float32).astype(np.float64)
+    bound = 1e3 * np.abs(values).max()  # a loose one
+    sums = {
+        core.float64.order_free_sum(rng.permutation(values), bound, most)
+        for most in (5000, 8192)
+        for _ in range(5)
+    }
+    exact = math.fsum(values)
+    assert len(sums) == 1  # every addend of float32 is held exactly
+    assert sums.pop() == pytest.approx(exact, rel=1e-15)
+
+
+def test_order_free_sums_reach_their_bound_and_refuse_what_is_above() -> None:
+    for most in (1, 2, 4096, 1 << 26):
+        count = min(most, 4096)
+        for bound in (1e-30, 1.0, 2.0, 3e38):
+            full = np.full(count, bound)
+            total = core.float64.order_free_sum(full, bound, most)
+            assert total == pytest.approx(count * bound, rel=2**-35 / most + 1e-15)
+            total = core.float64.order_free_sum(np.concatenate([full, -full]), bound, 2 * most)
+            assert total == 0.0
+    assert core.float64.order_free_sum(np.zeros(3), 0.0, 3) == 0.0
+    for wrong in (np.nan, np.inf, -np.inf, 2.5):
+        with pytest.raises(ValueError, match="not finite or above"):
+            core.float64.order_free_sum(np.array([1.0, wrong]), 1.0, 2)

@@ -72,6 +72,19 @@ def test_cpu_sums_do_not_depend_on_threads(threads: int) -> None:
         torch.set_num_threads(before)
 
 
+@pytest.mark.cuda
+def test_gpu_sums_have_no_order() -> None:
+    """The same bits in every run, and of occupancy for any order of the splats."""
+    means, _, scales = (t.float().cuda() for t in splats(150_000))
+    order = torch.randperm(len(means), generator=torch.Generator().manual_seed(5)).cuda()
+    place = frame().float().cuda()
+    want, bulk = occupancy(means, place, NODES, full=0.8), splat_bulk(means, scales)
+    for _ in range(4):
+        assert torch.equal(occupancy(means, place, NODES, full=0.8), want)
+        assert torch.equal(occupancy(means[order], place, NODES, full=0.8), want)
+        assert splat_bulk(means, scales) == bulk
+
+
 def test_every_level_holds_the_same_matter() -> None:
     means, _, _ = splats()
     means = means[(means.abs() < 1.3).all(dim=1)]  # the outermost cell centres stand at 1.39

@@ -83,6 +83,25 @@ def test_whole_numbers_hold_what_points_give(spread: float, speed: float) -> Non
         assert bool(((sums.fixed - sums.exact).sum(dim=0).abs() < 1e-7 * scale).all())
 
 
+@pytest.mark.parametrize("slow", [1.0, 1e-3, 1e-5, 1e-7, 1e-9])
+@pytest.mark.parametrize("light", [1.0, 1e-6])
+def test_who_takes_a_point_changes_no_sum(slow: float, light: float) -> None:
+    """Two CTAs share a home, and which takes a point is chance: their halves add up exactly."""
+    given = points(1.0, 3.0)
+    half = given["position"][:, 0] > 2.5 * DX  # a part of the body is slower, a part lighter
+    for name in ("velocity", "affine", "strain"):
+        given[name][half] *= slow
+    given["mass"][half] *= light
+    given["volume"][half] *= light
+    t, clock = primed(given)
+    units = clock["momentum_unit"], clock["mass_unit"]
+    whole = fixed.node_sums(t, *units)
+    for seed in range(3):
+        chance = torch.Generator().manual_seed(seed)
+        part = torch.randint(2, t.home.shape, generator=chance)
+        assert torch.equal(fixed.node_sums(t, *units, part).fixed, whole.fixed)
+
+
 @pytest.mark.parametrize("spread", [1.0, 1e6])
 @pytest.mark.parametrize("speed", [1e-6, 3.0, 4e4])
 def test_the_clock_knows_the_largest_addend(spread: float, speed: float) -> None:

@@ -45,6 +45,24 @@ def test_what_was_measured_stands_there(tmp_path: Path) -> None:
     assert text.count("<svg") == 1 and "<video" not in text and "Plan against fact" not in text
 
 
+def test_what_broke_is_drawn_and_told_where_the_run_has_kept_it(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    old = report_page(tmp_path, record()).render()
+    for words in ("ever broken", "loose", "over 1 %", "blocks in use"):
+        assert words not in old
+    values = record()
+    values["simulation"]["per_frame"] |= {
+        "loose_fraction": [0.0, 0.0, 0.0123], "broken_fraction": [0.0, 0.0, 0.0456],
+        "pieces": [1, 1, 11], "pieces_over_1_percent": [1, 1, 4], "active_blocks": [28, 28, 31],
+    }  # fmt: skip
+    text = report_page(tmp_path, values).render()
+    for words in ("0.0123", "0.0456", ">11<", ">4<"):
+        assert words in text
+    drawn = text[text.index("<svg") :]
+    for words in ("ever broken", "loose", "over 1 % of the matter", "blocks in use"):
+        assert words in drawn
+
+
 @pytest.mark.parametrize(("verdict", "kind"), [("healed", "warn"), ("failed", "bad")])
 def test_what_went_wrong_is_coloured(verdict: str, kind: str, tmp_path: Path) -> None:
     text = report_page(tmp_path, record(verdict=verdict, simulation=None)).render()

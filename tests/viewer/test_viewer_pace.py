@@ -143,3 +143,18 @@ def test_curves_have_units_gaps_and_a_line_at_the_moment() -> None:
     np.testing.assert_allclose(kinetic, [0, 2, 6, 7, 7, 8])
     np.testing.assert_allclose(line, [np.nan] * 3 + [0, 1, np.nan])
     assert plots_of([{}, {"time": 1.0}]) == []
+
+
+def test_what_broke_is_drawn_where_the_run_has_kept_it() -> None:
+    old = [{"time": float(i), "fragments": i, "damaged_fraction": 0.1 * i} for i in range(3)]
+    more = {"pieces_over_1_percent": 2, "broken_fraction": 0.25, "loose_fraction": 0.01}
+    new = [row | more | {"active_blocks": 2800 + row["fragments"]} for row in old]
+    before, after = ({plot.name: plot for plot in plots_of(facts)} for facts in (old, new))
+    assert set(before) == {"Fragments", "Broken"} and set(after) == {*before, "Blocks"}
+    assert len(before["Fragments"].labels) == len(before["Broken"].labels) == 1
+    assert len(after["Fragments"].labels) == 2 and len(after["Broken"].labels) == 3
+    assert after["Broken"].title == "Broken [%]"
+    shares = dict(zip(after["Broken"].labels, after["Broken"].values, strict=True))
+    np.testing.assert_allclose(shares["share of the mass loose"], [1.0] * 3)
+    np.testing.assert_allclose(after["Blocks"].values[0], [2800, 2801, 2802])
+    assert after["Blocks"].title == "Blocks"

@@ -43,6 +43,13 @@ def test_a_finished_run_is_named_with_its_verdict_and_holes(tmp_path: Path) -> N
     assert source.facts(3)["time"] == pytest.approx(3 / FPS)
 
 
+def test_a_finished_run_is_named_with_its_notes(tmp_path: Path) -> None:
+    out = write_run(tmp_path / "ball")
+    record = {"verdict": "clean", "simulation": {"notes": ["nothing broke"]}}
+    (out / "run.json").write_text(json.dumps(record))
+    assert RunSource(out).state() == f"**Clean:** {FRAMES} frames. nothing broke."
+
+
 def test_a_run_at_work_grows_and_a_killed_one_is_called_stopped(tmp_path: Path) -> None:
     out = write_run(tmp_path / "ball", 2, finished=False)
     source = RunSource(out)

@@ -82,6 +82,7 @@ struct RasterGradArgs {
   T* grad_background;  // zeroed by the host
   T* grad_offset;      // [C, N, 2]
   T* grad_absolute;    // [C, N, 2]
+  bool deterministic;  // sums must not depend on an order that is chance (CUDA; the CPU has none)
 };
 
 template <typename T>

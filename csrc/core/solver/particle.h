@@ -2,6 +2,7 @@
 // and its update from what it gathered. The bodies of both back ends' loops.
 #pragma once
 
+#include "core/material/loss.h"
 #include "core/material/return_mapping.h"
 #include "core/mpm/grid.h"
 #include "core/solver/clock.h"
@@ -255,6 +256,8 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     }
     whole = max(out.alpha, peak) < T(0) || law != kNacc;
     stress = out.stress;
+    if (law == kNacc && material.exponent > T(0))
+      stress = unloading_share(material.exponent, r[kPaceColumn], stress, c) * stress;
     if (waves) wave2 = wave_speed_squared(law, material, out.strain);
   }
   T slope[9];
@@ -311,8 +314,12 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     return;
   }
   const Mat3<T> none{};
-  const ReturnMapped<T> state = return_mapping(load_strain(s, p), alpha, none, s.law[row],
-                                               material_now(s, row, peak), s.options, dt);
+  const MaterialRow<T> material = material_now(s, row, peak);
+  ReturnMapped<T> state =
+      return_mapping(load_strain(s, p), alpha, none, s.law[row], material, s.options, dt);
+  if (s.law[row] == kNacc && material.exponent > T(0))
+    state.stress =
+        unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;
   T slope[9];
   store_slope(slope, c, state.stress, r, dt);
   store_motion(s, p, v, slope);

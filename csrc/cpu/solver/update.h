@@ -93,6 +93,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
            (j2m1 <= P(kJMax * kJMax - 1.0)) & (n2 <= P(kDeviatorMax * kDeviatorMax)) &
            (det_identity_plus(increment) > P(0));
   Int whole = Int{} - 1;  // not broken
+  P loss(0);
   if constexpr (kLaws != kElasticOnly) {
     Int nacc{}, elastic{};
     if (packet.same_rows()) {
@@ -110,10 +111,13 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
       plain &= ~nacc | (surely_elastic(row, cohesion, alpha, j2m1, n2) & (alpha <= peak));
       whole = ~nacc | (peak < P(0));
+      loss = select<T>(nacc, row[7], P(0));
     }
   }
 
-  const Sym3<P> stress = add_diagonal(row[0] * d, P(0.5) * row[1] * j2m1);
+  Sym3<P> stress = add_diagonal(row[0] * d, P(0.5) * row[1] * j2m1);
+  if (kLaws != kElasticOnly && mask_bits(loss > P(0)) != 0)
+    stress = unloading_share(loss, row[kPaceColumn], stress, c) * stress;
   P slope[9];
   const P scale = P(dt_next) * row[kStressColumn];
   const Mat3<P> tau = to_mat3(stress);

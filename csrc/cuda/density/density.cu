@@ -12,14 +12,24 @@ inline unsigned blocks_for(int64_t n) {
   return static_cast<unsigned>((n + kThreads - 1) / kThreads);
 }
 
+// Whole numbers: the order in which threads come changes no bit.
 template <typename T>
-__global__ void scatter_kernel(DensityArgs<T> a) {
+__global__ void scatter_kernel(DensityArgs<T> a, double per_weight) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   DensityPlace<T> place;
   if (i >= a.count || !place.of(a.frame, a.nodes, a.means + 3 * i)) return;
-  const T share = T(1) / a.full;
   for (int corner = 0; corner < 8; ++corner)
-    atomicAdd(a.values + place.cell(corner, a.nodes), place.weight(corner) * share);
+    atomicAdd(
+        reinterpret_cast<unsigned long long*>(a.units + place.cell(corner, a.nodes)),
+        static_cast<unsigned long long>(__double2ll_rn(double(place.weight(corner)) * per_weight)));
+}
+
+template <typename T>
+__global__ void occupied_kernel(DensityArgs<T> a, int64_t cells, double per_weight) {
+  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (k >= cells) return;
+  const int64_t units = a.units[k];
+  if (units != 0) a.values[k] = T(double(units) / per_weight) * (T(1) / a.full);
 }
 
 // Cuts the finest level off at one and averages it into the next.
@@ -72,24 +82,32 @@ __global__ void __launch_bounds__(kThreads) bulk_sums_kernel(BulkArgs<T> a) {
   const int64_t step = int64_t(gridDim.x) * kThreads;
   for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < a.count; i += step)
     bulk_terms(a, i, sum);
-  // One atomic per block and sum: all go to the same few addresses.
-  __shared__ double block[kBulkSums];
-  if (threadIdx.x < kBulkSums) block[threadIdx.x] = 0.0;
-  __syncthreads();
+  // Every block leaves its share; they are added up in one order.
+  __shared__ double warps[kThreads / 32][kBulkSums];
   for (int k = 0; k < kBulkSums; ++k) {
     const double total = warp_total(sum[k]);
-    if (threadIdx.x % 32 == 0) atomicAdd(block + k, total);
+    if (threadIdx.x % 32 == 0) warps[threadIdx.x / 32][k] = total;
   }
   __syncthreads();
-  if (threadIdx.x < kBulkSums) atomicAdd(a.out + threadIdx.x, block[threadIdx.x]);
+  if (threadIdx.x >= kBulkSums) return;
+  double all = 0.0;
+  for (int w = 0; w < kThreads / 32; ++w) all += warps[w][threadIdx.x];
+  a.shares[blockIdx.x * kBulkSums + threadIdx.x] = all;
+}
+
+// One warp.
+template <typename T>
+__global__ void bulk_finish_kernel(BulkArgs<T> a, int shares) {
+  double sum[kBulkSums] = {};
+  for (int s = threadIdx.x; s < shares; s += 32)
+    for (int k = 0; k < kBulkSums; ++k) sum[k] += a.shares[s * kBulkSums + k];
+  for (int k = 0; k < kBulkSums; ++k) sum[k] = warp_total(sum[k]);
+  if (threadIdx.x == 0) bulk_finish(sum, a.out);
 }
 
 template <typename T>
-__global__ void bulk_finish_kernel(BulkArgs<T> a, bool root) {
-  if (root)
-    a.out[4] = sqrt(a.out[4]);
-  else
-    bulk_finish(a.out, a.out);
+__global__ void bulk_root_kernel(BulkArgs<T> a) {
+  a.out[4] = sqrt(a.out[4]);
 }
 
 template <typename T>
@@ -116,7 +134,11 @@ __global__ void normal_kernel(DensityNormalArgs<T> a) {
 
 template <typename T>
 cudaError_t occupancy(const DensityArgs<T>& a, cudaStream_t stream) {
-  if (a.count > 0) scatter_kernel<T><<<blocks_for(a.count), kThreads, 0, stream>>>(a);
+  if (a.count > 0) {
+    const int64_t cells = int64_t(a.nodes) * a.nodes * a.nodes;
+    scatter_kernel<T><<<blocks_for(a.count), kThreads, 0, stream>>>(a, a.per_weight());
+    occupied_kernel<T><<<blocks_for(cells), kThreads, 0, stream>>>(a, cells, a.per_weight());
+  }
   for (int level = 1; level < kDensityLevels; ++level) {
     const int64_t side = a.nodes >> level;
     pool_kernel<T><<<blocks_for(side * side * side), kThreads, 0, stream>>>(
@@ -128,12 +150,11 @@ cudaError_t occupancy(const DensityArgs<T>& a, cudaStream_t stream) {
 
 template <typename T>
 cudaError_t splat_bulk(const BulkArgs<T>& a, cudaStream_t stream) {
-  constexpr unsigned kMostBlocks = 512;
-  const unsigned needed = blocks_for(a.count), blocks = needed < kMostBlocks ? needed : kMostBlocks;
+  const unsigned needed = blocks_for(a.count), blocks = needed < kBulkShares ? needed : kBulkShares;
   if (a.count > 0) bulk_sums_kernel<T><<<blocks, kThreads, 0, stream>>>(a);
-  bulk_finish_kernel<T><<<1, 1, 0, stream>>>(a, false);
+  bulk_finish_kernel<T><<<1, 32, 0, stream>>>(a, a.count > 0 ? static_cast<int>(blocks) : 0);
   if (a.count > 0) bulk_reach_kernel<T><<<blocks, kThreads, 0, stream>>>(a);
-  bulk_finish_kernel<T><<<1, 1, 0, stream>>>(a, true);
+  bulk_root_kernel<T><<<1, 1, 0, stream>>>(a);
   return cudaGetLastError();
 }
 

@@ -7,7 +7,7 @@
 
 namespace gsf::cuda {
 
-// `values` come in as zeros.
+// `values` and `units` come in as zeros.
 template <typename T>
 cudaError_t occupancy(const DensityArgs<T>& a, cudaStream_t stream);
 // `out` comes in as zeros.

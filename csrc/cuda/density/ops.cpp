@@ -8,6 +8,7 @@ namespace {
 
 struct DensityCuda {
   using Scope = CudaScope;
+  static constexpr bool kShares = true;
   GSF_LAUNCH(occupancy)
   GSF_LAUNCH(splat_bulk)
   GSF_LAUNCH(density_normals)

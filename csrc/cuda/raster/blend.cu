@@ -1,4 +1,5 @@
 // Forward blend on CUDA.
+#include "core/raster/order_free.h"
 #include "cuda/raster/launch.h"
 #include "cuda/raster/walk.h"
 
@@ -8,7 +9,8 @@ namespace {
 // kExtras: sibling groups, contribution or median depth are wanted; without, nothing of them is in
 // the loop.
 template <typename T, int kF, bool kExtras>
-__global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
+__global__ void __launch_bounds__(kBlockThreads)
+    blend_kernel(RasterArgs<T> a, int64_t* units, double per_unit) {
   __shared__ StagedSplat<T, kF> stage[kBlockWarps][32];
   const WarpPlace place = warp_place(a);
   const T px = T(place.lane_x) + T(0.5);
@@ -52,7 +54,9 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
           if (a.contribution && __any_sync(kAllLanes, both > T(0))) {
             const T total = warp_sum(both);
             if (threadIdx.x % 32 == 0)
-              atomicAdd(a.contribution + (s.id - int64_t(place.camera) * a.count), total);
+              atomicAdd(reinterpret_cast<unsigned long long*>(
+                            units + (s.id - int64_t(place.camera) * a.count)),
+                        static_cast<unsigned long long>(__double2ll_rn(double(total) * per_unit)));
           }
         }
       });
@@ -87,18 +91,36 @@ __global__ void __launch_bounds__(kBlockThreads) blend_kernel(RasterArgs<T> a) {
   }
 }
 
+template <typename T>
+__global__ void contribution_kernel(RasterArgs<T> a, const int64_t* units, double per_unit) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) a.contribution[i] = T(double(units[i]) / per_unit);
+}
+
 }  // namespace
 
 template <typename T>
-cudaError_t raster_blend(const RasterArgs<T>& a, cudaStream_t stream) {
+cudaError_t raster_blend(const RasterArgs<T>& a, int64_t* units, cudaStream_t stream) {
   const bool extras = a.groups || a.contribution || a.median;
-  return with_variant<T>(a.features, extras, [&]<int kF, bool kExtras>() {
-    blend_kernel<T, kF, kExtras><<<blend_blocks(a), kBlockThreads, 0, stream>>>(a);
+  // A pixel gives a Gaussian a weight of one at most, so no sum over all pixels can overflow.
+  const int64_t pixels = int64_t(a.width) * a.height * a.cameras;
+  const double per_unit = double(int64_t(1) << (62 - bits_above(pixels)));
+  if (a.contribution && a.count > 0) {
+    const size_t bytes = sizeof(int64_t) * static_cast<size_t>(a.count);
+    const cudaError_t error = cudaMemsetAsync(units, 0, bytes, stream);
+    if (error != cudaSuccess) return error;
+  }
+  const cudaError_t error = with_variant<T>(a.features, extras, [&]<int kF, bool kExtras>() {
+    blend_kernel<T, kF, kExtras><<<blend_blocks(a), kBlockThreads, 0, stream>>>(a, units, per_unit);
     return cudaGetLastError();
   });
+  if (error != cudaSuccess || !a.contribution || a.count == 0) return error;
+  const auto blocks = static_cast<unsigned>((a.count + 255) / 256);
+  contribution_kernel<T><<<blocks, 256, 0, stream>>>(a, units, per_unit);
+  return cudaGetLastError();
 }
 
-template cudaError_t raster_blend<float>(const RasterArgs<float>&, cudaStream_t);
-template cudaError_t raster_blend<double>(const RasterArgs<double>&, cudaStream_t);
+template cudaError_t raster_blend<float>(const RasterArgs<float>&, int64_t*, cudaStream_t);
+template cudaError_t raster_blend<double>(const RasterArgs<double>&, int64_t*, cudaStream_t);
 
 }  // namespace gsf::cuda

@@ -49,8 +49,10 @@ template <typename T>
 cudaError_t raster_bin(const RasterArgs<T>& a, const RasterOrder& o, void* scratch, size_t bytes,
                        cudaStream_t stream);
 
+// `units`: [N] words for the sums of blend weights, when those are wanted. They are whole numbers,
+// so that the order of the warps changes no bit.
 template <typename T>
-cudaError_t raster_blend(const RasterArgs<T>& a, cudaStream_t stream);
+cudaError_t raster_blend(const RasterArgs<T>& a, int64_t* units, cudaStream_t stream);
 
 // Sums of a splat over the pixels: moments, the absolute gradients of the centre when wanted, and
 // the gradients of the first `active` features. Word k of splat m stands in one of up to three
@@ -64,6 +66,11 @@ struct SplatSums {
   int end[kParts];  // first word that is not in the part
   int active;
   int features;  // word of the first feature
+  // Order-free sums of the same words (core/raster/order_free.h): kBounds numbers whose bits say
+  // how large an addend can be, then a coarse and a fine word for each of [M, width()]. They are
+  // rounded to the words above at the end. Null: floats are added there at once.
+  static constexpr int kBounds = 4;
+  int64_t* fixed;
 
   GSF_HOST_DEVICE int width() const { return features + active; }
   // Written without indices that change: those would put the struct into local memory.
@@ -79,11 +86,17 @@ struct SplatSums {
 // Numbers of memory of their own that the sums need; 0 when the gradients' will do.
 template <typename T>
 int64_t raster_sums_size(const RasterGradArgs<T>& b);
+// Whole numbers that order-free sums need beside; 0 when not asked for.
 template <typename T>
-SplatSums<T> raster_sums(const RasterGradArgs<T>& b, T* own);
+int64_t raster_fixed_size(const RasterGradArgs<T>& b);
+template <typename T>
+SplatSums<T> raster_sums(const RasterGradArgs<T>& b, T* own, int64_t* fixed);
+// Numbers that the gradient of the background needs, 0 without.
+template <typename T>
+int64_t raster_background_size(const RasterGradArgs<T>& b);
 // Fills every gradient but the background's, which it adds to.
 template <typename T>
-cudaError_t raster_backward(const RasterGradArgs<T>& b, const SplatSums<T>& sums,
+cudaError_t raster_backward(const RasterGradArgs<T>& b, const SplatSums<T>& sums, T* background,
                             cudaStream_t stream);
 // Its last part: from the sums to the inputs.
 template <typename T>

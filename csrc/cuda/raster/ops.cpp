@@ -48,7 +48,9 @@ struct RasterCuda {
       Tensor scratch = gsf::new_empty(like_, {static_cast<int64_t>(bytes)}, ScalarType::Byte);
       check_cuda(kRasterOp,
                  cuda::raster_bin(a_, order_, mptr<uint8_t>(scratch), bytes, scope_.stream()));
-      check_cuda(kRasterOp, cuda::raster_blend(a_, scope_.stream()));
+      Tensor units =
+          gsf::new_empty(like_, {a_.contribution ? a_.count : int64_t(0)}, ScalarType::Long);
+      check_cuda(kRasterOp, cuda::raster_blend(a_, mptr<int64_t>(units), scope_.stream()));
     }
 
    private:
@@ -64,8 +66,13 @@ struct RasterCuda {
   static void backward(const RasterGradArgs<T>& b, const Tensor& like, const Scope& scope) {
     check(b.forward);
     Tensor own = gsf::new_empty(like, {cuda::raster_sums_size(b)}, scalar_type_of<T>());
-    const cuda::SplatSums<T> sums = cuda::raster_sums(b, own.numel() > 0 ? mptr<T>(own) : nullptr);
-    check_cuda(kRasterOp, cuda::raster_backward(b, sums, scope.stream()));
+    Tensor fixed = gsf::new_empty(like, {cuda::raster_fixed_size(b)}, ScalarType::Long);
+    Tensor background =
+        gsf::new_empty(like, {cuda::raster_background_size(b)}, scalar_type_of<T>());
+    const cuda::SplatSums<T> sums =
+        cuda::raster_sums(b, own.numel() > 0 ? mptr<T>(own) : nullptr,
+                          fixed.numel() > 0 ? mptr<int64_t>(fixed) : nullptr);
+    check_cuda(kRasterOp, cuda::raster_backward(b, sums, mptr<T>(background), scope.stream()));
   }
 };
 

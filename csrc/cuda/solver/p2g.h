@@ -1,7 +1,9 @@
 // Particles to nodes: one CTA per home, its window of 8^3 nodes in shared memory. Sums are
 // integers: in the window 32 bits (float state) in a unit of the home, between windows 64 bits in a
-// unit of the step, so that no order of additions changes a bit. The units leave room for every
-// particle at one node (csrc/core/solver/clock.h), so nothing overflows.
+// unit of the step. Each addend is rounded once, to the unit of its home, and both are powers of
+// two, the first never the finer: no order of additions changes a bit, nor does it matter which CTA
+// adds what. The units leave room for every particle at one node (csrc/core/solver/clock.h), so
+// nothing overflows.
 #pragma once
 
 #include "cuda/solver/grid.h"
@@ -35,14 +37,20 @@ struct Fixed<double> {
   }
 };
 
-// Unit of a window: `count` contributions of at most `bound` fit into 2^kBits of it. The double
-// window uses the unit of the step itself.
+// Unit of a window: `count` contributions of at most `bound` fit into 2^kBits of it. Never finer
+// than the unit of the step, which the double window uses itself: two CTAs may share a home, and
+// which of them takes a point is chance, so what each hands over must be exact. No digits are lost
+// that a node could have kept: the step's unit is 2^-unit_bits of the largest bound of all points
+// (43 bits at 10^6 points), and is the coarser one only where all of a home is 0.43 count
+// 2^(unit_bits - 30) times slower (10^6 in a full home). Each addend is off by half a unit of the
+// step there, where the sum of the window was before.
 template <typename T>
 __device__ double window_unit(double bound, double share, int64_t count, double step_unit) {
   if constexpr (sizeof(T) == 8)
     return step_unit;
   else
-    return ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits);
+    return fmax(ldexp(power_above(fmax(bound, 1e-25) * share * double(count)), -Fixed<T>::kBits),
+                step_unit);
 }
 
 __device__ int window_node(int index, int& i, int& j, int& k) {
@@ -77,11 +85,10 @@ int split_shift(const SolverView<T>& s) {
   return s.count < 600000 ? 1 : 0;
 }
 
-// Words of a window times 2^shift are units of the step: exact for shift >= 0.
+// Words of a window times 2^shift (shift >= 0, see window_unit) are units of the step: exact.
 template <typename Word>
 __device__ long long to_units(Word word, int shift) {
-  if (shift >= 0) return static_cast<long long>(word) << shift;
-  return __double2ll_rn(ldexp(double(word), shift));
+  return static_cast<long long>(word) << shift;
 }
 
 // Units of the window of a home.

@@ -32,7 +32,10 @@ def power_above(x: float) -> float:
 
 
 def window_unit(bound: float, share: float, count: int) -> float:
-    """Unit of a window to which ``count`` points give at most ``share bound`` each."""
+    """Unit of a window to which ``count`` points give at most ``share bound`` each.
+
+    :func:`node_sums` takes the unit of the step where that is the coarser one.
+    """
     return math.ldexp(power_above(max(bound, 1e-25) * share * count), -WINDOW_BITS)
 
 
@@ -123,8 +126,17 @@ class NodeSums:
         return (weight[..., None].to(sums.dtype) * velocity[self.node]).sum(dim=1)
 
 
-def node_sums(t: Transfer, momentum_unit: float, mass_unit: float) -> NodeSums:
+def node_sums(
+    t: Transfer, momentum_unit: float, mass_unit: float, part: Tensor | None = None
+) -> NodeSums:
     """Sums of one step in the units of its clock.
+
+    Args:
+        t: What the points give.
+        momentum_unit: Of the clock [kg m/s], a power of two.
+        mass_unit: Of the clock [kg], a power of two.
+        part: Which of the CTAs that share a home takes the point, int64 [N]; one takes all when
+            None. It changes no sum.
 
     Raises:
         OverflowError: A sum leaves its word.
@@ -143,8 +155,10 @@ def node_sums(t: Transfer, momentum_unit: float, mass_unit: float) -> NodeSums:
         dtype=torch.float64,
     )
     step_units = units.new_tensor([momentum_unit] * 3 + [mass_unit])
+    units = torch.maximum(units, step_units)  # so that the hand-over below is exact
     # One row for every node of every window.
-    place = torch.cat([t.home[:, None, None].expand(-1, 27, 1), t.node], dim=2).view(-1, 4)
+    taker = t.home if part is None else t.home + homes * part
+    place = torch.cat([taker[:, None, None].expand(-1, 27, 1), t.node], dim=2).view(-1, 4)
     windows, owner = torch.unique(place, dim=0, return_inverse=True)
     scaled = t.given * (1.0 / units).to(t.given)[t.home][:, None]
     words = torch.round(t.weight[..., None] * scaled).long().view(-1, 4)
@@ -152,17 +166,16 @@ def node_sums(t: Transfer, momentum_unit: float, mass_unit: float) -> NodeSums:
     if int(tile.abs().max()) >= 2**31:
         raise OverflowError("node_sums: a sum of a window leaves 32 bits")
     nodes, at = torch.unique(windows[:, 1:], dim=0, return_inverse=True)
-    ratio = units[windows[:, 0]] / step_units
+    ratio = units[windows[:, 0] % homes] / step_units
     whole = words.new_zeros(nodes.shape[0], 4)
-    whole.index_add_(0, at, torch.round(tile.double() * ratio).long())
+    whole.index_add_(0, at, tile * ratio.long())
     if int(whole.abs().max()) >= 2**62:
         raise OverflowError("node_sums: a sum of a node leaves 63 bits")
     real = (t.weight[..., None].double() * t.given.double()).view(-1, 4)
     exact = units.new_zeros(nodes.shape[0], 4).index_add_(0, at[owner], real)
-    # Half a unit and the float32 rounding of every addend, half a step unit for every window.
+    # Half a unit and the float32 rounding of every addend.
     slack = torch.zeros_like(exact)
-    slack.index_add_(0, at[owner], 0.5 * units[place[:, 0]] + 2.0**-21 * real.abs())
-    slack.index_add_(0, at, 0.5 * step_units.expand(windows.shape[0], 4))
+    slack.index_add_(0, at[owner], 0.5 * units[place[:, 0] % homes] + 2.0**-21 * real.abs())
     return NodeSums(
         fixed=whole.double() * step_units, exact=exact, slack=slack, node=at[owner].view(-1, 27)
     )

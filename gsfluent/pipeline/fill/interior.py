@@ -122,17 +122,18 @@ def interior_gaussians(
     mass, factor = mass * (factor / better) ** 3, better
     bits = math.ceil(math.log2(8 * max(inside.shape)))
     order = hilbert_code((point * 8.0).long(), bits).argsort(stable=True)
-    point, reach, mass = point[order].double(), reach[order].double(), mass[order].double()
+    # On the host from here on: a GPU adds in an order that is chance.
+    point, reach, mass = (v[order].cpu().double() for v in (point, reach, mass))
     total = mass.cumsum(0)
     count = min(max(1, round(float(total[-1]))), max_count)
     stretch = ((total - 0.5 * mass) * (count / float(total[-1]))).long().clamp(0, count - 1)
-    share = torch.zeros(count, dtype=torch.float64, device=device).index_add_(0, stretch, mass)
+    share = torch.zeros(count, dtype=torch.float64).index_add_(0, stretch, mass)
 
     def mean(value: Tensor) -> Tensor:
         """Averages over the stretches."""
-        sums = torch.zeros((count, *value.shape[1:]), dtype=torch.float64, device=device)
+        sums = torch.zeros((count, *value.shape[1:]), dtype=torch.float64)
         sums.index_add_(0, stretch, mass.view(-1, *[1] * (value.dim() - 1)) * value)
-        return sums[share > 0] / share[share > 0].view(-1, *[1] * (value.dim() - 1))
+        return (sums[share > 0] / share[share > 0].view(-1, *[1] * (value.dim() - 1))).to(device)
 
     middle, skin_spacing = mean(point), mean(reach)
     deep = sample(field, middle)

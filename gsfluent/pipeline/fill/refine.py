@@ -78,7 +78,7 @@ def witness(
             -1,
         )
         probe = gaussians.means.new_zeros(gaussians.count, 6).requires_grad_(True)
-        image = draw(gaussians, view.camera, colors=probe).image
+        image = draw(gaussians, view.camera, colors=probe, deterministic=True).image
         sums = torch.autograd.grad(image, probe, asked)[0].double()
         total[:, 0] += _unhidden(gaussians, view.camera.viewmat, view.camera.K)
         total[:, 1] += sums[:, 0]

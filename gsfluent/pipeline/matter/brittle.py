@@ -41,15 +41,14 @@ def brittle_rows(
         ``(rows, alpha0)``: float64 [N, 8] and [N].
     """
     rows, alpha0 = material.parameters(sample), material.start_alphas(sample)
-    if material.energy_by_hand:
+    given = material.fracture_energy
+    if given is None or material.energy_by_hand:
         return rows, alpha0 * weakness
     step = (weakness.clamp(min=1e-3).log() / STEP).round()
-    assert material.fracture_energy is not None  # else the energy is by hand
-    energy = sample(material.fracture_energy)
+    energy = sample(given)
     key = torch.cat([rows, torch.stack([alpha0, energy, step], dim=1)], dim=1)
     kinds, which = torch.unique(key, dim=0, return_inverse=True)
-    table = kinds[:, :8]
-    alpha0, energy, step = kinds[:, 8:].unbind(dim=1)
+    table, (alpha0, energy, step) = kinds[:, :8], kinds[:, 8:].unbind(dim=1)
     strength = table[:, 1] * torch.sinh(table[:, 4] * alpha0.abs())
     hardening, alpha0, _ = softened(table, strength, energy, (STEP * step).exp(), dx)
     table = table.clone()

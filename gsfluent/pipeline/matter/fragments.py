@@ -22,9 +22,9 @@ class Fragments:
     """The pieces of one moment.
 
     Args:
-        labels: Piece of each point, of broken ones, too, int32 [N]: the row of its first
-            point that never broke, so that a piece keeps its label as long as it keeps that point; -1 for loose
-            matter (chips, dust) and for what flows.
+        labels: Piece of each point, of broken ones, too, int32 [N]: the row of its first point that
+            never broke, so that a piece keeps its label as long as it keeps that point; -1 for
+            loose matter (chips, dust) and for what flows.
         ids: Labels of the pieces, largest mass first, int64 [F].
         mass_fractions: Share of the total mass of each piece, float64 [F].
         debris_fraction: Share of the mass in no piece.

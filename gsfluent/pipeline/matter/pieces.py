@@ -1,11 +1,11 @@
 """Pieces of broken bodies: each owns its half of the crack band.
 
 A crack is a band of broken points some two cells wide. What hangs together without a broken point,
-with enough points that never broke, is the *seed* of a piece, and every other point belongs to the seed that is nearest along links that
-still hold, where a stretched link is a long way: so the border between two pieces runs where the
-band has opened most, and no point is left over in between. A link between two pieces is cut for
-good, also after the band has been welded (:mod:`gsfluent.pipeline.matter.weld`). What no seed
-reaches is loose: a chip, or dust.
+with enough points that never broke, is the *seed* of a piece, and every other point belongs to the
+seed that is nearest along links that still hold, where a stretched link is a long way: so the
+border between two pieces runs where the band has opened most, and no point is left over in between.
+A link between two pieces is cut for good, also after the band has been welded
+(:mod:`gsfluent.pipeline.matter.weld`). What no seed reaches is loose: a chip, or dust.
 
 Costs are whole numbers and every sum is one of whole numbers, so that the pieces do not depend on
 the order of the points, on threads, or on the device.
@@ -74,8 +74,8 @@ class Pieces(NamedTuple):
     Attributes:
         fragments: The pieces; of broken points, too. -1 for loose matter and for what flows.
         unit: What each point moves with, int64 [N]: the label of its piece (the lowest row of its
-            seed that never broke), the lowest row of its chip, the first row of its body where that is whole; -1 for dust, and for what flows
-            and lies on no piece.
+            seed that never broke), the lowest row of its chip, the first row of its body where
+            that is whole; -1 for dust, and for what flows and lies on no piece.
         cut_links: Links that are cut for good, bool [L].
         dust: Points that belong to nothing, bool [N].
         chip: Points of chips, bool [N].
@@ -110,7 +110,8 @@ def find_pieces(
             is no seed alone: a weld near a crack must not part what lies behind it.
         sides: Sides of blades, int32 [N]; a link between opposite sides is cut.
         gone: Dust that left the grid before, bool [N]; nothing hangs on it.
-        least: Points of a seed that never broke; a body of less than twice as many needs half of its own.
+        least: Points of a seed that never broke; a body of less than twice as many needs half of
+            its own.
 
     Returns:
         The pieces. A body in which nothing is broken or cut is whole, whatever its size.

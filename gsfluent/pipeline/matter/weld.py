@@ -2,10 +2,13 @@
 
 Once the pieces on both sides of a crack have velocity fields of their own, these carry the crack,
 and the loose band between them is no longer needed. Points of it that have come to rest inside get
-``alpha = peak = w alpha0`` (a lower alpha stays); strain, velocity and place stay. Yield surfaces of NACC are nested in
-alpha (``p0`` and the tip grow with ``-alpha``), so the old state lies inside the new surface, and
-stored energy is a function of the strain alone: stress, energy and momentum do not jump. Matter
-that breaks still, or that was crushed, is never welded.
+``alpha = peak = w alpha0``; strain, velocity and place stay. Stored energy and stress are functions
+of the strain alone, so energy, momentum and stress do not jump where the old state lies inside the
+new surface. Yield surfaces of NACC are nested in alpha (``p0`` and the tip grow with ``-alpha``);
+they are not in the cohesion that comes back, since ``q^2 ~ (p + beta p0) (p0 - p) / (1 + 2 beta)``
+falls with beta above ``p0 / 2``. So the return map itself is asked, and what would flow is left as
+it is: matter under nearly all the pressure that it holds. What breaks still, or was crushed, is
+never welded.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.pipeline.matter.pieces import Pieces, Web
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -105,14 +109,21 @@ def weldable(matter: Matter, web: Web, state: State, pieces: Pieces) -> Tensor:
 
 
 def weld(matter: Matter, web: Web, state: State, pieces: Pieces) -> State:
-    """The state with the points of :func:`weldable` welded; arguments as there."""
+    """The state with those points of :func:`weldable` welded whose state the surface holds."""
     at = weldable(matter, web, state, pieces)
-    if not bool(at.any()):
+    rows = at.nonzero()[:, 0]
+    if rows.numel() == 0:
         return state
-    alpha = state.particles.alpha
+    alpha, strain = state.particles.alpha, state.particles.strain
     strong = (STRENGTH * matter.particles.alpha).to(alpha)
-    # What was compacted again may hold more than the weld gives: nothing becomes weaker.
-    alpha = torch.where(at, torch.minimum(alpha, strong), alpha)
+    wanted, held = strong[rows], strain[rows]
+    after, kept, _, _ = ops.return_mapping(
+        held, wanted, strain.new_zeros(rows.shape[0], 3, 3), law=matter.law,
+        params=matter.params.to(strain), material=matter.particles.material[rows],
+    )  # fmt: skip
+    fits = (after == held).all(dim=1) & (kept == wanted) & (alpha[rows] >= wanted)
+    at = at.index_put((rows,), fits)
+    alpha = torch.where(at, strong, alpha)
     return state._replace(
         particles=state.particles.replace(alpha=alpha),
         peak=torch.where(at, strong.to(state.peak), state.peak),

@@ -375,9 +375,10 @@ def grow(model: SplatModel, count: int, weight: Tensor, generator: torch.Generat
 
 def _draw(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Rows drawn with replacement in proportion to ``weight``, by inversion (no 2^24 limit)."""
-    edges = weight.double().cumsum(0)
-    at = torch.rand(count, generator=generator, dtype=torch.float64).to(edges.device) * edges[-1]
-    return torch.searchsorted(edges, at, right=True).clamp_max(len(weight) - 1)
+    edges = weight.cpu().double().cumsum(0)  # in one order; a GPU's is chance
+    at = torch.rand(count, generator=generator, dtype=torch.float64) * edges[-1]
+    drawn = torch.searchsorted(edges, at, right=True).clamp_max(len(weight) - 1)
+    return drawn.to(weight.device)
 
 
 def _share(model: SplatModel, source: Tensor) -> None:

@@ -26,13 +26,21 @@ class SplatModel:
             the cameras from it.
         isotropic: Keep one standard deviation per Gaussian.
         rates: Learning rates.
+        deterministic: The same bits of the gradients in every run on a GPU too.
     """
 
     def __init__(
-        self, start: Gaussians, extent: float, *, isotropic: bool, rates: LearningRates
+        self,
+        start: Gaussians,
+        extent: float,
+        *,
+        isotropic: bool,
+        rates: LearningRates,
+        deterministic: bool = False,
     ) -> None:
         self.extent = extent
         self.isotropic = isotropic
+        self.deterministic = deterministic
         self.rates = rates
         scales = start.scales.log()
         if isotropic:
@@ -115,6 +123,7 @@ class SplatModel:
             contribution=contribution,
             depth=False,
             near=0.01 * self.extent,
+            deterministic=self.deterministic,
         )
 
     # -- optimisation ----------------------------------------------------------------------------

@@ -63,6 +63,8 @@ class Reconstruct(Stage):
             where the error is above it, and dropped while it is below. None: as many as the
             schedule makes.
         exposure: Learn an affine change of colour per photograph. Held-out photographs get none.
+        deterministic: The same bits in every run on the same GPU, for some time
+            (docs/measured/deterministic.md); on the CPU they are the same anyway.
         checkpoint: File to save to while training and to resume from when it exists.
         checkpoint_every: Steps between saves; a tenth of the run, at least 250, when None.
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
@@ -93,6 +95,7 @@ class Reconstruct(Stage):
         densify: str = "adc",
         target_psnr: float | None = None,
         exposure: bool = False,
+        deterministic: bool = False,
         checkpoint: str | Path | None = None,
         checkpoint_every: int | None = None,
         separate: bool = True,
@@ -143,6 +146,7 @@ class Reconstruct(Stage):
         self.gradient_threshold = float(gradient_threshold)
         self.target_psnr = target_psnr
         self.exposure = bool(exposure)
+        self.deterministic = bool(deterministic)
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.checkpoint_every = int(checkpoint_every or max(250, self.iterations // 10))
         self.separate = bool(separate)
@@ -199,6 +203,7 @@ class Reconstruct(Stage):
             "densify": self.densify,
             "target_psnr": self.target_psnr,
             "exposure": self.exposure,
+            "deterministic": self.deterministic or device.type == "cpu",
             "history": run.history,
             "cleaned": run.cleaned,
             "resumed_at": run.resumed_at,
@@ -214,7 +219,9 @@ class Reconstruct(Stage):
             "sh_degree", "start_gaussians", "gradient_threshold", "absgrad", "densify",
             "target_psnr", "exposure", "separate", "seed",
         )  # fmt: skip
-        return {name: getattr(self, name) for name in names} | {"recipe": self.recipe.name}
+        identity = {name: getattr(self, name) for name in names} | {"recipe": self.recipe.name}
+        # what was trained until then must repeat as well
+        return identity | ({"deterministic": True} if self.deterministic else {})
 
 
 class _Run:
@@ -253,7 +260,13 @@ class _Run:
                 stage.recipe,
             )
             rates = stage.recipe.scene_rates
-            model = SplatModel(start, extent, isotropic=stage.kernel == "isotropic", rates=rates)
+            model = SplatModel(
+                start,
+                extent,
+                isotropic=stage.kernel == "isotropic",
+                rates=rates,
+                deterministic=stage.deterministic,
+            )
             scene = self._train(model, views, 0, 0, steps, None, None)
         if steps == stage.iterations:
             return scene
@@ -301,6 +314,7 @@ class _Run:
             0.5 * float((upper - lower).max()),
             isotropic=stage.kernel == "isotropic",
             rates=stage.recipe.object_rates,
+            deterministic=stage.deterministic,
         )
         phase = 0 if scene is None else 1
         gaussians = self._train(model, views, phase, before, steps, hull, scene)

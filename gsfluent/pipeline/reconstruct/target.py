@@ -85,9 +85,9 @@ def least_seen(
         seen = model.render(view, 0, contribution=True).contribution
         assert seen is not None
         weight += seen
-    order = weight.argsort()
-    spent = weight[order].cumsum(0)
-    least = spent <= weight_share * spent[-1]
+    order = weight.argsort(stable=True)
+    spent = weight[order].cpu().double().cumsum(0)  # in one order; a GPU's is chance
+    least = (spent <= weight_share * spent[-1]).to(weight.device)
     least[int(count_share * model.count) :] = False
     chosen = torch.zeros_like(least)
     chosen[order] = least

@@ -115,7 +115,7 @@ def label_votes(gaussians: Gaussians, view: LabelView, labels: NDArray[np.int64]
             gaussians.count, len(wanted), device=device, dtype=gaussians.dtype, requires_grad=True
         )
         with torch.enable_grad():
-            drawn = draw(gaussians, view.camera, colors=colors).image
+            drawn = draw(gaussians, view.camera, colors=colors, deterministic=True).image
         (votes,) = torch.autograd.grad(drawn, colors, shown)
         found.append(votes.detach())
     return torch.cat(found, dim=1) if found else torch.zeros(gaussians.count, 0, device=device)

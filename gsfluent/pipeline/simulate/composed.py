@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Particles
-from gsfluent.ops.plasticity import weakened
+from gsfluent.materials import LAWS
+from gsfluent.ops.plasticity import unloading_share, weakened
 from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.proximity import proximity_pairs
 from gsfluent.pipeline.colliders.rigid import RigidSet
@@ -64,6 +65,7 @@ class Composed:
         self._refresh = 0
         self._proximity = False
         self._lost: Tensor | int = 0
+        self._loses = bool((matter.params[matter.law == LAWS["nacc"], 7] > 0).any())
         self._info = torch.zeros(4, dtype=torch.int64, device=device)
         p = self.points
         _, _, self.stress, _ = ops.return_mapping(
@@ -175,6 +177,12 @@ class Composed:
             p.strain, p.alpha, dt * affine,
             law=self._law, params=self._params, material=self._row, dt=dt, **self._map,
         )  # fmt: skip
+        if self._loses:
+            share = unloading_share(
+                self.stress, affine, law=self.matter.law, params=self.matter.params,
+                material=p.material, dx=dx,
+            )  # fmt: skip
+            self.stress = self.stress * share[:, None]
         self.points = p.replace(
             position=position, velocity=velocity, affine=affine, deformation=deformation,
             strain=strain, alpha=alpha,

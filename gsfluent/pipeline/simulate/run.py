@@ -33,12 +33,6 @@ REGROUP = 64
 """Grid steps between two looks for new pieces within a frame."""
 LOOKS = 240.0
 """Looks for new pieces, and for what may leave the grid, in a simulated second at most."""
-DUST = {
-    "glass": 1.0, "ceramic": 1.0, "bone": 0.5, "chocolate": 0.5, "bread": 0.5, "fruit": 0.15,
-}  # fmt: skip
-"""Share of a body that may be dust, by its material or the family of that; see
-:func:`gsfluent.pipeline.matter.pieces.dust_limit`. Chosen by eye."""
-DUST_ELSE = 0.5
 Hook = Callable[[State], State]
 
 
@@ -86,8 +80,7 @@ class Run:
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
         device = matter.particles.device
-        names = [body.material.name.split(".") for body in scene.bodies]
-        shares = [DUST.get(name[-1], DUST.get(name[0], DUST_ELSE)) for name in names]
+        shares = [body.material.dust for body in scene.bodies]
         self._dust = torch.tensor(shares, dtype=torch.float64, device=device)
         self._spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=device)
 

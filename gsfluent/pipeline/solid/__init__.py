@@ -11,5 +11,5 @@ __getattr__, __dir__, __all__ = room(
     mesh="is_mesh mesh_to",
     source="find_solid",
     tsdf="depth_views",
-    walls="thin_shells walls",
+    walls="WALL_CELLS thin_shells walls",
 )

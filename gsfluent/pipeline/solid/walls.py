@@ -13,7 +13,8 @@ from gsfluent.spatial.voxels import distance_transform, surface
 
 _STEP = 0.25  # voxels of a march
 _FIRST = 0.75  # voxels below the surface where it starts: within a wall of one and a half
-_CELLS = 2.0  # cells a wall needs
+WALL_CELLS = 3.0
+"""Cells that a wall needs to break as a wall: a crack through it is two cells wide or more."""
 _SHARE = 0.05  # of the surface that may be thinner
 
 
@@ -81,8 +82,8 @@ def thin_shells(
 ) -> dict[str, Any]:
     """Flag walls that a simulation grid cannot carry.
 
-    Thin is what is thinner than two cells and farther than a cell from where a ball of two cells
-    fits in: flakes and bumps of a rough surface ride on thick matter and are no walls.
+    Thin is what is thinner than three cells and farther than a cell from where a ball of three
+    cells fits in: flakes and bumps of a rough surface ride on thick matter and are no walls.
 
     Args:
         field: The solid, world units.
@@ -92,17 +93,18 @@ def thin_shells(
         unit: What lengths are called in the warning.
 
     Returns:
-        ``cell``, ``limit`` (two cells), ``share`` of the surface that is thinner, ``thinnest`` (the
-        5 % quantile) and ``median`` (both None when thicker than eight cells), ``middle`` (of the
-        thin surface, [3], or None), ``cells_needed`` (how many times finer a grid would carry the
-        thinnest), ``warning`` and ``hint`` (texts, or None).
+        ``cell``, ``cells`` (of the thinnest; None without a warning), ``limit`` (three cells),
+        ``share`` of the surface that is thinner, ``thinnest`` (the 5 % quantile) and ``median``
+        (both None when thicker than eight cells), ``middle`` (of the thin surface, [3], or None),
+        ``cells_needed`` (how many times finer a grid would carry the thinnest), ``warning`` and
+        ``hint`` (texts, or None).
 
     Raises:
         ValueError: ``cell`` is not positive.
     """
     if not (math.isfinite(cell) and cell > 0):
         raise ValueError(f"thin_shells: cell must be positive, got {cell}")
-    limit, most = _CELLS * cell, 8.0 * cell
+    limit, most = WALL_CELLS * cell, 8.0 * cell
     points, thickness = wall_thickness(field, most)
     thin = (thickness < limit) & (_from_core(field, points, 0.5 * limit) > 0.5 * limit + cell)
     share = float(thin.double().mean()) if len(thickness) else 0.0
@@ -110,6 +112,7 @@ def thin_shells(
         "cell": cell,
         "limit": limit,
         "share": share,
+        "cells": None,
         "thinnest": None,
         "median": None,
         "middle": None,
@@ -131,11 +134,13 @@ def thin_shells(
         return report
     thinnest = max(low, field.voxel)
     report["cells_needed"] = limit / thinnest
+    report["cells"] = thinnest / cell
     report["warning"] = (
-        f"{100 * share:.0f} % of the surface stands on walls under two cells ({limit:.3g}{unit}); "
-        f"5 % is thinner than {thinnest:.3g}{unit}"
+        f"{100 * share:.0f} % of the surface stands on walls under {WALL_CELLS:g} cells "
+        f"({limit:.3g}{unit}), 5 % of the walls under {report['cells']:.2g} cells "
+        f"({thinnest:.3g}{unit})"
     )
-    hint = f"a grid {report['cells_needed']:.1f} times finer (solve.quality)"
+    hint = f"a grid {report['cells_needed']:.2g} times finer"
     if gaussian_size is not None and thinnest < 2.0 * gaussian_size:
         hint += "; the splats are as large as the wall is thick: reconstruct at a larger image_size"
     if field.voxel > 0.5 * thinnest:

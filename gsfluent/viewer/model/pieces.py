@@ -27,7 +27,7 @@ class Pieces:
         """Pieces of the points of a frame.
 
         Labels of fragments are rows of material points; here they become 0, 1, 2 and so on in the
-        order in which they are met, the largest first. Broken points have no label of their own and
+        order in which they are met, the largest first. Loose points have no label of their own and
         get that of the piece they hang on.
 
         Returns:
@@ -40,8 +40,8 @@ class Pieces:
                 return self._frames[frame.index]
             labels = frame.fragments.long()
             slots = self._numbered(labels)
-            broken = labels < 0
-            found = (_joined(slots, broken, frame), broken)
+            loose = labels < 0
+            found = (_joined(slots, loose, frame), loose | (frame.damage >= 1.0))
             self._frames[frame.index] = found
             if len(self._frames) > _KEPT:
                 self._frames.popitem(last=False)
@@ -57,13 +57,13 @@ class Pieces:
         return torch.tensor(slots, device=labels.device)[inverse]
 
 
-def _joined(slots: Tensor, broken: Tensor, frame: SavedFrame) -> Tensor:
-    """Give broken points the piece they hang on, through other broken points if need be, [P].
+def _joined(slots: Tensor, loose: Tensor, frame: SavedFrame) -> Tensor:
+    """Give loose points the piece they hang on, through other loose points if need be, [P].
 
     Shortest paths over links between close points: debris that lies on a piece is reached, a spray
     in the air is not.
     """
     reach = REACH * max(float(frame.volumes.double().mean()) ** (1.0 / 3.0), 1e-9)
     place = frame.positions.double().cpu().numpy()
-    piece = np.where(broken.cpu().numpy(), -1, slots.cpu().numpy())
+    piece = np.where(loose.cpu().numpy(), -1, slots.cpu().numpy())
     return torch.from_numpy(clinging(place, piece, reach)).to(slots.device)

@@ -21,8 +21,16 @@ _CURVES: dict[str, tuple[tuple[str, str, str], ...]] = {
         ("momentum_y", "y", "#3f9d5a"),
         ("momentum_z", "z", "#2f6fc4"),
     ),
-    "Fragments": (("fragments", "pieces", "#8d62c0"),),
-    "Broken": (("damaged_fraction", "share of the volume broken", "#d0453f"),),
+    "Fragments": (
+        ("fragments", "pieces", "#8d62c0"),
+        ("pieces_over_1_percent", "over 1 % of the mass", "#2f6fc4"),
+    ),
+    "Broken": (
+        ("damaged_fraction", "share of the volume broken", "#d0453f"),
+        ("broken_fraction", "share of the mass ever broken", "#8a8f98"),
+        ("loose_fraction", "share of the mass loose", "#d98a1f"),
+    ),
+    "Blocks": (("active_blocks", "blocks of the grid in use", "#3f9d5a"),),
     "Holes": (("holes", "holes in the silhouette", "#d98a1f"),),
 }
 _UNITS = {"Energy": "J", "Momentum": "kg m/s", "Broken": "%", "Holes": "%"}

@@ -151,8 +151,10 @@ class RunSource:
             return f"**Running:** {count}{doing}.{gaps}"
         if self._unfinished() and not complete:
             return f"**Stopped:** {count}; no new one for {_span(self._age())}.{gaps}"
-        verdict = str(self._read_record().get("verdict", "finished"))
-        return f"**{verdict.capitalize()}:** {count}.{gaps}"
+        record = self._read_record()
+        verdict = str(record.get("verdict", "finished"))
+        notes = (record.get("simulation") or {}).get("notes") or []
+        return f"**{verdict.capitalize()}:** {count}.{gaps}" + "".join(f" {n}." for n in notes)
 
     def _simulated(self) -> list[int]:
         """Numbers of the frames on disk, from 1, ascending."""

@@ -116,11 +116,13 @@ def test_what_nothing_reaches_is_chip_or_dust_by_its_size() -> None:
     assert labels == [0] * 20 + [-1] * 8 + [28] * 12
     assert pieces.chip.nonzero()[:, 0].tolist() == list(range(20, 25))
     assert pieces.unit[20:25].tolist() == [20] * 5
-    assert pieces.dust.nonzero()[:, 0].tolist() == [25, 26, 27] and not pieces.unit[25:28].ge(0).any()
+    assert (
+        pieces.dust.nonzero()[:, 0].tolist() == [25, 26, 27] and not pieces.unit[25:28].ge(0).any()
+    )
 
 
 def test_bits_that_move_with_their_piece_belong_to_it() -> None:
-    web, position, broken = block()
+    web, _, broken = block()
     alone = torch.zeros_like(broken)
     alone[len(alone) // 2] = True
     a, b = web.links.unbind(dim=1)
@@ -168,7 +170,15 @@ def test_dust_is_bounded_and_the_surplus_joins_its_piece() -> None:
     assert int(find_pieces(none, flown, broken, cut).dust.sum()) == len(powder)
 
 
-def shuffled(web: Web, position: Tensor, broken: Tensor, order: Tensor) -> tuple[Web, Tensor, Tensor]:
+def test_the_bound_on_dust_falls_with_the_size_of_the_pieces() -> None:
+    # An octave in size costs a factor of 2^(-1/2): eight times the points.
+    limits = dust_limit(torch.ones(2).double(), torch.tensor([1000, 8000]))
+    assert float(limits[0] / limits[1]) == pytest.approx(math.sqrt(2.0))
+
+
+def shuffled(
+    web: Web, position: Tensor, broken: Tensor, order: Tensor
+) -> tuple[Web, Tensor, Tensor]:
     place = torch.empty_like(order)
     place[order] = torch.arange(len(order))
     links = place[web.links]

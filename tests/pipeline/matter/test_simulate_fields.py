@@ -80,7 +80,7 @@ def pieces_of(matter: Matter, broken: Tensor, position: Tensor) -> Pieces:
     links = rest_links(matter.rest, matter.ranges, matter.spacing)
     p = matter.particles
     web = Web(
-        links, matter.rest, p.body.long(), torch.tensor(matter.spacing, dtype=torch.float64), p.mass,
+        links, matter.rest, p.body.long(), torch.tensor(matter.spacing).double(), p.mass,
         matter.of_law("fluid", "drucker_prager"), breakable(matter), torch.tensor([0.5]).double(),
     )  # fmt: skip
     return find_pieces(web, position, broken, torch.zeros(len(links), dtype=torch.bool))

@@ -63,9 +63,7 @@ def test_what_lies_near_the_crack_and_stands_still_is_welded() -> None:
     assert bool(welded[(away < 1.0) & state.ever].all())
     assert torch.equal(after.ever, state.ever)
     # What is welded is a seed of its piece; the crack between the pieces stays.
-    again = find_pieces(
-        web, after.position, after.peak >= 0, pieces.cut_links, ever=after.ever
-    )
+    again = find_pieces(web, after.position, after.peak >= 0, pieces.cut_links, ever=after.ever)
     assert torch.equal(again.unit, pieces.unit)
     assert again.fragments.count == 2
     side = matter.rest[:, 0] > 0

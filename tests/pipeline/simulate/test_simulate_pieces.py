@@ -89,7 +89,13 @@ def clusters(
 
     index = torch.arange(count).repeat_interleave(size)
     position = 0.01 * rand(count * size, 3) + rand(count, 3)[index]
-    return rand(count * size).abs(), position, rand(count * size, 3), rand(count * size, 3, 3), index
+    return (
+        rand(count * size).abs(),
+        position,
+        rand(count * size, 3),
+        rand(count * size, 3, 3),
+        index,
+    )
 
 
 def moments(

@@ -1,0 +1,120 @@
+"""What a run says of itself in words: walls too thin, what was struck and stayed whole, pieces."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from gsfluent.data import SURFACE
+from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.stage import QUALITY
+from gsfluent.pipeline.solid.field import SignedDistance
+from gsfluent.pipeline.solid.walls import WALL_CELLS, thin_shells
+from gsfluent.scene.scene import Scene
+
+_log = logging.getLogger(__name__)
+
+
+def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
+    """Walls that a grid cannot carry, by body; a warning in the log for each body with some.
+
+    Args:
+        scene: The scene; only its solids have walls.
+        dx: Grid spacing [m].
+
+    Returns:
+        By name what :func:`gsfluent.pipeline.solid.walls.thin_shells` reports in scene metres, and
+        ``solve_cells``: the ``solve.cells`` with which the thinnest walls have
+        :data:`WALL_CELLS` cells; None where they have.
+    """
+    found = {}
+    for body in scene.bodies:
+        if body.solid is None:
+            continue
+        scale, splats = body.frame.scale, body.solid.gaussians
+        assert splats.labels is not None  # a solid has labels
+        skin = splats.select(splats.labels.eq(SURFACE))
+        field = SignedDistance.of_solid(body.solid)
+        report = thin_shells(
+            field.replace(values=field.values * scale, voxel=field.voxel * scale),
+            dx,
+            gaussian_size=scale * float(skin.scales.amax(1).median()) if skin.count else None,
+            unit=" m",
+        )
+        if report["middle"] is not None:
+            # measured from the corner of the grid, in metres
+            local = torch.tensor(report["middle"]) - field.origin
+            report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
+        report["solve_cells"] = None
+        if report["warning"]:
+            report["solve_cells"] = cells_for(scene, dx / report["cells_needed"])
+            report["hint"] = f"{setting(report['solve_cells'])}: {report['hint']}"
+            _log.warning("%s: %s; hint: %s", body.name, report["warning"], report["hint"])
+        found[body.name] = report
+    return found
+
+
+def cells_for(scene: Scene, dx: float) -> int:
+    """Cells along the largest solid that make a grid at least as fine as ``dx`` [m]."""
+    return math.ceil(grid_spacing(scene, 1) / dx - 1e-9)
+
+
+def setting(cells: int) -> str:
+    """How a shot asks for so many cells along its largest solid."""
+    enough = [name for name, count in QUALITY.items() if count >= cells]
+    return f"solve.cells: {cells}" + (f" (or solve.quality: {enough[0]})" if enough else "")
+
+
+def notes_of(
+    thin: Mapping[str, Any], unbroken: Sequence[Mapping[str, Any]], pull: float
+) -> list[str]:
+    """What a reader of the verdict must know although the run is sound, a sentence each.
+
+    Args:
+        thin: Of :func:`thin_walls`.
+        unbroken: Of :meth:`gsfluent.stages.strikes.Strikes.unbroken`.
+        pull: Strength of gravity [m/s^2].
+    """
+    notes = [
+        f"{name}: {report['warning']}, too few to break as walls do; "
+        f"{setting(report['solve_cells'])} gives them {WALL_CELLS:g} cells"
+        for name, report in thin.items()
+        if report["warning"]
+    ]
+    for row in unbroken:
+        speed, needed = row["speed"], row["speed_needed"]
+        fall = f" (a fall of {needed**2 / (2.0 * pull):.2g} m)" if pull > 0.0 else ""
+        but = "" if speed < needed else "strike harder still, "
+        notes.append(
+            f"{row['body']} met {row['met']} at {speed:.2g} m/s and nothing broke; {but}"
+            f"{row['material']} is estimated to break from about {needed:.2g} m/s{fall}, "
+            "which is right to an order of magnitude only"
+        )
+    return notes
+
+
+def summary(per_frame: Mapping[str, Sequence[Any]]) -> str:
+    """How a run ended, in one sentence; what the run has not counted is left out."""
+
+    def last(*names: str) -> Any:
+        return next((per_frame[name][-1] for name in names if per_frame.get(name)), None)
+
+    pieces, large = last("pieces", "fragments"), last("pieces_over_1_percent")
+    loose, broken = last("loose_fraction"), last("broken_fraction", "damaged_fraction")
+    said = []
+    if pieces is not None:
+        said.append(f"{pieces} {'piece' if pieces == 1 else 'pieces'}")
+        said[0] += "" if large is None else f" ({large} over 1 % of the mass)"
+    if loose is not None:
+        said.append(f"{_percent(loose)} of the mass loose")
+    if broken is not None:
+        said.append(f"{_percent(broken)} broken")
+    return ", ".join(said)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.2g} %"

@@ -1,0 +1,176 @@
+"""What a run says of breaking: strikes that broke nothing, walls too thin, the sentence at the end.
+
+Speeds, heights and thicknesses are known in closed form.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from simulation_scenes import at
+from simulation_shapes import ellipsoid
+
+from gsfluent import materials
+from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.pipeline.solid.walls import WALL_CELLS
+from gsfluent.results.record import RunRecord
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.findings import cells_for, notes_of, setting, summary, thin_walls
+from gsfluent.stages.strikes import FILE, Strikes
+
+HARD = materials.bread.override(cohesion=50.0, name="hard")
+"""Brittle, slow waves (few steps), and too strong for what these tests do to it."""
+DX = 0.02
+
+
+def ball(scene: Scene, name: str, x: float, z: float, **more: Any) -> None:
+    scene.add(
+        ellipsoid((0.06,) * 3, voxels=16, splats=20), HARD, frame=at(x, 0, z), name=name, **more
+    )
+
+
+def watch(scene: Scene, folder: Path, seconds: float, fps: float = 50.0) -> Strikes:
+    frames = Simulate(dx=DX, splats=False)(scene, fps=fps, seconds=seconds)
+    strikes = Strikes(scene, frames.run.matter, folder)
+    for frame in frames:
+        strikes.see(frame)
+    assert frames.report["verdict"] == "clean", frames.report["reason"]
+    return strikes
+
+
+@pytest.mark.parametrize("drop", [0.1, 0.3])
+def test_a_fall_that_breaks_nothing_is_told_with_its_speed(drop: float, tmp_path: Path) -> None:
+    scene = Scene()
+    ball(scene, "ball", 0.0, 0.06 + drop, velocity=(3.0, 0, 0))  # what slides does not strike
+    (found,) = watch(scene, tmp_path, math.sqrt(2 * drop / 9.81) + 0.1).unbroken()
+    assert (found["body"], found["met"], found["material"]) == ("ball", "floor", "hard")
+    assert found["speed"] == pytest.approx(math.sqrt(2 * 9.81 * drop), rel=0.1)
+    assert found["speed_needed"] == scene.bodies[0].breaking_speed > found["speed"]
+
+
+def test_what_lies_there_or_falls_past_was_not_struck(tmp_path: Path) -> None:
+    scene = Scene()
+    ball(scene, "lies", 0.0, 0.06)
+    ball(scene, "flies", 0.135, 0.45, velocity=(0, 0, -3.0))  # past it, 15 mm away
+    strikes = watch(scene, tmp_path, 0.12)
+    low = float(strikes.rows[-1]["bodies"][1]["low"][2])
+    assert low < 0.06 and strikes.met == [] and strikes.unbroken() == []
+
+
+def test_two_bodies_meet_at_their_relative_speed(tmp_path: Path) -> None:
+    scene = Scene(floor=None, gravity=(0, 0, 0))
+    ball(scene, "left", -0.11, 0.0, velocity=(2.0, 0, 0))
+    ball(scene, "right", 0.11, 0.0, velocity=(-1.0, 0, 0))
+    found = watch(scene, tmp_path, 0.12).unbroken()
+    assert [(row["body"], row["met"]) for row in found] == [("left", "right"), ("right", "left")]
+    assert [row["speed"] for row in found] == pytest.approx([3.0, 3.0], rel=0.02)
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+@pytest.mark.parametrize("start", [0.0, 0.047])
+def test_a_bullet_that_bounces_off_is_told(rigid: bool, start: float, tmp_path: Path) -> None:
+    scene = Scene()
+    ball(scene, "ball", 0.0, 0.06)
+    name = scene.bullet((-0.2, 0, 0.08), (0, 0, 0.08), 6.0, radius=0.02, at=start, rigid=rigid)
+    (found,) = watch(scene, tmp_path, 0.12).unbroken()
+    assert (found["body"], found["met"]) == ("ball", name)
+    assert found["speed"] == pytest.approx(6.0, rel=0.05)
+
+
+def test_a_run_in_which_something_broke_has_nothing_to_tell(tmp_path: Path) -> None:
+    scene = Scene()
+    weak = materials.bread.override(cohesion=0.01)
+    ball(scene, "hard", 0.3, 0.1)
+    scene.add(ellipsoid((0.06,) * 3, voxels=16), weak, frame=at(0, 0, 0.16), velocity=(0, 0, -4.0))
+    strikes = watch(scene, tmp_path, 0.15)
+    assert strikes.broken[0] == 0.0 and strikes.broken[1] > 0.01
+    assert strikes.unbroken() == []
+
+
+def test_a_run_taken_up_again_knows_what_came_before(tmp_path: Path) -> None:
+    scene = Scene()
+    ball(scene, "ball", 0.0, 0.16)
+    frames = Simulate(dx=DX, splats=False)(scene, fps=50.0, seconds=0.24)
+    matter, seen = frames.run.matter, list(frames)
+    whole = Strikes(scene, matter, tmp_path)
+    for frame in seen:
+        whole.see(frame)
+    kept = (tmp_path / FILE).read_bytes()
+    (tmp_path / FILE).unlink()
+    for frame in seen[:10]:
+        Strikes(scene, matter, tmp_path).see(frame)
+    # it stopped after this file and before its state: the last frames come once more
+    for frame in seen[9:]:
+        Strikes(scene, matter, tmp_path).see(frame)
+    assert (tmp_path / FILE).read_bytes() == kept
+    assert whole.unbroken() == Strikes(scene, matter, tmp_path).unbroken() != []
+    (tmp_path / FILE).write_text("{")
+    assert Strikes(scene, matter, tmp_path).met == []
+
+
+def slab() -> Scene:
+    scene = Scene()
+    scene.add(ellipsoid((0.1, 0.1, 0.015), voxels=64), HARD, frame=at(0, 0, 0.015), name="plate")
+    return scene
+
+
+def test_thin_walls_are_told_with_the_cells_that_would_do(caplog: pytest.LogCaptureFixture) -> None:
+    scene = slab()
+    coarse = grid_spacing(scene, 16)
+    with caplog.at_level(logging.WARNING):
+        report = thin_walls(scene, coarse)["plate"]
+    assert report["limit"] == pytest.approx(WALL_CELLS * coarse)
+    assert report["cells"] == pytest.approx(report["thinnest"] / coarse) and report["cells"] < 2.5
+    cells = report["solve_cells"]
+    assert f"plate: {report['warning']}" in caplog.text and f"solve.cells: {cells}" in caplog.text
+    assert f"{report['cells']:.2g} cells" in report["warning"]
+    # what it asks for is just enough
+    fine = grid_spacing(scene, cells)
+    assert WALL_CELLS <= report["thinnest"] / fine < WALL_CELLS * cells / (cells - 1)
+    caplog.clear()
+    enough = thin_walls(scene, grid_spacing(scene, 2 * cells))["plate"]
+    assert enough["warning"] is enough["solve_cells"] is None and caplog.text == ""
+    assert cells_for(scene, fine) == cells
+    assert setting(30) == "solve.cells: 30 (or solve.quality: shot)"
+    assert setting(1000) == "solve.cells: 1000"
+
+
+def test_notes_are_whole_sentences_and_honest() -> None:
+    row = {"body": "head", "material": "plaster", "met": "floor", "speed": 2.0, "speed_needed": 4.0}
+    (note,) = notes_of({}, [row], 9.81)
+    assert "head met floor at 2 m/s and nothing broke" in note and "about 4 m/s" in note
+    assert (
+        "harder" not in note
+        and f"a fall of {16 / (2 * 9.81):.2g} m" in note
+        and "order of magnitude" in note
+    )
+    (note,) = notes_of({}, [row | {"speed": 5.0}], 0.0)
+    assert "nothing broke; strike harder still, plaster is" in note and "fall" not in note
+    assert notes_of({"head": {"warning": None}}, [], 9.81) == []
+    thin = {"warning": "9 % of it is thin", "solve_cells": 60}
+    (note,) = notes_of({"head": thin}, [], 9.81)
+    assert note.startswith("head: 9 % of it is thin") and "solve.cells: 60" in note
+
+
+def test_the_end_of_a_run_is_one_sentence() -> None:
+    old = {"fragments": [1, 7], "damaged_fraction": [0.0, 0.25]}
+    assert summary(old) == "7 pieces, 25 % broken"
+    new = {"pieces": [1, 1], "pieces_over_1_percent": [1, 1], "loose_fraction": [0.0, 0.0123]}
+    said = summary(old | new | {"broken_fraction": [0.0, 0.05]})
+    assert said == "1 piece (1 over 1 % of the mass), 1.2 % of the mass loose, 5 % broken"
+    assert summary({}) == ""
+
+
+def test_the_verdict_of_a_run_names_its_notes(tmp_path: Path) -> None:
+    record = RunRecord(tmp_path / "run.json", {}, torch.device("cpu"), 0)
+    record.values["simulation"] = {"verdict": "clean", "reason": "", "notes": ["one", "two"]}
+    record.finish([])
+    values = json.loads((tmp_path / "run.json").read_text())
+    assert values["verdict"] == "clean" and values["reason"].endswith("healed; one; two")
