@@ -25,7 +25,7 @@ from gsfluent.fracturebench.shapes import box, elastic, free
 from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.shapes import nacc
-from gsfluent.pipeline.matter import crack_band
+from gsfluent.pipeline.matter.crack_band import fracture_energy
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {
@@ -66,7 +66,7 @@ def test_a_row_says_what_its_parameters_mean(name: str) -> None:
             assert m["tensile_strength"] == pytest.approx(wanted, rel=1e-9)
         else:
             assert m["tensile_strength"] < wanted
-        energy = crack_band.fracture_energy(row, m["alpha"], dx=scene.dx)
+        energy = fracture_energy(row, m["alpha"], dx=scene.dx)
         # strength of tens of percent: the energy is linear in the softening no more
         soft = name in ("shatter", "struck_rock")
         assert m["fracture_energy"] == pytest.approx(energy, rel=0.35 if soft else 0.06)

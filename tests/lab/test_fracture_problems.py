@@ -13,10 +13,15 @@ from gsfluent.lab.problems.flow import granular, liquid
 from gsfluent.lab.problems.fracture import notch, spall
 from gsfluent.lab.world import registry
 from gsfluent.lab.world.shapes import nacc
-from gsfluent.pipeline.matter import crack_band
+from gsfluent.pipeline.matter.crack_band import (
+    brittle_spacing,
+    crack_band,
+    fracture_energy,
+    softening_energy,
+)
 
 FAST = (
-    "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",
+    "bar_energy", "brazilian_disc", "kalthoff_winkler", "liquid_at_rest", "plate_impact_spall",
     "return_map_paths", "single_edge_notch", "softening_bar", "taylor_bar",
 )  # fmt: skip
 
@@ -54,25 +59,25 @@ def test_implicit_alpha_breaks_a_few_steps_earlier_than_explicit() -> None:
 def test_crack_band_keeps_strength_and_stretches_softening() -> None:
     row = nacc(1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, hardening=0.4)
     alpha = torch.tensor([-0.05, -0.02, 0.0, 0.3], dtype=torch.float64)
-    rows, stretched = crack_band.crack_band(row, alpha, dx=0.01, reference=0.04)
+    rows, stretched = crack_band(row, alpha, dx=0.01, reference=0.04)
     assert torch.allclose(stretched, torch.tensor([-0.2, -0.08, 0.0, 0.3], dtype=torch.float64))
     before, after = row[4] * alpha[:2], rows[4] * stretched[:2]
     assert torch.allclose(before, after, rtol=1e-14)  # p0 = kappa sinh(xi |alpha|) is the same
     assert torch.equal(rows[torch.arange(8) != 4], row[torch.arange(8) != 4])
-    same = crack_band.fracture_energy(row, -0.05, dx=0.04)
-    assert crack_band.fracture_energy(rows, -0.2, dx=0.01) == pytest.approx(same, rel=0.03)
+    same = fracture_energy(row, -0.05, dx=0.04)
+    assert fracture_energy(rows, -0.2, dx=0.01) == pytest.approx(same, rel=0.03)
     # without scaling the finer grid would take a quarter of the energy
-    assert crack_band.fracture_energy(row, -0.05, dx=0.01) == pytest.approx(0.25 * same)
+    assert fracture_energy(row, -0.05, dx=0.01) == pytest.approx(0.25 * same)
 
 
 def test_crack_band_knows_the_grid_that_is_too_coarse() -> None:
     row = nacc(1e9, 0.2, 1000.0, friction=2.0, cohesion=0.5, hardening=1.0)
-    limit = float(crack_band.brittle_spacing(row, reference=0.01))
+    limit = float(brittle_spacing(row, reference=0.01))
     assert limit == pytest.approx(0.02)
     energy = []
     for dx in (limit / 8.0, limit / 4.0, 2.0 * limit, 4.0 * limit):
-        scaled, alpha = crack_band.crack_band(row, torch.tensor(-0.02), dx=dx, reference=0.01)
-        energy.append(crack_band.fracture_energy(scaled, float(alpha), dx=dx))
+        scaled, alpha = crack_band(row, torch.tensor(-0.02), dx=dx, reference=0.01)
+        energy.append(fracture_energy(scaled, float(alpha), dx=dx))
     assert energy[1] == pytest.approx(energy[0], rel=0.1)
     assert energy[3] > 1.3 * energy[2]  # a one-step failure takes the stored energy of the band
 
@@ -80,15 +85,15 @@ def test_crack_band_knows_the_grid_that_is_too_coarse() -> None:
 def test_crack_band_refuses_bad_numbers() -> None:
     row = nacc(1e9, 0.2, 1000.0, friction=2.0, cohesion=0.1, hardening=0.4)
     with pytest.raises(ValueError, match="positive"):
-        crack_band.crack_band(row, torch.tensor(-0.1), dx=0.0, reference=1.0)
+        crack_band(row, torch.tensor(-0.1), dx=0.0, reference=1.0)
     with pytest.raises(ValueError, match="below"):
-        crack_band.crack_band(row, torch.tensor(-0.1), dx=1e-3, reference=1.0)
+        crack_band(row, torch.tensor(-0.1), dx=1e-3, reference=1.0)
     with pytest.raises(ValueError, match="negative"):
-        crack_band.softening_energy(row, 0.0)
+        softening_energy(row, 0.0)
     with pytest.raises(ValueError, match="positive"):
-        crack_band.fracture_energy(row, -0.1, dx=-1.0)
+        fracture_energy(row, -0.1, dx=-1.0)
     with pytest.raises(ValueError, match="still"):  # alpha moves by 0.2 in a step at most
-        crack_band.softening_energy(row, -9.0, steps=10)
+        softening_energy(row, -9.0, steps=10)
 
 
 def test_a_strip_torn_too_fast_fails_everywhere_and_that_is_no_crack() -> None:

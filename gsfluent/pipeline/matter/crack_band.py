@@ -98,7 +98,7 @@ def softening_energy(params: Tensor, alpha: float, *, steps: int = 400) -> float
     if not math.isfinite(energy):
         kappa, beta, xi = (float(row[0, i]) for i in (1, 3, 4))
         raise ValueError(
-            f"softening_energy: the strength is not lost on a path of 1.5 |alpha| = "
+            f"softening_energy: strength is still left after a path of 1.5 |alpha| = "
             f"{-1.5 * alpha:.3g} beyond the elastic limit (kappa {kappa:g}, cohesion {beta:g}, "
             f"hardening {xi:g})"
         )

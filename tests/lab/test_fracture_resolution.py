@@ -1,0 +1,92 @@
+"""The study of fracture over the resolution: areas of cuts, exponents, lines and tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from loaded_scripts import load_script
+
+from gsfluent.pipeline.matter.fragments import rest_links
+
+study = load_script("study/fracture_resolution")
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.25])
+def test_area_of_cut_links_is_that_of_planes_of_all_directions(jitter: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    axis = (torch.arange(24, dtype=torch.float64) + 0.5) / 24.0 - 0.5
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    noise = 2.0 * torch.rand(points.shape, generator=generator, dtype=torch.float64) - 1.0
+    points = points + jitter * noise / 24.0
+    ball = points[points.norm(dim=1) < 0.5]
+    links = rest_links(ball, ((0, ball.shape[0]),), (1.0 / 24.0,))
+    each = study.link_area(links, ball, math.pi / 6.0)
+    found = []
+    for _ in range(40):
+        normal = torch.randn(3, generator=generator, dtype=torch.float64)
+        side = ball @ (normal / normal.norm()) > 0.01
+        cut = side[links[:, 0]] != side[links[:, 1]]
+        found.append(int(cut.sum()) * each / (math.pi / 4.0))
+    assert sum(found) / len(found) == pytest.approx(1.0, abs=0.04)
+    assert 0.85 < min(found) and max(found) < 1.15
+    side = ball[:, 0] > 1e-9 if jitter == 0.0 else ball[:, 0] > 0.01
+    flat = int((side[links[:, 0]] != side[links[:, 1]]).sum()) * each / (math.pi / 4.0)
+    assert flat == pytest.approx(5.0 / 5.74, abs=0.06)
+
+
+def test_exponent_is_that_of_a_power_law_and_none_of_one_grid() -> None:
+    rows = [{"dx": dx, "v": 3.0 * dx**1.25} for dx in (0.1, 0.05, 0.02)]
+    assert study.exponent(rows, "v") == pytest.approx(1.25)
+    assert math.isnan(study.exponent(rows[:1], "v"))
+    assert math.isnan(study.exponent([{"dx": 0.1, "v": 0.0}, {"dx": 0.2, "v": 1.0}], "v"))
+
+
+def test_bodies_have_their_volumes() -> None:
+    for shape, half, volume in (
+        (study.ball, (0.1, 0.1, 0.08), 4.0 / 3.0 * math.pi * 0.1 * 0.1 * 0.08),
+        (study.disc, (0.05, 0.02, 0.05), math.pi * 0.05**2 * 0.04),
+        (study.notched, (0.02, 0.08, 0.02), 0.04 * 0.04 * 0.16 * (1.0 - 0.05 * 0.75)),
+    ):
+        body = study.solid(half, shape)
+        assert int(body.occupancy.sum()) * body.voxel**3 == pytest.approx(volume, rel=0.05)
+
+
+def test_a_fall_is_measured_once_and_entered(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    lines = tmp_path / "lines.jsonl"
+    words = ["-o", str(lines), "--only", "drop", "--cells", "8"]
+    assert study.main([*words, "--estimate"]) == 0 and not lines.exists()
+    assert study.main(words) == 0
+    (row,) = study.read(lines)
+    assert row["cells"] == 8 and row["verdict"] == "clean" and row["largest"] > 0.5
+    assert 0.0 < row["dissipated"] < row["at_start"] and row["broken"] > 0.0
+    assert row["blocks"] >= 0.9 * row["blocks_intact"] > 0.0
+    lines.write_text(lines.read_text() + '{"part": "dr')  # cut off
+    capsys.readouterr()
+    assert study.main(words) == 0
+    assert "there" in capsys.readouterr().err and len(study.read(lines)) == 1
+    cells = study.line(row)
+    assert len(cells) == len(study._HEAD) and cells[0] == "watermelon"
+    assert "| 8 |" in study.seeds_table([row])
+
+
+def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:
+    scene = study.thrown("glass", 0.03, 0.01, 8)
+    assert len(scene.materials) <= 16 and scene.v[0, 2] < 0.0
+    strong = [math.sinh(-m["hardening"] * m["alpha"]) for m in scene.materials]
+    assert min(strong) < max(strong)
+    row = study.run_bench("watermelon", 3, 3, "cpu")
+    rows = [
+        {**json.loads(json.dumps(row)), "part": "bench", "name": "watermelon", "cells": n}
+        for n in (3, 4)
+    ]
+    table = study.bench_table(rows)
+    assert table.count("watermelon") == 2 and "band" in table
+
+
+def test_an_unknown_part_is_named() -> None:
+    with pytest.raises(SystemExit, match="dorp"):
+        study.main(["--only", "dorp", "--estimate"])
