@@ -26,22 +26,22 @@ def ellipse(
     Args:
         friction: M, [N].
         tensile: Uniaxial tensile strength t [Pa], [N].
-        compressive: Uniaxial compressive strength c [Pa], [N], larger than the tensile one.
+        compressive: Uniaxial compressive strength c [Pa], [N]; at least t / 0.9 is taken.
         largest: Largest p0 [Pa], [N]; where the strengths ask for more, p0 is this, and the ellipse
-            goes through the tensile one alone.
+            goes through the tensile one alone, or as near to it as a cohesion of one allows.
 
     Returns:
         ``(beta, p0)``, [N] each.
     """
-    m2, t = friction**2, tensile
-    ratio = t / compressive.maximum(1.001 * t)
+    m2 = friction**2
+    t = tensile.minimum(0.95 * friction * largest / (3.0 + m2 / 9.0).sqrt())
+    ratio = (t / compressive).clamp(max=0.9)
     k = ratio * m2 / (1.0 - ratio) ** 2
     # (18 - k) beta^2 + (9 + M^2 + 2 k) beta - k = 0; its small root without cancellation
     linear = 9.0 + m2 + 2.0 * k
     beta = 2.0 * k / (linear + (linear**2 + 4.0 * (18.0 - k) * k).sqrt())
     p0 = 3.0 * (t / ratio - t) * (1.0 + 2.0 * beta + m2 / 9.0) / (m2 * (1.0 - beta))
-    alone = (t**2 / m2 + t / 3.0 * (largest + t / 3.0)) / (
-        largest * (largest + t / 3.0) - 2.0 * t**2 / m2
-    ).clamp(min=1e-12 * torch.ones_like(t))
+    reach = largest + t / 3.0
+    alone = (t**2 / m2 + t / 3.0 * reach) / (largest * reach - 2.0 * t**2 / m2)
     crowded = p0 > largest
     return torch.where(crowded, alone, beta), torch.where(crowded, largest, p0)

@@ -25,7 +25,9 @@ from gsfluent.scene.scene import Scene
 from gsfluent.stages.findings import cells_for, notes_of, setting, summary, thin_walls
 from gsfluent.stages.strikes import FILE, Strikes
 
-HARD = materials.bread.override(cohesion=50.0, name="hard")
+HARD = materials.bread.override(
+    tensile_strength=1e6, compressive_strength=2e6, weibull_modulus=0.0, name="hard"
+)
 """Brittle, slow waves (few steps), and too strong for what these tests do to it."""
 DX = 0.02
 
@@ -86,7 +88,9 @@ def test_a_bullet_that_bounces_off_is_told(rigid: bool, start: float, tmp_path: 
 
 def test_a_run_in_which_something_broke_has_nothing_to_tell(tmp_path: Path) -> None:
     scene = Scene()
-    weak = materials.bread.override(cohesion=0.01)
+    weak = materials.bread.override(
+        tensile_strength=100.0, compressive_strength=1000.0, fracture_energy=0.1
+    )
     ball(scene, "hard", 0.3, 0.1)
     scene.add(ellipsoid((0.06,) * 3, voxels=16), weak, frame=at(0, 0, 0.16), velocity=(0, 0, -4.0))
     strikes = watch(scene, tmp_path, 0.15)

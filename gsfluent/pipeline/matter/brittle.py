@@ -101,7 +101,8 @@ def softened(
     def dissipated(strength: Tensor, alpha0: Tensor) -> Tensor:
         table = rows.clone()
         table[:, 4] = torch.asinh(strength / kappa) / alpha0.abs()
-        return softening_energies(table, alpha0)
+        # Next to no strength: what is left of it when it is gone hides what it took.
+        return softening_energies(table, alpha0).nan_to_num(nan=0.0).clamp(min=1e-9 * target)
 
     def steepest(strength: Tensor) -> Tensor:
         return -torch.asinh(strength / kappa) * beta / STEEPEST
@@ -116,13 +117,13 @@ def softened(
     # Beyond it the energy grows almost linearly with alpha0 at fixed strength: secant steps.
     least = steepest(strength)
     before, found = least, dissipated(strength, least)
-    alpha0 = least * (target / found).clamp(min=1.0)
+    alpha0 = (least * (target / found).clamp(min=1.0)).clamp(min=ALPHA_MIN)
     for _ in range(6):
         now = dissipated(strength, alpha0)
         slope = (now - found) / (alpha0 - before)
         before, found = alpha0, now
         closer = alpha0 + (target - now) / slope
-        alpha0 = torch.where(slope < 0.0, closer.minimum(least), alpha0)  # NaN: nothing moved
-    # The return map keeps no smaller alpha: on very fine grids soft matter tears with less energy.
-    alpha0 = alpha0.clamp(min=ALPHA_MIN)
+        # A slope that is no number: nothing moved. On very fine grids soft matter tears with less
+        # energy, because the return map keeps no alpha below ALPHA_MIN.
+        alpha0 = torch.where(slope < 0.0, closer.minimum(least), alpha0).clamp(min=ALPHA_MIN)
     return torch.asinh(strength / kappa) / alpha0.abs(), alpha0, kept
