@@ -20,12 +20,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsfluent.errors import InputError
-from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, RANGES, READS
+from gsfluent.materials.laws import DEFAULTS, HANDBOOK, LAWS, PARAMETERS, RANGES, READS
 from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, WHOLE, Field, Material, nearest
 from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
 __all__ = [
     "DEFAULTS",
+    "HANDBOOK",
     "LARGEST",
     "LAWS",
     "LOOKS",

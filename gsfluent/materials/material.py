@@ -268,10 +268,12 @@ class Material:
         """Smallest volumetric strain at which tension breaks it; infinite when it never breaks."""
         if self.law != "nacc":
             return math.inf
-        if self.by_handbook:
+        by_hand = [f for f in DERIVED if getattr(self, f) is not None]
+        if self.by_handbook and not by_hand:
             strength, young = self._at("tensile_strength"), self._at("young_modulus")
             return float((strength / (self.softening**0.5 * young)).min())
-        alpha, xi, beta = (self._at(f) for f in DERIVED[::-1])
+        found = self._nacc(_tensor)
+        alpha, xi, beta = (found[f] for f in DERIVED[::-1])
         ratio = torch.sinh((xi * (-alpha).clamp(min=0.0)).clamp(max=5.0)) + 1e-5
         return float((0.5 * torch.log1p(2.0 * beta * ratio.clamp(max=0.495))).min())
 
