@@ -68,10 +68,10 @@ def test_two_materials_part_at_a_weak_interface(tmp_path: Path, weak: bool) -> N
         parts.append({"name": "glue", "where": glue, **GLUE})
     scene = Scene(floor=None, gravity=(0, 0, 0))
     labelled = label_regions(bar(), [part["where"] for part in parts])
-    scene.add(labelled, "plaster", parts=parts, angular_velocity=(0, 0, 100))
+    scene.add(labelled, "plaster", parts=parts, angular_velocity=(0, 0, 60))
     stage = Simulate("preview", repair=False, splats=False, free_flight=False, piece_flight=False,
                      sleep=False)  # fmt: skip
-    *_, last = stage(scene, fps=1000, seconds=0.006)
+    *_, last = stage(scene, fps=1000, seconds=0.009)
     rest = build_matter(scene, grid_spacing(scene, 20)).rest[:, 0].numpy()
     broken = last.broken.numpy()
     pieces = last.fragments.numpy()
