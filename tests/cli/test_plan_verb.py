@@ -78,7 +78,10 @@ def test_the_tables_say_what_binds_and_what_to_mend(
     for line in ("passes", "bounds of dx: ", "stages", "warnings", "in all"):
         assert f"\n{line}" in text or f"\n  {line}" in text, line
     assert "  +  damage variable" in text and "  -  blades" in text
-    assert f"watermelon/rind breaks from about {rind:.2g} m/s" in text and "hint: raise the drop" in text
+    assert (
+        f"watermelon/rind breaks from about {rind:.2g} m/s" in text
+        and "hint: raise the drop" in text
+    )
     # how many cells the thinnest part has, and how many make it bend
     assert re.search(r"thinnest, [\d.]+ cells of [\d.]+ mm, under 4; hint: .*solve.cells: ", text)
     assert " lets it bend" in text
