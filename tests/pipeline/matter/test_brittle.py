@@ -1,8 +1,9 @@
-"""Brittle matter by handbook numbers: strengths, fracture energy on a grid, Weibull, restitution."""
+"""Brittle matter by handbook numbers: strengths, energy on a grid, Weibull, restitution."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 
 import pytest
@@ -104,7 +105,7 @@ def test_the_band_takes_the_fracture_energy_at_full_strength(name: str, dx: floa
 def test_half_the_spacing_is_twice_the_softening() -> None:
     """As the crack band asks; a little less, since elastic unloading has a share of its own."""
     alphas = [float(on_grid(materials.plaster, dx)[1]) for dx in FINE]
-    for fine, coarse in zip(alphas, alphas[1:], strict=False):
+    for fine, coarse in itertools.pairwise(alphas):
         assert 1.8 < fine / coarse < 2.3
 
 
