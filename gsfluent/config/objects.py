@@ -184,8 +184,10 @@ def read_objects(value: Any, place: Place) -> dict[str, ObjectSettings]:
 
 
 def _object(name: str, value: Any, place: Place) -> ObjectSettings:
+    from gsfluent import materials
+
     settings = mapping(value, place)
-    _refuse_parameters(settings, ("select", "material", "parts"), place)
+    _refuse_parameters(settings, ("select", "material", "parts", *materials.WHOLE), place)
     material = text(settings.pop("material", "fruit.watermelon"), place.inside("material"))
     select = _select(settings.pop("select", "all"), place.inside("select"))
     parts = settings.pop("parts", None)
@@ -229,6 +231,7 @@ def _parts(material: str, base: Mapping[str, Any], value: Any, place: Place) -> 
         settings = mapping(item, where)
         name = text(settings.pop("name", f"part{index + 1}"), where.inside("name"))
         where = Place(f"{place.path}.{name}", place.folder)
+        _refuse_whole(settings, where)
         _refuse_parameters(settings, ("where", "material"), where)
         chosen = section(Where, settings.pop("where", None), where.inside("where"))
         _needs(
@@ -267,6 +270,17 @@ def _one_source(chosen: Where, place: Place) -> None:
         raise InputError(
             f"{place.inside('label').path} does nothing with mask", "remove it, or write labels"
         )
+
+
+def _refuse_whole(settings: Mapping[str, Any], place: Place) -> None:
+    from gsfluent import materials
+
+    for name in materials.WHOLE:
+        if name in settings:
+            raise InputError(
+                f"{place.inside(name).path} is of a part, but {name} holds for a whole object",
+                f"give {name} to the object",
+            )
 
 
 def _refuse_parameters(settings: Mapping[str, Any], extra: tuple[str, ...], place: Place) -> None:

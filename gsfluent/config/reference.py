@@ -65,7 +65,12 @@ def parameters() -> str:
     """Markdown: the material parameters that an object or part may override."""
     laws = ", ".join(f"`{law}`" for law in materials.LAWS)
     names = (*materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS)
-    return f"`law` ({laws}), " + ", ".join(f"`{name}`" for name in names) + ".\n"
+    whole = ", ".join(f"`{name}`" for name in materials.WHOLE)
+    return (
+        f"`law` ({laws}), "
+        + ", ".join(f"`{name}`" for name in names)
+        + f".\nOf an object only, as its parts share them: {whole}.\n"
+    )
 
 
 def _keys(cls: type[Any]) -> Iterator[tuple[str, str, str, str]]:

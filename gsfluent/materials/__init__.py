@@ -3,7 +3,8 @@
 ``gsfluent.materials.fruit.watermelon``, ``gsfluent.materials.glass`` and so on are
 :class:`Material` objects; :func:`get` finds them by name and :meth:`Material.override` changes
 single parameters. They stand in ``presets.toml``. Each preset says of every number whether it is
-measured, derived or chosen by eye (:meth:`Material.source`, docs/measured/materials.md).
+measured, derived, an estimate or chosen by eye (:meth:`Material.source`,
+docs/measured/materials.md).
 
 Strength of ``nacc`` material is set by strain, not by stress: the compressive yield pressure is
 ``kappa * sinh(hardening * max(-alpha, 0))`` and tension fails at ``cohesion * p0``. ``alpha`` is
@@ -20,12 +21,13 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsfluent.errors import InputError
-from gsfluent.materials.laws import DEFAULTS, LAWS, PARAMETERS, RANGES, READS
+from gsfluent.materials.laws import DEFAULTS, HANDBOOK, LAWS, PARAMETERS, RANGES, READS
 from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, WHOLE, Field, Material, nearest
 from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
 __all__ = [
     "DEFAULTS",
+    "HANDBOOK",
     "LARGEST",
     "LAWS",
     "LOOKS",

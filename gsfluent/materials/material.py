@@ -145,6 +145,12 @@ class Material:
                 f"material {self.name!r}: unknown law {self.law!r}", hint=nearest(self.law, LAWS)
             )
         reads, defaults = READS[self.law], DEFAULTS.get(self.law, {})
+        for field in RANGES:
+            if getattr(self, field) is not None and field not in reads:
+                raise InputError(
+                    f"material {self.name!r}: {field} does nothing under law {self.law!r}",
+                    hint=f"remove it, or use law {_readers(field)}",
+                )
         missing = [name for name in HANDBOOK if getattr(self, name) is None]
         if missing and len(missing) < len(HANDBOOK):
             raise InputError(
@@ -155,11 +161,6 @@ class Material:
         by_handbook = not missing
         for field, (low, high, unit) in RANGES.items():
             value = getattr(self, field)
-            if value is not None and field not in reads:
-                raise InputError(
-                    f"material {self.name!r}: {field} does nothing under law {self.law!r}",
-                    hint=f"remove it, or use law {_readers(field)}",
-                )
             if value is None and (field in HANDBOOK or (by_handbook and field in DERIVED)):
                 continue
             if value is None and field in defaults:
@@ -241,7 +242,14 @@ class Material:
         return changes
 
     def source(self, field: str) -> str:
-        """Say where a number is from: ``measured: ...``, ``derived: ...`` or ``chosen by eye``."""
+        """Say where a number is from.
+
+        Returns:
+            ``measured: ...``, ``derived: ...``, ``estimate: ...`` or ``chosen by eye``.
+
+        Raises:
+            InputError: No such field.
+        """
         if field not in (*PARAMETERS, *SCATTER, *WHOLE, *LOOKS):
             raise InputError(
                 f"material {self.name!r}: unknown parameter {field!r}",
@@ -260,10 +268,12 @@ class Material:
         """Smallest volumetric strain at which tension breaks it; infinite when it never breaks."""
         if self.law != "nacc":
             return math.inf
-        if self.by_handbook:
+        by_hand = [f for f in DERIVED if getattr(self, f) is not None]
+        if self.by_handbook and not by_hand:
             strength, young = self._at("tensile_strength"), self._at("young_modulus")
             return float((strength / (self.softening**0.5 * young)).min())
-        alpha, xi, beta = (self._at(f) for f in DERIVED[::-1])
+        found = self._nacc(_tensor)
+        alpha, xi, beta = (found[f] for f in DERIVED[::-1])
         ratio = torch.sinh((xi * (-alpha).clamp(min=0.0)).clamp(max=5.0)) + 1e-5
         return float((0.5 * torch.log1p(2.0 * beta * ratio.clamp(max=0.495))).min())
 

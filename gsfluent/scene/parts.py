@@ -60,7 +60,7 @@ class Part:
         """Read a part from the mapping of a shot file: ``name``, ``where`` and material parameters.
 
         Raises:
-            InputError: ``where`` is missing or has an unknown key.
+            InputError: ``where`` is missing, a key is unknown, or one holds for a whole object.
         """
         if isinstance(value, Part):
             return value
@@ -81,6 +81,11 @@ class Part:
                 hint="keep one of them, or make two parts",
             )
         for key in rest:
+            if key in materials.WHOLE:
+                raise InputError(
+                    f"part {name!r}: {key} holds for a whole object",
+                    hint=f"give {key} to the material of the object",
+                )
             looks = (*materials.LOOKS, *materials.SCATTER)
             known_key(f"part {name!r}", key, (*materials.PARAMETERS, *looks, "material", "law"))
         return Part(name, dict(where), rest)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gsfluent.config import EVENTS, Bullet, Drop, Shot, Throw, load_shot, typed_dict
 from gsfluent.errors import InputError
+from gsfluent.scene.parts import Part
 
 FULL = """
 splats: melon.ply
@@ -349,3 +350,23 @@ def test_scatter_of_strength_may_be_set(folder: Path) -> None:
     assert shot.objects["melon"].overrides == {"variation": 0.2, "grain": 0.01}
     with pytest.raises(InputError, match="variation"):
         read(folder, objects={"melon": {"material": "jelly", "variation": 0.2}})
+
+
+def test_handbook_numbers_of_objects_and_parts(folder: Path) -> None:
+    whole = {"softening": 4.0, "restitution": 0.5, "dust": 0.2}
+    own = {"tensile_strength": 1e5, "weibull_modulus": 6.0, "reference_volume": 1e-5}
+    part = {"name": "rind", "where": {"depth_below": 0.01}, **own}
+    keys = {"material": "fruit.apple", **whole, **own, "parts": [part]}
+    (item,) = read(folder, objects={"apple": keys}).objects.values()
+    assert dict(item.overrides) == whole | own
+    assert item.parts is not None and dict(item.parts[0].overrides) == own
+
+
+@pytest.mark.parametrize("key", ["softening", "restitution", "dust"])
+def test_what_holds_for_a_whole_object_is_refused_in_a_part(folder: Path, key: str) -> None:
+    part = {"name": "rind", "where": {"depth_below": 0.01}, key: 0.5}
+    with pytest.raises(InputError, match=rf"parts\.rind\.{key} .*whole object") as caught:
+        read(folder, objects={"apple": {"material": "fruit.apple", "parts": [part]}})
+    assert "to the object" in caught.value.hint
+    with pytest.raises(InputError, match=f"part 'rind': {key} holds for a whole object"):
+        Part.parse(part)

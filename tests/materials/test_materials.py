@@ -40,11 +40,17 @@ def test_friction_slope_at_45_degrees_is_the_published_one():
         "hardening",
         "friction_angle",
         "shear_damage",
+        "tensile_strength",
+        "compressive_strength",
+        "softening",
+        "restitution",
     ],
 )
 def test_every_parameter_changes_the_row(field):
-    base = materials.fruit.watermelon
-    changed = base.override(**{field: float(getattr(base, field)) * 1.1 + 0.01})
+    base = materials.fruit.orange
+    columns = {"cohesion": 3, "hardening": 4}  # these follow from the strengths unless given
+    value = base.parameters()[columns[field]] if field in columns else getattr(base, field)
+    changed = base.override(**{field: float(value) * 1.1 + 0.01})
     assert not torch.equal(base.parameters(), changed.parameters())
 
 
@@ -52,7 +58,12 @@ def test_every_preset_says_where_its_numbers_come_from():
     for name in materials.names():
         preset = materials.get(name)
         for field in preset.reads:
-            assert preset.source(field).split(":")[0] in ("measured", "derived", "chosen by eye")
+            assert preset.source(field).split(":")[0] in (
+                "measured",
+                "derived",
+                "estimate",
+                "chosen by eye",
+            )
 
 
 def test_unknown_names_suggest_the_nearest():
@@ -83,6 +94,8 @@ def test_brittle_and_elastic_failure_strain():
     assert math.isinf(materials.jelly.failure_strain)
     weak = materials.fruit.watermelon.override(cohesion=0.01)
     assert 0 < weak.failure_strain < materials.fruit.watermelon.failure_strain
+    weak = materials.fruit.watermelon.override(tensile_strength=2e4)
+    assert weak.failure_strain == pytest.approx(0.5 * materials.fruit.watermelon.failure_strain)
 
 
 def test_drop_puts_the_lowest_point_at_the_height():
@@ -195,21 +208,25 @@ def test_a_parameter_field_varies_in_space():
         build_matter(wrong, 0.02)
 
 
+BY_HAND = materials.glass.override(cohesion=0.05, hardening=10.0, alpha0=-0.03, variation=0.0)
+"""Softening as given, on every grid, and no Weibull modulus."""
+
+
 def test_weakness_noise_is_bounded_and_seeded():
     scene = Scene(floor=None)
-    scene.add(ellipsoid(), materials.glass)
+    scene.add(ellipsoid(), BY_HAND)
     alpha = build_matter(scene, 0.02).particles.alpha
-    base = materials.glass.alpha0
+    base = BY_HAND.alpha0
     assert float(alpha.min()) >= base * 1.1501 and float(alpha.max()) <= base * 0.8499
     assert float(alpha.std()) > 0.05 * abs(base)
     assert torch.equal(alpha, build_matter(scene, 0.02).particles.alpha)
 
 
 def test_strength_scatter_is_smooth_seeded_and_of_the_size_asked_for():
-    varied = materials.glass.override(variation=0.3, grain=0.03)
+    varied = BY_HAND.override(variation=0.3, grain=0.03)
     scene, plain = Scene(floor=None), Scene(floor=None)
     scene.add(ellipsoid(), varied)
-    plain.add(ellipsoid(), materials.glass)
+    plain.add(ellipsoid(), BY_HAND)
     matter = build_matter(scene, 0.01, jitter=0.0)
     factor = matter.particles.alpha / build_matter(plain, 0.01, jitter=0.0).particles.alpha
     assert 0.2 < float(factor.std()) < 0.4

@@ -96,7 +96,9 @@ class Resident:
         law, params = matter.law, matter.params
         if not options.law_kernels:  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
-            params = torch.cat([params, params[:1]])
+            spare = params[:1].clone()
+            spare[:, 7] = 0.0  # there a loss of nacc, which is no exponent of a fluid
+            params = torch.cat([params, spare])
         self._special = options.law_kernels and set(law.tolist()) <= {
             LAWS["elastic"],
             LAWS["nacc"],
