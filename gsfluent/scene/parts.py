@@ -95,6 +95,8 @@ class Part:
         changes = dict(self.overrides)
         start = changes.pop("material", None)
         whole = base if start is None else materials.get(start) if isinstance(start, str) else start
+        if start is None and "young_modulus" in changes:  # as much softer as what is around it
+            changes = {"softening": base.softening, **changes}
         return whole.override(name=f"{base.name}/{self.name}", **changes)
 
 

@@ -25,7 +25,14 @@ def hard(ball: Path, tmp_path: Path) -> Path:
     return write_shot(
         tmp_path / "shot.yaml",
         tmp_path / "lens.ply",
-        objects={"ball": {"material": "bread", "tensile_strength": 1e6, "compressive_strength": 2e6}},
+        objects={
+            "ball": {
+                "material": "bread",
+                "tensile_strength": 1e6,
+                "compressive_strength": 2e6,
+                "fracture_energy": 1e6,
+            }
+        },
         events=[{"type": "drop", "height": 0.6}],
         solve={"cells": 8},
         output={"fps": 20, "seconds": 0.6, "size": [64, 48], "what": ["mp4"]},

@@ -26,7 +26,11 @@ from gsfluent.stages.findings import cells_for, notes_of, setting, summary, thin
 from gsfluent.stages.strikes import FILE, Strikes
 
 HARD = materials.bread.override(
-    tensile_strength=1e6, compressive_strength=2e6, weibull_modulus=0.0, name="hard"
+    tensile_strength=1e6,
+    compressive_strength=2e6,
+    fracture_energy=1e6,
+    weibull_modulus=0.0,
+    name="hard",
 )
 """Brittle, slow waves (few steps), and too strong for what these tests do to it."""
 DX = 0.02

@@ -27,13 +27,11 @@ def test_a_dropped_watermelon_breaks_into_chunks(height):
     report = simulation.report
     assert report["verdict"] == "clean"
     assert report["momentum_error"] < 1e-4
-    assert last.stats["fragments"] >= 5
     assert last.stats["fragments_over_3_percent"] >= 2
-    # chunks, not dust: a good part of the mass is still in pieces
-    assert float(last.pieces.mass_fractions.sum()) > 0.2
-    # pieces have parted: the matter covers much more ground than the melon did
-    x = last.particles.position[~last.broken]
-    assert float(x[:, :2].std(dim=0).norm()) > 1.15 * 0.26 / math.sqrt(20) * math.sqrt(1.7)
+    # chunks, not dust: next to nothing is loose, though cracks are cells wide
+    assert last.stats["loose_fraction"] < 0.03
+    assert float(last.pieces.mass_fractions.sum()) > 0.97
+    assert last.stats["broken_fraction"] > 0.1
 
 
 def test_a_melon_that_is_laid_down_stays_whole():
