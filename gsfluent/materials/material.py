@@ -46,8 +46,10 @@ LOOKS: dict[str, tuple[float, float, str]] = {
     "shininess": (1.0, 10_000.0, "no unit"),
 }
 """What only a picture needs: range and unit. No part of a simulation."""
-SHEAR = 0.5
-"""Shear damage of what is given by strengths: crushed matter loses its tension too."""
+SHEAR = 0.03
+"""Shear damage of what is given by strengths: enough that crushed matter loses its tension, too,
+and so little that what is pressed hard cracks before it is powder (a plaster ball that falls 0.75 m
+is whole, with 0.5 it is crushed)."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
 

@@ -109,7 +109,7 @@ def softened(
 
     # The energy at the steepest softening goes as the strength squared.
     limit = strength
-    for _ in range(4):
+    for _ in range(8):
         limit = limit * (target / dissipated(limit, steepest(limit))).sqrt()
         limit = limit.minimum(LARGEST * kappa)
     kept = (limit / strength).clamp(max=1.0)
@@ -118,7 +118,7 @@ def softened(
     least = steepest(strength)
     before, found = least, dissipated(strength, least)
     alpha0 = (least * (target / found).clamp(min=1.0)).clamp(min=ALPHA_MIN)
-    for _ in range(6):
+    for _ in range(10):
         now = dissipated(strength, alpha0)
         slope = (now - found) / (alpha0 - before)
         before, found = alpha0, now

@@ -20,7 +20,7 @@ from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.scene.scene import Scene
 
 BRITTLE = [name for name in materials.names() if materials.get(name).by_handbook]
-FINE = (0.002, 0.004, 0.008)
+FINE = (0.0015, 0.003, 0.006)
 BY_HAND = materials.plaster.override(cohesion=0.05, hardening=10.0, alpha0=-0.03)
 
 
