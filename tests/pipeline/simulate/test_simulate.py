@@ -290,7 +290,7 @@ def test_a_stage_keeps_nothing_of_the_scenes_it_was_given():
 
 def test_a_bullet_gives_momentum_to_what_it_hits():
     scene = Scene(floor=None, gravity=(0, 0, 0))
-    scene.add(ellipsoid((0.04,) * 3), materials.fruit.apple)
+    scene.add(ellipsoid((0.04,) * 3), materials.fruit.watermelon)
     scene.bullet(start=(0.3, 0, 0), toward=(0, 0, 0), speed=40.0, radius=0.006, at=0.0)
     simulate = Simulate(dx=0.006)
     simulation = simulate(scene, fps=100, seconds=0.03)
