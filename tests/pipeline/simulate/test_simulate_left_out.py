@@ -15,7 +15,9 @@ from gsfluent.ops.reference import plasticity
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.scene.scene import Scene
 
-APPLE = materials.fruit.apple.override(variation=0.0)
+APPLE = materials.fruit.apple.override(
+    tensile_strength=4e4, compressive_strength=4e5, fracture_energy=20.0, restitution=1.0
+)
 DX = 0.02
 
 
