@@ -22,7 +22,7 @@ from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 from gsfluent.materials import Material
-from gsfluent.pipeline.matter.brittle import brittle_rows
+from gsfluent.pipeline.matter.brittle import brittle_rows, distinct_rows
 
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 TENSILE, COMPRESSIVE = 4e6, 4e7
@@ -58,7 +58,7 @@ def rows_of(material: Material, weakness: Tensor, dx: float) -> tuple[Tensor, Te
         return torch.as_tensor(value, dtype=torch.float64).expand(weakness.shape[0])
 
     rows, alpha = brittle_rows(material, everywhere, weakness, dx)
-    table, which = torch.unique(rows, dim=0, return_inverse=True)
+    table, which = distinct_rows(rows)
     return table, which.int(), alpha
 
 
