@@ -288,7 +288,7 @@ def _refuse_parameters(settings: Mapping[str, Any], extra: tuple[str, ...], plac
 
     refuse_unknown(
         settings,
-        [*extra, "law", *materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS],
+        [*extra, *materials.WORDS, *materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS],
         place,
     )
 
@@ -300,7 +300,7 @@ def _parameters(
     from gsfluent import materials
 
     read = {
-        name: (text if name == "law" else number())(value, place.inside(name))
+        name: (text if name in materials.WORDS else number())(value, place.inside(name))
         for name, value in settings.items()
     }
     try:

@@ -63,11 +63,14 @@ def tables() -> str:
 
 def parameters() -> str:
     """Markdown: the material parameters that an object or part may override."""
-    laws = ", ".join(f"`{law}`" for law in materials.LAWS)
+    words = ", ".join(
+        f"`{name}` ({', '.join(f'`{word}`' for word in each)})"
+        for name, each in materials.WORDS.items()
+    )
     names = (*materials.PARAMETERS, *materials.SCATTER, *materials.LOOKS)
     whole = ", ".join(f"`{name}`" for name in materials.WHOLE)
     return (
-        f"`law` ({laws}), "
+        f"{words}, "
         + ", ".join(f"`{name}`" for name in names)
         + f".\nOf an object only, as its parts share them: {whole}.\n"
     )

@@ -21,7 +21,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsfluent.errors import InputError
-from gsfluent.materials.laws import DEFAULTS, HANDBOOK, LAWS, PARAMETERS, RANGES, READS
+from gsfluent.materials.laws import DEFAULTS, HANDBOOK, LAWS, PARAMETERS, RANGES, READS, WORDS
 from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, WHOLE, Field, Material, nearest
 from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
@@ -38,6 +38,7 @@ __all__ = [
     "STEEPEST",
     "UNBROKEN",
     "WHOLE",
+    "WORDS",
     "Field",
     "Material",
     "ellipse",

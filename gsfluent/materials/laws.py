@@ -46,6 +46,12 @@ POSITIVE = (
 )  # fmt: skip
 """Parameters that must be above their lowest value."""
 
+WORDS: dict[str, tuple[str, ...]] = {
+    "law": tuple(LAWS),
+    "prefer": ("toughness", "strength"),
+}
+"""What of a material is a word, and which words there are."""
+
 HANDBOOK = ("tensile_strength", "compressive_strength", "fracture_energy")
 """What fixes cohesion, hardening and alpha0 of nacc matter on a grid, all three together."""
 DERIVED = ("cohesion", "hardening", "alpha0")

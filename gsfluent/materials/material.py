@@ -23,6 +23,7 @@ from gsfluent.materials.laws import (
     POSITIVE,
     RANGES,
     READS,
+    WORDS,
 )
 from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
@@ -92,6 +93,9 @@ class Material:
         grain: Length over which the strength varies [m].
         weibull_modulus: nacc: Weibull modulus of the strength, small for scattered; 0 for none.
         reference_volume: Volume of the specimens whose median strength is given [m^3].
+        prefer: nacc: what a grid keeps that is too coarse for both. ``toughness`` keeps the fracture
+            energy and lowers the strength (Bazant and Oh 1983), ``strength`` keeps the strength,
+            and a crack takes more energy than it should.
         softening: How many times softer than the real thing ``young_modulus`` is, for the sake of
             the time step. Strengths are divided by its root: the speed at which it breaks and the
             number of pieces stay (Bazant's size number E G_c / s^2 L does not change).
@@ -131,6 +135,7 @@ class Material:
     grain: float = 0.025
     weibull_modulus: float = 0.0
     reference_volume: float = 1e-6
+    prefer: str = "toughness"
     softening: float = 1.0
     restitution: float = 1.0
     dust: float = 0.5
@@ -142,10 +147,13 @@ class Material:
 
     def __post_init__(self) -> None:
         """Fill in defaults; check the law and every number."""
-        if self.law not in LAWS:
-            raise InputError(
-                f"material {self.name!r}: unknown law {self.law!r}", hint=nearest(self.law, LAWS)
-            )
+        for field, words in WORDS.items():
+            word = getattr(self, field)
+            if word not in words:
+                raise InputError(
+                    f"material {self.name!r}: unknown {field} {word!r}",
+                    hint=nearest(str(word), words),
+                )
         reads, defaults = READS[self.law], DEFAULTS.get(self.law, {})
         for field in RANGES:
             if getattr(self, field) is not None and field not in reads:
@@ -179,8 +187,9 @@ class Material:
             if isinstance(value, Tensor):
                 raise InputError(f"material {self.name!r}: {field} must be one number")
             _check_number(self.name, field, value, low, high, unit)
-        for field in ("variation", "weibull_modulus") if self.law != "nacc" else ():
-            if getattr(self, field) > 0.0:
+        plain = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness"}
+        for field, nothing in plain.items() if self.law != "nacc" else ():
+            if getattr(self, field) != nothing:
                 raise InputError(
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
                     hint="remove it, or use law nacc",
@@ -213,7 +222,7 @@ class Material:
             InputError: An unknown field, a number outside its range, a parameter the law does not
                 read, or one that it needs and this material does not have.
         """
-        known = [*PARAMETERS, *SCATTER, *WHOLE, *LOOKS, "law", "name", "parts"]
+        known = [*PARAMETERS, *SCATTER, *WHOLE, *LOOKS, *WORDS, "name", "parts"]
         for key in changes:
             if key not in known:
                 raise InputError(
@@ -224,7 +233,8 @@ class Material:
             dropped = [f for f in PARAMETERS if f not in READS[law] and f not in changes]
             changes = {**dict.fromkeys(dropped), **changes}
             if law != "nacc":
-                changes = {"variation": 0.0, "weibull_modulus": 0.0, "parts": (), **changes}
+                plain = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness"}
+                changes = {**plain, "parts": (), **changes}
         if "variation" in changes:
             changes = {"weibull_modulus": 0.0, **changes}
         changes = self._softened(changes)

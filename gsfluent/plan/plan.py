@@ -41,7 +41,7 @@ from gsfluent.plan.work import (
 )
 from gsfluent.progress import Progress
 from gsfluent.scene.scene import Scene
-from gsfluent.stages.findings import cells_for, setting
+from gsfluent.stages.findings import cells_for, lowered, setting
 from gsfluent.stages.simulate import build_scene
 
 
@@ -294,7 +294,7 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
             weakest = min(body.materials, key=lambda material: material.breaking_speed)
             found.append(
                 f"{body.name}: meets something at {mover.speed:.2g} m/s, but {weakest.name} "
-                f"breaks from about {limit:.2g} m/s; hint: raise the drop or lower cohesion"
+                f"breaks from about {limit:.2g} m/s; hint: raise the drop, or lower tensile_strength"
             )
         thin = thickness(body)
         if thin < THIN_CELLS * dx:
@@ -306,6 +306,7 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
                 f"{breaks if thin < WALL_CELLS * dx else ''}"
                 f"{setting(cells_for(scene, thin / THIN_CELLS))} lets it bend"
             )
+    found.extend(lowered(scene, dx))
     if outlook.grid_seconds <= 0.0:
         found.append(
             "nothing meets anything before the end; hint: a longer output.seconds, or another event"

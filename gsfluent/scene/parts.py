@@ -87,7 +87,9 @@ class Part:
                     hint=f"give {key} to the material of the object",
                 )
             looks = (*materials.LOOKS, *materials.SCATTER)
-            known_key(f"part {name!r}", key, (*materials.PARAMETERS, *looks, "material", "law"))
+            known_key(
+                f"part {name!r}", key, (*materials.PARAMETERS, *looks, *materials.WORDS, "material")
+            )
         return Part(name, dict(where), rest)
 
     def material(self, base: Material) -> Material:

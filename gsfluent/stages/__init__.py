@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     chain="run_stages",
     context="RunContext",
-    findings="cells_for setting thin_walls",
+    findings="cells_for lowered setting thin_walls",
     select="select_mask",
     show="render_again",
     simulate="build_scene moving_settings saved solver_options",

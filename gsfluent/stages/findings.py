@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from gsfluent.data import SURFACE
+from gsfluent.pipeline.matter.brittle import kept_strength
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.pipeline.solid.field import SignedDistance
@@ -17,6 +18,9 @@ from gsfluent.pipeline.solid.walls import WALL_CELLS, thin_shells
 from gsfluent.scene.scene import Scene
 
 _log = logging.getLogger(__name__)
+
+LOWERED = 0.9
+"""Share of the strength from which on nobody is told that the grid has lowered it."""
 
 
 def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
@@ -58,6 +62,28 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
     return found
 
 
+def lowered(scene: Scene, dx: float) -> list[str]:
+    """Materials whose strength a grid lowers to keep their fracture energy, a sentence each.
+
+    Args:
+        scene: The scene.
+        dx: Grid spacing [m].
+    """
+    found = {}
+    for body in scene.bodies:
+        for material in body.materials:
+            kept = kept_strength(material, dx)
+            if kept < LOWERED:
+                found[body.name, material.name] = (
+                    f"{body.name}: cells of {1000 * dx:.3g} mm are too coarse for the strength and "
+                    f"the fracture energy of {material.name} both; {_percent(kept)} of the "
+                    f"strength are left, so it breaks from {_percent(kept)} of its speed; hint: "
+                    f"solve.cells: {cells_for(scene, dx * kept**2)} keeps both, prefer: strength "
+                    "keeps the strength and makes cracks tougher"
+                )
+    return list(found.values())
+
+
 def cells_for(scene: Scene, dx: float) -> int:
     """Cells along the largest solid that make a grid at least as fine as ``dx`` [m]."""
     return math.ceil(grid_spacing(scene, 1) / dx - 1e-9)
@@ -70,12 +96,16 @@ def setting(cells: int) -> str:
 
 
 def notes_of(
-    thin: Mapping[str, Any], unbroken: Sequence[Mapping[str, Any]], pull: float
+    thin: Mapping[str, Any],
+    weak: Sequence[str],
+    unbroken: Sequence[Mapping[str, Any]],
+    pull: float,
 ) -> list[str]:
     """What a reader of the verdict must know although the run is sound, a sentence each.
 
     Args:
         thin: Of :func:`thin_walls`.
+        weak: Of :func:`lowered`.
         unbroken: Of :meth:`gsfluent.stages.strikes.Strikes.unbroken`.
         pull: Strength of gravity [m/s^2].
     """
@@ -85,6 +115,7 @@ def notes_of(
         for name, report in thin.items()
         if report["warning"]
     ]
+    notes.extend(weak)
     for row in unbroken:
         speed, needed = row["speed"], row["speed_needed"]
         fall = f" (a fall of {needed**2 / (2.0 * pull):.2g} m)" if pull > 0.0 else ""

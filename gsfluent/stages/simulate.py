@@ -22,7 +22,7 @@ from gsfluent.results.frames import SavedFrame, count_frames, save_frame
 from gsfluent.results.store import content_digest
 from gsfluent.scene.scene import Body, Scene
 from gsfluent.stages.context import RunContext
-from gsfluent.stages.findings import notes_of, summary, thin_walls
+from gsfluent.stages.findings import lowered, notes_of, summary, thin_walls
 from gsfluent.stages.solids import load_solids
 from gsfluent.stages.strikes import FILE as STRIKES
 from gsfluent.stages.strikes import Strikes
@@ -137,6 +137,9 @@ def simulate_stage(context: RunContext) -> None:
         )
         # before the work: who must take a finer grid learns it while there is something to save
         thin = thin_walls(scene, frames.run.matter.dx)
+        weak = lowered(scene, frames.run.matter.dx)
+        for note in weak:
+            _log.warning("%s", note)
         if resume is None:
             (folder / STRIKES).unlink(missing_ok=True)  # of other settings
         strikes = Strikes(scene, frames.run.matter, folder)
@@ -146,7 +149,7 @@ def simulate_stage(context: RunContext) -> None:
             # after the frame: a state on disk always has its picture
             frames.save(state)
         unbroken, report = strikes.unbroken(), frames.report
-        notes = notes_of(thin, unbroken, math.hypot(*scene.gravity))
+        notes = notes_of(thin, weak, unbroken, math.hypot(*scene.gravity))
         for note in notes[-len(unbroken) :] if unbroken else ():
             _log.warning("%s", note)
         _log.info("simulate: %s", summary(report["per_frame"]))

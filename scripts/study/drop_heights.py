@@ -30,7 +30,7 @@ from gsfluent.data import Frame, Particles, Solid
 from gsfluent.figure.markdown import enter
 from gsfluent.materials import Material
 from gsfluent.pipeline import Simulate
-from gsfluent.pipeline.matter.brittle import softened
+from gsfluent.pipeline.matter.brittle import kept_strength
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.progress import reporter
@@ -69,6 +69,7 @@ class Case:
         cells: Cells across its wall or, where it is solid, across its longest side.
         limit: Longest time of a fall, in traversals of the longest side by the wave.
         hairline: Whether a crack is enough.
+        prefer: What a grid keeps that is too coarse for both; a height is a matter of strength.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Case:
     cells: float
     limit: float
     hairline: bool = False
+    prefer: str = "toughness"
 
     def spacing(self, coarse: bool) -> float:
         """Node spacing [m]; ``coarse`` is half the cells."""
@@ -88,15 +90,25 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
     if name.startswith("egg"):
         shell = egg(given["length_m"], given["diameter_m"], SHELL * given["wall_m"])
         lies = turned(shell, "y", 90.0) if name == "egg_on_side" else shell
-        return Case(name, lies, 2.0, 40.0, hairline=True)
+        return Case(name, lies, 2.0, 40.0, hairline=True, prefer="strength")
     if name == "glass_plate_flat":  # nothing falls quite flat
-        return Case(name, turned(box(tuple(given["size_m"])), "y", 1.0), 3.0, 60.0)
+        return Case(
+            name, turned(box(tuple(given["size_m"])), "y", 1.0), 3.0, 60.0, prefer="strength"
+        )
     if name == "glass_tumbler":
         keys = ("diameter_m", "length_m", "wall_m", "base_m")
-        return Case(name, turned(tumbler(*(given[k] for k in keys)), "y", 85.0), 2.0, 50.0)
+        return Case(
+            name,
+            turned(tumbler(*(given[k] for k in keys)), "y", 85.0),
+            2.0,
+            50.0,
+            prefer="strength",
+        )
     if name == "ceramic_bowl":
         keys = ("diameter_m", "height_of_bowl_m", "wall_m")
-        return Case(name, turned(bowl(*(given[k] for k in keys)), "y", 90.0), 3.0, 50.0)
+        return Case(
+            name, turned(bowl(*(given[k] for k in keys)), "y", 90.0), 3.0, 50.0, prefer="strength"
+        )
     if name == "bread":
         return Case(name, turned(box(tuple(given["size_m"])), "y", 5.0), 32.0, 40.0)
     return Case(name, ball(given["diameter_m"]), 32.0, 40.0)
@@ -130,14 +142,6 @@ def stiff(material: Material, how: str) -> Material:
     return material.override(softening=1.0, parts=parts)
 
 
-def kept(material: Material, dx: float) -> float:
-    """Share of its strength that a material keeps on a grid."""
-    row, alpha0 = material.parameters()[None], torch.tensor([material.start_alpha]).double()
-    strength = row[:, 1] * torch.sinh(row[:, 4] * alpha0.abs())
-    energy = torch.tensor([float(material.fracture_energy)], dtype=torch.float64)
-    return float(softened(row, strength, energy, torch.ones_like(strength), dx)[2])
-
-
 @dataclasses.dataclass(frozen=True)
 class Fall:
     """What became of one specimen; speeds over that of the landing, energies over its."""
@@ -165,7 +169,7 @@ class Drop:
         self.case, self.device, self.how = case, device, how
         self.dx = case.spacing(coarse)
         self.body: Solid = solid(case.shape, 0.5 * self.dx)
-        self.material = stiff(materials.get(given["preset"]), how)
+        self.material = stiff(materials.get(given["preset"]), how).override(prefer=case.prefer)
         if case.hairline:
             self.material = thicker(self.material, SHELL, given["mass_kg"], self.body.volume)
         self.points = round(8 * self.body.volume / self.dx**3)
@@ -383,7 +387,7 @@ def study(
         "restitution_at": whole[0].height if whole else None,
         "cells": round(2.0 * max(case.shape.half) / drop.dx), "dx": drop.dx,
         "points": drop.points, "mass": float(drop.material.density) * drop.body.volume,
-        "kept": kept(drop.material, drop.dx),
+        "kept": kept_strength(drop.material, drop.dx),
         "wave_speed": drop.material.wave_speed, "softening": drop.material.softening,
         "steps": drop.steps, "calls": drop.calls, "simulated": drop.simulated,
         "seconds": drop.seconds, "verdicts": drop.verdicts,

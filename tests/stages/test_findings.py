@@ -17,12 +17,13 @@ from simulation_scenes import at
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials
+from gsfluent.pipeline.matter.brittle import kept_strength
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.pipeline.solid.walls import WALL_CELLS
 from gsfluent.results.record import RunRecord
 from gsfluent.scene.scene import Scene
-from gsfluent.stages.findings import cells_for, notes_of, setting, summary, thin_walls
+from gsfluent.stages.findings import cells_for, lowered, notes_of, setting, summary, thin_walls
 from gsfluent.stages.strikes import FILE, Strikes
 
 HARD = materials.bread.override(
@@ -152,19 +153,40 @@ def test_thin_walls_are_told_with_the_cells_that_would_do(caplog: pytest.LogCapt
 
 def test_notes_are_whole_sentences_and_honest() -> None:
     row = {"body": "head", "material": "plaster", "met": "floor", "speed": 2.0, "speed_needed": 4.0}
-    (note,) = notes_of({}, [row], 9.81)
+    (note,) = notes_of({}, [], [row], 9.81)
     assert "head met floor at 2 m/s and nothing broke" in note and "about 4 m/s" in note
     assert (
         "harder" not in note
         and f"a fall of {16 / (2 * 9.81):.2g} m" in note
         and "order of magnitude" in note
     )
-    (note,) = notes_of({}, [row | {"speed": 5.0}], 0.0)
+    (note,) = notes_of({}, [], [row | {"speed": 5.0}], 0.0)
     assert "nothing broke; strike harder still, plaster is" in note and "fall" not in note
-    assert notes_of({"head": {"warning": None}}, [], 9.81) == []
+    assert notes_of({"head": {"warning": None}}, [], [], 9.81) == []
     thin = {"warning": "9 % of it is thin", "solve_cells": 60}
-    (note,) = notes_of({"head": thin}, [], 9.81)
+    (note,) = notes_of({"head": thin}, [], [], 9.81)
     assert note.startswith("head: 9 % of it is thin") and "solve.cells: 60" in note
+
+
+def test_a_grid_that_lowers_the_strength_says_so_with_the_cells_that_would_do() -> None:
+    scene = Scene()
+    glass = materials.glass
+    scene.add(ellipsoid((0.1, 0.1, 0.1), voxels=24), glass, frame=at(0, 0, 0.1), name="ball")
+    coarse = grid_spacing(scene, 16)
+    (note,) = lowered(scene, coarse)
+    kept = kept_strength(glass, coarse)
+    assert (
+        note.startswith("ball: cells of 12.5 mm") and f"{100 * kept:.2g} % of the strength" in note
+    )
+    assert notes_of({}, [note], [], 9.81) == [note]
+    cells = int(note.split("solve.cells: ")[1].split()[0])
+    assert kept_strength(glass, grid_spacing(scene, cells)) == pytest.approx(1.0, abs=0.05)
+    strong = Scene()
+    strong.add(
+        ellipsoid((0.1, 0.1, 0.1), voxels=24), glass.override(prefer="strength"),
+        frame=at(0, 0, 0.1), name="ball",
+    )  # fmt: skip
+    assert lowered(strong, coarse) == []
 
 
 def test_the_end_of_a_run_is_one_sentence() -> None:

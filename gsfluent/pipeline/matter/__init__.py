@@ -4,7 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    brittle="brittle_rows distinct_rows",
+    brittle="brittle_rows distinct_rows kept_strength",
     carry="BLEND Carry Motion Points STRETCH nearest_points",
     crack_band="crack_band fracture_energy softening_energy",
     debris="REACH clinging",

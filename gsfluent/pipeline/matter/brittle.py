@@ -50,7 +50,9 @@ def brittle_rows(
     kinds, which = distinct_rows(key)
     table, (alpha0, energy, step) = kinds[:, :8], kinds[:, 8:].unbind(dim=1)
     strength = table[:, 1] * torch.sinh(table[:, 4] * alpha0.abs())
-    hardening, alpha0, _ = softened(table, strength, energy, (STEP * step).exp(), dx)
+    hardening, alpha0, _ = softened(
+        table, strength, energy, (STEP * step).exp(), dx, prefer=material.prefer
+    )
     table = table.clone()
     table[:, 4] = hardening
     return table[which], alpha0[which]
@@ -79,8 +81,36 @@ def distinct_rows(table: Tensor) -> tuple[Tensor, Tensor]:
     return table[first], which
 
 
+def kept_strength(material: Material, dx: float) -> float:
+    """Share of its strength that a material keeps on a grid; 1 where nothing asks for less.
+
+    Args:
+        material: Of any law; a parameter that varies in space counts where it keeps least.
+        dx: Node spacing [m].
+    """
+    if material.law != "nacc" or material.energy_by_hand or material.prefer == "strength":
+        return 1.0
+    columns = (material.parameters(), material.start_alpha, material.fracture_energy)
+    row, alpha0, energy = (torch.as_tensor(c, dtype=torch.float64) for c in columns)
+    shape = torch.broadcast_shapes(row.shape[:-1], alpha0.shape, energy.shape)
+    rows = row.expand(*shape, 8).reshape(-1, 8)
+    table = torch.cat(
+        [rows, alpha0.expand(shape).reshape(-1, 1), energy.expand(shape).reshape(-1, 1)], dim=1
+    )
+    table = distinct_rows(table)[0]
+    strength = table[:, 1] * torch.sinh(table[:, 4] * table[:, 8].abs())
+    ones = torch.ones_like(strength)
+    return float(softened(table[:, :8], strength, table[:, 9], ones, dx)[2].min())
+
+
 def softened(
-    rows: Tensor, strength: Tensor, energy: Tensor, weakness: Tensor, dx: float
+    rows: Tensor,
+    strength: Tensor,
+    energy: Tensor,
+    weakness: Tensor,
+    dx: float,
+    *,
+    prefer: str = "toughness",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Softening with a given fracture energy on a grid.
 
@@ -88,9 +118,10 @@ def softened(
         rows: NACC rows, of which all but the hardening are read, float64 [M, 8].
         strength: p0 [Pa], [M].
         energy: Fracture energy G_c [J/m^2], [M].
-        weakness: Factor on the strength, [M]. Where the grid has to lower the strength, what is
-            stronger than that has the lowered one.
+        weakness: Factor on the strength, [M]. What is then stronger than the grid can hold with
+            this energy has the strength that it can hold.
         dx: Node spacing [m].
+        prefer: ``strength`` leaves the strength as it is, and takes more energy where it must.
 
     Returns:
         ``(hardening, alpha0, kept)``, [M] each; the last is the share of the strength that is left.
@@ -107,13 +138,16 @@ def softened(
     def steepest(strength: Tensor) -> Tensor:
         return -torch.asinh(strength / kappa) * beta / STEEPEST
 
-    # The energy at the steepest softening goes as the strength squared.
-    limit = strength
-    for _ in range(8):
-        limit = limit * (target / dissipated(limit, steepest(limit))).sqrt()
-        limit = limit.minimum(LARGEST * kappa)
+    limit = LARGEST * kappa
+    if prefer == "toughness":
+        # The energy at the steepest softening goes as the strength squared.
+        held = strength
+        for _ in range(8):
+            held = held * (target / dissipated(held, steepest(held))).sqrt()
+            held = held.minimum(limit)
+        limit = held
     kept = (limit / strength).clamp(max=1.0)
-    strength = (kept * strength * weakness).minimum(limit)
+    strength = (strength * weakness).minimum(limit)
     # Beyond it the energy grows almost linearly with alpha0 at fixed strength: secant steps.
     least = steepest(strength)
     before, found = least, dissipated(strength, least)

@@ -12,8 +12,9 @@ from simulation_shapes import ellipsoid
 from torch import Tensor
 
 from gsfluent import materials
+from gsfluent.errors import InputError
 from gsfluent.materials import LARGEST, STEEPEST, Field, Material, ellipse
-from gsfluent.pipeline.matter.brittle import BAND, brittle_rows, softened
+from gsfluent.pipeline.matter.brittle import BAND, brittle_rows, kept_strength, softened
 from gsfluent.pipeline.matter.crack_band import softening_energies
 from gsfluent.pipeline.matter.points import Matter, build_matter
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
@@ -125,13 +126,49 @@ def test_beyond_the_brittle_spacing_strength_gives_way_and_energy_stays(name: st
         assert crack_energy(table, start, dx) == pytest.approx(float(energy), rel=1e-6)
         found.append(float(kept))
     assert found[0] / found[1] == pytest.approx(2.0, rel=0.03)  # dx^-1/2
-    # what is stronger than the grid can keep has the lowered strength, what is weaker its own
+    # what is stronger than the grid can hold has the lowered strength, what is weaker its own
     strong = softened(rows, p0, energy, f64(1.5), 0.02)
     assert torch.equal(strong[1], softened(rows, p0, energy, f64(1.0), 0.02)[1])
-    hardening, start, _ = softened(rows, p0, energy, f64(0.5), 0.02)
+    hardening, start, _ = softened(rows, p0, energy, f64(0.8 * found[0]), 0.02)
     table = rows.clone()
     table[:, 4] = hardening
-    assert float(strength(table, start)) == pytest.approx(0.5 * found[0] * float(p0), rel=1e-9)
+    assert float(strength(table, start)) == pytest.approx(0.8 * found[0] * float(p0), rel=1e-9)
+    assert crack_energy(table, start, 0.02) == pytest.approx(float(energy), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["glass", "ceramic"])
+def test_who_prefers_strength_keeps_it_and_pays_with_energy(name: str) -> None:
+    tough, strong = materials.get(name), materials.get(name).override(prefer="strength")
+    p0 = strength(tough.parameters(), one(tough.start_alpha))
+    energy, fine, coarse = float(one(tough.fracture_energy or 0.0)), 1e-5, 0.02
+    assert kept_strength(strong, coarse) == 1.0 and kept_strength(tough, coarse) < 0.5
+    rows, alpha = on_grid(strong, coarse)
+    assert float(strength(rows, alpha)[0]) == pytest.approx(float(p0), rel=1e-9)
+    assert float(rows[0, 3] * rows[0, 4]) == pytest.approx(STEEPEST, rel=1e-9)
+    # as the strength squared, but for finite strains, over what the energy would allow
+    ratio = crack_energy(rows, alpha, coarse) / energy
+    assert ratio == pytest.approx(kept_strength(tough, coarse) ** -2, rel=0.1)
+    # where the grid is fine enough there is nothing to prefer
+    assert kept_strength(tough, fine) == 1.0
+    for one_, other in zip(on_grid(strong, fine), on_grid(tough, fine), strict=True):
+        assert torch.equal(one_, other)
+
+
+def test_what_is_lowered_is_counted_where_it_is_least() -> None:
+    glass, dx = materials.glass, 0.01
+    field = torch.tensor([[[8.0, 800.0], [80.0, 8.0]]])
+    mixed = glass.override(fracture_energy=field)
+    assert kept_strength(mixed, dx) == kept_strength(glass, dx) < 1.0
+    assert kept_strength(materials.jelly, dx) == kept_strength(BY_HAND, dx) == 1.0
+
+
+def test_a_preference_is_one_of_two_words_and_of_brittle_matter() -> None:
+    with pytest.raises(InputError, match="unknown prefer 'both'"):
+        materials.glass.override(prefer="both")
+    with pytest.raises(InputError, match="prefer does nothing under law 'elastic'"):
+        materials.jelly.override(prefer="strength")
+    strong = materials.glass.override(prefer="strength")
+    assert strong.override(law="elastic").prefer == "toughness"
 
 
 def test_softening_keeps_the_breaking_speed_and_the_size_number() -> None:
