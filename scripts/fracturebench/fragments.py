@@ -93,8 +93,8 @@ def run(name: str, cells: int, seeds: int, device: str) -> Row:
     )
     return {
         **key_of(name, cells, seeds, device), "points": members[0].scene.count,
-        "speed": float(-members[0].scene.v[0, 2]), "machine": machine(device), "commit": commit(),
-        "wall": round(time.perf_counter() - begun, 2),
+        "thrown_at": float(-members[0].scene.v[0, 2]), "machine": machine(device),
+        "commit": commit(), "wall": round(time.perf_counter() - begun, 2),
         "runs": [m.figures.plain() for m in members],
     }  # fmt: skip
 
@@ -189,7 +189,7 @@ def table(found: dict[str, list[Row]]) -> str:
             )
     machines = {f"{r['machine']} ({r['device']})" for rows in found.values() for r in rows}
     speeds = ", ".join(
-        f"{name} of radius {1e3 * rows[-1]['radius']:g} mm at {rows[-1]['speed']:.3g} m/s"
+        f"{name} of radius {1e3 * rows[-1]['radius']:g} mm at {rows[-1]['thrown_at']:.3g} m/s"
         for name, rows in found.items()
     )
     return "\n".join([f"{', '.join(sorted(machines))}; {speeds}.", "", *lines])

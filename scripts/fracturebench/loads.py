@@ -4,8 +4,8 @@
 
 Speed of the notch's crack with light and heavy grips at two CFL numbers and two speeds of
 tearing, energy that the cantilever's crack takes at three speeds of opening and where it goes in
-other settings, strength of pressed rock beside the experiment's, shapes of the pieces of struck
-rock on three grids (four minutes on one core).
+other settings, all cases with the grid moved, strength of pressed rock beside the experiment's,
+shapes of the pieces of struck rock on three grids (six minutes on one core).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.figure.markdown import enter
-from gsfluent.fracturebench.registry import find, judge
+from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.scenes.cantilever import cantilever, crack_tip
 from gsfluent.fracturebench.scenes.plane import notch
 from gsfluent.fracturebench.scenes.rock import experiment
@@ -210,6 +210,18 @@ def accounts(quick: bool) -> list[str]:
     return rows
 
 
+def places(quick: bool) -> list[str]:
+    """Rows of every case with the points where they are and a quarter of a cell off."""
+    rows = ["| case | tolerance | error | a quarter of a cell off |", "|---|---|---|---|"]
+    for case in cases()[: 1 if quick else None]:
+        scene = case.build(case.dx, 8)
+        here, there = (judge(scene, run_case(scene, place=place))[0] for place in (0.0, 0.25))
+        said = [f"**{m.error:.2g}**" if m.passed else f"{m.error:.2g}" for m in (here, there)]
+        rows.append(f"| {case.name} | {here.tolerance:.3g} | {' | '.join(said)} |")
+        sys.stderr.write(f"{rows[-1]}\n")
+    return rows
+
+
 def strengths(quick: bool) -> list[str]:
     """Rows of the table of pressed rock, and what a strength without a rate can reach."""
     case = find("rock_press")
@@ -251,6 +263,7 @@ def shapes(quick: bool) -> list[str]:
 
 TABLES: dict[str, Callable[[bool], list[str]]] = {
     "notch_loads": speeds, "cantilever_loads": energies, "cantilever_account": accounts,
+    "grid_place": places,
     "rock_strength": strengths, "rock_shapes": shapes,
 }  # fmt: skip
 
