@@ -199,6 +199,9 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
     """Per material: mass over pieces with the band over seeds, and three figures over the grid."""
     places = np.geomspace(1e-4, 1.0, 300)
     shades = (COLORS[0], COLORS[1], OURS, COLORS[2], COLORS[4])
+    most = max(
+        Fragments.of(f).count for rows in found.values() for r in rows for f in figures_of(r)
+    )
     with new_figure(3.2 * len(found), 7.6) as figure:
         grid = figure.subplots(3, len(found), squeeze=False, sharey="row")
         for column, (name, rows) in enumerate(found.items()):
@@ -226,7 +229,7 @@ def draw(found: dict[str, list[Row]], path: Path) -> None:
                 axes.plot(cells, [np.mean(v) for v in values], "o-", color=color, lw=1.4, ms=4,
                           label=label)  # fmt: skip
                 axes.set(xlabel="cells along the radius", xticks=cells)
-            middle.set_ylim(bottom=0.0)
+            middle.set_ylim(0.0, 1.05 * most)
             lower.set_ylim(0.0, 1.0)
             if column == 0:
                 upper.set_ylabel("share of the mass in lighter pieces")

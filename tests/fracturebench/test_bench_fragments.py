@@ -75,8 +75,8 @@ def test_table_and_picture_show_the_spread(tmp_path: Path) -> None:
     assert "2.0 (2.0 to 2.0) | 0.70 (0.50 to 0.90) | 0.00 (0.00 to 0.01)" in rows[0]
     assert "| 3.0 (3.0 to 3.0) | 0.50 (0.50 to 0.50) |" in rows[1]
     assert rows[1].endswith("0.00 (0.00 to 0.00), band |")  # the same runs: no band
-    # half of the mass is in 0.5, a fifth in 0.2: 0.5 away from halves, 0.5 from 0.9 and less
-    assert rows[0].endswith("| 0.50 (0.50 to 0.50) |")
+    # fine: 0.5 at 0.3, where halves have 0, and 1 at 0.5, where that of 0.9 has 0.1
+    assert rows[0].endswith("| 0.70 (0.50 to 0.90) |")
     picture = tmp_path / "fragments.png"
     script.draw(found, picture)
     assert picture.read_bytes()[:4] == b"\x89PNG" and picture.stat().st_size > 20_000
