@@ -39,7 +39,7 @@ def answer(name: str, args: argparse.Namespace, path: Path) -> Run:
         raise SceneError(f"{name}: not what was frozen: {drift[0]}")
     options: dict[str, Any] = {
         "device": args.device, "dtype": getattr(torch, args.dtype), "cfl": args.cfl,
-        "fields": not args.one_field,
+        "fields": not args.one_field, "place": args.place,
     }  # fmt: skip
     run = run_case(scene, method=args.method, **options)
     wall = run.wall_seconds
@@ -63,6 +63,10 @@ def main() -> int:
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32")
     parser.add_argument("--cfl", type=float, default=0.5, help="Courant number")
+    parser.add_argument(
+        "--place", type=float, default=0.0, metavar="DX",
+        help="move the points on the grid by this, along the axes without a collider",
+    )  # fmt: skip
     parser.add_argument("--one-field", action="store_true", help="all bodies in one velocity field")
     parser.add_argument("--method", default="gsfluent", help="name in the table")
     parser.add_argument("--repeat", type=int, default=3, help="timed runs")
@@ -81,8 +85,9 @@ def main() -> int:
             path = folder / f"{name}.npz"
             if path.is_file():
                 was = Run.load(path)
-                now = {"dtype": args.dtype, "cfl": args.cfl}
-                if was.device != args.device or any(was.settings.get(k) != now[k] for k in now):
+                now = {"dtype": args.dtype, "cfl": args.cfl, "place": args.place}
+                had = {"place": 0.0, **was.settings}
+                if was.device != args.device or any(had.get(k) != now[k] for k in now):
                     raise SceneError(
                         f"{path} was computed on {was.device} with {dict(was.settings)}: give "
                         "another -o or --method, or remove it"

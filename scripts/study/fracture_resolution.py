@@ -208,16 +208,17 @@ SPEED = 5.0
 _SCATTER, _LEVELS = 0.3, 16
 
 
-def thrown(name: str, radius: float, dx: float, per_cell: int) -> BenchScene:
+def thrown(name: str, radius: float, dx: float, per_cell: int, speed: float = SPEED) -> BenchScene:
     """A ball of a preset, of scattered strength, thrown on a plane.
 
     Args:
-        name: Of :data:`THROWN`.
+        name: Of :data:`THROWN`, or of a brittle preset.
         radius: [m].
         dx: Node spacing [m].
         per_cell: Points per cell.
+        speed: Over the one at which the material breaks; a quarter of its wave speed at most.
     """
-    preset = materials.get(THROWN[name])
+    preset = materials.get(THROWN.get(name, name))
     points = lattice_ball(radius, dx, per_cell)
     factor = np.clip(1.0 + _SCATTER * shape_noise(points, 0.8 * radius, 3), 0.4, 1.6)
     low, high = float(factor.min()), float(factor.max())
@@ -243,9 +244,9 @@ def thrown(name: str, radius: float, dx: float, per_cell: int) -> BenchScene:
         for row, start in zip(table, alpha, strict=True)
     )  # fmt: skip
     c = preset.wave_speed
-    speed = min(0.25, SPEED * preset.failure_strain) * c
+    fall = min(0.25, speed * preset.failure_strain) * c
     return free(
-        f"thrown {name}", points, [0.0, 0.0, -speed], dx, per_cell,
+        f"thrown {name}", points, [0.0, 0.0, -fall], dx, per_cell,
         np.linspace(0.0, 30.0 * radius / c, 21)[1:], rows, material=index,
         asks=("stress",), colliders=(plane(2, -radius, kind="separate", friction=0.3),),
     )  # fmt: skip

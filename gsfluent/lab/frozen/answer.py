@@ -55,6 +55,14 @@ def _colliders(scene: Scene) -> torch.Tensor | None:
     return torch.stack(made) if made else None
 
 
+def _shift(scene: Scene, place: float) -> np.ndarray:
+    """How far the points are moved so that the grid lies elsewhere in them [m], [3]."""
+    free = np.ones(3, dtype=bool)
+    for item in scene.colliders:
+        free &= np.abs(np.asarray(item["normal"], dtype=np.float64)) < 1e-9
+    return np.where(free, place * scene.dx, 0.0)
+
+
 def _handed(name: str, world: World, alpha: torch.Tensor, drives: Drives | None) -> torch.Tensor:
     """What a scene asks for beside positions and velocities."""
     if name == "damage":
@@ -82,8 +90,10 @@ def run_case(
     dt: float | None = None,
     engine: Literal["solver", "ops"] | None = None,
     fields: bool = True,
+    place: float = 0.0,
     method: str = "gsfluent",
     watch: Callable[[World, int], None] | None = None,
+    setup: Callable[[World], None] | None = None,
     **options: Any,
 ) -> Run:
     """Run a scene by gsfluent's solver.
@@ -96,8 +106,11 @@ def run_case(
         dt: Fixed time step [s] instead.
         engine: As in :class:`gsfluent.lab.world.driver.World`.
         fields: A velocity field per body; False puts all into one.
+        place: How far the points lie off their place on the grid [dx], along the axes that no
+            collider looks along: a wall has to stay on its nodes. What is handed in does not move.
         method: Name in the record.
         watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
+        setup: ``setup(world)`` is called once before the first step; it may wrap ``world.force``.
         **options: Further arguments of World (``k``, ``epsilon``, ``implicit``, ...).
 
     Returns:
@@ -109,9 +122,11 @@ def run_case(
     law, params, alpha = rows(scene)
     several = fields and int(scene.body.max()) > 0
     drives = Drives(scene, dtype, device) if scene.drives else None
+    shift = _shift(scene, place)
     world = World(
-        torch.from_numpy(scene.x), torch.from_numpy(scene.v), volume=torch.from_numpy(scene.volume),
-        dx=scene.dx, law=law, params=params, material=torch.from_numpy(scene.material), alpha=alpha,
+        torch.from_numpy(scene.x + shift), torch.from_numpy(scene.v),
+        volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
+        material=torch.from_numpy(scene.material), alpha=alpha,
         body=torch.from_numpy(scene.body) if several else None,
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
@@ -119,6 +134,8 @@ def run_case(
         deformation=bool(options.pop("deformation", False)) or "deformation" in scene.asks,
         **options,
     )  # fmt: skip
+    if setup is not None:
+        setup(world)
     count = scene.times.shape[0]
     shape = (count, scene.count, 3)
     x, v = np.full(shape, math.nan), np.full(shape, math.nan)
@@ -135,14 +152,15 @@ def run_case(
         if cuda:
             torch.cuda.synchronize()
         wall += time.perf_counter() - start
-        x[i], v[i] = world.position.double().cpu().numpy(), world.velocity.double().cpu().numpy()
+        x[i] = world.position.double().cpu().numpy() - shift
+        v[i] = world.velocity.double().cpu().numpy()
         for name, values in asked.items():
             values.append(_handed(name, world, alpha, drives).double().cpu().numpy())
         if watch is not None:
             watch(world, i)
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
-        "engine": world.engine, "fields": several, **options,
+        "engine": world.engine, "fields": several, **({"place": place} if place else {}), **options,
     }  # fmt: skip
     return Run(
         scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed,
