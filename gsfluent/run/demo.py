@@ -35,11 +35,11 @@ class DemoSize:
 
 
 SIZES = {
-    "full": DemoSize(42, 256, 800, 30_000, 80, "preview", (640, 480), 1.3, 40.0),
-    "preview": DemoSize(26, 128, 300, 8_000, 64, "preview", (320, 240), 0.8, 15.0),
+    "full": DemoSize(42, 256, 800, 30_000, 80, "preview", (640, 480), 1.4, 40.0),
+    "preview": DemoSize(26, 128, 300, 8_000, 64, "preview", (320, 240), 0.9, 15.0),
 }
 SCENES: dict[str, dict[str, Any]] = {
-    "watermelon": {"material": "fruit.watermelon", "height": 0.75},
+    "watermelon": {"material": "fruit.watermelon", "height": 1.5},
     "orange": {"material": "fruit.orange", "height": 1.0},
 }
 
