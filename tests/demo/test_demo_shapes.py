@@ -14,7 +14,7 @@ from gsfluent.demo.baked import CREAM, ICING, JAM, SPONGE, Cake
 from gsfluent.demo.capture import ring_cameras
 from gsfluent.demo.shapes import walk
 
-NAMES = ("bread", "cake", "melons")
+NAMES = ("bread", "cake", "melons", "bowl", "egg", "chocolate")
 
 
 def rays(obj: demo.DemoObject, side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
