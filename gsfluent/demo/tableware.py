@@ -96,7 +96,8 @@ class Egg(DistanceObject):
         level = q.norm(dim=1)
         scale = torch.stack([torch.full_like(reach, long), reach, reach], dim=1)
         slope = (q / scale).norm(dim=1)
-        return level * (level - 1.0) / slope.clamp_min(1e-9)
+        away = level * (level - 1.0) / slope.clamp_min(1e-9)
+        return torch.where(level < 1e-6, torch.full_like(away, -thick), away)  # no slope there
 
     def _lowest_point(self) -> float:
         return -self.axes[2]
