@@ -48,9 +48,7 @@ class Bowl(DistanceObject):
         """See :meth:`DemoObject.surface_color`."""
         p = self._local(points).to(torch.float32)
         cloud = self.noise.fractal(p, 28.0, 3)
-        jade = mix(
-            rgb(0.44, 0.72, 0.60), rgb(0.58, 0.82, 0.70), smoothstep(-0.5, 0.5, cloud[:, 0])
-        )
+        jade = mix(rgb(0.44, 0.72, 0.60), rgb(0.58, 0.82, 0.70), smoothstep(-0.5, 0.5, cloud[:, 0]))
         band = smoothstep(0.0015, 0.0005, (p[:, 2] - 0.016).abs())
         return mix(jade, rgb(0.93, 0.90, 0.80), 0.8 * band).clamp(0.0, 1.0)
 
@@ -177,9 +175,7 @@ class Chocolate(DistanceObject):
         """See :meth:`DemoObject.surface_color`."""
         p = self._local(points).to(torch.float32)
         broad = self.noise.fractal(p, 45.0, 3)
-        return mix(
-            rgb(0.36, 0.20, 0.12), rgb(0.30, 0.16, 0.09), smoothstep(-0.5, 0.5, broad[:, 0])
-        )
+        return mix(rgb(0.36, 0.20, 0.12), rgb(0.30, 0.16, 0.09), smoothstep(-0.5, 0.5, broad[:, 0]))
 
     def interior(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.interior`."""

@@ -1,4 +1,4 @@
-"""The demo objects that are no fruit: loaf, cake, two melons, tableware. Rays, distances and layers agree."""
+"""The demo objects that are no fruit: loaf, cake, melons, tableware. Rays, layers agree."""
 
 from __future__ import annotations
 
