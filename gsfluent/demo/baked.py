@@ -13,7 +13,7 @@ CRUST, UNDER, CRUMB = 1, 2, 3
 ICING, SPONGE, CREAM, JAM = 1, 3, 4, 5
 
 
-def _rounded_box(local: Tensor, half: Tensor, radius: float) -> Tensor:
+def rounded_box(local: Tensor, half: Tensor, radius: float) -> Tensor:
     """Signed distance of a box with rounded edges, [N]."""
     q = local.abs() - (half - radius)
     return q.clamp_min(0.0).norm(dim=1) + q.amax(dim=1).clamp_max(0.0) - radius
@@ -38,7 +38,7 @@ class Bread(DistanceObject):
         wave = torch.sin(61.0 * x + 40.0 * y) + torch.sin(97.0 * y - 45.0 * x + self.seed)
         shaped = torch.stack([x, y * bulge, z - dome * lift + 0.010], dim=1)
         half = local.new_tensor([0.108, 0.051, 0.046])
-        return _rounded_box(shaped, half, 0.017) - 0.0007 * wave * lift
+        return rounded_box(shaped, half, 0.017) - 0.0007 * wave * lift
 
     def surface_color(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.surface_color`."""

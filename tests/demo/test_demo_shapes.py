@@ -1,4 +1,4 @@
-"""The demo objects that are no fruit: loaf, cake, two melons. Rays, distances and layers agree."""
+"""The demo objects that are no fruit: loaf, cake, melons, tableware. Rays, layers agree."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from gsfluent.cli import main
 from gsfluent.demo.baked import CREAM, ICING, JAM, SPONGE, Cake
 from gsfluent.demo.capture import ring_cameras
 from gsfluent.demo.shapes import walk
+from gsfluent.demo.tableware import SHELL, WHITE, YOLK, Chocolate, Egg, Pane
 
-NAMES = ("bread", "cake", "melons")
+NAMES = ("bread", "cake", "melons", "pane", "egg", "chocolate")
 
 
 def rays(obj: demo.DemoObject, side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
@@ -143,3 +144,43 @@ def test_both_of_two_melons_are_rebuilt(tmp_path: Path) -> None:
     assert 0.3 < float((x > 0).float().mean()) < 0.7
     low, high = (float(torch.quantile(x, q)) for q in (0.02, 0.98))
     assert low < -0.2 and high > 0.2
+
+
+def test_the_pane_is_10_mm_thick_and_green_where_one_looks_along_it() -> None:
+    pane = Pane(0)
+    around = torch.tensor([[0.03, 0, 0.0049], [0.03, 0, 0.0051], [0.0799, 0, 0], [0.0801, 0, 0]])
+    assert pane.inside(pane.center + around.double()).tolist() == [True, False, True, False]
+    face, edge = pane.surface_color(pane.center + torch.tensor([[0.03, 0, 0.005], [0.08, 0, 0]]))
+    assert float(face.min()) > 0.6 > 0.5 > float(edge[0])
+    assert edge[1] > 1.5 * edge[0]
+
+
+def test_the_egg_is_thicker_at_its_blunt_end_and_has_shell_white_and_yolk() -> None:
+    egg = Egg(0)
+    y = torch.linspace(0, 0.03, 3001, dtype=torch.float64)
+    wide = []
+    for x in (-0.014, 0.014):
+        line = torch.stack([torch.full_like(y, x), y, torch.zeros_like(y)], dim=1) + egg.center
+        wide.append(float(y[egg.inside(line)].max()))
+    assert wide[0] > 1.1 * wide[1]
+    assert max(wide) < 0.022
+    column = torch.tensor([[0.0, 0, 0.001], [0.0, 0, 0.004], [0, 0, 0.022]], dtype=torch.float64)
+    assert egg.labels(column).tolist() == [SHELL, WHITE, YOLK]
+    color = egg.interior(column)
+    assert color[2, 2] < 0.3 * color[2, 0]  # the yolk is yellow
+    assert float(color[1].min()) > 0.6
+
+
+def test_the_chocolate_has_six_times_three_blocks() -> None:
+    bar = Chocolate(0)
+    x = torch.linspace(-0.06, 0.06, 4801, dtype=torch.float64)
+    for axis, count in ((0, 6), (1, 3)):
+        line = torch.zeros(len(x), 3, dtype=torch.float64)
+        line[:, axis] = x
+        line[:, 1 - axis] = 0.0 if axis == 0 else 0.010  # off the grooves of the other axis
+        line[:, 2] = 0.005
+        inside = bar.inside(bar.center + line)
+        starts = int((inside[1:] & ~inside[:-1]).sum())
+        assert starts == count
+    deep = torch.tensor([[0.0, 0.0, 0.0015], [0.0, 0.0, 0.0005]], dtype=torch.float64)
+    assert bar.inside(bar.center + deep).tolist() == [False, True]  # 7 of 12 mm are left

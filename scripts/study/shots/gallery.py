@@ -1,6 +1,6 @@
 """Run the shots of examples/, collect a picture and the times of each, and write the page.
 
-    python scripts/study/shots/gallery.py            # all seven scenes, resumable
+    python scripts/study/shots/gallery.py            # all scenes, resumable
     python scripts/study/shots/gallery.py cake_cut milk_poured -o gallery_out --device cpu
     python scripts/study/shots/gallery.py --quality shot --device cuda
     python scripts/study/shots/gallery.py --page     # only the page, from the lines there are
@@ -67,6 +67,9 @@ SCENES = {
     "cake_cut": Scene("cake cut by a blade", "cake", (0.12, 0.36, 0.56, 0.98)),
     "milk_poured": Scene("milk poured", "orange", (0.12, 0.35, 0.6, 0.98)),
     "melons_collided": Scene("two bodies collided", "melons", (0.02, 0.2, 0.45, 0.98)),
+    "glass_dropped": Scene("glass dropped", "pane", (0.05, 0.2, 0.45, 0.98)),
+    "egg_dropped": Scene("egg dropped", "egg", (0.05, 0.2, 0.45, 0.98)),
+    "chocolate_snapped": Scene("chocolate snapped", "chocolate", (0.02, 0.2, 0.45, 0.98)),
 }
 
 
