@@ -30,6 +30,9 @@ ENERGY_SLACK = 0.05
 energy so far. Contact and breaking only take energy away."""
 ROUNDING = 1e-7
 """Of gravity's energy: places are rounded, and what is held still has no other energy."""
+LIFT = 0.01
+"""How far the weight may be lifted [cells]: what settles on a floor wakes by less, and has no other
+energy to measure that with."""
 RING = 2
 LEAST_SCALE = 2.0**-12
 """Factor on the time step at which a run is given up."""
@@ -167,7 +170,9 @@ class Watch:
         given = self.energy + float(state.work)
         self.scale = max(self.scale, min(now.kinetic + now.elastic, max(given - now.gravity, 0.0)))
         excess = now.total - given
-        if not excess <= ENERGY_SLACK * self.scale + ROUNDING * abs(now.gravity) + 1e-9:
+        weight = math.hypot(*self.gravity) * float(self.matter.particles.mass.double().sum())
+        slack = ENERGY_SLACK * self.scale + ROUNDING * abs(now.gravity)
+        if not excess <= slack + LIFT * weight * self.matter.dx + 1e-9:
             speed = p.velocity.norm(dim=1)
             return Unhealthy(
                 f"energy rose by {excess:.3g} J over the {given:.3g} J it had and was given",

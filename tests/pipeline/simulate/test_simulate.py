@@ -188,6 +188,18 @@ def test_energy_from_nowhere_is_noticed():
     assert report["verdict"] in ("healed", "failed") and "energy rose" in report["reason"]
 
 
+@pytest.mark.parametrize(("cells", "well"), [(0.005, True), (0.05, False)])
+def test_a_body_at_rest_may_be_lifted_by_less_than_its_cells_can_tell(cells, well):
+    """What it rests on wakes it: nothing moves yet, so no kinetic energy says what is much."""
+    scene = Scene()
+    scene.add(ellipsoid((0.1,) * 3), materials.elastic, frame=at(0, 0, 0.1))
+    run = Simulate(dx=0.04)(scene, fps=50, seconds=0.1).run
+    up = torch.tensor([0.0, 0.0, cells * 0.04], dtype=torch.float64)
+    lifted = run.state._replace(position=run.state.position + up)
+    trouble = run.watch.check(lifted, run.stepper)
+    assert (trouble is None) == well
+
+
 def test_resuming_repeats_the_run_bit_for_bit(tmp_path):
     scene = Scene()
     scene.add(ellipsoid(), materials.fruit.watermelon.override(parts=()))
