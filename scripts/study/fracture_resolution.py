@@ -39,7 +39,8 @@ from gsfluent.fracturebench.statistics import MEASURES, Figures, distance, ensem
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import commit, machine
 from gsfluent.lab.frozen.answer import run_case
-from gsfluent.pipeline.matter.brittle import BAND, brittle_rows
+from gsfluent.pipeline.matter.brittle import brittle_rows
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
 
@@ -351,7 +352,7 @@ def run_all(todo: Sequence[Job], out: Path, device: str) -> None:
         sys.stderr.write(f"{number}/{len(todo)} {name}\n")
         row = {
             **job.key, "device": device, "machine": machine(device), "commit": commit(),
-            "band_cells": BAND, **job.make(),
+            "band_cells": BAND_CELLS, **job.make(),
         }  # fmt: skip
         shown = {k: v for k, v in row.items() if k not in ("runs", "machine", "commit")}
         sys.stderr.write(f"    {json.dumps(shown)}\n")

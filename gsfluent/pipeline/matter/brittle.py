@@ -15,12 +15,8 @@ import torch
 from torch import Tensor
 
 from gsfluent.materials import LARGEST, STEEPEST, Field, Material
-from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, softening_energies
+from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, BAND_CELLS, softening_energies
 
-BAND = 2.0
-"""Cells in which a crack dissipates, mean over its places between the nodes: 2.5 to 3 where it lies
-on nodes, 1.2 to 1.7 between them (gsfluent.lab.problems.fracture.energy). A hard blow breaks up to
-four."""
 STEP = 0.04
 """Steps of the logarithm of strength in which it varies from place to place."""
 
@@ -127,7 +123,7 @@ def softened(
         ``(hardening, alpha0, kept)``, [M] each; the last is the share of the strength that is left.
     """
     kappa, beta = rows[:, 1], rows[:, 3]
-    target = energy / (BAND * dx)
+    target = energy / (BAND_CELLS * dx)
 
     def dissipated(strength: Tensor, alpha0: Tensor) -> Tensor:
         table = rows.clone()

@@ -20,8 +20,9 @@ from gsfluent import ops
 from gsfluent.materials import LAWS
 
 BAND_CELLS = 2.0
-"""Width of the narrowest band a quadratic B-spline grid can localise to [dx]; it is reached when
-the crack runs along a plane of nodes (measured, docs/theory/fracture.md)."""
+"""Cells in which a crack dissipates, mean over its places between the nodes: 2.5 to 3 where it lies
+on nodes, 1.2 to 1.7 between them (gsfluent.lab.problems.fracture.energy). A hard blow breaks up to
+four."""
 ALPHA_MIN = -10.0
 """Smallest alpha the return map keeps."""
 
@@ -145,8 +146,8 @@ def softening_energies(params: Tensor, alpha: Tensor, *, steps: int = 400) -> Te
 def fracture_energy(params: Tensor, alpha: float, *, dx: float) -> float:
     """Energy per crack area of a NACC material on a grid of spacing ``dx`` [J/m^2].
 
-    :func:`softening_energy` times a band of ``BAND_CELLS`` cells, so a lower bound: measured cracks
-    are up to a half wider, depending on how they lie on the grid (docs/theory/fracture.md).
+    :func:`softening_energy` times a band of ``BAND_CELLS`` cells; one crack takes up to a half more
+    or less, depending on how it lies on the grid (docs/theory/fracture.md).
 
     Raises:
         ValueError: As :func:`softening_energy`, or ``dx`` is not positive.

@@ -14,8 +14,8 @@ from torch import Tensor
 from gsfluent import materials
 from gsfluent.errors import InputError
 from gsfluent.materials import LARGEST, STEEPEST, Field, Material, ellipse
-from gsfluent.pipeline.matter.brittle import BAND, brittle_rows, kept_strength, softened
-from gsfluent.pipeline.matter.crack_band import softening_energies
+from gsfluent.pipeline.matter.brittle import brittle_rows, kept_strength, softened
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS, softening_energies
 from gsfluent.pipeline.matter.points import Matter, build_matter
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.scene.scene import Scene
@@ -88,7 +88,7 @@ def on_grid(material: Material, dx: float, weakness: float = 1.0) -> tuple[Tenso
 
 def crack_energy(rows: Tensor, alpha: Tensor, dx: float) -> float:
     """Energy per area of the band [J/m^2]."""
-    return BAND * dx * float(softening_energies(rows, alpha)[0])
+    return BAND_CELLS * dx * float(softening_energies(rows, alpha)[0])
 
 
 @pytest.mark.parametrize("dx", FINE)
