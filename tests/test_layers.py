@@ -25,7 +25,7 @@ ORDER = (
     "_lazy.py __init__.py lazy.py errors.py geometry.py colors.py progress.py hardware.py "
     "_load.py _check.py data materials ops metrics.py draw.py spatial demo io scene figure "
     "config/yaml_file.py config config/physgaussian results "
-    "pipeline/__init__.py pipeline/stage.py pipeline/capture pipeline/matter pipeline/colliders "
+    "pipeline/__init__.py pipeline/stage.py pipeline/capture pipeline/matter pipeline/liquid pipeline/colliders "
     "pipeline/light pipeline/solid pipeline/reconstruct pipeline/regions pipeline/fill "
     "pipeline/texture/volume pipeline/texture/presets pipeline/texture/photo "
     "pipeline/texture/synthesis pipeline/texture/inpaint pipeline/texture "

@@ -8,10 +8,9 @@ from torch import Tensor
 from gsfluent.data import SURFACE, Gaussians, Particles
 from gsfluent.geometry import matrix_to_quaternion
 from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.liquid.sheet import CLOSED, ellipsoids
 from gsfluent.scene.scene import Scene
 
-# Splats of this many standard deviations per spacing close a packing of particles.
-_SIGMA_IN_SPACINGS = 0.6
 _STEEL = (0.25, 0.25, 0.25)
 _BLADE = (0.55, 0.57, 0.60)
 _PLATE_POINTS = 100
@@ -29,7 +28,8 @@ _LIQUID = (0.45, 0.60, 0.68)
 def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
     """Splats for bodies that have matter but no photographs, or None without any.
 
-    Bullets are steel grey; liquids have the colour of their name, or that of water.
+    Bullets are steel grey; liquids have the colour of their name, or that of water, and are drawn
+    by the sheet (:mod:`gsfluent.pipeline.liquid.sheet`).
     """
     groups = []
     for number, body in enumerate(scene.bodies):
@@ -37,9 +37,14 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
             continue
         rows = particles.body == number
         position, volume = particles.position[rows], particles.volume[rows]
-        plain = _LIQUID if body.material.law == "fluid" else _STEEL
-        paint = _PAINT.get(body.material.name.split(".")[-1], plain)
-        groups.append(_splats(position, _SIGMA_IN_SPACINGS * volume.pow(1.0 / 3.0), paint))
+        flows = body.material.law == "fluid"
+        paint = _PAINT.get(body.material.name.split(".")[-1], _LIQUID if flows else _STEEL)
+        if flows:
+            drawn = ellipsoids(position, volume)
+            made = _splats(drawn.means, drawn.scales, paint)
+            groups.append(made.replace(quats=drawn.quats))
+        else:
+            groups.append(_splats(position, CLOSED * volume.pow(1.0 / 3.0), paint))
     return Gaussians.cat(groups) if groups else None
 
 
@@ -63,7 +68,7 @@ def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
     points, normals, spacing = rigid.surfaces(rows)
     if points.shape[0] == 0:
         return None
-    sizes = torch.full_like(points[:, 0], _SIGMA_IN_SPACINGS * spacing)
+    sizes = torch.full_like(points[:, 0], CLOSED * spacing)
     made = _splats(points.float(), sizes.float(), _STEEL)
     return made.replace(normals=normals.float())
 
@@ -102,7 +107,7 @@ def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") 
         normal = torch.linalg.cross(edge, way)
         normal = (normal / normal.norm()).float()
         # as thin as a blade: seen along its plane it must not be a row of balls
-        sizes = torch.full((points.shape[0], 3), _SIGMA_IN_SPACINGS * step, device=device)
+        sizes = torch.full((points.shape[0], 3), CLOSED * step, device=device)
         sizes[:, 2] = 0.1 * sizes[:, 0]
         turn = torch.stack([edge.float(), torch.linalg.cross(normal, edge.float()), normal], dim=1)
         quat = matrix_to_quaternion(turn.double()).float().to(device)
