@@ -7,6 +7,7 @@ import math
 from torch import Tensor
 
 from gsfluent.pipeline.liquid.nozzle import held_weights, pours, release_times, waiting
+from gsfluent.pipeline.liquid.spacing import apart
 from gsfluent.pipeline.liquid.wetting import Skin, held
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -14,6 +15,8 @@ from gsfluent.scene.scene import Scene
 
 TICK = 1.0 / 500.0
 """Time between two looks [s]."""
+EVERY = 4
+"""Looks from one at which points are pushed apart to the next."""
 
 
 class Liquids:
@@ -58,7 +61,19 @@ class Liquids:
         out = (state.group < -1) & (self._release <= state.time + 0.5 * TICK)
         if bool(out.any()):
             state = state._replace(group=state.group.masked_fill(out, -1))
+        rows = self._liquid[on_grid[self._liquid]]
+        if round(state.time / TICK) % EVERY == 0 and rows.numel():
+            state = self._spaced(state, rows)
         if self._skin is not None:
-            rows = self._liquid[on_grid[self._liquid]]
             state = held(state, self._skin, rows, on_grid, self.matter.dx)
         return state
+
+    def _spaced(self, state: State, rows: Tensor) -> State:
+        """Points that have run together apart again, each liquid for itself."""
+        position = state.position.clone()
+        for (a, b), spacing in zip(self.matter.ranges, self.matter.spacing, strict=True):
+            mine = rows[(rows >= a) & (rows < b)]
+            if mine.numel():
+                position[mine] = apart(position[mine], spacing)
+        p = state.particles
+        return state._replace(position=position, particles=p.replace(position=position.to(p.dtype)))

@@ -18,7 +18,7 @@ from gsfluent.spatial.neighbours import nearest_rows
 
 REACH = 4.0
 """Radius of a neighbourhood, in spacings."""
-STRETCHED = 6.0
+STRETCHED = 8.0
 """The same where a film is so thin that :data:`FEW` points lie no nearer."""
 FEW = 25
 """Points in a neighbourhood below which it has no shape."""
@@ -32,6 +32,8 @@ SPRAY = 0.5
 """Size of a splat without neighbours over that of one inside."""
 CLOSED = 0.6
 """Splats of this many standard deviations per spacing close a packing of points."""
+FILM = 0.9
+"""The same in a film, whose points lie less evenly."""
 
 
 class Ellipsoids(NamedTuple):
@@ -85,7 +87,7 @@ def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
     value, axes = torch.linalg.eigh(covariance)
     value, axes = value.flip(1).clamp(min=1e-30), axes.flip(2)
     # From nothing at half of FEW to everything at FEW: a neighbourhood gets its shape gently.
-    inside = (near < 1.0).sum(dim=1).double()
+    inside = (distance <= reach).sum(dim=1).double()
     known = ((inside - 0.5 * FEW) / (0.5 * FEW)).clamp(0.0, 1.0)[:, None]
     shape = value / value[:, :1]
     shape = torch.lerp(torch.ones_like(shape), shape, known)
@@ -98,8 +100,8 @@ def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
     scales = long * (volume_left / long.prod(dim=1, keepdim=True)).pow(1.0 / 3.0)
     # In a film of n points on the disc of the neighbourhood each has reach^2 pi / n.
     sheet = reach * (torch.pi / inside[:, None].clamp(min=1.0)).sqrt()
-    thin = known * (1.0 - shape[:, 2:]) * shape[:, 1:2]
-    wide = torch.maximum(scales[:, :2], thin * CLOSED * sheet)
+    thin = known * (1.0 - shape[:, 2:]) * (2.0 * shape[:, 1:2]).clamp(max=1.0)
+    wide = torch.maximum(scales[:, :2], thin * FILM * sheet)
     thick = volume_left / wide.prod(dim=1, keepdim=True)
     thick = torch.maximum(thick, wide[:, :1] / RATIO)
     thick = torch.minimum(thick, wide[:, 1:])

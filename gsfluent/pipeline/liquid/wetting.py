@@ -98,13 +98,15 @@ def held(state: State, skin: Skin, liquid: Tensor, on_grid: Tensor, dx: float) -
     speed = (away * normal).sum(dim=1)
     speed = torch.where((speed > 0.0) & (speed < TEARS), speed, 0.0)
     mass = p.mass.double()
-    # Between two masses what is left of the relative speed is none.
-    both = mass[liquid] * mass[rows[place_in]] / (mass[liquid] + mass[rows[place_in]])
-    push = (both * speed)[:, None] * normal
     # Sums in whole numbers have no order.
     unit = float(mass.max()) * 2.0**-40
+    given = torch.zeros((rows.shape[0], 3), dtype=torch.long, device=rows.device)
+    mine = torch.where(speed > 0.0, mass[liquid], 0.0)
+    load = given[:, 0].index_add(0, place_in, (mine / unit).round().long()).double() * unit
+    # As many inelastic impacts on one point of the wall: by Cauchy's inequality energy falls.
+    share = mass[rows] / (mass[rows] + load)
+    push = (mine * share[place_in] * speed)[:, None] * normal
     push = (push / unit).round().long()
-    given = torch.zeros((rows.shape[0], 3), dtype=torch.long, device=push.device)
     given.index_add_(0, place_in, push)
     velocity = p.velocity.clone()
     taken = push.double() * unit / mass[liquid][:, None]
