@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials
-from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.figure.markdown import enter
+from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.pipeline.liquid.sheet import CLOSED, Ellipsoids
 from gsfluent.results.frames import SavedFrame, count_frames, load_frame
 from gsfluent.spatial.neighbours import nearest_rows

@@ -13,6 +13,8 @@ from gsfluent.scene.scene import Scene
 
 _STEEL = (0.25, 0.25, 0.25)
 _BLADE = (0.55, 0.57, 0.60)
+_FLAT = 0.2
+"""Thickness of the splats of rigid things, in widths."""
 _PLATE_POINTS = 100
 _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
@@ -68,9 +70,14 @@ def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
     points, normals, spacing = rigid.surfaces(rows)
     if points.shape[0] == 0:
         return None
-    sizes = torch.full_like(points[:, 0], CLOSED * spacing)
-    made = _splats(points.float(), sizes.float(), _STEEL)
-    return made.replace(normals=normals.float())
+    # Flat, so that a thin wall and an edge are not rows of balls.
+    sizes = (CLOSED * spacing)[:, None] * spacing.new_tensor([1.0, 1.0, _FLAT])
+    made = _splats(points.float(), sizes.float().contiguous(), _STEEL)
+    # The shortest turn of +z to the normal's line: a flat splat has no sides.
+    x, y, z = torch.where(normals[:, 2:] < 0.0, -normals, normals).unbind(1)
+    w = (0.5 * (1.0 + z)).sqrt()
+    quats = torch.stack([w, -0.5 * y / w, 0.5 * x / w, torch.zeros_like(w)], dim=1).float()
+    return made.replace(quats=quats, normals=normals.float())
 
 
 def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") -> Gaussians | None:

@@ -6,7 +6,7 @@ import math
 
 from torch import Tensor
 
-from gsfluent.pipeline.liquid.nozzle import held_weights, pours, release_times, waiting
+from gsfluent.pipeline.liquid.nozzle import held_weights, release_times, waiting
 from gsfluent.pipeline.liquid.spacing import apart
 from gsfluent.pipeline.liquid.wetting import Skin, held
 from gsfluent.pipeline.matter.points import Matter
@@ -35,7 +35,7 @@ class Liquids:
         solids = [n for n in solids if n not in flowing]
         self._skin = Skin.of(matter, solids) if flowing and solids else None
         self._release = release_times(scene, matter, TICK)
-        self._active = bool(flowing) or any(pours(body) for body in scene.bodies)
+        self._active = bool(flowing)
 
     def held(self, first: int = 0) -> list[tuple[float, float]]:
         """What waits in nozzles, from a row on: masses [kg], and until when [s]."""

@@ -21,8 +21,9 @@ WAITING = torch.iinfo(torch.int32).min
 
 
 def pours(body: Body) -> bool:
-    """Whether a body is a jet that leaves a nozzle (and not a pool, which stands)."""
-    return body.held and body.length > 0.0 and math.hypot(*body.velocity) > 0.0
+    """Whether a body is a jet of liquid that leaves a nozzle, and no pool, which stands."""
+    flows = body.material.law == "fluid"
+    return flows and body.held and body.length > 0.0 and math.hypot(*body.velocity) > 0.0
 
 
 def release_times(scene: Scene, matter: Matter, tick: float) -> Tensor:

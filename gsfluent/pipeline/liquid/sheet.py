@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.geometry import matrix_to_quaternion
+from gsfluent.pipeline.liquid.depth import deep
 from gsfluent.spatial.neighbours import nearest_rows
 
 REACH = 4.0
@@ -22,7 +23,7 @@ STRETCHED = 8.0
 """The same where a film is so thin that :data:`FEW` points lie no nearer."""
 FEW = 25
 """Points in a neighbourhood below which it has no shape."""
-MOST = 48
+MOST = 36
 """Points of a neighbourhood that are looked at; a film has no more within :data:`REACH`."""
 RATIO = 4.0
 """Longest over shortest axis of a splat, at most."""
@@ -62,16 +63,27 @@ def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
         volume: Their volumes [m^3], [N].
 
     Returns:
-        One splat a point, on the device and of the dtype of ``position``; it is a continuous
-        function of the positions, so that nothing pops.
+        One splat a point, on the device and of the dtype of ``position``. What is seen of them is
+        a continuous function of the positions, so that nothing pops; deep points stay round.
     """
     count = position.shape[0]
     edge = volume.double().pow(1.0 / 3.0)
     if count <= FEW:
-        return _round(position, edge)
+        return _round(position, edge, SPRAY * CLOSED)
     spacing = float(edge.mean())
-    places = position.double()
-    distance, index = nearest_rows(places, places, min(MOST, count), 2.0 * spacing)
+    seen = (~deep(position, spacing)).nonzero()[:, 0]
+    made = _round(position, edge, CLOSED)
+    if seen.numel() == 0:
+        return made
+    shaped = _shaped(position.double(), seen, edge[seen], spacing)
+    pairs = zip(made, shaped, strict=True)
+    return Ellipsoids(*(a.index_copy(0, seen, b.to(a)) for a, b in pairs))
+
+
+def _shaped(everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float) -> Ellipsoids:
+    """Ellipsoids of some points among all."""
+    count, places = everywhere.shape[0], everywhere[rows]
+    distance, index = nearest_rows(everywhere, places, min(MOST, count), 2.0 * spacing)
     # As far as REACH where that holds enough points, farther in a film stretched thin; where it
     # holds more than are looked at, only as far as those.
     reach = distance[:, FEW - 1 : FEW].clamp(REACH * spacing, STRETCHED * spacing)
@@ -80,7 +92,7 @@ def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
     near = (distance / reach).clamp(max=1.0)
     weight = 1.0 - near**3
     weight = weight / weight.sum(dim=1, keepdim=True)
-    arm = places[index] - places[:, None]
+    arm = everywhere[index] - places[:, None]
     middle = (weight[..., None] * arm).sum(dim=1)
     arm = arm - middle[:, None]
     covariance = torch.einsum("nk,nki,nkj->nij", weight, arm, arm)
@@ -108,13 +120,15 @@ def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
     scales = torch.cat([wide, thick], dim=1)
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     quats = matrix_to_quaternion(axes)
-    return Ellipsoids(*(v.to(position) for v in (means, quats, scales, shape, sheet[:, 0])))
+    return Ellipsoids(means, quats, scales, shape, sheet[:, 0])
 
 
-def _round(position: Tensor, edge: Tensor) -> Ellipsoids:
-    """Spray: too few points to have a shape."""
+def _round(position: Tensor, edge: Tensor, sigma: float) -> Ellipsoids:
+    """Balls, of a standard deviation in edges: spray, and what lies deep."""
     count = position.shape[0]
-    size = (SPRAY * CLOSED * edge)[:, None].expand(count, 3)
+    size = (sigma * edge)[:, None].expand(count, 3)
     quats = position.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4)
     ones = torch.ones_like(position)
-    return Ellipsoids(position, quats.contiguous(), size.to(position).contiguous(), ones, edge.to(position))
+    return Ellipsoids(
+        position, quats.contiguous(), size.to(position).contiguous(), ones, edge.to(position)
+    )

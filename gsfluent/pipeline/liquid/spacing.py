@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 
+from gsfluent.pipeline.liquid.depth import deep
 from gsfluent.spatial.neighbours import nearest_rows
 
 NEIGHBOURS = 12
@@ -21,7 +21,7 @@ SHARE = 0.25
 
 
 def apart(position: Tensor, spacing: float) -> Tensor:
-    """Positions of points moved away from those that are too near.
+    """Positions of points moved away from those that are too near; deep ones are left alone.
 
     Too near is nearer than the mean distance that the twelve nearest neighbours would have in a
     plane: 0.7 spacings inside a liquid, and the distance in the sheet in a sheet.
@@ -36,6 +36,10 @@ def apart(position: Tensor, spacing: float) -> Tensor:
     count = position.shape[0]
     if count <= NEIGHBOURS:
         return position
+    rows = (~deep(position, spacing)).nonzero()[:, 0]
+    if rows.shape[0] <= NEIGHBOURS:
+        return position
+    everywhere, position = position, position[rows]
     distance, index = nearest_rows(position, position, NEIGHBOURS + 1, spacing)
     # Spray is nobody's neighbour.
     reach = distance[:, -1].clamp(max=4.0 * spacing) * math.sqrt(math.pi / NEIGHBOURS)
@@ -49,4 +53,4 @@ def apart(position: Tensor, spacing: float) -> Tensor:
     push = (push / unit).round().long()
     moved = push.sum(dim=1)
     moved.index_add_(0, index.reshape(-1), -push.reshape(-1, 3))
-    return position + moved.double() * unit
+    return everywhere.index_add(0, rows, moved.double() * unit)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.liquid.nozzle import pours
+from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.matter.fields import breakable, cut_bodies
 from gsfluent.pipeline.matter.fragments import Fragments, rest_links
 from gsfluent.pipeline.matter.pieces import Pieces, Web, find_pieces
@@ -68,9 +68,7 @@ class Run:
             max_rollbacks=self.stepper.options.max_rollbacks,
             names=[body.name for body in scene.bodies],
         )  # fmt: skip
-        held = [
-            body.start if body.held and not pours(body) else 0.0 for body in scene.bodies
-        ]
+        held = [body.start if body.held and not pours(body) else 0.0 for body in scene.bodies]
         self.ledger = Ledger(matter, scene.gravity, self.start, held)
         self.ledger.held += self.stepper.liquids.held()
         self.per_frame: list[dict[str, Any]] = []
