@@ -3,10 +3,10 @@
     python scripts/accuracy/liquids.py RUN [RUN ...] [--name NAME ...]
         [--json docs/measured/data/liquids.jsonl] [--page docs/measured/liquids.md]
 
-The ball is the first body of the run, the liquid the bodies of a fluid. A direction from the middle
-of the ball is touched where a point of the liquid lies within two spacings beside it and at most
-four above the ball; wetted is what is touched, with gaps narrower than eight spacings closed
-(dilated by four, eroded by four). A wetted direction is uncovered where the splats let more than
+The ball is the first body of the run, the liquid the bodies of a fluid. Points of the
+liquid that lie at most four spacings above the ball wet it: the directions to them from its middle,
+dilated by four spacings and eroded by as much, so that gaps narrower than eight are closed and the
+front is where the outermost points are. A wetted direction is uncovered where the splats let more than
 half of a ray to the middle through: the splats of the run, and balls, one round splat of 0.6
 spacings a point, on the same motion. Of every run the frames count in which a twentieth of the ball
 is wet.
@@ -31,7 +31,6 @@ from gsfluent.results.frames import SavedFrame, count_frames, load_frame
 from gsfluent.spatial.neighbours import nearest_rows
 
 DIRECTIONS = 10_000
-TOUCH = 2.0
 ABOVE = 4.0
 GAP = 4.0
 LEAST = 0.05
@@ -56,8 +55,8 @@ def within(places: Tensor, queries: Tensor, reach: float) -> Tensor:
 
 
 def wetted(way: Tensor, touched: Tensor, gap: float) -> Tensor:
-    """Touched directions with gaps closed: dilated and eroded by ``gap`` [rad], bool [M]."""
-    wide = within(way[touched], way, gap)
+    """Directions [M, 3] among touched ones [N, 3]: dilated, eroded by ``gap`` [rad], bool [M]."""
+    wide = within(touched, way, gap)
     return wide & ~within(way[~wide], way, gap)
 
 
@@ -95,8 +94,7 @@ def figures(frame: SavedFrame) -> dict[str, float]:
     far = arm.norm(dim=1)
     near = far < radius + ABOVE * spacing
     way = directions(DIRECTIONS)
-    touched = within(arm[near] / far[near, None], way, TOUCH * spacing / radius)
-    wet = wetted(way, touched, GAP * spacing / radius)
+    wet = wetted(way, arm[near] / far[near, None], GAP * spacing / radius)
     found = {
         "time": frame.time,
         "wetted": float(wet.double().mean()),

@@ -12,6 +12,7 @@ from gsfluent.pipeline.liquid.sheet import CLOSED, ellipsoids
 from gsfluent.scene.scene import Scene
 
 _STEEL = (0.25, 0.25, 0.25)
+_OPAQUE = 0.95
 _BLADE = (0.55, 0.57, 0.60)
 _FLAT = 0.2
 """Thickness of the splats of rigid things, in widths."""
@@ -19,12 +20,14 @@ _PLATE_POINTS = 100
 _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
 _PAINT = {
-    "water": (0.45, 0.60, 0.68),
+    "water": (0.50, 0.62, 0.66),
     "milk": (0.93, 0.91, 0.85),
     "honey": (0.75, 0.45, 0.08),
     "oil": (0.70, 0.60, 0.15),
 }
-_LIQUID = (0.45, 0.60, 0.68)
+_LIQUID = (0.50, 0.62, 0.66)
+_OPACITY = {"water": 0.4}
+"""Of one splat; many behind each other are opaque all the same, drops and edges are not."""
 
 
 def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
@@ -44,7 +47,9 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
         if flows:
             drawn = ellipsoids(position, volume)
             made = _splats(drawn.means, drawn.scales, paint)
-            groups.append(made.replace(quats=drawn.quats))
+            share = _OPACITY.get(body.material.name.split(".")[-1], _OPAQUE)
+            opacities = torch.full_like(made.opacities, share)
+            groups.append(made.replace(quats=drawn.quats, opacities=opacities))
         else:
             groups.append(_splats(position, CLOSED * volume.pow(1.0 / 3.0), paint))
     return Gaussians.cat(groups) if groups else None
@@ -130,4 +135,4 @@ def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") 
 
 def _splats(position: Tensor, sizes: Tensor, paint: tuple[float, float, float]) -> Gaussians:
     colors = position.new_tensor(paint).expand_as(position).contiguous()
-    return Gaussians.from_colors(position, sizes, colors, opacities=0.95, label=SURFACE)
+    return Gaussians.from_colors(position, sizes, colors, opacities=_OPAQUE, label=SURFACE)
