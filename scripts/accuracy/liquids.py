@@ -6,8 +6,8 @@
 The ball is the first body of the run, the liquid the bodies of a fluid. Points of the
 liquid that lie at most four spacings above the ball wet it: the directions to them from its middle,
 dilated by four spacings and eroded by as much, so that gaps narrower than eight are closed and the
-front is where the outermost points are. A wetted direction is uncovered where the splats let more than
-half of a ray to the middle through: the splats of the run, and balls, one round splat of 0.6
+front is where the outermost points are. A wetted direction is uncovered where the splats let more
+than half of a ray to the middle through: the splats of the run, and balls, one round splat of 0.6
 spacings a point, on the same motion. Of every run the frames count in which a twentieth of the ball
 is wet.
 """
