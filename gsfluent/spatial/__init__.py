@@ -4,6 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    blue_noise="blue_cylinder",
     density="GridBox choose_grid density_field",
     mesh_distance="load_mesh mesh_body oriented_samples signed_distances",
     neighbours="nearest nearest_rows",

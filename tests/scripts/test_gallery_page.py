@@ -39,7 +39,9 @@ def test_every_scene_has_a_shot_that_reads(
     monkeypatch.setenv("GSFLUENT_DATA", str(tmp_path))
     for word in text.replace(",", " ").replace("}", " ").split():
         path = word.removeprefix("$GSFLUENT_DATA/")
-        if "/" in path and path.startswith(("data/", "captures/", "exemplars/", "cameras/")):
+        if "/" in path and path.startswith(
+            ("data/", "captures/", "exemplars/", "cameras/", "meshes/")
+        ):
             (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / path).touch()
     (tmp_path / "shot.yaml").write_text(text, encoding="utf-8")

@@ -264,17 +264,17 @@ class RigidSet:
         result: list[float] = (distance - slack).amin(dim=1).tolist()
         return result
 
-    def surfaces(self, rows: Tensor, points: int = 2000) -> tuple[Tensor, Tensor, float]:
+    def surfaces(self, rows: Tensor, points: int = 2000) -> tuple[Tensor, Tensor, Tensor]:
         """Points spread over the surfaces of all colliders but endless planes, to draw them.
 
         Args:
             rows: Rows, [M, 32].
-            points: About how many per collider.
+            points: About how many per collider; a mesh, which may be hollow, gets eight times that.
 
         Returns:
-            Points [P, 3] and normals [P, 3] in scene metres, and the largest spacing [m].
+            Points [P, 3] and normals [P, 3] in scene metres, and the spacing at each [m], [P].
         """
-        found, normals, widest = [], [], 0.0
+        found, normals, spacing = [], [], []
         for collider, one in zip(self._colliders, rows, strict=True):
             if collider is not None and not collider.shown:
                 continue
@@ -283,7 +283,8 @@ class RigidSet:
             if not math.isfinite(bound):
                 continue
             # A ball of this radius has about this many points of a lattice on its surface.
-            step = bound * math.sqrt(12.0 / points)
+            fine = 8 if collider is not None and collider.kind == "mesh" else 1
+            step = bound * math.sqrt(12.0 / (fine * points))
             side = math.ceil(bound / step)
             axis = torch.arange(-side, side + 1, dtype=rows.dtype, device=rows.device) * step
             at = row[3:6] + torch.cartesian_prod(axis, axis, axis)
@@ -291,11 +292,11 @@ class RigidSet:
             near = distance[:, 0].abs() <= 0.5 * step
             found.append((at - distance * normal[:, 0])[near])
             normals.append(normal[near, 0])
-            widest = max(widest, step)
+            spacing.append(torch.full_like(normals[-1][:, 0], step))
         if not found:
             none = rows.new_zeros(0, 3)
-            return none, none, 0.0
-        return torch.cat(found), torch.cat(normals), widest
+            return none, none, rows.new_zeros(0)
+        return torch.cat(found), torch.cat(normals), torch.cat(spacing)
 
     def _drawn(self, c: Collider | None, row: Tensor) -> Tensor:
         """The row as it was asked for, not as the grid needs it."""

@@ -8,28 +8,33 @@ from torch import Tensor
 from gsfluent.data import SURFACE, Gaussians, Particles
 from gsfluent.geometry import matrix_to_quaternion
 from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.liquid.sheet import CLOSED, ellipsoids
 from gsfluent.scene.scene import Scene
 
-# Splats of this many standard deviations per spacing close a packing of particles.
-_SIGMA_IN_SPACINGS = 0.6
 _STEEL = (0.25, 0.25, 0.25)
+_OPAQUE = 0.95
 _BLADE = (0.55, 0.57, 0.60)
+_FLAT = 0.2
+"""Thickness of the splats of rigid things, in widths."""
 _PLATE_POINTS = 100
 _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
 _PAINT = {
-    "water": (0.45, 0.60, 0.68),
+    "water": (0.50, 0.62, 0.66),
     "milk": (0.93, 0.91, 0.85),
     "honey": (0.75, 0.45, 0.08),
     "oil": (0.70, 0.60, 0.15),
 }
-_LIQUID = (0.45, 0.60, 0.68)
+_LIQUID = (0.50, 0.62, 0.66)
+_OPACITY = {"water": 0.4}
+"""Of one splat; many behind each other are opaque all the same, drops and edges are not."""
 
 
 def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
     """Splats for bodies that have matter but no photographs, or None without any.
 
-    Bullets are steel grey; liquids have the colour of their name, or that of water.
+    Bullets are steel grey; liquids have the colour of their name, or that of water, and are drawn
+    by the sheet (:mod:`gsfluent.pipeline.liquid.sheet`).
     """
     groups = []
     for number, body in enumerate(scene.bodies):
@@ -37,9 +42,16 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
             continue
         rows = particles.body == number
         position, volume = particles.position[rows], particles.volume[rows]
-        plain = _LIQUID if body.material.law == "fluid" else _STEEL
-        paint = _PAINT.get(body.material.name.split(".")[-1], plain)
-        groups.append(_splats(position, _SIGMA_IN_SPACINGS * volume.pow(1.0 / 3.0), paint))
+        flows = body.material.law == "fluid"
+        paint = _PAINT.get(body.material.name.split(".")[-1], _LIQUID if flows else _STEEL)
+        if flows:
+            drawn = ellipsoids(position, volume)
+            made = _splats(drawn.means, drawn.scales, paint)
+            share = _OPACITY.get(body.material.name.split(".")[-1], _OPAQUE)
+            opacities = torch.full_like(made.opacities, share)
+            groups.append(made.replace(quats=drawn.quats, opacities=opacities))
+        else:
+            groups.append(_splats(position, CLOSED * volume.pow(1.0 / 3.0), paint))
     return Gaussians.cat(groups) if groups else None
 
 
@@ -63,9 +75,14 @@ def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
     points, normals, spacing = rigid.surfaces(rows)
     if points.shape[0] == 0:
         return None
-    sizes = torch.full_like(points[:, 0], _SIGMA_IN_SPACINGS * spacing)
-    made = _splats(points.float(), sizes.float(), _STEEL)
-    return made.replace(normals=normals.float())
+    # Flat, so that a thin wall and an edge are not rows of balls.
+    sizes = (CLOSED * spacing)[:, None] * spacing.new_tensor([1.0, 1.0, _FLAT])
+    made = _splats(points.float(), sizes.float().contiguous(), _STEEL)
+    # The shortest turn of +z to the normal's line: a flat splat has no sides.
+    x, y, z = torch.where(normals[:, 2:] < 0.0, -normals, normals).unbind(1)
+    w = (0.5 * (1.0 + z)).sqrt()
+    quats = torch.stack([w, -0.5 * y / w, 0.5 * x / w, torch.zeros_like(w)], dim=1).float()
+    return made.replace(quats=quats, normals=normals.float())
 
 
 def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") -> Gaussians | None:
@@ -102,7 +119,7 @@ def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") 
         normal = torch.linalg.cross(edge, way)
         normal = (normal / normal.norm()).float()
         # as thin as a blade: seen along its plane it must not be a row of balls
-        sizes = torch.full((points.shape[0], 3), _SIGMA_IN_SPACINGS * step, device=device)
+        sizes = torch.full((points.shape[0], 3), CLOSED * step, device=device)
         sizes[:, 2] = 0.1 * sizes[:, 0]
         turn = torch.stack([edge.float(), torch.linalg.cross(normal, edge.float()), normal], dim=1)
         quat = matrix_to_quaternion(turn.double()).float().to(device)
@@ -118,4 +135,4 @@ def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") 
 
 def _splats(position: Tensor, sizes: Tensor, paint: tuple[float, float, float]) -> Gaussians:
     colors = position.new_tensor(paint).expand_as(position).contiguous()
-    return Gaussians.from_colors(position, sizes, colors, opacities=0.95, label=SURFACE)
+    return Gaussians.from_colors(position, sizes, colors, opacities=_OPAQUE, label=SURFACE)

@@ -24,6 +24,7 @@ from gsfluent.materials import Material
 from gsfluent.pipeline.matter.brittle import brittle_rows, distinct_rows
 from gsfluent.scene.parts import quaternion_to, turned
 from gsfluent.scene.scene import Body, Part, Scene
+from gsfluent.spatial.blue_noise import blue_cylinder
 
 _log = logging.getLogger(__name__)
 
@@ -234,15 +235,12 @@ def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
     # A ball is never coarser than four points across, so that even a bullet smaller than a cell
     # has a shape.
     step = min(step, 0.5 * body.radius)
-    side = math.ceil(body.radius / step)
-    axis = (torch.arange(-side, side, dtype=torch.float64) + 0.5) * step
     if body.length == 0.0:
+        side = math.ceil(body.radius / step)
+        axis = (torch.arange(-side, side, dtype=torch.float64) + 0.5) * step
         lattice = torch.cartesian_prod(axis, axis, axis)
         return lattice[lattice.norm(dim=1) <= body.radius], volume
-    layers = max(1, round(body.length / step))
-    along = ((torch.arange(layers, dtype=torch.float64) + 0.5) / layers - 0.5) * body.length
-    lattice = torch.cartesian_prod(axis, axis, along)
-    lattice = lattice[lattice[:, :2].norm(dim=1) <= body.radius]
+    lattice = blue_cylinder(body.radius, body.length, step, seed)
     turn = [turned(quaternion_to(body.axis), e) for e in torch.eye(3).tolist()]
     return lattice @ torch.tensor(turn, dtype=torch.float64), volume
 

@@ -163,6 +163,27 @@ class Flight:
         return moved, place
 
 
+class Queue(Flight):
+    """Liquid that waits in its nozzle: it moves on with one velocity, out of gravity's reach.
+
+    Args:
+        particles: Its points.
+        position: Their positions [m], float64 [M, 3].
+        time: Time of the given state [s].
+        dx: Grid spacing [m].
+        held: Time [s] until which nothing flows.
+    """
+
+    def __init__(
+        self, particles: Particles, position: Tensor, time: float, dx: float, *, held: float
+    ) -> None:
+        still = particles.replace(affine=torch.zeros_like(particles.affine))
+        gravity = torch.zeros(3, dtype=torch.float64)
+        super().__init__(still, position, gravity, time, dx, held=held)
+        # It comes to the grid by leaving the nozzle, not by what is near.
+        self.held = math.inf
+
+
 def _cross_matrix(vector: Tensor) -> Tensor:
     """Return [v]_x with ``[v]_x a = v x a``, [3, 3]."""
     x, y, z = vector.unbind()

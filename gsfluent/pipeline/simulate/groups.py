@@ -76,7 +76,7 @@ class Group:
 
 def grid_mask(state: State, matter: Matter) -> Tensor:
     """Points on the grid, bool [N]."""
-    mask = ~state.loose & (state.group < 0)
+    mask = ~state.loose & (state.group == -1)
     for (a, b), landed in zip(matter.ranges, state.landed, strict=True):
         if not landed:
             mask[a:b] = False

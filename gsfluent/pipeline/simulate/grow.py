@@ -18,6 +18,7 @@ from torch import Tensor
 from gsfluent.data import Particles
 from gsfluent.errors import InputError
 from gsfluent.ops.solver_state import UNBROKEN
+from gsfluent.pipeline.liquid.nozzle import WAITING, pours
 from gsfluent.pipeline.matter.fragments import rest_links
 from gsfluent.pipeline.matter.points import Matter, build_matter
 from gsfluent.pipeline.matter.state import State
@@ -61,8 +62,11 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
         if matter.particles.deformation is None:
             more = dataclasses.replace(more, particles=more.particles.replace(deformation=None))
         matter = _joined(matter, more)
-        state = _joined_state(state, matter, len(fresh), landed=not run.stepper.options.free_flight)
+        flies = run.stepper.options.free_flight
+        landed = tuple(not flies or pours(body) for body in fresh)
+        state = _joined_state(state, matter, landed)
     _refit(run, scene, matter, state)
+    run.state = run.stepper.liquids.begun(run.state)
     run.state = run.state._replace(colliders=_colliders(run, old, state))
     if fresh:
         start = matter.ranges[len(old.bodies)][0]
@@ -75,7 +79,9 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
         cut = run.state.cut_links
         run.state = run.state._replace(cut_links=torch.cat([cut, cut.new_zeros(len(links))]))
         rows = torch.arange(start, matter.particles.count, device=matter.particles.device)
-        _account(run, rows, [body.start if body.held else 0.0 for body in fresh], sign=1.0)
+        held = [body.start if body.held and not pours(body) else 0.0 for body in fresh]
+        _account(run, rows, held, sign=1.0)
+        run.ledger.wait(run.stepper.liquids.held(start), run.state.time)
 
 
 def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
@@ -130,7 +136,7 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
     state = state._replace(
         particles=kept(state.particles),
         landed=tuple(state.landed[n] for n in stay),
-        group=torch.where(group == -1, group, named),
+        group=torch.where((group == -1) | (group == WAITING), group, named),
         unit=torch.where(unit >= 0, place[unit.clamp(min=0)], unit),
         cut_links=state.cut_links[~out[run.links].any(dim=1)],
         **{
@@ -203,7 +209,7 @@ def _joined(a: Matter, b: Matter) -> Matter:
     )
 
 
-def _joined_state(state: State, matter: Matter, bodies: int, *, landed: bool) -> State:
+def _joined_state(state: State, matter: Matter, landed: tuple[bool, ...]) -> State:
     """A state with the points that matter has more, as they start."""
     first = state.particles.count
     rows = torch.arange(first, matter.particles.count, device=state.position.device)
@@ -219,7 +225,7 @@ def _joined_state(state: State, matter: Matter, bodies: int, *, landed: bool) ->
         particles=Particles.cat([state.particles, new]),
         position=torch.cat([state.position, new.position.to(torch.float64)]),
         peak=torch.cat([state.peak, torch.where(brittle, new.alpha, UNBROKEN).to(state.peak)]),
-        landed=state.landed + (landed,) * bodies,
+        landed=state.landed + landed,
         loose=more("loose", False),
         field=torch.cat([state.field, new.body.to(state.field)]),
         cut=more("cut", 0),

@@ -290,6 +290,12 @@ class Ledger:
         self.start = self.start + self.gravity * (sum(weight for weight, _ in waits) * time)
         self.mass += mass
 
+    def wait(self, waits: Sequence[tuple[float, float]], time: float) -> None:
+        """Enter when matter that is there already [kg] comes under gravity's reach [s]."""
+        waits = [(weight, until) for weight, until in waits if until > time]
+        self.held += waits
+        self.start = self.start + self.gravity * (sum(weight for weight, _ in waits) * time)
+
     def error(self, state: State, now: Figures) -> float:
         """Return the relative error of the balance at this moment.
 

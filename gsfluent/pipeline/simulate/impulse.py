@@ -45,7 +45,7 @@ def _pushed(state: State, matter: Matter, push: Impulse) -> State:
     start, end = matter.ranges[push.body]
     mine = torch.zeros_like(state.loose)
     mine[start:end] = True
-    rows = (mine & ~state.loose).nonzero()[:, 0]
+    rows = (mine & ~state.loose & (state.group >= -1)).nonzero()[:, 0]
     # Sleepers and flights leave the grid as whole heaps, which may hold other bodies' matter.
     called = torch.unique(state.group[rows])
     woken = torch.isin(state.group, called[called >= 0])

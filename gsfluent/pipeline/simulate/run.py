@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.pipeline.liquid.nozzle import pours
 from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.matter.fields import breakable, cut_bodies
 from gsfluent.pipeline.matter.fragments import Fragments, rest_links
@@ -22,6 +23,7 @@ from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State, load_state, save_state
 from gsfluent.pipeline.matter.weld import seen, weld
 from gsfluent.pipeline.simulate.engine import Counters, SolverOptions, Unhealthy
+from gsfluent.pipeline.simulate.groups import grid_mask
 from gsfluent.pipeline.simulate.health import CHECK_EVERY, Figures, Ledger, Watch, figures_of
 from gsfluent.pipeline.simulate.impulse import Impulses
 from gsfluent.pipeline.simulate.step import Stepper
@@ -66,8 +68,9 @@ class Run:
             max_rollbacks=self.stepper.options.max_rollbacks,
             names=[body.name for body in scene.bodies],
         )  # fmt: skip
-        held = [body.start if body.held else 0.0 for body in scene.bodies]
+        held = [body.start if body.held and not pours(body) else 0.0 for body in scene.bodies]
         self.ledger = Ledger(matter, scene.gravity, self.start, held)
+        self.ledger.held += self.stepper.liquids.held()
         self.per_frame: list[dict[str, Any]] = []
         self.seconds = 0.0
         self.failure = ""
@@ -134,8 +137,10 @@ class Run:
                 left = CHECK_EVERY - (state.step - checked)
                 state = self.impulses.given(state)
                 stop = min(until, self.impulses.next_change(state))
+                stop = min(stop, stepper.liquids.next_look(state.time))
                 now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
+                state = stepper.liquids.look(state, grid_mask(state, self.matter))
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
                     state = bounded(state)
                     trouble = watch.check(state, stepper)

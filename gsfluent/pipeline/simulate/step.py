@@ -17,6 +17,8 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.proximity import box_gaps, boxes, distance, time_to_meet
 from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.liquid.looks import Liquids
+from gsfluent.pipeline.liquid.nozzle import WAITING, pours
 from gsfluent.pipeline.matter.fields import LIMIT, MOST, number_fields
 from gsfluent.pipeline.matter.pieces import Pieces
 from gsfluent.pipeline.matter.points import Matter
@@ -24,7 +26,7 @@ from gsfluent.pipeline.matter.state import State, at_rows
 from gsfluent.pipeline.simulate import debris
 from gsfluent.pipeline.simulate.composed import FIELDS, Composed
 from gsfluent.pipeline.simulate.engine import Counters, Engine, Points, SolverOptions
-from gsfluent.pipeline.simulate.flight import Flight
+from gsfluent.pipeline.simulate.flight import Flight, Queue
 from gsfluent.pipeline.simulate.groups import (
     LANDING,
     Group,
@@ -71,6 +73,7 @@ class Stepper:
         self._pull = float(self._gravity.norm())
         self.rigid = RigidSet(scene, matter.dx, device)
         self.blades = BladeSet(scene, matter.dx)
+        self.liquids = Liquids(scene, matter)
         self.leaving = Leaving(
             matter, self.rigid, self._gravity, sleep=options.sleep,
             fly=options.piece_flight and options.free_flight,
@@ -108,8 +111,10 @@ class Stepper:
 
     def initial(self, links: int = 0) -> State:
         """Return the state at time 0, of matter with so many links at rest."""
-        landed = (not self.options.free_flight,) * len(self.flights)
+        flies = self.options.free_flight
+        landed = tuple(not flies or pours(body) for body in self.scene.bodies)
         state = State.start(self.matter, self.rigid.start, landed, links)
+        state = self.liquids.begun(state)
         self._take(state)
         state = self._land(state)[0]
         if not self.options.standing:
@@ -258,6 +263,11 @@ class Stepper:
             if not state.landed[i]:
                 rows = torch.arange(a, b, device=device)
                 self._groups.append(Group(rows, flight, i, state.position[a:b], flight.mass))
+        waits = state.group == WAITING
+        for i, body in enumerate(self.scene.bodies if bool(waits.any()) else ()):
+            rows = (waits & (state.particles.body == i)).nonzero()[:, 0]
+            if rows.numel():
+                self._groups.append(self._queue(state, rows, body.start))
         for number in torch.unique(state.group[state.group >= 0]).tolist():
             rows = (state.group == number).nonzero()[:, 0]
             self._groups.append(self._group(state, rows))
@@ -275,6 +285,11 @@ class Stepper:
             rigid=False,
         )  # fmt: skip
         return Group(rows, flight, None, position, mass)
+
+    def _queue(self, state: State, rows: Tensor, start: float) -> Group:
+        points, position = state.particles.select(rows), state.position[rows]
+        flight = Queue(points, position, state.time, self.matter.dx, held=start)
+        return Group(rows, flight, None, position, flight.mass)
 
     def _land(self, state: State) -> tuple[State, float]:
         """Put on the grid every group that something is close to; say how long the rest is clear.

@@ -226,7 +226,7 @@ def test_surfaces_to_draw_lie_on_the_shapes(mesh_file: Path) -> None:
     assert d.abs().min(dim=1).values.max() < 0.01
     ball = points[:, 0] < 0.5
     assert torch.allclose(normals[ball], n[ball, 0], atol=1e-6)
-    assert 300 < int(ball.sum()) < 4000 and spacing < 0.1
+    assert 300 < int(ball.sum()) < 4000 and float(spacing.max()) < 0.1
 
 
 def test_frames_show_plate_bullet_and_liquid() -> None:
@@ -244,8 +244,10 @@ def test_frames_show_plate_bullet_and_liquid() -> None:
     extra = kept.gaussians.means[own : kept.carried]
     jet = int((frame.particles.body == 1).sum())
     assert extra.shape[0] > jet + 600
+    # One splat a point, in its sheet: no farther off than the points are apart.
     milk = kept.gaussians.means[own : own + jet]
-    assert torch.equal(milk, frame.particles.position[frame.particles.body == 1])
+    points = frame.particles.position[frame.particles.body == 1]
+    assert float((milk - points).norm(dim=1).max()) < 1.5 * DX / 2.0
     steel = extra[jet:]
     ball = (steel - torch.tensor([1.0, 0.0, 0.6])).norm(dim=1)
     # Drawn as large as it is, though the grid sees it with 0.9 cells.

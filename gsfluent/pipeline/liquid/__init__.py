@@ -1,0 +1,10 @@
+"""Liquids: how they leave a nozzle, hold to what they wet, and are drawn."""
+
+from gsfluent._lazy import room
+
+__getattr__, __dir__, __all__ = room(
+    __name__,
+    looks="Liquids",
+    nozzle="WAITING pours",
+    sheet="CLOSED ellipsoids",
+)
