@@ -93,9 +93,9 @@ class Material:
         grain: Length over which the strength varies [m].
         weibull_modulus: nacc: Weibull modulus of the strength, small for scattered; 0 for none.
         reference_volume: Volume of the specimens whose median strength is given [m^3].
-        prefer: nacc: what a grid keeps that is too coarse for both. ``toughness`` keeps the fracture
-            energy and lowers the strength (Bazant and Oh 1983), ``strength`` keeps the strength,
-            and a crack takes more energy than it should.
+        prefer: nacc: what a grid keeps that is too coarse for both. ``toughness`` keeps the
+            fracture energy and lowers the strength (Bazant and Oh 1983), ``strength`` keeps the
+            strength, and a crack takes more energy than it should.
         softening: How many times softer than the real thing ``young_modulus`` is, for the sake of
             the time step. Strengths are divided by its root: the speed at which it breaks and the
             number of pieces stay (Bazant's size number E G_c / s^2 L does not change).

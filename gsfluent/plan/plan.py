@@ -294,7 +294,7 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
             weakest = min(body.materials, key=lambda material: material.breaking_speed)
             found.append(
                 f"{body.name}: meets something at {mover.speed:.2g} m/s, but {weakest.name} "
-                f"breaks from about {limit:.2g} m/s; hint: raise the drop, or lower tensile_strength"
+                f"breaks from about {limit:.2g} m/s; hint: raise the drop or lower its strength"
             )
         thin = thickness(body)
         if thin < THIN_CELLS * dx:
