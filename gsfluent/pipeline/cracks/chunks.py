@@ -34,7 +34,7 @@ from gsfluent.spatial.neighbours import nearest_rows
 
 OPACITY = 0.97
 """Opacity of a face element where the gap is wide."""
-CLOSED, SHOWN = 0.02, 0.3
+CLOSED, SHOWN = 0.1, 0.3
 """Gaps [voxels] up to which nothing shows, and from which on cuts and faces are all there."""
 WIDE = 1.5
 """Width of the blend of neighbouring points where matter is broken, in point spacings: what is
