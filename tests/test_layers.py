@@ -30,6 +30,7 @@ ORDER = (
     "pipeline/light pipeline/solid pipeline/reconstruct pipeline/regions pipeline/fill "
     "pipeline/texture/volume pipeline/texture/presets pipeline/texture/photo "
     "pipeline/texture/synthesis pipeline/texture/inpaint pipeline/texture "
+    "pipeline/partition "
     "pipeline/render pipeline/cracks pipeline/simulate "
     "export stages inspection live viewer/model viewer/draw viewer/panels viewer plan choose run "
     "lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers lab/charts lab/stability "

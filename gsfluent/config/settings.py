@@ -318,11 +318,12 @@ class OutputSettings:
         default="studio",
     )
     cracks: str = key(
-        choice("gap", "mvee", "none"),
-        "How crack faces are drawn: splats born on the faces that open, transition splats from "
-        "overlapping ellipsoids (for comparison), or nothing added.",
+        choice("chunks", "gap", "mvee", "none"),
+        "How pieces are drawn: cut from the solid by a smooth partition, splats born between "
+        "points that part, transition splats from overlapping ellipsoids (both for comparison), "
+        "or nothing added.",
         "none",
-        default="gap",
+        default="chunks",
     )
     what: tuple[str, ...] = key(
         several(choice("mp4", *EXPORTS)), "What to write.", "[mp4, ply-seq]", default=("mp4",)

@@ -52,11 +52,13 @@ class Cracks(NamedTuple):
         points: The material points, with how they hang together.
         rest: The splats at rest, those that lie across a crack cut.
         births: Splats on open faces; None where there is none.
+        carry: The binding that moves the splats.
     """
 
     points: Points
     rest: Gaussians
     births: Births | None
+    carry: Carry
 
 
 class Gaps:
@@ -84,12 +86,27 @@ class Gaps:
         self._before: Hanging | None = self.carry.links.restored(state) if state else None
         self._opened = torch.zeros_like(self.carry.links.near, dtype=torch.bool)
         self._debris = torch.zeros_like(self._opened[:, 0])
+        self._stale = torch.zeros_like(self._debris)
         self._elements: Elements | None = None
         self._rest = self.carry.gaussians
 
     def state(self) -> dict[str, Any]:
         """What a later run needs to go on from here."""
         return {} if self._before is None else self._before.state()
+
+    def rebind(self, carry: Carry) -> None:
+        """Go on with a binding of the same splats in which some points have other neighbours."""
+        before, self.carry = self.carry, carry
+        if carry.links is before.links and carry.owner is before.owner:
+            return
+        changed = (carry.links.near != before.links.near).any(dim=1)
+        self._stale |= changed
+        self._stale[carry.owner[carry.owner != before.owner]] = True
+        if self._before is not None:
+            parted, opened = (
+                flag & ~changed[:, None] for flag in (self._before.parted, self._before.opened)
+            )
+            self._before = self._before._replace(parted=parted, opened=opened)
 
     def step(self, points: Points) -> Cracks:
         """Go on to the next frame.
@@ -106,13 +123,17 @@ class Gaps:
         debris = points.fragments[: hanging.opened.shape[0]] < 0
         changed = (hanging.opened != self._opened).any(dim=1)
         changed |= (debris != self._debris) & hanging.opened.any(dim=1)
+        # what has other neighbours now
+        changed |= self._stale & (hanging.opened | self._opened).any(dim=1)
+        self._stale = torch.zeros_like(self._stale)
         if bool(changed.any()):
             self._opened, self._debris = hanging.opened, debris
             self._cut(changed)
             self._open(changed)
         if self._elements is None or self._elements.count == 0:
-            return Cracks(points, self._rest, None)
-        return Cracks(points, self._rest, _births(self._elements, self.carry, points))
+            return Cracks(points, self._rest, None, self.carry)
+        births = _births(self._elements, self.carry, points)
+        return Cracks(points, self._rest, births, self.carry)
 
     def _cut(self, changed: Tensor) -> None:
         """Cut the splats of points [N] anew."""

@@ -119,15 +119,21 @@ def _of_solid(solid: Solid, pitch: float) -> tuple[Tensor, ...]:
     inward = [sample(field, place + e) - sample(field, place - e) for e in half]
     outward = -torch.nn.functional.normalize(torch.stack(inward, dim=1), dim=1)
     means = place * solid.voxel + solid.origin.to(place)
-    color = _colors(solid, place, means)
+    color = matter_colors(solid, place, means)
     skin = color.clone()
     near = (depth * solid.voxel < SKIN * pitch).nonzero()[:, 0]
-    if near.numel() and _has_skin(solid.gaussians):
-        shown = surface_colors(
-            solid.gaussians, means[near].double().cpu().numpy(), 0.5 * solid.voxel
-        )
-        skin[near] = torch.from_numpy(shown).to(skin)
+    shown = skin_colors_at(solid, means[near])
+    if shown is not None:
+        skin[near] = shown.to(skin)
     return means, color, outward, depth * solid.voxel, skin
+
+
+def skin_colors_at(solid: Solid, means: Tensor) -> Tensor | None:
+    """Colours of the skin near places [M, 3] in the solid's coordinates; None where it has none."""
+    if means.shape[0] == 0 or not _has_skin(solid.gaussians):
+        return None
+    shown = surface_colors(solid.gaussians, means.double().cpu().numpy(), 0.5 * solid.voxel)
+    return torch.from_numpy(shown)
 
 
 def _has_skin(gaussians: Gaussians) -> bool:
@@ -136,7 +142,7 @@ def _has_skin(gaussians: Gaussians) -> bool:
     return gaussians.labels is not None and bool((gaussians.labels == SURFACE).any())
 
 
-def _colors(solid: Solid, place: Tensor, means: Tensor) -> Tensor:
+def matter_colors(solid: Solid, place: Tensor, means: Tensor) -> Tensor:
     """Colour of the matter at places [voxels]: trilinear over the voxels that hold matter."""
     if solid.color is None:
         _, nearest = nearest_rows(solid.gaussians.means, means, 1, 2.0 * solid.voxel)

@@ -1,8 +1,11 @@
 """Repair of cracks: splats that give both sides of a crack a face.
 
-Two ways, see docs/theory/cracks.md:
+Three ways, see docs/theory/cracks.md and docs/theory/partition.md:
 
-* ``gap`` (the default) puts fine, flat splats with the colour of the matter on the faces that open
+* ``chunks`` (the default) cuts pieces from the rest solid by a smooth partition and puts fine,
+  flat splats on its faces (:mod:`gsfluent.pipeline.cracks.chunks`); inside of a piece it does as
+  ``gap``;
+* ``gap`` puts fine, flat splats with the colour of the matter on the faces that open
   (:mod:`gsfluent.pipeline.cracks.faces`);
 * ``mvee`` adds transition splats shaped as the overlap of broken splats and their unbroken
   neighbours, as the Fracture-GS notes describe it (:mod:`gsfluent.pipeline.cracks.mvee`).
@@ -18,12 +21,13 @@ from torch import Tensor
 
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
+from gsfluent.pipeline.cracks.chunks import Chunks
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.cracks.mvee import CROSS_RADIUS, NEIGHBOUR_RADIUS, CrackGraph, transitions
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.stage import Stage
 
-METHODS = ("gap", "mvee", "none")
+METHODS = ("chunks", "gap", "mvee", "none")
 
 
 class Repaired(NamedTuple):
@@ -60,7 +64,7 @@ class Repair(Stage):
     """Adds splats along cracks.
 
     Args:
-        method: ``gap``, ``mvee`` or ``none``.
+        method: ``chunks``, ``gap``, ``mvee`` or ``none``.
         radius: Size of the ellipsoids that are intersected, in standard deviations (``mvee``).
         neighbour_radius: Largest distance of neighbours, in mean splat spacings (``mvee``).
         seed: Not used; repair is deterministic.
@@ -73,7 +77,7 @@ class Repair(Stage):
 
     def __init__(
         self,
-        method: str = "gap",
+        method: str = "chunks",
         *,
         radius: float = CROSS_RADIUS,
         neighbour_radius: float = NEIGHBOUR_RADIUS,
@@ -92,7 +96,7 @@ class Repair(Stage):
         """Begin a run with the splats of a binding.
 
         Raises:
-            InputError: The binding knows no scene (method ``gap``).
+            InputError: The binding knows no scene (methods ``chunks`` and ``gap``).
         """
         return CrackHistory(self, carry)
 
@@ -110,7 +114,7 @@ class Repair(Stage):
         Args:
             carry: The binding of the splats.
             motion: Their motion.
-            carried: The carried splats, when they are at hand (method ``gap``: the cut ones).
+            carried: The carried splats, when they are at hand (not with ``mvee``: the cut ones).
             history: The run this moment belongs to; without it the moment stands alone.
             cracks: What its :meth:`CrackHistory.step` returned for this moment; without it the step
                 is made here.
@@ -122,12 +126,12 @@ class Repair(Stage):
             InputError: As :meth:`begin`.
         """
         history = self.begin(carry) if history is None else history
-        if cracks is None and self.method == "gap":
+        if cracks is None and self.method in ("chunks", "gap"):
             cracks, carried = history.step(motion.points), None
-            assert cracks is not None  # method gap
-            motion = carry.follow(cracks.points, cracks.rest)
+            assert cracks is not None  # of these methods
+            motion = cracks.carry.follow(cracks.points, cracks.rest)
         if cracks is not None:
-            moved = carry.apply(motion, cracks.rest) if carried is None else carried
+            moved = cracks.carry.apply(motion, cracks.rest) if carried is None else carried
             return _with_births(moved, motion, cracks.births)
         moved = carry.apply(motion) if carried is None else carried
         if self.method == "none":
@@ -151,7 +155,9 @@ class CrackHistory:
 
     def __init__(self, repair: Repair, carry: Carry) -> None:
         self.repair, self.carry = repair, carry
-        self._gaps = Gaps(carry) if repair.method == "gap" else None
+        self._gaps: Chunks | Gaps | None = None
+        if repair.method in ("chunks", "gap"):
+            self._gaps = Chunks(carry) if repair.method == "chunks" else Gaps(carry)
 
     @functools.cached_property
     def graph(self) -> CrackGraph:
@@ -159,7 +165,7 @@ class CrackHistory:
         return CrackGraph(self.carry, self.repair.radius, self.repair.neighbour_radius)
 
     def step(self, points: Points) -> Cracks | None:
-        """Go on to the next frame (method ``gap``): call once per frame, in their order.
+        """Go on to the next frame (``chunks``, ``gap``): call once per frame, in their order.
 
         What was open before decides with what is open now, so that nothing flickers.
 

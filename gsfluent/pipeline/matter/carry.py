@@ -43,6 +43,8 @@ class Points(NamedTuple):
         fragments: Piece of each point, int32 [N], -1 for none.
         broken: Broken points, bool [N].
         hanging: How they hang together; None to see it afresh.
+        unit: What each moves with, its piece or its chip, int64 [N], -1 for nothing
+            (:class:`gsfluent.pipeline.matter.pieces.Pieces`); None where only pieces are known.
     """
 
     position: Tensor
@@ -51,14 +53,21 @@ class Points(NamedTuple):
     fragments: Tensor
     broken: Tensor
     hanging: Hanging | None = None
+    unit: Tensor | None = None
 
     @staticmethod
-    def of(position: Tensor, deformation: Tensor, fragments: Tensor, broken: Tensor) -> Points:
+    def of(
+        position: Tensor,
+        deformation: Tensor,
+        fragments: Tensor,
+        broken: Tensor,
+        unit: Tensor | None = None,
+    ) -> Points:
         """Split total deformation gradients [N, 3, 3] into rotation and clamped stretch."""
         rotation, clamped = ops.polar_clamped(deformation, *STRETCH)
         shapeless = ((fragments < 0) | broken)[:, None, None]
         shown = torch.where(shapeless, rotation, clamped)
-        return Points(position, shown, rotation, fragments, broken)
+        return Points(position, shown, rotation, fragments, broken, unit=unit)
 
 
 class Motion(NamedTuple):
@@ -99,6 +108,7 @@ class Carry:
         self.gaussians, self.body, self.matter = gaussians, body, matter
         self.scene: Scene | None = None
         self.links = Links(matter)
+        self.width = BLEND * self.links.spacing
         self.owner = nearest_points(gaussians.means, body, matter)
 
     @staticmethod
@@ -169,7 +179,7 @@ class Carry:
             links.rest,
             points.position[:count],
             points.map[:count],
-            BLEND * links.spacing,
+            self.width,
         )
 
     def cells(self, owners: Tensor, points: Points) -> tuple[Tensor, Tensor, Tensor]:

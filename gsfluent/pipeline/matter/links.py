@@ -8,6 +8,7 @@ frame to frame. An *opening*, where faces show, is a pair that has parted and mo
 
 from __future__ import annotations
 
+import copy
 from typing import Any, NamedTuple
 
 import torch
@@ -69,8 +70,24 @@ class Links:
             found = nearest_rows(rest[a:b], rest[a:b], k, 1.5 * spacing)[1]
             self.near[a:b, :k] = found + a
             self.spacing[a:b] = spacing
-        self._apart = (rest[self.near] - rest[:, None]).norm(dim=2)
-        self._own = self.near == torch.arange(count, device=device)[:, None]
+        self._measure(torch.zeros_like(self.near, dtype=torch.bool))
+
+    def _measure(self, void: Tensor) -> None:
+        self._apart = (self.rest[self.near] - self.rest[:, None]).norm(dim=2)
+        rows = torch.arange(self.near.shape[0], device=self.near.device)
+        self._own, self._void = self.near == rows[:, None], void
+
+    def rewired(self, near: Tensor, void: Tensor) -> Links:
+        """The same points with other neighbours.
+
+        Args:
+            near: As :attr:`near`, int64 [N, K].
+            void: Columns that count for nothing, as there are not so many neighbours, bool [N, K].
+        """
+        other = copy.copy(self)
+        other.near = near
+        other._measure(void)
+        return other
 
     def look(
         self,
@@ -103,7 +120,8 @@ class Links:
             limit = torch.where(before.parted, BACK * limit, limit)
             opening = torch.where(before.opened, BACK * opening, opening)
         parted = (ratio > limit) | ((piece != other) & (piece >= 0) & (other >= 0))
-        return Hanging(parted, parted & (ratio > opening), ratio)
+        opened = parted & (ratio > opening) & ~self._void
+        return Hanging(parted | self._void, opened, ratio)
 
     def restored(self, state: dict[str, Any]) -> Hanging:
         """The last look of another run, from :meth:`Hanging.state`."""

@@ -193,6 +193,11 @@ class Run:
             self._pieces = state, found
         return self._pieces[1]
 
+    @property
+    def units(self) -> Tensor:
+        """What each point moves with now, int64 [N] (:class:`Pieces`)."""
+        return self._look(self.state).unit
+
     def _regroup(self, state: State, *, at_frame: bool = True) -> State:
         """Let the stepper know what hangs together, and weld what need not be loose any more."""
         pieces = self._look(state)

@@ -89,6 +89,11 @@ class SimulationFrame:
         return self._history
 
     @property
+    def _carry(self) -> Carry:
+        """The binding of the splats as it was at this moment."""
+        return self._binding().carry if self._cracks is None else self._cracks.carry
+
+    @property
     def _rest(self) -> Gaussians | None:
         """The splats at rest, cut at cracks."""
         return None if self._cracks is None else self._cracks.rest
@@ -102,7 +107,7 @@ class SimulationFrame:
         """
         history = self._binding()
         return history.repair(
-            history.carry, self.motion, self.carried, history=history, cracks=self._cracks
+            self._carry, self.motion, self.carried, history=history, cracks=self._cracks
         )
 
     @property
@@ -118,12 +123,12 @@ class SimulationFrame:
     @functools.cached_property
     def carried(self) -> Gaussians:
         """The splats without repair: one for one those of the solids."""
-        return self._binding().carry.apply(self.motion, self._rest)
+        return self._carry.apply(self.motion, self._rest)
 
     @functools.cached_property
     def motion(self) -> Motion:
         """Where each splat has gone."""
-        carry = self._binding().carry
+        carry = self._carry
         assert self._points is not None  # with the binding
         return carry.follow(self._points, self._rest)
 
@@ -312,7 +317,9 @@ def frame_of(
     damage = torch.where(broken, 1.0, torch.where(run.matter.brittle, damage, 0.0))
     particles, points, cracks = run.state.particles, None, None
     if history is not None and particles.deformation is not None:
-        points = Points.of(particles.position, particles.deformation, pieces.labels, broken)
+        points = Points.of(
+            particles.position, particles.deformation, pieces.labels, broken, run.units
+        )
         cracks = history.step(points)
         points = points if cracks is None else cracks.points
     return SimulationFrame(

@@ -40,7 +40,7 @@ def parted(bound: Carry, gap: float, *, broken: bool = False, tilt: float = 0.0)
 
 
 def test_nothing_is_born_while_nothing_parts(bound):
-    repair = Repair()
+    repair = Repair("gap")
     history = repair.begin(bound)
     turned = parted(bound, 0.0)
     assert history.step(turned).births is None
@@ -52,7 +52,7 @@ def test_nothing_is_born_while_nothing_parts(bound):
 
 def test_faces_lie_where_the_halves_part_and_look_into_the_gap(bound):
     gap = 0.05
-    births = Repair().begin(bound).step(parted(bound, gap)).births
+    births = Repair("gap").begin(bound).step(parted(bound, gap)).births
     assert births is not None
     g, spacing = births.gaussians, bound.matter.spacing[0]
     left = bound.matter.rest[births.anchor, 0] < 0.0
@@ -73,7 +73,7 @@ def test_faces_are_opaque_from_the_gap(bound):
     """Seen through the gap the elements alone cover nine tenths, in the colour of the inside."""
     from gsfluent import geometry, ops
 
-    cracks = Repair().begin(bound).step(parted(bound, 0.3))
+    cracks = Repair("gap").begin(bound).step(parted(bound, 0.3))
     left = bound.matter.rest[cracks.births.anchor, 0] < 0.0
     g = cracks.births.gaussians.select(left)
     view = geometry.look_at(torch.tensor([0.3, 0, 0]), torch.zeros(3), torch.eye(3)[2]).float()
@@ -90,7 +90,7 @@ def test_faces_are_opaque_from_the_gap(bound):
 
 
 def test_faces_ride_rigidly_with_their_piece(bound):
-    history = Repair().begin(bound)
+    history = Repair("gap").begin(bound)
     one = history.step(parted(bound, 0.2)).births
     two = history.step(parted(bound, 0.4, tilt=0.5)).births
     assert torch.equal(one.ids, two.ids)
@@ -108,10 +108,12 @@ def test_faces_ride_rigidly_with_their_piece(bound):
 
 def test_a_gap_between_the_two_widths_keeps_what_it_had(bound):
     """Hysteresis: a gap on its way shut shows what one as wide on its way open does not."""
-    spacing, history = bound.matter.spacing[0], Repair().begin(bound)
+    spacing, history = bound.matter.spacing[0], Repair("gap").begin(bound)
     history.step(parted(bound, 0.2))
     shut = [history.step(parted(bound, g * spacing)).births for g in (0.1, 0.05, 0.0)]
-    fresh = [Repair().begin(bound).step(parted(bound, g * spacing)).births for g in (0.1, 0.05)]
+    fresh = [
+        Repair("gap").begin(bound).step(parted(bound, g * spacing)).births for g in (0.1, 0.05)
+    ]
     was, soon, none, new, never = (0 if b is None else b.ids.numel() for b in (*shut, *fresh))
     assert was > 2 * new > 0 and soon > 0 and never == none == 0
     # what leaves soon is faint already
@@ -120,7 +122,7 @@ def test_a_gap_between_the_two_widths_keeps_what_it_had(bound):
 
 def test_frames_in_between_change_nothing(bound):
     """A run at twice the frame rate shows the same faces in the frames that both have."""
-    coarse, fine = Repair().begin(bound), Repair().begin(bound)
+    coarse, fine = Repair("gap").begin(bound), Repair("gap").begin(bound)
     for gap in (0.001, 0.002, 0.004):
         one = coarse.step(parted(bound, gap, broken=True)).births
         fine.step(parted(bound, 0.75 * gap, broken=True))
@@ -132,7 +134,7 @@ def test_frames_in_between_change_nothing(bound):
 
 
 def test_a_broken_layer_leaves_one_face_on_either_side(bound):
-    births = Repair().begin(bound).step(parted(bound, 0.05, broken=True)).births
+    births = Repair("gap").begin(bound).step(parted(bound, 0.05, broken=True)).births
     assert births is not None
     inner = births.gaussians.means[:, 1:].norm(dim=1) < 0.06
     assert bool((births.gaussians.means[inner, 0] < 0.02).any())
@@ -146,7 +148,7 @@ def test_methods_are_checked_and_none_adds_nothing(bound):
     assert Repair("none")(bound, motion).added == 0
     alone = Carry(bound.gaussians, bound.body, bound.matter)
     with pytest.raises(InputError, match=r"Carry\.bind"):
-        Repair()(alone, alone.follow(parted(bound, 0.2)))
+        Repair("gap")(alone, alone.follow(parted(bound, 0.2)))
 
 
 def _dropped() -> Scene:

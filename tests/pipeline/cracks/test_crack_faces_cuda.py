@@ -35,7 +35,7 @@ def test_the_same_faces_open():
         eye = torch.eye(3, device=device).expand(rest.shape[0], 3, 3).contiguous()
         away = torch.tensor([0.05, 0.0, 0.0], device=device) * right[:, None]
         points = Points(rest + away, eye, eye, right.to(torch.int32), torch.zeros_like(right))
-        cracks = Repair().begin(carry).step(points)
+        cracks = Repair("gap").begin(carry).step(points)
         assert cracks is not None and cracks.births is not None
         found.append((cracks.births, cracks.rest))
     (one, cut), (two, same) = found

@@ -1,0 +1,267 @@
+"""Faces and cuts of chunks: what a split of the rest solid leaves on its two sides.
+
+All of it is at rest and made once, when a region is split
+(:mod:`gsfluent.pipeline.partition.tree`); from frame to frame it is only carried along.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent import geometry, ops
+from gsfluent.data import Gaussians, Solid
+from gsfluent.pipeline.cracks.cuts import REACH, cut_at
+from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
+from gsfluent.pipeline.partition.tree import Partition, Split
+
+INSET = 0.15
+"""How far below its face an element lies, in voxels."""
+WIDTH, THICKNESS = 0.75, 0.15
+"""Standard deviations of an element along and across its face, in voxels."""
+CRUST = 0.5
+"""Depth [voxels of the colours] to which an element wears the colour of the skin."""
+_STEP = 1.5  # voxels that an element may be moved onto its face
+_LEAST = 1e-12
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ChunkFaces:
+    """Face elements at rest.
+
+    Args:
+        key: What names an element for good, int64 [E].
+        voxel: Number of its voxel in its body's grid, int64 [E].
+        region: Region that it belongs to, int64 [E].
+        beyond: Region across the face when it was made, int64 [E].
+        means: Centres [m], [E, 3].
+        quats: Orientations, the third axis along the normal, [E, 4].
+        scales: Standard deviations [m], [E, 3].
+        color: RGB in 0..1, [E, 3].
+        normals: Unit normals away from the matter, [E, 3].
+        owner: Point that each moves with, int64 [E].
+        rival: Point across the face, int64 [E].
+    """
+
+    key: Tensor
+    voxel: Tensor
+    region: Tensor
+    beyond: Tensor
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    color: Tensor
+    normals: Tensor
+    owner: Tensor
+    rival: Tensor
+
+    @property
+    def count(self) -> int:
+        """Number of elements E."""
+        return int(self.key.shape[0])
+
+    def select(self, rows: Tensor) -> ChunkFaces:
+        """The elements picked by a mask or by rows."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return ChunkFaces(*(getattr(self, name)[rows] for name in names))
+
+    @staticmethod
+    def joined(parts: list[ChunkFaces]) -> ChunkFaces:
+        """All elements of some splits."""
+        names = [field.name for field in dataclasses.fields(ChunkFaces)]
+        return ChunkFaces(*(torch.cat([getattr(p, name) for p in parts]) for name in names))
+
+
+class ChunkCuts(NamedTuple):
+    """Splats that lie across a face.
+
+    Attributes:
+        splat: Row of each, int64 [C].
+        beyond: Region across the face when it was made, int64 [C].
+        normal: Unit normal of the face, away from the splat's matter, [C, 3].
+        distance: Way from the splat's centre to the face along it [m], [C].
+        rival: Point across the face, int64 [C].
+    """
+
+    splat: Tensor
+    beyond: Tensor
+    normal: Tensor
+    distance: Tensor
+    rival: Tensor
+
+
+def _slope(split: Split, label: Tensor, voxel: Tensor, edge: float) -> tuple[Tensor, Tensor]:
+    """Signed distance [M] of voxels [M, 3] from their label's face, and its gradient [M, 3]."""
+    here = split.signed(label, voxel)
+    parts = []
+    for axis in range(3):
+        step = torch.zeros(3, dtype=torch.int64, device=voxel.device)
+        step[axis] = 1
+        ahead, behind = split.signed(label, voxel + step), split.signed(label, voxel - step)
+        lone = ahead.isnan() | behind.isnan()
+        ahead, behind = (torch.where(v.isnan(), here, v) for v in (ahead, behind))
+        parts.append((ahead - behind) / torch.where(lone, edge, 2.0 * edge))
+    return here, torch.stack(parts, dim=1)
+
+
+def find_faces(partition: Partition, split: Split, solid: Solid, number: int) -> ChunkFaces:
+    """Face elements of a split: one in every voxel beside a voxel of another piece.
+
+    Owner and rival are left to the caller (-1).
+
+    Args:
+        partition: Of the body.
+        split: What was done.
+        solid: The body's solid, for the colours.
+        number: Number of the split, which enters the keys.
+    """
+    first, edge = split.labels.first.long(), partition.voxel
+    device = first.device
+    span = tuple(slice(a, a + n) for a, n in zip(split.low, first.shape, strict=True))
+    depth = partition.depth[span]
+    inside = (first >= 0) & (depth > 0.0)
+    face = torch.zeros_like(inside)
+    other = torch.full_like(first, -1)
+    for axis in range(3):
+        n = first.shape[axis]
+        a, b = first.narrow(axis, 0, n - 1), first.narrow(axis, 1, n - 1)
+        both = inside.narrow(axis, 0, n - 1) & inside.narrow(axis, 1, n - 1) & (a != b)
+        face.narrow(axis, 0, n - 1).logical_or_(both)
+        face.narrow(axis, 1, n - 1).logical_or_(both)
+        for start, theirs in ((0, b), (1, a)):
+            part = other.narrow(axis, start, n - 1)
+            part.copy_(torch.where(both, theirs, part))
+    voxel = face.nonzero()
+    x, y, z = voxel.unbind(dim=1)
+    label = first[x, y, z]
+    second = split.labels.second[x, y, z].long()
+    beyond = torch.where((second >= 0) & (second != label), second, other[x, y, z])
+    far, gradient = _slope(split, label, voxel, edge)
+    slope = gradient.norm(dim=1).clamp(min=_LEAST)
+    normal = -gradient / slope[:, None]
+    reach = (far / slope.clamp(min=0.2)).clamp(0.0, _STEP * edge)
+    grid = voxel + torch.tensor(split.low, device=device)
+    center = partition.center(grid).to(torch.float32)
+    below = depth[x, y, z]
+    outward = _outward(partition, grid)
+    table = torch.tensor(split.ids, device=device)
+    flat = (grid[:, 0] * partition.shape[1] + grid[:, 1]) * partition.shape[2] + grid[:, 2]
+    matter, skin = _colors(partition, solid, center, below)
+    crust = below < min(CRUST * partition.solid_voxel, edge)
+    common = {"voxel": flat, "region": table[label], "beyond": table[beyond]}
+    spot = center + (reach - INSET * edge)[:, None] * normal
+    parts = [
+        _elements(
+            spot, normal, edge, torch.where(crust[:, None], skin, matter), number, 0,
+            (outward, below - ((spot - center) * outward).sum(dim=1)), **common,
+        )
+    ]  # fmt: skip
+    # the skin along the rim, which splats cut at the face leave open
+    rim = below < 1.2 * edge
+    place = center + (below - INSET * edge)[:, None] * outward
+    left = reach - ((place - center) * normal).sum(dim=1)
+    parts.append(
+        _elements(
+            place, outward, edge, skin, number, 1, (normal, left), **common
+        ).select(rim & (left > -edge))
+    )  # fmt: skip
+    return ChunkFaces.joined(parts)
+
+
+def _elements(
+    means: Tensor, normal: Tensor, edge: float, color: Tensor, number: int, kind: int,
+    plane: tuple[Tensor, Tensor], *, voxel: Tensor, region: Tensor, beyond: Tensor,
+) -> ChunkFaces:  # fmt: skip
+    """Flat elements that end at a plane: its unit normal, and how far off it is [m]."""
+    reference = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
+    one = torch.nn.functional.normalize(torch.linalg.cross(normal, reference), dim=1)
+    axes = torch.stack([one, torch.linalg.cross(normal, one), normal], dim=2)
+    size = torch.tensor([WIDTH, WIDTH, THICKNESS], device=means.device) * edge
+    root = axes * size
+    covariance = root @ root.mT
+    means, covariance = cut_at(means, covariance, *plane)
+    quats, scales = ops.covariance_axes(geometry.pack_symmetric(covariance))
+    none = torch.full_like(voxel, -1)
+    return ChunkFaces(
+        key=(((number << 40) + voxel) << 1) + kind, voxel=voxel, region=region, beyond=beyond,
+        means=means, quats=quats, scales=scales, color=color, normals=normal,
+        owner=none, rival=none,
+    )  # fmt: skip
+
+
+def _outward(partition: Partition, grid: Tensor) -> Tensor:
+    """Unit vectors to the skin at voxels [M, 3]."""
+    depth, size = partition.depth, torch.tensor(partition.shape, device=grid.device)
+    parts = []
+    for axis in range(3):
+        step = torch.zeros(3, dtype=torch.int64, device=grid.device)
+        step[axis] = 1
+        a = torch.minimum(grid + step, size - 1).unbind(dim=1)
+        b = (grid - step).clamp(min=0).unbind(dim=1)
+        parts.append(depth[a] - depth[b])
+    return -torch.nn.functional.normalize(torch.stack(parts, dim=1), dim=1)
+
+
+def _colors(
+    partition: Partition, solid: Solid, center: Tensor, below: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Colours of the matter at places [m], and of the skin where it is near."""
+    means = partition.own(center).to(torch.float32)
+    place = (means - solid.origin.to(means)) / solid.voxel
+    matter = matter_colors(solid, place, means)
+    skin = matter.clone()
+    near = (below < 1.5 * max(partition.voxel, CRUST * partition.solid_voxel)).nonzero()[:, 0]
+    shown = skin_colors_at(solid, means[near])
+    if shown is not None:
+        skin[near] = shown.to(skin)
+    return matter, skin
+
+
+def find_cuts(
+    partition: Partition, split: Split, splats: Gaussians, rows: Tensor
+) -> tuple[Tensor, ChunkCuts]:
+    """Which splats a split divides.
+
+    Args:
+        partition: Of the body.
+        split: What was done.
+        splats: At rest.
+        rows: Those of the region that was split, int64 [M].
+
+    Returns:
+        The region of each row now, int64 [M], and the cuts; rivals are left to the caller (-1).
+    """
+    edge, device = partition.voxel, rows.device
+    means = splats.means[rows]
+    place = partition.place(means) - torch.tensor(split.low, device=device)
+    voxel = place.round().long()
+    size = torch.tensor(split.face.shape, device=device)
+    here = ((voxel >= 0) & (voxel < size)).all(dim=1)
+    table = torch.tensor(split.ids, device=device)
+    region = torch.full_like(rows, split.ids[0])
+    found = here.nonzero()[:, 0]
+    x, y, z = voxel[found].unbind(dim=1)
+    label = split.labels.first[x, y, z].long()
+    # a splat off the matter goes with the matter beside it
+    known = label >= 0
+    found, label = found[known], label[known]
+    region[found] = table[label]
+    voxel, place = voxel[found], place[found]
+    x, y, z = voxel.unbind(dim=1)
+    second = split.labels.second[x, y, z].long()
+    far, gradient = _slope(split, label, voxel, edge)
+    far = far + (gradient * ((place - voxel) * edge).to(gradient)).sum(dim=1)
+    slope = gradient.norm(dim=1).clamp(min=_LEAST)
+    normal = -gradient / slope[:, None]
+    distance = far / slope.clamp(min=0.2)
+    root = geometry.quaternion_to_matrix(splats.quats[rows[found]])
+    root = root * splats.scales[rows[found], None]
+    sigma = (normal[:, None] @ root)[:, 0].norm(dim=1)
+    cut = (second >= 0) & (distance < REACH * sigma)
+    found, second = found[cut], second[cut]
+    return region, ChunkCuts(
+        rows[found], table[second], normal[cut], distance[cut], torch.full_like(second, -1)
+    )

@@ -1,0 +1,9 @@
+"""The rest solid cut into pieces by a smooth partition, finer than the points that carry them."""
+
+from gsfluent._lazy import room
+
+__getattr__, __dir__, __all__ = room(
+    __name__,
+    roughness="amplitude",
+    tree="Partition Split ranked",
+)

@@ -1,0 +1,383 @@
+"""Smooth partition of voxels by labelled points: threshold dynamics with volumes kept.
+
+The label of the nearest point makes faces as rough as the lattice of the points. So each label's
+indicator is blurred, the largest wins, and what has won is blurred once more (Merriman, Bence and
+Osher 1992; Esedoglu and Otto 2015): the differences of the results are smooth functions whose zero
+sets are the faces. Constants added to them keep the volumes (Ruuth and Wetton 2003).
+
+Blurs count whole numbers and labels go by size and place, so that neither the order of the points
+nor the device matters.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent.pipeline.matter.fragments import components
+from gsfluent.pipeline.partition.blur import blur, box_width, reach, trilinear
+from gsfluent.pipeline.partition.roughness import displacements
+
+STAMP = 1.45
+"""Point spacings from a point to the voxels that it can name."""
+FIRST, SECOND = 1.2, 0.8
+"""Standard deviations of the blurs of pieces, in point spacings."""
+CHIP_FIRST, CHIP_SECOND = 0.5, 0.4
+"""The same for chips, which wider ones would blur away."""
+CHIP = 64
+"""Points from which on a label is a piece."""
+ISLAND = 27
+"""Voxels below which a lump joins what is around it."""
+VOLUME = 0.01
+"""Error of a volume that is good enough."""
+_CLEAR = 0.95  # difference of two shares from which on no displacement changes the label
+_PASSES = 60
+_KEPT = 0.7  # share of its voxels that a chip keeps when it is smoothed, or it is not
+_FINE = 1024.0  # squared distances are whole numbers of this share of a voxel squared
+_RANKS = 16  # bits of a key that hold a rank
+_AT_ONCE = 1 << 20  # points
+FAR = 3.5
+"""Standard deviations of the second blur at which the distance from a face is capped."""
+
+
+class Field(NamedTuple):
+    """A label's share of its surroundings, 0 to 1, in its box of the grid.
+
+    Attributes:
+        low: First voxel of the box.
+        share: [x, y, z].
+    """
+
+    low: tuple[int, int, int]
+    share: Tensor
+
+    @property
+    def span(self) -> tuple[slice, slice, slice]:
+        """The box as slices of the grid."""
+        x, y, z = (slice(a, a + n) for a, n in zip(self.low, self.share.shape, strict=True))
+        return x, y, z
+
+
+class Labels(NamedTuple):
+    """Labels of voxels.
+
+    Attributes:
+        first: Label of each voxel, -1 outside of the domain, int16 [X, Y, Z].
+        second: The label that is next there, -1 for none, int16 [X, Y, Z].
+        lead: By how much the first leads, 0 to 1, float32 [X, Y, Z].
+    """
+
+    first: Tensor
+    second: Tensor
+    lead: Tensor
+
+
+def nearest_labels(place: Tensor, rank: Tensor, shape: tuple[int, ...], radius: float) -> Tensor:
+    """Label of the nearest point of every voxel, int16 [X, Y, Z]; -1 where none is near.
+
+    Args:
+        place: Points in voxels, centres at whole numbers, float64 [P, 3]; none further outside of
+            the grid than ``radius``.
+        rank: Labels of the points, int64 [P], below 2^16; what is as near goes to the lower.
+        shape: Voxels along each axis.
+        radius: How far a point sees [voxels].
+    """
+    device, r = place.device, math.ceil(radius)
+    steps = torch.arange(-r, r + 1, device=device)
+    padded = tuple(n + 4 * r + 2 for n in shape)  # for points outside of the grid
+    far = (1 << 62) - 1
+    best = torch.full((math.prod(padded),), far, dtype=torch.int64, device=device)
+    limit = round(radius * radius * _FINE)
+    for rows in torch.arange(place.shape[0], device=device).split(_AT_ONCE):
+        voxel = place[rows].round().long()
+        apart = voxel[:, None] + steps[:, None] - place[rows, None]  # [n, 2 r + 1, 3]
+        voxel = voxel + r + 1
+        # squares along each axis as whole numbers: their sums are exact
+        square = (apart * apart * _FINE).round().long()
+        x, y, z = square.unbind(dim=2)
+        label = rank[rows, None]
+        corner = (voxel[:, 0] * padded[1] + voxel[:, 1]) * padded[2] + voxel[:, 2]
+        line = corner[:, None] + torch.arange(2 * r + 1, device=device)
+        for i in range(2 * r + 1):
+            for j in range(2 * r + 1):
+                away = x[:, i : i + 1] + y[:, j : j + 1]
+                close = (away[:, 0] <= limit).nonzero()[:, 0]
+                total = away[close] + z[close]
+                key = torch.where(total <= limit, (total << _RANKS) + label[close], far)
+                flat = line[close] + (i * padded[1] + j) * padded[2]
+                best.scatter_reduce_(0, flat.view(-1), key.view(-1), "amin")
+    found = torch.where(best < far, best & ((1 << _RANKS) - 1), -1).to(torch.int16)
+    inner = tuple(slice(2 * r + 1, 2 * r + 1 + n) for n in shape)
+    return found.view(padded)[inner].contiguous()
+
+
+def _boxes(labels: Tensor, count: int) -> list[list[tuple[int, int]] | None]:
+    """First and last index along each axis of every label; None for those without a voxel."""
+    where = (labels >= 0).nonzero()
+    label = labels[where[:, 0], where[:, 1], where[:, 2]].long()
+    ends = []
+    for axis in range(3):
+        size = labels.shape[axis]
+        line = torch.bincount(label * size + where[:, axis], minlength=count * size)
+        there = line.view(count, size) > 0
+        steps = torch.arange(size, device=labels.device)
+        low = torch.where(there, steps, size).amin(dim=1)
+        high = torch.where(there, steps, -1).amax(dim=1)
+        ends.append(torch.stack([low, high], dim=1).tolist())
+    boxes = [[(a, b) for a, b in (axis[n] for axis in ends)] for n in range(count)]
+    return [box if box[0][1] >= 0 else None for box in boxes]
+
+
+def fields(nearest: Tensor, small: list[bool], per_spacing: float) -> list[Field | None]:
+    """Shares of every label after threshold dynamics.
+
+    Args:
+        nearest: Label of each voxel, -1 outside of the domain, int16 [X, Y, Z].
+        small: Which labels are chips.
+        per_spacing: Voxels per point spacing.
+
+    Returns:
+        One for each label; None where it has no voxel.
+    """
+    inside = nearest >= 0
+    sums: dict[int, Tensor] = {}
+    count = len(small)
+    large = torch.tensor([not chip for chip in small], device=nearest.device)
+
+    def share(mask: Tensor, width: int, span: tuple[slice, ...]) -> Tensor:
+        if width not in sums:
+            sums[width] = blur(inside, width).to(torch.float32).clamp_(min=1.0)
+        return blur(mask, width).to(torch.float32) / sums[width][span]
+
+    def shares(labels: Tensor, wide: float, narrow: float) -> list[Field | None]:
+        found: list[Field | None] = []
+        widths = [box_width(sigma * per_spacing) for sigma in (wide, narrow)]
+        mixed = None
+        if any(small) and not all(small):
+            # beside chips, pieces have what the narrow blur leaves them
+            every = tuple(slice(0, n) for n in labels.shape)
+            mask = inside & large[labels.long().clamp(min=0)]
+            mixed = share(mask, widths[1], every) / share(mask, widths[0], every).clamp(min=1e-6)
+        for label, box in enumerate(_boxes(labels, count)):
+            if box is None:
+                found.append(None)
+                continue
+            width = widths[small[label]]
+            margin = reach(width)
+            low = (max(0, box[0][0] - margin), max(0, box[1][0] - margin),
+                   max(0, box[2][0] - margin))  # fmt: skip
+            span = tuple(slice(a, end + 1 + margin) for a, (_, end) in zip(low, box, strict=True))
+            part = share(labels[span] == label, width, span)
+            if mixed is not None and not small[label]:
+                part = part * mixed[span]
+            found.append(Field(low, part))
+        return found
+
+    won = torch.full_like(nearest, -1)
+    best = torch.zeros(nearest.shape, device=nearest.device)
+    for label, field in enumerate(shares(nearest, FIRST, CHIP_FIRST)):
+        if field is None:
+            continue
+        span = field.span
+        more = inside[span] & (field.share > best[span])
+        best[span] = torch.where(more, field.share, best[span])
+        won[span] = won[span].masked_fill(more, label)
+    # a voxel that no blur reached keeps its own
+    won = torch.where(inside & (won < 0), nearest, won)
+    if any(small):
+        # chips as thin as a point are blurred away: those keep what they had
+        had, has = (torch.bincount(x[inside].long(), minlength=count) for x in (nearest, won))
+        thin = ~large & (has < _KEPT * had)
+        won = torch.where(inside & thin[nearest.long().clamp(min=0)], nearest, won)
+    return shares(won, SECOND, CHIP_SECOND)
+
+
+def top_two(shape: tuple[int, ...], found: list[Field | None], inside: Tensor) -> Labels:
+    """The two largest of the fields at every voxel."""
+    device = inside.device
+    first = torch.full(shape, -1, dtype=torch.int16, device=device)
+    second = first.clone()
+    one, two = torch.zeros(shape, device=device), torch.zeros(shape, device=device)
+    for label, field in enumerate(found):
+        if field is None:
+            continue
+        s, value = field.span, field.share
+        ahead, next_ = value > one[s], value > two[s]
+        second[s] = torch.where(ahead, first[s], torch.where(next_, label, second[s].long())).to(
+            torch.int16
+        )
+        two[s] = torch.where(ahead, one[s], torch.where(next_, value, two[s]))
+        first[s] = torch.where(ahead, label, first[s].long()).to(torch.int16)
+        one[s] = torch.where(ahead, value, one[s])
+    first = torch.where(inside, first, -1)
+    return Labels(first, torch.where(inside, second, -1), one - two)
+
+
+def displaced(
+    smooth: Labels, found: list[Field | None], low: tuple[int, int, int], amplitude: float
+) -> tuple[Tensor, Labels]:
+    """The two largest fields at displaced places, for voxels near a face.
+
+    Args:
+        smooth: From :func:`top_two`.
+        found: The fields.
+        low: Index of the first voxel, by which the displacements go.
+        amplitude: Rms displacement along each axis [voxels].
+
+    Returns:
+        Voxels near a face, int64 [M, 3], and their labels, each [M].
+    """
+    near = ((smooth.second >= 0) & (smooth.lead < _CLEAR)).nonzero()
+    shift = displacements(near, low, smooth.first.shape)
+    place = near.to(torch.float32) + shift * amplitude
+    count = near.shape[0]
+    first = torch.full((count,), -1, dtype=torch.int16, device=near.device)
+    second = first.clone()
+    one, two = torch.zeros(count, device=near.device), torch.zeros(count, device=near.device)
+    for label, field in enumerate(found):
+        if field is None:
+            continue
+        start = torch.tensor(field.low, device=near.device)
+        end = start + torch.tensor(field.share.shape, device=near.device)
+        rows = ((place > start - 1) & (place < end)).all(dim=1).nonzero()[:, 0]
+        value = trilinear(field.share, place[rows] - start)
+        ahead, next_ = value > one[rows], value > two[rows]
+        second[rows] = torch.where(
+            ahead, first[rows], torch.where(next_, label, second[rows].long()).to(torch.int16)
+        )
+        two[rows] = torch.where(ahead, one[rows], torch.where(next_, value, two[rows]))
+        first[rows] = torch.where(ahead, label, first[rows].long()).to(torch.int16)
+        one[rows] = torch.where(ahead, value, one[rows])
+    # displaced out of every field: what it was
+    old = [part[near[:, 0], near[:, 1], near[:, 2]] for part in smooth]
+    lost = first < 0
+    first, second = torch.where(lost, old[0], first), torch.where(lost, old[1], second)
+    return near, Labels(first, second, torch.where(lost, old[2], one - two))
+
+
+def keep_volumes(
+    labels: Labels, counted: Tensor, fixed: Tensor, wanted: Tensor
+) -> tuple[Labels, Tensor]:
+    """Add constants to the fields until every label has its volume.
+
+    Args:
+        labels: Of the voxels near a face, each [M].
+        counted: Which of them count, bool [M].
+        fixed: Voxels of every label that are far from any face, int64 [F].
+        wanted: Volumes [voxels], float64 [F].
+
+    Returns:
+        The labels, and how far the volumes are off [voxels], float64 [F].
+    """
+    count = wanted.shape[0]
+    first, second = labels.first.long(), labels.second.long()
+    pair = counted & (second >= 0)
+    a, b, lead = first[pair], second[pair], labels.lead[pair]
+    alone = torch.bincount(first[counted & (second < 0)], minlength=count) + fixed
+    alone = alone.to(torch.float64).cpu()
+    offset = torch.zeros(count, dtype=torch.float64)
+    wanted = wanted.cpu()
+    bar = torch.clamp(0.5 * VOLUME * wanted, min=1.0)
+    width, best = 0.2, (math.inf, offset)
+    gain, last = torch.full_like(offset, 0.6), torch.zeros_like(offset)
+    for _ in range(_PASSES):
+        now = _margin(lead, offset, a, b)
+        mine = torch.where(now >= 0, a, b)
+        volume = alone + torch.bincount(mine, minlength=count).cpu()
+        error = volume - wanted
+        worst = float((error.abs() / bar).amax())
+        if worst < best[0]:
+            best = worst, offset.clone()
+        if worst <= 1.0:
+            break
+        # by how much a volume grows with its constant: voxels within a band about the faces
+        band = now.abs() < width
+        slope = torch.bincount(a[band], minlength=count) + torch.bincount(b[band], minlength=count)
+        slope = (slope.cpu().to(torch.float64) / (2.0 * width)).clamp(min=1.0)
+        # where the error has changed sign the step was too long
+        gain = torch.where(error * last < 0.0, 0.6 * gain, (1.1 * gain).clamp(max=0.6))
+        last = error
+        offset = (offset - (gain * error / slope).clamp(-0.1, 0.1)).clamp(-0.9, 0.9)
+        width = max(0.05, 0.9 * width)
+    now = _margin(labels.lead, best[1], first, second.clamp(min=0))
+    swap = (second >= 0) & (now < 0)
+    changed = Labels(
+        torch.where(swap, labels.second, labels.first),
+        torch.where(swap, labels.first, labels.second),
+        torch.where(second >= 0, now.abs().to(torch.float32), labels.lead),
+    )
+    mine = torch.where(swap, second, first)[counted]
+    volume = (torch.bincount(mine, minlength=count) + fixed).cpu().to(torch.float64)
+    return changed, volume - wanted
+
+
+def _margin(lead: Tensor, offset: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    constant = offset.to(lead.device)
+    return lead.double() + (constant[a] - constant[b])
+
+
+def join_islands(labels: Labels, near: Tensor) -> Labels:
+    """Give lumps of less than 27 voxels the label that touches most of their faces.
+
+    Args:
+        labels: Of all voxels, each [X, Y, Z].
+        near: Voxels near a face, int64 [M, 3]; nothing else can be an island.
+    """
+    first = labels.first
+    shape, device, count = first.shape, first.device, near.shape[0]
+    if count == 0:
+        return labels
+    row = torch.full((math.prod(shape),), -1, dtype=torch.int32, device=device)
+    flat = (near[:, 0] * shape[1] + near[:, 1]) * shape[2] + near[:, 2]
+    row[flat] = torch.arange(count, dtype=torch.int32, device=device)
+    values = first.reshape(-1)
+    own = values[flat].long()
+    a, b = [], []
+    rooted = torch.zeros(count, dtype=torch.bool, device=device)
+    touch: list[tuple[Tensor, Tensor]] = []
+    for axis in range(3):
+        stride = (shape[1] * shape[2], shape[2], 1)[axis]
+        for side in (-1, 1):
+            at = near[:, axis] + side
+            rows = ((at >= 0) & (at < shape[axis])).nonzero()[:, 0]
+            beside = flat[rows] + side * stride
+            other = values[beside].long()
+            same, link = other == own[rows], row[beside].long()
+            if side > 0:
+                joined = same & (link >= 0)
+                a.append(rows[joined])
+                b.append(link[joined])
+            rooted[rows[same & (link < 0)]] = True
+            foreign = ~same & (other >= 0)
+            touch.append((rows[foreign], other[foreign]))
+    root = components(torch.cat(a), torch.cat(b), count)
+    size = torch.bincount(root, minlength=count)
+    safe = torch.zeros(count, dtype=torch.int64, device=device).index_add(0, root, rooted.long())
+    many = int(values.max()) + 1
+    whole = torch.bincount(values[values >= 0].long(), minlength=many)
+    island = ((size < ISLAND) & (safe == 0))[root] & (own >= 0)
+    island &= size[root] < whole[own.clamp(min=0)]  # what is all of its label stays
+    if not bool(island.any()):
+        return labels
+    rows = torch.cat([r for r, _ in touch])
+    other = torch.cat([o for _, o in touch])
+    kept = island[rows]
+    lump, slot = torch.unique(root[island], return_inverse=True)
+    beside = torch.searchsorted(lump, root[rows[kept]])
+    faces = torch.bincount(beside * many + other[kept], minlength=len(lump) * many)
+    faces = faces.view(len(lump), many)
+    most = faces.amax(dim=1, keepdim=True)
+    # of what touches as many, the lowest
+    around = torch.where(faces == most, torch.arange(many, device=device), many).amin(dim=1)
+    change = island.clone()
+    change[island] = most[slot, 0] > 0
+    around = around[slot[most[slot, 0] > 0]]
+    where = flat[change]
+    parts = [part.clone().reshape(-1) for part in labels]
+    parts[1][where] = parts[0][where]
+    parts[0][where] = around.to(torch.int16)
+    parts[2][where] = 1e-3
+    return Labels(*(part.view(shape) for part in parts))

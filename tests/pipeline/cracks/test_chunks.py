@@ -1,0 +1,207 @@
+"""Chunks: when they are cut, how they move, that nothing pops and that a run can be taken up."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from simulation_shapes import ellipsoid
+
+from gsfluent import materials, ops
+from gsfluent.data import TRANSITION, Gaussians
+from gsfluent.errors import InputError
+from gsfluent.geometry import look_at
+from gsfluent.pipeline.cracks.chunks import OPACITY
+from gsfluent.pipeline.cracks.stage import Repair, Repaired
+from gsfluent.pipeline.matter.carry import Carry, Points
+from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.scene.scene import Scene
+
+
+def binding(device: str = "cpu") -> Carry:
+    scene = Scene(floor=None)
+    scene.add(ellipsoid(splats=600), materials.get("fruit.apple"))
+    return Carry.bind(scene, build_matter(scene, 0.03, device=device))
+
+
+@pytest.fixture(scope="module")
+def bound() -> Carry:
+    return binding()
+
+
+def moment(
+    bound: Carry, unit: torch.Tensor, moved: torch.Tensor | None = None, bent: float = 0.0
+) -> Points:
+    """Points of these pieces, moved by vectors and bent about y."""
+    rest = bound.matter.rest
+    position = rest.clone()
+    position[:, 2] += bent * rest[:, 0].square()
+    stretch = torch.eye(3, device=rest.device).repeat(len(rest), 1, 1)
+    stretch[:, 2, 0] = 2.0 * bent * rest[:, 0]
+    if moved is not None:
+        position = position + moved
+    none = torch.zeros_like(unit, dtype=torch.bool)
+    return Points.of(position, stretch, unit.to(torch.int32), none, unit)
+
+
+def halves(bound: Carry) -> torch.Tensor:
+    right = bound.matter.rest[:, 0] > 0.0
+    return torch.where(right, int(right.nonzero()[0]), int((~right).nonzero()[0]))
+
+
+def apart(bound: Carry, gap: float) -> torch.Tensor:
+    right = bound.matter.rest[:, :1] > 0.0
+    return gap * right * torch.eye(3, device=right.device)[0]
+
+
+def drawn(bound: Carry, history, points: Points) -> Repaired:
+    cracks = history.step(points)
+    motion = cracks.carry.follow(cracks.points, cracks.rest)
+    return history.repair(cracks.carry, motion, history=history, cracks=cracks)
+
+
+def picture(gaussians: Gaussians, eye: tuple[float, float, float] = (0.1, -0.3, 0.15)):
+    view = look_at(torch.tensor(eye), torch.zeros(3), torch.eye(3)[2]).float()
+    K = torch.tensor([[120.0, 0, 48], [0, 120.0, 48], [0, 0, 1]])
+    g = gaussians
+    return ops.rasterize(
+        g.means, g.opacities, view, K, 96, 96, quats=g.quats, scales=g.scales, sh=g.sh
+    )
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.3])
+def test_a_split_alone_changes_no_picture(bound: Carry, bent: float) -> None:
+    """The same motion, before and after what hung together is seen to be two pieces."""
+    history = Repair().begin(bound)
+    whole = torch.zeros(len(bound.matter.rest), dtype=torch.int64)
+    before = drawn(bound, history, moment(bound, whole, bent=bent))
+    after = drawn(bound, history, moment(bound, halves(bound), bent=bent))
+    assert before.added == 0
+    change = (picture(before.gaussians).image - picture(after.gaussians).image).abs()
+    assert float(change.max()) < 1.0 / 255.0
+
+
+def test_what_does_not_split_costs_nothing(bound: Carry) -> None:
+    history = Repair().begin(bound)
+    whole = torch.zeros(len(bound.matter.rest), dtype=torch.int64)
+    points = moment(bound, whole, bent=0.2)
+    cracks = history.step(points)
+    assert cracks.births is None and cracks.rest is bound.gaussians
+    assert cracks.carry.links is bound.links and cracks.points.position is points.position
+    assert history.state()["splits"] == []
+
+
+def test_faces_are_flat_opaque_and_of_the_inside(bound: Carry) -> None:
+    spacing = bound.matter.spacing[0]
+    cracks = Repair().begin(bound).step(moment(bound, halves(bound), apart(bound, 0.3)))
+    births = cracks.births
+    g = births.gaussians
+    left = bound.matter.rest[births.anchor, 0] < 0.0
+    place = torch.where(left, g.means[:, 0], g.means[:, 0] - 0.3)
+    assert float(place.abs().max()) < 1.2 * spacing
+    assert float(place.square().mean().sqrt()) < 0.45 * spacing
+    assert bool((g.labels == TRANSITION).all())
+    assert torch.allclose(g.opacities, torch.full_like(g.opacities, OPACITY))
+    assert len(births.ids.unique()) == len(births.ids)
+    inner = (g.means[:, 1:].norm(dim=1) < 0.07) & left
+    assert float(g.normals[inner, 0].mean()) > 0.8
+    seen = picture(g.select(left), (0.3, 0.0, 0.0))
+    y, x = torch.meshgrid(torch.arange(96) + 0.5, torch.arange(96) + 0.5, indexing="ij")
+    disc = ((x - 48).square() + (y - 48).square()).sqrt() * 0.3 / 120 < 0.07
+    assert float(seen.alpha[disc].min()) > 0.95
+    red = seen.image[disc].mean(dim=0) / seen.alpha[disc].mean()
+    assert float((red - torch.tensor([0.9, 0.2, 0.2])).abs().max()) < 0.05
+
+
+def test_pieces_move_rigidly_and_splats_end_at_their_face(bound: Carry) -> None:
+    spacing = bound.matter.spacing[0]
+    history = Repair().begin(bound)
+    done = drawn(bound, history, moment(bound, halves(bound), apart(bound, 0.3)))
+    g, rest = done.gaussians, bound.gaussians
+    right = g.means[: rest.count, 0] > 0.15
+    moved = g.means[: rest.count] - 0.3 * right[:, None] * torch.eye(3)[0]
+    far = rest.means[:, 0].abs() > 3.0 * spacing
+    assert torch.allclose(moved[far], rest.means[far], atol=1e-5)
+    assert bool((right == (rest.means[:, 0] > 0.0))[far].all())
+    # what lay across is cut: no splat reaches far beyond the face
+    from gsfluent.geometry import covariance
+
+    sigma = covariance(g.quats, g.scales)[:, 0].sqrt()
+    inner = torch.where(g.means[:, 0] > 0.15, 0.3 - g.means[:, 0], g.means[:, 0])
+    assert float((inner + sigma).max()) < 1.2 * spacing
+    before = covariance(rest.quats, rest.scales)[:, 0].sqrt()
+    assert float((sigma[: rest.count] - before).min()) < -0.2 * spacing
+
+
+def test_older_faces_do_not_change_and_a_run_can_be_taken_up(bound: Carry) -> None:
+    unit = halves(bound)
+    rest = bound.matter.rest
+    top = (rest[:, 2] > 0.02) & (rest[:, 0] > 0.0)
+    again = torch.where(top, int(top.nonzero()[0]), unit)
+    left = torch.where(rest[:, 0] > 0.0, int(again[(rest[:, 0] > 0) & ~top][0]), unit)
+    again = torch.where(top, again, left)
+    move = apart(bound, 0.1)
+    history = Repair().begin(bound)
+    one = history.step(moment(bound, unit, move))
+    state = history.state()
+    two = history.step(moment(bound, again, move))
+    # nothing has moved: the older faces are what they were; points carry them from either side
+    common = torch.isin(two.births.ids, one.births.ids)
+    assert int(common.sum()) == len(one.births.ids)
+    for name in ("sh", "opacities"):
+        now = getattr(two.births.gaussians, name)[common]
+        assert torch.equal(now, getattr(one.births.gaussians, name))
+    now = two.births.gaussians.means[common]
+    assert torch.allclose(now, one.births.gaussians.means, rtol=0.0, atol=1e-6)
+    other = Repair().begin(bound)
+    other.restore(state)
+    lift = 0.05 * top[:, None] * torch.eye(3)[2]
+    got = other.step(moment(bound, again, move + lift))
+    want = history.step(moment(bound, again, move + lift))
+    assert torch.equal(got.births.ids, want.births.ids)
+    assert torch.equal(got.births.gaussians.means, want.births.gaussians.means)
+    assert torch.equal(got.rest.means, want.rest.means)
+    assert torch.equal(got.carry.owner, want.carry.owner)
+
+
+def test_crumbs_follow_what_is_firm(bound: Carry) -> None:
+    """Points that fly off one by one take no splats with them; the body keeps its shape."""
+    rest, spacing = bound.matter.rest, bound.matter.spacing[0]
+    unit = torch.zeros(len(rest), dtype=torch.int64)
+    cap = rest[:, 2] > 0.07
+    draw = torch.Generator().manual_seed(4)
+    noise = 6.0 * spacing * torch.rand(rest.shape, generator=draw) * cap[:, None]
+    points = moment(bound, unit, noise)._replace(broken=cap)
+    cracks = Repair().begin(bound).step(points)
+    moved = cracks.carry.follow(cracks.points, cracks.rest).means
+    assert float((moved - bound.gaussians.means).norm(dim=1).max()) < 0.5 * spacing
+    raw = Repair("gap").begin(bound).step(points)
+    thrown = raw.carry.follow(raw.points, raw.rest).means
+    assert float((thrown - bound.gaussians.means).norm(dim=1).max()) > 2.0 * spacing
+
+
+def test_dust_goes_with_nobody(bound: Carry) -> None:
+    unit = halves(bound)
+    unit[::97] = -1
+    fly = torch.zeros_like(bound.matter.rest)
+    fly[::97, 2] = 5.0
+    cracks = Repair().begin(bound).step(moment(bound, unit, apart(bound, 0.1) + fly))
+    means = cracks.carry.follow(cracks.points, cracks.rest).means
+    assert float(means[:, 2].max()) < 0.2
+    assert float(cracks.births.gaussians.means[:, 2].max()) < 0.2
+
+
+def test_a_binding_without_a_scene_is_refused(bound: Carry) -> None:
+    alone = Carry(bound.gaussians, bound.body, bound.matter)
+    with pytest.raises(InputError, match="knows no scene"):
+        Repair("chunks").begin(alone)
+
+
+@pytest.mark.cuda
+def test_the_same_chunks_on_a_gpu() -> None:
+    found = []
+    for device in ("cpu", "cuda"):
+        bound = binding(device)
+        cracks = Repair().begin(bound).step(moment(bound, halves(bound), apart(bound, 0.2)))
+        found.append((cracks.births.ids.cpu().sort()[0], cracks.carry.owner.cpu()))
+    assert torch.equal(found[0][0], found[1][0])
+    assert torch.equal(found[0][1], found[1][1])
