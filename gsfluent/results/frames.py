@@ -24,6 +24,7 @@ from gsfluent.io import atomic_path
 _HALF = ("quats", "opacities", "sh", "damage", "velocity")
 _SPLATS = ("groups", "ids", "anchor")
 _POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "material")
+_LED = ("led_rows", "led_positions")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +51,22 @@ class SavedFrame:
     body: Tensor  # Number of each point's body in the scene, int32 [P]
     material: Tensor  # Row of each point in the scene's table of materials, int32 [P]
     facts: dict[str, Any]  # Plain figures of the frame (energies, counts)
+    # Points that are drawn elsewhere than they are, with their chunk: rows int32 [K], [m] [K, 3].
+    led: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def shown(self) -> Tensor:
+        """Where the material points are drawn [m], [P, 3]."""
+        if self.led is None:
+            return self.positions
+        rows, places = self.led
+        return self.positions.index_copy(0, rows.long(), places.to(self.positions))
 
     def to(self, device: torch.device) -> SavedFrame:
         """The same frame on another device."""
         moved = {name: getattr(self, name).to(device) for name in (*_SPLATS, *_POINTS)}
-        return replace(self, gaussians=self.gaussians.to(device), **moved)
+        led = None if self.led is None else (self.led[0].to(device), self.led[1].to(device))
+        return replace(self, gaussians=self.gaussians.to(device), led=led, **moved)
 
 
 def frame_path(folder: Path, index: int) -> Path:
@@ -75,6 +87,8 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
         arrays["labels"] = frame.gaussians.labels.cpu().numpy().astype(np.int8)
     for name in (*_SPLATS, *_POINTS):
         arrays[name] = _packed(name, getattr(frame, name))
+    if frame.led is not None:
+        arrays |= {name: _packed(name, value) for name, value in zip(_LED, frame.led, strict=True)}
     head = {
         "index": frame.index,
         "time": frame.time,
@@ -105,6 +119,7 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
             carried=head["carried"],
             facts=head["facts"],
             gaussians=_gaussians(arrays),
+            led=(_tensor(arrays[_LED[0]]), _tensor(arrays[_LED[1]])) if _LED[0] in arrays else None,
             **{name: _tensor(arrays[name]) for name in (*_SPLATS, *_POINTS)},
         )
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:

@@ -211,6 +211,7 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         velocity=particles.velocity,
         body=particles.body,
         material=particles.material,
+        led=frame.led,
         facts=dict(frame.stats)
         | {
             "energy": dict(frame.energy),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import mmap
 from pathlib import Path
@@ -143,6 +144,16 @@ def make_frame(index: int = 0) -> SavedFrame:
         material=torch.tensor([0, 2, 1, 1], dtype=torch.int32),
         facts={"fragments": 2},
     )
+
+
+def test_a_frame_knows_where_its_points_are_drawn(tmp_path: Path) -> None:
+    plain = make_frame(3)
+    assert plain.shown is plain.positions
+    led = (torch.tensor([1, 3], dtype=torch.int32), torch.tensor([[1.0, 2, 3], [4, 5, 6]]))
+    save_frame(tmp_path, dataclasses.replace(plain, led=led))
+    back = load_frame(tmp_path, 3)
+    assert torch.equal(back.shown[[1, 3]], led[1]) and torch.equal(back.positions, plain.positions)
+    assert torch.equal(back.shown[[0, 2]], plain.positions[[0, 2]])
 
 
 def test_frame_comes_back_as_it_was(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ class _Last(NamedTuple):
     number: int
     matter: MatterView
     camera: Camera
-    positions: Tensor
+    shown: Tensor
     images: list[Tensor]
 
 
@@ -137,7 +137,7 @@ class FilmFigures:
         """
         index = len(self._values["flicker"])
         view = small(camera)
-        matter = MatterView.of(frame.positions, frame.volumes, view)
+        matter = MatterView.of(frame.shown, frame.volumes, view)
         film = Holes.of(alpha, depth, matter)
         for values in self._values.values():
             values.append(None)
@@ -156,14 +156,15 @@ class FilmFigures:
             (_plain(frame.gaussians), frame.groups if added else None),
         ]
         drawn = [_drawn(splats, view, groups) for splats, groups in shown]
-        self._enter("", [_holes(drawn[0], matter), film])
+        self._enter("", [_holes(drawn[0], _bare(frame, matter, view)), film])
         images = [picture.image for picture in drawn]
-        self._enter_flicker(_Last(index, matter, view, frame.positions, images))
+        self._enter_flicker(_Last(index, matter, view, frame.shown, images))
         if self._around:
             view = self._around[index % len(self._around)]
-            matter = MatterView.of(frame.positions, frame.volumes, view)
+            matter = MatterView.of(frame.shown, frame.volumes, view)
             drawn = [_drawn(splats, view, groups) for splats, groups in shown]
-            self._enter("_around", [_holes(picture, matter) for picture in drawn])
+            before = _holes(drawn[0], _bare(frame, matter, view))
+            self._enter("_around", [before, _holes(drawn[1], matter)])
 
     def _set(self, name: str, value: float | int | None) -> None:
         self._values[name][-1] = round(value, 6) if isinstance(value, float) else value
@@ -178,9 +179,9 @@ class FilmFigures:
         last, self._last = self._last, now
         if last is None or last.number != now.number - 1:
             return
-        if last.positions.shape != now.positions.shape:
+        if last.shown.shape != now.shown.shape:
             return
-        moved, views = (last.positions, now.positions), (last.camera, now.camera)
+        moved, views = (last.shown, now.shown), (last.camera, now.camera)
         flow = Flow.of(last.matter, now.matter, moved, views, self._spacing)
         for k, end in enumerate(("_before", "")):
             self._set(f"flicker{end}", flicker(last.images[k], now.images[k], flow))
@@ -191,6 +192,11 @@ class FilmFigures:
         ``_around``: in a camera around the matter, another one each time.
         """
         return self._values
+
+
+def _bare(frame: SavedFrame, shown: MatterView, view: Camera) -> MatterView:
+    """Matter where it is: with that a splat goes of which nobody takes care."""
+    return shown if frame.led is None else MatterView.of(frame.positions, frame.volumes, view)
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, groups: Tensor | None) -> Rendered:

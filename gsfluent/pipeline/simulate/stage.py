@@ -98,6 +98,18 @@ class SimulationFrame:
         """The splats at rest, cut at cracks."""
         return None if self._cracks is None else self._cracks.rest
 
+    @property
+    def led(self) -> tuple[Tensor, Tensor] | None:
+        """Points that are drawn elsewhere than they are, with their chunk, and where.
+
+        Rows int32 [K] and places [m], [K, 3]; None where all are drawn where they are.
+        """
+        if self._points is None:
+            return None
+        places = self._points.position
+        rows = (places != self.particles.position.to(places)).any(dim=1).nonzero()[:, 0]
+        return (rows.to(torch.int32), places[rows]) if rows.numel() else None
+
     @functools.cached_property
     def repaired(self) -> Repaired:
         """The splats of this moment in scene coordinates, carried and repaired (made when asked).

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -202,6 +203,25 @@ def test_raw_splats_ride_rigidly_on_their_points() -> None:
     then = moved(points, 0.4, (0.1, 0.2, 0.0))
     made = raw.at(saved(then, splats, 1, splats.count))
     assert torch.allclose(made.means, moved(splats.means, 0.4, (0.1, 0.2, 0.0)), atol=1e-5)
+
+
+def test_holes_are_judged_where_the_matter_is_drawn() -> None:
+    """A crumb that a chunk carries leaves no hole where the solver has it."""
+    points = slab(layers=1)
+    whole = fine(points)
+    frame = saved(points, whole, 0, whole.count)
+    gone = points + torch.tensor([-0.04, 0.0, 0.0]) * (torch.arange(len(points)) < 20)[:, None]
+    rows = torch.arange(20, dtype=torch.int32)
+    view = camera()
+    picture = draw(whole, view, near=0.01, depth=True)
+    assert picture.depth is not None
+    found = []
+    for led in (None, (rows, points[:20])):
+        figures = FilmFigures(frame)
+        there = dataclasses.replace(saved(gone, whole, 1, whole.count), led=led)
+        figures.add(there, view, picture.alpha, picture.depth)
+        found.append(figures.report()["hole_fraction"][0])
+    assert found[0] is not None and found[1] is not None and 10.0 * found[1] < found[0]
 
 
 def test_the_figures_of_a_film_put_what_is_drawn_beside_what_is_not_repaired() -> None:
