@@ -84,21 +84,22 @@ def trilinear(field: Tensor, place: Tensor) -> Tensor:
     Returns:
         [M]. One operation at a time, which rounds alike on every device.
     """
-    base = place.floor()
-    t = place - base
-    x, y, z = base.long().unbind(dim=1)
-    shape = field.shape
     flat = field.reshape(-1)
-    total = torch.zeros_like(t[:, 0])
-    for i in (0, 1):
-        u = t[:, 0] if i else 1.0 - t[:, 0]
-        for j in (0, 1):
-            w = u * (t[:, 1] if j else 1.0 - t[:, 1])
-            for k in (0, 1):
-                a, b, c = x + i, y + j, z + k
-                here = (a >= 0) & (a < shape[0]) & (b >= 0) & (b < shape[1])
-                here = here & (c >= 0) & (c < shape[2])
-                index = ((a * shape[1] + b) * shape[2] + c).clamp(0, max(flat.shape[0] - 1, 0))
-                weight = w * (t[:, 2] if k else 1.0 - t[:, 2])
-                total = total + weight * torch.where(here, flat[index], 0.0)
+    axes = []
+    for axis, stride in enumerate((field.shape[1] * field.shape[2], field.shape[2], 1)):
+        base = place[:, axis].floor()
+        t, most = place[:, axis] - base, field.shape[axis] - 1
+        index, ends = base.long(), []
+        for step, share in ((0, 1.0 - t), (1, t)):
+            at = index + step
+            held = at.clamp(0, most)
+            # what lies outside has no share: the value there counts as 0
+            ends.append((held * stride, torch.where(held == at, share, 0.0)))
+        axes.append(ends)
+    total = torch.zeros_like(place[:, 0])
+    for a, u in axes[0]:
+        for b, v in axes[1]:
+            corner, w = a + b, u * v
+            for c, share in axes[2]:
+                total = total + w * share * flat[corner + c]
     return total

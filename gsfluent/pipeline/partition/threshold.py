@@ -243,6 +243,10 @@ def displaced(
         start = torch.tensor(field.low, device=near.device)
         end = start + torch.tensor(field.share.shape, device=near.device)
         rows = ((place > start - 1) & (place < end)).all(dim=1).nonzero()[:, 0]
+        # far from the label its share is nothing
+        around = (place[rows] - start).round().long().clamp(min=0)
+        x, y, z = torch.minimum(around, end - start - 1).unbind(dim=1)
+        rows = rows[field.share[x, y, z] > 0.0]
         value = trilinear(field.share, place[rows] - start)
         ahead, next_ = value > one[rows], value > two[rows]
         second[rows] = torch.where(
