@@ -79,6 +79,19 @@ class Split(NamedTuple):
         value = torch.where((first != label) & (second != label), -2.0 * far, value)
         return torch.where(here & (first >= 0), value, torch.nan)
 
+    def slope(self, label: Tensor, voxel: Tensor, edge: float) -> tuple[Tensor, Tensor]:
+        """:meth:`signed` [M] at voxels [M, 3] of the edge ``edge`` [m], and its gradient [M, 3]."""
+        here = self.signed(label, voxel)
+        parts = []
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.int64, device=voxel.device)
+            step[axis] = 1
+            ahead, behind = self.signed(label, voxel + step), self.signed(label, voxel - step)
+            lone = ahead.isnan() | behind.isnan()
+            ahead, behind = (torch.where(v.isnan(), here, v) for v in (ahead, behind))
+            parts.append((ahead - behind) / torch.where(lone, edge, 2.0 * edge))
+        return here, torch.stack(parts, dim=1)
+
 
 class Partition:
     """The regions of one body.
