@@ -134,7 +134,8 @@ class Surfaces:
     def __init__(self, partition: Partition) -> None:
         self._partition = partition
         self.step = 2.0 ** math.floor(math.log2(partition.voxel / _STEPS))
-        region = torch.where(partition.depth > 0.0, partition.region.long(), OUTSIDE)
+        self._depth = partition.depth - _level(partition)
+        region = torch.where(self._depth > 0.0, partition.region.long(), OUTSIDE)
         # a rim of nothing, so that everything is closed
         self._label = torch.nn.functional.pad(region, (1,) * 6, value=OUTSIDE)
         shape = self._label.shape
@@ -195,7 +196,7 @@ class Surfaces:
         normal = torch.zeros(count, 3, dtype=torch.float64, device=self._node.device)
         voxel = self._place(self._ends.view(-1)).long().view(count, 2, 3) - 1
         skin = (self._sides == OUTSIDE).any(dim=1)
-        depth = torch.nn.functional.pad(partition.depth, (1,) * 6, value=-partition.voxel)
+        depth = torch.nn.functional.pad(self._depth, (1,) * 6, value=-partition.voxel)
         value = depth.view(-1)[self._ends[skin]].double()
         share[skin] = value[:, 0] / (value[:, 0] - value[:, 1])
         normal[skin] = _gradient(depth, voxel[skin] + 1).double().sum(dim=1)
@@ -357,6 +358,22 @@ class Surfaces:
         even = [0.5 * (point[1] + point[2]), 0.5 * (point[3] + point[0])]  # corners 2 and 0
         chosen = [torch.where(faces.even[:, None], *pair) for pair in zip(odd, even, strict=True)]
         return torch.stack(chosen, dim=1).view(-1, 3)
+
+
+def _level(partition: Partition) -> float:
+    """Depth [m] of the surface that encloses the volume of the solid.
+
+    The depth field is 0 a little outside of it, because it smooths the stairs of the voxels.
+    """
+    edge, wanted = partition.voxel, partition.solid_volume / partition.voxel**3
+    near = partition.depth[partition.depth > -edge].double() / edge
+    low, high = 0.0, 0.5 * partition.solid_voxel / edge
+    for _ in range(20):
+        level = 0.5 * (low + high)
+        # a voxel is as full as its centre is deep
+        full = float((near - level + 0.5).clamp(0.0, 1.0).sum())
+        low, high = (level, high) if full > wanted else (low, level)
+    return 0.5 * (low + high) * edge
 
 
 def _fans(faces: Tensor) -> tuple[Tensor, Tensor]:

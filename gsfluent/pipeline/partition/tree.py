@@ -179,6 +179,11 @@ class Partition:
         """Edge of the solid's voxels [m]."""
         return self._frame.scale * self._solid.voxel
 
+    @property
+    def solid_volume(self) -> float:
+        """Volume of the solid [m^3]."""
+        return self._frame.scale**3 * self._solid.volume
+
     def center(self, voxel: Tensor) -> Tensor:
         """Centres [m] of voxels [M, 3], float64."""
         return voxel.double() * self.voxel + self.origin
