@@ -127,7 +127,7 @@ def measure(given: argparse.Namespace, device: torch.device) -> dict[str, Any]:
             assert cracks is not None  # method gap
             still, cracks = timed(device, lambda p=points: history.step(p), given.repeats)
             move, motion = timed(
-                device, lambda c=cracks: carry.apply(carry.follow(c.points, c.rest), c.rest), 1
+                device, lambda c=cracks: c.carry.apply(c.carry.follow(c.points, c.rest), c.rest), 1
             )
             splats = motion.replace(normals=None)
             if cracks.births is not None:

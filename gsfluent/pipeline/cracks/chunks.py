@@ -39,10 +39,12 @@ CLOSED, SHOWN = 0.1, 0.3
 WIDE = 1.5
 """Width of the blend of neighbouring points where matter is broken, in point spacings: what is
 left of the crack band is rougher than a face."""
-FIRM = 6
+FIRM = 5
 """Of its neighbours at rest so many must hang together with a point, or it is crumb."""
 LUMP = 64
 """Points of one piece that hang together, below which they are crumbs as well."""
+MOST = 32_000
+"""Pieces that a region is split into at once, at most."""
 _NUMBERS = 1 << 54  # ids of face elements begin here, beyond those of births
 _FINE = 2.0**20
 
@@ -175,7 +177,9 @@ class Chunks:
             if not torn:
                 break
             for region in torn:
-                units = piece[enough & (chunk == region)]
+                units, members = (x[enough & (chunk == region)] for x in (piece, many))
+                if units.numel() > MOST:  # labels are small numbers; the rest goes where it lay
+                    units = units[members.argsort(descending=True, stable=True)[:MOST]]
                 mine = self._may & (self._chunk == region)
                 rows = (mine & torch.isin(unit, units)).nonzero()[:, 0]
                 _, rank = ranked(unit[rows], self.base.matter.rest[rows])

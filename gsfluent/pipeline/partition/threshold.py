@@ -35,6 +35,7 @@ VOLUME = 0.01
 """Error of a volume that is good enough."""
 _CLEAR = 0.95  # difference of two shares from which on no displacement changes the label
 _PASSES = 60
+_KEPT = 0.7  # share of its voxels that a chip keeps when it is smoothed, or it is not
 _FINE = 1024.0  # squared distances are whole numbers of this share of a voxel squared
 _RANKS = 16  # bits of a key that hold a rank
 _AT_ONCE = 1 << 20  # points
@@ -143,28 +144,41 @@ def fields(nearest: Tensor, small: list[bool], per_spacing: float) -> list[Field
     """
     inside = nearest >= 0
     sums: dict[int, Tensor] = {}
+    count = len(small)
+    large = torch.tensor([not chip for chip in small], device=nearest.device)
 
-    def shares(labels: Tensor, sigmas: list[float]) -> list[Field | None]:
+    def share(mask: Tensor, width: int, span: tuple[slice, ...]) -> Tensor:
+        if width not in sums:
+            sums[width] = blur(inside, width).to(torch.float32).clamp_(min=1.0)
+        return blur(mask, width).to(torch.float32) / sums[width][span]
+
+    def shares(labels: Tensor, wide: float, narrow: float) -> list[Field | None]:
         found: list[Field | None] = []
-        boxes = _boxes(labels, len(sigmas))
-        for label, (sigma, box) in enumerate(zip(sigmas, boxes, strict=True)):
+        widths = [box_width(sigma * per_spacing) for sigma in (wide, narrow)]
+        mixed = None
+        if any(small) and not all(small):
+            # beside chips, pieces have what the narrow blur leaves them
+            every = tuple(slice(0, n) for n in labels.shape)
+            mask = inside & large[labels.long().clamp(min=0)]
+            mixed = share(mask, widths[1], every) / share(mask, widths[0], every).clamp(min=1e-6)
+        for label, box in enumerate(_boxes(labels, count)):
             if box is None:
                 found.append(None)
                 continue
-            width = box_width(sigma * per_spacing)
+            width = widths[small[label]]
             margin = reach(width)
             low = (max(0, box[0][0] - margin), max(0, box[1][0] - margin),
                    max(0, box[2][0] - margin))  # fmt: skip
             span = tuple(slice(a, end + 1 + margin) for a, (_, end) in zip(low, box, strict=True))
-            if width not in sums:
-                sums[width] = blur(inside, width).to(torch.float32).clamp_(min=1.0)
-            count = blur(labels[span] == label, width).to(torch.float32)
-            found.append(Field(low, count / sums[width][span]))
+            part = share(labels[span] == label, width, span)
+            if mixed is not None and not small[label]:
+                part = part * mixed[span]
+            found.append(Field(low, part))
         return found
 
     won = torch.full_like(nearest, -1)
     best = torch.zeros(nearest.shape, device=nearest.device)
-    for label, field in enumerate(shares(nearest, [CHIP_FIRST if c else FIRST for c in small])):
+    for label, field in enumerate(shares(nearest, FIRST, CHIP_FIRST)):
         if field is None:
             continue
         span = field.span
@@ -173,7 +187,12 @@ def fields(nearest: Tensor, small: list[bool], per_spacing: float) -> list[Field
         won[span] = won[span].masked_fill(more, label)
     # a voxel that no blur reached keeps its own
     won = torch.where(inside & (won < 0), nearest, won)
-    return shares(won, [CHIP_SECOND if chip else SECOND for chip in small])
+    if any(small):
+        # chips as thin as a point are blurred away: those keep what they had
+        had, has = (torch.bincount(x[inside].long(), minlength=count) for x in (nearest, won))
+        thin = ~large & (has < _KEPT * had)
+        won = torch.where(inside & thin[nearest.long().clamp(min=0)], nearest, won)
+    return shares(won, SECOND, CHIP_SECOND)
 
 
 def top_two(shape: tuple[int, ...], found: list[Field | None], inside: Tensor) -> Labels:
@@ -263,6 +282,7 @@ def keep_volumes(
     wanted = wanted.cpu()
     bar = torch.clamp(0.5 * VOLUME * wanted, min=1.0)
     width, best = 0.2, (math.inf, offset)
+    gain, last = torch.full_like(offset, 0.6), torch.zeros_like(offset)
     for _ in range(_PASSES):
         now = _margin(lead, offset, a, b)
         mine = torch.where(now >= 0, a, b)
@@ -277,7 +297,10 @@ def keep_volumes(
         band = now.abs() < width
         slope = torch.bincount(a[band], minlength=count) + torch.bincount(b[band], minlength=count)
         slope = (slope.cpu().to(torch.float64) / (2.0 * width)).clamp(min=1.0)
-        offset = (offset - (0.6 * error / slope).clamp(-0.1, 0.1)).clamp(-0.9, 0.9)
+        # where the error has changed sign the step was too long
+        gain = torch.where(error * last < 0.0, 0.6 * gain, (1.1 * gain).clamp(max=0.6))
+        last = error
+        offset = (offset - (gain * error / slope).clamp(-0.1, 0.1)).clamp(-0.9, 0.9)
         width = max(0.05, 0.9 * width)
     now = _margin(labels.lead, best[1], first, second.clamp(min=0))
     swap = (second >= 0) & (now < 0)

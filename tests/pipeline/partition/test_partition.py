@@ -68,6 +68,20 @@ def test_volumes_are_those_of_the_points_and_sum_exactly(pieces: int) -> None:
     assert float(split.error.abs().max()) < 0.01
 
 
+@pytest.mark.parametrize("radius", [0.9, 1.5])
+def test_chips_keep_their_volume(radius: float) -> None:
+    """A few points in the middle of a piece are a part of their own, with the volume they had."""
+    rest, spacing = points_of(cube())
+    chip = (rest - rest.mean(dim=0)).norm(dim=1) < radius * spacing
+    assert 2 < int(chip.sum()) < 30
+    partition = fresh(rest, spacing)
+    whole = partition.volume(7)
+    partition.split(7, rest, chip.long(), [7, 1])
+    wanted = whole * int(chip.sum()) / len(rest)
+    assert abs(partition.volume(1) - wanted) <= max(1.0, 0.01 * wanted)
+    assert partition.volume(1) + partition.volume(7) == whole
+
+
 def test_the_order_of_the_points_does_not_matter() -> None:
     rest, spacing = points_of(cube())
     unit = slabs(rest, 4)
