@@ -263,6 +263,31 @@ class Partition:
         self.splits.append(done)
         return done
 
+    def assign(
+        self, owner: Tensor, done: Split, rest: Tensor, rows: Tensor, piece: Tensor
+    ) -> Tensor:
+        """Regions of points after a split.
+
+        Args:
+            owner: Before it, int64 [N].
+            done: The split, the last one so far.
+            rest: All points at rest [m], [N, 3].
+            rows: What was given to :meth:`split`, int64 [P].
+            piece: The same, int64 [P].
+
+        Returns:
+            int64 [N]. What belongs to no piece goes where it lay.
+        """
+        table, region = torch.tensor(done.ids, device=owner.device), done.ids[0]
+        others = owner == region
+        others[rows] = False
+        owner = owner.clone()
+        owner[rows] = table[piece]
+        lone = others.nonzero()[:, 0]
+        where = self.at(rest[lone])
+        owner[lone] = torch.where(torch.isin(where, table), where, region)
+        return owner
+
     def _span(
         self, place: Tensor, piece: Tensor
     ) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
