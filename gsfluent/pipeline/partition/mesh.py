@@ -7,8 +7,8 @@ as the voxels go. All of it is made once, between the last regions: a piece is b
 polygons that have it on one side only. So neighbours have the same vertices, bit by bit, and
 nothing moves when a piece splits.
 
-Where the four corners of a face of the grid are unlike their neighbours, four polygons would meet in
-one line. There the two corners that stay one piece longer are joined, and the line becomes two:
+Where the four corners of a face of the grid are unlike their neighbours, four polygons would meet
+in one line. There the two corners that stay one piece longer are joined, and the line becomes two:
 every line of a piece then lies between just two of its polygons, whatever the labels are.
 """
 
@@ -41,23 +41,19 @@ class PieceMesh:
         vertices: [V, 3] in metres, on the lattice of :attr:`Surfaces.step`, float64.
         faces: [F, 3], normals out, int64.
         skin: Which of the triangles are skin, the others are crack faces, bool [F].
+        source: Row of each vertex in :attr:`Surfaces.vertices`, int64 [V].
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     skin: NDArray[np.bool_]
+    source: NDArray[np.int64]
 
     @property
     def volume(self) -> float:
         """Volume that it encloses [m^3]."""
         a, b, c = (self.vertices[self.faces[:, i]] - self.vertices.mean(axis=0) for i in range(3))
         return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
-
-    def on_skin(self) -> NDArray[np.bool_]:
-        """Which of the vertices touch the skin, bool [V]."""
-        found = np.zeros(len(self.vertices), bool)
-        found[self.faces[self.skin].reshape(-1)] = True
-        return found
 
     def normals(self) -> NDArray[np.float64]:
         """Unit normals of the vertices [V, 3], by the area around each."""
@@ -170,9 +166,16 @@ class Surfaces:
         old, faces = _fans(faces)
         vertices = self.vertices[old]
         other = torch.where(behind, self.outer, self.inner)[kept]
-        return PieceMesh(
-            vertices.cpu().numpy(), faces.cpu().numpy(), (other == OUTSIDE).cpu().numpy()
-        )
+        skin = other == OUTSIDE
+        return PieceMesh(*(part.cpu().numpy() for part in (vertices, faces, skin, old)))
+
+    @property
+    def on_skin(self) -> Tensor:
+        """Which of the vertices touch the skin, bool [V]."""
+        found = torch.zeros(len(self.vertices), dtype=torch.bool, device=self.vertices.device)
+        outer = (self.inner == OUTSIDE) | (self.outer == OUTSIDE)
+        found[self.triangles[outer].view(-1)] = True
+        return found
 
     # --- crossings ---
 
