@@ -70,7 +70,7 @@ def save_partition(folder: Path, saved: SavedPartition) -> Path:
         arrays[f"rank_{number}"] = split.rank.cpu().numpy().astype(np.int32)
     path = folder / FILE
     with atomic_path(path) as part, part.open("wb") as stream:
-        np.savez(stream, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
+        np.savez(stream, head=np.array(json.dumps(head)), **arrays)
     return path
 
 

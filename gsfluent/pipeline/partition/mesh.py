@@ -316,7 +316,7 @@ class Surfaces:
             nodes.append(node)
             corners = torch.stack([node, node + p, node + p + q, node + q], dim=1)
             labels.append(self._flat[corners])
-        axis, node, label = torch.cat(axes), torch.cat(nodes), torch.cat(labels)
+        facing, node, label = torch.cat(axes), torch.cat(nodes), torch.cat(labels)
         together = self._together(label)
         even = together[:, 0] > together[:, 1]
         # for as long as each other: the lower one, and matter rather than nothing
@@ -324,7 +324,7 @@ class Surfaces:
         lower = rank[:, [0, 2]].amin(dim=1) < rank[:, [1, 3]].amin(dim=1)
         even |= (together[:, 0] == together[:, 1]) & lower
         joined = torch.where(even[:, None], label[:, [0, 2]], label[:, [1, 3]])
-        return _Saddles(axis * size + node, axis, node, even, joined)
+        return _Saddles(facing * size + node, facing, node, even, joined)
 
     def _together(self, label: Tensor) -> Tensor:
         """Until which split the two diagonals of faces [M, 4] are one piece each, int64 [M, 2]."""

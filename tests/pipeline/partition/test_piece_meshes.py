@@ -1,4 +1,4 @@
-"""Meshes of pieces: closed whatever the labels, fitting their neighbours bit by bit, of full volume."""
+"""Meshes of pieces: closed whatever the labels, fitting their neighbours, of full volume."""
 
 from __future__ import annotations
 
