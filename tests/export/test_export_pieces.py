@@ -228,7 +228,7 @@ def test_a_run_without_pieces_is_refused_in_words(run: Path, tmp_path: Path) -> 
     record = json.loads((out / "run.json").read_text())
     record["shot"]["output"]["cracks"] = "gap"
     (out / "run.json").write_text(json.dumps(record))
-    with pytest.raises(InputError, match="output.cracks: gap"):
+    with pytest.raises(InputError, match=r"output\.cracks: gap"):
         export(out, ["pieces-glb"], device=CPU, to=to)
     (out / "stages" / "simulate" / FILE).write_bytes(b"no archive")
     with pytest.raises(RunError, match="no readable partition"):
