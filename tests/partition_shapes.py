@@ -37,3 +37,19 @@ def slabs(rest: torch.Tensor, count: int) -> torch.Tensor:
     tilted = rest[:, 0] + 0.3 * rest[:, 1] - 0.2 * rest[:, 2]
     ranks = tilted.argsort().argsort().double() / len(rest)
     return (count * ranks**1.4).long().clamp(max=count - 1)
+
+
+def ball(hollow: bool, voxels: int = 24) -> Solid:
+    """A ball of diameter 0.1 m, or a shell of it three eighths of its radius thick."""
+    voxel, size = EDGE / voxels, voxels + 4
+    axis = (torch.arange(size) + 0.5 - 0.5 * size) * voxel
+    x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
+    radius = (x * x + y * y + z * z).sqrt()
+    depth = 0.5 * EDGE - radius
+    if hollow:
+        depth = torch.minimum(depth, radius - 0.625 * 0.5 * EDGE)
+    splats = Gaussians.from_colors(
+        torch.zeros(1, 3), torch.full((1,), voxel), torch.ones(1, 3), label=INTERIOR
+    )
+    origin = torch.full((3,), -0.5 * size * voxel)
+    return Solid(splats, depth > 0, depth.clamp(min=0.0), origin, voxel)

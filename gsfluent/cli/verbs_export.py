@@ -26,6 +26,7 @@ class Export(Verb):
       gsfluent export out --to usd -o cut_07                 # Houdini, usdview: one scene.usdc
       gsfluent export out --to vtk,vti                       # ParaView: open particles.vtk.series
       gsfluent export out --to meshes --mesh-ending obj      # Blender, Houdini: closed fragments
+      gsfluent export out --to pieces-glb                    # Blender, games: out/pieces.glb
       gsfluent export out --to mp4 --camera freeze           # time stands still, once around
       gsfluent export out --to webp --alpha --size 480x270   # to lay over a web page
 
@@ -35,6 +36,7 @@ class Export(Verb):
       usd      all frames in one file: splats, particles with velocity and damage
       vtk, points, vti                 the material points: .vtk, .ply, density volume
       meshes                           a closed, coloured surface per fragment
+      pieces-glb, pieces-usd           closed meshes cut from the solid, moving rigidly, animated
       mp4, gif, webp, png              pictures, along any camera path
 
     An interrupted sequence goes on where it stopped when the command is given again.
@@ -63,7 +65,7 @@ class Export(Verb):
     spz_version: Literal[2, 3] = 3
     """spz: 2 for old readers, with coarser rotations."""
     usd_ending: Literal["usdc", "usda", "usdz"] = "usdc"
-    """usd: binary, text or zipped."""
+    """usd, pieces-usd: binary, text or zipped."""
     usd_parts: str = "splats,particles"
     """usd: what goes in, of splats, particles, meshes."""
     mesh_ending: Literal["ply", "obj", "glb"] = "ply"

@@ -53,6 +53,10 @@ FORMATS: dict[str, Format] = {
     "vtk": Format("material points per frame: ParaView, VisIt", "points.vtk"),
     "points": Format("material points as .ply: Houdini, Blender", "points.points"),
     "meshes": Format("a closed surface per fragment: Houdini, Blender, games", "meshes.meshes"),
+    "pieces-glb": Format(
+        "glTF, a rigid closed mesh per piece, animated: Blender, games", "pieces.pieces_glb"
+    ),
+    "pieces-usd": Format("the same as USD: Houdini, usdview", "pieces.pieces_usd"),
     "vti": Format("density and damage volume per frame: ParaView", "points.vti"),
 }
 
@@ -62,7 +66,8 @@ _OTHERS: dict[tuple[str, ...], str] = {
     ("abc", "alembic", "fbx"): "use usd, or meshes and points",
     ("obj", "stl"): "use meshes, with --mesh-ending obj",
     ("ksplat", "sog", "sogs"): "write ply-seq and convert it with splat-transform (npm)",
-    ("gltf",): "use glb",
+    ("gltf",): "use glb for splats, pieces-glb for meshes",
+    ("pieces",): "use pieces-glb or pieces-usd",
     ("ply",): "use ply-seq for splats, points for material points, meshes for fragments",
     ("avi", "mov", "mkv", "video"): "use mp4",
     ("jpg", "jpeg", "pictures.frames"): "use png",

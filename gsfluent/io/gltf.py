@@ -54,7 +54,7 @@ def save_glb(gaussians: Gaussians, path: str | Path) -> None:
             attributes[f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"] = values
     document, body = _document(attributes)
     with atomic_path(path) as part:
-        part.write_bytes(_container(document, body))
+        part.write_bytes(container(document, body))
 
 
 def _document(attributes: dict[str, np.ndarray]) -> tuple[dict[str, Any], bytes]:
@@ -99,7 +99,7 @@ def _document(attributes: dict[str, np.ndarray]) -> tuple[dict[str, Any], bytes]
     return document, bytes(body)
 
 
-def _container(document: dict[str, Any], body: bytes) -> bytes:
+def container(document: dict[str, Any], body: bytes) -> bytes:
     """The binary container: a header of 12 bytes, a JSON chunk, a binary chunk."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

@@ -8,7 +8,7 @@ while the fragment exists. Needs usd-core (``pip install "gsfluent[usd]"``).
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from gsfluent.colors import srgb_to_linear
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError, need
 from gsfluent.io.atomic import atomic_path
+from gsfluent.io.rigid import RigidMesh
 
 _THREE_SIGMA = 3.0
 
@@ -207,6 +208,44 @@ class UsdWriter:
         prim.GetDisplayColorPrimvar().Set(Vt.Vec3fArray.FromNumpy(srgb_to_linear(colors)), time)
         prim.CreateExtentAttr().Set(_box(where, 0.0), time)
         self._seen[name].add(time)
+
+    def rigid(self, times: Sequence[float], meshes: Sequence[RigidMesh]) -> None:
+        """Author meshes that only move rigidly, at all time codes at once.
+
+        Args:
+            times: Time codes, K, ascending.
+            meshes: In the axes of the stage.
+        """
+        from pxr import Gf, UsdGeom, Vt
+
+        for time in times:
+            self._at(time)
+        UsdGeom.Scope.Define(self.stage, "/scene/pieces")
+        for mesh in meshes:
+            prim = UsdGeom.Mesh.Define(self.stage, f"/scene/pieces/{mesh.name}")
+            prim.CreateSubdivisionSchemeAttr().Set(UsdGeom.Tokens.none)
+            prim.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(_floats(mesh.vertices)))
+            counts = np.full(len(mesh.faces), 3, dtype=np.int32)
+            prim.CreateFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(counts))
+            corners = np.ascontiguousarray(mesh.faces.reshape(-1), np.int32)
+            prim.CreateFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(corners))
+            normals = _floats(mesh.corner_normals.reshape(-1, 3))
+            prim.CreateNormalsAttr().Set(Vt.Vec3fArray.FromNumpy(normals))
+            prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
+            colors = Vt.Vec3fArray.FromNumpy(_floats(srgb_to_linear(mesh.colors)))
+            prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(colors)
+            prim.CreateExtentAttr().Set(_box(mesh.vertices, 0.0))
+            shift = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+            turn = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+            seen, before = prim.CreateVisibilityAttr(), None
+            for k, time in enumerate(times):
+                w, x, y, z = mesh.rotation[k].tolist()
+                shift.Set(Gf.Vec3d(*mesh.translation[k].tolist()), time)
+                turn.Set(Gf.Quatd(w, x, y, z), time)
+                if before is None or mesh.shown[k] != before:  # holds until the next one
+                    before = mesh.shown[k]
+                    word = UsdGeom.Tokens.inherited if before else UsdGeom.Tokens.invisible
+                    seen.Set(word, time)
 
     def finish(self) -> None:
         """Set the time range and visibilities and save.

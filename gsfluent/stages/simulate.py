@@ -19,6 +19,8 @@ from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.results.frames import SavedFrame, count_frames, save_frame
+from gsfluent.results.partition import FILE as PARTITION
+from gsfluent.results.partition import save_partition
 from gsfluent.results.store import content_digest
 from gsfluent.scene.scene import Body, Scene
 from gsfluent.stages.context import RunContext
@@ -141,11 +143,16 @@ def simulate_stage(context: RunContext) -> None:
         for note in weak:
             _log.warning("%s", note)
         if resume is None:
-            (folder / STRIKES).unlink(missing_ok=True)  # of other settings
+            for old in (STRIKES, PARTITION):  # of other settings
+                (folder / old).unlink(missing_ok=True)
         strikes = Strikes(scene, frames.run.matter, folder)
         for frame in frames:
             save_frame(folder, saved(frame, scene))
             strikes.see(frame)
+            assert frames.history is not None  # a run of a shot carries splats
+            partition = frames.history.partition()
+            if partition is not None:
+                save_partition(folder, partition)
             # after the frame: a state on disk always has its picture
             frames.save(state)
         unbroken, report = strikes.unbroken(), frames.report

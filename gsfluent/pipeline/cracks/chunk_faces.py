@@ -93,20 +93,6 @@ class ChunkCuts(NamedTuple):
     rival: Tensor
 
 
-def _slope(split: Split, label: Tensor, voxel: Tensor, edge: float) -> tuple[Tensor, Tensor]:
-    """Signed distance [M] of voxels [M, 3] from their label's face, and its gradient [M, 3]."""
-    here = split.signed(label, voxel)
-    parts = []
-    for axis in range(3):
-        step = torch.zeros(3, dtype=torch.int64, device=voxel.device)
-        step[axis] = 1
-        ahead, behind = split.signed(label, voxel + step), split.signed(label, voxel - step)
-        lone = ahead.isnan() | behind.isnan()
-        ahead, behind = (torch.where(v.isnan(), here, v) for v in (ahead, behind))
-        parts.append((ahead - behind) / torch.where(lone, edge, 2.0 * edge))
-    return here, torch.stack(parts, dim=1)
-
-
 def find_faces(partition: Partition, split: Split, solid: Solid, number: int) -> ChunkFaces:
     """Face elements of a split: one in every voxel beside a voxel of another piece.
 
@@ -139,7 +125,7 @@ def find_faces(partition: Partition, split: Split, solid: Solid, number: int) ->
     label = first[x, y, z]
     second = split.labels.second[x, y, z].long()
     beyond = torch.where((second >= 0) & (second != label), second, other[x, y, z])
-    far, gradient = _slope(split, label, voxel, edge)
+    far, gradient = split.slope(label, voxel, edge)
     slope = gradient.norm(dim=1).clamp(min=_LEAST)
     normal = -gradient / slope[:, None]
     reach = (far / slope.clamp(min=0.2)).clamp(0.0, _STEP * edge)
@@ -252,7 +238,7 @@ def find_cuts(
     voxel, place = voxel[found], place[found]
     x, y, z = voxel.unbind(dim=1)
     second = split.labels.second[x, y, z].long()
-    far, gradient = _slope(split, label, voxel, edge)
+    far, gradient = split.slope(label, voxel, edge)
     far = far + (gradient * ((place - voxel) * edge).to(gradient)).sum(dim=1)
     slope = gradient.norm(dim=1).clamp(min=_LEAST)
     normal = -gradient / slope[:, None]

@@ -30,6 +30,7 @@ from gsfluent.pipeline.matter.pieces import CHIP
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude
 from gsfluent.pipeline.partition.tree import Partition, ranked
+from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
 from gsfluent.spatial.neighbours import nearest_rows
 
 OPACITY = 0.97
@@ -99,7 +100,7 @@ class Chunks:
         device = self._body.device
         self._partitions: dict[int, Partition] = {}
         self._events: list[dict[str, Any]] = []
-        self._regions = len(self._scene.bodies)
+        self._regions, self._steps = len(self._scene.bodies), 0
         self._chunk = self._body.clone()
         self._drives = torch.ones_like(self._may)
         self._crumb = torch.zeros_like(self._may)
@@ -112,7 +113,9 @@ class Chunks:
         self._links = self.base.links
         for event in state.get("splits", ()):
             rows, rank = event["rows"].to(device), event["rank"].to(device)
+            self._steps = int(event.get("frame", 0))
             self._split(int(event["region"]), rows, rank)
+        self._steps = int(state.get("steps", 0))
         if state:
             self._crumb[state["crumbs"].to(device)] = True
             self._relink()
@@ -130,7 +133,31 @@ class Chunks:
             ],
             "crumbs": self._crumb.nonzero()[:, 0].cpu(),
             "gaps": self._gaps.state(),
+            "steps": self._steps,
         }
+
+    def partition(self) -> SavedPartition:
+        """All splits so far, with what it takes to make them again."""
+        matter, scene = self.base.matter, self._scene
+        bodies = tuple(
+            SavedBody(
+                number, body.name, body_frame(body, scene), float(matter.spacing[number]),
+                amplitude(body.material.name),
+            )
+            for number, body in enumerate(scene.bodies)
+            if body.solid is not None and bool(self._may[self._body == number].any())
+        )  # fmt: skip
+        return SavedPartition(
+            rest=matter.rest,
+            body=self._body,
+            carries=self._may,
+            crumbs=self._crumb.nonzero()[:, 0],
+            regions=len(scene.bodies),
+            bodies=bodies,
+            splits=tuple(
+                SavedSplit(e["region"], e["frame"], e["rows"], e["rank"]) for e in self._events
+            ),
+        )
 
     # --- frames ---
 
@@ -150,6 +177,7 @@ class Chunks:
             self._look(unit)
             if self._chunk is not before:
                 self._relink()
+        self._steps += 1
         shown, carry = self._moved(points), self._carry(points)
         self._gaps.rebind(carry)
         cracks = self._gaps.step(shown)
@@ -195,7 +223,8 @@ class Chunks:
 
     def _split(self, region: int, rows: Tensor, rank: Tensor) -> None:
         """Divide a region by the pieces of some of its points."""
-        self._events.append({"region": region, "rows": rows, "rank": rank.to(torch.int32)})
+        event = {"region": region, "rows": rows, "rank": rank.to(torch.int32)}
+        self._events.append({**event, "frame": self._steps})
         matter = self.base.matter
         body = int(self._body[rows[0]])
         partition = self._partitions.get(body)
@@ -214,15 +243,7 @@ class Chunks:
         ids = [region, *range(self._regions, self._regions + pieces - 1)]
         self._regions += pieces - 1
         split = partition.split(region, rest[rows], rank, ids)
-        # what belongs to no piece goes where it lay
-        chunk = self._chunk.clone()
-        table = torch.tensor(ids, device=rest.device)
-        others = self._chunk == region
-        others[rows] = False
-        chunk[rows] = table[rank]
-        lone = others.nonzero()[:, 0]
-        where = partition.at(rest[lone])
-        chunk[lone] = torch.where(torch.isin(where, table), where, region)
+        chunk = partition.assign(self._chunk, split, rest, rows, rank)
         self._chunk = chunk
         self._reassign(region, partition, chunk, rows)
         splats = (self._region == region).nonzero()[:, 0]

@@ -26,6 +26,7 @@ from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.cracks.mvee import CROSS_RADIUS, NEIGHBOUR_RADIUS, CrackGraph, transitions
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.stage import Stage
+from gsfluent.results.partition import SavedPartition
 
 METHODS = ("chunks", "gap", "mvee", "none")
 
@@ -180,6 +181,10 @@ class CrackHistory:
     def state(self) -> dict[str, Any]:
         """What a resumed run needs besides the points: plain tensors."""
         return {} if self._gaps is None else self._gaps.state()
+
+    def partition(self) -> SavedPartition | None:
+        """How the solids are split so far (``chunks``); None with the other methods."""
+        return self._gaps.partition() if isinstance(self._gaps, Chunks) else None
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state`; from nothing for an empty one."""

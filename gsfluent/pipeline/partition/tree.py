@@ -79,6 +79,19 @@ class Split(NamedTuple):
         value = torch.where((first != label) & (second != label), -2.0 * far, value)
         return torch.where(here & (first >= 0), value, torch.nan)
 
+    def slope(self, label: Tensor, voxel: Tensor, edge: float) -> tuple[Tensor, Tensor]:
+        """:meth:`signed` [M] at voxels [M, 3] of the edge ``edge`` [m], and its gradient [M, 3]."""
+        here = self.signed(label, voxel)
+        parts = []
+        for axis in range(3):
+            step = torch.zeros(3, dtype=torch.int64, device=voxel.device)
+            step[axis] = 1
+            ahead, behind = self.signed(label, voxel + step), self.signed(label, voxel - step)
+            lone = ahead.isnan() | behind.isnan()
+            ahead, behind = (torch.where(v.isnan(), here, v) for v in (ahead, behind))
+            parts.append((ahead - behind) / torch.where(lone, edge, 2.0 * edge))
+        return here, torch.stack(parts, dim=1)
+
 
 class Partition:
     """The regions of one body.
@@ -166,6 +179,11 @@ class Partition:
         """Edge of the solid's voxels [m]."""
         return self._frame.scale * self._solid.voxel
 
+    @property
+    def solid_volume(self) -> float:
+        """Volume of the solid [m^3]."""
+        return self._frame.scale**3 * self._solid.volume
+
     def center(self, voxel: Tensor) -> Tensor:
         """Centres [m] of voxels [M, 3], float64."""
         return voxel.double() * self.voxel + self.origin
@@ -244,6 +262,31 @@ class Partition:
         )  # fmt: skip
         self.splits.append(done)
         return done
+
+    def assign(
+        self, owner: Tensor, done: Split, rest: Tensor, rows: Tensor, piece: Tensor
+    ) -> Tensor:
+        """Regions of points after a split.
+
+        Args:
+            owner: Before it, int64 [N].
+            done: The split, the last one so far.
+            rest: All points at rest [m], [N, 3].
+            rows: What was given to :meth:`split`, int64 [P].
+            piece: The same, int64 [P].
+
+        Returns:
+            int64 [N]. What belongs to no piece goes where it lay.
+        """
+        table, region = torch.tensor(done.ids, device=owner.device), done.ids[0]
+        others = owner == region
+        others[rows] = False
+        owner = owner.clone()
+        owner[rows] = table[piece]
+        lone = others.nonzero()[:, 0]
+        where = self.at(rest[lone])
+        owner[lone] = torch.where(torch.isin(where, table), where, region)
+        return owner
 
     def _span(
         self, place: Tensor, piece: Tensor
