@@ -131,7 +131,7 @@ def shortened(
     fits = _beyond(hull, ends(*part)) <= overhang
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        good = _beyond(hull, ends(*part, middle)) <= overhang
+        good = _beyond(hull, ends(*part, share=middle)) <= overhang
         low, high = torch.where(good, middle, low), torch.where(good, high, middle)
     share[rows] = torch.where(fits, torch.ones_like(low), low.clamp_min(_LEAST_AXIS))
     return share
