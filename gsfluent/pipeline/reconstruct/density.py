@@ -126,7 +126,7 @@ def shortened(
     """
     share = torch.ones_like(scales)
     rows = (_beyond(hull, ends(means, quats, scales, opacities)) > overhang).any(1).nonzero()[:, 0]
-    part = [value[rows] for value in (means, quats, scales, opacities)]
+    part = (means[rows], quats[rows], scales[rows], opacities[rows])
     low, high = torch.zeros_like(part[2]), torch.ones_like(part[2])
     fits = _beyond(hull, ends(*part)) <= overhang
     for _ in range(_HALVINGS):
