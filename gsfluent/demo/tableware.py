@@ -1,4 +1,4 @@
-"""Brittle things of a kitchen: a pane of glass, an egg, a bar of chocolate."""
+"""Brittle things of a kitchen: a pane of glass, a bowl of it, an egg, a bar of chocolate."""
 
 from __future__ import annotations
 
@@ -55,6 +55,65 @@ class Pane(DistanceObject):
             rgb(0.20, 0.52, 0.43), rgb(0.30, 0.62, 0.53), smoothstep(-0.5, 0.5, cloud[:, 0])
         )
         return mix(self.surface_color(points), fresh, smoothstep(0.0003, 0.0010, depth))
+
+
+class Bowl(DistanceObject):
+    """A bowl of pressed opal glass, 0.12 m wide and 0.05 m high, its wall 9 mm.
+
+    Opal, because splats are drawn opaque: clear glass would need refraction.
+    """
+
+    name = "bowl"
+    axes = (0.060, 0.060, 0.025)
+    rind_depth = 0.0005
+    pith_depth = 0.0005
+    wall = 0.009
+    radius = 0.061
+    """Of the outer sphere [m]: (0.06^2 + 0.05^2) / (2 x 0.05)."""
+
+    def distance(self, local: Tensor) -> Tensor:
+        """See :meth:`DistanceObject.distance`."""
+        # Seen from the axis: the middle line of the wall is an arc that ends half a wall below the
+        # rim, so that the rim is round. A foot as wide as half the bowl lets it stand.
+        middle = self.radius - 0.5 * self.wall
+        height = local[:, 2] + self.axes[2] - self.radius
+        around = local[:, :2].norm(dim=1)
+        end = self.radius - 2.0 * self.axes[2] + 0.5 * self.wall  # of the arc, below its centre
+        ring = (middle**2 - end**2) ** 0.5
+        below = -height * ring >= around * end  # the nearest point of the arc lies on it
+        arc = ((around**2 + height**2).sqrt() - middle).abs()
+        rim = ((around - ring) ** 2 + (height + end) ** 2).sqrt()
+        wall = torch.where(below, arc, rim) - 0.5 * self.wall
+        foot = torch.stack([around - 0.026, (height + self.radius - 0.006).abs() - 0.006], dim=1)
+        disc = foot.clamp_min(0.0).norm(dim=1) + foot.amax(dim=1).clamp_max(0.0)
+        return torch.minimum(wall, disc)
+
+    def surface_color(self, points: Tensor) -> Tensor:
+        """See :meth:`DemoObject.surface_color`."""
+        p = self._local(points).to(torch.float32)
+        cloud = self.noise.fractal(p, 28.0, 3)
+        jade = mix(rgb(0.44, 0.72, 0.60), rgb(0.58, 0.82, 0.70), smoothstep(-0.5, 0.5, cloud[:, 0]))
+        band = smoothstep(0.0015, 0.0005, (p[:, 2] - 0.016).abs())
+        return mix(jade, rgb(0.93, 0.90, 0.80), 0.8 * band).clamp(0.0, 1.0)
+
+    def interior(self, points: Tensor) -> Tensor:
+        """See :meth:`DemoObject.interior`."""
+        p = self._local(points).to(torch.float32)
+        cloud = self.noise.fractal(p, 60.0, 2)
+        fresh = mix(
+            rgb(0.66, 0.88, 0.78), rgb(0.76, 0.94, 0.86), smoothstep(-0.5, 0.5, cloud[:, 0])
+        )
+        depth = self.depth(points).to(torch.float32)
+        skin = smoothstep(0.0012, 0.0004, depth)
+        return mix(fresh, self.surface_color(points), skin).clamp(0.0, 1.0)
+
+    def labels(self, points: Tensor) -> Tensor:
+        """Class of each point, int64 [N]: 0 outside, 1 glass."""
+        return (self.level(points) <= 0.0).long() * WALL
+
+    def parts(self, points: Tensor) -> Tensor:
+        """As :meth:`labels`."""
+        return self.labels(points)
 
 
 class Egg(DistanceObject):

@@ -13,9 +13,9 @@ from gsfluent.cli import main
 from gsfluent.demo.baked import CREAM, ICING, JAM, SPONGE, Cake
 from gsfluent.demo.capture import ring_cameras
 from gsfluent.demo.shapes import walk
-from gsfluent.demo.tableware import SHELL, WHITE, YOLK, Chocolate, Egg, Pane
+from gsfluent.demo.tableware import SHELL, WHITE, YOLK, Bowl, Chocolate, Egg, Pane
 
-NAMES = ("bread", "cake", "melons", "pane", "egg", "chocolate")
+NAMES = ("bread", "cake", "melons", "pane", "bowl", "egg", "chocolate")
 
 
 def rays(obj: demo.DemoObject, side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
@@ -153,6 +153,24 @@ def test_the_pane_is_10_mm_thick_and_green_where_one_looks_along_it() -> None:
     face, edge = pane.surface_color(pane.center + torch.tensor([[0.03, 0, 0.005], [0.08, 0, 0]]))
     assert float(face.min()) > 0.6 > 0.5 > float(edge[0])
     assert edge[1] > 1.5 * edge[0]
+
+
+def test_the_bowl_is_open_its_wall_is_9_mm_and_its_rim_is_round() -> None:
+    bowl = Bowl(0)
+    center = torch.tensor([0.0, 0.0, 0.061], dtype=torch.float64)  # of its spheres
+    generator = torch.Generator().manual_seed(0)
+    way = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    way = way / way.norm(dim=1, keepdim=True)
+    way = way[(way[:, 2] < -0.3) & (way[:, 2] > -0.75)]  # between rim and foot
+    assert len(way) > 50
+    for radius, level in ((0.061, 0.0), (0.052, 0.0), (0.0565, -0.0045), (0.04, 0.012)):
+        found = bowl.level(center + radius * way)
+        assert found.numpy() == pytest.approx([level] * len(way), abs=1e-9)
+    # what stands highest is the rim, half a wall across, and a ray from above ends inside
+    points = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.0, 0.0105]], dtype=torch.float64)
+    assert bowl.inside(points).tolist() == [False, True]
+    index, hit = bowl.intersect(torch.tensor([0.0, 0.0, 0.4]), torch.tensor([[0.0, 0.0, -1.0]]))
+    assert index.tolist() == [0] and float(hit[0, 2]) == pytest.approx(0.012, abs=1e-4)
 
 
 def test_the_egg_is_thicker_at_its_blunt_end_and_has_shell_white_and_yolk() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -15,9 +16,10 @@ from torch.nn import functional
 
 from gsfluent.data import Capture, View
 from gsfluent.errors import InputError
+from gsfluent.geometry import trilinear
 from gsfluent.pipeline.capture.views import TrainView
 from gsfluent.spatial.density import GridBox
-from gsfluent.spatial.voxels import surface
+from gsfluent.spatial.voxels import distance_transform, surface
 
 Array = NDArray[np.float64]
 _View = TypeVar("_View")
@@ -26,6 +28,7 @@ _SCRAP = 0.3  # share of the largest body of a hull below which another one is a
 _COARSE = 40  # cells per side of the first hull
 _COARSE_SIZE = 128  # pixels of the masks then: finer than a voxel
 _COARSE_VIEWS = 24
+_RIM = 8  # voxels around a hull in which the distance from it is exact
 _AGREE = 0.9  # share of them that must agree on a voxel; one bad mask must not cut the object
 
 
@@ -57,6 +60,26 @@ class Hull:
         on = ((index >= 0) & (index < size)).all(1)
         index = torch.minimum(index.clamp_min(0), size - 1)
         return on & grown[index[:, 0], index[:, 1], index[:, 2]]
+
+    def beyond(self, points: Tensor) -> Tensor:
+        """How far points [N, 3] lie outside the hull [world units], 0 in it, [N].
+
+        Between the centres of voxels it is interpolated; off the grid, the distance to the grid is
+        added, a bound from above.
+        """
+        size = torch.tensor(self._beyond.shape, device=points.device)
+        # a rim of _RIM voxels around the grid
+        place = (points - self.origin.to(points)) / self.voxel + (_RIM - 0.5)
+        held = torch.minimum(place.clamp_min(0.0), (size - 1).to(place))
+        away = trilinear(self._beyond.to(points), held) + (place - held).norm(dim=1)
+        return away * self.voxel
+
+    @functools.cached_property
+    def _beyond(self) -> Tensor:
+        """Distances of the voxels outside from the boundary [voxels], with a rim."""
+        outside = functional.pad(~self.occupancy, (_RIM,) * 6, value=True).cpu().numpy()
+        away = np.where(outside, distance_transform(outside) - 0.5, 0.0)
+        return torch.from_numpy(away.astype(np.float32))
 
 
 def focus_point(viewmats: Tensor) -> Tensor:

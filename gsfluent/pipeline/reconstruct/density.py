@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.data import Gaussians
 from gsfluent.errors import RunError
 from gsfluent.geometry import normalize_quaternions, quaternion_to_matrix
 from gsfluent.pipeline.capture.hull import Hull
@@ -35,6 +36,12 @@ _SHARPNESS = 100.0  # of the switch that spares opaque Gaussians from noise
 _MOST_COPIES = 50  # one Gaussian is split among at most so many
 _MCMC_OPACITY = 0.01  # weight of the mean opacity in the loss
 _MCMC_SCALE = 0.01  # weight of the mean scale, in units of the extent
+_ASPECT = 4.0  # longest over middle axis of what is kept: more is a needle
+_OVERHANG = 0.004  # of the object's size: how far a Gaussian may reach beyond the hull
+_LOOSE = 0.01  # the same in training: a tighter hold costs half a decibel inside the masks
+_SEEN = 0.02  # opacity at which a Gaussian ends for the eye
+_LEAST_AXIS = 0.02  # of its length that an axis keeps when the hull cuts it
+_HALVINGS = 8  # of the interval in which the cut of an axis lies
 
 
 def draws(seed: int, purpose: int, step: int) -> torch.Generator:
@@ -63,6 +70,100 @@ class Place:
                 wrong |= (means - eye).square().sum(1) < (0.3 * model.extent) ** 2
             wrong |= largest >= model.extent
         return wrong
+
+    @torch.no_grad()
+    def restrain(self, model: SplatModel) -> None:
+        """Shorten what reaches beyond the hull until it ends there; nothing without a hull."""
+        if self.hull is None or model.isotropic:
+            return
+        rooms = shortened(
+            model.parameters["means"].detach(),
+            model.parameters["quats"].detach(),
+            model.scales(),
+            model.opacities(),
+            self.hull,
+            _LOOSE * 2.0 * model.extent,
+        )
+        model.parameters["scales"].detach().add_(rooms.log())
+
+
+@torch.no_grad()
+def ends(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, share: Tensor | None = None
+) -> Tensor:
+    """Where Gaussians end for the eye: both ends of each axis, [N, 3, 2, 3].
+
+    An axis ends where the opacity has fallen to 0.02, ``sqrt(2 log(o / 0.02))`` deviations from the
+    centre; what is fainter at its centre is a point.
+
+    Args:
+        means: Centres, [N, 3].
+        quats: Rotations, [N, 4].
+        scales: Standard deviations, [N, 3].
+        opacities: Peak opacities, [N].
+        share: Of each axis that is taken, [N, 3]; all of it when None.
+    """
+    reach = (2.0 * (opacities.clamp_min(_SEEN) / _SEEN).log()).sqrt()
+    length = scales * reach[:, None]
+    if share is not None:
+        length = length * share
+    axes = (quaternion_to_matrix(normalize_quaternions(quats)) * length[:, None, :]).mT
+    return torch.stack([means[:, None] + axes, means[:, None] - axes], 2)
+
+
+@torch.no_grad()
+def shortened(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    hull: Hull,
+    overhang: float,
+) -> Tensor:
+    """Share of each axis [N, 3] that ends at most ``overhang`` [world units] beyond the hull.
+
+    At least 0.02 is left, also of what has its centre farther out.
+    """
+    share = torch.ones_like(scales)
+    rows = (_beyond(hull, ends(means, quats, scales, opacities)) > overhang).any(1).nonzero()[:, 0]
+    part = (means[rows], quats[rows], scales[rows], opacities[rows])
+    low, high = torch.zeros_like(part[2]), torch.ones_like(part[2])
+    fits = _beyond(hull, ends(*part)) <= overhang
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        good = _beyond(hull, ends(*part, share=middle)) <= overhang
+        low, high = torch.where(good, middle, low), torch.where(good, high, middle)
+    share[rows] = torch.where(fits, torch.ones_like(low), low.clamp_min(_LEAST_AXIS))
+    return share
+
+
+def contained(gaussians: Gaussians, hull: Hull) -> tuple[Gaussians, int]:
+    """Gaussians that end within the hull, give or take 0.4 % of its size, and how many went.
+
+    Axes that reach farther are cut; what still does has its centre outside and goes.
+    """
+    low, high = hull.bounds()
+    overhang = _OVERHANG * float((high - low).max())
+    shape = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    scales = gaussians.scales * shortened(*shape, hull, overhang)
+    cut = ends(gaussians.means, gaussians.quats, scales, gaussians.opacities)
+    keep = (_beyond(hull, cut) <= overhang).all(1)
+    return gaussians.replace(scales=scales).select(keep), int((~keep).sum())
+
+
+def _beyond(hull: Hull, points: Tensor) -> Tensor:
+    """How far both ends [N, 3, 2, 3] of each axis lie outside, the farther one, [N, 3]."""
+    return hull.beyond(points.reshape(-1, 3)).reshape(points.shape[:3]).amax(2)
+
+
+@torch.no_grad()
+def clamp_aspect(model: SplatModel) -> None:
+    """No longest axis over four times the middle one; needles swing and stick out."""
+    if model.isotropic:
+        return
+    scales = model.parameters["scales"].detach()
+    middle = scales.sort(dim=1).values[:, 1]
+    scales.copy_(torch.minimum(scales, (middle + math.log(_ASPECT))[:, None]))
 
 
 @dataclass(frozen=True)
@@ -95,6 +196,9 @@ class Density:
 
     def control(self, model: SplatModel, done: int, wanted: Wanted) -> None:
         """Change the Gaussians; called every ``densify_every`` steps."""
+
+    def forget(self) -> None:
+        """Drop what was noted of single Gaussians: their rows have changed."""
 
     def state(self) -> dict[str, Tensor]:
         """What must be saved."""
@@ -187,6 +291,10 @@ class Adc(Density):
                 hint="check that masks, poses and photographs belong together",
             )
         model.keep(keep)
+        self.forget()
+
+    def forget(self) -> None:
+        """Start the sums afresh."""
         self.gradient = self.visits = torch.empty(0)
 
     def state(self) -> dict[str, Tensor]:

@@ -15,6 +15,8 @@ from gsfluent.draw import draw
 from gsfluent.io import save_image
 from gsfluent.io.atomic import write_json
 from gsfluent.metrics import psnr, ssim
+from gsfluent.pipeline.capture.hull import Hull
+from gsfluent.pipeline.reconstruct.density import ends
 from gsfluent.pipeline.reconstruct.masks import silhouette
 
 HOLD_OUT = 8
@@ -96,6 +98,37 @@ def evaluate(gaussians: Gaussians, held_out: Capture | None, max_size: int) -> d
         "psnr_inside": round(sum(inside) / len(inside), 3) if inside else None,
         "psnr_region": "whole image before white" if masked else "whole image",
         "psnr_views": [round(value, 2) for value in whole],
+    }
+
+
+_STICKS = 0.01  # of the object's size
+_NEEDLE = 8.0  # axis ratio
+
+
+@torch.no_grad()
+def hair(gaussians: Gaussians, hull: Hull) -> dict[str, int]:
+    """Count what sticks out of an object: an axis that ends over 1 % of its size beyond the hull.
+
+    An axis ends for the eye where the opacity has fallen to 0.02 (:func:`ends`); the size is the
+    longest side of the hull.
+
+    Args:
+        gaussians: The object.
+        hull: Where it can be.
+
+    Returns:
+        ``sticking_out`` (all of them), ``needles`` (of these, longest over middle axis above 8) and
+        ``slivers`` (longest over shortest above 8: needles and thin discs).
+    """
+    low, high = hull.bounds()
+    tips = ends(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    away = hull.beyond(tips.reshape(-1, 3)).reshape(-1, 6).amax(1)
+    out = away > _STICKS * float((high - low).max())
+    axes = gaussians.scales.sort(dim=1).values
+    return {
+        "sticking_out": int(out.sum()),
+        "needles": int((out & (axes[:, 2] > _NEEDLE * axes[:, 1])).sum()),
+        "slivers": int((out & (axes[:, 2] > _NEEDLE * axes[:, 0])).sum()),
     }
 
 

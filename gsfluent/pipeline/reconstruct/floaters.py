@@ -168,6 +168,29 @@ def clean_floaters(
     return gaussians.select(~gone), report
 
 
+@torch.no_grad()
+def floating(
+    gaussians: Gaussians,
+    views: Sequence[TrainView],
+    hull: Hull | None,
+    limits: CleanLimits | None = None,
+) -> Tensor:
+    """Which Gaussians :func:`clean_floaters` would take whatever it costs, bool [N].
+
+    In training: what the photographs lose by it, the rest still has time to learn.
+    """
+    mine = torch.ones(gaussians.count, dtype=torch.bool, device=gaussians.device)
+    chosen = [views[i] for i in _evenly(len(views), _MOST_CAMERAS)]
+    reason, _ = _reasons(gaussians, mine, _cameras(chosen), hull, limits or CleanLimits())
+    return reason >= 0
+
+
+def _cameras(views: Sequence[TrainView]) -> list[Camera]:
+    return [
+        Camera(view.viewmat.double().cpu(), view.K.double().cpu(), *view.size) for view in views
+    ]
+
+
 def clean_views(
     gaussians: Gaussians,
     views: Sequence[TrainView],
@@ -176,11 +199,10 @@ def clean_views(
     limits: CleanLimits | None = None,
 ) -> tuple[Gaussians, dict[str, Any]]:
     """As :func:`clean_floaters`, with the views that a reconstruction trained on."""
-    cameras = [
-        Camera(view.viewmat.double().cpu(), view.K.double().cpu(), *view.size) for view in views
-    ]
     photographs = [view.color for view in views]
-    return clean_floaters(gaussians, cameras, hull=hull, photographs=photographs, limits=limits)
+    return clean_floaters(
+        gaussians, _cameras(views), hull=hull, photographs=photographs, limits=limits
+    )
 
 
 def _evenly(count: int, most: int) -> list[int]:

@@ -19,7 +19,7 @@ from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.capture.hull import Hull
 from gsfluent.pipeline.capture.views import TrainView, read_views
-from gsfluent.pipeline.reconstruct.density import draws
+from gsfluent.pipeline.reconstruct.density import contained, draws
 from gsfluent.pipeline.reconstruct.evaluate import HOLD_OUT, evaluate
 from gsfluent.pipeline.reconstruct.floaters import clean_views
 from gsfluent.pipeline.reconstruct.init import hull_gaussians, joined_start, point_gaussians
@@ -318,6 +318,11 @@ class _Run:
         )
         phase = 0 if scene is None else 1
         gaussians = self._train(model, views, phase, before, steps, hull, scene)
+        if stage.clean and gaussians.count and stage.kernel == "anisotropic":
+            inside, outside = contained(gaussians, hull)
+            if inside.count:
+                gaussians = inside
+                _log.info("%d Gaussians lay outside the hull", outside)
         if stage.clean and gaussians.count:
             gaussians, self.cleaned = clean_views(gaussians, views, hull=hull)
         return gaussians

@@ -10,7 +10,7 @@ import json
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,16 @@ from gsfluent.errors import InputError, RunError
 from gsfluent.io.atomic import atomic_path
 from gsfluent.pipeline.capture.hull import Hull
 from gsfluent.pipeline.capture.views import TrainView, halved
-from gsfluent.pipeline.reconstruct.density import Adc, Density, Mcmc, Place, Wanted, draws
+from gsfluent.pipeline.reconstruct.density import (
+    Adc,
+    Density,
+    Mcmc,
+    Place,
+    Wanted,
+    clamp_aspect,
+    draws,
+)
+from gsfluent.pipeline.reconstruct.floaters import CleanLimits, floating
 from gsfluent.pipeline.reconstruct.model import Exposure, SplatModel
 from gsfluent.pipeline.reconstruct.recipe import Recipe
 from gsfluent.pipeline.reconstruct.target import ErrorTarget
@@ -31,6 +40,10 @@ from gsfluent.pipeline.reconstruct.target import ErrorTarget
 _HALVED_FROM = 64  # pixels; smaller photographs are not halved
 _MASK_WEIGHT = 2.0  # weight of the opacity loss; 0.5 leaves a rim of a third of a pixel (measured)
 _NEEDLE = 6.0  # longest over middle axis before it is pulled back
+_SWEEPS = (0.3, 0.5, 0.7, 0.85)  # of an object's run: what hangs before its skin is swept away
+_SWEPT = CleanLimits(depth=0.01)  # closer than cleaning at the end, since the rest can still learn
+_RESTRAIN_EVERY = 10  # steps
+_OBJECT_PULL = 0.03  # opacity_pull of an object at least: its start is a hull that is too large
 _DROP_UNTIL = 0.9  # of the run; what was dropped for an error target is made up for afterwards
 _RECENT = 64  # steps whose losses are remembered
 _LOOK = {"cpu": 10}  # steps between two looks at the losses
@@ -81,11 +94,16 @@ class Trainer:
     ) -> None:
         self.model, self.views, self.settings = model, views, settings
         recipe = settings.recipe
+        if hull is not None:
+            recipe = replace(recipe, opacity_pull=max(recipe.opacity_pull, _OBJECT_PULL))
         large = min(min(view.size) for view in views) >= _HALVED_FROM
         self.half_until = recipe.half_until * settings.iterations if large else 0.0
         self.small = [halved(view) for view in views] if self.half_until > 0 else views
         eyes = torch.stack([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views])
-        place = Place(hull, eyes)
+        self.place = place = Place(hull, eyes)
+        self.sweeps: set[int] = set()
+        if hull is not None:
+            self.sweeps = {round(share * settings.iterations) for share in _SWEEPS}
         steps, limit = settings.iterations, settings.max_gaussians
         self.density: Density
         if settings.densify == "mcmc":
@@ -132,15 +150,34 @@ class Trainer:
             self._step(self.done)
             self.done += 1
             done, last = self.done, self.done == settings.iterations
+            # before the look at the density, which adds none then: what is left has to settle first
+            if done in self.sweeps and not last:
+                self._sweep(done)
             if done % recipe.densify_every == 0 and not last:
                 error = self._look()
                 self._control(done)
                 self.history.append((done, self.model.count, decibels(error)))
+            if self.place.hull is not None and (done % _RESTRAIN_EVERY == 0 or last):
+                self.place.restrain(self.model)
             if done % look == 0 or last:
                 on_look(done, self._look())
             if done % save_every == 0:
                 self._look()
                 save(done)
+
+    def _sweep(self, done: int) -> None:
+        """Take away what hangs before the skin of an object, or shows in no photograph."""
+        gaussians = self.model.gaussians(0)
+        if gaussians.count != self.model.count:  # not finite: the losses will say so
+            return
+        gone = floating(gaussians, self.views, self.place.hull, _SWEPT)
+        if bool(gone.all()):
+            raise RunError(
+                f"reconstruct: no Gaussian survived step {done}",
+                hint="check that masks, poses and photographs belong together",
+            )
+        self.model.keep(~gone)
+        self.density.forget()
 
     def _view(self, step: int) -> tuple[int, TrainView]:
         count = len(self.views)
@@ -188,6 +225,8 @@ class Trainer:
         self.density.observe(rendered, probe, view)
         progress = step / settings.iterations
         model.step(progress)
+        if self.place.hull is not None:
+            clamp_aspect(model)
         if self.exposure is not None:
             self.exposure.step(index, step // len(self.views) + 1, progress)
         self.density.after_step(model, step + 1)
