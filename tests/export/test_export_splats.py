@@ -407,8 +407,11 @@ def test_bad_requests(run: Path, tmp_path: Path, kind: str, options: Any, said: 
 def test_shots_can_ask_for_every_format_without_pictures() -> None:
     from gsfluent.config.settings import EXPORTS
 
+    # meshes of pieces are asked of a finished run: not every shot has one that split
     assert set(EXPORTS) == {
-        name for name, kind in FORMATS.items() if not kind.writer.startswith("pictures.")
+        name
+        for name, kind in FORMATS.items()
+        if not kind.writer.startswith("pictures.") and not name.startswith("pieces-")
     }
 
 

@@ -74,7 +74,7 @@ def test_a_fall_is_measured_once_and_entered(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:
-    scene = study.thrown("glass", 0.03, 0.01, 8)
+    scene = study.thrown("glass", 3e-4, 1e-4, 8)
     assert len(scene.materials) <= 16 and scene.v[0, 2] < 0.0
     strong = [math.sinh(-m["hardening"] * m["alpha"]) for m in scene.materials]
     assert min(strong) < max(strong)

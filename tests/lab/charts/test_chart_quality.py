@@ -124,6 +124,7 @@ def test_every_kind_has_a_ladder_with_names_of_their_own(kind: str) -> None:
 def test_more_steps_come_nearer_to_the_photographs_held_out() -> None:
     case = reconstruction._Case(10, 32, CPU)
     few, many = (case(1, {"iterations": n, "start_gaussians": 800}) for n in (5, 80))
-    assert many.error < 0.8 * few.error < 0.8
+    # five steps are cut at the hull, too, so the silhouette is right from the start
+    assert many.error < 0.9 * few.error < 0.8
     assert many.measures["PSNR [dB]"] == pytest.approx(-20.0 * math.log10(many.error))
     assert many.settings["steps"] == 80
