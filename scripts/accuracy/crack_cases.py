@@ -52,8 +52,8 @@ class Case:
 
 
 CASES = {
-    "melon": Case("watermelon", "fruit.watermelon", 1.0, 0.8),
-    "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.0, 0.8, isotropic=True),
+    "melon": Case("watermelon", "fruit.watermelon", 1.5, 0.9),
+    "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.5, 0.9, isotropic=True),
     "marble": Case("marble", "fruit.watermelon", 1.5, 0.8),
     "bread": Case("bread", "fruit.watermelon", 1.2, 0.8),
 }
