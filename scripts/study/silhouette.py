@@ -2,6 +2,7 @@
 
     python scripts/study/silhouette.py [--capture apple] [--iterations 1000] [--size 320]
 
+Every run is a line of docs/measured/data/silhouette.jsonl and a row of docs/measured/silhouette.md.
 The hull is carved anew from the silhouettes of the result in all photographs, those held out as
 well, twice as fine as that of the training. Needs the data folder (GSFLUENT_DATA, or ../shared/data
 beside the checkout).
@@ -18,13 +19,19 @@ from pathlib import Path
 import torch
 
 from gsfluent.data import BACKGROUND, SURFACE
+from gsfluent.figure.markdown import enter
 from gsfluent.io import load_capture
+from gsfluent.io.atomic import atomic_path
 from gsfluent.pipeline import Reconstruct
 from gsfluent.pipeline.capture import read_views, visual_hull
 from gsfluent.pipeline.reconstruct.evaluate import hair
 from gsfluent.pipeline.reconstruct.masks import object_views
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "measured" / "silhouette.md"
+LINES = PAGE.parent / "data" / "silhouette.jsonl"
+HEAD = ("capture", "steps", "pixels", "psnr", "psnr_inside", "object_gaussians", "sticking_out",
+        "needles", "slivers")  # fmt: skip
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data"))
 FINE = 192  # voxels along the longest side of the hull
 
@@ -51,6 +58,18 @@ def main() -> int:
         views, _ = object_views(views, found, rest)
     figures = {name: result.report[name] for name in ("psnr", "psnr_inside", "object_gaussians")}
     figures |= hair(found, visual_hull(views, FINE))
+    key = {"capture": given.capture, "steps": given.iterations, "pixels": given.size}
+    rows = [json.loads(line) for line in LINES.read_text().splitlines()] if LINES.exists() else []
+    rows = [row for row in rows if any(row[name] != key[name] for name in key)]
+    rows.append(key | figures)
+    with atomic_path(LINES) as part:
+        part.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    table = ["| " + " | ".join(HEAD) + " |", "|" + " --- |" * len(HEAD)]
+    table += ["| " + " | ".join(f"{row[name]:.5g}" if isinstance(row[name], float) else
+              str(row[name]) for name in HEAD) + " |" for row in rows]  # fmt: skip
+    text = enter(PAGE.read_text(encoding="utf-8"), "silhouette", "\n".join(table))
+    with atomic_path(PAGE) as part:
+        part.write_text(text, encoding="utf-8")
     sys.stdout.write(json.dumps(figures) + "\n")
     return 0
 
