@@ -17,6 +17,7 @@ from gsfluent.data import Gaussians, Solid
 from gsfluent.pipeline.cracks.cuts import REACH, cut_at
 from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
 from gsfluent.pipeline.partition.tree import Partition, Split
+from gsfluent.spatial.neighbours import nearest_rows
 
 INSET = 0.15
 """How far below its face an element lies, in voxels."""
@@ -251,3 +252,37 @@ def find_cuts(
     return region, ChunkCuts(
         rows[found], table[second], normal[cut], distance[cut], torch.full_like(second, -1)
     )
+
+
+def wide_cuts(
+    splats: Gaussians, rows: Tensor, region: Tensor, cuts: ChunkCuts, faces: ChunkFaces, cell: float
+) -> ChunkCuts:
+    """Add cuts of splats that reach a face from farther than the partition's distance goes.
+
+    A flat patch of skin may be one splat of many points' width. It is cut at the plane through the
+    nearest element of its region, across the way there.
+
+    Args:
+        splats: At rest.
+        rows: Those of the region that was split, int64 [M].
+        region: Region of each now, int64 [M].
+        cuts: Those near the face.
+        faces: Elements that the split made.
+        cell: Cell of the search [m].
+    """
+    known = torch.isin(rows, cuts.splat) | ~torch.isin(region, faces.region)
+    wide = (~known & (REACH * splats.scales[rows].amax(dim=1) > cell)).nonzero()[:, 0]
+    found = [cuts]
+    for number in torch.unique(region[wide]).tolist():
+        mine = rows[wide[region[wide] == number]]
+        its = (faces.region == number).nonzero()[:, 0]
+        means = splats.means[mine]
+        way, near = nearest_rows(faces.means[its], means, 1, cell)
+        element, distance = its[near[:, 0]], way[:, 0].to(means)
+        normal = (faces.means[element] - means) / distance.clamp(min=1e-12)[:, None]
+        root = geometry.quaternion_to_matrix(splats.quats[mine]) * splats.scales[mine, None]
+        across = (distance > 0.0) & (distance < REACH * (normal[:, None] @ root)[:, 0].norm(dim=1))
+        beyond = faces.beyond[element]
+        parts = (mine, beyond, normal, distance, torch.full_like(beyond, -1))
+        found.append(ChunkCuts(*(part[across] for part in parts)))
+    return ChunkCuts(*(torch.cat(parts) for parts in zip(*found, strict=True)))

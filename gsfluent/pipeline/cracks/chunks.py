@@ -20,7 +20,13 @@ from torch import Tensor
 from gsfluent import geometry, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.cracks.chunk_faces import ChunkCuts, ChunkFaces, find_cuts, find_faces
+from gsfluent.pipeline.cracks.chunk_faces import (
+    ChunkCuts,
+    ChunkFaces,
+    find_cuts,
+    find_faces,
+    wide_cuts,
+)
 from gsfluent.pipeline.cracks.cuts import cut_at
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
@@ -253,9 +259,11 @@ class Chunks:
         wrong = self._chunk[owner] != here
         owner[wrong] = self._nearest(means[wrong], here[wrong], rows)
         self._owner = self._owner.index_copy(0, splats, owner)
+        made = find_faces(partition, split, solid, len(self._events) - 1)
+        spacing = matter.spacing[body]
+        cuts = wide_cuts(self.base.gaussians, splats, here, cuts, made, spacing)
         rival = self._nearest(self.base.gaussians.means[cuts.splat], cuts.beyond, rows)
         self._cuts.append(cuts._replace(rival=rival))
-        made = find_faces(partition, split, solid, len(self._events) - 1)
         made = dataclasses.replace(
             made,
             owner=self._nearest(made.means, made.region, rows),

@@ -10,6 +10,7 @@ from gsfluent import materials, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
+from gsfluent.pipeline.cracks.chunk_faces import ChunkCuts, ChunkFaces, wide_cuts
 from gsfluent.pipeline.cracks.chunks import OPACITY
 from gsfluent.pipeline.cracks.stage import Repair, Repaired
 from gsfluent.pipeline.matter.carry import Carry, Points
@@ -205,3 +206,29 @@ def test_the_same_chunks_on_a_gpu() -> None:
         found.append((cracks.births.ids.cpu().sort()[0], cracks.carry.owner.cpu()))
     assert torch.equal(found[0][0], found[1][0])
     assert torch.equal(found[0][1], found[1][1])
+
+
+def test_a_splat_wider_than_its_points_is_cut_from_afar() -> None:
+    """A flat patch of skin is one splat: it reaches a face that its centre is far from."""
+    line = torch.linspace(-0.05, 0.05, 41)
+    y, z = torch.meshgrid(line, line, indexing="ij")
+    places = torch.stack([torch.zeros_like(y), y, z], dim=-1).reshape(-1, 3)
+    count = len(places)
+    whole = torch.arange(count)
+    faces = ChunkFaces(
+        whole, whole, torch.ones_like(whole), torch.full_like(whole, 2), places,
+        torch.zeros(count, 4), torch.full((count, 3), 1e-3), places, places, whole, whole,
+    )  # fmt: skip
+    means = torch.tensor([[-0.02, 0.0, 0.0], [-0.02, 0.01, 0.0], [-0.02, 0.0, 0.01], [0.02, 0, 0]])
+    scales = torch.tensor([[0.015] * 3, [0.002] * 3, [0.002, 0.015, 0.015], [0.015] * 3])
+    splats = Gaussians.from_colors(means, scales, torch.full((4, 3), 0.5))
+    region = torch.tensor([1, 1, 1, 3])
+    none = torch.zeros(0, dtype=torch.int64)
+    before = ChunkCuts(none, none, torch.zeros(0, 3), torch.zeros(0), none)
+    cuts = wide_cuts(splats, torch.arange(4), region, before, faces, 0.004)
+    # not what is small, lies along the face, or belongs to another region
+    assert cuts.splat.tolist() == [0] and cuts.beyond.tolist() == [2]
+    assert torch.allclose(cuts.normal, torch.tensor([[1.0, 0.0, 0.0]]), atol=1e-5)
+    assert float(cuts.distance) == pytest.approx(0.02, rel=1e-4)
+    again = wide_cuts(splats, torch.arange(4), region, cuts, faces, 0.004)
+    assert again.splat.tolist() == [0]
