@@ -121,10 +121,6 @@ class Cake(DistanceObject):
         label[depth < 0] = 0
         return label
 
-    def parts(self, points: Tensor) -> Tensor:
-        """As :meth:`labels`."""
-        return self.labels(points)
-
     def interior(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.interior`."""
         p = self._local(points).to(torch.float32)

@@ -44,6 +44,10 @@ class DistanceObject(DemoObject):
         """See :meth:`DemoObject.depth`."""
         return -self.level(points)
 
+    def parts(self, points: Tensor) -> Tensor:
+        """As :meth:`labels`: there are no seeds to tell apart."""
+        return self.labels(points)
+
     def normal(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.normal`."""
         wide = points.to(torch.float64)

@@ -13,7 +13,15 @@ WALL = 1
 SHELL, WHITE, YOLK = 1, 3, 5
 
 
-class Pane(DistanceObject):
+class _OneMatter(DistanceObject):
+    """The same all through, but for its colours."""
+
+    def labels(self, points: Tensor) -> Tensor:
+        """Class of each point, int64 [N]: 0 outside, 1 inside."""
+        return (self.level(points) <= 0.0).long() * WALL
+
+
+class Pane(_OneMatter):
     """A shelf of frosted float glass, 160 x 110 x 10 mm, lying flat.
 
     Frosted, because splats are drawn opaque: clear glass would need refraction.
@@ -27,14 +35,6 @@ class Pane(DistanceObject):
     def distance(self, local: Tensor) -> Tensor:
         """See :meth:`DistanceObject.distance`."""
         return rounded_box(local, local.new_tensor(self.axes), 0.001)
-
-    def labels(self, points: Tensor) -> Tensor:
-        """Class of each point, int64 [N]: 0 outside, 1 glass."""
-        return (self.level(points) <= 0.0).long() * WALL
-
-    def parts(self, points: Tensor) -> Tensor:
-        """As :meth:`labels`."""
-        return self.labels(points)
 
     def surface_color(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.surface_color`."""
@@ -57,7 +57,7 @@ class Pane(DistanceObject):
         return mix(self.surface_color(points), fresh, smoothstep(0.0003, 0.0010, depth))
 
 
-class Bowl(DistanceObject):
+class Bowl(_OneMatter):
     """A bowl of pressed opal glass, 0.12 m wide and 0.05 m high, its wall 9 mm.
 
     Opal, because splats are drawn opaque: clear glass would need refraction.
@@ -107,14 +107,6 @@ class Bowl(DistanceObject):
         skin = smoothstep(0.0012, 0.0004, depth)
         return mix(fresh, self.surface_color(points), skin).clamp(0.0, 1.0)
 
-    def labels(self, points: Tensor) -> Tensor:
-        """Class of each point, int64 [N]: 0 outside, 1 glass."""
-        return (self.level(points) <= 0.0).long() * WALL
-
-    def parts(self, points: Tensor) -> Tensor:
-        """As :meth:`labels`."""
-        return self.labels(points)
-
 
 class Egg(DistanceObject):
     """A brown hen's egg on its side, 57 mm long and 44 mm thick, its blunt end towards -x.
@@ -163,10 +155,6 @@ class Egg(DistanceObject):
         label[depth < 0] = 0
         return label
 
-    def parts(self, points: Tensor) -> Tensor:
-        """As :meth:`labels`."""
-        return self.labels(points)
-
     def interior(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.interior`."""
         p = self._local(points).to(torch.float32)
@@ -182,7 +170,7 @@ class Egg(DistanceObject):
         return mix(shell, color, smoothstep(0.0022, 0.0028, depth)).clamp(0.0, 1.0)
 
 
-class Chocolate(DistanceObject):
+class Chocolate(_OneMatter):
     """A bar of milk chocolate, 120 x 58 x 12 mm: six times three blocks, grooves 5 mm deep."""
 
     name = "chocolate"
@@ -206,14 +194,6 @@ class Chocolate(DistanceObject):
         floor = self.axes[2] - self.groove
         wedge = 0.8 * (away - 0.0005) - 0.6 * (local[:, 2] - floor)
         return torch.maximum(slab, -torch.maximum(wedge, floor - local[:, 2]))
-
-    def labels(self, points: Tensor) -> Tensor:
-        """Class of each point, int64 [N]: 0 outside, 1 chocolate."""
-        return (self.level(points) <= 0.0).long() * WALL
-
-    def parts(self, points: Tensor) -> Tensor:
-        """As :meth:`labels`."""
-        return self.labels(points)
 
     def surface_color(self, points: Tensor) -> Tensor:
         """See :meth:`DemoObject.surface_color`."""

@@ -51,6 +51,8 @@ SHEAR = 0.03
 """Shear damage of what is given by strengths: enough that crushed matter loses its tension, too,
 and so little that what is pressed hard cracks before it is powder (a plaster ball that falls 0.75 m
 is whole, with 0.5 it is crushed)."""
+_PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness"}
+"""What only brittle matter reads, as it is in other matter."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
 
@@ -187,8 +189,7 @@ class Material:
             if isinstance(value, Tensor):
                 raise InputError(f"material {self.name!r}: {field} must be one number")
             _check_number(self.name, field, value, low, high, unit)
-        plain = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness"}
-        for field, nothing in plain.items() if self.law != "nacc" else ():
+        for field, nothing in _PLAIN.items() if self.law != "nacc" else ():
             if getattr(self, field) != nothing:
                 raise InputError(
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
@@ -233,8 +234,7 @@ class Material:
             dropped = [f for f in PARAMETERS if f not in READS[law] and f not in changes]
             changes = {**dict.fromkeys(dropped), **changes}
             if law != "nacc":
-                plain = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness"}
-                changes = {**plain, "parts": (), **changes}
+                changes = {**_PLAIN, "parts": (), **changes}
         if "variation" in changes:
             changes = {"weibull_modulus": 0.0, **changes}
         changes = self._softened(changes)

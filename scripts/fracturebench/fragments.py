@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "study"))
-from fracture_resolution import thrown
+from fracture_resolution import numbers, thrown
 
 from gsfluent.figure.markdown import enter
 from gsfluent.figure.style import COLORS, OURS, new_figure, save_png
@@ -250,11 +250,6 @@ def page(lines: Path, device: str) -> int:
         file.write_text(text, encoding="utf-8")
     draw(found, PICTURE)
     return 0
-
-
-def numbers(text: str) -> tuple[int, ...]:
-    """Read ``4,6``."""
-    return tuple(sorted(int(n) for n in text.split(",") if n))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -137,7 +137,8 @@ class FilmFigures:
         """
         index = len(self._values["flicker"])
         view = small(camera)
-        matter = MatterView.of(frame.shown, frame.volumes, view)
+        places = frame.shown
+        matter = MatterView.of(places, frame.volumes, view)
         film = Holes.of(alpha, depth, matter)
         for values in self._values.values():
             values.append(None)
@@ -158,10 +159,10 @@ class FilmFigures:
         drawn = [_drawn(splats, view, groups) for splats, groups in shown]
         self._enter("", [_holes(drawn[0], _bare(frame, matter, view)), film])
         images = [picture.image for picture in drawn]
-        self._enter_flicker(_Last(index, matter, view, frame.shown, images))
+        self._enter_flicker(_Last(index, matter, view, places, images))
         if self._around:
             view = self._around[index % len(self._around)]
-            matter = MatterView.of(frame.shown, frame.volumes, view)
+            matter = MatterView.of(places, frame.volumes, view)
             drawn = [_drawn(splats, view, groups) for splats, groups in shown]
             before = _holes(drawn[0], _bare(frame, matter, view))
             self._enter("_around", [before, _holes(drawn[1], matter)])
