@@ -146,13 +146,18 @@ def simulate_stage(context: RunContext) -> None:
             for old in (STRIKES, PARTITION):  # of other settings
                 (folder / old).unlink(missing_ok=True)
         strikes = Strikes(scene, frames.run.matter, folder)
+        written: tuple[int, int] | None = None
         for frame in frames:
             save_frame(folder, saved(frame, scene))
             strikes.see(frame)
             assert frames.history is not None  # a run of a shot carries splats
             partition = frames.history.partition()
             if partition is not None:
-                save_partition(folder, partition)
+                # both only grow, and all else of it stays
+                grown = len(partition.splits), len(partition.crumbs)
+                if grown != written:
+                    save_partition(folder, partition)
+                written = grown
             # after the frame: a state on disk always has its picture
             frames.save(state)
         unbroken, report = strikes.unbroken(), frames.report
