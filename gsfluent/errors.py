@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import reprlib
 from collections.abc import Iterable
 from types import ModuleType
 
@@ -38,12 +39,40 @@ class InputError(GsfluentError, ValueError):
         super().__init__(f"{what}\n  hint: {hint}" if hint else what)
 
 
+class _Short(reprlib.Repr):
+    """``repr`` of what a file held, however large or nested it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel = 3
+        self.maxdict = self.maxlist = self.maxtuple = self.maxset = 6
+        self.maxstring = self.maxother = 120
+
+    def repr_int(self, x: int, level: int) -> str:
+        """A whole number; Python refuses to print those of thousands of digits."""
+        if x.bit_length() < 200:
+            return str(x)
+        return f"{'-' if x < 0 else ''}2^{x.bit_length() - 1} or more"
+
+
+def short(value: object, *, bare: bool = False) -> str:
+    """What a message shows of a value that came in: its ``repr``, cut.
+
+    Args:
+        value: Anything.
+        bare: Of text: itself, without quotes.
+    """
+    if isinstance(value, str) and bare:
+        return value if len(value) <= 400 else f"{value[:200]}...{value[-100:]}"
+    return _Short().repr(value)
+
+
 def check_choice(what: str, value: object, allowed: Iterable[object], hint: str = "") -> None:
     """Raise :class:`InputError` unless ``value`` is one of ``allowed``; ``what`` names it."""
     names = list(allowed)
     if value not in names:
         listed = ", ".join(str(name) for name in names if name != "")
-        raise InputError(f"{what} must be one of {listed}, got {value!r}", hint)
+        raise InputError(f"{what} must be one of {listed}, got {short(value)}", hint)
 
 
 class MissingPackage(InputError):

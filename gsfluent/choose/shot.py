@@ -16,6 +16,7 @@ from gsfluent.errors import InputError, MissingPackage
 from gsfluent.io import write_json
 from gsfluent.plan.proxy import proxy
 from gsfluent.progress import LineReporter, Reporter
+from gsfluent.results.lock import locked
 from gsfluent.results.store import publish
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.context import RunContext
@@ -92,9 +93,9 @@ def shot_scene(
         InputError: The shot is wrong.
     """
     if make or (out / "stages" / "texture" / "stage.json").is_file():
-        out.mkdir(parents=True, exist_ok=True)
         context = context_of(shot, out, device, seed, reporter)
-        make_solids(context)
+        with locked(out):
+            make_solids(context)
         return build_scene(shot, load_solids(context), context.frame), f"the stages in {out}"
     warnings: list[str] = []
     found = proxy(shot, warnings)
@@ -205,9 +206,9 @@ def choose_stage(context: RunContext) -> bool:
         return result
 
     result = context.do("choose", work, moving_settings(shot), bound, hands_on=False)
-    publish(result.folder / FILE, context.out / FILE)
+    publish(result, FILE, context.out / FILE)
     if (result.folder / PICTURE).is_file():
-        publish(result.folder / PICTURE, context.out / PICTURE)
+        publish(result, PICTURE, context.out / PICTURE)
         context.record.values["outputs"]["chart"] = PICTURE
     found = result.report
     context.record.values["choice"] = {k: v for k, v in found.items() if k != "settings"}

@@ -26,6 +26,8 @@ class Verb:
     """Where the heavy work runs."""
     seed: int = 0
     """Seed of everything random."""
+    allow_outside: bool = False
+    """Let a capture name files outside its folder."""
 
     def execute(self) -> dict[str, Any]:
         """Do the work and return what ``--json`` prints."""

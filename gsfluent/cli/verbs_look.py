@@ -10,7 +10,6 @@ import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
 from gsfluent.errors import InputError
-from gsfluent.io.solid import load_solid
 
 
 @dataclass(kw_only=True)
@@ -95,7 +94,7 @@ class Inspect(Verb):
 def _regions(path: Path, out: Path) -> dict[str, Any] | None:
     """The regions of a solid; None for a splat, or a solid without any."""
     from gsfluent.inspection.shot import inspect_solid
-    from gsfluent.io.solid import volume_path
+    from gsfluent.io.solid import load_solid, volume_path
 
     if not volume_path(path).is_file() or load_solid(path).regions is None:
         return None

@@ -21,7 +21,12 @@ class Run(Verb):
       gsfluent run shot.yaml -o out            # again: only what changed or was cut short
       gsfluent run shot.yaml -o out --force    # redo everything
       gsfluent run shot.yaml -o out --json     # run.json on stdout
+      gsfluent run vase.glb -o out             # a mesh, dropped; also a splat.ply or a capture
+      gsfluent run vase.glb -o out --material glass
       gsfluent run MODEL --config c.json -o out     # a PhysGaussian model folder and its config
+
+    Without a shot one is made, which breaks the object on the floor, and is written to
+    out/shot.yaml to be edited.
 
     The smallest useful shot.yaml:
       capture: captures/apple
@@ -29,40 +34,59 @@ class Run(Verb):
         - {type: drop, height: 1.0}
     """
 
-    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
-    """The shot file, or with --config a model folder of the INRIA trainer."""
+    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """The shot file; or a mesh, a splat or a folder; or with --config a model folder of INRIA's."""
     out: Out
     """Folder for the results; made when missing."""
+    material: str | None = None
+    """Without a shot: what the object is made of, a preset; guessed and said when absent."""
     config: Path | None = None
     """PhysGaussian's JSON config of the model; see docs/guide/physgaussian.md."""
     write_shot: bool = False
     """With --config: only write OUT/physgaussian/shot.yaml and say what became of every key."""
     force: bool = False
     """Redo every stage."""
+    unlock: bool = False
+    """Go on in a folder that a run on another machine has locked and left."""
+    untrusted: bool = False
+    """Refuse a shot that starts a program or loads a model: for shots of strangers."""
 
     def execute(self) -> dict[str, Any]:
         """Run the shot."""
-        from gsfluent.config import load_shot
+        from gsfluent.config import load_shot, refuse_programs
         from gsfluent.run.shot import run_shot
 
         if self.config is None:
             if self.write_shot:
                 raise InputError("--write-shot does nothing without --config", "drop it")
-            path, facts = existing(self.shot, "SHOT.yaml", folder=False), None
+            path, facts = existing(self.shot, "INPUT"), None
+            if path.suffix.lower() not in (".yaml", ".yml"):
+                from gsfluent.run.from_input import made_shot
+
+                path = made_shot(path, self.out, self.material)
+            elif self.material is not None:
+                raise InputError(
+                    "--material does nothing with a shot", "write it there: objects: NAME: material"
+                )
         else:
             from gsfluent.config.physgaussian.read import convert
+            from gsfluent.results.lock import locked
 
             folder = self.out / "physgaussian"
-            made = convert(existing(self.shot, "MODEL", folder=True), self.config, folder)
+            model = existing(self.shot, "MODEL", folder=True)
+            with locked(self.out, unlock=self.unlock):
+                made = convert(model, self.config, folder)
             path, facts = folder / "shot.yaml", {"physgaussian": made.report()}
             if self.write_shot:
                 return {"shot": str(path), **facts["physgaussian"]}
         shot = load_shot(path)
+        if self.untrusted:
+            refuse_programs(shot, path)
         device = self.torch_device()
         with self.reporter() as report:
             return run_shot(
                 shot, self.out, device=device, seed=self.seed, force=self.force, reporter=report,
-                facts=facts,
+                facts=facts, unlock=self.unlock,
             )  # fmt: skip
 
 
@@ -90,6 +114,8 @@ class Demo(Verb):
     """Only photograph the object into this folder: photographs/, cut.png, truth.npz."""
     force: bool = False
     """Redo every stage."""
+    unlock: bool = False
+    """Go on in a folder that a run on another machine has locked and left."""
 
     def execute(self) -> dict[str, Any]:
         """Run the demo."""
@@ -107,7 +133,7 @@ class Demo(Verb):
                 self.out,
                 device=device,
                 reporter=report,
-                **self.given("size", "seed", "force"),
+                **self.given("size", "seed", "force", "unlock"),
             )
 
 

@@ -8,7 +8,7 @@ from gsfluent.config.colliders import COLLIDERS, ColliderSettings
 from gsfluent.config.events import EVENTS, Bullet, Drop, Throw
 from gsfluent.config.objects import ObjectSettings, Select
 from gsfluent.config.read import typed_dict
-from gsfluent.config.shot import Shot, load_shot
+from gsfluent.config.shot import Shot, load_shot, refuse_programs
 
 __all__ = [
     "COLLIDERS",
@@ -21,5 +21,6 @@ __all__ = [
     "Shot",
     "Throw",
     "load_shot",
+    "refuse_programs",
     "typed_dict",
 ]

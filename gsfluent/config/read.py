@@ -7,13 +7,15 @@ import difflib
 import logging
 import math
 import os
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
 
 _Section = TypeVar("_Section")
+_LARGEST = sys.float_info.max
 _log = logging.getLogger(__name__)
 
 
@@ -31,7 +33,7 @@ class Place:
     def error(self, wanted: str, got: Any, hint: str = "") -> InputError:
         """Make the error ``{path} must {wanted}, got {got}``."""
         return InputError(
-            f"{self.path} must {wanted}, got {got!r}", hint or "correct the shot file"
+            f"{self.path} must {wanted}, got {short(got)}", hint or "correct the shot file"
         )
 
 
@@ -76,7 +78,9 @@ def key_name(field: dataclasses.Field[Any]) -> str:
 def nearest(word: Any, known: Iterable[str]) -> str:
     """Suggest the nearest known word, then list them all."""
     words = list(known)
-    close = difflib.get_close_matches(str(word), words, n=1, cutoff=0.4)
+    close = difflib.get_close_matches(
+        str(word)[:80] if isinstance(word, str) else "", words, n=1, cutoff=0.4
+    )
     return (f"did you mean {close[0]!r}? " if close else "") + f"known: {', '.join(words)}"
 
 
@@ -149,7 +153,8 @@ def number(low: float = -math.inf, high: float = math.inf, *, above: float | Non
                 raise place.error("be a number", value) from None
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise place.error("be a number", value)
-        if not math.isfinite(value) or not low <= value <= high:
+        # not isfinite(), which fails for a whole number of hundreds of digits
+        if not -_LARGEST <= value <= _LARGEST or not low <= value <= high:
             raise place.error(f"lie in {low:g}..{high:g}", value)
         if above is not None and not value > above:
             raise place.error(f"be above {above:g}", value)
@@ -246,7 +251,9 @@ def typed(value: Any, place: Place, known: Mapping[str, type[Any]], noun: str) -
         settings = mapping(item, where)
         kind = settings.pop("type", None)
         if not isinstance(kind, str) or kind not in known:
-            raise InputError(f"{where.path}.type: unknown {noun} {kind!r}", nearest(kind, known))
+            raise InputError(
+                f"{where.path}.type: unknown {noun} {short(kind)}", nearest(kind, known)
+            )
         found.append(section(known[kind], settings, where))
     return tuple(found)
 
@@ -297,16 +304,49 @@ def existing_path(value: Any, place: Place) -> Path:
     written = os.path.expandvars(text(value, place))
     if "$" in written:
         raise InputError(
-            f"{place.path}: {value} names an environment variable that is not set",
+            f"{place.path}: {short(value)} names an environment variable that is not set",
             "set it, or write the path out",
         )
-    path = (place.folder / Path(written).expanduser()).resolve()
-    if not path.exists():
+    try:
+        path = (place.folder / Path(written).expanduser()).resolve()
+        there = path.exists()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, an unknown ~user
+        why = error.strerror if isinstance(error, OSError) else error
         raise InputError(
-            f"{place.path}: {path} does not exist",
+            f"{place.path}: {short(written)} is no path ({why})", "correct the path"
+        ) from error
+    if not there:
+        raise InputError(
+            f"{place.path}: {short(str(path), bare=True)} does not exist",
             "check the path; it starts from the shot file's folder",
         )
     return path
+
+
+INPUTS = {"capture": "a capture", "splats": "a splat", "mesh": "a mesh"}
+"""Keys of a shot that name its input, and what they take in words."""
+
+
+def input_path(key: str) -> Reader:
+    """Reader of a path for one of :data:`INPUTS`; what belongs under another is told which."""
+
+    def read(value: Any, place: Place) -> Path:
+        from gsfluent.io.capture import kind_of
+
+        path = existing_path(value, place)
+        kind = kind_of(path)
+        if kind in INPUTS and kind != key:
+            raise InputError(
+                f"{place.path}: {value} is {INPUTS[kind]}, not {INPUTS[key]}",
+                f"write {kind}: {value}",
+            )
+        if key == "mesh" and kind is None:
+            raise InputError(
+                f"{place.path}: {value} is no mesh", "give .obj, .glb, .stl, .ply, .off or .dae"
+            )
+        return path
+
+    return read
 
 
 def nested(cls: type[Any]) -> Reader:

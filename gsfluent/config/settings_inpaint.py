@@ -19,7 +19,7 @@ from gsfluent.config.read import (
     text,
     whole,
 )
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,8 +110,10 @@ def read_inpaint(words: Sequence[str]) -> dict[str, Any]:
         name, separator, value = word.partition("=")
         try:
             found[name] = yaml.safe_load(value) if separator else None
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError):
             separator = ""
         if not separator or found[name] is None:
-            raise InputError(f"--inpaint takes name=value, got {word!r}", "write it like tile=2")
+            raise InputError(
+                f"--inpaint takes name=value, got {short(word)}", "write it like tile=2"
+            )
     return section(InpaintSettings, found, Place("inpaint", Path())).given()

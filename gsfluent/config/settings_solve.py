@@ -85,6 +85,12 @@ class SolveSettings:
         "and `cells`: as many cells as that allows, by the cost model of `gsfluent plan`.",
         "0.5",
     )
+    max_hours: float = key(
+        number(above=0.0),
+        "A run is refused whose simulation the plan expects to take longer than this [h].",
+        "100",
+        default=24.0,
+    )
     standing: bool = key(
         flag,
         "What stands still on the floor sleeps from the start, without a strain, until "

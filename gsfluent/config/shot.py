@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,11 @@ from gsfluent.config.colliders import COLLIDERS, ColliderSettings, read_collider
 from gsfluent.config.events import EVENTS, Event, read_events
 from gsfluent.config.objects import ObjectSettings, read_objects
 from gsfluent.config.read import (
+    INPUTS,
     Place,
     choice,
     either,
-    either_of,
-    existing_path,
+    input_path,
     key,
     nearest,
     nested,
@@ -40,12 +40,12 @@ from gsfluent.config.settings import (
 )
 from gsfluent.config.settings_light import LightSettings
 from gsfluent.config.settings_solve import SolveSettings, read_solve
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-def _up(value: Any, place: Place) -> str | tuple[float, ...]:
+def _axis(value: Any, place: Place) -> str | tuple[float, ...]:
     if not isinstance(value, str):
         return read_direction(value, place)
     if value == "auto":
@@ -62,12 +62,20 @@ class Shot:
     """One shot: what is read, what happens to it, what is written. Paths are absolute."""
 
     capture: Path | None = optional(
-        existing_path,
-        "Folder with a COLMAP model or transforms.json (this or splats).",
+        input_path("capture"),
+        "Folder with a COLMAP model or transforms.json (this, splats or mesh).",
         "captures/apple",
     )
     splats: Path | None = optional(
-        existing_path, "Trained 3DGS .ply (this or capture).", "melon.ply"
+        input_path("splats"),
+        "Trained 3DGS .ply, or a solid that `gsfluent fill` wrote (this, capture or mesh).",
+        "melon.ply",
+    )
+    mesh: Path | None = optional(
+        input_path("mesh"),
+        "Triangle mesh: .obj, .glb, .stl, .ply and others, with texture or vertex colours "
+        "(this, capture or splats).",
+        "vase.glb",
     )
     scale: float | None = optional(
         number(above=0.0), "Metres per world unit; from size when absent.", "0.08"
@@ -76,7 +84,14 @@ class Shot:
         number(above=0.0), "Largest extent of the object [m], instead of scale.", "0.08"
     )
     up: str | Vector = key(
-        _up, "Up axis of the input: auto, +x to -z, or [x, y, z].", "-y", default="auto"
+        _axis, "Up axis of the input: auto, +x to -z, or [x, y, z].", "-y", default="auto"
+    )
+    front: str | Vector = key(
+        _axis,
+        "Side of the input that faces the camera when the film begins: auto (the first photograph; "
+        "without one the custom of the axes), +x to -z, or [x, y, z].",
+        "+x",
+        default="auto",
     )
     floor: str | float = key(
         either(choice("auto", "none", "plane"), number()),
@@ -155,18 +170,28 @@ class Shot:
                 its path.
         """
         shot = section(Shot, values, Place("", Path(folder)))
-        either_of(shot, ("capture", "splats"), Place("the shot", Path()), "name one input")
+        named = [name for name in INPUTS if getattr(shot, name) is not None]
+        if len(named) != 1:
+            got = " and ".join(named) or "none"
+            raise InputError(
+                f"the shot must have one of {', '.join(INPUTS)}, got {got}", "name one input"
+            )
         if shot.scale is not None and shot.size is not None:
             raise InputError(
                 "'scale' and 'size' both set the size of the object", "keep one of them"
             )
-        if shot.splats is not None and shot.reconstruct != ReconstructSettings():
+        if shot.capture is None and shot.reconstruct != ReconstructSettings():
             raise InputError(
-                "reconstruct: does nothing when splats are given", "remove the section"
+                f"reconstruct: does nothing when {named[0]} is given", "remove the section"
+            )
+        if shot.mesh is not None and shot.fill.method != "auto":
+            raise InputError(
+                f"fill.method: {shot.fill.method} does nothing with a mesh, whose inside is known",
+                "remove the key",
             )
         if shot.floor == "plane" and shot.capture is None:
             raise InputError(
-                "floor: plane is found in a capture, got splats", "use auto, or its height"
+                f"floor: plane is found in a capture, got {named[0]}", "use auto, or its height"
             )
         if shot.capture is None:
             _refuse_photographs(shot.objects)
@@ -181,7 +206,7 @@ class Shot:
             for name in [one] if one is not None else getattr(event, "objects", ()):
                 if name not in shot.objects:
                     raise InputError(
-                        f"events[{index}]: no object is called {name!r}",
+                        f"events[{index}]: no object is called {short(name)}",
                         nearest(name, shot.objects),
                     )
         return shot
@@ -202,8 +227,7 @@ def _refuse_photographs(objects: Mapping[str, ObjectSettings]) -> None:
             for kind in ("mask", "labels"):
                 if getattr(part.where, kind) is not None:
                     raise InputError(
-                        f"objects.{name}.parts.{part.name}.where.{kind} needs photographs, "
-                        "got splats",
+                        f"objects.{name}.parts.{part.name}.where.{kind} needs photographs",
                         "start from the capture, or use label_image",
                     )
 
@@ -215,8 +239,14 @@ def load_shot(path: str | Path) -> Shot:
         InputError: Missing file, invalid YAML, or anything :meth:`Shot.from_dict` refuses.
     """
     from gsfluent.config.yaml_file import read_yaml
+    from gsfluent.io.capture import kind_of
 
     path = Path(path)
+    if (kind := kind_of(path)) in INPUTS:
+        raise InputError(
+            f"{path}: {INPUTS[kind]} is no shot file",
+            f"write {kind}: {path.name} into a shot.yaml, or gsfluent run {path.name} -o out",
+        )
     values = read_yaml(path)
     if not isinstance(values, Mapping):
         raise InputError(
@@ -227,3 +257,31 @@ def load_shot(path: str | Path) -> Shot:
         return Shot.from_dict(values, path.resolve().parent)
     except InputError as error:
         raise InputError(f"{path}: {error.what}", error.hint) from error
+
+
+_STARTS = ("command", "model", "ip_adapter", "controlnet")
+"""Keys whose values start a program, or load a model, which may hold one."""
+
+
+def refuse_programs(shot: Shot, source: str | Path) -> None:
+    """Refuse a shot that would start a program of its own or load a model.
+
+    Args:
+        shot: The shot.
+        source: Where it is from, for the message.
+
+    Raises:
+        InputError: It would.
+    """
+
+    def found(value: Any, path: str) -> Iterator[str]:
+        for name, item in value.items() if isinstance(value, dict) else ():
+            if name in _STARTS:
+                yield f"{path}{name}"
+            yield from found(item, f"{path}{name}.")
+
+    for path in found(shot.resolved(), ""):
+        raise InputError(
+            f"{source}: {path} starts a program or loads a model, and the shot is not trusted",
+            "remove the key, or leave --untrusted out when you know who wrote it",
+        )

@@ -3,7 +3,14 @@
 from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture, View
 from gsfluent.data.frame import Frame
-from gsfluent.data.gaussians import BACKGROUND, INTERIOR, SURFACE, TRANSITION, Gaussians
+from gsfluent.data.gaussians import (
+    BACKGROUND,
+    INTERIOR,
+    SPRAY,
+    SURFACE,
+    TRANSITION,
+    Gaussians,
+)
 from gsfluent.data.particles import Particles
 from gsfluent.data.solid import Solid
 
@@ -11,6 +18,7 @@ __all__ = [
     "BACKGROUND",
     "INTERIOR",
     "SURFACE",
+    "SPRAY",
     "TRANSITION",
     "Camera",
     "Capture",

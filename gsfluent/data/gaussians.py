@@ -14,8 +14,9 @@ from gsfluent.data._fields import TensorContainer, shape
 from gsfluent.data.frame import Frame
 from gsfluent.errors import InputError
 
-SURFACE, INTERIOR, TRANSITION, BACKGROUND = 0, 1, 2, 3
-"""Values of ``Gaussians.labels``: where a splat came from."""
+SURFACE, INTERIOR, TRANSITION, BACKGROUND, SPRAY = 0, 1, 2, 3, 4
+"""Values of ``Gaussians.labels``: where a splat came from. ``SPRAY`` is what flies as single grains
+and drops, which is no body."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,8 +30,8 @@ class Gaussians(TensorContainer):
             logarithms).
         opacities: Peak opacities [N] in 0..1 (not logits).
         sh: Spherical-harmonic colours [N, K, 3], K = (degree + 1)^2.
-        labels: ``SURFACE``, ``INTERIOR``, ``TRANSITION`` or ``BACKGROUND`` per splat, int32 [N], or
-            None.
+        labels: ``SURFACE``, ``INTERIOR``, ``TRANSITION``, ``BACKGROUND`` or ``SPRAY`` per splat,
+            int32 [N], or None.
         normals: Unit surface normals [N, 3], or None.
         report: What the stage that made them measured, JSON values; files do not hold it.
 

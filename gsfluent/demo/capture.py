@@ -67,7 +67,11 @@ def make_object(name: str = "watermelon", seed: int = 0) -> DemoObject:
 
 
 def ring_cameras(obj: DemoObject, views: int, *, on_table: bool) -> list[Tensor]:
-    """World-to-camera matrices on three rings, one of them below the object unless ``on_table``."""
+    """World-to-camera matrices on three rings, one of them below the object unless ``on_table``.
+
+    Views of the middle ring of an object with level faces graze these by turns: a silhouette from
+    elsewhere leaves a cone on a face, and nothing else shows a plain one flat.
+    """
     rings = _RINGS_ABOVE if on_table else _RINGS
     distance = 1.12 * max(obj.axes) / math.sin(math.radians(0.5 * _FIELD_OF_VIEW))
     distance *= 1.5 if on_table else 1.0
@@ -76,8 +80,10 @@ def ring_cameras(obj: DemoObject, views: int, *, on_table: bool) -> list[Tensor]
     cameras = []
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     for ring, ((elevation, _), count) in enumerate(zip(rings, counts, strict=True)):
-        height = math.radians(elevation)
+        middle = ring == 1 and obj.level_faces and not on_table
+        grazing = math.asin(obj.axes[2] / distance)
         for step in range(count):
+            height = (1 - step % 2 * 2) * grazing if middle else math.radians(elevation)
             turn = 2.0 * math.pi * (step + 0.37 * ring) / count
             unit = [
                 math.cos(turn) * math.cos(height),

@@ -28,6 +28,7 @@ class DemoObject:
         center: Centre [m]; its height rests the object on z = 0.
         rind_depth, pith_depth: Depths [m] at which the rind and the pith end.
         cut_axis: Axis across which the photograph of its inside is cut.
+        level_faces: Whether its top or bottom is flat.
     """
 
     name = ""
@@ -36,6 +37,7 @@ class DemoObject:
     rind_depth = 0.004
     pith_depth = 0.012
     cut_axis = 0
+    level_faces = False
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed

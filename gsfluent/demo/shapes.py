@@ -21,6 +21,7 @@ class DistanceObject(DemoObject):
     """
 
     bump_amplitude = 0.0
+    level_faces = True
 
     def distance(self, local: Tensor) -> Tensor:
         """Signed distance [m] of points relative to the centre [N, 3], negative inside, [N].

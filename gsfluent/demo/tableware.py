@@ -116,6 +116,7 @@ class Egg(DistanceObject):
 
     name = "egg"
     axes = (0.0285, 0.022, 0.022)
+    level_faces = False
     rind_depth = 0.0025
     pith_depth = 0.0025
     yolk = 0.0155

@@ -27,6 +27,8 @@ from gsfluent.results.frames import load_frame
 from gsfluent.results.partition import SavedBody, SavedPartition, load_partition
 from gsfluent.results.record import shot_of
 
+NOBODY = -1
+"""Owner of dust, which is no piece."""
 _LINE = 1e-6  # second singular value of a shape, by the first, below which it has no attitude
 
 
@@ -168,14 +170,23 @@ def body_pieces(saved: SavedPartition, body: SavedBody, solid: Solid) -> Iterato
     owner, region = saved.body.long().clone(), saved.regions
     parents: list[tuple[int, Split]] = []
     stages = [(0, owner)]
+    gone: dict[int, int] = {}
     for split in saved.splits:
         count = int(split.rank.max())
         ids = [split.region, *range(region, region + count)]
         region += count
         if int(saved.body[split.rows[0]]) != body.number:
             continue
-        done = partition.split(split.region, saved.rest[split.rows], split.rank, ids)
-        owner = partition.assign(owner, done, saved.rest, split.rows, split.rank)
+        if count:
+            done = partition.split(
+                split.region, saved.rest[split.rows], split.rank, ids, split.dust
+            )
+            owner = partition.assign(owner, done, saved.rest, split.rows, split.rank)
+        owner = owner.clone()  # dust has no mesh
+        owner[split.rows[split.rank == split.dust]] = NOBODY
+        if count == 0:  # all of a region
+            gone[split.region] = split.frame
+            continue
         parents.append((split.frame, done))
         stages.append((split.frame, owner))
     surfaces = Surfaces(partition)
@@ -195,6 +206,7 @@ def body_pieces(saved: SavedPartition, body: SavedBody, solid: Solid) -> Iterato
     for first, last, number, held, where in sorted(found, key=lambda f: (f[0], f[2])):
         mesh = surfaces.mesh(held)
         rows = ((where == number) & saved.carries).nonzero()[:, 0]
+        last = min(last, gone.get(number, last))
         # several splits in one frame: what was between them is in no frame
         if first < last and len(mesh.faces) and len(rows):
             yield Piece(body.name, first, last, rows, mesh, colors[mesh.source], surfaces.step)

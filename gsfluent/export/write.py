@@ -15,6 +15,7 @@ from gsfluent.export.frames import DeltaSequence, FrameSequence
 from gsfluent.export.job import ExportOptions, Job
 from gsfluent.export.relit import relight_of
 from gsfluent.progress import Progress
+from gsfluent.results.digests import require_intact
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,7 @@ def export(
                 raise InputError(f"{what}: {out} holds splats only", "export from the run")
         to = to or out.with_suffix("")
     else:
+        require_intact(out / "stages" / "simulate")
         sequence = FrameSequence(
             out,
             frames=options.frames,

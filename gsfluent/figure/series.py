@@ -9,6 +9,10 @@ from dataclasses import dataclass, field
 from gsfluent.figure.style import COLORS, FAILED, INK, OURS, new_figure, to_svg
 
 Values = Sequence[float | int | None]
+WIDE, HIGH = 4.6, 2.7
+"""Size of a panel with its labels [inches]."""
+LEFT, RIGHT, LOW, ABOVE = 0.75, 0.15, 0.5, 0.3
+"""What its labels take of that [inches]."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,15 @@ def curves(along: Sequence[float], label: str, panels: Sequence[Panel]) -> str:
         return ""
     columns = min(columns, len(drawn))
     rows = math.ceil(len(drawn) / columns)
-    with new_figure(4.6 * columns, 2.7 * rows) as figure:
+    width, height = WIDE * columns, HIGH * rows
+    with new_figure(width, height, fitted=False) as figure:
+        # margins by hand: to find them takes longer than to draw
+        left, right, low, high = LEFT / width, RIGHT / width, LOW / height, ABOVE / height
+        figure.subplots_adjust(
+            left=left, right=1.0 - right, bottom=low, top=1.0 - high,
+            wspace=(LEFT + RIGHT) / (WIDE - LEFT - RIGHT),
+            hspace=(LOW + ABOVE) / (HIGH - LOW - ABOVE),
+        )  # fmt: skip
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes, panel in zip(grid, drawn, strict=False):
             colors = (OURS, *COLORS)

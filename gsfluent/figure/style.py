@@ -45,8 +45,10 @@ _STYLE: Any = {  # Any: matplotlib types its keys one by one
 
 
 @contextmanager
-def new_figure(width: float, height: float) -> Iterator[Figure]:
+def new_figure(width: float, height: float, *, fitted: bool = True) -> Iterator[Figure]:
     """Yield an empty figure of this size [inches] under gsfluent's style; save it inside the block.
+
+    ``fitted`` lets matplotlib find the margins, by drawing everything twice.
 
     No window system and no global state of pyplot are touched.
 
@@ -59,7 +61,7 @@ def new_figure(width: float, height: float) -> Iterator[Figure]:
     from matplotlib.figure import Figure
 
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height), layout="constrained" if fitted else None)
         FigureCanvasAgg(figure)
         yield figure
 

@@ -16,6 +16,7 @@ from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.progress import Reporter
+from gsfluent.results.lock import locked
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.solids import context_of, load_solids, make_solids
 
@@ -50,9 +51,9 @@ def inspect_shot(
     Raises:
         InputError: The shot is wrong, or a part asks for what the solid does not have.
     """
-    run.mkdir(parents=True, exist_ok=True)
     context = context_of(shot, run, device, seed, reporter)
-    make_solids(context)
+    with locked(run):
+        make_solids(context)
     scene = Scene(floor=None)
     solids = load_solids(context)
     for name, settings in shot.objects.items():

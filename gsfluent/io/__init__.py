@@ -1,7 +1,7 @@
 """Files in and out: splats, captures, images. Nothing here keeps state."""
 
 from gsfluent.io.atomic import atomic_path, write_json
-from gsfluent.io.capture import load_capture
+from gsfluent.io.capture import kind_of, load_capture
 from gsfluent.io.images import load_image, save_image
 from gsfluent.io.solid import load, load_solid, save, save_solid
 from gsfluent.io.splats.delta import DeltaReader
@@ -11,6 +11,7 @@ from gsfluent.io.splats.ply import read_ply, write_ply
 __all__ = [
     "DeltaReader",
     "atomic_path",
+    "kind_of",
     "load",
     "load_capture",
     "load_image",

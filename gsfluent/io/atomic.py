@@ -6,11 +6,29 @@ import contextlib
 import errno
 import json
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 from gsfluent.errors import RunError
+from gsfluent.io.process import is_alive
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_PARTIAL = re.compile(r"^\..*\.(\d+)\.partial")
+
+Watcher = Callable[[Path, Path], None]
+_watchers: list[Watcher] = []
+
+
+@contextlib.contextmanager
+def watching(watcher: Watcher) -> Iterator[None]:
+    """While the block runs, call ``watcher(temporary, path)`` before each file appears."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
 
 
 @contextlib.contextmanager
@@ -31,9 +49,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         with open(temporary, "rb") as stream:
             os.fsync(stream.fileno())
+        for watcher in _watchers:
+            watcher(temporary, path)
         os.replace(temporary, path)
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+        if error.errno in (*_FULL, errno.EACCES, errno.EROFS):
             raise RunError(
                 f"{path}: cannot be written ({error.strerror})",
                 "nothing; the file was not touched",
@@ -44,11 +64,62 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def remove_partials(folder: Path) -> list[Path]:
+    """Remove the temporaries below a folder whose processes have ended; return their paths."""
+    found = []
+    for path in folder.rglob(".*.partial*"):
+        name = _PARTIAL.match(path.name)
+        with contextlib.suppress(FileNotFoundError):
+            if name and path.is_file() and not is_alive(int(name[1]), path.stat().st_mtime):
+                path.unlink()
+                found.append(path)
+    return found
+
+
+class _Stream:
+    """A file that remembers why a write failed: torch tells of its own confusion only."""
+
+    def __init__(self, raw: Any) -> None:
+        self.raw = raw
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            return int(self.raw.write(data))
+        except OSError as error:
+            self.error = self.error or error
+            raise
+
+    def flush(self) -> None:
+        self.raw.flush()
+
+
+def write_tensors(path: str | Path, values: dict[str, Any]) -> None:
+    """Write with ``torch.save``, atomically.
+
+    Raises:
+        RunError: The disk is full or the folder cannot be written.
+    """
+    import torch
+
+    with atomic_path(path) as temporary, open(temporary, "wb", buffering=0) as raw:
+        stream = _Stream(raw)
+        try:
+            torch.save(values, cast(IO[bytes], stream))
+        except Exception as error:
+            raise (stream.error or error) from None
+
+
+def to_json(value: Any) -> str:
+    """Indented JSON with a final newline; NaN and infinity become null."""
+    return json.dumps(_finite(value), indent=1, allow_nan=False) + "\n"
+
+
 def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON atomically, indented, with a final newline; NaN and infinity become null."""
-    text = json.dumps(_finite(value), indent=1, allow_nan=False)
+    """Write :func:`to_json` of a value atomically."""
+    text = to_json(value)
     with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _finite(value: Any) -> Any:

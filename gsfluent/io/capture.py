@@ -10,8 +10,27 @@ from gsfluent.errors import InputError
 from gsfluent.io.colmap import find_model, read_model
 from gsfluent.io.images import IMAGE_SUFFIXES
 from gsfluent.io.transforms import read_poses, read_transforms
+from gsfluent.spatial.mesh_file import is_mesh
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
+_SPLATS = (".ply", ".splat", ".spz", ".ksplat", ".sog")
+
+
+def kind_of(path: str | Path) -> str | None:
+    """What a path holds: ``capture``, ``splats``, ``mesh`` or ``shot``; None for anything else.
+
+    Names and headers are looked at, nothing is read.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        posed = any((path / name).is_file() for name in _TRANSFORMS)
+        return "capture" if posed or find_model(path) is not None else None
+    if is_mesh(path):
+        return "mesh"
+    if suffix in _SPLATS:
+        return "splats"
+    return {".json": "capture", ".yaml": "shot", ".yml": "shot"}.get(suffix)
 
 
 def load_capture(path: str | Path) -> Capture:

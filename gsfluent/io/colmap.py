@@ -6,10 +6,9 @@ corner of the first pixel; both as gsfluent has them.
 
 from __future__ import annotations
 
-import math
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,10 @@ import torch
 from gsfluent import geometry
 from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
+from gsfluent.io.checked.files import is_file, read_bytes
+from gsfluent.io.checked.inside import inside
+from gsfluent.io.checked.pictures import check_pixels
 from gsfluent.io.images import IMAGE_SUFFIXES, load_view
 
 # name -> (COLMAP id, parameter count, places of fx fy cx cy, of the OpenCV coefficients or None)
@@ -39,6 +41,8 @@ _UNSUPPORTED = {
     9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE",
 }
+_POINT_BYTES = 51  # of a point without a track
+_LARGE = 1e30  # no number of a capture is beyond; a float32 still holds it
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", ".")
 _IMAGE_FOLDERS = ("images", "input", "../images", "../../images", ".")
 
@@ -47,7 +51,7 @@ class _Bytes:
     """A file read into memory with a cursor; running off its end is an InputError."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.place = path, path.read_bytes(), 0
+        self.path, self.data, self.place = path, read_bytes(path), 0
 
     def take(self, layout: str) -> tuple[float, ...]:
         packed = struct.Struct("<" + layout)
@@ -138,11 +142,11 @@ def read_model(model: Path, root: Path, *, photographs: bool = True) -> Capture:
                 height,
                 distortion,
                 name,
-                folder / name,
+                inside(folder, name, model),
                 find_mask(root, name),
             )
         )
-    good = np.isfinite(points).all(axis=1)
+    good = (np.abs(points) < _LARGE).all(axis=1) & np.isfinite(colors).all(axis=1)
     return Capture(
         cameras,
         torch.from_numpy(np.ascontiguousarray(points[good])),
@@ -154,19 +158,21 @@ def read_model(model: Path, root: Path, *, photographs: bool = True) -> Capture:
 
 def find_mask(root: Path, name: str) -> Path | None:
     """Return the mask of image ``name``: in ``masks/``, same name, name + .png, or same stem."""
-    relative = Path(name)
+    parts = Path(os.path.normpath(name)).parts
+    if os.path.isabs(name):  # allowed, see inside(): its mask has the same name in masks/
+        parts = parts[-1:]
     for folder in (root / "masks", root / "mask"):
-        if folder.is_dir():
-            beside = folder / relative
+        if not folder.is_dir():
+            continue
+        for start in range(len(parts)):
+            beside = inside(folder, str(Path(*parts[start:])), folder)
             for candidate in (
                 beside,
                 beside.with_name(beside.name + ".png"),
                 *map(beside.with_suffix, IMAGE_SUFFIXES),
             ):
-                if candidate.is_file():
+                if is_file(candidate):
                     return candidate
-            if len(relative.parts) > 1:
-                return find_mask(root, str(Path(*relative.parts[1:])))
     return None
 
 
@@ -175,15 +181,31 @@ def _image_folder(root: Path, names: list[str]) -> Path:
     best: tuple[int, Path, list[str]] | None = None
     for place in _IMAGE_FOLDERS:
         folder = root / place
-        missing = [name for name in names if not (folder / name).is_file()]
+        missing = [n for n in names if not is_file(inside(folder, n, root))]
         if not missing:
             return Path(os.path.normpath(folder))
         if best is None or len(missing) < best[0]:
             best = (len(missing), folder, missing)
     folder, missing = (best[1], best[2]) if best else (root, names)
     raise InputError(
-        f"{folder}: {len(missing)} of {len(names)} posed images are missing, first {missing[0]}",
+        f"{folder}: {len(missing)} of {len(names)} posed images are missing, first "
+        f"{short(missing[0], bare=True)}",
         "restore the images, or delete these views from the model",
+    )
+
+
+def is_lens(focal: Sequence[float], middle: Sequence[float], bent: Sequence[float]) -> bool:
+    """Whether there are such lenses; far beyond, the picture overflows where it is resampled.
+
+    Args:
+        focal: Focal lengths [pixels].
+        middle: Principal point [pixels].
+        bent: Coefficients of the distortion.
+    """
+    return (
+        all(1e-2 <= f <= 1e8 for f in focal)
+        and all(abs(c) <= 1e7 for c in middle)
+        and all(abs(k) <= 1e3 for k in bent)
     )
 
 
@@ -198,18 +220,23 @@ def _lens(path: Path, model: str, width: float, height: float, params: tuple[flo
     layout = _MODELS.get(model)
     if layout is None:
         raise InputError(
-            f"{path}: camera model {model} is not supported",
+            f"{path}: camera model {short(model, bare=True)} is not supported",
             f"undistort with `colmap image_undistorter`, or use one of {', '.join(_MODELS)}",
         )
     _, count, (fx, fy, cx, cy), coefficients = layout
     if (
         len(params) != count
-        or not all(map(math.isfinite, params))
-        or min(params[fx], params[fy], width, height) <= 0
+        or not all(abs(number) < _LARGE for number in (*params, width, height))
+        or min(params[fx], params[fy]) <= 0
+        or min(width, height) < 1
     ):
         raise _damaged(
             path, f"camera model {model} with size {width} x {height} and parameters {list(params)}"
         )
+    bent = [params[place] for place in coefficients if place is not None]
+    if not is_lens([params[fx], params[fy]], [params[cx], params[cy]], bent):
+        raise _damaged(path, f"no lens has the parameters {list(params)}")
+    check_pixels(int(width), int(height), path)
     k = [[params[fx], 0.0, params[cx]], [0.0, params[fy], params[cy]], [0.0, 0.0, 1.0]]
     distortion = tuple(0.0 if place is None else params[place] for place in coefficients)
     if not any(distortion):
@@ -222,7 +249,7 @@ def _pose(
 ) -> torch.Tensor:
     """World-to-camera matrix from COLMAP's quaternion (wxyz) and translation."""
     numbers = (*quat, *translation)
-    if not all(map(math.isfinite, numbers)) or not any(quat):
+    if not all(abs(n) < _LARGE for n in numbers) or not sum(q * q for q in quat) > 0:
         raise InputError(
             f"{path}: the pose of {name} is not a number: {list(numbers)}",
             "pose this image again or delete it",
@@ -255,6 +282,8 @@ def _binary_images(path: Path) -> Iterator[tuple[str, int, torch.Tensor]]:
 def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     data = _Bytes(path)
     count = data.count()
+    if count * _POINT_BYTES > len(data.data):
+        raise _damaged(path, f"it announces {count} points")
     table = np.zeros((count, 6))
     for row in range(count):
         _, *values, _ = data.take("Q3d3Bd")
@@ -264,7 +293,7 @@ def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bytes(path).decode("utf-8", errors="replace").splitlines():
         if not line.startswith("#"):
             yield line.split()
 
@@ -274,8 +303,14 @@ def _numbers(
 ) -> tuple[float, ...]:
     try:
         return tuple(kind(word) for word in words)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise _damaged(path, f"{' '.join(words)[:60]!r} are not numbers") from error
+
+
+def _number_of(path: Path, word: str) -> int:
+    """The number of a camera."""
+    (number,) = _numbers(path, [word[:20]], int)
+    return int(number)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
@@ -285,7 +320,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, _Lens]]:
                 raise _damaged(path, f"line {' '.join(words)!r} is too short")
             width, height, *params = _numbers(path, words[2:])
             yield (
-                int(_numbers(path, words[:1])[0]),
+                _number_of(path, words[0]),
                 _lens(path, words[1], width, height, tuple(params)),
             )
 
@@ -298,9 +333,9 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, torch.Tensor]]:
             continue
         if len(words) < 10:
             raise _damaged(path, f"line {' '.join(words)[:60]!r} is too short")
-        numbers, name = _numbers(path, words[1:9]), " ".join(words[9:])
+        numbers, name = _numbers(path, words[1:8]), " ".join(words[9:])
         next(lines, None)
-        yield name, int(numbers[7]), _pose(path, name, numbers[:4], numbers[4:7])
+        yield name, _number_of(path, words[8]), _pose(path, name, numbers[:4], numbers[4:7])
 
 
 def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

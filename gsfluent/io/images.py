@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from gsfluent.data.camera import Camera
 from gsfluent.data.capture import View
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
+from gsfluent.io.checked.pictures import opened_image
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -33,13 +33,15 @@ def read_array(path: str | Path) -> NDArray[np.float32]:
     """Read an image file as float32 [H, W, C] in 0..1 with C = 1, 3 or 4.
 
     Raises:
-        InputError: The file is missing, truncated, or not an image.
+        InputError: The file is missing, truncated, not an image, too large, or holds NaN.
     """
     with _opened(path) as opened:
         opened.load()
         image: Image.Image = opened
         if image.mode.startswith("I") or image.mode == "F":
             deep = np.asarray(image, dtype=np.float32)
+            if not np.isfinite(deep).all():
+                raise InputError(f"{path}: holds NaN or infinity", "write the picture again")
             top = 65535.0 if image.mode.startswith("I") else 1.0
             return (deep / top).clip(0, 1)[..., None]
         if image.mode == "P" or image.mode == "LA":
@@ -77,26 +79,13 @@ def image_size(path: str | Path) -> tuple[int, int]:
     return int(width), int(height)
 
 
-@contextlib.contextmanager
-def _opened(path: str | Path) -> Iterator[Image.Image]:
-    """An image of a capture, so that what goes wrong with it names the file."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            yield image
-    except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no such image", "restore the file or remove it from the capture"
-        ) from error
-    except UnidentifiedImageError as error:
-        raise InputError(
-            f"{path}: not an image that Pillow can read", "convert it to PNG or JPEG"
-        ) from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{path}: the image is damaged ({error})", "copy it again or remove it from the capture"
-        ) from error
+def _opened(path: str | Path) -> AbstractContextManager[Image.Image]:
+    """An image of a capture."""
+    return opened_image(
+        path,
+        "copy it again as PNG or JPEG, or remove it from the capture",
+        missing="restore the file or remove it from the capture",
+    )
 
 
 def save_image(image: Tensor, path: str | Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from gsfluent.data.gaussians import Gaussians
 from gsfluent.data.solid import Solid
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
+from gsfluent.io.checked.arrays import read_npz
 from gsfluent.io.splats.load import load_splats, save_splats
 
 
@@ -63,7 +64,7 @@ def save_solid(solid: Solid, path: str | Path) -> None:
         "depth": solid.depth.cpu().numpy(),
         "origin": solid.origin.cpu().numpy(),
         "voxel": np.float64(solid.voxel),
-        "report": np.array(json.dumps(solid.report)),
+        "report": np.array(json.dumps(_timeless(solid.report))),
         "frame": np.array(json.dumps(None if solid.frame is None else solid.frame.to_dict())),
     }
     if solid.color is not None:
@@ -73,6 +74,15 @@ def save_solid(solid: Solid, path: str | Path) -> None:
     save_splats(solid.gaussians, path)
     with atomic_path(volume_path(path)) as temporary, open(temporary, "wb") as stream:
         np.savez_compressed(stream, **arrays)
+
+
+def _timeless(report: Mapping[str, Any]) -> dict[str, Any]:
+    """A report without wall times: the same solid is the same file."""
+    kept = {key: value for key, value in report.items() if key != "seconds"}
+    return {
+        key: _timeless(value) if isinstance(value, Mapping) else value
+        for key, value in kept.items()
+    }
 
 
 def load_solid(path: str | Path) -> Solid:
@@ -89,12 +99,17 @@ def load_solid(path: str | Path) -> Solid:
             f"{path}: a solid needs {beside.name} beside it, got none",
             "make both with `gsfluent fill`",
         )
+    hint = "make it again with `gsfluent fill`"
+    arrays = read_npz(beside, hint=hint)
     try:
-        with np.load(beside, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
         size = tuple(int(count) for count in arrays["shape"])
+        if len(size) != 3 or min(size) < 1 or math.prod(size) > 8 * arrays["occupancy"].size:
+            raise ValueError(f"a grid of {list(size)} in {arrays['occupancy'].size} bytes")
         bits = np.unpackbits(arrays["occupancy"], count=math.prod(size))
         frame = json.loads(str(arrays["frame"]))
+        for name in ("depth", "origin", "color"):
+            if name in arrays and not np.isfinite(arrays[name]).all():
+                raise ValueError(f"{name} holds NaN or infinity")
         if gaussians.labels is None:
             gaussians = gaussians.replace(labels=torch.zeros(gaussians.count, dtype=torch.int32))
         return Solid(
@@ -108,11 +123,8 @@ def load_solid(path: str | Path) -> Solid:
             json.loads(str(arrays["report"])),
             None if frame is None else Frame.from_dict(frame),
         )
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{beside}: the volume file is damaged ({error})",
-            "make it again with `gsfluent fill`",
-        ) from error
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{beside}: the volume file is damaged ({error})", hint) from error
 
 
 def volume_path(path: str | Path) -> Path:

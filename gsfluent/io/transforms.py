@@ -6,7 +6,6 @@ OpenCV here and nowhere else.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -17,12 +16,17 @@ import torch
 
 from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
-from gsfluent.errors import InputError
-from gsfluent.io.colmap import find_mask
+from gsfluent.errors import InputError, short
+from gsfluent.io.checked.files import is_file, read_json
+from gsfluent.io.checked.inside import inside
+from gsfluent.io.checked.pictures import check_pixels
+from gsfluent.io.colmap import find_mask, is_lens
 from gsfluent.io.images import IMAGE_SUFFIXES, image_size, load_view
 from gsfluent.io.splats.ply import read_ply
 
 _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_LARGE = 1e30
+"""No number of a capture is beyond; a float32 still holds it, and its square a float64."""
 _RIGID_TOLERANCE = 1e-3
 """How far a rotation may be from orthonormal: files round to a few digits."""
 
@@ -41,7 +45,7 @@ def read_transforms(path: Path) -> Capture:
     cameras = [_camera(path, data, frame, index) for index, frame in enumerate(_frames(path, data))]
     cameras.sort(key=lambda camera: camera.name)
     missing = [
-        camera for camera in cameras if camera.image_path is None or not camera.image_path.is_file()
+        camera for camera in cameras if camera.image_path is None or not is_file(camera.image_path)
     ]
     if missing:
         first = missing[0].name
@@ -77,12 +81,7 @@ def _frames(path: Path, data: dict[str, Any]) -> list[Any]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(
-            f"{path}: not readable as JSON ({error})", "export the capture again"
-        ) from error
+    data = read_json(path, "export the capture again")
     if not isinstance(data, dict):
         raise InputError(
             f"{path}: must hold a JSON object, got {type(data).__name__}",
@@ -95,17 +94,19 @@ def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int) -> Camer
     where = f"{path}: frames[{index}]"
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise InputError(f"{where} has no file_path", "name the image of every frame")
-    where += f" ({frame['file_path']})"
+    where += f" ({short(frame['file_path'], bare=True)})"
     settings = {**shared, **frame}
-    model = str(settings.get("camera_model", "OPENCV")).upper()
+    model = settings.get("camera_model", "OPENCV")
+    model = model.upper() if isinstance(model, str) else short(model)
     if model not in _LENSES or settings.get("is_fisheye"):
-        lens = "fisheye" if settings.get("is_fisheye") else model
+        lens = "fisheye" if settings.get("is_fisheye") else short(model, bare=True)
         raise InputError(
             f"{where}: camera model {lens} is not supported",
             f"undistort, or use one of {', '.join(_LENSES)}",
         )
     viewmat = _viewmat(where, frame)
-    image = _find_image(path.parent, frame["file_path"])
+    named = inside(path.parent, frame["file_path"], where)
+    image = _find_image(named)
     width, height = _number(where, settings, "w", 0), _number(where, settings, "h", 0)
     if (width < 1 or height < 1) and image is not None:
         width, height = image_size(image)
@@ -114,6 +115,7 @@ def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int) -> Camer
             f"{where}: neither 'w', 'h' nor the image tell the size",
             "restore the image or add w and h",
         )
+    check_pixels(int(width), int(height), where)
     name = os.path.normpath(frame["file_path"])
     return Camera(
         viewmat,
@@ -122,16 +124,16 @@ def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int) -> Camer
         int(height),
         _distortion(where, settings),
         name,
-        image if image is not None else path.parent / frame["file_path"],
+        image if image is not None else named,
         _mask(path, frame, name, where),
     )
 
 
 def _number(where: str, settings: dict[str, Any], key: str, default: float) -> float:
     value = settings.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGE:
         raise InputError(
-            f"{where}: {key} must be a finite number, got {value!r}", "correct the file"
+            f"{where}: {key} must be a finite number, got {short(value)}", "correct the file"
         )
     return float(value)
 
@@ -144,13 +146,14 @@ def _viewmat(where: str, frame: dict[str, Any]) -> torch.Tensor:
         )
     try:
         matrix = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InputError(
             f"{where}: transform_matrix must be 4 x 4 numbers", "correct the file"
         ) from error
-    if tuple(matrix.shape) not in ((4, 4), (3, 4)) or not bool(torch.isfinite(matrix).all()):
+    if tuple(matrix.shape) not in ((4, 4), (3, 4)) or not bool((matrix.abs() < _LARGE).all()):
+        got = short(frame["transform_matrix"])
         raise InputError(
-            f"{where}: transform_matrix must be 4 x 4 finite numbers, got {matrix.tolist()}",
+            f"{where}: transform_matrix must be 4 x 4 finite numbers, got {got}",
             "correct the pose",
         )
     rotation = matrix[:3, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
@@ -175,9 +178,20 @@ def _intrinsics(where: str, settings: dict[str, Any], width: float, height: floa
     if focal_y <= 0 and "camera_angle_y" in settings:
         focal_y = 0.5 * height / math.tan(0.5 * _angle(where, settings, "camera_angle_y"))
     focal_x, focal_y = focal_x or focal_y, focal_y or focal_x
-    if focal_x <= 0:
+    if focal_x == 0:
         raise InputError(f"{where}: no focal length (fl_x or camera_angle_x)", "add one of them")
+    if min(focal_x, focal_y) <= 0:
+        raise InputError(
+            f"{where}: focal lengths must be positive, got {focal_x:g} and {focal_y:g}",
+            "correct fl_x and fl_y",
+        )
     cx, cy = _number(where, settings, "cx", width / 2), _number(where, settings, "cy", height / 2)
+    if not is_lens((focal_x, focal_y), (cx, cy), ()):
+        raise InputError(
+            f"{where}: no lens has focal lengths of {focal_x:g} and {focal_y:g} pixels and its "
+            f"middle at {cx:g}, {cy:g}",
+            "correct the file",
+        )
     return torch.tensor(
         [[focal_x, 0.0, cx], [0.0, focal_y, cy], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
@@ -200,18 +214,23 @@ def _distortion(where: str, settings: dict[str, Any]) -> tuple[float, ...]:
     values = tuple(_number(where, settings, key, 0) for key in ("k1", "k2", "p1", "p2", "k3"))
     if not any(values):
         return ()
+    if not is_lens((), (), values):
+        raise InputError(
+            f"{where}: k1, k2, p1, p2, k3 are {list(values)}, which no lens has", "correct the file"
+        )
     return values if values[4] else values[:4]
 
 
-def _find_image(root: Path, name: str) -> Path | None:
+def _find_image(plain: Path) -> Path | None:
     """Return the image a frame names, trying the usual extensions; None when there is none."""
-    plain = Path(os.path.normpath(root / name))
-    if plain.is_file():
+    if is_file(plain):
         return plain
+    if not plain.name:
+        return None
     for suffix in IMAGE_SUFFIXES:
         for spelling in (suffix, suffix.upper()):
             candidate = plain.with_name(plain.name + spelling)
-            if candidate.is_file():
+            if is_file(candidate):
                 return candidate
     return None
 
@@ -220,10 +239,13 @@ def _mask(path: Path, frame: dict[str, Any], name: str, where: str) -> Path | No
     named = frame.get("mask_path")
     if named is None:
         return find_mask(path.parent, name)
-    mask = _find_image(path.parent, str(named))
+    if not isinstance(named, str):
+        raise InputError(f"{where}: mask_path must be text, got {short(named)}", "correct the file")
+    mask = _find_image(inside(path.parent, named, where))
     if mask is None:
         raise InputError(
-            f"{where}: mask {named} is missing", "restore the mask, or remove mask_path"
+            f"{where}: mask {short(named, bare=True)} is missing",
+            "restore the mask, or remove mask_path",
         )
     return mask
 
@@ -231,9 +253,14 @@ def _mask(path: Path, frame: dict[str, Any], name: str, where: str) -> Path | No
 def _points(path: Path, data: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
     """Read the sparse points that ``ply_file_path`` names; none is fine."""
     empty = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3)
-    if not data.get("ply_file_path"):
+    named = data.get("ply_file_path")
+    if not named:
         return empty
-    file = path.parent / str(data["ply_file_path"])
+    if not isinstance(named, str):
+        raise InputError(
+            f"{path}: ply_file_path must be text, got {short(named)}", "correct the file"
+        )
+    file = inside(path.parent, named, path)
     rows = read_ply(file).get("vertex")
     if rows is None or not {"x", "y", "z"} <= set(rows.dtype.names or ()):
         raise InputError(
@@ -248,5 +275,5 @@ def _points(path: Path, data: dict[str, Any]) -> tuple[torch.Tensor, torch.Tenso
         )
         if rows["red"].dtype.kind == "u":
             colors /= np.float32(np.iinfo(rows["red"].dtype).max)
-    good = np.isfinite(points).all(axis=1)
+    good = np.isfinite(points).all(axis=1) & np.isfinite(colors).all(axis=1)
     return torch.from_numpy(points[good]), torch.from_numpy(np.ascontiguousarray(colors[good]))

@@ -9,8 +9,9 @@ from typing import Any
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
-from gsfluent.io import atomic_path, write_json
+from gsfluent.io import atomic_path
 from gsfluent.live.session import LiveSession
+from gsfluent.results.digests import Journal
 from gsfluent.results.frames import SavedFrame, save_frame
 from gsfluent.results.record import RunRecord
 from gsfluent.results.store import StageResult, fingerprint
@@ -72,8 +73,8 @@ class Recording:
         result = StageResult(
             "simulate", self.folder, fingerprint("live", values), report, seconds=seconds
         )
-        marker = {"fingerprint": result.fingerprint, "complete": True, "report": report}
-        write_json(self.folder / "stage.json", marker | result.summary())
+        result.files = Journal(self.folder, self.out).files()
+        result.save()
         record = RunRecord(self.out / "run.json", values, session.device, session.seed)
         record.values["simulation"] = report
         record.values["live"] = {"pokes": len(session.pokes), "from": self._start}

@@ -13,6 +13,8 @@ from gsfluent.errors import InputError
 from gsfluent.io.solid import load_solid, volume_path
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL
 from gsfluent.progress import Reporter
+from gsfluent.results.digests import require_intact
+from gsfluent.results.lock import locked
 from gsfluent.results.record import read_frame, shot_of
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.simulate import build_scene
@@ -76,6 +78,8 @@ def open_stage(
                 f"live: the objects of {out} are not filled and textured yet",
                 hint="finish `gsfluent run` first, or give its shot",
             )
+        for name in ("isolate", "texture"):
+            require_intact(out / "stages" / name)
         context.frame = read_frame(out / "stages" / "isolate")
     else:
         shot = load_shot(source)
@@ -85,8 +89,8 @@ def open_stage(
                 hint="name it (-o OUT); `gsfluent run` goes on from there",
             )
         context = context_of(shot, out, device, seed, reporter)
-        out.mkdir(parents=True, exist_ok=True)
-        make_solids(context)
+        with locked(out):
+            make_solids(context)
     shot = dataclasses.replace(shot, events=())
     scene = build_scene(shot, load_solids(context), context.frame)
     return Stage(out.resolve().name, _stood(scene), shot)

@@ -45,7 +45,11 @@ __all__ = [
     "fruit",
     "get",
     "names",
+    "wet",
 ]
+
+_WET = ("fruit", "jelly")
+"""Families whose debris is juice: drops, and not powder."""
 
 
 def _preset(name: str, keys: dict[str, Any]) -> Material:
@@ -89,6 +93,15 @@ def __getattr__(name: str) -> Material:
 def names() -> tuple[str, ...]:
     """Return the names of all presets."""
     return tuple(sorted(_PRESETS))
+
+
+def wet(name: str) -> bool:
+    """Whether what flies off a material is juice; else it is powder.
+
+    Args:
+        name: Of the preset; what stands before its first dot is the family.
+    """
+    return name.split(".")[0] in _WET
 
 
 def get(name: str) -> Material:

@@ -49,6 +49,7 @@ POSITIVE = (
 WORDS: dict[str, tuple[str, ...]] = {
     "law": tuple(LAWS),
     "prefer": ("toughness", "strength"),
+    "hysteresis": ("pressed", "both"),
 }
 """What of a material is a word, and which words there are."""
 

@@ -51,7 +51,7 @@ SHEAR = 0.03
 """Shear damage of what is given by strengths: enough that crushed matter loses its tension, too,
 and so little that what is pressed hard cracks before it is powder (a plaster ball that falls 0.75 m
 is whole, with 0.5 it is crushed)."""
-_PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness"}
+_PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness", "hysteresis": "pressed"}
 """What only brittle matter reads, as it is in other matter."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
@@ -102,6 +102,8 @@ class Material:
             the time step. Strengths are divided by its root: the speed at which it breaks and the
             number of pieces stay (Bazant's size number E G_c / s^2 L does not change).
         restitution: Speed after over before of a body that lands on a hard floor and stays whole.
+        hysteresis: nacc: whether what springs back loses energy where it is ``pressed``, as dry
+            matter, or in tension too (``both``), as wet tissue: cracks there are fed with less.
         dust: How much of a break is dust, 0 to 1; sets the most mass that may come loose.
         specular: Strength of its highlights, k_s of Blinn-Phong.
         shininess: Narrowness of its highlights, n_s of Blinn-Phong.
@@ -138,6 +140,7 @@ class Material:
     weibull_modulus: float = 0.0
     reference_volume: float = 1e-6
     prefer: str = "toughness"
+    hysteresis: str = "pressed"
     softening: float = 1.0
     restitution: float = 1.0
     dust: float = 0.5
@@ -320,9 +323,12 @@ class Material:
         """
         at = sample or _tensor
         values = self._nacc(at) if self.law == "nacc" else {}
-        return laws.row(
+        row = laws.row(
             self.law, lambda field: values[field] if field in values else self._at(field, at)
         )
+        if self.hysteresis == "both":
+            row[..., 7] += row[..., 7] > 0.0
+        return row
 
     def strengths(self, sample: Callable[[Field], Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Uniaxial strengths of the softened material in tension and compression [Pa], float64.

@@ -59,11 +59,11 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
         wrong[:, 1] |= (params[:, 1] == 0) & (law != LAWS["rigid"])
         fluid, nacc = law == LAWS["fluid"], law == LAWS["nacc"]
         wrong[:, 7] |= fluid & (params[:, 7] > 0) & (params[:, 7] < 1)  # energy needs gamma >= 1
-        wrong[:, 7] |= nacc & (params[:, 7] > 1)  # a loss
+        wrong[:, 7] |= nacc & (params[:, 7] > 2)  # a loss
         if bool(wrong.any()):
             _checked.pop(given, None)
             row, column = (int(i) for i in wrong.nonzero()[0])
-            need = {1: "positive and finite", 7: "0 or at least 1 (fluid), 0 to 1 (nacc)"}
+            need = {1: "positive and finite", 7: "0 or at least 1 (fluid), 0 to 2 (nacc)"}
             raise ValueError(
                 f"{op}: params[{row}] {PARAM_COLUMNS[column]} must be "
                 f"{need.get(column, 'finite and not negative')}, got {float(params[row, column]):g}"
@@ -115,7 +115,8 @@ def unloading_share(
         stress: Kirchhoff stress [Pa], [N, 6].
         affine: Velocity gradient [1/s], [N, 3, 3].
         law: Law of each row, int32 [M].
-        params: Parameters of each row, [M, 8]; column 7 of NACC is the loss, 1 - e^2.
+        params: Parameters of each row, [M, 8]; column 7 of NACC is the loss, 1 - e^2, and one
+            more where it acts in tension too.
         material: Row of each point, int32 [N].
         dx: Node spacing [m].
     """
@@ -128,8 +129,9 @@ def unloading_share(
     rate = affine + affine.transpose(1, 2)
     power = 0.5 * (xx * rate[:, 0, 0] + yy * rate[:, 1, 1] + zz * rate[:, 2, 2])
     power = power + xy * rate[:, 0, 1] + xz * rate[:, 0, 2] + yz * rate[:, 1, 2]
-    pressed = (-(xx + yy + zz) / size.sqrt()).clamp(0.0, 1.0)
-    return 1.0 - loss * pressed * (-pace * power / size).clamp(0.0, 1.0)
+    anyhow = (loss > 1.0).to(loss.dtype)
+    pressed = (-(xx + yy + zz) / size.sqrt()).clamp(0.0, 1.0).maximum(anyhow)
+    return 1.0 - (loss - anyhow) * pressed * (-pace * power / size).clamp(0.0, 1.0)
 
 
 def weakened(law: Tensor, params: Tensor, material: Tensor, peak: Tensor) -> tuple[Tensor, Tensor]:

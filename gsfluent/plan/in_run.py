@@ -12,10 +12,12 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from gsfluent.errors import InputError
 from gsfluent.plan.cost import CostModel
 from gsfluent.plan.fact import compare, learn
 from gsfluent.results.store import content_digest, fingerprint
 from gsfluent.stages.context import RunContext
+from gsfluent.stages.known import source_digest
 
 _log = logging.getLogger(__name__)
 
@@ -36,7 +38,8 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
         plan: Whether a plan is wanted where the shot does not need one.
 
     Raises:
-        InputError: The budget is too small, or the input cannot be read while there is one.
+        InputError: The budget is too small, or the input cannot be read while there is one. Or the
+            simulation would take longer than ``solve.max_hours``.
     """
     shot, device = context.shot, context.device
     chosen = None
@@ -54,6 +57,8 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
     except Exception as error:  # a plan is advice: whatever is wrong, the run itself will say so
         _log.info("no plan: %s", str(error).splitlines()[0] if str(error) else type(error).__name__)
         return None
+    if made["refused"]:
+        raise InputError(made["refused"], made["hint"])
     if model is None:
         _log.info("plan: this machine is not calibrated (gsfluent plan does it): no times")
     section = {"calibrated": made["calibrated"], "predicted": predicted_of(made)}
@@ -90,8 +95,7 @@ def _chosen(context: RunContext) -> dict[str, Any]:
     with, whatever the model has learned since.
     """
     shot = context.shot
-    source = shot.capture or shot.splats
-    digest = content_digest(Path(source)) if source is not None else ""
+    digest = source_digest(shot) if shot.capture is None else content_digest(shot.capture)
     # before any stage: the source of the first one is not known yet
     key = fingerprint("budget", [context.seed, context.device.type, shot.resolved(), digest])
 

@@ -133,7 +133,8 @@ def plan_shot(
         ``dt``, ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and
         memory_bytes by name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``,
         ``size_m``, ``assumed``, ``warnings``, ``calibrated``, ``model`` (when it was measured,
-        corrections by runs), ``device`` and ``work`` (features by stage).
+        corrections by runs), ``device`` and ``work`` (features by stage); ``refused``, why a run
+        refuses the shot, and ``hint``, what to do, both empty where it does not.
 
     Raises:
         InputError: The input cannot be read, or a material or event cannot be.
@@ -159,6 +160,9 @@ def plan_shot(
             f"texture: what {texture_method(shot)} costs hangs on the model you bring and is not "
             "predicted; hint: texture.method: exemplar is"
         )
+    refused, hint = _too_long(prospect, outlook, dx, stages["simulate"]["seconds"], sum(counts))
+    if refused:
+        warnings.append(f"gsfluent run refuses this shot: {refused}; hint: {hint}")
     first = next(body for body in prospect.scene.bodies if body.solid is not None)
     low, high = first.bounds()
     return {
@@ -188,7 +192,35 @@ def plan_shot(
         "memory_bytes": max(row["memory_bytes"] for row in stages.values()),
         "work": work,
         "warnings": warnings,
+        "refused": refused,
+        "hint": hint,
     }
+
+
+_STEP, _POINT_STEP = 2e-5, 2e-10
+"""Seconds that no machine goes below, for a step and for each of its points."""
+
+
+def _too_long(
+    prospect: Prospect, outlook: Outlook, dx: float, seconds: float | None, points: int
+) -> tuple[str, str]:
+    """Why a shot takes longer than it may, and what to do; empty where it does not."""
+    said = "about"
+    if seconds is None:
+        seconds, said = outlook.substeps * (_STEP + _POINT_STEP * points), "at least"
+    hours, allowed = seconds / 3600.0, prospect.shot.solve.max_hours
+    if hours <= allowed:
+        return "", ""
+    low, high = prospect.scene.bodies[0].bounds()
+    longest = float((high - low).max())
+    return (
+        f"the simulation takes {said} {hours:.3g} hours, more than solve.max_hours: {allowed:g}; "
+        f"an object {longest:.3g} m long on cells of {dx:.3g} m needs {outlook.substeps} steps of "
+        f"{outlook.dt:.2g} s"
+    ), (
+        "check size and scale, take fewer solve.cells or a shorter output.seconds; or allow it: "
+        f"solve.max_hours: {math.ceil(hours)}"
+    )
 
 
 def cells_of(prospect: Prospect, model: CostModel | None) -> int:

@@ -21,15 +21,18 @@ from gsfluent.inspection.capture import inspect
 from gsfluent.io import load_capture, load_splats
 from gsfluent.pipeline.capture.hull import hull_grid, masked_views
 from gsfluent.pipeline.capture.orient import DEFAULT_SIZE, look_at_point, make_frame
+from gsfluent.pipeline.fill.mesh_skin import SPLATS, mesh_gaussians
 from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.reconstruct.recipe import recipe_for
 from gsfluent.spatial.voxels import nearest_empty
+from gsfluent.stages.known import extended, known_solid, parted
 from gsfluent.stages.select import select_mask
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _VOXELS = 48
+_MESH_SPLATS = 5000  # enough for the box and the axes of a mesh
 _MARGIN = 8
 """Pixels that training keeps around a mask."""
 _SOLID_SHARE = 0.75
@@ -65,20 +68,36 @@ def proxy(shot: Shot, warnings: list[str]) -> Proxy:
     Raises:
         InputError: The input cannot be read, or an object selects nothing of it.
     """
-    if shot.splats is not None:
-        gaussians = load_splats(shot.splats).validated(shot.splats.name)
+    if shot.splats is not None or shot.mesh is not None:
+        if shot.mesh is not None:
+            gaussians = mesh_gaussians(shot.mesh, _MESH_SPLATS)
+        else:
+            assert shot.splats is not None
+            gaussians = load_splats(shot.splats).validated(shot.splats.name)
         frame = make_frame(gaussians, None, shot)
         options = shot.fill.given(frame.scale) | {"resolution": _VOXELS}
-        solids = {}
+        masks = {}
         taken = torch.zeros(gaussians.count, dtype=torch.bool)
         for name, settings in shot.objects.items():
-            mask = select_mask(gaussians, settings.select, frame) & ~taken
-            taken |= mask
-            solids[name] = _grey(Fill(**options, refine_views=0)(gaussians.select(mask)))
+            masks[name] = select_mask(gaussians, settings.select, frame) & ~taken
+            taken |= masks[name]
+        whole = known_solid(shot, gaussians, options | {"finer": False})
+        if whole is not None:
+            masks = {
+                name: extended(mask, gaussians, whole.gaussians) for name, mask in masks.items()
+            }
+            known = {name: _grey(solid) for name, solid in parted(whole, masks).items()}
+            told = "the solid as it is" if shot.mesh is None else f"the mesh at {_VOXELS} voxels"
+            count = gaussians.count if shot.mesh is None else SPLATS
+            return Proxy(known, frame, told, splats=count)
+        solids = {
+            name: _grey(Fill(**options, refine_views=0)(gaussians.select(mask)))
+            for name, mask in masks.items()
+        }
         what = f"the splat, filled at {_VOXELS} voxels"
         return Proxy(solids, frame, what, splats=gaussians.count)
     if shot.capture is None:
-        raise InputError("the shot has neither capture nor splats", "name one input")
+        raise InputError("the shot has no capture, splats or mesh", "name one input")
     # what is wrong with a capture is an error; what is not in it is a warning
     capture = load_capture(shot.capture)
     views = masked_views(capture)

@@ -4,7 +4,12 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    frames="SavedFrame count_frames frame_path frame_rate frame_time load_frame save_frame",
+    digests="Journal require_intact",
+    frames=(
+        "DUST SavedFrame count_frames frame_head frame_path frame_rate frame_time load_frame "
+        "save_frame"
+    ),
+    lock="locked",
     partition="FILE SavedBody SavedPartition SavedSplit load_partition save_partition",
     record="RunRecord read_frame shot_of",
     store="StageResult StageStore content_digest fingerprint publish",

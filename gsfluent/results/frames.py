@@ -8,7 +8,7 @@ stored in half precision.
 from __future__ import annotations
 
 import json
-import zipfile
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,19 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Gaussians
-from gsfluent.errors import RunError
+from gsfluent.errors import RunError, short
 from gsfluent.io import atomic_path
+from gsfluent.io.checked.arrays import read_npz
 
 _HALF = ("quats", "opacities", "sh", "damage", "velocity")
 _SPLATS = ("groups", "ids", "anchor")
 _POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "material")
+_FINITE = ("means", "quats", "scales", "opacities", "sh", "positions")
+_DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 _LED = ("led_rows", "led_positions")
+_DUST = "dust_rows"
+DUST = 1 << 60
+"""Numbers of the splats of dust begin here, beyond all others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +59,26 @@ class SavedFrame:
     facts: dict[str, Any]  # Plain figures of the frame (energies, counts)
     # Points that are drawn elsewhere than they are, with their chunk: rows int32 [K], [m] [K, 3].
     led: tuple[Tensor, Tensor] | None = None
+    # Points that are drawn as dust, which is no body that one could see through: int32 [D].
+    dust: Tensor | None = None
 
     @property
     def shown(self) -> Tensor:
-        """Where the material points are drawn [m], [P, 3]."""
-        if self.led is None:
-            return self.positions
-        rows, places = self.led
-        return self.positions.index_copy(0, rows.long(), places.to(self.positions))
+        """Where the material points are drawn [m], [P, 3]; nan for dust."""
+        places = self.positions
+        if self.led is not None:
+            rows, there = self.led
+            places = places.index_copy(0, rows.long(), there.to(places))
+        if self.dust is not None:
+            places = places.index_fill(0, self.dust.long(), torch.nan)
+        return places
 
     def to(self, device: torch.device) -> SavedFrame:
         """The same frame on another device."""
         moved = {name: getattr(self, name).to(device) for name in (*_SPLATS, *_POINTS)}
         led = None if self.led is None else (self.led[0].to(device), self.led[1].to(device))
-        return replace(self, gaussians=self.gaussians.to(device), led=led, **moved)
+        dust = None if self.dust is None else self.dust.to(device)
+        return replace(self, gaussians=self.gaussians.to(device), led=led, dust=dust, **moved)
 
 
 def frame_path(folder: Path, index: int) -> Path:
@@ -89,6 +101,8 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
         arrays[name] = _packed(name, getattr(frame, name))
     if frame.led is not None:
         arrays |= {name: _packed(name, value) for name, value in zip(_LED, frame.led, strict=True)}
+    if frame.dust is not None:
+        arrays[_DUST] = _packed(_DUST, frame.dust)
     head = {
         "index": frame.index,
         "time": frame.time,
@@ -110,9 +124,11 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
     """
     path = frame_path(folder, index)
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        head = json.loads(str(arrays["head"]))
+        arrays = read_npz(path)
+        head = _head(arrays)
+        for name in _FINITE:
+            if not np.isfinite(arrays[name]).all():
+                raise ValueError(f"{name} holds NaN or infinity")
         return SavedFrame(
             index=head["index"],
             time=head["time"],
@@ -120,9 +136,10 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
             facts=head["facts"],
             gaussians=_gaussians(arrays),
             led=(_tensor(arrays[_LED[0]]), _tensor(arrays[_LED[1]])) if _LED[0] in arrays else None,
+            dust=_tensor(arrays[_DUST]) if _DUST in arrays else None,
             **{name: _tensor(arrays[name]) for name in (*_SPLATS, *_POINTS)},
         )
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise _unreadable(path, error) from error
 
 
@@ -134,6 +151,26 @@ def count_frames(folder: Path) -> int:
     return count
 
 
+def frame_head(path: Path) -> dict[str, Any]:
+    """The plain values of a frame's file: ``index``, ``time`` [s], ``carried``, ``facts``.
+
+    Raises:
+        ValueError: It is missing or damaged; also an :class:`InputError`.
+        LookupError: A value is missing.
+    """
+    return _head(read_npz(path, ("head",)))
+
+
+def _head(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    head: dict[str, Any] = json.loads(str(arrays["head"]))
+    numbers = (head["index"], head["time"], head["carried"])
+    if not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
+        raise ValueError(f"its head has index, time and carried {short(numbers)}")
+    if not isinstance(head["facts"], dict):
+        raise ValueError("its facts are no mapping")
+    return head
+
+
 def frame_time(folder: Path, index: int) -> float:
     """Simulated time [s] of a frame, without reading the rest of it.
 
@@ -142,9 +179,8 @@ def frame_time(folder: Path, index: int) -> float:
     """
     path = frame_path(folder, index)
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return float(json.loads(str(data["head"]))["time"])
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        return float(frame_head(path)["time"])
+    except _DAMAGE as error:
         raise _unreadable(path, error) from error
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from torch import Tensor
 from gsfluent.data import Frame
 from gsfluent.errors import RunError
 from gsfluent.io import atomic_path
+from gsfluent.io.checked.arrays import read_npz
 
 FILE = "partition.npz"
 """Its name in the folder of the simulation."""
@@ -40,6 +40,7 @@ class SavedSplit:
     frame: int  # First frame in which it is divided, from 0
     rows: Tensor  # Its points that are of a piece, int64 [S]
     rank: Tensor  # Which one, int64 [S]
+    dust: int = -1  # The rank that is dust, which is no piece; -1 for none
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ def save_partition(folder: Path, saved: SavedPartition) -> Path:
         RunError: The disk is full.
     """
     bodies = [vars(body) | {"frame": body.frame.to_dict()} for body in saved.bodies]
-    splits = [[split.region, split.frame] for split in saved.splits]
+    splits = [[split.region, split.frame, split.dust] for split in saved.splits]
     head = {"regions": saved.regions, "bodies": bodies, "splits": splits}
     arrays = {name: getattr(saved, name).cpu().numpy() for name in _ARRAYS}
     for number, split in enumerate(saved.splits):
@@ -84,9 +85,9 @@ def load_partition(folder: Path) -> SavedPartition | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as data:
-            head: dict[str, Any] = json.loads(str(data["head"]))
-            arrays = {name: torch.from_numpy(data[name]) for name in data.files if name != "head"}
+        found = read_npz(path)
+        head: dict[str, Any] = json.loads(str(found.pop("head")))
+        arrays = {name: torch.from_numpy(array) for name, array in found.items()}
         return SavedPartition(
             **{name: arrays[name] for name in _ARRAYS},
             regions=head["regions"],
@@ -95,10 +96,10 @@ def load_partition(folder: Path) -> SavedPartition | None:
                 for body in head["bodies"]
             ),
             splits=tuple(
-                SavedSplit(region, frame, arrays[f"rows_{n}"], arrays[f"rank_{n}"].long())
-                for n, (region, frame) in enumerate(head["splits"])
+                SavedSplit(region, frame, arrays[f"rows_{n}"], arrays[f"rank_{n}"].long(), *dust)
+                for n, (region, frame, *dust) in enumerate(head["splits"])
             ),
         )
-    except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         hint = "run the shot again with --force"
         raise RunError(f"{path}: no readable partition ({error})", "the frames", hint) from error

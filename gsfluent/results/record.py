@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from gsfluent.config import Shot
 from gsfluent.data import Frame
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.io import write_json
+from gsfluent.io.checked.files import read_json
 from gsfluent.results.store import StageResult
 
 CLEAN, FAILED = "clean", "failed"
@@ -41,7 +41,8 @@ class RunRecord:
         verdict = simulation.get("verdict", CLEAN)
         reason = simulation.get("reason") or "every stage finished, nothing had to be healed"
         # sound, and still not what was wanted: whoever reads the verdict reads that too
-        reason = "; ".join([reason, *(simulation.get("notes") or [])])
+        redone = [f"{s.name} was done anew: {s.redone}" for s in stages if s.redone]
+        reason = "; ".join([reason, *redone, *(simulation.get("notes") or [])])
         return self._write(verdict, reason, stages)
 
     def fail(self, error: BaseException, stages: list[StageResult]) -> dict[str, Any]:
@@ -73,18 +74,30 @@ def shot_of(out: Path) -> Shot:
     """The resolved shot of a run, from its ``run.json``.
 
     Raises:
-        InputError: There is none.
+        InputError: There is none, or it is damaged.
     """
     path = out / "run.json"
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))["shot"]
-    except (OSError, ValueError, KeyError) as error:
+        values = read_json(path)["shot"]
+    except (LookupError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: not the record of a run ({error})", "run the shot first"
         ) from error
-    return Shot.from_dict(values, out)
+    try:
+        return Shot.from_dict(values, out)
+    except InputError as error:
+        raise InputError(f"{path}: shot: {error.what}", error.hint) from error
 
 
 def read_frame(folder: Path) -> Frame:
-    """World-to-scene frame that the isolate stage wrote; the floor, if any, is at z = 0."""
-    return Frame.from_dict(json.loads((folder / "frame.json").read_text(encoding="utf-8")))
+    """World-to-scene frame that the isolate stage wrote; the floor, if any, is at z = 0.
+
+    Raises:
+        InputError: It is missing or damaged.
+    """
+    path, hint = folder / "frame.json", "run the shot again with --force"
+    values = read_json(path, hint)
+    try:
+        return Frame.from_dict(values)
+    except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise InputError(f"{path}: no frame ({error})", hint) from error

@@ -4,19 +4,21 @@ A stage's folder holds its results and ``stage.json``. The fingerprint covers gs
 the part of the shot the stage reads, the content of its input files and the fingerprint of the
 stage before it, so a changed texture exemplar redoes the texture and what follows, and leaves the
 reconstruction alone. A folder whose work was cut short stays, marked incomplete, and is handed back
-to the stage, which may go on from there.
+to the stage, which may go on from there. Nothing is taken up before its files were compared with
+their digests; a stage of which one differs is done anew, and the run says so.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import resource
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,9 +28,20 @@ import torch
 
 import gsfluent
 from gsfluent.errors import RunError
-from gsfluent.io import atomic_path, write_json
+from gsfluent.io import atomic_path
+from gsfluent.io.atomic import watching
+from gsfluent.results.digests import (
+    RECORD,
+    WRITTEN,
+    Journal,
+    differing,
+    read_record,
+    update,
+    write_record,
+)
 
-_CHUNK = 1 << 20
+_log = logging.getLogger(__name__)
+_READ_ON = (".ply", ".npz", ".json")
 
 
 def fingerprint(*parts: object) -> str:
@@ -47,9 +60,7 @@ def content_digest(path: Path) -> str:
     for file in files:
         name = file.relative_to(path).as_posix() if path.is_dir() else file.name
         digest.update(f"{name}\0{file.stat().st_size}\0".encode())
-        with file.open("rb") as stream:
-            while chunk := stream.read(_CHUNK):
-                digest.update(chunk)
+        update(digest, file)
     return digest.hexdigest()
 
 
@@ -68,9 +79,33 @@ class StageResult:
     # Highest memory allocated on the GPU during the stage (0 on CPU).
     peak_device_memory_bytes: int = 0
     resumed: bool = False  # The whole result was found finished
+    files: dict[str, str] = field(default_factory=dict)  # Digest of each file of a finished stage
+    redone: str = ""  # Why what had been there was not believed and done anew
+
+    @property
+    def content(self) -> str:
+        """Digest of what later stages read: not of the stage's own report, which holds times."""
+        read = {
+            name: digest
+            for name, digest in self.files.items()
+            if name.endswith(_READ_ON) and not name.startswith(f"{self.name}.")
+        }
+        return fingerprint(read)
+
+    def save(self, *, complete: bool = True) -> None:
+        """Write ``stage.json``.
+
+        Raises:
+            RunError: The disk is full.
+        """
+        head = {"fingerprint": self.fingerprint, "complete": complete}
+        files = {"files": self.files} if complete else {}
+        values = {**head, **files, "report": self.report, **self.summary()}
+        write_record(self.folder / RECORD, values)
 
     def summary(self) -> dict[str, Any]:
         """The stage's line in ``run.json``."""
+        redone = {"redone": self.redone} if self.redone else {}
         return {
             "name": self.name,
             "seconds": round(self.seconds, 3),
@@ -78,6 +113,7 @@ class StageResult:
             "peak_memory_bytes": self.peak_memory_bytes,
             "peak_device_memory_bytes": self.peak_device_memory_bytes,
             "resumed": self.resumed,
+            **redone,
         }
 
 
@@ -89,61 +125,118 @@ class StageStore:
         self.force = force
         self.results: list[StageResult] = []
 
-    def run(self, name: str, key: str, work: Callable[[Path], dict[str, Any]]) -> StageResult:
+    def run(
+        self,
+        name: str,
+        key: str,
+        work: Callable[[Path], dict[str, Any]],
+        scratch: Sequence[str] = (),
+    ) -> StageResult:
         """Return the result of stage ``name``, doing ``work(folder)`` only when it must be done.
 
         Args:
             name: Folder name under the root.
             key: Fingerprint of the inputs.
             work: Writes its files into the folder and returns the report. The folder may hold what
-                an earlier try with the same fingerprint left.
+                an earlier try with the same fingerprint left, which is as that try wrote it.
+            scratch: Files that only an unfinished stage needs; they are removed in the end.
         """
         folder = self.root / name
-        marker = folder / "stage.json"
-        before = _read_marker(marker)
-        same = before.get("fingerprint") == key
-        if same and before.get("complete") and not self.force:
-            result = StageResult(
-                name,
-                folder,
-                key,
-                before["report"],
-                before["seconds"],
-                before.get("cpu_seconds", 0.0),
-                before["peak_memory_bytes"],
-                before["peak_device_memory_bytes"],
-                resumed=True,
-            )
-            self.results.append(result)
-            return result
-        if folder.exists() and (not same or self.force):
-            shutil.rmtree(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        spent = before if same and not self.force else {}
+        journal = Journal(folder, self.root.parent)
+        before, wrong = read_record(folder / RECORD) if _holds_results(folder) else ({}, "")
+        same = not self.force and before.get("fingerprint") == key
+        if same and before.get("complete"):
+            lost = differing(folder, before["files"])
+            wrong = f"{_listed(lost)} missing or different from the digest" if lost else ""
+            if not lost:
+                result = _found(name, folder, before)
+                self.results.append(result)
+                _clear(folder, journal, scratch)
+                return result
+        elif same:
+            wrong = journal.read()
+        if wrong and not self.force:
+            _log.warning("%s: %s; the stage is done anew", name, wrong)
+            same = False
+        if not same:
+            _begin_anew(folder, journal, before, damaged=bool(wrong))
+        spent = before if same else {}
         result = StageResult(
             name,
             folder,
             key,
             seconds=float(spent.get("seconds", 0.0)),
             cpu_seconds=float(spent.get("cpu_seconds", 0.0)),
+            redone="" if self.force else wrong,
         )
         self.results.append(result)
-        write_json(marker, _marker(result, complete=False))
+        result.save(complete=False)
         complete = False
         try:
-            with measured(result):
+            with measured(result), watching(journal.note):
                 result.report = work(folder)
             # a stage that gave up is asked again next time
             complete = result.report.get("verdict") != "failed"
+            if complete:
+                result.files = journal.files(scratch)
         finally:
             # on failure this keeps the time already spent; when even that cannot be written, the
-            # marker from before still says "incomplete", which is all a later run needs
+            # record from before still says "incomplete", which is all a later run needs
             try:
-                write_json(marker, _marker(result, complete=complete))
+                result.save(complete=complete)
             except (OSError, RunError):
                 if complete:
                     raise
+        if complete:
+            _clear(folder, journal, scratch)
         return result
+
+
+def _holds_results(folder: Path) -> bool:
+    """Whether there is more than what a run killed at the very start of a stage leaves."""
+    names = {path.name for path in folder.iterdir()} if folder.exists() else set()
+    return any(name != WRITTEN and not name.startswith(".") for name in names)
+
+
+def _found(name: str, folder: Path, record: dict[str, Any]) -> StageResult:
+    """A finished stage, from its record."""
+    names = ("report", "seconds", "cpu_seconds", "peak_memory_bytes", "peak_device_memory_bytes")
+    return StageResult(
+        name,
+        folder,
+        record["fingerprint"],
+        **{each: record[each] for each in names},
+        resumed=True,
+        files=record["files"],
+    )
+
+
+def _listed(names: list[str]) -> str:
+    """A few names in words, with the verb."""
+    more = f" and {len(names) - 1} more files are" if len(names) > 1 else " is"
+    return f"{names[0]}{more}"
+
+
+def _begin_anew(folder: Path, journal: Journal, record: dict[str, Any], *, damaged: bool) -> None:
+    """Empty a stage's folder; of files that it wrote elsewhere only the damaged ones' go."""
+    outside = {
+        name: known
+        for name, known in (record.get("files") or {}).items()
+        if name.startswith("../") and (folder / name).is_file()
+    }
+    if damaged:
+        for name in outside:
+            (folder / name).unlink()
+    if folder.exists():
+        shutil.rmtree(folder)
+    journal.keep({} if damaged else outside)
+
+
+def _clear(folder: Path, journal: Journal, scratch: Sequence[str]) -> None:
+    """Remove what a finished stage needs no more."""
+    journal.remove()
+    for name in scratch:
+        (folder / name).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -180,26 +273,19 @@ def _peak_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-def _marker(result: StageResult, *, complete: bool) -> dict[str, Any]:
-    return {
-        "fingerprint": result.fingerprint,
-        "complete": complete,
-        "report": result.report,
-        **result.summary(),
-    }
+def publish(result: StageResult, name: str, target: Path) -> None:
+    """Show a stage's result in the result folder: a hard link where possible, else a copy.
 
-
-def _read_marker(path: Path) -> dict[str, Any]:
-    """The marker, or nothing when it is missing or unreadable (then the stage is redone)."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return value if isinstance(value, dict) else {}
-
-
-def publish(source: Path, target: Path) -> None:
-    """Show a stage's result in the result folder: a hard link where possible, else a copy."""
+    Raises:
+        RunError: The file is not what the stage has written, or the disk is full.
+    """
+    source = result.folder / name
+    if differing(result.folder, {name: result.files[name]}):
+        raise RunError(
+            f"{source}: changed since it was written",
+            "the other stages",
+            "run the same command again; it does this stage anew",
+        )
     with atomic_path(target) as part:
         try:
             os.link(source, part)

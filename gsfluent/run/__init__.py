@@ -5,6 +5,7 @@ from gsfluent._lazy import room
 __getattr__, __dir__, __all__ = room(
     __name__,
     demo="SIZES photograph_demo run_demo",
+    from_input="made_shot",
     report="read_run write_report",
     shot="run_shot",
     single="fill_to reconstruct_to texture_to",

@@ -14,8 +14,9 @@ from gsfluent.errors import InputError
 from gsfluent.io import atomic_path
 from gsfluent.io.solid import load_solid
 from gsfluent.progress import LineReporter, Progress, Reporter
+from gsfluent.results.lock import locked
 from gsfluent.results.store import StageStore, fingerprint
-from gsfluent.run.shot import run_shot
+from gsfluent.run.shot import run_in
 from gsfluent.stages.context import RunContext
 
 
@@ -96,6 +97,7 @@ def run_demo(
     device: torch.device | str = "cpu",
     seed: int = 0,
     force: bool = False,
+    unlock: bool = False,
     reporter: Reporter | None = None,
 ) -> dict[str, Any]:
     """Photograph a built-in object and run its shot.
@@ -110,16 +112,28 @@ def run_demo(
 
     Raises:
         InputError: No such scene or size.
-        RunError: A stage failed.
+        RunError: A stage failed, or another run is at work in the folder.
     """
-    import yaml
-
     if name not in SCENES:
         raise InputError(f"demo {name!r}", f"choose one of {', '.join(SCENES)}")
     if size not in SIZES:
         raise InputError(f"--size {size}", f"choose one of {', '.join(SIZES)}")
     reporter = reporter or LineReporter()
-    scale = SIZES[size]
+    with locked(out, unlock=unlock):
+        return _run(name, out, SIZES[size], device, seed, force, reporter)
+
+
+def _run(
+    name: str,
+    out: Path,
+    scale: DemoSize,
+    device: torch.device | str,
+    seed: int,
+    force: bool,
+    reporter: Reporter,
+) -> dict[str, Any]:
+    import yaml
+
     store = StageStore(out / "stages", force=force)
 
     def photograph(folder: Path) -> dict[str, Any]:
@@ -139,7 +153,7 @@ def run_demo(
         reconstruction = context.record.values["reconstruction"]
         return {"demo": {"interior_error": error, "psnr": reconstruction["psnr"]}}
 
-    return run_shot(
+    return run_in(
         shot,
         out,
         device=device,

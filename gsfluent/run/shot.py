@@ -21,10 +21,12 @@ from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
 from gsfluent.plan.in_run import foresee_run, judge_plan
 from gsfluent.progress import LineReporter, Reporter
+from gsfluent.results.lock import locked
 from gsfluent.results.record import RunRecord
 from gsfluent.results.store import StageResult, StageStore
 from gsfluent.run.report import REPORT, write_report
 from gsfluent.stages.chain import run_stages
+from gsfluent.stages.check import check_shot
 from gsfluent.stages.context import RunContext
 
 _log = logging.getLogger(__name__)
@@ -44,6 +46,7 @@ def run_shot(
     after: AfterRun | None = None,
     facts: Mapping[str, Any] | None = None,
     plan: bool = True,
+    unlock: bool = False,
 ) -> dict[str, Any]:
     """Run a shot into a folder.
 
@@ -58,16 +61,38 @@ def run_shot(
         after: Called when all stages are done; what it returns is added to ``run.json``.
         facts: What is known before and belongs into ``run.json``.
         plan: Plan the run first, and put plan and fact beside each other into ``run.json``.
+        unlock: Take the folder although a run on another machine has not given it back.
 
     Returns:
         The content of ``run.json``.
 
     Raises:
         InputError: The shot or a file it names is wrong.
-        RunError: A stage failed; finished stages are kept.
+        RunError: A stage failed; finished stages are kept. Or another run is at work in the
+            folder; nothing is touched.
         KeyboardInterrupt: Interrupted; finished stages and frames are kept.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    with locked(out, unlock=unlock):
+        return run_in(
+            shot, out, device=device, seed=seed, force=force, reporter=reporter, before=before,
+            after=after, facts=facts, plan=plan,
+        )  # fmt: skip
+
+
+def run_in(
+    shot: Shot,
+    out: Path,
+    *,
+    device: torch.device | str,
+    seed: int,
+    force: bool,
+    reporter: Reporter | None,
+    before: StageResult | None = None,
+    after: AfterRun | None = None,
+    facts: Mapping[str, Any] | None = None,
+    plan: bool = True,
+) -> dict[str, Any]:
+    """:func:`run_shot` in a folder that is locked already."""
     device = torch.device(device)
     store = StageStore(out / "stages", force=force)
     if before is not None:
@@ -85,6 +110,7 @@ def run_shot(
             foreseen = foresee_run(context, plan=plan)
 
     try:
+        check_shot(shot)
         foreseen = foresee_run(context, plan=plan)
         run_stages(context, settle)
         if after is not None:

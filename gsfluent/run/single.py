@@ -12,14 +12,15 @@ from gsfluent.data import Capture
 from gsfluent.io import load_capture, load_splats
 from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.io.splats.load import save_splats
+from gsfluent.pipeline.fill.mesh_skin import mesh_gaussians
 from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.reconstruct.evaluate import write_report
 from gsfluent.pipeline.reconstruct.isolate import Isolate
 from gsfluent.pipeline.reconstruct.stage import Reconstruct
 from gsfluent.pipeline.render.cuts import save_cut_views
-from gsfluent.pipeline.solid.mesh import is_mesh
 from gsfluent.pipeline.texture import Texture
 from gsfluent.progress import Progress
+from gsfluent.spatial.mesh_file import is_mesh
 
 
 def reconstruct_to(
@@ -76,7 +77,7 @@ def fill_to(
     if model.is_dir():
         photographs = load_capture(model)
     elif is_mesh(model):
-        solid = model
+        solid, gaussians = model, mesh_gaussians(model, seed=seed).to(device)
     else:
         gaussians = load_splats(model).to(device)
     start = time.perf_counter()

@@ -18,6 +18,7 @@ _log = logging.getLogger(__name__)
 
 MAX_VALUES = 256
 """Most values of a grid along one axis."""
+_LEAST = 1e-5  # spacings
 _NEIGHBOURS = 12
 """Triangles looked at for each grid node, nearest sample first."""
 
@@ -95,7 +96,7 @@ def signed_distances(
 
     grid = [corner[i] + spacing * np.arange(size[i]) for i in range(3)]
     nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = _inside(triangles, grid)
+    inside = grid_winding(triangles, grid) != 0
     if band is None:
         distance = _distance(nodes, triangles, spacing)
     else:
@@ -105,6 +106,7 @@ def signed_distances(
         near = steps <= band
         distance = steps * spacing
         distance[near] = _distance(nodes[near], triangles, spacing)
+    distance = np.maximum(distance, _LEAST * spacing)  # a node on the surface has a side as well
     signed = np.where(inside.reshape(-1), -distance, distance).reshape(tuple(size))
     return np.asarray(signed, dtype=np.float32)
 
@@ -123,11 +125,11 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
             mesh = trimesh.util.concatenate(mesh.dump())
     except Exception as error:  # readers of many formats, each with errors of its own
         raise InputError(
-            f"collider: {path} cannot be read as a mesh ({error})",
-            hint="give a file that trimesh reads: obj, ply, stl, glb",
+            f"{path}: cannot be read as a mesh ({error})",
+            hint="give a file that trimesh reads: obj, glb, stl, ply",
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"collider: {path} holds no triangles", hint="give a triangle mesh")
+        raise InputError(f"{path}: holds no triangles", hint="give a triangle mesh")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures are no openings
     return mesh
 
@@ -198,8 +200,17 @@ def _point_triangle(p: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     return np.where(over, np.minimum(best, height), best)
 
 
-def _inside(triangles: np.ndarray, grid: list[np.ndarray]) -> np.ndarray:
-    """Whether each node is inside: an odd number of crossings below it on a vertical line."""
+def grid_winding(triangles: np.ndarray, grid: list[np.ndarray]) -> np.ndarray:
+    """Winding numbers of a closed surface at the nodes of a grid, int [X, Y, Z]; 0 is outside.
+
+    Counted on vertical lines: one more for each crossing below that enters, one less for each that
+    leaves. So parts that overlap are one body, in which the number is 2. A line whose crossings do
+    not cancel (triangles wound against each other) is counted by odd and even instead.
+
+    Args:
+        triangles: Corners [F, 3, 3].
+        grid: Coordinates of the nodes along x, y and z, evenly spaced.
+    """
     spacing = grid[0][1] - grid[0][0]
     # Off the lattice by an odd amount, so that no line passes through an edge of a tidy mesh.
     x, y = grid[0] + 3.1e-5 * spacing, grid[1] + 1.7e-5 * spacing
@@ -220,5 +231,10 @@ def _inside(triangles: np.ndarray, grid: list[np.ndarray]) -> np.ndarray:
         hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
         k = np.searchsorted(grid[2], az + u * (bz - az) + v * (cz - az))
         where = np.nonzero(hit)
-        np.add.at(crossings, (i[where[0]], j[where[1]], k[where]), 1)
-    return np.cumsum(crossings, axis=2)[:, :, :-1] % 2 == 1
+        # seen from below a face that is wound left-handed looks at us: there the line enters
+        step = 1 if area < 0.0 else -1
+        np.add.at(crossings, (i[where[0]], j[where[1]], k[where]), step)
+    winding = np.cumsum(crossings, axis=2)
+    odd = np.cumsum(np.abs(crossings), axis=2) % 2
+    counted = np.where(winding[:, :, -1:] == 0, winding, odd)
+    return np.asarray(counted[:, :, :-1])

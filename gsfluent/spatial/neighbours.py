@@ -72,26 +72,93 @@ def nearest_rows(points: Tensor, queries: Tensor, count: int, cell: float) -> tu
         distance, index = grid_search(
             points.detach().double(), queries.detach().double(), count, cell
         )
-    index, order = index.to(torch.int64).sort(dim=1)
+    return _in_order(distance, index.to(torch.int64))
+
+
+def nearest_in_group(
+    points: Tensor, group: Tensor, queries: Tensor, wanted: Tensor, count: int, cell: float
+) -> tuple[Tensor, Tensor]:
+    """Nearest points of one's own group, for all groups at once.
+
+    Groups are searched as one set: each stands at a place of its own on a coarse lattice, so far
+    from the others that none of their points is asked.
+
+    Args:
+        points: Where to look, [N, 3], world units.
+        group: Of each point, int64 [N].
+        queries: [M, 3], world units.
+        wanted: Group in which each query looks, int64 [M].
+        count: Neighbours per query.
+        cell: As for :func:`nearest`.
+
+    Returns:
+        Distances float64 [M, count], ascending, infinite where a group has too few points, and
+        rows int64 [M, count], -1 there.
+    """
+    distance = torch.full((len(queries), count), math.inf, dtype=torch.float64)
+    distance = distance.to(points.device)
+    index = torch.full_like(distance, -1, dtype=torch.int64)
+    names, place = torch.unique(group, return_inverse=True)
+    slot = torch.searchsorted(names, wanted).clamp(max=max(len(names) - 1, 0))
+    asks = (names[slot] == wanted).nonzero()[:, 0] if len(names) else slot[:0]
+    if len(asks) == 0:
+        return distance, index
+    places, asked = points.detach().double(), queries.detach()[asks].double()
+    both = torch.cat([places, asked])
+    extent = max(float((both.amax(0) - both.amin(0)).amax()), cell)
+    # a power of two: coordinates of single precision keep their digits, and ties stay ties
+    pitch = 2.0 ** (math.ceil(math.log2(extent)) + 2)
+    side = math.ceil(len(names) ** (1 / 3))
+
+    def apart(x: Tensor, number: Tensor) -> Tensor:
+        lattice = [number // side**2, number // side % side, number % side]
+        return x + pitch * torch.stack(lattice, dim=1)
+
+    places, asked = apart(places, place), apart(asked, slot[asks])
+    most = min(count, len(points))
+    if points.device.type == "cpu":
+        from scipy.spatial import cKDTree
+
+        found = cKDTree(places.numpy()).query(
+            asked.numpy(), k=list(range(1, most + 1)), distance_upper_bound=2.0 * extent
+        )
+        near, rows = (torch.from_numpy(np.asarray(part)) for part in found)
+        rows = rows.to(torch.int64)
+    else:
+        near, rows = grid_search(places, asked, most, cell, extent)
+    rows = torch.where(near.isfinite(), rows, len(points))
+    near, rows = _in_order(near, rows)
+    distance[asks, :most] = near
+    index[asks, :most] = torch.where(near.isfinite(), rows, -1)
+    return distance, index
+
+
+def _in_order(distance: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """By distance, and by row where that is the same."""
+    index, order = index.sort(dim=1)
     distance, order = distance.gather(1, order).sort(dim=1, stable=True)
     return distance, index.gather(1, order)
 
 
-def grid_search(points: Tensor, queries: Tensor, count: int, cell: float) -> tuple[Tensor, Tensor]:
+def grid_search(
+    points: Tensor, queries: Tensor, count: int, cell: float, reach: float = math.inf
+) -> tuple[Tensor, Tensor]:
     """As :func:`nearest`, by cells; double precision, any device.
 
     What lies in the 27 cells around a query is complete up to a distance of one cell. Queries whose
-    last neighbour is farther ask a grid twice as coarse.
+    last neighbour is farther ask a grid twice as coarse, up to cells of ``reach``, beyond which
+    nothing is looked for: what is not found is at an infinite distance.
     """
     low = torch.minimum(points.amin(0), queries.amin(0)) if len(queries) else points.amin(0)
     high = torch.maximum(points.amax(0), queries.amax(0)) if len(queries) else points.amax(0)
     extent = max(float((high - low).amax()), 1e-300)
     cell = max(cell, extent / (_SIDE - 4))
+    reach = min(extent, reach)
     distance = torch.full((len(queries), count), math.inf, dtype=points.dtype, device=points.device)
     index = torch.zeros((len(queries), count), dtype=torch.long, device=points.device)
     left = torch.arange(len(queries), device=points.device)
     while len(left):
-        last = cell >= extent
+        last = cell >= reach
         order, starts, keys = _sorted_cells(points, low, cell)
         pairs = _candidates(queries[left], low, cell, starts, keys)
         for part in _parts(pairs[1].sum(1)):
@@ -101,7 +168,7 @@ def grid_search(points: Tensor, queries: Tensor, count: int, cell: float) -> tup
             )
             distance[rows], index[rows] = square.sqrt(), place
         left = left[left.new_zeros(0)] if last else left[distance[left, -1] > cell]
-        cell *= 2.0
+        cell = min(2.0 * cell, reach) if reach > cell else 2.0 * cell
     return distance, index
 
 
@@ -129,17 +196,17 @@ def _candidates(
     return starts[slot], torch.where(there, starts[slot + 1] - starts[slot], 0)
 
 
-def _parts(totals: Tensor) -> list[slice]:
-    """Runs of queries whose padded candidates stay below the chunk."""
-    parts, start, widest = [], 0, 1
-    for place, total in enumerate(totals.tolist()):
-        wider = max(widest, total)
-        if place > start and wider * (place + 1 - start) > _CHUNK:
-            parts.append(slice(start, place))
-            start, wider = place, max(1, total)
-        widest = wider
-    if len(totals) > start:
-        parts.append(slice(start, len(totals)))
+def _parts(totals: Tensor) -> list[Tensor]:
+    """Queries in groups of like numbers of candidates, whose padded tables stay below the chunk."""
+    sizes, order = totals.sort()
+    sizes = sizes.clamp(min=1).cpu()
+    parts, start = [], 0
+    while start < len(sizes):
+        most = min(len(sizes) - start, max(_CHUNK // int(sizes[start]), 1))
+        n = torch.arange(1, most + 1)
+        fits = int((sizes[start : start + most] * n <= _CHUNK).sum())
+        parts.append(order[start : start + max(fits, 1)])
+        start += max(fits, 1)
     return parts
 
 

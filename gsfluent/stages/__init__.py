@@ -5,8 +5,10 @@ from gsfluent._lazy import room
 __getattr__, __dir__, __all__ = room(
     __name__,
     chain="run_stages",
+    check="check_shot",
     context="RunContext",
     findings="cells_for lowered setting thin_walls",
+    known="extended known_solid parted source_digest",
     select="select_mask",
     show="render_again",
     simulate="build_scene moving_settings saved solver_options",

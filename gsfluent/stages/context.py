@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ class RunContext:
         *parts: Any,
         section: str = "",
         hands_on: bool = True,
+        scratch: Sequence[str] = (),
     ) -> StageResult:
         """Do a stage, or find it done.
 
@@ -50,11 +51,13 @@ class RunContext:
             parts: What it depends on beside the stages before it.
             section: Of ``run.json``, takes its report.
             hands_on: Whether the next stages build on it.
+            scratch: Files that only an unfinished stage needs.
         """
         key = fingerprint(name, [self.seed, self.device.type, self.source_key, *parts])
-        result = self.store.run(name, key, work)
+        result = self.store.run(name, key, work, scratch)
         if section:
             self.record.values[section] = dict(result.report)
         if hands_on:
-            self.source_key = result.fingerprint
+            # and the content: a stage done anew, with other results, is built on anew
+            self.source_key = fingerprint(result.fingerprint, result.content)
         return result

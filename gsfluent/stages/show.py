@@ -19,6 +19,7 @@ from gsfluent.pipeline.render.figures import FilmFigures
 from gsfluent.pipeline.render.film import Film, poster_frame
 from gsfluent.pipeline.render.video import to_bytes, write_video
 from gsfluent.progress import Progress, report_progress
+from gsfluent.results.digests import require_intact
 from gsfluent.results.record import shot_of
 from gsfluent.results.store import content_digest, publish
 from gsfluent.stages.context import RunContext
@@ -67,7 +68,7 @@ def render_stage(context: RunContext) -> None:
 
     result = context.do("render", work, looks, output, camera_key, section="render", hands_on=False)
     for name in ("video.mp4", "poster.png"):
-        publish(result.folder / name, context.out / name)
+        publish(result, name, context.out / name)
         context.record.values["outputs"][name.split(".")[0]] = name
 
 
@@ -112,6 +113,7 @@ def render_again(
     if size is not None:
         output = replace(output, size=size)
     shot = replace(shot, output=output)
+    require_intact(out / "stages" / "simulate")
     film = Film(out, shot, changed(light_of(shot), **light), device)
     target = to or out / ("render.mp4" if frame is None else "render.png")
     start = time.perf_counter()

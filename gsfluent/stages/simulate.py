@@ -167,7 +167,7 @@ def simulate_stage(context: RunContext) -> None:
         _log.info("simulate: %s", summary(report["per_frame"]))
         return report | {"thin": thin, "unbroken": unbroken, "notes": notes}
 
-    report = context.do("simulate", work, settings, section="simulation").report
+    report = context.do("simulate", work, settings, section="simulation", scratch=(_STATE,)).report
     fill = context.record.values["fill"]
     # the number of material points is known only once the grid is
     for name in ("particles", "particles_per_cell"):
@@ -224,6 +224,7 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         body=particles.body,
         material=particles.material,
         led=frame.led,
+        dust=frame.dust,
         facts=dict(frame.stats)
         | {
             "energy": dict(frame.energy),

@@ -18,6 +18,7 @@ from gsfluent.io import atomic_path, load_capture, load_splats, write_json
 from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.io.splats.load import save_splats
 from gsfluent.pipeline.capture.orient import Orientation, make_frame, orient
+from gsfluent.pipeline.fill.mesh_skin import mesh_gaussians
 from gsfluent.pipeline.fill.stage import Fill, fill_resolution, visible_extent
 from gsfluent.pipeline.reconstruct.evaluate import write_report
 from gsfluent.pipeline.reconstruct.isolate import Isolate
@@ -31,6 +32,7 @@ from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.record import RunRecord, read_frame
 from gsfluent.results.store import StageStore, content_digest, publish
 from gsfluent.stages.context import RunContext
+from gsfluent.stages.known import extended, is_solid, known_solid, parted, source_digest
 from gsfluent.stages.select import select_mask
 
 _log = logging.getLogger(__name__)
@@ -57,25 +59,39 @@ def reconstruct_stage(context: RunContext) -> None:
         write_report(folder, gaussians, capture)
         return dict(gaussians.report)
 
-    context.do("reconstruct", work, shot.reconstruct.given(), section="reconstruction")
+    context.do(
+        "reconstruct",
+        work,
+        shot.reconstruct.given(),
+        section="reconstruction",
+        scratch=("training.pt",),
+    )
 
 
 def isolate_stage(context: RunContext) -> None:
     """The object apart from its background, and where it stands in the scene."""
     shot = context.shot
-    if shot.splats is not None:
-        source = shot.splats
-        context.source_key = content_digest(source)
-    else:
-        source = context.store.root / "reconstruct" / "model.ply"
+    if shot.capture is None:
+        context.source_key = source_digest(shot)
+    source = shot.splats or context.store.root / "reconstruct" / "model.ply"
     placing = {"scale": shot.scale, "size": shot.size, "up": shot.up, "floor": shot.floor}
+    placing["front"] = shot.front
     placing["origin"] = shot.origin
     captured = shot.output.backdrop == "captured"
 
     def work(folder: Path) -> dict[str, Any]:
-        gaussians = load_splats(source).validated(source.name)
-        whole, background = Isolate(seed=context.seed).split(gaussians, context.capture)
-        stance = orient(whole, context.capture, shot.up)
+        if shot.mesh is not None:
+            gaussians = mesh_gaussians(shot.mesh, seed=context.seed).to(context.device)
+        else:
+            gaussians = load_splats(source).validated(source.name)
+        # the rows of a solid belong to its volume: nothing is taken from it
+        isolate = Isolate("all" if is_solid(shot.splats) else "auto", seed=context.seed)
+        whole, background = isolate.split(gaussians, context.capture)
+        if is_solid(shot.splats):
+            whole = gaussians.replace(report=whole.report)
+        stance = orient(whole, context.capture, shot.up, shot.mesh)
+        said = ", ".join(f"{part:+.2f}" for part in stance.up)
+        _log.info("up is [%s] (%s); set up: in the shot if that is wrong", said, stance.up_from)
         frame = make_frame(whole, context.capture, shot)
         save_splats(whole, folder / "object.ply")
         if background.count:
@@ -121,12 +137,26 @@ def fill_stage(context: RunContext) -> None:
 
     def work(folder: Path) -> dict[str, Any]:
         everything = load_splats(context.store.root / "isolate" / "object.ply")
-        objects = {}
+        masks = {}
         taken = torch.zeros(everything.count, dtype=torch.bool)
         for name, settings in shot.objects.items():
-            mask = select_mask(everything, settings.select, frame) & ~taken
-            taken |= mask
-            objects[name] = everything.select(mask)
+            masks[name] = select_mask(everything, settings.select, frame) & ~taken
+            taken |= masks[name]
+        whole = known_solid(
+            shot, everything, {"resolution": fill_resolution(1.0, 1.0, cells)} | options,
+            seed=context.seed, progress=context.reporter.task("fill"),
+        )  # fmt: skip
+        if whole is not None:
+            # splats inside a mesh are none of those that were selected
+            masks = {
+                name: extended(mask, everything, whole.gaussians) for name, mask in masks.items()
+            }
+            reports = []
+            for name, solid in parted(whole, masks).items():
+                save_solid(solid.transformed(frame), folder / f"{name}.ply")
+                reports.append(solid.report | {"volume_m3": solid.volume * frame.scale**3})
+            return _merged(reports)
+        objects = {name: everything.select(mask) for name, mask in masks.items()}
         extents = {name: visible_extent(splats) for name, splats in objects.items()}
         largest = max(extents.values())
         down = tuple((-frame.rotation[2]).tolist())
@@ -154,6 +184,12 @@ def texture_stage(context: RunContext) -> None:
         reports = []
         for name in shot.objects:
             solid = load_solid(context.store.root / "fill" / f"{name}.ply")
+            if solid.color is not None and not options:
+                _log.info("texture: %s has an inside with colours already, they stay", name)
+                save_solid(solid, folder / f"{name}.ply")
+                save_cut_views(solid, folder / f"{name}.png")
+                reports.append({"method": "textured before"})
+                continue
             # slices finished before a kill are found again: the folder outlives it
             stage = Texture(
                 **options,
@@ -169,7 +205,7 @@ def texture_stage(context: RunContext) -> None:
 
     result = context.do("texture", work, options, exemplar, section="texture")
     first = next(iter(shot.objects))
-    publish(result.folder / f"{first}.png", context.out / "interior.png")
+    publish(result, f"{first}.png", context.out / "interior.png")
     context.record.values["outputs"]["interior"] = "interior.png"
 
 

@@ -22,6 +22,7 @@ from gsfluent.pipeline.render.film import poster_frame
 from gsfluent.viewer.draw.artist import Artist
 from gsfluent.viewer.draw.picture import PictureMaker, browser_camera
 from gsfluent.viewer.draw.splats import BrowserSplats
+from gsfluent.viewer.guard import Guard
 from gsfluent.viewer.model.look import Look
 from gsfluent.viewer.model.pace import Pace
 from gsfluent.viewer.model.playback import Playback
@@ -53,6 +54,7 @@ class App:
     Attributes:
         source: Where frames come from.
         timeline: They and what they have in common.
+        guard: Who may talk to the page.
         server: viser's server; panels may add controls and scene nodes of their own.
         playback: The clock.
         index: Frame shown.
@@ -104,7 +106,8 @@ class App:
         self.lock = threading.RLock()
         self._done = threading.Event()
         self.browser = BrowserSplats(self.timeline) if splats else None
-        self.server = start_server(host, port, f"gsfluent · {source.title}")
+        self.guard = Guard(host)
+        self.server = start_server(host, port, f"gsfluent · {source.title}", self.guard)
         self._state = self.server.gui.add_markdown("")
         self.server.gui.main_panel.dock_right()
         self.server.gui.main_panel.set_width(_PANEL_WIDTH)
@@ -129,9 +132,11 @@ class App:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """Address of the page, with the token where it can be reached from elsewhere."""
         host = self.server.get_host()
-        return f"http://{'localhost' if host == '0.0.0.0' else host}:{self.server.get_port()}"
+        shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        token = f"/?token={self.guard.token}" if self.guard.token else ""
+        return f"http://{shown}:{self.server.get_port()}{token}"
 
     def show(self, index: int) -> None:
         """Go to frame ``index``."""

@@ -9,6 +9,7 @@ import socket
 from typing import TYPE_CHECKING
 
 from gsfluent.errors import InputError, need
+from gsfluent.viewer.guard import Guard, guarded
 
 if TYPE_CHECKING:
     import viser
@@ -18,19 +19,25 @@ _TRIES = 50  # ports after the wanted one
 _BRAND = (47, 111, 196)
 
 
-def start_server(host: str, port: int, label: str) -> viser.ViserServer:
-    """Start serving.
+def start_server(host: str, port: int, label: str, guard: Guard) -> viser.ViserServer:
+    """Start serving behind a guard.
 
     Raises:
         InputError: viser is not installed, or host and port cannot be had.
     """
     viser = need("viser", "viewer", "view: the page")
-    free = free_port(host, port)
+    free, server = free_port(host, port), None
     if port not in (0, free):
         _log.warning("viewer: port %d is in use; taking %d", port, free)
     # viser greets on stdout, which belongs to --json
     with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=free, label=label, verbose=False)
+        try:
+            with guarded(guard):
+                server = viser.ViserServer(host=host, port=free, label=label, verbose=False)
+        except InputError:
+            if server is not None:
+                server.stop()
+            raise
     server.gui.configure_theme(
         show_logo=False, show_share_button=False, dark_mode=False, brand_color=_BRAND
     )

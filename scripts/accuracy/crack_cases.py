@@ -7,27 +7,32 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsfluent import demo, geometry, materials, ops
-from gsfluent.data import SURFACE, Gaussians, Solid
+from gsfluent.data import Gaussians, Solid
 from gsfluent.demo.catalogue import OBJECTS
-from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud
+from gsfluent.lab.truth.fracture_pictures import TrueSolid
 from gsfluent.lab.truth.interiors import known_interior
-from gsfluent.pipeline.cracks.stage import CrackHistory, Repair
+from gsfluent.lab.truth.true_pieces import Displacement
+from gsfluent.pipeline.cracks.gaps import Cracks
+from gsfluent.pipeline.cracks.stage import CrackHistory, Repair, Repaired
 from gsfluent.pipeline.fill.stage import Fill
-from gsfluent.pipeline.matter.carry import Carry
+from gsfluent.pipeline.matter.carry import Carry, Points
 from gsfluent.pipeline.matter.points import Matter, body_frame
+from gsfluent.pipeline.partition.roughness import amplitude, displacement
+from gsfluent.pipeline.partition.tree import PER_SPACING
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.scene.scene import Scene
 
-VERSION = 1
+VERSION = 2
 """Counts up when cached simulations are no longer what this file would make."""
-FPS = 30.0
+FPS = 60.0
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,6 @@ class Case:
         material: Preset.
         height: It falls from [m].
         seconds: Length of the simulation [s].
-        isotropic: Every splat is a ball.
         longest: Longest side [m] of known interiors.
     """
 
@@ -47,15 +51,14 @@ class Case:
     material: str
     height: float
     seconds: float
-    isotropic: bool = False
     longest: float = 0.25
 
 
 CASES = {
     "melon": Case("watermelon", "fruit.watermelon", 1.5, 0.9),
-    "melon-isotropic": Case("watermelon", "fruit.watermelon", 1.5, 0.9, isotropic=True),
-    "marble": Case("marble", "fruit.watermelon", 1.5, 0.8),
-    "bread": Case("bread", "fruit.watermelon", 1.2, 0.8),
+    "orange": Case("orange", "fruit.watermelon", 1.5, 0.8),
+    "marble": Case("marble", "plaster", 3.0, 1.1),
+    "bread": Case("bread", "fruit.watermelon", 3.0, 1.1),
 }
 
 
@@ -109,14 +112,6 @@ def make_solid(case: Case, known: Inside, resolution: int) -> Solid:
     field = SignedDistance.of_voxels(matter.numpy(), low.double().numpy(), voxel, "known")
     solid = Fill(resolution=resolution)(None, None, solid=field)
     splats = solid.gaussians
-    if case.isotropic:
-        skin = splats.labels == SURFACE
-        # a ball as large as a disc hides as much; its centre goes in by half its size
-        size = splats.scales.amax(1)
-        round_ = torch.where(skin, 0.8 * size, splats.scales.prod(1) ** (1 / 3))
-        inward = -geometry.quaternion_to_matrix(splats.quats)[..., 2] * 0.5 * round_[:, None]
-        means = torch.where(skin[:, None], splats.means + inward, splats.means)
-        splats = splats.replace(means=means, scales=round_[:, None].expand(-1, 3).contiguous())
     colors = known.colors(splats.means.double()).float()
     splats = splats.replace(sh=geometry.rgb_to_sh0(colors)[:, None])
     return solid.replace(gaussians=splats)
@@ -126,15 +121,19 @@ def make_solid(case: Case, known: Inside, resolution: int) -> Solid:
 class Moment:
     """The material points of one frame."""
 
+    index: int
     position: Tensor
     deformation: Tensor
     strain: Tensor
     fragments: Tensor
+    unit: Tensor
     broken: Tensor
     pieces: int
 
-    def motion(self, carry: Carry):
-        return carry.motion(self.position, self.deformation, self.fragments, self.broken)
+    def points(self, unit: Tensor | None = None) -> Points:
+        """As the repair takes them; hanging together as at another moment if so asked."""
+        unit = self.unit if unit is None else unit
+        return Points.of(self.position, self.deformation, self.fragments, self.broken, unit)
 
 
 class Broken:
@@ -161,10 +160,10 @@ class Broken:
         self.scene.add(self.solid, materials.get(self.case.material))
         self.scene.drop(self.case.height)
         longest = float((self.known.bounds[1] - self.known.bounds[0]).max())
-        self.stage = Simulate(dx=longest / cells)
+        self.stage = Simulate(dx=longest / cells, repair="none")
         self.matter: Matter = self.stage.prepare(self.scene)
         self.carry = Carry.bind(self.scene, self.matter)
-        self.histories: dict[str, CrackHistory] = {}
+        self.histories: dict[str, tuple[CrackHistory, int]] = {}
         self.count = round(FPS * self.case.seconds)
         if not self._file(self.count - 1).exists():
             self._simulate()
@@ -173,7 +172,8 @@ class Broken:
         return self.folder / f"moment_{index:03d}.npz"
 
     def _simulate(self) -> None:
-        for frame in self.stage(self.scene, fps=FPS, seconds=self.case.seconds):
+        frames = self.stage(self.scene, fps=FPS, seconds=self.case.seconds)
+        for frame in frames:
             p = frame.particles
             np.savez(
                 self._file(frame.index),
@@ -181,6 +181,7 @@ class Broken:
                 deformation=p.deformation,
                 strain=p.strain,
                 fragments=frame.fragments,
+                unit=frames.run.units,
                 broken=frame.broken,
                 pieces=frame.pieces.count,
             )
@@ -188,7 +189,7 @@ class Broken:
     def moment(self, index: int) -> Moment:
         with np.load(self._file(index)) as data:
             values = {k: torch.from_numpy(data[k]) for k in data.files}
-        return Moment(**values | {"pieces": int(values["pieces"])})
+        return Moment(index=index, **values | {"pieces": int(values["pieces"])})
 
     @functools.cache  # noqa: B019
     def broken_frames(self) -> list[int]:
@@ -196,31 +197,70 @@ class Broken:
         parts = [float(self.moment(k).broken.float().mean()) for k in range(self.count)]
         return [k for k, part in enumerate(parts) if part >= 0.01]
 
-    def cloud(self, voxels: int, parted: float = PARTED) -> TrueCloud:
-        """The dense true cloud with ``voxels`` voxels along the object, kept in the folder."""
-        stored = self.folder / f"cloud_{voxels}.pt"
+    def truth(self, finer: float) -> TrueSolid:
+        """The true pieces, of voxels of ``1 / finer`` spacings, kept in the folder."""
+        stored = self.folder / f"true_{finer:g}.pt"
         shift = body_frame(self.scene.bodies[0], self.scene).translation
-        low, high = self.known.bounds
         if stored.exists():
-            cloud: TrueCloud = torch.load(stored, weights_only=False)
+            solid: TrueSolid = torch.load(stored, weights_only=False)
         else:
-            cloud = TrueCloud(
+            low, high = self.known.bounds
+            spacing = self.matter.spacing[0]
+            solid = TrueSolid(
                 lambda p: self.known.inside(p - shift),
                 lambda p: self.known.colors(p - shift),
                 (low + shift, high + shift),
-                float((high - low).max()) / voxels,
+                spacing / finer,
                 self.matter.rest,
-                self.matter.spacing[0],
+                self.moment(self.count - 1).unit,
+                spacing,
+                roughness(self.matter.rest, spacing, self.case.material),
             )
-            keep, cloud.colors = cloud.colors, None
-            torch.save(cloud, stored)
-            cloud.colors = keep
-        cloud.colors = lambda p: self.known.colors(p - shift)
-        cloud.parted = parted
-        return cloud
+            keep, solid.colors = solid.colors, None
+            torch.save(solid, stored)
+            solid.colors = keep
+        solid.colors = lambda p: self.known.colors(p - shift)
+        return solid
+
+    def stepped(self, method: str, index: int) -> tuple[CrackHistory, Cracks | None]:
+        """The cracks of a frame by a method that goes on from frame to frame."""
+        first = max(0, self.broken_frames()[0] - 1)
+        begun = Repair(method).begin(self.carry), first
+        history, nearest = self.histories.setdefault(method, begun)
+        if index < nearest:
+            history.restore({})
+            nearest = first
+        cracks = None
+        for k in range(nearest, index + 1):
+            cracks = history.step(self.moment(k).points())
+        self.histories[method] = history, index + 1
+        return history, cracks
 
 
-Drawn = tuple[Gaussians, Tensor | None]
+def roughness(rest: Tensor, spacing: float, material: str) -> Displacement:
+    """How faces of a material are displaced: what is hashed from the rest place, in between."""
+    from scipy import ndimage
+
+    edge = spacing / PER_SPACING
+    low = rest.double().amin(0).numpy() - 2.0 * spacing
+    extent = rest.double().amax(0).numpy() + 2.0 * spacing - low
+    shape = tuple(int(n) for n in np.ceil(extent / edge) + 1)
+    field = displacement((0, 0, 0), shape, rest.device).numpy()
+
+    def shift(places: np.ndarray) -> np.ndarray:
+        at = ((places - low) / edge).T
+        parts = [ndimage.map_coordinates(f, at, order=1, mode="nearest") for f in field]
+        return np.stack(parts, 1) * np.float32(amplitude(material) * spacing)
+
+    return shift
+
+
+class Drawn(NamedTuple):
+    """What a method shows."""
+
+    gaussians: Gaussians
+    groups: Tensor | None
+    shown: Tensor  # where the material points are drawn [m], [P, 3]
 
 
 def raw(broken: Broken, moment: Moment, *, total: bool = False) -> Drawn:
@@ -247,40 +287,28 @@ def raw(broken: Broken, moment: Moment, *, total: bool = False) -> Drawn:
     root = local @ geometry.quaternion_to_matrix(rest.quats) * rest.scales[:, None]
     quats, scales = ops.covariance_axes(geometry.pack_symmetric(root @ root.mT))
     sh = geometry.rotate_sh(rest.sh, turn)
-    return rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None), None
+    gaussians = rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None)
+    return Drawn(gaussians, None, moment.position)
 
 
-def ideal(broken: Broken, moment: Moment, cloud: TrueCloud) -> Drawn:
-    """The splats moved exactly as the true matter: what a perfect binding would reach."""
-    rest = broken.carry.gaussians
-    owner = broken.carry.owner
-    means, local = cloud.follow(
-        rest.means, owner, moment.position, moment.deformation, moment.fragments
-    )
-    turn, local = ops.polar_clamped(local.contiguous(), 0.6, 1.5)
-    root = local @ geometry.quaternion_to_matrix(rest.quats) * rest.scales[:, None]
-    quats, scales = ops.covariance_axes(geometry.pack_symmetric(root @ root.mT))
-    sh = geometry.rotate_sh(rest.sh, turn)
-    return rest.replace(means=means, quats=quats, scales=scales, sh=sh, normals=None), None
+def repaired(broken: Broken, moment: Moment, method: str) -> Drawn:
+    """A repair, kept from frame to frame as in a run."""
+    history, cracks = broken.stepped(method, moment.index)
+    made = drawn(broken, history, cracks, moment.points())
+    shown = moment.position if cracks is None else cracks.points.position
+    return Drawn(made.gaussians, made.groups, shown)
 
 
-def carried(broken: Broken, moment: Moment) -> Drawn:
-    """Our carry, no repair."""
-    return broken.carry.apply(moment.motion(broken.carry)), None
-
-
-def repaired(broken: Broken, moment: Moment, **options: str) -> Drawn:
-    """Our carry and a repair, which is kept from frame to frame as in a run."""
-    repair = Repair(**options)
-    history = broken.histories.setdefault(repair.method, repair.begin(broken.carry))
-    made = repair(broken.carry, moment.motion(broken.carry), history=history)
-    return made.gaussians, made.groups
+def drawn(broken: Broken, history: CrackHistory, cracks: Cracks | None, points: Points) -> Repaired:
+    """The splats of a moment."""
+    if cracks is None:
+        motion = broken.carry.follow(points)
+        return history.repair(broken.carry, motion, history=history)
+    motion = cracks.carry.follow(cracks.points, cracks.rest)
+    return history.repair(cracks.carry, motion, history=history, cracks=cracks)
 
 
 METHODS: dict[str, Callable[[Broken, Moment], Drawn]] = {
     "raw": raw,
     "raw-total": lambda b, m: raw(b, m, total=True),
-    "carried": carried,
-    "mvee": lambda b, m: repaired(b, m, method="mvee"),
-    "default": repaired,
-}
+} | {name: functools.partial(repaired, method=name) for name in ("mvee", "gap", "chunks")}

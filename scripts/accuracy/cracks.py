@@ -2,11 +2,13 @@
 
     python scripts/accuracy/cracks.py [--object melon ...] [--frames 15,18] [--only raw,default]
         [--size 400] [--cells 20] [--sheets FOLDER] [--lpips FOLDER] [--write]
+    python scripts/accuracy/cracks.py --chunks [--object melon ...] [--write]
+    python scripts/accuracy/cracks.py --cuts [--write]
 
 An object whose inside is known is filled with splats of the true colours and broken by the
-simulator; the truth is a dense cloud of voxels carried by the same material points
-(gsfluent.lab.truth.fracture_pictures). Simulations and true pictures are kept in --cache, so a
-second call scores in seconds. Colours are unlit, over white.
+simulator; the truth is its solid, cut on fine voxels by the converged partition and moved piece by
+piece (gsfluent.lab.truth.fracture_pictures). Simulations and true pictures are kept
+in --cache, so a second call scores in seconds. Colours are unlit, over white.
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
-from crack_cases import CASES, METHODS, Broken, Drawn, Moment, ideal
+from crack_cases import CASES, METHODS, Broken, Drawn
+from crack_chunks import chunk_figures, chunk_table, cut_table, flat_cuts
 from torch import Tensor
 
 from gsfluent.data import Camera
@@ -31,14 +34,14 @@ from gsfluent.draw import draw
 from gsfluent.figure.markdown import enter
 from gsfluent.inspection.compare_weights import Lpips
 from gsfluent.io import save_image
-from gsfluent.lab.truth.fracture_pictures import PARTED, TrueCloud, TruePicture
+from gsfluent.lab.truth.fracture_pictures import COVER, TruePicture, TrueSolid
 from gsfluent.metrics import psnr, ssim
 from gsfluent.ops.raster import Rendered
 from gsfluent.pipeline.render.camera import Action, look_at
 from gsfluent.pipeline.render.figures import RawCarry
 from gsfluent.pipeline.render.film import Film
 from gsfluent.pipeline.render.flicker import Flow, flicker
-from gsfluent.pipeline.render.holes import Holes, MatterView, small
+from gsfluent.pipeline.render.holes import REACH, Holes, MatterView, small
 from gsfluent.results.record import shot_of
 from gsfluent.stages.show import light_of
 
@@ -60,29 +63,63 @@ def cameras(broken: Broken, size: tuple[int, int]) -> list[Camera]:
     return [look_at(center, distance, a, e, size) for a, e in VIEWS]
 
 
-def true_pictures(
-    broken: Broken, cloud: TrueCloud, index: int, views: list[Camera], voxels: int
-) -> list[TruePicture]:
-    """The truth in every camera, kept in the folder of the case."""
-    size = f"{views[0].width}x{views[0].height}"
-    stored = broken.folder / f"truth_{index:03d}_{size}_{voxels}_{cloud.parted:g}.npz"
-    if not stored.exists():
-        moment = broken.moment(index)
-        seen = cloud.exposed(moment.position, moment.deformation, moment.fragments)
-        made = [cloud.draw(seen, camera, background=WHITE) for camera in views]
-        arrays = {
-            k: torch.stack([getattr(p, k) for p in made]) for k in TruePicture.__annotations__
-        }
-        np.savez_compressed(stored, **{k: v.numpy().astype(np.float16) for k, v in arrays.items()})
-    with np.load(stored) as data:
-        parts = [torch.from_numpy(data[k]).float() for k in TruePicture.__annotations__]
-    return [TruePicture(*(part[c] for part in parts)) for c in range(len(views))]
+class Truth:
+    """The truth in every camera at one moment: pieces that bend, and rigid ones."""
+
+    def __init__(self, broken: Broken, solid: TrueSolid, index: int, views: list[Camera]) -> None:
+        at = broken.moment(index).position
+        self.position = solid.moved(at, bent=True)
+        size = f"{views[0].width}x{views[0].height}_{len(solid.rest)}"
+        stored = broken.folder / f"truth_{index:03d}_{size}.npz"
+        names = list(TruePicture.__annotations__)
+        if not stored.exists():
+            arrays = {}
+            for kind, places in (("bent", self.position), ("rigid", solid.moved(at))):
+                made = [solid.draw(places, camera, background=WHITE) for camera in views]
+                for k in names:
+                    part = torch.stack([getattr(seen, k) for seen in made])
+                    arrays[f"{kind}_{k}"] = part.numpy().astype(np.float16)
+            np.savez_compressed(stored, **arrays)
+        with np.load(stored) as data:
+            values = {k: torch.from_numpy(data[k]).float() for k in data.files}
+        self.bent, self.rigid = (
+            [
+                TruePicture(*(values[f"{kind}_{k}"][c] for k in names))
+                for c in range(len(views))
+            ]
+            for kind in ("bent", "rigid")
+        )  # fmt: skip
+        # its voxels as discs: what ought to be opaque, and where it goes
+        volume = torch.full((len(self.position),), (COVER / REACH * solid.voxel) ** 3)
+        self.matter = [MatterView.of(self.position, volume, camera) for camera in views]
 
 
 def picture(drawn: Drawn, camera: Camera) -> Rendered:
-    gaussians, groups = drawn
-    options: dict[str, Any] = {"near": 0.01, "depth": True, "groups": groups}
-    return draw(gaussians, camera, background=torch.tensor(WHITE), **options)
+    options: dict[str, Any] = {"near": 0.01, "depth": True, "groups": drawn.groups}
+    return draw(drawn.gaussians, camera, background=torch.tensor(WHITE), **options)
+
+
+class Seen(NamedTuple):
+    """The matter of a method at one moment: what is not at its place yet should not flicker."""
+
+    index: int
+    places: Tensor
+    matter: list[MatterView]
+
+    @staticmethod
+    def of(broken: Broken, index: int, drawn: Drawn, views: list[Camera]) -> Seen:
+        volume = broken.matter.particles.volume
+        matter = [MatterView.of(drawn.shown, volume, camera) for camera in views]
+        return Seen(index, drawn.shown, matter)
+
+
+def flows(before: Seen | None, now: Seen, views: list[Camera], spacing: float) -> list[Flow | None]:
+    """From the frame before, along the motion; None where that was not seen."""
+    if before is None or before.index != now.index - 1:
+        return [None] * len(views)
+    moved = before.places, now.places
+    pairs = zip(before.matter, now.matter, views, strict=True)
+    return [Flow.of(a, b, moved, (view, view), spacing) for a, b, view in pairs]
 
 
 class Score:
@@ -94,15 +131,17 @@ class Score:
         self._last: dict[int, Tensor] = {}
 
     def add(
-        self, image: Tensor, truth: TruePicture, holes: Holes | None, view: int, flow: Flow | None
+        self, image: Tensor, truth: Truth, view: int, holes: Holes | None, flow: Flow | None
     ) -> None:
+        true = truth.bent[view]
         row = {
-            "psnr": psnr(image, truth.image),
-            "psnr_inside": psnr(image, truth.image, (truth.alpha > 0.5).float()),
-            "ssim": float(ssim(image, truth.image)),
+            "psnr": psnr(image, true.image),
+            "rigid": psnr(image, truth.rigid[view].image),
+            "psnr_inside": psnr(image, true.image, (true.alpha > 0.5).float()),
+            "ssim": float(ssim(image, true.image)),
         }
         if self.lpips is not None:
-            pair = [(x.numpy() * 255).round().astype(np.uint8) for x in (image, truth.image)]
+            pair = [(x.numpy() * 255).round().astype(np.uint8) for x in (image, true.image)]
             row["lpips"] = self.lpips(*pair)
         if holes is not None:
             row |= {"holes": 100 * holes.fraction, "through": 100 * holes.through}
@@ -121,53 +160,44 @@ class Score:
         return found
 
 
-def methods(broken: Broken, cloud: TrueCloud, only: list[str] | None) -> dict[str, Any]:
-    known = METHODS | {"ideal": lambda b, m: ideal(b, m, cloud)}
-    return {k: v for k, v in known.items() if only is None or k in only}
-
-
 def judge(broken: Broken, given: argparse.Namespace) -> dict[str, Any]:
     """All methods over broken frames of one case, and the whole object for comparison."""
     size = (given.size, round(0.75 * given.size))
     views = cameras(broken, size)
-    cloud = broken.cloud(given.voxels, given.parted)
+    solid = broken.truth(given.finer)
     every = broken.broken_frames()
     # two frames shortly after the break, for flicker, and the last
-    frames = given.frames or sorted({*every[1:3], every[-1]})
+    frames = given.frames or sorted({*every[2:4], every[-1]})
     lpips = Lpips(given.lpips, torch.device("cpu")) if given.lpips else None
-    chosen = methods(broken, cloud, given.only)
+    chosen = {k: v for k, v in METHODS.items() if given.only is None or k in given.only}
     scores = {name: Score(lpips) for name in ("truth", *chosen)}
     whole = Score(lpips)
     before = every[0] - 1
-    first = broken.carry.apply(broken.moment(before).motion(broken.carry)), None
-    truths = true_pictures(broken, cloud, before, views, given.voxels)
-    for number, (camera, truth) in enumerate(zip(views, truths, strict=True)):
-        whole.add(picture(first, camera).image.clamp(0, 1), truth, None, number, None)
-    volume, spacing = broken.matter.particles.volume, broken.matter.spacing[0]
-    last: tuple[int, Moment, list[MatterView]] | None = None
+    points = broken.moment(before).points()
+    first = Drawn(broken.carry.apply(broken.carry.follow(points)), None, points.position)
+    truth = Truth(broken, solid, before, views)
+    for number, camera in enumerate(views):
+        image = picture(first, camera).image.clamp(0, 1)
+        whole.add(image, truth, number, None, None)
+    last: dict[str, Seen] = {}
+    spacing = broken.matter.spacing[0]
     for index in frames:
-        truths = true_pictures(broken, cloud, index, views, given.voxels)
-        moment = broken.moment(index)
-        matter = [MatterView.of(moment.position, volume, camera) for camera in views]
-        flows: list[Flow | None] = [None] * len(views)
-        if last is not None and last[0] == index - 1:
-            moved = last[1].position, moment.position
-            flows = [
-                Flow.of(old, new, moved, (camera, camera), spacing)
-                for old, new, camera in zip(last[2], matter, views, strict=True)
-            ]
-        last = index, moment, matter
-        rows: list[list[Tensor]] = [[truth.image] for truth in truths]
-        for number, truth in enumerate(truths):
-            own = Holes.of(truth.alpha, truth.depth, matter[number])
-            scores["truth"].add(truth.image, truth, own, number, flows[number])
+        truth, moment = Truth(broken, solid, index, views), broken.moment(index)
+        seen = Seen(index, truth.position, truth.matter)
+        along, last["truth"] = flows(last.get("truth"), seen, views, spacing), seen
+        rows: list[list[Tensor]] = [[true.image] for true in truth.bent]
+        for number, true in enumerate(truth.bent):
+            own = Holes.of(true.alpha, true.depth, truth.matter[number])
+            scores["truth"].add(true.image, truth, number, own, along[number])
         for name, method in chosen.items():
             drawn = method(broken, moment)
-            for number, (row, camera, truth) in enumerate(zip(rows, views, truths, strict=True)):
-                seen = picture(drawn, camera)
-                row.append(seen.image.clamp(0.0, 1.0))
-                holes = Holes.of(seen.alpha, cast(Tensor, seen.depth), matter[number])
-                scores[name].add(row[-1], truth, holes, number, flows[number])
+            seen = Seen.of(broken, index, drawn, views)
+            along, last[name] = flows(last.get(name), seen, views, spacing), seen
+            for number, (row, camera) in enumerate(zip(rows, views, strict=True)):
+                found = picture(drawn, camera)
+                row.append(found.image.clamp(0.0, 1.0))
+                holes = Holes.of(found.alpha, cast(Tensor, found.depth), seen.matter[number])
+                scores[name].add(row[-1], truth, number, holes, along[number])
         if given.sheets:
             titles = ["truth", *chosen]
             sheet(rows[given.view], titles, given.sheets / f"{broken.name}_{index:03d}.png")
@@ -181,6 +211,18 @@ def judge(broken: Broken, given: argparse.Namespace) -> dict[str, Any]:
         "methods": {name: score.means() for name, score in scores.items()},
         "rows": {name: score.rows for name, score in scores.items()},
     }
+
+
+def promised(given: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Figures of chunks for every object."""
+    found = {}
+    for name in given.object:
+        broken = Broken(name, given.cells, given.resolution, given.cache)
+        views = cameras(broken, (given.size, round(0.75 * given.size)))
+        every = broken.broken_frames()
+        found[name] = chunk_figures(broken, given.frames or [every[2], every[-1]], views)
+        sys.stderr.write(f"{name}: {found[name]}\n")
+    return found
 
 
 def sheet(pictures: list[Tensor], titles: list[str], path: Path) -> None:
@@ -202,6 +244,7 @@ def sheet(pictures: list[Tensor], titles: list[str], path: Path) -> None:
 
 COLUMNS = {
     "psnr": ("PSNR image", ".2f"),
+    "rigid": ("rigid truth", ".2f"),
     "psnr_inside": ("silhouette", ".2f"),
     "ssim": ("SSIM", ".3f"),
     "lpips": ("LPIPS", ".3f"),
@@ -220,17 +263,19 @@ def table(name: str, found: dict[str, Any]) -> Iterator[str]:
         f"frames {', '.join(map(str, found['frames']))}, {found['cameras']} cameras"
     )
     yield ""
-    yield "| method | " + " | ".join(COLUMNS[k][0] for k in columns) + " | over raw |"
-    yield "| --- " * (len(columns) + 2) + "|"
-    base = found["methods"].get("raw", {}).get("psnr")
+    yield "| method | " + " | ".join(COLUMNS[k][0] for k in columns) + " | over raw | rigid |"
+    yield "| --- " * (len(columns) + 3) + "|"
+    base = found["methods"].get("raw")
     for method, row in everything.items():
         judged = method not in ("truth", "(before it breaks)")
-        over = f"{row['psnr'] - base:+.2f}" if base is not None and judged else ""
+        over = ["", ""]
+        if base is not None and judged:
+            over = [f"{row[k] - base[k]:+.2f}" for k in ("psnr", "rigid")]
         cells = [
             format(row[k], COLUMNS[k][1]) if k in row and (judged or math.isfinite(row[k])) else ""
             for k in columns
         ]
-        yield "| " + " | ".join([method, *cells, over]) + " |"
+        yield "| " + " | ".join([method, *cells, *over]) + " |"
 
 
 def of_run(out: Path) -> Iterator[str]:
@@ -281,14 +326,17 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--object", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--chunks", action="store_true", help="what chunks promise, instead")
+    parser.add_argument("--cuts", action="store_true", help="flat cuts through a cube, instead")
     parser.add_argument("--run", type=Path, help="tabulate a finished run's run.json instead")
     parser.add_argument("--frames", type=numbers, help="default: two early, one late")
     parser.add_argument("--only", type=lambda s: s.split(","), help="methods, comma-separated")
     parser.add_argument("--size", type=int, default=400, help="width of the pictures [px]")
     parser.add_argument("--cells", type=int, default=20, help="grid cells along the object")
     parser.add_argument("--resolution", type=int, default=192, help="voxels of the fill")
-    parser.add_argument("--voxels", type=int, default=300, help="voxels of the truth")
-    parser.add_argument("--parted", type=float, default=PARTED, help="see TrueCloud")
+    parser.add_argument(
+        "--finer", type=float, default=6.0, help="voxels of the truth per point spacing"
+    )
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir(), "gsfluent-crack"))
     parser.add_argument("--lpips", type=Path, help="folder with LPIPS' weights")
     parser.add_argument("--sheets", type=Path, help="folder for pictures side by side")
@@ -301,6 +349,13 @@ def main() -> int:
         sys.stdout.write(text + "\n")
         if given.write:
             PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), "run", text))
+        return 0
+    if given.chunks or given.cuts:
+        text = "\n".join(cut_table(flat_cuts()) if given.cuts else chunk_table(promised(given)))
+        sys.stdout.write(text + "\n")
+        if given.write:
+            name = "cuts" if given.cuts else "chunks"
+            PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), name, text))
         return 0
     lines: list[str] = []
     everything = {}

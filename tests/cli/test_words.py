@@ -182,3 +182,14 @@ def test_logging_is_left_as_it_was() -> None:
     before = (list(logger.handlers), logger.level, logger.propagate)
     assert main(["demo", "brick"]) == 2
     assert (logger.handlers, logger.level, logger.propagate) == before
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["--version"]])
+def test_words_cost_no_torch(words: list[str]) -> None:
+    """Help is read by people who wait for it: importing torch takes seconds."""
+    program = (
+        "import sys; from gsfluent.cli import main; code = main(sys.argv[1:]); "
+        "sys.exit(code or any(name in sys.modules for name in ('torch', 'numpy', 'scipy')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()

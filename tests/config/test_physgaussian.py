@@ -321,10 +321,10 @@ def test_what_cannot_be_is_refused(
 def test_folders_and_files_that_are_none(model: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no point_cloud/iteration_N"):
         convert(tmp_path, config(tmp_path / "config.json"), tmp_path / "made")
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match="no such file"):
         convert(model, tmp_path / "none.json", tmp_path / "made")
     (tmp_path / "bad.json").write_text("{")
-    with pytest.raises(InputError, match="not JSON"):
+    with pytest.raises(InputError, match="not readable as JSON"):
         convert(model, tmp_path / "bad.json", tmp_path / "made")
 
 

@@ -181,7 +181,10 @@ def test_a_time_budget_stands_alone(folder: Path, other: dict[str, Any]) -> None
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"capture": "capture", "splats": "melon.ply"}, "either 'capture' or 'splats', got both"),
+        (
+            {"capture": "capture", "splats": "melon.ply"},
+            "one of capture, splats, mesh, got capture and splats",
+        ),
         ({"splats": "none.ply"}, "none.ply does not exist"),
         ({"scale": 0}, "scale must be above 0, got 0"),
         ({"scale": 1.0, "size": 1.0}, "'scale' and 'size' both"),
@@ -192,7 +195,7 @@ def test_a_time_budget_stands_alone(folder: Path, other: dict[str, Any]) -> None
         ({"up": [0, 0, 0]}, "up must not be zero"),
         ({"up": [0, 1]}, "up must be 3 numbers"),
         ({"floor": "low"}, "floor must be one of auto, none, plane, got 'low'"),
-        ({"reconstruct": {"iterations": 100}}, "does nothing when splats are given"),
+        ({"reconstruct": {"iterations": 100}}, "does nothing when splats is given"),
         ({"texture": {"method": "exemplar"}}, "texture.exemplar is missing"),
         ({"texture": {"method": "procedural"}}, "texture.preset is missing"),
         ({"texture": {"method": "diffusion"}}, "texture.model is missing"),
@@ -270,7 +273,7 @@ def test_bad_values_name_their_path(folder: Path, keys: dict[str, Any], message:
 
 
 def test_neither_input_is_an_error(folder: Path) -> None:
-    with pytest.raises(InputError, match="got neither"):
+    with pytest.raises(InputError, match="got none"):
         Shot.from_dict({}, folder)
 
 
@@ -298,7 +301,7 @@ def test_missing_and_binary_files(folder: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_shot(folder / "none.yaml")
     (folder / "shot.yaml").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(InputError, match=r"cannot be read|not valid YAML"):
+    with pytest.raises(InputError, match=r"is no text"):
         load_shot(folder / "shot.yaml")
 
 

@@ -23,7 +23,15 @@ CASES = [
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name in ("melon.ply", "cut.jpg", "labels.npy", "bowl.obj", "side.png", "room.hdr"):
+    for name in (
+        "melon.ply",
+        "cut.jpg",
+        "labels.npy",
+        "bowl.obj",
+        "side.png",
+        "room.hdr",
+        "vase.glb",
+    ):
         (tmp_path / name).write_bytes(b"")
     for name in ("captures/apple", "parts/stem", "segmentation"):
         (tmp_path / name).mkdir(parents=True)

@@ -352,7 +352,7 @@ def test_solid_load_says_what_is_missing_or_damaged(tmp_path: Path) -> None:
     volume = tmp_path / "melon.volume.npz"
     whole = volume.read_bytes()
     volume.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="volume file is damaged"):
+    with pytest.raises(InputError, match="file is damaged"):
         load_solid(tmp_path / "melon.ply")
     volume.unlink()
     with pytest.raises(InputError, match=r"needs melon\.volume\.npz beside it"):

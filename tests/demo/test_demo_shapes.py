@@ -202,3 +202,19 @@ def test_the_chocolate_has_six_times_three_blocks() -> None:
         assert starts == count
     deep = torch.tensor([[0.0, 0.0, 0.0015], [0.0, 0.0, 0.0005]], dtype=torch.float64)
     assert bar.inside(bar.center + deep).tolist() == [False, True]  # 7 of 12 mm are left
+
+
+@pytest.mark.parametrize("name", ["cake", "chocolate", "pane", "bread"])
+def test_silhouettes_leave_no_cone_on_level_faces(name: str) -> None:
+    """A third of the eyes graze top or base by turns, all around; of round things none does."""
+    obj = demo.make_object(name, 0)
+    eyes = torch.stack([-(v[:3, :3].T @ v[:3, 3]) for v in ring_cameras(obj, 40, on_table=False)])
+    for height in (0.0, 2.0 * obj.axes[2]):
+        near = eyes[(eyes[:, 2] - height).abs() < 1e-6]
+        assert len(near) >= 6
+        turns = torch.atan2(near[:, 1], near[:, 0]).sort().values
+        assert float(turns.diff().max()) < 2.0 * math.pi / 5
+    melon = demo.make_object("watermelon", 0)
+    views = ring_cameras(melon, 40, on_table=False)
+    heights = torch.stack([-(v[:3, :3].T @ v[:3, 3]) for v in views])[:, 2]
+    assert len(heights.mul(1e6).round().unique()) == 3

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 import yaml
 from PIL import Image
 
@@ -108,6 +109,7 @@ def write_inputs(folder: Path) -> None:
     save(shell(), folder / "melon.ply")
     write_cut(folder / "cut.jpg")
     write_box(folder / "scan.obj")
+    trimesh.creation.box((0.06, 0.14, 0.06)).export(folder / "vase.glb")
     make_capture("orange", folder / "captures" / "apple", views=9, size=64)
     write_parts(folder, folder / "captures" / "apple")
     if importlib.util.find_spec("transformers"):  # of the extra `inpaint`

@@ -23,6 +23,7 @@ import yaml
 from gsfluent.cli import main
 from gsfluent.config import Shot, load_shot
 from gsfluent.run import demo as run_demo
+from gsfluent.run import from_input
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs/guide").glob("*.md"))]
@@ -111,6 +112,8 @@ def test_command_does_what_it_says(
     skip_without_extra(" ".join(words))
     monkeypatch.chdir(place)
     monkeypatch.setitem(run_demo.SIZES, "preview", TINY_DEMO)
+    monkeypatch.setitem(from_input.SETTINGS, "solve", {"cells": 8})
+    monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5})
     before = files(place)
     assert main(smaller(words)) == 0
     said = capsys.readouterr().out
@@ -138,7 +141,10 @@ def test_page_is_served_until_ctrl_c(
     serving, over = threading.Event(), threading.Event()
     wait = App.wait
 
+    address = [""]
+
     def say_so_and_wait(app: App) -> None:
+        address[0] = app.url.replace("localhost", "127.0.0.1")
         serving.set()
         wait(app)
 
@@ -150,7 +156,7 @@ def test_page_is_served_until_ctrl_c(
         if over.is_set():
             return
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=30) as page:
+            with urllib.request.urlopen(address[0], timeout=30) as page:
                 answers.append(page.status)
         finally:
             os.kill(os.getpid(), signal.SIGINT)
@@ -222,7 +228,7 @@ def test_python_runs(
 @pytest.mark.parametrize(("page", "text"), blocks("yaml"), ids=lambda x: getattr(x, "name", ""))
 def test_shot_is_a_shot(page: Path, text: str, place: Path) -> None:
     values = yaml.safe_load(text)
-    if "capture" in values or "splats" in values:
+    if {"capture", "splats", "mesh"} & set(values):
         path = place / f"of_{page.stem}.yaml"
         path.write_text(text)
         assert load_shot(path).events

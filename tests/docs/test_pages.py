@@ -80,10 +80,10 @@ def test_yaml_examples_load(page: str, text: str) -> None:
     assert yaml.safe_load(text) is not None
 
 
-def test_the_smallest_shot_of_the_readme_is_a_shot(tmp_path: Path) -> None:
+def test_the_smallest_shot_of_the_guide_is_a_shot(tmp_path: Path) -> None:
     from gsfluent.config import load_shot
 
-    text = next(text for page, text in blocks("yaml") if page == "README.md")
+    text = next(text for page, text in blocks("yaml") if page.endswith("shot-file.md"))
     (tmp_path / "captures" / "apple").mkdir(parents=True)
     (tmp_path / "shot.yaml").write_text(text)
     shot = load_shot(tmp_path / "shot.yaml")

@@ -177,3 +177,22 @@ def test_an_animation_needs_pictures(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="webp"):
         write_animation(tmp_path / "a.avi", iter([]), fps=10.0)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tall_object_is_whole_in_the_picture_while_it_falls() -> None:
+    """Nine tenths of a pole lie near its middle where it is thick; its tip counts as well."""
+    generator = torch.Generator().manual_seed(0)
+    height = torch.cat([0.1 * torch.rand(2000, generator=generator), torch.tensor([0.8])])
+    pole = torch.stack([0 * height, 0 * height, height], 1).double()
+    falls = [pole + torch.tensor([0.0, 0.0, 2.0 - 4.9 * (i / 30) ** 2]) for i in range(18)]
+    cameras = orbit(Action.of(falls), (320, 240))
+    for index in (0, 6, 12, 17):
+        pixel, depth = cameras[index].project(falls[index])
+        assert (depth > 0).all()
+        assert (pixel >= 0).all() and (pixel <= torch.tensor([320.0, 240.0])).all()
+
+
+def test_a_film_passes_the_front_in_its_middle() -> None:
+    still = Action.of([torch.rand(50, 3).double() - 0.5] * 9)
+    ahead = orbit(still, (320, 240))[4].forward()
+    assert abs(float(ahead[0])) < 1e-6 and float(ahead[1]) > 0.9

@@ -277,7 +277,7 @@ def test_what_is_no_splat_file_is_said(tmp_path: Path, content: bytes, message: 
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_splats(tmp_path / "none.ply")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is a folder"):
         load_splats(tmp_path)
 
 

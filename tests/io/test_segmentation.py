@@ -380,7 +380,7 @@ def broken(tmp_path: Path, kind: str) -> Path:
         ("fraction", "whole"),
         ("negative", "negative"),
         ("npz", "damaged"),
-        ("json", "damaged"),
+        ("json", "not readable as JSON"),
         ("area", "says area 3"),
         ("score", "NaN"),
         ("names", "mapping"),

@@ -15,9 +15,10 @@ import torch
 from gsfluent.data import INTERIOR, TRANSITION, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.render.video import to_bytes, write_video
+from gsfluent.results.digests import file_digest
 from gsfluent.results.frames import SavedFrame, count_frames, load_frame, save_frame
 from gsfluent.results.record import RunRecord
-from gsfluent.results.store import StageStore, content_digest, fingerprint, publish
+from gsfluent.results.store import StageResult, StageStore, content_digest, fingerprint, publish
 
 
 def test_fingerprint_sees_every_part() -> None:
@@ -115,9 +116,13 @@ def test_publish_replaces_without_touching_the_source(tmp_path: Path) -> None:
     source, target = tmp_path / "source", tmp_path / "target"
     target.write_text("old")
     source.write_text("new")
-    publish(source, target)
+    result = StageResult("s", tmp_path, "key", files={"source": file_digest(source)})
+    publish(result, "source", target)
     assert target.read_text() == source.read_text() == "new"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["source", "target"]
+    source.write_text("another")
+    with pytest.raises(RunError, match="changed since it was written"):
+        publish(result, "source", target)
 
 
 def make_frame(index: int = 0) -> SavedFrame:

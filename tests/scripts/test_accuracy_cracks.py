@@ -15,8 +15,8 @@ def script():
 
 
 def test_methods_are_told_apart_and_work_is_kept(script, tmp_path, monkeypatch, capsys):
-    options = ["--object", "melon", "--cells", "12", "--resolution", "40", "--voxels", "60"]
-    options += ["--size", "200", "--frames", "24,25", "--cache", str(tmp_path / "cache")]
+    options = ["--object", "melon", "--cells", "12", "--resolution", "40", "--finer", "3"]
+    options += ["--size", "200", "--frames", "48,49", "--cache", str(tmp_path / "cache")]
     options += ["--sheets", str(tmp_path / "sheets"), "--json", str(tmp_path / "all.json")]
 
     def run(*more: str) -> str:
@@ -24,18 +24,28 @@ def test_methods_are_told_apart_and_work_is_kept(script, tmp_path, monkeypatch, 
         assert script.main() == 0
         return capsys.readouterr().out
 
-    run("--only", "raw,raw-total,ideal")
+    run("--only", "raw,raw-total,chunks")
     found = json.loads((tmp_path / "all.json").read_text())["melon"]["methods"]
-    # the true motion cannot be further from the truth than needles that reach across the picture
-    assert found["ideal"]["psnr"] > found["raw-total"]["psnr"] + 0.2
+    # clean pieces are nearer to the truth than beads, and those than needles across the picture
+    assert found["chunks"]["psnr"] > found["raw"]["psnr"]
     assert found["raw"]["psnr"] > found["raw-total"]["psnr"] + 0.2
     assert all(0.0 < row["flicker"] < 10.0 for row in found.values())
     # the truth has no holes and is its own truth
     assert found["truth"]["holes"] < 0.2 and found["truth"]["ssim"] == pytest.approx(1.0)
     assert 0.0 <= found["raw"]["holes"] <= found["raw"]["most holes"] <= 100.0
-    assert (tmp_path / "sheets" / "melon_025.png").is_file()
+    assert (tmp_path / "sheets" / "melon_049.png").is_file()
 
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.*")}
-    table = run("--only", "carried")
-    assert "| carried |" in table and "| raw |" not in table
+    table = run("--only", "mvee")
+    assert "| mvee |" in table and "| raw |" not in table
+    promised = run("--chunks")
+    rows = dict(line.strip("| ").split(" | ", 1) for line in promised.splitlines() if "|" in line)
+    assert rows["sum of the volumes, voxels lost"] == "0 | 0"
+    assert float(rows["overlap of pieces [%]"].split(" | ")[1]) < 5.0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.*")} == kept
+
+
+def test_flat_cuts_have_the_heights_that_were_asked_for(script):
+    found = script.flat_cuts(cells=16, rough=0.3)
+    assert 0.6 < found["slope"] < 1.0
+    assert 0.7 < found["rms over the material's"] < 1.3

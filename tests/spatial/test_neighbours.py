@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsfluent.spatial.neighbours import grid_search, nearest
+from gsfluent.spatial.neighbours import grid_search, nearest, nearest_in_group, nearest_rows
 
 
 def _cloud(kind: str) -> tuple[torch.Tensor, np.ndarray]:
@@ -49,3 +49,42 @@ def test_refusals(count: int, cell: float) -> None:
     points, queries = _cloud("shell")
     with pytest.raises(ValueError, match="nearest"):
         nearest(points, queries, count, cell)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_groups_are_searched_as_each_by_itself(device: str) -> None:
+    make = torch.Generator().manual_seed(7)
+    points = torch.rand(900, 3, generator=make)
+    points[::3] = (points[::3] * 8).round() / 8  # distances that are the same
+    group = torch.randint(0, 40, (900,), generator=make) ** 2
+    group[group == 49] = 50
+    queries = torch.cat([points[:300], torch.rand(50, 3, generator=make) * 3 - 1])
+    wanted = torch.cat([group[:300], torch.randint(0, 40, (50,), generator=make) ** 2])
+    count = 30  # more than some groups have
+    found = nearest_in_group(*(x.to(device) for x in (points, group, queries, wanted)), count, 0.1)
+    distance, index = (x.cpu() for x in found)
+    assert (wanted == 49).any()
+    for name in wanted.unique().tolist():
+        its, mine = (group == name).nonzero()[:, 0], (wanted == name).nonzero()[:, 0]
+        k = min(count, len(its))
+        assert bool((index[mine, k:] == -1).all())
+        assert bool(distance[mine, k:].isinf().all())
+        if k:
+            apart, rows = nearest_rows(points[its], queries[mine], k, 0.1)
+            assert torch.equal(index[mine, :k], its[rows])
+            torch.testing.assert_close(distance[mine, :k], apart, rtol=1e-12, atol=0.0)
+
+
+def test_no_groups_nothing_found() -> None:
+    none, nobody = torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64)
+    distance, index = nearest_in_group(
+        none, nobody, torch.zeros(2, 3), torch.tensor([0, 1]), 3, 1.0
+    )
+    assert bool(distance.isinf().all()) and bool((index == -1).all())
+
+
+def test_beyond_the_reach_nothing_is_found() -> None:
+    points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [9.0, 0, 0]], dtype=torch.float64)
+    distance, index = grid_search(points, points[:1], 3, 0.01, reach=0.5)
+    assert index[0, :2].tolist() == [0, 1]
+    assert bool(distance[0, 2].isinf())

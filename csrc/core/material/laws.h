@@ -29,7 +29,7 @@ struct MaterialRow {
   T hardening;  // nacc: xi | von_mises: hardening modulus [Pa]
   T damage;     // nacc: eta, shear damage
   T density;    // [kg/m^3]
-  T exponent;   // fluid: gamma, 7 when 0 | nacc: loss 1 - e^2 of restitution e (loss.h)
+  T exponent;   // fluid: gamma, 7 when 0 | nacc: loss, by restitution (loss.h)
 };
 
 inline constexpr double kFluidExponent = 7.0;

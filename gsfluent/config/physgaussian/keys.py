@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from gsfluent.config.read import nearest
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
+from gsfluent.io.checked.files import read_json
 
 MAPPED, NEAR, UNSUPPORTED, INERT, UNKNOWN = "mapped", "near", "unsupported", "inert", "unknown"
 """Same meaning; nearly so; no meaning here yet; does nothing there or here; not a key."""
@@ -118,11 +118,9 @@ def read_config(path: Path) -> tuple[dict[str, Any], list[Note]]:
         InputError: Not such a file, or a known key of the wrong kind.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"--config {path}: {error.strerror}", "check the path") from error
-    except ValueError as error:
-        raise InputError(f"--config {path}: not JSON ({error})", "correct the file") from error
+        values = read_json(path, "correct the file")
+    except InputError as error:
+        raise InputError(f"--config {error.what}", error.hint) from error
     if not isinstance(values, dict):
         raise InputError(
             f"--config {path}: must hold one JSON object", "see docs/guide/physgaussian.md"
@@ -145,7 +143,7 @@ def read_config(path: Path) -> tuple[dict[str, Any], list[Note]]:
         kind = _section(entry, where).get("type")
         if kind not in BOUNDARIES:
             raise InputError(
-                f"{where}.type: unknown boundary condition {kind!r}", nearest(kind, BOUNDARIES)
+                f"{where}.type: unknown boundary condition {short(kind)}", nearest(kind, BOUNDARIES)
             )
         _, _, needed, more = BOUNDARIES[kind]
         conditions.append(_known(entry, ("type", *needed, *more), f"{where}.", notes))
@@ -170,14 +168,14 @@ def _known(
 
 def _section(value: Any, place: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise InputError(f"{place} must be a JSON object, got {value!r}", "correct the config")
+        raise InputError(f"{place} must be a JSON object, got {short(value)}", "correct the config")
     return value
 
 
 def _entries(values: Mapping[str, Any], name: str) -> list[Any]:
     entries = values.get(name, [])
     if not isinstance(entries, list):
-        raise InputError(f"{name} must be a list, got {entries!r}", "correct the config")
+        raise InputError(f"{name} must be a list, got {short(entries)}", "correct the config")
     return entries
 
 
@@ -188,8 +186,8 @@ def number(values: Mapping[str, Any], key: str, default: float, place: str = "")
         InputError: It is something else.
     """
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or value - value != 0:
-        raise InputError(f"{place}{key} must be a number, got {value!r}", "correct the config")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+        raise InputError(f"{place}{key} must be a number, got {short(value)}", "correct the config")
     return float(value)
 
 
@@ -204,6 +202,6 @@ def numbers(
     found = values.get(key, default)
     if not isinstance(found, list) or len(found) != count:
         raise InputError(
-            f"{place}{key} must be {count} numbers, got {found!r}", "correct the config"
+            f"{place}{key} must be {count} numbers, got {short(found)}", "correct the config"
         )
     return [number({key: value}, key, 0.0, place) for value in found]

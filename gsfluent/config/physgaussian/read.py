@@ -34,7 +34,7 @@ from gsfluent.config.physgaussian.keys import (
 from gsfluent.config.physgaussian.space import Space, camera_path, in_box, model_file, space_of
 from gsfluent.config.read import nearest
 from gsfluent.data import BACKGROUND
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
 from gsfluent.io import atomic_path, load_splats, save_splats, write_json
 
 _log = logging.getLogger(__name__)
@@ -77,6 +77,15 @@ def convert(model: Path, config: Path, folder: Path) -> Conversion:
     Raises:
         InputError: No such model, or a config that cannot be.
     """
+    try:
+        return _convert(model, config, folder)
+    except InputError as error:
+        if str(config) in error.what or str(model) in error.what:
+            raise
+        raise InputError(f"{config}: {error.what}", error.hint) from error
+
+
+def _convert(model: Path, config: Path, folder: Path) -> Conversion:
     import yaml
 
     values, notes = read_config(config)
@@ -179,7 +188,7 @@ def _object(values: Mapping[str, Any], space: Space, notes: list[Note]) -> dict[
     """The object: its material, and parts of other stiffness."""
     kind = values.get("material", "jelly")
     if kind not in MATERIALS:
-        raise InputError(f"material: unknown material {kind!r}", nearest(kind, MATERIALS))
+        raise InputError(f"material: unknown material {short(kind)}", nearest(kind, MATERIALS))
     law = _LAW.get(kind, "drucker_prager")
     young, nu = number(values, "E", 1e5), number(values, "nu", 0.4)
     made: dict[str, Any] = {

@@ -11,7 +11,6 @@ by as much of the object's size in as many seconds.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,7 +32,8 @@ from gsfluent.config.physgaussian.keys import (
     numbers,
 )
 from gsfluent.data import BACKGROUND, SURFACE, Frame, Gaussians
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
+from gsfluent.io.checked.files import read_json
 
 Array = NDArray[np.float64]
 _ORBIT = ("init_azimuthm", "init_elevation", "init_radius")
@@ -110,14 +110,15 @@ def rotation(values: Mapping[str, Any]) -> Array:
     degrees, axes = values.get("rotation_degree", []), values.get("rotation_axis", [])
     if not isinstance(degrees, list) or not isinstance(axes, list) or len(degrees) != len(axes):
         raise InputError(
-            f"rotation_degree {degrees!r} and rotation_axis {axes!r} must be lists of one length",
+            f"rotation_degree {short(degrees)} and rotation_axis {short(axes)} must be lists of "
+            "one length",
             "give an axis for every angle",
         )
     turn = np.eye(3)
     for i, axis in enumerate(axes):
         if axis not in (0, 1, 2):
             raise InputError(
-                f"rotation_axis[{i}] must be 0, 1 or 2, got {axis!r}", "name x, y or z"
+                f"rotation_axis[{i}] must be 0, 1 or 2, got {short(axis)}", "name x, y or z"
             )
         angle = math.radians(number({"a": degrees[i]}, "a", 0.0, f"rotation_degree[{i}] "))
         c, s = math.cos(angle), math.sin(angle)
@@ -201,15 +202,18 @@ def camera_path(
                 notes.append(Note(key, UNSUPPORTED, "the model folder has no cameras.json"))
         return None, None
     try:
-        cameras = json.loads(path.read_text(encoding="utf-8"))
+        cameras = read_json(path)
         raw = cameras[max(index, 0)]
         size = [int(raw["width"]), int(raw["height"])]
         fov = math.degrees(2.0 * math.atan(0.5 * size[1] / float(raw["fy"])))
         position = np.array(raw["position"], dtype=np.float64).reshape(3)
         axes = np.array(raw["rotation"], dtype=np.float64).reshape(3, 3)
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        if min(size) < 1 or not (np.isfinite(position).all() and np.isfinite(axes).all()):
+            raise ValueError("a size below 1, or a pose that is not finite")
+    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
         raise InputError(
-            f"{path}: no camera {max(index, 0)} of the INRIA trainer ({error!r})",
+            f"{path}: no camera {max(index, 0)} of the INRIA trainer "
+            f"({type(error).__name__}: {short(str(error), bare=True)})",
             "check default_camera_index, or train the model again",
         ) from error
     frame = space.frame()

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsfluent.errors import InputError
+from gsfluent.io.checked.arrays import read_npy
+from gsfluent.io.checked.pictures import check_pixels, opened_image
 from gsfluent.io.images import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
@@ -122,17 +124,12 @@ def read_array_file(path: Path) -> NDArray[np.generic]:
     Raises:
         InputError: Missing, empty, damaged, or of another shape.
     """
-    try:
-        values = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file", "check the path") from error
-    except (OSError, ValueError, EOFError) as error:
+    values = read_npy(path)
+    if values.ndim != 2 or values.size == 0:
         raise InputError(
-            f"{path}: the NumPy file is damaged ({error})", "save it again with numpy.save"
-        ) from error
-    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.size == 0:
-        got = list(values.shape) if isinstance(values, np.ndarray) else "an archive"
-        raise InputError(f"{path}: labels must be [H, W], got {got}", "save one map per view")
+            f"{path}: labels must be [H, W], got {list(values.shape)}", "save one map per view"
+        )
+    check_pixels(values.shape[1], values.shape[0], path)
     return values
 
 
@@ -256,23 +253,8 @@ def open_picture(path: Path) -> Image.Image:
     """Decode a picture file.
 
     Raises:
-        InputError: Missing, empty, truncated, or not an image.
+        InputError: Missing, empty, truncated, too large, or not an image.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        if path.stat().st_size == 0:
-            raise InputError(f"{path}: the file is empty", "export it again")
-        with Image.open(path) as opened:
-            opened.load()
-            return opened.copy()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file", "check the path") from error
-    except UnidentifiedImageError as error:
-        raise InputError(
-            f"{path}: not an image that Pillow can read", "save label images as PNG"
-        ) from error
-    except InputError:
-        raise
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: the image is damaged ({error})", "export it again") from error
+    with opened_image(path, "save label images as PNG") as opened:
+        opened.load()
+        return opened.copy()

@@ -9,7 +9,8 @@ photograph itself is resampled to (:func:`gsfluent.io.images.load_view`), neares
 from __future__ import annotations
 
 import dataclasses
-import json
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,16 @@ from numpy.typing import NDArray
 
 from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
+from gsfluent.io.checked.arrays import read_npy, read_npz
+from gsfluent.io.checked.files import read_json
+from gsfluent.io.checked.limits import within
 from gsfluent.io.images import IMAGE_SUFFIXES, pinhole_map
 from gsfluent.io.segmentation import sam
 from gsfluent.io.segmentation.files import (
     ARRAY_SUFFIXES,
     LABEL_SUFFIXES,
+    RawLabels,
     numbered,
     read_binary,
     read_raw,
@@ -80,6 +85,29 @@ class _Wanted:
     names: ViewNames
     max_size: int | None
     least: float = 0.0
+    pixels: list[int] = dataclasses.field(default_factory=list)  # of the maps read so far
+
+    def counted(self, shape: tuple[int, ...]) -> None:
+        """Count a map; all are held at once.
+
+        Raises:
+            InputError: Together they are above the limit ``label_pixels``.
+        """
+        self.pixels.append(math.prod(shape))
+        within("label_pixels", sum(self.pixels), self.path)
+
+    def raw(self, file: Path) -> RawLabels:
+        """One label image, counted."""
+        labels = read_raw(file)
+        codes = labels.values if labels.values is not None else labels.colors
+        self.counted(() if codes is None else codes.shape)
+        return labels
+
+    def binary(self, file: Path) -> NDArray[np.bool_]:
+        """One mask, counted."""
+        mask = read_binary(file)
+        self.counted(mask.shape)
+        return mask
 
     def matched(self, files: list[Path]) -> dict[int, Path]:
         """Files by view; two files for one view are refused."""
@@ -105,7 +133,7 @@ class _Wanted:
 
     def finished(
         self,
-        maps: dict[int, NDArray[np.int64]],
+        maps: Mapping[int, NDArray[np.signedinteger[Any]]],
         labels: dict[int, str],
         notes: list[str],
         *,
@@ -210,7 +238,7 @@ def load_masks(path: str | Path, capture: Capture, *, max_size: int | None = 640
         raise InputError(f"{path}: no such folder of masks", "name a folder, one mask per photo")
     files = [f for f in sorted(path.rglob("*")) if f.suffix.lower() in _MASK_SUFFIXES]
     found = wanted.matched(files)
-    maps = {index: read_binary(file).astype(np.int64) for index, file in found.items()}
+    maps = {index: wanted.binary(file).astype(np.int32) for index, file in found.items()}
     return wanted.finished(maps, {1: path.name}, wanted.leftover(files, found))
 
 
@@ -222,7 +250,7 @@ def _label_images(wanted: _Wanted) -> Segmentation:
         if f.suffix.lower() in (*LABEL_SUFFIXES, ".jpg", ".jpeg") and f.is_file()
     ]
     found = wanted.matched(files)
-    maps, labels, notes = numbered([read_raw(file) for file in found.values()])
+    maps, labels, notes = numbered([wanted.raw(file) for file in found.values()])
     notes = [*notes, *wanted.leftover(files, found)]
     labels = _renamed(path / _NAMES_FILE, labels)
     return wanted.finished(dict(zip(found, maps, strict=True)), labels, notes)
@@ -241,7 +269,7 @@ def _label_folders(wanted: _Wanted, folders: list[Path]) -> Segmentation:
             index = wanted.names.find(file.relative_to(folder).as_posix())
             if index is None:
                 continue
-            mask = read_binary(file)
+            mask = wanted.binary(file)
             if index in maps and maps[index].shape != mask.shape:
                 raise InputError(
                     f"{file}: the mask is {mask.shape[1]} x {mask.shape[0]}, another label's is "
@@ -279,6 +307,7 @@ def _sam_items(wanted: _Wanted, items: dict[str, Any]) -> Segmentation:
             continue
         masks, labels = sam.json_masks(found, f"{source}: {name}", wanted.least)
         if masks:
+            wanted.counted(masks[0].shape)
             maps[index] = sam.painted(masks, f"{source}: {name}")
             kinds[index] = labels
     if not maps:
@@ -304,16 +333,7 @@ def _of_file(wanted: _Wanted) -> Segmentation:
             f"{path}: a segmentation must be a folder, .json, .npy or .npz",
             "see docs/guide/regions.md",
         )
-    import zipfile
-
-    try:
-        with open(path, "rb") as stream:
-            loaded = np.load(stream, allow_pickle=False)
-            arrays = {k: loaded[k] for k in loaded.files} if suffix == ".npz" else {"": loaded}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{path}: the NumPy file is damaged ({error})", "save it again with numpy.save"
-        ) from error
+    arrays = read_npz(path) if suffix == ".npz" else {"": read_npy(path)}
     maps: dict[int, NDArray[np.int64]] = {}
     if suffix == ".npy":
         stack = arrays[""]
@@ -340,6 +360,13 @@ def _of_file(wanted: _Wanted) -> Segmentation:
     return wanted.finished(maps, labels, [])
 
 
+def _label(value: Any, table: Path) -> str:
+    """A label's name out of ``labels.json``."""
+    if not isinstance(value, str | int | float):
+        raise InputError(f"{table}: a name must be text, got {short(value)}", "mend the file")
+    return str(value)
+
+
 def _mirrors(path: Path, folders: list[Path], names: ViewNames) -> bool:
     """Whether sub-folders repeat those of the photographs (camera folders), not labels."""
     files = [f for folder in folders for f in folder.rglob("*") if f.suffix in LABEL_SUFFIXES]
@@ -352,13 +379,11 @@ def _renamed(table: Path, labels: dict[int, str]) -> dict[int, str]:
     """Names out of ``labels.json``: number, colour or present name -> name."""
     if not table.is_file():
         return labels
-    try:
-        given = json.loads(table.read_text(encoding="utf-8"))
-        if not isinstance(given, dict):
-            raise ValueError("no mapping")
-        new = {str(key).lower(): str(value) for key, value in given.items()}
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    given = read_json(table, "mend the file")
+    if not isinstance(given, dict):
         raise InputError(
-            f'{table}: names must be a mapping like {{"1": "rind"}} ({error})', "mend the file"
-        ) from error
+            f'{table}: names must be a mapping like {{"1": "rind"}}, got {short(given)}',
+            "mend the file",
+        )
+    new = {str(key).lower(): _label(value, table) for key, value in given.items()}
     return {n: new.get(name.lower(), new.get(str(n), name)) for n, name in labels.items()}

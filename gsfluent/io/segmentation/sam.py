@@ -8,7 +8,8 @@ digit first, plus 48 to be printable; 32 marks that digits follow and 16 in the 
 from __future__ import annotations
 
 import csv
-import json
+import dataclasses
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,52 +17,112 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
+from gsfluent.io.checked.files import read_json as load_json
+from gsfluent.io.checked.files import read_text
+from gsfluent.io.checked.inside import inside
+from gsfluent.io.checked.limits import within
+from gsfluent.io.checked.pictures import check_pixels
 from gsfluent.io.segmentation.files import read_binary
 
 Mask = NDArray[np.bool_]
-_LARGE = 1 << 30
+
+
+@dataclasses.dataclass(frozen=True)
+class Runs:
+    """A mask as its run lengths: as small as its file, whatever it covers."""
+
+    lengths: NDArray[np.int64]  # down the columns, background first
+    height: int
+    width: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.height, self.width
+
+    @property
+    def area(self) -> int:
+        """Pixels of the mask."""
+        return int(self.lengths[1::2].sum())
+
+    def extent(self) -> tuple[int, int]:
+        """First pixel of the mask and the one after its last, counted down the columns."""
+        ends = np.cumsum(self.lengths)
+        last = len(ends) - 1 - (len(ends) % 2)
+        return (int(ends[0]), int(ends[last])) if last > 0 else (0, 0)
+
+    def paint(self, flat: NDArray[Any], value: int) -> None:
+        """Set the mask's pixels of a picture that is flat down the columns, [width height]."""
+        low, high = self.extent()
+        inner = self.lengths[1 : len(self.lengths) - len(self.lengths) % 2]
+        chosen = np.repeat(np.arange(len(inner)) % 2 == 0, inner)
+        flat[low:high][chosen] = value
+
+    def mask(self) -> Mask:
+        """Bool [H, W]."""
+        flat = np.zeros(self.height * self.width, bool)
+        self.paint(flat, True)
+        return flat.reshape(self.width, self.height).T
 
 
 def decode_rle(code: Any, where: str = "segmentation") -> Mask:
     """Decode ``{size: [H, W], counts: list or text}`` to a mask, bool [H, W].
 
     Raises:
-        InputError: Keys are missing, or the lengths do not add up to the size.
+        InputError: As :func:`read_rle`.
+    """
+    return read_rle(code, where).mask()
+
+
+def read_rle(code: Any, where: str = "segmentation") -> Runs:
+    """Check ``{size: [H, W], counts: list or text}``; nothing of the mask's size is allocated.
+
+    Raises:
+        InputError: Keys are missing, the lengths do not add up to the size, or it is above the
+            limit ``pixels``.
     """
     if not isinstance(code, Mapping) or "size" not in code or "counts" not in code:
         raise InputError(
-            f"{where}: run-length code must have 'size' and 'counts', got {_short(code)}",
+            f"{where}: run-length code must have 'size' and 'counts', got {short(code)}",
             "write masks with output_mode 'uncompressed_rle' or 'coco_rle'",
         )
     size = code["size"]
     if (
         not isinstance(size, Sequence)
         or len(size) != 2
-        or not all(isinstance(n, int) and 0 < n < _LARGE for n in size)
+        or not all(isinstance(n, int) and n > 0 for n in size)
     ):
-        raise InputError(f"{where}: size must be [height, width], got {_short(size)}", "export it")
+        raise InputError(f"{where}: size must be [height, width], got {short(size)}", "export it")
     height, width = size
-    counts = code["counts"]
+    check_pixels(width, height, where)
+    counts, area = code["counts"], height * width
     if isinstance(counts, str | bytes):
         lengths = _unpacked(counts, where)
     elif isinstance(counts, Sequence) and all(
         isinstance(n, int) and not isinstance(n, bool) for n in counts
     ):
+        # in Python's integers: in 64 bits a sum can wrap to the size
+        total = sum(counts)
+        if total != area or not all(0 <= n <= area for n in counts):
+            raise _uneven(where, total, height, width)
         lengths = np.array(counts, dtype=np.int64)
     else:
         raise InputError(
-            f"{where}: counts must be whole numbers or text, got {_short(counts)}", "export it"
+            f"{where}: counts must be whole numbers or text, got {short(counts)}", "export it"
         )
-    total = int(lengths.sum()) if lengths.size else 0
-    if (lengths < 0).any() or total != height * width:
-        raise InputError(
-            f"{where}: run lengths add up to {total} pixels, the size {height} x {width} has "
-            f"{height * width}",
-            "the file is cut short or the size is swapped ([height, width]); export it again",
-        )
-    value = np.arange(len(lengths)) % 2 == 1
-    return np.repeat(value, lengths).reshape(width, height).T
+    total = int(lengths.sum())  # at most 2^35 each, see _unpacked: does not wrap
+    if (lengths < 0).any() or total != area:
+        raise _uneven(where, total, height, width)
+    return Runs(lengths, height, width)
+
+
+def _uneven(where: str, total: int, height: int, width: int) -> InputError:
+    return InputError(
+        f"{where}: run lengths add up to {short(total)} pixels, the size {height} x {width} has "
+        f"{height * width}",
+        "the file is cut short or the size is swapped ([height, width]); export it again",
+    )
 
 
 def _unpacked(text: str | bytes, where: str) -> NDArray[np.int64]:
@@ -88,25 +149,35 @@ def _unpacked(text: str | bytes, where: str) -> NDArray[np.int64]:
     return value
 
 
-def painted(masks: list[Mask], where: str) -> NDArray[np.int64]:
+def painted(masks: list[Runs], where: str) -> NDArray[np.int32]:
     """One label map of overlapping masks: small ones lie on large ones; numbered from 1, [H, W].
 
     Raises:
-        InputError: Their sizes differ.
+        InputError: Their sizes differ, or together they are above the limit ``painted_pixels``.
     """
-    shapes = {mask.shape for mask in masks}
-    if len(shapes) != 1:
+    height, width = _one_shape([mask.shape for mask in masks], where)
+    within("painted_pixels", sum(b - a for a, b in (m.extent() for m in masks)), where)
+    flat = np.zeros(height * width, dtype=np.int32)
+    for index in _large_first([mask.area for mask in masks]):
+        masks[index].paint(flat, index + 1)
+    return flat.reshape(width, height).T
+
+
+def _one_shape(shapes: list[tuple[int, int]], where: str) -> tuple[int, int]:
+    if len(set(shapes)) != 1:
         raise InputError(
-            f"{where}: masks of one image must have one size, got {sorted(shapes)}", "export again"
+            f"{where}: masks of one image must have one size, got {short(sorted(set(shapes)))}",
+            "export again",
         )
-    result = np.zeros(shapes.pop(), dtype=np.int64)
-    areas = np.array([int(mask.sum()) for mask in masks])
-    for index in np.argsort(-areas, kind="stable"):
-        result[masks[index]] = index + 1
-    return result
+    return shapes[0]
 
 
-def read_mask_folder(folder: Path, least: float = 0.0) -> NDArray[np.int64]:
+def _large_first(areas: list[int]) -> list[int]:
+    order: list[int] = np.argsort(-np.array(areas), kind="stable").tolist()
+    return order
+
+
+def read_mask_folder(folder: Path, least: float = 0.0) -> NDArray[np.int32]:
     """Read the masks of one image: ``0.png``, ``1.png``, ... with ``metadata.csv`` beside them.
 
     Args:
@@ -119,9 +190,8 @@ def read_mask_folder(folder: Path, least: float = 0.0) -> NDArray[np.int64]:
     table = folder / "metadata.csv"
     if table.is_file():
         try:
-            with table.open(newline="", encoding="utf-8") as stream:
-                rows = list(csv.DictReader(stream))
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            rows = list(csv.DictReader(io.StringIO(read_text(table, noun="table"), newline="")))
+        except csv.Error as error:
             raise InputError(f"{table}: the table is damaged ({error})", "export it") from error
         if rows and "id" not in rows[0]:
             raise InputError(f"{table}: has no column 'id'", "export the masks again")
@@ -134,7 +204,15 @@ def read_mask_folder(folder: Path, least: float = 0.0) -> NDArray[np.int64]:
             f"{folder}: no mask is left" if table.is_file() else f"{folder}: holds no mask",
             "run the mask generator on this image again, or remove the folder",
         )
-    return painted([read_binary(folder / name) for name in names], str(folder))
+    masks, pixels = list[Mask](), 0
+    for name in names:
+        masks.append(read_binary(inside(folder, name, table)))
+        pixels += masks[-1].size
+        within("painted_pixels", pixels, folder)
+    result = np.zeros(_one_shape([(m.shape[0], m.shape[1]) for m in masks], str(folder)), np.int32)
+    for index in _large_first([int(mask.sum()) for mask in masks]):
+        result[masks[index]] = index + 1
+    return result
 
 
 def read_json(path: Path) -> dict[str, list[Mapping[str, Any]]]:
@@ -147,39 +225,41 @@ def read_json(path: Path) -> dict[str, list[Mapping[str, Any]]]:
     Raises:
         InputError: No JSON, or none of these.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: the JSON is damaged ({error})", "export it again") from error
+    data = load_json(path)
     if isinstance(data, list) and all(isinstance(item, Mapping) for item in data):
         return {path.stem: data}
     if isinstance(data, Mapping):
         found = data.get("annotations")
         if isinstance(found, list) and isinstance(data.get("images"), list):
             names = {
-                item.get("id"): str(item.get("file_name", item.get("id")))
+                _id(item, "id", path): str(item.get("file_name", item.get("id")))
                 for item in data["images"]
                 if isinstance(item, Mapping)
             }
+            kinds_given = data.get("categories") or []
+            if not isinstance(kinds_given, list):
+                raise InputError(
+                    f"{path}: categories must be a list, got {short(kinds_given)}", "export it"
+                )
             kinds = {
-                item.get("id"): str(item.get("name", item.get("id")))
-                for item in data.get("categories") or ()
+                _id(item, "id", path): str(item.get("name", item.get("id")))
+                for item in kinds_given
                 if isinstance(item, Mapping)
             }
             result: dict[str, list[Mapping[str, Any]]] = {name: [] for name in names.values()}
             for index, item in enumerate(found):
-                if not isinstance(item, Mapping) or item.get("image_id") not in names:
+                if not isinstance(item, Mapping) or _id(item, "image_id", path) not in names:
                     raise InputError(
                         f"{path}: annotations[{index}] belongs to no image", "export it again"
                     )
-                kind = kinds.get(item.get("category_id"))
+                kind = kinds.get(_id(item, "category_id", path))
                 named = item if kind is None else {**item, "label": kind}
                 result[names[item["image_id"]]].append(named)
             return result
         if isinstance(found, list):
             image = data.get("image")
             name = image.get("file_name", path.stem) if isinstance(image, Mapping) else path.stem
-            return {str(name): found}
+            return {short(name, bare=True) if isinstance(name, str) else short(name): found}
         if data and all(isinstance(item, list) for item in data.values()):
             return {str(name): item for name, item in data.items()}
     raise InputError(
@@ -188,19 +268,27 @@ def read_json(path: Path) -> dict[str, list[Mapping[str, Any]]]:
     )
 
 
+def _id(item: Mapping[str, Any], key: str, path: Path) -> str | int | float | None:
+    """A number or a name that things are told apart by."""
+    value = item.get(key)
+    if value is not None and not isinstance(value, str | int | float):
+        raise InputError(f"{path}: {key} must be a number or text, got {short(value)}", "export it")
+    return value
+
+
 def json_masks(
     items: list[Mapping[str, Any]], where: str, least: float = 0.0
-) -> tuple[list[Mask], list[str | None]]:
+) -> tuple[list[Runs], list[str | None]]:
     """Masks of the annotations of one image that are good enough, and their labels if any.
 
     Raises:
         InputError: An annotation without a mask, or whose area is not that of its mask.
     """
-    masks, labels = [], []
+    masks, labels = list[Runs](), list[str | None]()
     for index, item in enumerate(items):
         place = f"{where}[{index}]"
         if not isinstance(item, Mapping) or "segmentation" not in item:
-            raise InputError(f"{place}: has no 'segmentation', got {_short(item)}", "export it")
+            raise InputError(f"{place}: has no 'segmentation', got {short(item)}", "export it")
         if not _good(item, least, place):
             continue
         code = item["segmentation"]
@@ -208,12 +296,15 @@ def json_masks(
             raise InputError(
                 f"{place}: is a polygon or a plain array", "export with output_mode 'coco_rle'"
             )
-        masks.append(decode_rle(code, place))
-        labels.append(item.get("label"))
+        masks.append(read_rle(code, place))
+        label = item.get("label")
+        if label is not None and not isinstance(label, str | int | float):
+            raise InputError(f"{place}: label must be text, got {short(label)}", "export it")
+        labels.append(None if label is None else str(label))
         area = item.get("area")
-        if isinstance(area, int) and area != int(masks[-1].sum()):
+        if isinstance(area, int) and area != masks[-1].area:
             raise InputError(
-                f"{place}: says area {area}, its mask has {int(masks[-1].sum())} pixels",
+                f"{place}: says area {short(area)}, its mask has {masks[-1].area} pixels",
                 "the masks were exported for another size; export them again",
             )
     return masks, labels
@@ -227,15 +318,12 @@ def _good(item: Mapping[str, Any], least: float, where: str) -> bool:
             continue
         try:
             score = float(value)
-        except (TypeError, ValueError):
-            raise InputError(f"{where}: {name} must be a number, got {value!r}", "export") from None
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(
+                f"{where}: {name} must be a number, got {short(value)}", "export"
+            ) from None
         if np.isnan(score):
             raise InputError(f"{where}: {name} is NaN", "export the masks again")
         if score < least:
             return False
     return True
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -50,6 +50,11 @@ def decode_compressed(path: Path, data: dict[str, NDArray[Any]]) -> Gaussians:
             f"missing {', '.join(absent)}" if absent else f"{len(chunk)} chunks for {count} splats"
         )
         raise InputError(f"{path}: the compressed splat is incomplete ({got})", "export it again")
+    wrong = [name for name in packed if vertex.dtype[name] != np.uint32]
+    if wrong:
+        raise InputError(
+            f"{path}: {wrong[0]} must be uint, got {vertex.dtype[wrong[0]]}", "export it again"
+        )
     limits = chunk[np.arange(count) // _CHUNK]
     position = _unpack_111011(vertex["packed_position"])
     scale = _unpack_111011(vertex["packed_scale"])
@@ -57,7 +62,9 @@ def decode_compressed(path: Path, data: dict[str, NDArray[Any]]) -> Gaussians:
         [(vertex["packed_color"] >> shift & 255) / 255.0 for shift in (24, 16, 8, 0)], axis=1
     )
     rgb = color[:, :3]
-    if "min_r" in (chunk.dtype.names or ()):
+    if {f"{side}_{name}" for side in ("min", "max") for name in "rgb"} <= set(
+        chunk.dtype.names or ()
+    ):
         rgb = _between(limits, ("r", "g", "b"), rgb)
     sh = ((rgb - 0.5) / geometry.SH0)[:, None]
     if rest is not None:
@@ -109,6 +116,9 @@ def _rest(path: Path, rows: NDArray[Any]) -> NDArray[Any]:
         raise InputError(
             f"{path}: element sh must have 9, 24 or 45 properties, got {count}", "export it again"
         )
+    absent = [i for i in range(count) if f"f_rest_{i}" not in (rows.dtype.names or ())]
+    if absent:
+        raise InputError(f"{path}: element sh has no f_rest_{absent[0]}", "export it again")
     level = np.stack([rows[f"f_rest_{index}"].astype(np.float64) for index in range(count)], axis=1)
     fraction = np.where(level == 0, 0.0, np.where(level == 255, 1.0, (level + 0.5) / 256))
     values = (fraction - 0.5) * 8

@@ -34,6 +34,7 @@ import json
 import struct
 import zlib
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +42,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsfluent.errors import InputError
+from gsfluent.io.checked.files import regular_file
+from gsfluent.io.checked.limits import unpacked_limit, within
 
 MAGIC, END = b"GSFDELTA", b"GSFD-END"
 VERSION = 1
 BLOCK = struct.Struct("<4sIII")
 TRAILER = struct.Struct("<Q8s")
 ROSTER, KEY, DELTA, INDEX = b"ROST", b"KEYF", b"DELT", b"INDX"
+_LEVELS = [3, 1, 3]  # columns: colour, opacity, log scale
+_BORN = [1, 3, 1, 3, 7]  # fragment, position, largest, small, levels
+_STAYS = [1, 22, 3, 3, 7]  # fragment, predictor, position, rotation, levels
+_ARRAYS = 11  # of a difference
+_FLOAT32 = 3e38
+_LOG_SCALE = 80.0  # exp of it is a float32
 QUATERNION_LEVELS = 2047  # per component of a key frame, over 1/sqrt(2)
 PLACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
@@ -109,7 +118,7 @@ class DeltaReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         try:
-            self._size = self.path.stat().st_size
+            self._size = regular_file(self.path)
             with self.path.open("rb") as stream:
                 self.header = self._read_header(stream.read(16), stream)
         except OSError as error:
@@ -120,6 +129,10 @@ class DeltaReader:
         self._start, self._frames = offsets[0], offsets[1:]
         self.step: dict[str, float] = self.header["step"]
         roster = self._payload(self._start, ROSTER, 0)
+        if [array.shape[1] for array in roster] != [1, *_LEVELS] or len(
+            {len(array) for array in roster}
+        ) != 1:
+            raise self._damaged("the roster")
         self.ids: Ints = roster[0][:, 0]
         self._born: Ints = np.concatenate(roster[1:4], axis=1)
         self._at, self._state = -1, self._nothing()
@@ -145,7 +158,8 @@ class DeltaReader:
             arrays = self._payload(self._frames[place], kind, place)
             try:
                 self._state = decode(arrays, self._state, self._born, self.step, kind == KEY)
-            except (ValueError, IndexError) as error:
+                _check_finite(self._state, self.step)
+            except (ValueError, IndexError, KeyError, np.linalg.LinAlgError) as error:
                 self._at = -1
                 raise self._damaged(f"frame {place} does not fit its roster ({error})") from error
             self._at = place
@@ -191,11 +205,8 @@ class DeltaReader:
         self._body = 16 + size
         try:
             header: dict[str, Any] = json.loads(text)
-            if len(header["times"]) != header["frames"] or not header["key_every"] >= 1:
-                raise ValueError("times")
-            for name in ("position", "rotation", "log_scale", "opacity", "f_dc"):
-                float(header["step"][name])
-        except (ValueError, KeyError, TypeError) as error:
+            _check_header(header)
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise self._damaged(f"the header ({error!r})") from error
         return header
 
@@ -207,8 +218,11 @@ class DeltaReader:
         if len(tail) < TRAILER.size or tail[8:] != END:
             raise self._short("before its index")
         at = TRAILER.unpack(tail)[0]
-        words = self._payload(at, INDEX, 0)[0]
-        offsets: list[int] = (words[:, 0] + (words[:, 1] << 32)).tolist()
+        words = self._payload(at, INDEX, 0)
+        if len(words) != 1 or words[0].shape[1] != 2 or (words[0] < 0).any():
+            raise self._damaged("the index")
+        low, high = words[0].T
+        offsets: list[int] = (low + (high << 32)).tolist()
         if len(offsets) != self.header["frames"] + 1:
             raise self._damaged("the index")
         return offsets
@@ -232,9 +246,23 @@ class DeltaReader:
         if zlib.crc32(data) != check:
             raise self._damaged(f"{name} fails its check sum")
         try:
-            return unpack_arrays(zlib.decompress(data))
+            return self._unpacked(data, kind, name)
+        except InputError:
+            raise
         except (zlib.error, struct.error, ValueError) as error:
             raise self._damaged(f"{name} ({error})") from error
+
+    def _unpacked(self, data: bytes, kind: bytes, name: str) -> list[Ints]:
+        """The arrays of a payload, which neither zlib nor their sizes make larger than allowed."""
+        most = unpacked_limit(self._size)
+        packed = zlib.decompressobj()
+        plain = packed.decompress(data, most + 1)
+        within("unpacked_bytes", len(plain), f"{self.path}: {name}", most)
+        if not packed.eof:
+            raise ValueError("incomplete")
+        if kind in (ROSTER, INDEX):
+            return unpack_arrays(plain, len(plain), most, _ARRAYS)
+        return unpack_arrays(plain, max(len(self.ids), len(plain)), most, _ARRAYS)
 
     def _short(self, where: str) -> InputError:
         return InputError(
@@ -245,16 +273,64 @@ class DeltaReader:
         return InputError(f"{self.path}: damaged: {what}", "copy or export it again")
 
 
-def unpack_arrays(data: bytes) -> list[Ints]:
+def _check_header(header: dict[str, Any]) -> None:
+    """Raise ValueError, KeyError or TypeError for what is no header."""
+    times, steps = header["times"], header["step"]
+    if not isinstance(times, list) or len(times) != header["frames"]:
+        raise ValueError("times")
+    every = header["key_every"]
+    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+        raise ValueError("key_every")
+    named = ("position", "rotation", "log_scale", "opacity", "f_dc")
+    for number in (*times, *(steps[name] for name in named)):
+        # the same bound keeps whole numbers of hundreds of digits out
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            raise ValueError(f"{number!r:.60} is no number")
+        if not -1e300 < number < 1e300:
+            raise ValueError("a time or step that is not finite")
+    if any(later < earlier for earlier, later in pairwise(times)):
+        raise ValueError("times that go back")
+
+
+def _check_finite(state: State, step: dict[str, float]) -> None:
+    """Raise ValueError where a living splat has a value that no splat has."""
+    alive = state.alive
+    log_scale = state.levels[alive, 4:] * step["log_scale"]
+    if not (
+        np.isfinite(state.means[alive]).all()
+        and np.isfinite(state.quats[alive]).all()
+        and (np.abs(state.means[alive]) < _FLOAT32).all()
+        and (np.abs(log_scale) < _LOG_SCALE).all()
+        and (np.abs(state.levels[alive, :3] * step["f_dc"]) < _FLOAT32).all()
+    ):
+        raise ValueError("a splat without a finite place, turn, size or colour")
+
+
+def unpack_arrays(
+    data: bytes, most_rows: int = 1 << 32, most_bytes: int = 1 << 40, most_arrays: int = 1 << 20
+) -> list[Ints]:
     """Inverse of :func:`gsfluent.io.splats.delta_write.pack_arrays`.
 
-    Each array is int64 [rows, columns].
+    Args:
+        data: The payload.
+        most_rows: Rows that an array may have: numbers of no bytes (all zero) cost nothing.
+        most_bytes: Bytes that all arrays may take.
+        most_arrays: How many there may be; an empty one takes six bytes.
+
+    Returns:
+        Arrays, each int64 [rows, columns].
+
+    Raises:
+        ValueError: The payload is none, or larger than that.
     """
     arrays: list[Ints] = []
-    at = 0
+    at, total = 0, 0
     while at < len(data):
         rows, columns, width = struct.unpack_from("<IBB", data, at)
         at += 6
+        total += 8 * rows * columns
+        if rows > most_rows or total > most_bytes or width > 8 or len(arrays) >= most_arrays:
+            raise ValueError(f"{rows} rows of {columns} numbers of {width} bytes")
         planes = np.frombuffer(data, np.uint8, rows * columns * width, at)
         at += len(planes)
         coded = np.zeros((columns, rows), np.uint64)
@@ -288,6 +364,8 @@ def decode(
     if key:
         empty = replace(before, alive=np.zeros(count, bool), moved=np.zeros((count, 3)))
         return _with_born(arrays[1:], np.flatnonzero(mask), empty, born, step)
+    if [array.shape[1] for array in arrays[1:6]] != _STAYS or len(arrays) != _ARRAYS:
+        raise ValueError("columns")
     alive = before.alive ^ mask
     stay, new = np.flatnonzero(before.alive & alive), np.flatnonzero(alive & ~before.alive)
     fragment = before.fragment.copy()
@@ -314,6 +392,12 @@ def _with_born(
 ) -> State:
     """Add splats whose values stand alone."""
     fragment, position, largest, small, levels = arrays
+    if [array.shape[1] for array in arrays] != _BORN:
+        raise ValueError("columns")
+    if any(len(array) != len(rows) for array in arrays):
+        raise ValueError("rows")
+    if ((largest < 0) | (largest > 3)).any():
+        raise ValueError("a quaternion has four components")
     fragments = state.fragment.copy()
     fragments[rows] = fragment[:, 0]
     means = np.cumsum(position, axis=0) * step["position"]

@@ -153,6 +153,12 @@ def _sigmoid(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _unit_quaternions(path: Path, quats: NDArray[np.float64]) -> torch.Tensor:
+    bad = int((~np.isfinite(quats)).any(axis=1).sum())
+    if bad:
+        raise InputError(
+            f"{path}: quaternions must be finite, got others in {bad} of {len(quats)} rows",
+            "remove these rows or export the splat again",
+        )
     zero = int((np.linalg.norm(quats, axis=1) == 0).sum())
     if zero:
         logger.warning("%s: %d quaternions of length zero read as no rotation", path, zero)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
+from gsfluent.io.checked.files import regular_file
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -36,6 +36,8 @@ _NAMES = {
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 20
 """A longer header is no PLY header; stops the search for its end in some other large file."""
+_WORD = 128
+"""Letters of a number in an ASCII file; a column takes as many for each of its rows."""
 
 
 @dataclasses.dataclass
@@ -66,8 +68,8 @@ def read_ply(path: str | Path) -> dict[str, NDArray[Any]]:
         InputError: The file is missing, not a PLY, truncated, or holds text where numbers belong.
     """
     path = Path(path)
+    size = regular_file(path)
     try:
-        size = os.path.getsize(path)
         with open(path, "rb") as stream:
             order, elements = _read_header(path, stream)
             data: dict[str, NDArray[Any]] = {}
@@ -77,8 +79,6 @@ def read_ply(path: str | Path) -> dict[str, NDArray[Any]]:
                     data[element.name] = _read_ascii(path, body, element)
                 else:
                     data[element.name] = _read_binary(path, body, element, order, size)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file", "check the path") from error
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror})", "check the path and its permissions"
@@ -133,7 +133,10 @@ def _read_header(path: Path, stream: Any) -> tuple[str, list[_Element]]:
             elif words[0] == "element":
                 elements.append(_Element(words[1], int(words[2]), []))
             elif words[0] == "property" and words[1] == "list":
-                elements[-1].properties.append((words[4], _TYPES[words[3]], _TYPES[words[2]]))
+                length = _TYPES[words[2]]
+                if length.startswith("f"):
+                    raise ValueError("a list has a whole number of entries")
+                elements[-1].properties.append((words[4], _TYPES[words[3]], length))
             elif words[0] == "property":
                 elements[-1].properties.append((words[2], _TYPES[words[1]], None))
             else:
@@ -151,6 +154,10 @@ def _read_header(path: Path, stream: Any) -> tuple[str, list[_Element]]:
         names = [name for name, _, _ in element.properties]
         if len(set(names)) != len(names):
             raise InputError(f"{path}: element {element.name} names a property twice", hint)
+        if not names and element.count:
+            raise InputError(
+                f"{path}: element {element.name} promises {element.count} rows of no property", hint
+            )
     return order, elements
 
 
@@ -186,18 +193,23 @@ def _read_binary(path: Path, stream: Any, element: _Element, order: str, size: i
         for name, kind, length in element.properties:
             repeat = 1
             if length is not None:
-                repeat = int(_read_values(path, stream, element, order + length, 1, row)[0])
-            values = _read_values(path, stream, element, order + kind, repeat, row)
+                repeat = int(_read_values(path, stream, element, order + length, 1, row, size)[0])
+            values = _read_values(path, stream, element, order + kind, repeat, row, size)
             if length is None:
                 rows[name][row] = values[0]
     return rows
 
 
 def _read_values(
-    path: Path, stream: Any, element: _Element, kind: str, count: int, row: int
+    path: Path, stream: Any, element: _Element, kind: str, count: int, row: int, most: int
 ) -> NDArray[Any]:
-    width = np.dtype(kind).itemsize * max(count, 0)
-    raw = stream.read(width)
+    if count < 0:
+        raise InputError(
+            f"{path}: element {element.name}, row {row}: a list of {count} entries",
+            "export it again",
+        )
+    width = np.dtype(kind).itemsize * count
+    raw = stream.read(min(width, most))
     if len(raw) < width:
         raise _truncated(path, element, row)
     return np.frombuffer(raw, dtype=kind)
@@ -208,6 +220,7 @@ def _read_ascii(path: Path, stream: Any, element: _Element) -> NDArray[Any]:
     dtype = _scalar_dtype(element, "=")
     names = [name for name, _, _ in element.properties]
     lines: list[list[bytes]] = []
+    longest = 0
     while len(lines) < element.count:
         raw = stream.readline()
         if not raw:
@@ -215,6 +228,11 @@ def _read_ascii(path: Path, stream: Any, element: _Element) -> NDArray[Any]:
         words = raw.split()
         if words:
             lines.append(words)
+            longest = max(longest, *map(len, words))
+    if longest > _WORD:
+        raise InputError(
+            f"{path}: element {element.name} has a word of {longest} letters", "export it again"
+        )
     try:
         if element.has_lists:
             lines = [_scalar_words(words, element) for words in lines]
@@ -224,7 +242,7 @@ def _read_ascii(path: Path, stream: Any, element: _Element) -> NDArray[Any]:
         scalars = [name for name in names if name in (dtype.names or ())]
         for column, name in enumerate(scalars):
             rows[name] = np.array([words[column] for words in lines], dtype="S").astype(dtype[name])
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(
             f"{path}: element {element.name} holds text that is not a number ({error})",
             "export it again",
@@ -241,5 +259,8 @@ def _scalar_words(words: list[bytes], element: _Element) -> list[bytes]:
             kept.append(words[place])
             place += 1
         else:
-            place += 1 + int(words[place])
+            entries = int(words[place])
+            if entries < 0:
+                raise ValueError(f"a list of {entries} entries")
+            place += 1 + entries
     return kept

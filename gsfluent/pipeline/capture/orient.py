@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,27 @@ from gsfluent import geometry
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.spatial.mesh_file import in_metres, up_axes
 from gsfluent.spatial.shape import cluster, robust_box
+from gsfluent.spatial.standing import upright
 
 Array = NDArray[np.float64]
+
 
 DEFAULT_SIZE = 0.2
 """Largest extent [m] assumed for an object of unknown size: what fits in two hands."""
 
 _SPLAT_UP = (0.0, -1.0, 0.0)
 """Up of a splat without cameras: trainers keep COLMAP's axes, where y points down."""
+
+_OTHER_UPS = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+"""Up of splats that somebody has turned, likeliest first."""
+
+_HELD = np.radians(45.0)
+"""Photographers hold their camera upright to within this; their splats lean no farther."""
+
+_PLAUSIBLE = (0.01, 5.0)
+"""Extents [m] of objects that a file in metres is believed about."""
 
 _LEVEL = 0.05
 """Mean squared sine of the cameras' roll below which they count as held level."""
@@ -39,7 +52,8 @@ class Orientation:
     """How an input stands in its own coordinates."""
 
     up: Array  # unit up axis [3], world
-    # what it was taken from: ``given``, ``support plane``, ``cameras`` or ``convention``.
+    # what it was taken from: ``given``, ``support plane``, ``cameras``, ``file format``,
+    # ``convention`` or, against it, ``shape``.
     up_from: str
     floor: float  # coordinate of the floor along ``up``, world units
     floor_from: str  # ``given``, ``support plane`` or ``lowest point``
@@ -47,18 +61,23 @@ class Orientation:
 
 
 def orient(
-    gaussians: Gaussians | None, capture: Capture | None = None, up: Any = "auto"
+    gaussians: Gaussians | None,
+    capture: Capture | None = None,
+    up: Any = "auto",
+    mesh: Path | None = None,
 ) -> Orientation:
     """Find the up axis and the floor.
 
     Up: as given; else the normal of the plane that carries the object, if the sparse points show
-    one near what the cameras suggest; else the axis that level cameras turn about; else, for a bare
-    splat, -y. Floor: that plane, else the lowest point of the object.
+    one near what the cameras suggest; else the axis that level cameras turn about. Without cameras:
+    what the format of a mesh lays down, or -y for a splat, unless the thing falls over on it
+    (:func:`gsfluent.spatial.standing.upright`). Floor: that plane, else the lowest point.
 
     Args:
         gaussians: The object's splats, or None when there is only a capture.
         capture: The photographs it comes from, or None.
         up: ``"auto"`` or three numbers.
+        mesh: The mesh file that the splats cover, or None.
 
     Raises:
         InputError: Neither splats nor a capture with points are given.
@@ -70,7 +89,7 @@ def orient(
         axis, source = np.asarray(up, dtype=np.float64), "given"
         axis = axis / np.linalg.norm(axis)
     elif capture is None:
-        axis, source = np.array(_SPLAT_UP), "convention"
+        axis, source = _standing_up(points, mesh)
     else:
         axis, source = camera_up(capture.cameras), "cameras"
     if capture is not None and len(capture.points) >= 100:
@@ -87,6 +106,23 @@ def orient(
     )
 
 
+def _standing_up(points: Array, mesh: Path | None) -> tuple[Array, str]:
+    """The axis on which a thing without cameras stands, and what says so."""
+    if mesh is None:
+        axes, said = [np.array(axis) for axis in (_SPLAT_UP, *_OTHER_UPS)], False
+    else:
+        known = up_axes(mesh)
+        axes, said = [axis for axis, _ in known], known[0][1]
+    if said:
+        return axes[0], "file format"
+    if mesh is not None:
+        axis, turned = upright(points, axes)
+    else:
+        # photographs are held upright, more or less
+        axis, turned = upright(points[~cluster(points).floaters], axes, most=_HELD)
+    return axis, "shape" if turned else "convention"
+
+
 def make_frame(
     gaussians: Gaussians, capture: Capture | None = None, shot: Shot | None = None
 ) -> Frame:
@@ -98,14 +134,20 @@ def make_frame(
     Args:
         gaussians: The object's splats (background removed), world coordinates.
         capture: The photographs, used for the up axis.
-        shot: Settings ``up``, ``floor``, ``origin``, ``scale`` and ``size``; automatic without.
+        shot: Settings ``up``, ``front``, ``floor``, ``origin``, ``scale`` and ``size``, and the
+            mesh whose unit may be known; automatic without.
 
     Raises:
         InputError: No splats, or all in one point; or no support plane where one is asked for.
     """
     gaussians.validated("make_frame")
-    stance = orient(gaussians, capture, "auto" if shot is None else shot.up)
-    rotation = upright_rotation(stance.up, None if capture is None else capture.cameras)
+    mesh, up = (None, "auto") if shot is None else (shot.mesh, shot.up)
+    stance = orient(gaussians, capture, up, mesh)
+    rotation = upright_rotation(
+        stance.up,
+        None if capture is None else capture.cameras,
+        None if shot is None or isinstance(shot.front, str) else shot.front,
+    )
     points = _object_points(gaussians, None)
     points = points[~cluster(points).floaters] @ rotation.T
     low, high = robust_box(points)
@@ -119,6 +161,8 @@ def make_frame(
         scale = shot.scale
     elif shot is not None and shot.size is not None:
         scale = shot.size / extent
+    elif mesh is not None and in_metres(mesh) and _PLAUSIBLE[0] <= extent <= _PLAUSIBLE[1]:
+        scale = 1.0
     ground = low[2]
     if shot is not None and not isinstance(shot.floor, str):
         ground = shot.floor / scale
@@ -135,16 +179,31 @@ def make_frame(
     return Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
 
 
-def upright_rotation(up: Array, cameras: list[Camera] | None = None) -> Array:
-    """Rotation [3, 3] that carries ``up`` onto +z and faces the first camera (if any) along +y.
+def upright_rotation(up: Array, cameras: list[Camera] | None = None, front: Any = None) -> Array:
+    """Rotation [3, 3] that carries ``up`` onto +z and the front onto -y, where films begin.
 
-    So the front view of a scene is the view of the first photograph.
+    The front: the direction ``front`` [3] (from the object towards who looks at it); else where the
+    first photograph was taken from; else what stands there by the custom of the axes, which is +z
+    of a y-up and -z of a -y-up world, and -y of a z-up one.
+
+    Raises:
+        InputError: ``front`` points along ``up``.
     """
     rotation = geometry.rotation_between(
         torch.from_numpy(up), torch.tensor([0.0, 0.0, 1.0])
     ).numpy()
-    if cameras:
+    ahead = None
+    if front is not None:
+        ahead = -(rotation @ np.asarray(front, dtype=np.float64))
+        ahead /= np.linalg.norm(ahead)
+        if np.hypot(ahead[0], ahead[1]) < 0.1:
+            raise InputError(
+                f"front: [{', '.join(f'{part:g}' for part in front)}] points up or down",
+                "give a direction across the up axis",
+            )
+    elif cameras:
         ahead = rotation @ cameras[0].forward().numpy()
+    if ahead is not None:
         length = float(np.hypot(ahead[0], ahead[1]))
         if length > 0.1:  # a camera that looks straight down has no front
             x, y = ahead[0] / length, ahead[1] / length

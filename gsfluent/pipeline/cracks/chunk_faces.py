@@ -44,7 +44,8 @@ class ChunkFaces:
         color: RGB in 0..1, [E, 3].
         normals: Unit normals away from the matter, [E, 3].
         owner: Point that each moves with, int64 [E].
-        rival: Point across the face, int64 [E].
+        rival: Point across the face, int64 [E]; the one of dust where it was that.
+        ash: Point of the dust that the element's own matter has become, int64 [E]; -1 for none.
     """
 
     key: Tensor
@@ -58,6 +59,7 @@ class ChunkFaces:
     normals: Tensor
     owner: Tensor
     rival: Tensor
+    ash: Tensor
 
     @property
     def count(self) -> int:
@@ -175,7 +177,7 @@ def _elements(
     return ChunkFaces(
         key=(((number << 40) + voxel) << 1) + kind, voxel=voxel, region=region, beyond=beyond,
         means=means, quats=quats, scales=scales, color=color, normals=normal,
-        owner=none, rival=none,
+        owner=none, rival=none, ash=none,
     )  # fmt: skip
 
 
@@ -205,6 +207,17 @@ def _colors(
     if shown is not None:
         skin[near] = shown.to(skin)
     return matter, skin
+
+
+def colors_at(partition: Partition, solid: Solid, means: Tensor) -> Tensor:
+    """Colours of a body at places at rest [m], [M, 3]: the skin's at the skin, else the inside's.
+
+    Places beside the matter have the colour of the skin nearest to them.
+    """
+    below = partition.depth_at(means)
+    matter, skin = _colors(partition, solid, means, below)
+    crust = below < min(CRUST * partition.solid_voxel, partition.voxel)
+    return torch.where(crust[:, None], skin, matter).clamp(0.0, 1.0)
 
 
 def find_cuts(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import torch
@@ -23,11 +24,13 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.cracks.chunk_faces import (
     ChunkCuts,
     ChunkFaces,
+    colors_at,
     find_cuts,
     find_faces,
     wide_cuts,
 )
 from gsfluent.pipeline.cracks.cuts import cut_at
+from gsfluent.pipeline.cracks.dust import Dust
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
@@ -37,7 +40,7 @@ from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude
 from gsfluent.pipeline.partition.tree import Partition, ranked
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
-from gsfluent.spatial.neighbours import nearest_rows
+from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
 
 OPACITY = 0.97
 """Opacity of a face element where the gap is wide."""
@@ -48,6 +51,9 @@ WIDE = 1.5
 left of the crack band is rougher than a face."""
 FIRM = 5
 """Of its neighbours at rest so many must hang together with a point, or it is crumb."""
+STRAY, BAND = 1.0, 4.0
+"""A broken point this many spacings from where unbroken ones of its chunk carry its place is crumb
+as well; asked of points that lay so many spacings from those, the width of a crack band."""
 LUMP = 64
 """Points of one piece that hang together, below which they are crumbs as well."""
 MOST = 32_000
@@ -110,7 +116,12 @@ class Chunks:
         self._chunk = self._body.clone()
         self._drives = torch.ones_like(self._may)
         self._crumb = torch.zeros_like(self._may)
+        # points that are dust, and for each splat of such matter which of them takes it away
+        self._dust = Dust(self._scene, self.base.matter)
+        self._gone = torch.zeros_like(self._may)
+        self._ash = torch.full_like(self.base.owner, -1)
         self._follow: _Followers | None = None
+        self._unbroken: _Followers | None = None
         self._unit: Tensor | None = None
         self._faces: ChunkFaces | None = None
         self._cuts: list[ChunkCuts] = []
@@ -120,10 +131,12 @@ class Chunks:
         for event in state.get("splits", ()):
             rows, rank = event["rows"].to(device), event["rank"].to(device)
             self._steps = int(event.get("frame", 0))
-            self._split(int(event["region"]), rows, rank)
+            self._split(int(event["region"]), rows, rank, int(event.get("dust", -1)))
         self._steps = int(state.get("steps", 0))
         if state:
             self._crumb[state["crumbs"].to(device)] = True
+            if "dust" in state:
+                self._dust.resume(state["dust"])
             self._relink()
         self._gaps.restore({})
         self._gaps.rebind(self._carry())
@@ -139,6 +152,7 @@ class Chunks:
             ],
             "crumbs": self._crumb.nonzero()[:, 0].cpu(),
             "gaps": self._gaps.state(),
+            "dust": self._dust.state(),
             "steps": self._steps,
         }
 
@@ -161,7 +175,8 @@ class Chunks:
             regions=len(scene.bodies),
             bodies=bodies,
             splits=tuple(
-                SavedSplit(e["region"], e["frame"], e["rows"], e["rank"]) for e in self._events
+                SavedSplit(e["region"], e["frame"], e["rows"], e["rank"], e["dust"])
+                for e in self._events
             ),
         )
 
@@ -185,29 +200,37 @@ class Chunks:
                 self._relink()
         self._steps += 1
         shown, carry = self._moved(points), self._carry(points)
+        self._dust.step(points.position, shown.position)
         self._gaps.rebind(carry)
         cracks = self._gaps.step(shown)
-        if self._faces is None:
+        if not self._events:
             return cracks
-        points = cracks.points
-        rest = self._cut(cracks.rest, carry, points)
-        births = self._born(carry, points, cracks.births)
-        return Cracks(points, rest, births, carry)
+        rest = self._cut(cracks.rest, carry, cracks.points)
+        parts = [cracks.births, self._born(carry, cracks.points)]
+        dust = self._dust.born(points.position)
+        births = Births.joined([*parts, dust])
+        thrown = None if dust is None else self._dust.thrown()
+        return Cracks(cracks.points, rest, births, carry, thrown)
 
     # --- what belongs together ---
 
     def _look(self, unit: Tensor) -> None:
-        """Split regions whose points belong to several pieces, and see which points drive them."""
+        """Split regions whose points belong to several pieces, and see which points drive them.
+
+        Dust is a piece of its own: one label for all of it in a region.
+        """
         count = unit.shape[0]
         while True:
-            counted = self._may & (unit >= 0)
+            label = torch.where((unit < 0) & ~self._gone, count, unit)
+            counted = self._may & (label >= 0)
             pair, many = torch.unique(
-                self._chunk[counted] * count + unit[counted], return_counts=True
+                self._chunk[counted] * (count + 1) + label[counted], return_counts=True
             )
-            chunk, piece = pair // count, pair % count
-            enough = many >= CHIP
+            chunk, piece = pair // (count + 1), pair % (count + 1)
+            enough = (many >= CHIP) | (piece == count)
             times = torch.bincount(chunk[enough], minlength=self._regions)
-            torn = (times > 1).nonzero()[:, 0].tolist()
+            dusty = torch.bincount(chunk[piece == count], minlength=self._regions)
+            torn = ((times > 1) | (dusty > 0)).nonzero()[:, 0].tolist()
             if not torn:
                 break
             for region in torn:
@@ -215,9 +238,10 @@ class Chunks:
                 if units.numel() > MOST:  # labels are small numbers; the rest goes where it lay
                     units = units[members.argsort(descending=True, stable=True)[:MOST]]
                 mine = self._may & (self._chunk == region)
-                rows = (mine & torch.isin(unit, units)).nonzero()[:, 0]
-                _, rank = ranked(unit[rows], self.base.matter.rest[rows])
-                self._split(region, rows, rank)
+                rows = (mine & torch.isin(label, units)).nonzero()[:, 0]
+                names, rank = ranked(label[rows], self.base.matter.rest[rows])
+                dust = (names == count).nonzero()
+                self._split(region, rows, rank, int(dust[0]) if len(dust) else -1)
         # a region moves with the piece that most of its points belong to
         most = torch.zeros(self._regions, dtype=torch.int64, device=unit.device)
         most.scatter_reduce_(0, chunk, many, "amax")
@@ -227,9 +251,9 @@ class Chunks:
         theirs = lead[self._chunk]
         self._drives = ~self._may | (unit == theirs) | (theirs == count)
 
-    def _split(self, region: int, rows: Tensor, rank: Tensor) -> None:
-        """Divide a region by the pieces of some of its points."""
-        event = {"region": region, "rows": rows, "rank": rank.to(torch.int32)}
+    def _split(self, region: int, rows: Tensor, rank: Tensor, dust: int) -> None:
+        """Divide a region by the pieces of some of its points, one of which may be dust."""
+        event = {"region": region, "rows": rows, "rank": rank.to(torch.int32), "dust": dust}
         self._events.append({**event, "frame": self._steps})
         matter = self.base.matter
         body = int(self._body[rows[0]])
@@ -248,31 +272,77 @@ class Chunks:
         pieces = int(rank.max()) + 1
         ids = [region, *range(self._regions, self._regions + pieces - 1)]
         self._regions += pieces - 1
-        split = partition.split(region, rest[rows], rank, ids)
-        chunk = partition.assign(self._chunk, split, rest, rows, rank)
-        self._chunk = chunk
-        self._reassign(region, partition, chunk, rows)
+        thrown, ash = rows[rank == dust], ids[dust] if dust >= 0 else -1
+        if dust >= 0:
+            self._gone = self._gone.index_fill(0, thrown, True)
+            self._dust.add(thrown, functools.partial(colors_at, partition, solid))
         splats = (self._region == region).nonzero()[:, 0]
+        if pieces == 1:  # all of it is dust
+            self._home(region, ids, rows[:0], body)
+            self._burn(splats, thrown)
+            self._reassign(region, partition, rows, ash, thrown)
+            return
+        split = partition.split(region, rest[rows], rank, ids, dust)
+        self._chunk = partition.assign(self._chunk, split, rest, rows, rank)
+        rows = rows[rank != dust]  # dust has no place to go by
+        self._home(ash, ids, rows, body)
+        self._reassign(region, partition, rows, ash, thrown)
         here, cuts = find_cuts(partition, split, self.base.gaussians, splats)
         self._region = self._region.index_copy(0, splats, here)
         owner, means = self._owner[splats], self.base.gaussians.means[splats]
         wrong = self._chunk[owner] != here
         owner[wrong] = self._nearest(means[wrong], here[wrong], rows)
         self._owner = self._owner.index_copy(0, splats, owner)
+        self._burn(splats[here == ash], thrown)
         made = find_faces(partition, split, solid, len(self._events) - 1)
+        made = made.select(made.region != ash)
         spacing = matter.spacing[body]
         cuts = wide_cuts(self.base.gaussians, splats, here, cuts, made, spacing)
-        rival = self._nearest(self.base.gaussians.means[cuts.splat], cuts.beyond, rows)
-        self._cuts.append(cuts._replace(rival=rival))
+        cuts = ChunkCuts(*(part[self._region[cuts.splat] != ash] for part in cuts))
+        means = self.base.gaussians.means[cuts.splat]
+        self._cuts.append(cuts._replace(rival=self._across(means, cuts.beyond, rows, ash, thrown)))
         made = dataclasses.replace(
             made,
             owner=self._nearest(made.means, made.region, rows),
-            rival=self._nearest(made.means, made.beyond, rows),
+            rival=self._across(made.means, made.beyond, rows, ash, thrown),
         )
         old = [] if self._faces is None else [self._faces]
         self._faces = ChunkFaces.joined([*old, made])
 
-    def _reassign(self, region: int, partition: Partition, chunk: Tensor, rows: Tensor) -> None:
+    def _across(
+        self, places: Tensor, region: Tensor, rows: Tensor, ash: int, thrown: Tensor
+    ) -> Tensor:
+        """:meth:`_nearest` of regions across a face; of what is thrown where that is dust."""
+        found = self._nearest(places, region, rows)
+        dust = (region == ash).nonzero()[:, 0]
+        return found.index_copy(0, dust, self._beside(places[dust], thrown))
+
+    def _beside(self, places: Tensor, rows: Tensor) -> Tensor:
+        """Nearest of some rows of each place."""
+        if places.shape[0] == 0:
+            return rows[:0]
+        spacing = self.base.matter.spacing[int(self._body[rows[0]])]
+        return rows[nearest_rows(self.base.matter.rest[rows], places, 1, spacing)[1][:, 0]]
+
+    def _home(self, ash: int, ids: list[int], rows: Tensor, body: int) -> None:
+        """Dust goes on belonging to a chunk, which leads it: that of the nearest of some rows."""
+        within = torch.isin(self._chunk, torch.tensor(ids, device=self._chunk.device))
+        lone = ((self._gone & within) | (self._chunk == ash)).nonzero()[:, 0]
+        if rows.numel() == 0:  # of any other chunk
+            rest = self._may & ~self._gone & (self._body == body) & (self._chunk != ash)
+            rows = rest.nonzero()[:, 0]
+        if lone.numel() and rows.numel():
+            near = self._beside(self.base.matter.rest[lone], rows)
+            self._chunk = self._chunk.index_copy(0, lone, self._chunk[near])
+
+    def _burn(self, splats: Tensor, thrown: Tensor) -> None:
+        """Splats whose matter has become dust go when that is seen to leave."""
+        near = self._beside(self.base.gaussians.means[splats], thrown)
+        self._ash = self._ash.index_copy(0, splats, near)
+
+    def _reassign(
+        self, region: int, partition: Partition, rows: Tensor, ash: int, thrown: Tensor
+    ) -> None:
         """Older elements of a region go with the part that their voxel lies in."""
         faces = self._faces
         if faces is None:
@@ -280,25 +350,25 @@ class Chunks:
         stale = (faces.region == region).nonzero()[:, 0]
         now = partition.region.view(-1)[faces.voxel[stale]].long()
         owner = faces.owner[stale]
-        wrong = chunk[owner] != now
+        wrong = self._chunk[owner] != now
         owner[wrong] = self._nearest(faces.means[stale[wrong]], now[wrong], rows)
+        burnt = stale[now == ash]
+        near = self._beside(faces.means[burnt], thrown)
         self._faces = dataclasses.replace(
             faces,
             region=faces.region.index_copy(0, stale, now),
             owner=faces.owner.index_copy(0, stale, owner),
+            ash=faces.ash.index_copy(0, burnt, near),
         )
 
     def _nearest(self, places: Tensor, region: Tensor, rows: Tensor) -> Tensor:
         """Nearest of some rows of each place's region; of all where there is none."""
-        found = torch.full_like(region, -1)
-        rest, chunk = self.base.matter.rest, self._chunk[rows]
-        spacing = self.base.matter.spacing[int(self._body[rows[0]])]
-        for number in torch.unique(region).tolist():
-            mine, its = (region == number).nonzero()[:, 0], rows[chunk == number]
-            its = its if its.numel() else rows
-            near = nearest_rows(rest[its], places[mine], 1, spacing)[1][:, 0]
-            found[mine] = its[near]
-        return found
+        rest, spacing = self.base.matter.rest, self.base.matter.spacing[int(self._body[rows[0]])]
+        near = nearest_in_group(rest[rows], self._chunk[rows], places, region, 1, spacing)[1][:, 0]
+        lost = (near < 0).nonzero()[:, 0]
+        if lost.numel():
+            near[lost] = nearest_rows(rest[rows], places[lost], 1, spacing)[1][:, 0]
+        return rows[near]
 
     # --- motion ---
 
@@ -320,20 +390,13 @@ class Chunks:
         """
         rest, chunk = self.base.links.rest, self._chunk
         width = self.base.links.near.shape[1]
-        near = rows[:, None].repeat(1, width)
-        lone = torch.ones_like(near, dtype=torch.bool)
+        its = among.nonzero()[:, 0]
+        cell = 1.5 * float(self.base.links.spacing[rows].mean())
+        found = nearest_in_group(rest[its], chunk[its], rest[rows], chunk[rows], width, cell)[1]
+        lone = found < 0
+        near = its[found.clamp(min=0)] if its.numel() else found
+        near = torch.where(lone, torch.where(lone[:, :1], rows[:, None], near[:, :1]), near)
         lone[:, 0] = False
-        for number in torch.unique(chunk[rows]).tolist():
-            its = ((chunk == number) & among).nonzero()[:, 0]
-            mine = (chunk[rows] == number).nonzero()[:, 0]
-            k = min(width, its.numel())
-            if k == 0:
-                continue
-            spacing = float(self.base.links.spacing[rows[mine[0]]])
-            found = its[nearest_rows(rest[its], rest[rows[mine]], k, 1.5 * spacing)[1]]
-            near[mine] = found[:, :1]
-            near[mine, :k] = found
-            lone[mine, :k] = False
         return near, lone
 
     def _carry(self, points: Points | None = None) -> Carry:
@@ -366,6 +429,7 @@ class Chunks:
         moved[:count] = torch.where(shapeless, turn, moved[:count])
         rotation[:count] = torch.where(shapeless, turn, rotation[:count])
         self._crumb = self._crumb | self._crumbs(position, chunk, points.broken)
+        self._crumb = self._crumb | self._strayed(position, moved, broken)
         position = self._led(position, moved)
         return points._replace(position=position, fragments=chunk, map=moved, rotation=rotation)
 
@@ -385,17 +449,38 @@ class Chunks:
         whole[self._chunk[firm]] = True
         return self._may & ~firm & whole[self._chunk] & broken[:count]
 
+    def _strayed(self, position: Tensor, moved: Tensor, broken: Tensor) -> Tensor:
+        """Broken points that are no longer where the unbroken ones of their chunk are."""
+        held = self._drives & ~self._crumb
+        rows = (held & broken).nonzero()[:, 0]
+        found = torch.zeros_like(held)
+        if rows.numel() == 0:
+            return found
+        self._unbroken = self._following(self._unbroken, rows, held & ~broken)
+        apart = (self._placed(self._unbroken, position, moved) - position[rows]).norm(dim=1)
+        rest, spacing = self.base.links.rest, self._links.spacing[rows]
+        close = (rest[self._unbroken.near[:, 0]] - rest[rows]).norm(dim=1) <= BAND * spacing
+        return found.index_copy(0, rows, close & (apart > STRAY * spacing))
+
     def _led(self, position: Tensor, moved: Tensor) -> Tensor:
         """Positions in which crumbs, and what has left its piece, follow the firm points."""
         leads = self._drives & ~self._crumb
         rows = (self._may & ~leads).nonzero()[:, 0]
         if rows.numel() == 0:
             return position
+        self._follow = self._following(self._follow, rows, leads)
+        return position.index_copy(0, rows, self._placed(self._follow, position, moved))
+
+    def _following(self, before: _Followers | None, rows: Tensor, leads: Tensor) -> _Followers:
+        """The leading points around some rows; those found before if nothing has changed."""
         key = torch.stack([self._chunk, leads.long()])
-        if self._follow is None or not torch.equal(key, self._follow.key):
-            near, lone = self._neighbours(rows, leads)
-            self._follow = _Followers(rows, near, lone, key)
-        near, lone = self._follow.near, self._follow.lone
+        if before is not None and torch.equal(rows, before.rows) and torch.equal(key, before.key):
+            return before
+        return _Followers(rows, *self._neighbours(rows, leads), key)
+
+    def _placed(self, follow: _Followers, position: Tensor, moved: Tensor) -> Tensor:
+        """Where the points that lead carry the places of those that follow [m], [R, 3]."""
+        rows, near, lone, _ = follow
         rest, spacing = self.base.links.rest, self._links.spacing
         # on one side of a crack: that of the nearest
         first = near[:, :1]
@@ -413,7 +498,7 @@ class Chunks:
             moved[: rest.shape[0]],
             WIDE * spacing,
         )
-        return position.index_copy(0, rows, place)
+        return place
 
     def _turns(self, now: Tensor) -> Tensor:
         """Rotation of each point's chunk: the best fit (Kabsch 1976), [N, 3, 3].
@@ -456,6 +541,7 @@ class Chunks:
         for cuts in self._cuts:
             rows = cuts.splat
             _, _, share = self._gap(carry, points, whole[rows], carry.owner[rows], cuts.rival)
+            share = self._opened(share, cuts.rival)
             open_ = share > 0.0
             rows, share = rows[open_], share[open_, None]
             if rows.numel() == 0:
@@ -473,16 +559,32 @@ class Chunks:
                 old.index_copy(0, rows, new)
                 for old, new in zip((quats, scales), turned, strict=True)
             )
-        return rest.replace(means=means, quats=quats, scales=scales)
+        rest = rest.replace(means=means, quats=quats, scales=scales)
+        if self._dust.rows.numel() == 0:
+            return rest
+        left = torch.where(self._ash >= 0, 1.0 - self._dust.share(self._ash.clamp(min=0)), 1.0)
+        return rest.replace(opacities=rest.opacities * left.to(rest.opacities))
 
-    def _born(self, carry: Carry, points: Points, births: Births | None) -> Births | None:
-        """Face elements where faces have opened, after the births inside of pieces."""
+    def _opened(self, share: Tensor, rival: Tensor) -> Tensor:
+        """How far faces are open [E]: before dust as far as that has left."""
+        if self._dust.rows.numel() == 0:
+            return share
+        left = self._dust.share(rival).to(share)
+        return torch.where(self._gone[rival], torch.maximum(left, share), share)
+
+    def _born(self, carry: Carry, points: Points) -> Births | None:
+        """Face elements where faces have opened."""
         faces = self._faces
-        assert faces is not None  # step sees to it
+        if faces is None:
+            return None
         means, blend, share = self._gap(carry, points, faces.means, faces.owner, faces.rival)
+        share = self._opened(share, faces.rival)
+        if self._dust.rows.numel():
+            left = 1.0 - self._dust.share(faces.ash.clamp(min=0))
+            share = torch.where(faces.ash >= 0, share * left.to(share), share)
         rows = (share > 0.0).nonzero()[:, 0]
         if rows.numel() == 0:
-            return births
+            return None
         turn, _ = ops.polar_clamped(blend[rows].contiguous(), 0.3, 2.0)
         quats, scales = ops.carry_axes(faces.quats[rows], faces.scales[rows], turn, turn, rigid=0.0)
         gaussians = Gaussians(
@@ -494,11 +596,4 @@ class Chunks:
             labels=torch.full_like(rows, TRANSITION, dtype=torch.int32),
             normals=(turn * faces.normals[rows, None]).sum(dim=2),
         )
-        made = Births(gaussians, _NUMBERS + faces.key[rows], faces.owner[rows])
-        if births is None:
-            return made
-        return Births(
-            Gaussians.cat([births.gaussians, made.gaussians]),
-            torch.cat([births.ids, made.ids]),
-            torch.cat([births.anchor, made.anchor]),
-        )
+        return Births(gaussians, _NUMBERS + faces.key[rows], faces.owner[rows])

@@ -8,6 +8,7 @@ little of it changes from one frame to the next. It is part of a saved run (:met
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -44,6 +45,16 @@ class Births(NamedTuple):
     ids: Tensor
     anchor: Tensor
 
+    @classmethod
+    def joined(cls, parts: Sequence[Births | None]) -> Births | None:
+        """All of some, in their order; None where there are none."""
+        some = [part for part in parts if part is not None]
+        if len(some) < 2:
+            return some[0] if some else None
+        gaussians = Gaussians.cat([part.gaussians for part in some])
+        ids, anchor = (torch.cat(values) for values in zip(*(p[1:] for p in some), strict=True))
+        return cls(gaussians, ids, anchor)
+
 
 class Cracks(NamedTuple):
     """The cracks of one moment.
@@ -53,12 +64,14 @@ class Cracks(NamedTuple):
         rest: The splats at rest, those that lie across a crack cut.
         births: Splats on open faces; None where there is none.
         carry: The binding that moves the splats.
+        dust: Material points that are drawn as dust, int64 [D]; None where there are none.
     """
 
     points: Points
     rest: Gaussians
     births: Births | None
     carry: Carry
+    dust: Tensor | None = None
 
 
 class Gaps:

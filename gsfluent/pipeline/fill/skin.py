@@ -47,7 +47,7 @@ def skin_gaussians(field: SignedDistance, capture: Capture | None = None) -> Gau
     scales = torch.tensor([size, size, _FLAT * size]).repeat(len(points), 1)
     colors = torch.full((len(points), 3), _GREY)
     made = Gaussians.from_colors(
-        points, scales, colors, opacities=0.95, quats=_facing(normal)
+        points, scales, colors, opacities=0.95, quats=facing(normal)
     ).replace(normals=normal)
     if capture is None:
         return made
@@ -78,7 +78,7 @@ def _photographed(made: Gaussians, normal: Tensor, capture: Capture, slack: floa
     return torch.where(weight[:, None] > 1e-3, total / weight.clamp_min(1e-9)[:, None], grey)
 
 
-def _facing(normal: Tensor) -> Tensor:
+def facing(normal: Tensor) -> Tensor:
     """Quaternions [N, 4] that turn z to unit vectors [N, 3]."""
     zero = torch.zeros_like(normal[:, 0])
     quats = torch.stack([1.0 + normal[:, 2], -normal[:, 1], normal[:, 0], zero], 1)

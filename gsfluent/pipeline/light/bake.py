@@ -53,7 +53,7 @@ def bake_light(
     means = gaussians.means
     matter = bulk(gaussians)
     size = grid_for(gaussians, cell=normal_cell, radius=matter.radius)
-    grid = size.of(means, matter.center)
+    grid = size.of(gaussians, matter.center)
     normal = normalize(splat_normals(gaussians, grid), dim=-1)
     lamps = lighting.drawn()
     faces = faces_of(lamps, matter)

@@ -9,6 +9,7 @@ of radiance 1 sends back 1; basis and order: :func:`gsfluent.pipeline.light.shad
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from torch import Tensor
 
 from gsfluent._lazy import cv2
 from gsfluent.errors import InputError
+from gsfluent.io.checked.files import regular_file
+from gsfluent.io.checked.pictures import check_pixels, opened_image
 from gsfluent.pipeline.light.shade import harmonics, to_linear
 
 Coefficients = tuple[tuple[float, float, float], ...]
@@ -24,6 +27,7 @@ Coefficients = tuple[tuple[float, float, float], ...]
 # Share of each band that the cosine of Lambert's law keeps, over pi.
 _COSINE = (1.0, 2.0 / 3.0, 1.0 / 4.0)
 _BAND = (0, 1, 1, 1, 2, 2, 2, 2, 2)
+_HDR_SIZE = re.compile(rb"\n[-+][XY] +(\d{1,18}) +[-+][XY] +(\d{1,18}) *\n")
 _ROWS = 128  # of the picture that is projected; more do not change nine numbers
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".hdr")
 
@@ -59,8 +63,12 @@ def of_file(path: Path) -> Coefficients:
     """
     if path.suffix.lower() not in _ENDINGS:
         raise InputError(f"{path}: not a picture", f"give one of {', '.join(_ENDINGS)}")
-    found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if found is None or found.ndim != 3:
+    _check_size(path)
+    try:
+        found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        found = None
+    if found is None or found.ndim != 3 or found.shape[2] < 3:
         raise InputError(f"{path}: no readable colour picture", "give an equirectangular picture")
     height, width = found.shape[:2]
     if not 1.8 < width / height < 2.2:
@@ -75,6 +83,20 @@ def of_file(path: Path) -> Coefficients:
     if not np.isfinite(small).all():
         raise InputError(f"{path}: holds NaN or infinity", "write the picture again")
     return of_radiance(torch.from_numpy(small))
+
+
+def _check_size(path: Path) -> None:
+    """Refuse a picture by the size its header declares; OpenCV would decode a gigapixel."""
+    if path.suffix.lower() != ".hdr":
+        with opened_image(path):
+            return
+    regular_file(path, "picture")
+    with path.open("rb") as stream:
+        head = stream.read(4096)
+    found = _HDR_SIZE.search(head)
+    if not head.startswith(b"#?") or found is None:  # OpenCV goes by what it finds, not by the name
+        raise InputError(f"{path}: not a Radiance picture", "write it as .hdr or .png")
+    check_pixels(int(found.group(1)), int(found.group(2)), path)
 
 
 def turned(coefficients: Coefficients, degrees: float) -> Coefficients:

@@ -17,7 +17,7 @@ from gsfluent.config.yaml_file import read_yaml
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lamp, Lighting
-from gsfluent.results.frames import SavedFrame
+from gsfluent.results.frames import DUST, SavedFrame
 
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
@@ -105,24 +105,29 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     """k_s and n_s of every splat, [N, 2], from the material of the body that it follows.
 
     None for frames that do not say which body is what (written by an older gsfluent). Splats of
-    rigid things are steel.
+    rigid things are steel, and the dust of what is wet shines like water.
     """
     names = frame.facts.get("bodies")
     if not names:
         return None
-    rows, looks = [], looks_of(shot)
+    rows, looks, wet = [], looks_of(shot), []
     for name, preset in names:
         row = looks.get(name, (SPECULAR, SHININESS))
         if name not in looks and preset in materials.names():
             made_of = materials.get(preset)
             row = (made_of.specular, made_of.shininess)
         rows.append(row)
-    steel = materials.get("steel")
-    rows.append((steel.specular, steel.shininess))
+        wet.append(materials.wet(preset))
+    for name in ("steel", "water"):
+        rows.append((materials.get(name).specular, materials.get(name).shininess))
     table = torch.tensor(rows).to(frame.gaussians.means)
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()
-    return table[torch.where(anchor >= 0, body, len(rows) - 1)]
+    looks_like = torch.where(anchor >= 0, body, len(wet))
+    if frame.dust is not None:
+        juice = torch.tensor([*wet, False], device=anchor.device)[looks_like]
+        looks_like = torch.where((frame.ids >= DUST) & juice, len(wet) + 1, looks_like)
+    return table[looks_like]
 
 
 def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:

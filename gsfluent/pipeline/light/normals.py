@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.data import INTERIOR, Gaussians
+from gsfluent.data import INTERIOR, SPRAY, Gaussians
 from gsfluent.pipeline.light.occlusion import COARSEST, FULL, PER_CELL, Occupancy, box_frame
 from gsfluent.pipeline.light.shadow_maps import bulk
 
@@ -62,9 +63,16 @@ class Grid(NamedTuple):
     nodes: int
     per_cell: float
 
-    def of(self, means: Tensor, center: tuple[float, float, float]) -> Occupancy:
-        """Occupancy of centres [N, 3] around ``center`` [m]; those off the grid are left out."""
+    def of(self, gaussians: Gaussians, center: tuple[float, float, float]) -> Occupancy:
+        """Occupancy of Gaussians around ``center`` [m]; those off the grid are left out.
+
+        Spray is, too: a cloud of drops is no wall, however many there are.
+        """
+        means = gaussians.means
         frame = means.new_tensor(box_frame(center, self.cell, self.nodes))
+        if gaussians.labels is not None:
+            off = frame[:3] - 2.0 * self.cell
+            means = torch.where((gaussians.labels == SPRAY)[:, None], off, means)
         values = ops.occupancy(means, frame, self.nodes, full=FULL * self.per_cell)
         return Occupancy(values, frame, self.nodes)
 
@@ -92,7 +100,7 @@ def estimate_normals(gaussians: Gaussians, *, cell: float | None = None) -> Tens
     """Outward vectors of Gaussians, shape [N, 3], to be blended; length up to one by certainty."""
     matter = bulk(gaussians)
     grid = grid_for(gaussians, cell=cell, radius=matter.radius)
-    return splat_normals(gaussians, grid.of(gaussians.means, matter.center))
+    return splat_normals(gaussians, grid.of(gaussians, matter.center))
 
 
 def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = None) -> Tensor:

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import SURFACE, Gaussians
+from gsfluent.pipeline.matter.divide import divide_wide
+from gsfluent.pipeline.matter.fields import breakable
 from gsfluent.pipeline.matter.links import Hanging, Links
 from gsfluent.pipeline.matter.points import Matter, body_frame
 from gsfluent.scene.scene import Body, Scene
@@ -30,6 +32,8 @@ RIGID = 1e-3
 """Splats that are stretched by less than this keep their shape exactly."""
 BLEND = 0.6
 """Width of the blend of neighbouring points, in point spacings."""
+WIDEST = 1.0
+"""Standard deviation of the widest splat that breaks as one, in point spacings."""
 
 
 class Points(NamedTuple):
@@ -113,12 +117,18 @@ class Carry:
 
     @staticmethod
     def bind(scene: Scene, matter: Matter) -> Carry:
-        """Bind the splats of all bodies of a scene where they are at time 0."""
+        """Bind the splats of all bodies of a scene where they are at time 0.
+
+        Of bodies that can break, splats much wider than a point are divided first.
+        """
         parts, bodies = [], []
         device = matter.particles.device
+        parting = breakable(matter).tolist()
         for number, body in enumerate(scene.bodies):
             splats = _ball_splats(body) if body.solid is None else body.solid.gaussians
             placed = splats.to(device, torch.float32).transformed(body_frame(body, scene))
+            if parting[number]:
+                placed = divide_wide(placed, WIDEST * matter.spacing[number])
             parts.append(placed)
             bodies.append(torch.full((placed.count,), number, dtype=torch.int64, device=device))
         carry = Carry(Gaussians.cat(parts), torch.cat(bodies), matter)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsfluent.data import Particles
 from gsfluent.errors import InputError
-from gsfluent.io.atomic import atomic_path
+from gsfluent.io.atomic import write_tensors
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
@@ -162,8 +162,7 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "kicked": state.pushed,
         "extra": extra,
     }
-    with atomic_path(path) as temporary:
-        torch.save(values, temporary)
+    write_tensors(path, values)
 
 
 def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]:

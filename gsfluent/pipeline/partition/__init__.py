@@ -4,6 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    chips="hashed",
     mesh="PieceMesh Surfaces",
     roughness="amplitude",
     tree="Partition Split ranked",

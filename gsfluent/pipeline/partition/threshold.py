@@ -12,6 +12,7 @@ nor the device matters.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -19,14 +20,18 @@ from torch import Tensor
 
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.partition.blur import blur, box_width, reach, trilinear
+from gsfluent.pipeline.partition.chips import chip_fields
+from gsfluent.pipeline.partition.field import Field, boxes, grown
 from gsfluent.pipeline.partition.roughness import displacements
 
 STAMP = 1.45
 """Point spacings from a point to the voxels that it can name."""
 FIRST, SECOND = 1.2, 0.8
 """Standard deviations of the blurs of pieces, in point spacings."""
-CHIP_FIRST, CHIP_SECOND = 0.5, 0.4
-"""The same for chips, which wider ones would blur away."""
+DUST_BLUR = 0.4
+"""The same of dust, a point of which is not to be blurred away."""
+DUST_GAIN = 1.4
+"""By so much shares of dust are larger: the cell of one point, blurred, has one of half."""
 CHIP = 64
 """Points from which on a label is a piece."""
 ISLAND = 27
@@ -35,30 +40,11 @@ VOLUME = 0.01
 """Error of a volume that is good enough."""
 _CLEAR = 0.95  # difference of two shares from which on no displacement changes the label
 _PASSES = 60
-_KEPT = 0.7  # share of its voxels that a chip keeps when it is smoothed, or it is not
 _FINE = 1024.0  # squared distances are whole numbers of this share of a voxel squared
 _RANKS = 16  # bits of a key that hold a rank
 _AT_ONCE = 1 << 20  # points
 FAR = 3.5
 """Standard deviations of the second blur at which the distance from a face is capped."""
-
-
-class Field(NamedTuple):
-    """A label's share of its surroundings, 0 to 1, in its box of the grid.
-
-    Attributes:
-        low: First voxel of the box.
-        share: [x, y, z].
-    """
-
-    low: tuple[int, int, int]
-    share: Tensor
-
-    @property
-    def span(self) -> tuple[slice, slice, slice]:
-        """The box as slices of the grid."""
-        x, y, z = (slice(a, a + n) for a, n in zip(self.low, self.share.shape, strict=True))
-        return x, y, z
 
 
 class Labels(NamedTuple):
@@ -114,85 +100,61 @@ def nearest_labels(place: Tensor, rank: Tensor, shape: tuple[int, ...], radius: 
     return found.view(padded)[inner].contiguous()
 
 
-def _boxes(labels: Tensor, count: int) -> list[list[tuple[int, int]] | None]:
-    """First and last index along each axis of every label; None for those without a voxel."""
-    where = (labels >= 0).nonzero()
-    label = labels[where[:, 0], where[:, 1], where[:, 2]].long()
-    ends = []
-    for axis in range(3):
-        size = labels.shape[axis]
-        line = torch.bincount(label * size + where[:, axis], minlength=count * size)
-        there = line.view(count, size) > 0
-        steps = torch.arange(size, device=labels.device)
-        low = torch.where(there, steps, size).amin(dim=1)
-        high = torch.where(there, steps, -1).amax(dim=1)
-        ends.append(torch.stack([low, high], dim=1).tolist())
-    boxes = [[(a, b) for a, b in (axis[n] for axis in ends)] for n in range(count)]
-    return [box if box[0][1] >= 0 else None for box in boxes]
+def fields(
+    nearest: Tensor, small: list[bool], per_spacing: float, dust: int = -1
+) -> list[Field | None]:
+    """Shares of every label: pieces by threshold dynamics, chips between planes.
 
-
-def fields(nearest: Tensor, small: list[bool], per_spacing: float) -> list[Field | None]:
-    """Shares of every label after threshold dynamics.
+    Pieces are smoothed as if there were no chips and no dust, which are then cut out of them.
 
     Args:
         nearest: Label of each voxel, -1 outside of the domain, int16 [X, Y, Z].
         small: Which labels are chips.
         per_spacing: Voxels per point spacing.
+        dust: The label that is dust: the cells of single points; -1 for none.
 
     Returns:
         One for each label; None where it has no voxel.
     """
-    inside = nearest >= 0
-    sums: dict[int, Tensor] = {}
-    count = len(small)
-    large = torch.tensor([not chip for chip in small], device=nearest.device)
+    inside, count = nearest >= 0, len(small)
+    chips = [label for label, chip in enumerate(small) if chip and label != dust]
+    made = chip_fields(nearest, chips, boxes(nearest, count), per_spacing)
+    large, others = nearest, [*chips, dust] if dust >= 0 else chips
+    if others:
+        table = torch.arange(-1, count, dtype=torch.int16, device=nearest.device)
+        table[torch.tensor(others, device=nearest.device) + 1] = -1
+        large = table[nearest.long() + 1]
 
-    def share(mask: Tensor, width: int, span: tuple[slice, ...]) -> Tensor:
-        if width not in sums:
-            sums[width] = blur(inside, width).to(torch.float32).clamp_(min=1.0)
-        return blur(mask, width).to(torch.float32) / sums[width][span]
+    def shares(labels: Tensor, among: Tensor, sigma: float) -> Iterator[tuple[int, Field]]:
+        width = box_width(sigma * per_spacing)
+        sums = blur(among, width).to(torch.float32).clamp_(min=1.0)
+        for label, box in enumerate(boxes(labels, count)):
+            if box is not None:
+                low, span = grown(box, reach(width))
+                part = blur(labels[span] == label, width).to(torch.float32)
+                yield label, Field(low, part / sums[span])
 
-    def shares(labels: Tensor, wide: float, narrow: float) -> list[Field | None]:
-        found: list[Field | None] = []
-        widths = [box_width(sigma * per_spacing) for sigma in (wide, narrow)]
-        mixed = None
-        if any(small) and not all(small):
-            # beside chips, pieces have what the narrow blur leaves them
-            every = tuple(slice(0, n) for n in labels.shape)
-            mask = inside & large[labels.long().clamp(min=0)]
-            mixed = share(mask, widths[1], every) / share(mask, widths[0], every).clamp(min=1e-6)
-        for label, box in enumerate(_boxes(labels, count)):
-            if box is None:
-                found.append(None)
-                continue
-            width = widths[small[label]]
-            margin = reach(width)
-            low = (max(0, box[0][0] - margin), max(0, box[1][0] - margin),
-                   max(0, box[2][0] - margin))  # fmt: skip
-            span = tuple(slice(a, end + 1 + margin) for a, (_, end) in zip(low, box, strict=True))
-            part = share(labels[span] == label, width, span)
-            if mixed is not None and not small[label]:
-                part = part * mixed[span]
-            found.append(Field(low, part))
-        return found
-
+    if dust >= 0:
+        only = torch.where(nearest == dust, nearest, -1)
+        for label, field in shares(only, inside, DUST_BLUR):
+            made[label] = Field(field.low, DUST_GAIN * field.share)
     won = torch.full_like(nearest, -1)
     best = torch.zeros(nearest.shape, device=nearest.device)
-    for label, field in enumerate(shares(nearest, FIRST, CHIP_FIRST)):
-        if field is None:
-            continue
+    for label, field in shares(large, large >= 0, FIRST):
         span = field.span
         more = inside[span] & (field.share > best[span])
         best[span] = torch.where(more, field.share, best[span])
         won[span] = won[span].masked_fill(more, label)
     # a voxel that no blur reached keeps its own
-    won = torch.where(inside & (won < 0), nearest, won)
-    if any(small):
-        # chips as thin as a point are blurred away: those keep what they had
-        had, has = (torch.bincount(x[inside].long(), minlength=count) for x in (nearest, won))
-        thin = ~large & (has < _KEPT * had)
-        won = torch.where(inside & thin[nearest.long().clamp(min=0)], nearest, won)
-    return shares(won, SECOND, CHIP_SECOND)
+    won = torch.where(inside & (won < 0), large, won)
+    left = torch.ones_like(best)
+    for field in made.values():
+        left[field.span] = torch.minimum(left[field.span], 1.0 - field.share)
+    left.clamp_(min=0.0)
+    found: list[Field | None] = [made.get(label) for label in range(count)]
+    for label, field in shares(won, inside, SECOND):
+        found[label] = Field(field.low, field.share * left[field.span])
+    return found
 
 
 def top_two(shape: tuple[int, ...], found: list[Field | None], inside: Tensor) -> Labels:
@@ -323,12 +285,13 @@ def _margin(lead: Tensor, offset: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return lead.double() + (constant[a] - constant[b])
 
 
-def join_islands(labels: Labels, near: Tensor) -> Labels:
+def join_islands(labels: Labels, near: Tensor, dust: int = -1) -> Labels:
     """Give lumps of less than 27 voxels the label that touches most of their faces.
 
     Args:
         labels: Of all voxels, each [X, Y, Z].
         near: Voxels near a face, int64 [M, 3]; nothing else can be an island.
+        dust: A label that may have islands; -1 for none.
     """
     first = labels.first
     shape, device, count = first.shape, first.device, near.shape[0]
@@ -364,6 +327,8 @@ def join_islands(labels: Labels, near: Tensor) -> Labels:
     whole = torch.bincount(values[values >= 0].long(), minlength=many)
     island = ((size < ISLAND) & (safe == 0))[root] & (own >= 0)
     island &= size[root] < whole[own.clamp(min=0)]  # what is all of its label stays
+    if dust >= 0:
+        island &= own != dust
     if not bool(island.any()):
         return labels
     rows = torch.cat([r for r, _ in touch])

@@ -196,11 +196,19 @@ class Partition:
         x, y, z = torch.minimum(voxel.clamp(min=0), size - 1).unbind(dim=1)
         return torch.where(here, self.region[x, y, z].long(), -1)
 
+    def depth_at(self, points: Tensor) -> Tensor:
+        """Depth below the skin [m], negative outside, of the voxels around points [m], [M]."""
+        size = torch.tensor(self.shape, device=points.device)
+        voxel = torch.minimum(self.place(points).round().long().clamp(min=0), size - 1)
+        return self.depth[voxel.unbind(dim=1)]
+
     def volume(self, region: int) -> int:
         """Voxels of a region inside the skin."""
         return self._volumes.get(region, 0)
 
-    def split(self, region: int, points: Tensor, piece: Tensor, ids: list[int]) -> Split:
+    def split(
+        self, region: int, points: Tensor, piece: Tensor, ids: list[int], dust: int = -1
+    ) -> Split:
         """Divide a region by what its points have become.
 
         Args:
@@ -208,6 +216,7 @@ class Partition:
             points: Its points that are of a piece, at rest [m], [P, 3].
             piece: Which one, int64 [P]; 0 the largest, and so on (:func:`ranked`).
             ids: Regions by piece, the first one ``region`` itself.
+            dust: The piece that is dust, single points; -1 for none.
 
         Returns:
             What was done.
@@ -231,7 +240,7 @@ class Partition:
         nearest = torch.where(domain, nearest, -1)
         inside = domain & (self.depth[span] > 0.0)
         small = [int(n) < CHIP for n in sizes.tolist()]
-        found = fields(nearest, small, self.per_spacing)
+        found = fields(nearest, small, self.per_spacing, dust)
         labels = top_two(shape, found, domain)
         voxels, rest = displaced(labels, found, low, self.amplitude * self.per_spacing)
         x, y, z = voxels.unbind(dim=1)
@@ -245,7 +254,7 @@ class Partition:
         edge, _ = keep_volumes(rest, counted, fixed, wanted)
         for part, new in zip(labels, edge, strict=True):
             part[x, y, z] = new
-        labels = join_islands(labels, voxels)
+        labels = join_islands(labels, voxels, dust)
         volume = torch.bincount(labels.first[inside].long(), minlength=len(ids)).cpu()
         volume[0] += total - int(inside.sum())
         table = torch.tensor(ids, dtype=torch.int32, device=domain.device)

@@ -17,6 +17,7 @@ import torch
 
 from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
+from gsfluent.pipeline.capture.carve import carve_cavities
 from gsfluent.pipeline.capture.hull import Hull
 from gsfluent.pipeline.capture.views import TrainView, read_views
 from gsfluent.pipeline.reconstruct.density import contained, draws
@@ -70,6 +71,8 @@ class Reconstruct(Stage):
         separate: Without masks, spend the last 40 % of the steps on the object alone: find it in
             what was learned until then (:class:`Isolate`), and train it afresh on its silhouettes.
         clean: Take floaters out of the object at the end (:func:`clean_floaters`).
+        carve: Start in the cavities that no silhouette shows but colours do
+            (:func:`gsfluent.pipeline.capture.carve_cavities`), not on their lids.
         device: Where to train; where the points of the capture are when None.
         seed: Seed of everything random.
 
@@ -100,6 +103,7 @@ class Reconstruct(Stage):
         checkpoint_every: int | None = None,
         separate: bool = True,
         clean: bool = True,
+        carve: bool = True,
         device: str | torch.device | None = None,
         seed: int = 0,
     ) -> None:
@@ -151,6 +155,7 @@ class Reconstruct(Stage):
         self.checkpoint_every = int(checkpoint_every or max(250, self.iterations // 10))
         self.separate = bool(separate)
         self.clean = bool(clean)
+        self.carve = bool(carve)
         self.device = None if device is None else torch.device(device)
 
     def forward(self, capture: Capture, progress: Progress | None = None) -> Gaussians:
@@ -165,8 +170,9 @@ class Reconstruct(Stage):
             ssim, psnr_region, psnr_inside, gaussians, iterations, seconds, train_seconds (without
             reading and judging), resumed_at, start, object_gaussians, history (rows of step, count,
             PSNR on the last training photographs), cleaned`` (see :func:`clean_floaters`; None when
-            nothing was told from its background). When the object was told from its background,
-            labels are set.
+            nothing was told from its background), ``hull`` (see
+            :func:`~gsfluent.pipeline.capture.carve_cavities`; None when there was none). When the
+            object was told from its background, labels are set.
 
         Raises:
             InputError: Black photographs, no masks and no points, or masks that contradict poses.
@@ -206,6 +212,7 @@ class Reconstruct(Stage):
             "deterministic": self.deterministic or device.type == "cpu",
             "history": run.history,
             "cleaned": run.cleaned,
+            "hull": run.hull,
             "resumed_at": run.resumed_at,
             "train_seconds": round(trained, 2),
             "seconds": round(time.monotonic() - started, 2),
@@ -221,7 +228,8 @@ class Reconstruct(Stage):
         )  # fmt: skip
         identity = {name: getattr(self, name) for name in names} | {"recipe": self.recipe.name}
         # what was trained until then must repeat as well
-        return identity | ({"deterministic": True} if self.deterministic else {})
+        identity |= {"deterministic": True} if self.deterministic else {}
+        return identity | ({} if self.carve else {"carve": False})
 
 
 class _Run:
@@ -240,6 +248,7 @@ class _Run:
         self.saved = checkpoint.load()
         self.resumed_at = 0
         self.cleaned: dict[str, Any] | None = None
+        self.hull: dict[str, Any] | None = None
 
     def scene_of(self, capture: Capture, views: list[TrainView]) -> Gaussians:
         """Learn everything, then the object again from the silhouettes of what was found."""
@@ -305,7 +314,11 @@ class _Run:
         stage = self.stage
         hull = agreed_hull(views)
         count = min(stage.start_gaussians, _HULL_START)
-        start = hull_gaussians(hull, views, count, stage.sh_degree, draws(stage.seed, 6, 0))
+        # only the start: in training, Gaussians may be wherever the masks allow them
+        body = hull
+        if stage.carve:
+            body, self.hull = carve_cavities(hull, views)
+        start = hull_gaussians(body, views, count, stage.sh_degree, draws(stage.seed, 6, 0))
         if found is not None:
             start = joined_start(hull, start, found)
         lower, upper = hull.bounds()

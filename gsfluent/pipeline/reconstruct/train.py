@@ -20,7 +20,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError, RunError
-from gsfluent.io.atomic import atomic_path
+from gsfluent.io.atomic import write_tensors
 from gsfluent.pipeline.capture.hull import Hull
 from gsfluent.pipeline.capture.views import TrainView, halved
 from gsfluent.pipeline.reconstruct.density import (
@@ -332,8 +332,7 @@ class Checkpoint:
         values["settings"] = torch.tensor(list(self._mark.encode()), dtype=torch.uint8)
         if scene is not None:
             values |= {f"scene.{name}": getattr(scene, name) for name in _FIELDS}
-        with atomic_path(self.path) as temporary:
-            torch.save(values, temporary)
+        write_tensors(self.path, values)
 
     def load(self) -> dict[str, Tensor] | None:
         """The saved state, or None when there is none.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Capture, Frame
 from gsfluent.errors import InputError
+from gsfluent.io.checked.files import read_json
 from gsfluent.pipeline.render.path import dolly, holds_poses, through, turntable
 
 PATHS = ("orbit", "turntable", "dolly")
@@ -21,11 +21,13 @@ PATHS = ("orbit", "turntable", "dolly")
 # degrees over the shorter side: a short telephoto, little perspective distortion
 _FIELD_OF_VIEW = 32.0
 _ELEVATION = 20.0
-_START = -60.0
+_FRONT = -90.0  # azimuth from which the front is seen
 # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
 _SWEEP = 70.0
 _SMOOTH_FRAMES = 5.0
 _ROOM = 1.3  # free space around the matter, as a factor on its radius
+_LAG = 0.6  # share of the free space that a fall may run ahead of the camera
+_WHOLE = 1.12  # the same around the whole object while it is whole
 
 
 @dataclass(frozen=True)
@@ -35,14 +37,22 @@ class Action:
     Attributes:
         center: Robust centre of the matter per frame [m], shape [F, 3].
         radius: Distance from the centre that holds nine tenths of it, per frame [m], shape [F].
+        reach: Distance from the first centre that holds all of the objects [m].
     """
 
     center: Tensor
     radius: Tensor
+    reach: float = 0.0
 
     @classmethod
-    def of(cls, positions: Sequence[Tensor]) -> Action:
-        """Measure the action from positions [N, 3] of each frame."""
+    def of(cls, positions: Sequence[Tensor], objects: Tensor | None = None) -> Action:
+        """Measure the action.
+
+        Args:
+            positions: All matter of each frame [m], [N, 3].
+            objects: Which of the first frame's is of the objects, not of bullets or liquids, bool
+                [N]; all of it when absent.
+        """
         # the middle of what lies between the outer tenths: a median follows the largest heap only
         tenths = torch.tensor([0.1, 0.9], dtype=torch.float64)
         center = torch.stack(
@@ -52,7 +62,10 @@ class Action:
             torch.quantile(_thin((p.double().cpu() - c).norm(dim=-1)), 0.9)
             for p, c in zip(positions, center, strict=True)
         ]
-        return cls(center, torch.stack(radius))
+        first = positions[0].double().cpu()
+        first = first if objects is None else first[objects.cpu()]
+        reach = float((first - center[0]).norm(dim=-1).amax()) if len(first) else 0.0
+        return cls(center, torch.stack(radius), reach)
 
 
 def _thin(values: Tensor) -> Tensor:
@@ -82,7 +95,8 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    The distance shows nine tenths of the matter, but the whole object at least and 3.6 times the
+    It passes the front in the middle of the film. The distance shows nine tenths of the matter, but
+    the whole object at least, however tall, and 3.6 times the
     object at most: a spray of debris must not shrink the subject to a dot.
 
     Args:
@@ -96,7 +110,7 @@ def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> li
     centers = _follow(action, shown)
     steps = [i / max(1, count - 1) for i in range(count)]
     return [
-        look_at(centers[i], float(distance[i]), _START + sweep * step, _ELEVATION, size)
+        look_at(centers[i], float(distance[i]), _FRONT + sweep * (step - 0.5), _ELEVATION, size)
         for i, step in enumerate(steps)
     ]
 
@@ -108,14 +122,17 @@ def _shown(action: Action) -> Tensor:
     ahead = round(2.0 * _SMOOTH_FRAMES)
     padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
     widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values
-    return _ROOM * _smooth(widest[:, None], 1.5 * _SMOOTH_FRAMES)[:, 0]
+    shown = _ROOM * _smooth(widest[:, None], 1.5 * _SMOOTH_FRAMES)[:, 0]
+    return shown.clamp(min=_WHOLE * action.reach)
 
 
 def _follow(action: Action, shown: Tensor) -> Tensor:
     """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
     smooth = _smooth(action.center, _SMOOTH_FRAMES)
     lag = smooth - action.center
-    room = torch.maximum(shown - 1.5 * action.radius, 0.05 * shown)
+    # what is still whole has its farthest point beyond the nine tenths
+    least = torch.where(action.radius <= 1.02 * action.radius[0], action.reach, 0.0)
+    room = _LAG * torch.maximum(shown - torch.maximum(1.5 * action.radius, least), 0.05 * shown)
     length = lag.norm(dim=1).clamp(min=1e-12)
     held = action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
     return _smooth(held, 0.5)
@@ -203,17 +220,16 @@ def read_path(path: Path, count: int, size: tuple[int, int]) -> list[Camera]:
     """
     hint = 'give {"fov": 32, "frames": [{"eye": [x, y, z], "target": [x, y, z]}, ...]} in metres'
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path)
         keys = torch.tensor(
             [[*f["eye"], *f["target"]] for f in data["frames"]], dtype=torch.float64
         )
         field = float(data.get("fov", _FIELD_OF_VIEW))
-    except OSError as error:
+    except InputError as error:
         raise InputError(
-            f"output.camera: {path}: {error.strerror}",
-            f"give {', '.join(PATHS)}, an index, or a file",
+            f"output.camera: {error.what}", f"give {', '.join(PATHS)}, an index, or a file"
         ) from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"output.camera: {path}: {error!r}", hint) from error
     fine = keys.ndim == 2 and keys.shape[1] == 6 and bool(keys.isfinite().all())
     if not fine or not 1.0 <= field <= 150.0:

@@ -51,7 +51,7 @@ class Film:
         first = load_frame(self.folder, 0)
         positions = [first.positions]
         positions += [load_frame(self.folder, index).positions for index in range(1, count)]
-        action = Action.of(positions)
+        action = Action.of(positions, _of_objects(first, shot))
         studio = None
         if shot.floor != "none":
             x, y = action.center[:, :2].mean(dim=0).tolist()
@@ -102,6 +102,15 @@ class Film:
         )
         self._room = made.room
         return made
+
+
+def _of_objects(frame: SavedFrame, shot: Shot) -> torch.Tensor:
+    """Which material points of a frame are those of the shot's objects, bool [N]."""
+    bodies = frame.facts.get("bodies", ())
+    numbers = [n for n, (name, _) in enumerate(bodies) if name in shot.objects]
+    if frame.body is None or not numbers:
+        return torch.ones(len(frame.positions), dtype=torch.bool)
+    return torch.isin(frame.body.cpu(), torch.tensor(numbers, dtype=frame.body.dtype))
 
 
 def captured_backdrop(stages: Path, objects: list[str], device: torch.device) -> Backdrop:

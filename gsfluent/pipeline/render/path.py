@@ -6,7 +6,6 @@ many sides; :class:`Cut` pairs a camera with the frame it shows.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from gsfluent import geometry
 from gsfluent.data import Camera, Frame
 from gsfluent.errors import InputError
 from gsfluent.io.capture import load_poses
+from gsfluent.io.checked.files import read_json
 from gsfluent.io.images import undistorted
 
 FREEZE_SECONDS = 4.0
@@ -101,9 +101,9 @@ def holds_poses(path: Path) -> bool:
     if path.is_dir():
         return True
     try:
-        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        frames = read_json(path)["frames"]
         return isinstance(frames, list) and any("transform_matrix" in frame for frame in frames)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, LookupError, TypeError):
         return False
 
 

@@ -233,7 +233,7 @@ class Render(Stage):
             pack_lamps(lamps, faces, gaussians.means),
             lighting.around(gaussians.means),
             shadow_maps(gaussians, lamps, faces, texels, matter, groups=groups),
-            room.grid.of(gaussians.means, matter.center),
+            room.grid.of(gaussians, matter.center),
             lighting.occlusion,
         )
         return lit, room

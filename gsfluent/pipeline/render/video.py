@@ -80,8 +80,7 @@ def write_video(
             writer.close()
         if count == 0:
             raise InputError("video: no frame at all", "give at least one image")
-        # ffmpeg can end without an exception and without a file when the disk is full
-        if not part.is_file() or part.stat().st_size == 0:
+        if _frames_in(part) != count:
             raise _encoder_stopped(path)
     return count
 
@@ -132,6 +131,16 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> 
     with atomic_path(path) as part:
         first.save(part, save_all=True, append_images=images, loop=0, **options)  # type: ignore[arg-type]
     return count
+
+
+def _frames_in(path: Path) -> int:
+    """Frames that can be read from a video: ffmpeg ends a film on a full disk without a word."""
+    import imageio_ffmpeg
+
+    try:
+        return int(imageio_ffmpeg.count_frames_and_secs(str(path))[0])
+    except (OSError, RuntimeError):
+        return 0
 
 
 def _encoder_stopped(path: Path) -> RunError:

@@ -34,6 +34,13 @@ LIFT = 0.01
 """How far the weight may be lifted [cells]: what settles on a floor wakes by less, and has no other
 energy to measure that with."""
 RING = 2
+THINNEST = 0.1
+"""Least thickness of a body [point spacings]; half a spacing is all that one layer has."""
+MEAN_RATIO = (0.25, 4.0)
+"""Bounds of the mean volume ratio of a body that does not flow."""
+SUNK = 0.01
+"""Share of a body's mass that may lie a cell below the floor."""
+LEAST_POINTS = 20
 LEAST_SCALE = 2.0**-12
 """Factor on the time step at which a run is given up."""
 RECOVERY = 10
@@ -60,6 +67,10 @@ CAUSES = {
         "use a finer quality, or separate_fragments=False",
     ),
     "far": ("matter left the range of the grid", "add a floor, or end the run earlier"),
+    "crushed": (
+        "a load far beyond what the material carries: gravity, a press, a collider",
+        "lower the load, or take a stiffer material",
+    ),
     "step": (
         "a stiffness or a speed that asks for vanishing steps",
         "soften the stiffest material",
@@ -180,6 +191,53 @@ class Watch:
                 "energy",
             )
         return None
+
+    def implausible(self, state: State, waits: Sequence[bool], floor: float | None) -> str:
+        """What no matter can do, at a frame, in words; empty when there is nothing of the kind.
+
+        No smaller step mends it: every step was sound, and the outcome is not.
+
+        Args:
+            state: The state at a frame.
+            waits: Which bodies wait to be fired or poured yet.
+            floor: Height of the floor [m]; None without one.
+        """
+        flows = self.matter.of_law("fluid", "drucker_prager", "rigid")
+        ratio = _volume_ratio(state)
+        for number, (a, b) in enumerate(self.matter.ranges):
+            kept = a + (~state.loose[a:b]).nonzero()[:, 0]
+            if waits[number] or kept.numel() < LEAST_POINTS:
+                continue
+            wrong = self._sunk(state, kept, floor)
+            if not wrong and not bool(flows[kept].any()):
+                wrong = self._crushed(state, kept, self.matter.spacing[number])
+                mean = float(ratio[kept].mean())
+                if not wrong and not MEAN_RATIO[0] < mean < MEAN_RATIO[1]:
+                    wrong = f"has {mean:.3g} of its volume"
+            if wrong:
+                self.kind = "crushed"
+                self.reasons.append(f"t = {state.time:.6g} s: {self.names[number]!r} {wrong}")
+                return self.reasons[-1]
+        return ""
+
+    def _sunk(self, state: State, kept: Tensor, floor: float | None) -> str:
+        """Whether what began above the floor lies below it."""
+        if floor is None:
+            return ""
+        p = self.matter.particles
+        deep = (p.position[kept, 2] >= floor - 0.5 * self.matter.dx) & (
+            state.position[kept, 2] < floor - self.matter.dx
+        )
+        mass = p.mass[kept].double()
+        share = float((mass * deep).sum() / mass.sum())
+        return f"lies below the floor, with {share:.0%} of its mass" if share > SUNK else ""
+
+    def _crushed(self, state: State, kept: Tensor, spacing: float) -> str:
+        """Whether all of a body lies in one plane, thinner than a layer of points."""
+        now, rest = _thickness(state.position[kept]), _thickness(self.matter.rest[kept])
+        if now >= THINNEST * min(spacing, rest):
+            return ""
+        return f"is {now:.2g} m thick, and was {rest:.2g} m"
 
     def roll_back(self, trouble: Unhealthy, state: State, stepper: Stepper) -> State | None:
         """Return the state to go on from with half the time step, or None to give up.
@@ -310,6 +368,13 @@ class Ledger:
         error = residual / self.scale if self.scale > 0 else 0.0
         self.worst = max(self.worst, error)
         return error
+
+
+def _thickness(points: Tensor) -> float:
+    """Least extent [m] of a plate of the same least variance, ``sqrt(12 lambda)``."""
+    apart = points.double() - points.double().mean(dim=0)
+    least = torch.linalg.eigvalsh((apart.T @ apart / len(points)).cpu())[0]
+    return math.sqrt(12.0 * max(float(least), 0.0))
 
 
 def _volume_ratio(state: State) -> Tensor:

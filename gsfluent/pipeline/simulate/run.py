@@ -161,8 +161,11 @@ class Run:
                     state = self._regroup(state, at_frame=False)
                     broken = self._broken(state)  # some may have been welded
         self.state = state
+        waits = [body.held and body.start > state.time for body in self.scene.bodies]
+        if watch.implausible(state, waits, self.scene.floor):
+            self.failure = watch.verdict(frame)
         self.seconds += clock.perf_counter() - begun
-        return True
+        return not self.failure
 
     def _broken(self, state: State) -> int:
         return int((state.peak >= 0).sum())

@@ -110,6 +110,13 @@ class SimulationFrame:
         rows = (places != self.particles.position.to(places)).any(dim=1).nonzero()[:, 0]
         return (rows.to(torch.int32), places[rows]) if rows.numel() else None
 
+    @property
+    def dust(self) -> Tensor | None:
+        """Points that are drawn as dust, int32 [D]; None where there are none."""
+        if self._cracks is None or self._cracks.dust is None:
+            return None
+        return self._cracks.dust.to(torch.int32)
+
     @functools.cached_property
     def repaired(self) -> Repaired:
         """The splats of this moment in scene coordinates, carried and repaired (made when asked).

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from gsfluent.io.solid import load_solid, volume_path
 from gsfluent.pipeline.solid.colors import surface_colors
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.source import find_solid
+from gsfluent.spatial.mesh_file import is_mesh
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 FORMATS = ("obj", "ply", "glb", "stl")
-_MESHES = (".obj", ".stl", ".glb", ".gltf", ".off", ".vtk", ".dae", ".3mf")
 
 
 def closed_mesh(field: SignedDistance, gaussians: Gaussians | None = None) -> trimesh.Trimesh:
@@ -95,18 +94,6 @@ def save_mesh(mesh: trimesh.Trimesh, path: str | Path, *, scale: float = 1.0) ->
         mesh.apply_scale(scale)
     with atomic_path(path) as part:
         mesh.export(part, file_type=kind)
-
-
-def is_mesh(path: Path) -> bool:
-    """Whether a file holds a mesh rather than splats."""
-    if path.suffix.lower() in _MESHES:
-        return True
-    if path.suffix.lower() != ".ply":
-        return False
-    with open(path, "rb") as stream:
-        head = stream.read(4096).split(b"end_header")[0]
-    found = re.search(rb"element\s+face\s+(\d+)", head)
-    return found is not None and int(found.group(1)) > 0
 
 
 def mesh_to(

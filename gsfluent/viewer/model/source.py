@@ -5,19 +5,16 @@ Anything with the five members of :class:`Source` can be viewed; a live session 
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import time
-import zipfile
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, InputError
-from gsfluent.results.frames import SavedFrame, frame_path, load_frame
+from gsfluent.io.checked.files import read_json
+from gsfluent.results.frames import SavedFrame, frame_head, frame_path, load_frame
 from gsfluent.results.record import shot_of
 from gsfluent.viewer.model.still import still_frame
 
@@ -114,10 +111,9 @@ class RunSource:
     def facts(self, index: int) -> dict[str, Any]:
         """Figures of a frame, from its head only; empty where it cannot be read."""
         try:
-            with np.load(frame_path(self.folder, index), allow_pickle=False) as data:
-                head = json.loads(str(data["head"]))
+            head = frame_head(frame_path(self.folder, index))
             facts = dict(head["facts"]) | {"time": float(head["time"])}
-        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile):
+        except (LookupError, ValueError, TypeError, RecursionError):
             return {}
         holes = (self._read_record().get("render") or {}).get("hole_fraction") or []
         if index < len(holes) and not self.running:
@@ -202,8 +198,8 @@ class RunSource:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        value = read_json(path)
+    except InputError:
         return {}
     return value if isinstance(value, dict) else {}
 

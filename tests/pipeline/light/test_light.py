@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsfluent import materials
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import InputError
@@ -28,6 +29,7 @@ from gsfluent.pipeline.light.shadow import transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
+from gsfluent.results.frames import DUST
 
 BALL = truth.Ball((0.0, 0.0, 0.0), 0.1)
 
@@ -265,6 +267,7 @@ def frame(skin: Gaussians, colors: Gaussians, extra: int = 0) -> Any:
         positions=skin.means,
         body=torch.zeros(count, dtype=torch.int32),
         facts={"bodies": [["melon", "fruit.watermelon"]]},
+        dust=None,
     )
 
 
@@ -362,6 +365,9 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     loose.anchor = loose.anchor.clone()
     loose.anchor[3] = -1  # a blade
     assert float(gloss_of(shot(tmp_path), loose)[3, 0]) > 0.5  # type: ignore[index]
+    loose.ids[5], loose.dust = DUST + 7, torch.tensor([5])  # a drop of its juice
+    wet = torch.tensor([materials.get("water").specular, materials.get("water").shininess])
+    torch.testing.assert_close(gloss_of(shot(tmp_path), loose)[5], wet)  # type: ignore[index]
     loose.facts = {}
     assert gloss_of(shot(tmp_path), loose) is None
 

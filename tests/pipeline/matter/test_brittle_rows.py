@@ -14,6 +14,7 @@ from torch import Tensor
 from gsfluent import materials
 from gsfluent.errors import InputError
 from gsfluent.materials import LARGEST, STEEPEST, Field, Material, ellipse
+from gsfluent.ops.plasticity import LAWS, unloading_share
 from gsfluent.pipeline.matter.brittle import brittle_rows, kept_strength, softened
 from gsfluent.pipeline.matter.crack_band import BAND_CELLS, softening_energies
 from gsfluent.pipeline.matter.points import Matter, build_matter
@@ -271,10 +272,10 @@ BALL = Material(
 
 @functools.cache
 def bounced(
-    restitution: float, resident: bool = True, height: float = 0.75
+    restitution: float, resident: bool = True, height: float = 0.75, hysteresis: str = "pressed"
 ) -> tuple[list[SimulationFrame], dict[str, float]]:
     scene = Scene()
-    scene.add(ellipsoid((0.05,) * 3), BALL.override(restitution=restitution))
+    scene.add(ellipsoid((0.05,) * 3), BALL.override(restitution=restitution, hysteresis=hysteresis))
     scene.drop(height)
     stage = Simulate(dx=DX, splats=False, resident=resident)
     simulation = stage(scene, fps=100, seconds=math.sqrt(2.0 * height / 9.81) + 0.06)
@@ -299,8 +300,31 @@ def test_a_ball_with_restitution_rebounds_slower_and_keeps_the_books() -> None:
     assert 0.55 < rebound(lossy) < 0.85 * rebound(whole)
 
 
-def test_both_engines_lose_the_same_in_a_bounce() -> None:
-    (fast, _), (slow, report) = (bounced(0.5, flag, 0.1) for flag in (True, False))
+def test_wet_matter_loses_in_tension_too() -> None:
+    both, report = bounced(0.5, True, 0.1, "both")
+    assert report["momentum_error"] < 1e-5
+    assert rebound(both) < 0.98 * rebound(bounced(0.5, True, 0.1)[0])
+    dry, wet = BALL.override(restitution=0.5), BALL.override(restitution=0.5, hysteresis="both")
+    assert float(dry.parameters()[7]) == 0.75 and float(wet.parameters()[7]) == 1.75
+    assert float(BALL.override(hysteresis="both").parameters()[7]) == 0.0  # nothing is lost
+    rows = torch.stack([dry.parameters(), wet.parameters()])
+    law = torch.full((2,), LAWS["nacc"], dtype=torch.int32)
+    column = torch.tensor([0, 1])
+    stress = torch.zeros(2, 6, dtype=torch.float64)
+    stress[:, 0] = 1e3
+    for sign, shares in ((1.0, (1.0, 0.25)), (-1.0, (0.25, 0.25))):  # pulled, pressed
+        back = torch.zeros(2, 3, 3, dtype=torch.float64)
+        back[:, 0, 0] = -sign * 1e3  # it springs back
+        for rate, wanted in ((back, shares), (-back, (1.0, 1.0))):
+            found = unloading_share(
+                sign * stress, rate, law=law, params=rows, material=column, dx=DX
+            )
+            assert found.tolist() == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("hysteresis", ["pressed", "both"])
+def test_both_engines_lose_the_same_in_a_bounce(hysteresis: str) -> None:
+    (fast, _), (slow, report) = (bounced(0.5, flag, 0.1, hysteresis) for flag in (True, False))
     assert report["momentum_error"] < 1e-5
     assert rebound(slow) == pytest.approx(rebound(fast), rel=0.02)
     assert rebound(slow) < 0.8 * rebound(bounced(1.0, False, 0.1)[0])

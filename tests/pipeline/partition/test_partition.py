@@ -82,6 +82,52 @@ def test_chips_keep_their_volume(radius: float) -> None:
     assert partition.volume(1) + partition.volume(7) == whole
 
 
+def shape_of(partition: Partition, region: int) -> tuple[torch.Tensor, float]:
+    """Eigenvalues of a region's second moments, and its largest radius over the mean one."""
+    place = ((partition.region == region) & (partition.depth > 0.0)).nonzero().double()
+    place = place - place.mean(dim=0)
+    radius = place.norm(dim=1)
+    return torch.linalg.eigvalsh(place.T @ place / len(place)), float(radius.max() / radius.mean())
+
+
+def test_chips_are_angular_and_no_two_alike() -> None:
+    """Balls of points at eight places: a ball's farthest voxel is 4/3 of the mean away."""
+    rest, spacing = points_of(cube())
+    places = 0.025 * (torch.cartesian_prod(*[torch.arange(2)] * 3) * 2 - 1)
+    apart = torch.cdist(rest, places.to(rest))
+    rank = torch.where(apart.amin(dim=1) < 1.6 * spacing, apart.argmin(dim=1) + 1, 0)
+    partition = fresh(rest, spacing, rough=0.0)
+    partition.split(7, rest, rank, [7, *range(1, 9)])
+    shapes = [shape_of(partition, number) for number in range(1, 9)]
+    sharp = torch.tensor([ratio for _, ratio in shapes])
+    assert float(sharp.mean()) > 1.6 and float(sharp.min()) > 1.4
+    assert len({round(float(axes[2] / axes[0]), 2) for axes, _ in shapes}) > 5
+
+
+def test_long_chips_stay_long() -> None:
+    rest, spacing = points_of(cube())
+    rod = (rest[:, 0].abs() < 3.0 * spacing) & (rest[:, 1:].norm(dim=1) < 0.9 * spacing)
+    partition = fresh(rest, spacing)
+    partition.split(7, rest, rod.long(), [7, 1])
+    axes, _ = shape_of(partition, 1)
+    assert float(axes[2] / axes[1]) > 3.0
+
+
+def test_dust_keeps_its_volume_and_its_lumps() -> None:
+    """Single points all over a body are one label that no blur takes away."""
+    rest, spacing = points_of(cube())
+    dust = torch.zeros(len(rest), dtype=torch.int64)
+    dust[::53] = 1
+    partition = fresh(rest, spacing)
+    whole = partition.volume(7)
+    partition.split(7, rest, dust, [7, 1], dust=1)
+    wanted = whole * int(dust.sum()) / len(rest)
+    assert partition.volume(1) == pytest.approx(wanted, rel=0.02)
+    assert partition.volume(1) + partition.volume(7) == whole
+    place = partition.place(rest[::53]).round().long()
+    assert float((partition.region[place.unbind(dim=1)] == 1).double().mean()) > 0.8
+
+
 def test_the_order_of_the_points_does_not_matter() -> None:
     rest, spacing = points_of(cube())
     unit = slabs(rest, 4)

@@ -136,9 +136,7 @@ def test_contact_shadow_fades_with_height() -> None:
     def sky(height: float) -> float:
         grey = ball(center=(0.0, 0.0, height))
         return float(
-            ambient_occlusion(
-                spot, up, grid_for(grey, cell=0.012).of(grey.means, bulk(grey).center)
-            )
+            ambient_occlusion(spot, up, grid_for(grey, cell=0.012).of(grey, bulk(grey).center))
         )
 
     assert sky(0.1) < 0.6
@@ -186,7 +184,7 @@ def test_sheet_of_flat_splats_faces_the_eye() -> None:
     means = torch.cat([spots, torch.zeros_like(spots[:, :1])], 1)
     scales = torch.tensor([0.004, 0.004, 0.0002]).expand_as(means).contiguous()
     sheet = Gaussians.from_colors(means, scales, torch.full_like(means, 0.5))
-    grid = grid_for(sheet).of(means, (0.0, 0.0, 0.0))
+    grid = grid_for(sheet).of(sheet, (0.0, 0.0, 0.0))
     for height in (1.0, -1.0):
         normals = splat_normals(sheet, grid, torch.tensor([0.1, 0.2, height]))
         inner = spots.abs().amax(1) < 0.08

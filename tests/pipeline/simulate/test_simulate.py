@@ -314,7 +314,7 @@ def test_a_bullet_gives_momentum_to_what_it_hits():
     assert float(last.velocity[bullet[0] : bullet[1], 0].mean()) > -38.0
     pushed = (last.mass[:, None] * last.velocity)[apple[0] : apple[1], 0].sum()
     assert float(pushed) < -0.01
-    assert frames[-1].stats["damaged_fraction"] > 0.005
+    assert frames[-1].stats["damaged_fraction"] > 0.002
     assert report["skipped"]["free_flight_body_steps"] >= 0
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError
+from gsfluent.io.checked.pictures import opened_image
 from gsfluent.pipeline.texture.photo.exemplar import Exemplar
 
 _LIKE = 25.0  # Lab distance up to which a pixel has the named colour
@@ -42,18 +43,19 @@ def read_parts(source: object, photo: Exemplar) -> np.ndarray:
             f"texture: parts must be an image or a colour, got {type(source).__name__}",
             hint="give a label image of the exemplar's size, or three values in 0..1",
         )
+    where = f"texture: parts {source}" if isinstance(source, str | Path) else "texture: parts"
     if pixels.ndim == 3:
         pixels = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(2)
     height, width = photo.mask.shape
     if abs(pixels.shape[1] / pixels.shape[0] / (width / height) - 1.0) > 0.02:
         raise InputError(
-            f"texture: parts are {pixels.shape[1]} x {pixels.shape[0]} pixels, the exemplar "
+            f"{where} are {pixels.shape[1]} x {pixels.shape[0]} pixels, the exemplar "
             f"{width} x {height}",
             hint="label the exemplar itself, uncropped",
         )
     values = np.unique(pixels)
     labels = pixels > values[0] if len(values) <= 2 else pixels.astype(int)
-    return _checked(resized_parts(labels, photo.mask.shape))
+    return _checked(resized_parts(labels, photo.mask.shape), where)
 
 
 def resized_parts(labels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -63,21 +65,15 @@ def resized_parts(labels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return labels[rows[:, None], columns[None]]
 
 
-def _checked(labels: np.ndarray) -> np.ndarray:
+def _checked(labels: np.ndarray, where: str = "texture: parts") -> np.ndarray:
     if not labels.any():
-        raise InputError(
-            "texture: parts show nothing", hint="mark the inclusions, or leave parts away"
-        )
+        raise InputError(f"{where} show nothing", hint="mark the inclusions, or leave parts away")
     return labels
 
 
 def _read(path: Path) -> np.ndarray:
-    from PIL import Image
-
-    if not path.is_file():
-        raise InputError(f"{path}: label image not found", hint="check the path")
-    try:
-        with Image.open(path) as opened:
-            return np.asarray(opened)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: not an image ({error})", hint="use a PNG") from error
+    with opened_image(path, "use a PNG", noun="label image") as opened:
+        pixels = np.asarray(opened)
+        if not np.isfinite(pixels).all():
+            raise InputError(f"{path}: holds NaN or infinity", hint="write whole numbers")
+        return pixels

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsfluent._lazy import cv2
 from gsfluent.errors import InputError
+from gsfluent.io.checked.pictures import opened_image
 
 _LARGEST = 1024  # pixels; exemplars are reduced to voxel pitch anyway
 _SMALLEST = 16
@@ -64,20 +65,15 @@ def _read(path: Path) -> np.ndarray:
     """Pixels of an image file as uint8 [H, W, 3 or 4], turned upright."""
     from PIL import Image, ImageOps
 
-    if not path.is_file():
-        raise InputError(f"{path}: exemplar not found", hint="check the path")
-    try:
-        with Image.open(path) as opened:
-            picture: Image.Image = ImageOps.exif_transpose(opened)
-            if picture.mode.startswith("I") or picture.mode == "F":
-                # Pillow clips these to 255 instead of scaling them
-                deep = np.asarray(picture, dtype=np.float64)
-                top = 1.0 if deep.max() <= 1.0 else 255.0 if deep.max() <= 255.0 else 65535.0
-                picture = Image.fromarray((deep / top * 255.0).clip(0, 255).astype(np.uint8))
-            has_alpha = "A" in picture.getbands() or "transparency" in picture.info
-            picture = picture.convert("RGBA" if has_alpha else "RGB")
-            return np.asarray(picture)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(
-            f"{path}: exemplar cannot be read ({error})", hint="use a PNG or JPEG file"
-        ) from error
+    with opened_image(path, "use a PNG or JPEG file", noun="exemplar") as opened:
+        picture: Image.Image = ImageOps.exif_transpose(opened)
+        if picture.mode.startswith("I") or picture.mode == "F":
+            # Pillow clips these to 255 instead of scaling them
+            deep = np.asarray(picture, dtype=np.float64)
+            if not np.isfinite(deep).all():
+                raise InputError(f"{path}: holds NaN or infinity", "write the picture again")
+            top = 1.0 if deep.max() <= 1.0 else 255.0 if deep.max() <= 255.0 else 65535.0
+            picture = Image.fromarray((deep / top * 255.0).clip(0, 255).astype(np.uint8))
+        has_alpha = "A" in picture.getbands() or "transparency" in picture.info
+        picture = picture.convert("RGBA" if has_alpha else "RGB")
+        return np.asarray(picture)

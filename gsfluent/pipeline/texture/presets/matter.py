@@ -83,12 +83,24 @@ def concrete(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarr
 
 def bone(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Dense ivory cortex over spongy bone with reddish marrow in the pores."""
+    return _spongy(points, depth, seed, paint(0.66, 0.42, 0.32))
+
+
+def dry_bone(points: np.ndarray, depth: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bone of a collection: as ``bone``, its pores empty and brown with dust."""
+    return _spongy(points, depth, seed, paint(0.58, 0.47, 0.33))
+
+
+def _spongy(
+    points: np.ndarray, depth: np.ndarray, seed: int, pores: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ivory cortex over spongy bone whose pores have one colour [3]."""
     rgb = np.broadcast_to(paint(0.92, 0.87, 0.75), (len(points), 3))
     rgb = rgb * (1 + 0.03 * fractal(points, 8.0, seed, 2))[:, None].astype(np.float32)
     pore = cells(points, 9.0, seed + 1)
     wall = pore.second - pore.first
     spongy = smoothstep((depth - 0.22) / 0.12)
-    rgb = mix(rgb, paint(0.66, 0.42, 0.32), spongy * smoothstep((wall - 0.16) / 0.10))
+    rgb = mix(rgb, pores, spongy * smoothstep((wall - 0.16) / 0.10))
     return rgb, np.zeros(len(points), np.int64)
 
 

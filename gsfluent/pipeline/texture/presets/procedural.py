@@ -18,7 +18,15 @@ _CHUNK = 32_000
 """Points evaluated at a time: their fifty numbers each should stay in the cache."""
 
 _FOOD = (food.apple, food.bread, food.cake, food.orange, food.watermelon)
-_MATTER = (matter.bone, matter.concrete, matter.jelly, matter.marble, matter.stuffing, matter.wood)
+_MATTER = (
+    matter.bone,
+    matter.concrete,
+    matter.dry_bone,
+    matter.jelly,
+    matter.marble,
+    matter.stuffing,
+    matter.wood,
+)
 PRESETS: dict[str, Preset] = {preset.__name__: preset for preset in (*_FOOD, *_MATTER)}
 
 

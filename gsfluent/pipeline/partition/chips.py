@@ -1,0 +1,162 @@
+"""The shape of chips: crumbs between planes.
+
+A chip is a few points large, so that any blur makes a ball of it. What breaks off is angular. So a
+chip is what lies between planes around the voxels of its points: the sides of a box and up to four
+of its corners, turned and shifted by a hash of its place, then stretched as the points lie (by
+their second moments), so that flat chips stay flat and long ones long, and scaled until it has the
+volume of its points. All chips are different, and the same on every device.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsfluent.pipeline.partition.field import Box, Field, grown
+
+UNEVEN = 0.45
+"""By how much of its distance from the middle a plane is moved in or out, at most."""
+FLAT = 0.3
+"""By how much of it two opposite ones are."""
+TILT = 0.35
+"""By how much normals are tilted, as the tangent along each axis, at most."""
+LEAST = 1e-3
+"""Share of a chip in the voxels that are its points': it is never nothing there."""
+_CORNER = 3.0**-0.5
+_PLANES = (
+    (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0),
+    (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
+    (_CORNER, _CORNER, _CORNER), (_CORNER, -_CORNER, -_CORNER),
+    (-_CORNER, _CORNER, -_CORNER), (-_CORNER, -_CORNER, _CORNER),
+)  # fmt: skip
+_SIDES, _AWAY = 6, 3.0
+_MASK = 0xFFFFFFFF
+
+
+def chip_fields(
+    nearest: Tensor, chips: list[int], box_of: list[Box | None], per_spacing: float
+) -> dict[int, Field]:
+    """Shares of chips: 0.5 on their planes, one more for every two point spacings inward.
+
+    Args:
+        nearest: Label of each voxel, -1 outside of the domain, int16 [X, Y, Z].
+        chips: Labels that are chips.
+        box_of: Boxes of all labels; those without one have no field.
+        per_spacing: Voxels per point spacing.
+    """
+    there = [label for label in chips if box_of[label] is not None]
+    if not there:
+        return {}
+    middle, normal, reach = _planes(nearest, there)
+    margin = max(1, round(2.0 * per_spacing))
+    found: dict[int, Field] = {}
+    for slot, label in enumerate(there):
+        box = box_of[label]
+        assert box is not None  # there has no other
+        low, span = grown(box, margin)
+        mine = nearest[span] == label
+        inside = nearest[span] >= 0
+        axes = [
+            torch.arange(n, device=mine.device, dtype=torch.float64) + a - middle[slot, axis]
+            for axis, (a, n) in enumerate(zip(low, mine.shape, strict=True))
+        ]
+        out = []
+        for plane in range(len(_PLANES)):
+            x, y, z = (a * normal[slot, plane, axis] for axis, a in enumerate(axes))
+            out.append((x[:, None] + y)[..., None] + z)
+        gauge = out[0] / reach[slot, 0]
+        for plane in range(1, len(_PLANES)):
+            gauge = torch.maximum(gauge, out[plane] / reach[slot, plane])
+        size = gauge[inside].kthvalue(int(mine.sum())).values
+        sheet = size * reach[slot, 0] - out[0]
+        for plane in range(1, len(_PLANES)):
+            sheet = torch.minimum(sheet, size * reach[slot, plane] - out[plane])
+        share = (0.5 + sheet / (2.0 * per_spacing)).clamp(min=0.0).to(torch.float32)
+        found[label] = Field(low, torch.where(mine, share.clamp(min=LEAST), share))
+    return found
+
+
+def _planes(nearest: Tensor, chips: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Middles [F, 3], unit normals [F, 10, 3] and distances [F, 10] of their planes [voxels].
+
+    One operation at a time on whole sums, which rounds alike everywhere.
+    """
+    device = nearest.device
+    slot = torch.full((int(nearest.max()) + 2,), -1, dtype=torch.int64, device=device)
+    slot[torch.tensor(chips, device=device)] = torch.arange(len(chips), device=device)
+    where = (slot[nearest.long()] >= 0).nonzero()
+    mine = slot[nearest[where[:, 0], where[:, 1], where[:, 2]].long()]
+    count = torch.bincount(mine, minlength=len(chips))
+    total = torch.zeros(len(chips), 3, dtype=torch.int64, device=device)
+    total.index_add_(0, mine, where)
+    square = torch.zeros(len(chips), 3, 3, dtype=torch.int64, device=device)
+    square.index_add_(0, mine, where[:, :, None] * where[:, None])
+    many = count.double()[:, None]
+    middle = total.double() / many
+    spread = square.double() / many[..., None] - middle[:, :, None] * middle[:, None]
+    seed = (total[:, 0] * 0x8DA6B343) ^ (total[:, 1] * 0xD8163841) ^ (total[:, 2] * 0xCB1AB31F)
+    seed = (seed ^ (count * 0x9E3779B1)) & _MASK
+    turn = _turns(torch.stack([hashed(seed, n) for n in range(4)], dim=1))
+    base = torch.tensor(_PLANES, dtype=torch.float64, device=device)
+    parts = []
+    for axis in range(3):  # turned, one product at a time
+        row = turn[:, axis, :, None] * base.T
+        parts.append(row[:, 0] + row[:, 1] + row[:, 2])
+    normal = torch.stack(parts, dim=2)
+    planes = range(len(_PLANES))
+    tilt = [[hashed(seed, 8 + 3 * p + axis) for axis in range(3)] for p in planes]
+    normal = normal + TILT * torch.stack([torch.stack(t, dim=1) for t in tilt], dim=1)
+    x, y, z = normal.unbind(dim=2)
+    normal = normal / (x * x + y * y + z * z).sqrt()[..., None]
+    normal = _stretched(normal, spread)
+    x, y, z = normal.unbind(dim=2)
+    length = (x * x + y * y + z * z).sqrt()
+    normal, reach = normal / length[..., None], 1.0 / length
+    shift = torch.stack([hashed(seed, 64 + p) for p in planes], dim=1)
+    # half of the corners are not cut
+    far = torch.stack([(p >= _SIDES) & (hashed(seed, 96 + p) < 0.0) for p in planes], dim=1)
+    # opposite sides go out together: some boxes are slabs, some are rods
+    wide = torch.stack([hashed(seed, 112 + min(p, _SIDES) // 2) for p in planes], dim=1)
+    wide = 1.0 + FLAT * wide
+    return middle, normal, reach * torch.where(far, _AWAY, wide * (1.0 + UNEVEN * shift))
+
+
+def _stretched(normal: Tensor, spread: Tensor) -> Tensor:
+    """Normals [F, K, 3] of planes when what lies between them has these second moments [F, 3, 3].
+
+    With ``S = L L^T`` (Cholesky) places are stretched by L, and normals by the inverse of its
+    transpose.
+    """
+    s = spread + torch.eye(3, dtype=spread.dtype, device=spread.device) / 12.0  # of one voxel
+    a = s[:, 0, 0].sqrt()
+    b, d = s[:, 1, 0] / a, s[:, 2, 0] / a
+    c = (s[:, 1, 1] - b * b).sqrt()
+    e = (s[:, 2, 1] - d * b) / c
+    f = (s[:, 2, 2] - d * d - e * e).sqrt()
+    x, y, z = normal.unbind(dim=2)
+    z = z / f[:, None]
+    y = (y - e[:, None] * z) / c[:, None]
+    x = (x - b[:, None] * y - d[:, None] * z) / a[:, None]
+    return torch.stack([x, y, z], dim=2)
+
+
+def hashed(seed: Tensor, turn: int) -> Tensor:
+    """Uniform values in -1 to 1, float64, from whole numbers below 2^32 of any shape."""
+    h = (seed ^ ((turn * 0x9E3779B1 + 0x2545F491) & _MASK)) & _MASK
+    for factor in (0x7FEB352D, 0x846CA68B):
+        h = ((h ^ (h >> 16)) * factor) & _MASK
+    h = h ^ (h >> 16)
+    return h.double() * (2.0 / 4294967296.0) - 1.0
+
+
+def _turns(four: Tensor) -> Tensor:
+    """Rotations [F, 3, 3] of quaternions [F, 4] of any length but none."""
+    w, x, y, z = four.unbind(dim=1)
+    w = torch.where(w.abs() < 1e-3, 1.0, w)
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    rows = [
+        1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+        s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x),
+        s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=1).view(-1, 3, 3)

@@ -1,0 +1,238 @@
+"""A shot for an input that comes without one: ``gsfluent run vase.glb`` drops it so that it breaks.
+
+What had to be guessed is said, and the shot is written out, to be edited and run like any other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsfluent import materials
+from gsfluent.config.physgaussian.space import model_file
+from gsfluent.errors import InputError
+from gsfluent.io import atomic_path, kind_of, load_splats
+from gsfluent.spatial.mesh_file import surface_points
+
+_log = logging.getLogger(__name__)
+
+FILE = "shot.yaml"
+SETTINGS: dict[str, dict[str, Any]] = {"solve": {"quality": "preview"}, "output": {}}
+"""How a shot that nobody has written is simulated and filmed."""
+
+_MARGIN = 1.5  # times the speed from which the material is estimated to break
+_GRAVITY = 9.81
+_LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down as well
+_AFTER = 1.2  # seconds of film after the landing
+_SAMPLE = 2000  # points of a surface that are asked for their colour
+
+_WORDS = {
+    "fruit.watermelon": "watermelon melon",
+    "fruit.apple": "apple pear mango pepper paprika peach tomato plum fruit",
+    "fruit.orange": "orange lemon citrus grapefruit lime",
+    "fruit.pumpkin": "pumpkin squash gourd",
+    "ceramic": "ceramic porcelain china bowl plate cup mug pot vase jug tea teapot dish urn",
+    "glass": "glass bottle wineglass goblet jar",
+    "bone": "bone skull skeleton tooth",
+    "egg": "egg",
+    "bread": "bread loaf bun cake toast",
+    "chocolate": "chocolate",
+    "jelly": "jelly jello pudding",
+    "plush": "plush toy teddy doll pillow",
+    "rubber": "rubber tyre tire ball",
+    "rock": "rock stone boulder granite marble",
+    "ice": "ice",
+    "wood": "wood log trunk chair guitar violin",
+    "concrete": "concrete brick",
+    "plaster": "plaster gypsum bust statue statuette figure figurine bunny dragon buddha",
+    "clay": "clay",
+    "foam": "foam styrofoam",
+    "snow": "snow snowman",
+}
+"""Words in the names of files, by the preset that they suggest."""
+
+_INSIDE = {
+    "fruit.watermelon": "watermelon",
+    "fruit.apple": "apple",
+    "fruit.orange": "orange",
+    "bread": "bread",
+    "wood": "wood",
+    "bone": "bone",
+    "concrete": "concrete",
+    "jelly": "jelly",
+    "plush": "stuffing",
+}
+"""Procedural insides by material; others continue the colours of the skin."""
+
+
+def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
+    """Write ``OUT/shot.yaml`` for a mesh, a splat or a folder, and say what was guessed.
+
+    Args:
+        source: A mesh, a splat, a capture, a model folder of the INRIA trainer, or a folder with
+            one of them in it.
+        out: Result folder of the run.
+        material: Preset; guessed from name and colour without.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: There is no such input, no such preset, or the file there has been edited.
+    """
+    import yaml
+
+    key, path = find_input(source)
+    if material is None:
+        material, why = guess_material(key, path, source)
+        _log.info("material: %s, guessed from %s; --material NAME says better", material, why)
+    events, seconds, fall = _fall(materials.get(material))
+    _log.info("event: %s", fall)
+    values: dict[str, Any] = {key: str(path.resolve())}
+    values["objects"] = {"object": {"material": material}}
+    if material in _INSIDE:
+        values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
+    output = {"seconds": seconds, **SETTINGS["output"]}
+    values |= {"events": events, "solve": SETTINGS["solve"], "output": output}
+    text = yaml.safe_dump(values, sort_keys=False)
+    target = out / FILE
+    out.mkdir(parents=True, exist_ok=True)
+    _refuse_edited(target)
+    with atomic_path(target) as part:
+        part.write_text(f"{_HEAD}{_digest(text)}\n# edit it, then: gsfluent run {target} -o {out}\n"
+                        f"{text}", encoding="utf-8")  # fmt: skip
+    _log.info("shot: %s", target)
+    return target
+
+
+_HEAD = "# made by gsfluent run, digest "
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _refuse_edited(target: Path) -> None:
+    """Do not write over what somebody has written.
+
+    Raises:
+        InputError: The file is not one that was made here and left as it was.
+    """
+    if not target.is_file():
+        return
+    lines = target.read_text(encoding="utf-8", errors="replace").split("\n", 2)
+    if len(lines) == 3 and lines[0] == f"{_HEAD}{_digest(lines[2])}":
+        return
+    raise InputError(
+        f"{target} has been edited", f"run it: gsfluent run {target}, or remove it to start over"
+    )
+
+
+def find_input(source: Path) -> tuple[str, Path]:
+    """Key of a shot and path for what a user pointed at.
+
+    Raises:
+        InputError: Nothing that a run can start from, or more than one thing.
+    """
+    kind = kind_of(source)
+    if kind in ("mesh", "splats", "capture"):
+        return kind, source
+    if not source.is_dir():
+        raise InputError(
+            f"{source}: neither a shot, nor a mesh, a splat or a folder",
+            "give a shot.yaml, .obj, .glb, .stl, .ply, or the folder of a capture",
+        )
+    if (source / "run.json").is_file():
+        raise InputError(f"{source}: the result of a run", f"look at it: gsfluent view {source}")
+    if (source / "point_cloud").is_dir():
+        return "splats", model_file(source)
+    found = [
+        (kind, path)
+        for path in sorted(source.iterdir())
+        if path.is_file() and (kind := kind_of(path)) in ("mesh", "splats")
+    ]
+    if len(found) == 1:
+        return str(found[0][0]), found[0][1]
+    if found:
+        names = ", ".join(path.name for _, path in found[:5])
+        raise InputError(f"{source}: holds more than one input ({names})", "name one of them")
+    raise InputError(
+        f"{source}: holds no capture, splat or mesh",
+        "photographs need poses: run COLMAP on them, or give a transforms.json",
+    )
+
+
+def guess_material(key: str, path: Path, source: Path) -> tuple[str, str]:
+    """A preset for an input, and what it was guessed from.
+
+    Args:
+        key: ``mesh``, ``splats`` or ``capture``.
+        path: The file or folder.
+        source: What the user named, whose name counts as well.
+    """
+    names = dict.fromkeys((path.stem, source.stem, path.resolve().parent.name))
+    for name in names:
+        parts = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
+        for preset, words in _WORDS.items():
+            hit = set(words.split()) & {*parts, *(part.removesuffix("s") for part in parts)}
+            if hit:
+                return preset, f"the name {name!r}"
+    if key == "capture":
+        return "plaster", "nothing (it is brittle and breaks from any height)"
+    if key == "mesh":
+        found = surface_points(path, _SAMPLE)
+        if not found.colored:
+            return "plaster", "there being no colours"
+        colors = found.colors
+    else:
+        splats = load_splats(path)
+        colors = splats.colors().clamp(0.0, 1.0).double().numpy()[splats.opacities.numpy() > 0.3]
+    return _by_color(np.median(colors, axis=0))
+
+
+def _by_color(color: np.ndarray) -> tuple[str, str]:
+    """A preset for a colour [3] in 0..1, and the colour in words."""
+    high, low = float(color.max()), float(color.min())
+    saturation = (high - low) / max(high, 1e-6)
+    red, green, blue = (float(part) for part in color)
+    if saturation < 0.2:
+        if high > 0.7:
+            return "ceramic", "its pale colour"
+        return ("plaster", "its grey colour") if high > 0.35 else ("rock", "its dark colour")
+    if red >= green >= blue and high < 0.6 and saturation < 0.7:
+        return "wood", "its brown colour"
+    if blue > max(red, green):
+        return "ceramic", "its blue colour"
+    return ("fruit.apple", "its bright colour") if saturation > 0.5 else ("plaster", "its colour")
+
+
+def _fall(material: materials.Material) -> tuple[list[dict[str, Any]], float, str]:
+    """Events that break a material, how long the film is [s], and why in words."""
+    limit = material.breaking_speed
+    if not math.isfinite(limit):
+        height, why = 1.0, f"a drop from 1 m ({material.name} does not break)"
+        return [{"type": "drop", "height": height}], _seconds(height, 0.0), why
+    needed = (_MARGIN * limit) ** 2 / (2.0 * _GRAVITY)
+    height = round(min(max(needed, _LOW), _HIGH), 2)
+    events: list[dict[str, Any]] = [{"type": "drop", "height": height}]
+    about = f"{material.name} is estimated to break from {limit:.2g} m/s"
+    if needed <= _HIGH:
+        return events, _seconds(height, 0.0), f"a drop from {height:g} m ({about})"
+    speed = round(math.sqrt((_MARGIN * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
+    events.append({"type": "throw", "velocity": [0.0, 0.0, -speed]})
+    return (
+        events,
+        _seconds(height, speed),
+        f"thrown down from {height:g} m at {speed:g} m/s ({about})",
+    )
+
+
+def _seconds(height: float, speed: float) -> float:
+    fall = (math.sqrt(speed**2 + 2.0 * _GRAVITY * height) - speed) / _GRAVITY
+    return round(fall + _AFTER, 1)
