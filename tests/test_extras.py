@@ -23,6 +23,7 @@ from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.mesh import closed_mesh
 from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter, InpaintOptions
 from gsfluent.run.report import report_page
+from gsfluent.viewer.guard import Guard
 from gsfluent.viewer.server import start_server
 
 CPU = torch.device("cpu")
@@ -37,7 +38,7 @@ def surface(tmp_path: Path) -> None:
 
 
 def page(tmp_path: Path) -> None:
-    start_server("127.0.0.1", 0, "test")
+    start_server("127.0.0.1", 0, "test", Guard("127.0.0.1"))
 
 
 def stage(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from gsfluent.data.camera import Camera
@@ -23,7 +24,7 @@ def kind_of(path: str | Path) -> str | None:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if path.is_dir():
+    if os.path.isdir(path):  # no error for names that cannot be one
         posed = any((path / name).is_file() for name in _TRANSFORMS)
         return "capture" if posed or find_model(path) is not None else None
     if is_mesh(path):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,7 +49,7 @@ def is_mesh(path: str | Path) -> bool:
     path = Path(path)
     if path.suffix.lower() in ENDINGS:
         return True
-    if path.suffix.lower() != ".ply" or not path.is_file():
+    if path.suffix.lower() != ".ply" or not os.path.isfile(path):
         return False
     with open(path, "rb") as stream:
         head = stream.read(4096).split(b"end_header")[0]

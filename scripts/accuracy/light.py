@@ -238,7 +238,7 @@ def occlusion(name: str) -> tuple[float, Tensor, Tensor]:
     """RMS error of the sky's share, found and true values along the points."""
     things, splats, points, normals = occlusion_cases()[name]
     expected = truth.sky_share(points, normals, things, 4000)
-    grid = grid_for(splats).of(splats.means, bulk(splats).center)
+    grid = grid_for(splats).of(splats, bulk(splats).center)
     found = ambient_occlusion(points.float(), normals.float(), grid).double()
     return float((found - expected).square().mean().sqrt()), found, expected
 

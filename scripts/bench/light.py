@@ -89,7 +89,7 @@ def measure(
     whole = bulk(matter)
     faces = faces_of(drawn, whole)
     texels = 1024 if max(size) > 800 else 512
-    occupied = grid.of(matter.means, whole.center)
+    occupied = grid.of(matter, whole.center)
     normals = splat_normals(matter, occupied)
     viewmat, intrinsics = camera.viewmat.to(matter.means), camera.K.to(matter.means)
 
@@ -111,7 +111,7 @@ def measure(
         "main pass": main,
         "bulk": lambda: bulk(matter),
         "shadow maps": lambda: shadow_maps(matter, drawn, faces, texels, whole),
-        "occupancy": lambda: grid.of(matter.means, whole.center),
+        "occupancy": lambda: grid.of(matter, whole.center),
         "normals": lambda: splat_normals(matter, occupied),
         "unlit picture": lambda: plain(matter).image,
         "lit picture": lambda: render(matter, room=room).image,

@@ -63,7 +63,7 @@ def test_the_shot_alone(model: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_arguments_that_do_not_fit(model: Path, tmp_path: Path) -> None:
     out = ["-o", str(tmp_path / "out")]
-    assert main(["run", str(model), *out]) == 2
+    assert main(["run", str(model), *out, "--write-shot"]) == 2
     shot = tmp_path / "shot.yaml"
     shot.write_text("splats: none.ply\n")
     assert main(["run", str(shot), *out, "--write-shot"]) == 2

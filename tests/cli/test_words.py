@@ -66,7 +66,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     ("words", "said"),
     [
         (["smash"], "smash"),
-        (["run"], "SHOT.yaml"),
+        (["run"], "INPUT"),
         (["doctor", "--sed", "1"], "--seed"),
         (["doctor", "--seed", "x"], "--seed"),
         (["reconstruct", "."], "--out"),

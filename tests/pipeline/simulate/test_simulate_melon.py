@@ -13,7 +13,7 @@ from gsfluent.scene.scene import Scene
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("height", [1.0, 1.5])
+@pytest.mark.parametrize("height", [1.5, 2.0])
 def test_a_dropped_watermelon_breaks_into_chunks(height):
     scene = Scene(floor=0.0)
     scene.add(ellipsoid((0.125, 0.105, 0.105), voxels=48), materials.fruit.watermelon)

@@ -332,7 +332,7 @@ def test_errors(melon: tuple[Solid, np.ndarray, InteriorTexture], tmp_path: Path
         Texture("diffusion")
     with pytest.raises(InputError, match="quality"):
         Texture(preset="wood", quality="ultra")
-    with pytest.raises(InputError, match="not found"):
+    with pytest.raises(InputError, match="no such"):
         Texture(exemplar=tmp_path / "no.png")(solid)
     (tmp_path / "bad.png").write_bytes(b"not an image")
     with pytest.raises(InputError, match="cannot be read"):

@@ -372,7 +372,7 @@ def test_shown_parts_become_regions() -> None:
         exemplar_texture(domain, photo, parts=labels[:50])
     with pytest.raises(InputError, match="nothing"):
         exemplar_texture(domain, photo, parts=np.zeros_like(labels))
-    with pytest.raises(InputError, match="not found"):
+    with pytest.raises(InputError, match="no such"):
         exemplar_texture(domain, photo, parts="nowhere.png")
 
 

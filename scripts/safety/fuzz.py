@@ -1,7 +1,7 @@
 """Feed changed files to every reader for as long as you like, and keep what breaks one.
 
-    python scripts/fuzz.py --files 10000            # a table of what became of them
-    python scripts/fuzz.py --hours 8 --seed 5 -o out/fuzz
+    python scripts/safety/fuzz.py --files 10000            # a table of what became of them
+    python scripts/safety/fuzz.py --hours 8 --seed 5 -o out/fuzz
 
 Every file is read in a forked child with limits of time and memory (tests/fuzz/fuzz_server.py). A
 finding is written to OUT as JSON; move it to tests/fuzz/seeds once it is mended, and it stays a
@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 BATCH = 25  # files of a reader in a row
 PAGE = ROOT / "docs" / "measured" / "fuzz.md"
 
