@@ -1,4 +1,4 @@
-"""A short round of changed files over every reader, in seconds; the script of scripts/safety for hours."""
+"""A short round of changed files over every reader; scripts/safety has the long one."""
 
 from __future__ import annotations
 

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from gsfluent.data import Camera, Gaussians
+from gsfluent.data import INTERIOR, Camera, Gaussians
 from gsfluent.draw import draw_at
+from gsfluent.pipeline.matter import divide
 from gsfluent.pipeline.matter.divide import divide_wide
 
 
@@ -53,3 +54,15 @@ def test_what_is_narrow_is_left_alone() -> None:
     assert torch.equal(both.means[0], narrow.means[0])
     assert both.labels is not None
     assert int(both.labels.sum()) == 0
+
+
+def test_the_inside_is_left_alone_and_the_parts_have_a_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Faces hide what is inside; a skin of giants on tiny points does not fill the memory."""
+    inside = flat(0.9, (0.3, 0.3)).labelled(INTERIOR)
+    assert divide_wide(inside, 0.01) is inside
+    monkeypatch.setattr(divide, "MOST", 500)
+    both = Gaussians.cat([flat(0.9, (0.3, 0.3)), flat(0.9, (0.1, 0.1))])
+    parts = divide_wide(both, 0.001)
+    assert 1 < parts.count <= 501
