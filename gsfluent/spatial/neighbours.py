@@ -76,7 +76,13 @@ def nearest_rows(points: Tensor, queries: Tensor, count: int, cell: float) -> tu
 
 
 def nearest_in_group(
-    points: Tensor, group: Tensor, queries: Tensor, wanted: Tensor, count: int, cell: float
+    points: Tensor,
+    group: Tensor,
+    queries: Tensor,
+    wanted: Tensor,
+    count: int,
+    cell: float,
+    reach: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
     """Nearest points of one's own group, for all groups at once.
 
@@ -90,10 +96,11 @@ def nearest_in_group(
         wanted: Group in which each query looks, int64 [M].
         count: Neighbours per query.
         cell: As for :func:`nearest`.
+        reach: Distance beyond which nothing is looked for [world units]; far queries cost most.
 
     Returns:
-        Distances float64 [M, count], ascending, infinite where a group has too few points, and
-        rows int64 [M, count], -1 there.
+        Distances float64 [M, count], ascending, infinite where a group has too few points within
+        reach, and rows int64 [M, count], -1 there.
     """
     distance = torch.full((len(queries), count), math.inf, dtype=torch.float64)
     distance = distance.to(points.device)
@@ -120,12 +127,15 @@ def nearest_in_group(
         from scipy.spatial import cKDTree
 
         found = cKDTree(places.numpy()).query(
-            asked.numpy(), k=list(range(1, most + 1)), distance_upper_bound=2.0 * extent
+            asked.numpy(),
+            k=list(range(1, most + 1)),
+            distance_upper_bound=min(2.0 * extent, math.nextafter(reach, math.inf)),
         )
         near, rows = (torch.from_numpy(np.asarray(part)) for part in found)
         rows = rows.to(torch.int64)
     else:
-        near, rows = grid_search(places, asked, most, cell, extent)
+        near, rows = grid_search(places, asked, most, min(cell, reach), min(extent, reach))
+        near = torch.where(near <= reach, near, math.inf)
     rows = torch.where(near.isfinite(), rows, len(points))
     near, rows = _in_order(near, rows)
     distance[asks, :most] = near

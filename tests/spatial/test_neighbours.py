@@ -88,3 +88,16 @@ def test_beyond_the_reach_nothing_is_found() -> None:
     distance, index = grid_search(points, points[:1], 3, 0.01, reach=0.5)
     assert index[0, :2].tolist() == [0, 1]
     assert bool(distance[0, 2].isinf())
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_groups_are_searched_within_reach_alone(device: str) -> None:
+    make = torch.Generator().manual_seed(3)
+    points, queries = torch.rand(300, 3, generator=make), 3 * torch.rand(80, 3, generator=make)
+    group, wanted = torch.arange(300) % 4, torch.arange(80) % 5
+    asked = [x.to(device) for x in (points, group, queries, wanted)]
+    whole, every = (x.cpu() for x in nearest_in_group(*asked, 6, 0.1))
+    distance, index = (x.cpu() for x in nearest_in_group(*asked, 6, 0.1, 0.25))
+    assert bool((whole < 0.25).any()) and bool((whole > 0.25).any())
+    assert torch.equal(distance, torch.where(whole <= 0.25, whole, torch.inf))
+    assert torch.equal(index, torch.where(whole <= 0.25, every, -1))

@@ -17,7 +17,7 @@ from gsfluent.data import Gaussians, Solid
 from gsfluent.pipeline.cracks.cuts import REACH, cut_at
 from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
 from gsfluent.pipeline.partition.tree import Partition, Split
-from gsfluent.spatial.neighbours import nearest_rows
+from gsfluent.spatial.neighbours import nearest_in_group
 
 INSET = 0.15
 """How far below its face an element lies, in voxels."""
@@ -284,14 +284,16 @@ def wide_cuts(
         cell: Cell of the search [m].
     """
     known = torch.isin(rows, cuts.splat) | ~torch.isin(region, faces.region)
-    wide = (~known & (REACH * splats.scales[rows].amax(dim=1) > cell)).nonzero()[:, 0]
+    reach = REACH * splats.scales[rows].amax(dim=1) / cell
+    octave = torch.where(known, 0.0, torch.log2(reach.clamp(min=1.0)).ceil())
     found = [cuts]
-    for number in torch.unique(region[wide]).tolist():
-        mine = rows[wide[region[wide] == number]]
-        its = (faces.region == number).nonzero()[:, 0]
-        means = splats.means[mine]
-        way, near = nearest_rows(faces.means[its], means, 1, cell)
-        element, distance = its[near[:, 0]], way[:, 0].to(means)
+    for number in torch.unique(octave[octave > 0]).tolist():
+        some = (octave == number).nonzero()[:, 0]
+        mine, means = rows[some], splats.means[rows[some]]
+        way, near = nearest_in_group(
+            faces.means, faces.region, means, region[some], 1, cell, 2.0**number * cell
+        )
+        element, distance = near[:, 0].clamp(min=0), way[:, 0].to(means)
         normal = (faces.means[element] - means) / distance.clamp(min=1e-12)[:, None]
         root = geometry.quaternion_to_matrix(splats.quats[mine]) * splats.scales[mine, None]
         across = (distance > 0.0) & (distance < REACH * (normal[:, None] @ root)[:, 0].norm(dim=1))

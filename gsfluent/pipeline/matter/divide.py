@@ -6,6 +6,8 @@ anything moves: a lattice of narrower Gaussians of the same colour, whose opacit
 that together they hide at the centres and midway between what the wide one of opacity o hid::
 
     1 - prod_j (1 - o_j g_ij) = o exp(-sum_a x_ia^2 / (2 s_a^2))
+
+In units of the narrow ones this depends on the opacity and on how many there are along each axis.
 """
 
 from __future__ import annotations
@@ -17,16 +19,17 @@ from gsfluent import geometry
 from gsfluent.data import SURFACE, Gaussians
 
 NARROW = 0.75
-"""Standard deviation of the parts, as a share of the widest that is left alone."""
+"""Standard deviation of the parts at most, as a share of the widest that is left alone."""
 STEP = 1.5
 """Distance of their centres, in their standard deviations."""
-_REACH = 2.2  # deviations of the wide splat up to which it is made anew
+MOST = 1_000_000
+"""Parts that all splats together become at most; for more, wider ones are left alone."""
+_REACH = 2.4  # deviations of the wide splat up to which it is made anew
+_HALF = (0, 60, 11, 3)  # parts to each side at most, of splats with so many wide axes
 _LEAST = 1.0 / 255.0  # opacity below which a part is left out
 _OPAQUE = 0.99
-_ROUNDS = 8  # of the multiplicative fit; more change nothing to see
-MOST = 1_000_000
-"""Parts that all splats together become at most; beyond that wider ones are left alone."""
-_AT_ONCE = 4_000_000  # pairs of parts
+_OPACITIES = 65  # of wide splats that are fitted; what lies between is interpolated
+_ROUNDS = 12  # of the multiplicative fit; more change nothing to see
 
 
 def divide_wide(splats: Gaussians, widest: float) -> Gaussians:
@@ -50,46 +53,45 @@ def divide_wide(splats: Gaussians, widest: float) -> Gaussians:
         if not bool(wide.any()):
             return splats
         rows = wide.nonzero()[:, 0]
-        narrow = splats.scales[rows].clamp(max=NARROW * widest)
-        narrow = torch.where(splats.scales[rows] > widest, narrow, splats.scales[rows])
-        ratio = splats.scales[rows] / narrow
-        half = torch.ceil(_REACH * ratio / STEP - 0.5).long().clamp(min=1)
-        half = torch.where(ratio > 1.0, half, 0)
+        across = splats.scales[rows] > widest
+        most = torch.tensor(_HALF, device=rows.device)[across.sum(dim=1)]
+        half = torch.ceil(_REACH * splats.scales[rows] / (NARROW * widest * STEP) - 0.5).long()
+        half = torch.where(across, half.clamp(min=1).minimum(most[:, None]), 0)
         if float((2.0 * half + 1.0).prod(dim=1).sum()) <= MOST:
             break
         widest *= 1.25
     parts = [splats.select(~wide)]
     for counts in torch.unique(half, dim=0):
-        mine = (half == counts).all(dim=1).nonzero()[:, 0]
-        lattice, places = (_lattice([f * int(n) for n in counts], STEP / f, rows) for f in (1, 2))
-        pairs = lattice.shape[0] * places.shape[0]
-        for some in mine.split(max(1, _AT_ONCE // pairs)):
-            parts.append(_parts(splats.select(rows[some]), narrow[some], lattice, places))
+        mine = rows[(half == counts).all(dim=1)]
+        parts.append(_parts(splats.select(mine), counts))
     return Gaussians.cat(parts)
+
+
+def _parts(wide: Gaussians, counts: Tensor) -> Gaussians:
+    """Wide splats [M] as lattices of ``counts`` [3] narrower ones to each side."""
+    ratio = torch.where(counts > 0, STEP * (counts + 0.5) / _REACH, 1.0)  # of the deviations
+    lattice, places = (_lattice([f * int(n) for n in counts], STEP / f, ratio) for f in (1, 2))
+    known = torch.linspace(0.0, _OPAQUE, _OPACITIES, device=ratio.device)
+    hidden = known[:, None] * torch.exp(-0.5 * (places / ratio).square().sum(dim=1))
+    table = _opacities(-torch.log1p(-hidden), places, lattice)
+    row = wide.opacities.clamp(0.0, _OPAQUE) / _OPAQUE * (_OPACITIES - 1)
+    low = row.long().clamp(max=_OPACITIES - 2)
+    opacity = torch.lerp(table[low], table[low + 1], (row - low)[:, None])
+    narrow = wide.scales / ratio
+    source, part = (opacity > _LEAST).nonzero().unbind(dim=1)
+    axes = geometry.quaternion_to_matrix(wide.quats)
+    place = lattice[part] * narrow[source]
+    return wide.select(source).replace(
+        means=wide.means[source] + (axes[source] @ place[..., None])[..., 0],
+        scales=narrow[source],
+        opacities=opacity[source, part],
+    )
 
 
 def _lattice(counts: list[int], step: float, like: Tensor) -> Tensor:
     """Places -n .. n times ``step`` along three axes, [L, 3]."""
     axes = [torch.arange(-n, n + 1, device=like.device) for n in counts]
     return torch.cartesian_prod(*axes).to(torch.float32) * step
-
-
-def _parts(wide: Gaussians, narrow: Tensor, lattice: Tensor, places: Tensor) -> Gaussians:
-    """Wide splats [M] as splats of deviations ``narrow`` [M, 3] on a lattice [L, 3] of these.
-
-    They are held to the wide ones at ``places`` [P, 3], in the same unit.
-    """
-    fall = (places[None] * (narrow / wide.scales)[:, None]).square().sum(dim=2)
-    hidden = wide.opacities.clamp(max=_OPAQUE)[:, None] * torch.exp(-0.5 * fall)
-    opacity = _opacities(-torch.log1p(-hidden), places, lattice)
-    place = lattice[None] * narrow[:, None]
-    axes = geometry.quaternion_to_matrix(wide.quats)
-    means = wide.means[:, None] + (axes[:, None] @ place[..., None])[..., 0]
-    kept = opacity > _LEAST
-    source, part = kept.nonzero().unbind(dim=1)
-    return wide.select(source).replace(
-        means=means[source, part], scales=narrow[source], opacities=opacity[source, part]
-    )
 
 
 def _opacities(depth: Tensor, places: Tensor, lattice: Tensor) -> Tensor:
@@ -101,6 +103,6 @@ def _opacities(depth: Tensor, places: Tensor, lattice: Tensor) -> Tensor:
     share = seen / seen.sum(dim=0)
     opacity = -torch.expm1(-(depth @ share) / seen.sum(dim=1).mean())
     for _ in range(_ROUNDS):
-        found = -torch.log1p(-opacity[:, None] * seen).sum(dim=2)
+        found = torch.stack([-torch.log1p(-row * seen).sum(dim=1) for row in opacity])
         opacity = (opacity * ((depth / found.clamp(min=1e-12)) @ share)).clamp(max=_OPAQUE)
     return opacity
