@@ -213,7 +213,12 @@ def main() -> int:
         "--quality", choices=("preview", "shot", "hero"), help="the shot's own if absent"
     )
     parser.add_argument("--force", action="store_true", help="redo finished stages")
-    parser.add_argument("--lines", type=Path, default=LINES, help="where a line per run is added")
+    parser.add_argument(
+        "--lines",
+        type=Path,
+        default=LINES,
+        help="where a line per run is added; elsewhere the page stays as it is",
+    )
     parser.add_argument("--images", action="store_true", help="write docs/images/gallery_NAME.jpg")
     parser.add_argument("--page", action="store_true", help="write the page, run nothing")
     options = parser.parse_args()
@@ -247,6 +252,8 @@ def main() -> int:
         options.lines.parent.mkdir(parents=True, exist_ok=True)
         with options.lines.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(line) + "\n")
+    if options.lines != LINES and not options.page:
+        return 1 if failed else 0  # the page tells of its own lines
     lines = []
     if options.lines.is_file():
         texts = options.lines.read_text(encoding="utf-8").splitlines()
