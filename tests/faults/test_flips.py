@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fault_harm import flip, flips
 from fault_shot import redone, results, run
 
 from gsfluent.errors import RunError
@@ -25,22 +25,8 @@ class Begun(Exception):
     """A stage was not taken up but begun, with these files in its folder."""
 
 
-def flip(path: Path, place: int) -> None:
-    """Flip one bit of a file; ``place`` counts its bits."""
-    data = bytearray(path.read_bytes())
-    data[place // 8] ^= 1 << place % 8
-    path.write_bytes(bytes(data))
-
-
 def begin(folder: Path) -> dict[str, Any]:
     raise Begun(sorted(path.name for path in folder.iterdir()))
-
-
-def flips(source: Path, names: list[str], count: int) -> list[tuple[str, int]]:
-    """As many bits of every file."""
-    chance = random.Random(0)
-    sizes = {name: 8 * (source / name).stat().st_size for name in names}
-    return [(name, chance.randrange(size)) for name, size in sizes.items() for _ in range(count)]
 
 
 @pytest.mark.parametrize("stage", STAGES)
