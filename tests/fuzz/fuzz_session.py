@@ -1,4 +1,4 @@
-"""Rounds of changed files over all readers: short ones in the tests, long in scripts/safety/fuzz.py."""
+"""Rounds of changed files over all readers: short in the tests, long in scripts/safety/fuzz.py."""
 
 from __future__ import annotations
 
