@@ -77,6 +77,12 @@ def die_at(count: int, *, before: bool) -> None:
     os.replace = dying
 
 
+def die_after(seconds: float) -> None:
+    """This process is killed when it has used so much time of a core, whatever it does then."""
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+
+
 @contextmanager
 def little_room(size: int) -> Iterator[None]:
     """No file may grow beyond a size: the system itself refuses the write, as a full disk does."""
