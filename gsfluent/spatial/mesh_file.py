@@ -169,7 +169,7 @@ def read_parts(path: str | Path) -> list[trimesh.Trimesh]:
         for part in parts:
             picture = picture_of(part)
             if picture is not None:
-                check_pixels(*picture.size, path)
+                check_pixels(picture.width, picture.height, path)
                 picture.load()
             glued = getattr(part.visual, "uv", None)
             numbers = [part.vertices, part.area, *([] if glued is None else [glued])]
@@ -197,9 +197,10 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     parts = read_parts(path)
     for part in parts:
         part.process()
-    mesh = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
+    mesh: Any = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures are no openings
-    return mesh
+    whole: trimesh.Trimesh = mesh
+    return whole
 
 
 def _beside(path: str | Path) -> Any:

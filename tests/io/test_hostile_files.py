@@ -495,11 +495,12 @@ def test_honest_aliases_are_read(tmp_path: Path) -> None:
 # --- results ---
 
 
-def test_frames_with_nan_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["means", "damage", "velocity", "led_positions"])
+def test_frames_with_nan_are_refused(name: str, tmp_path: Path) -> None:
     stream = io.BytesIO()
     head = {"index": 0, "time": 0.0, "carried": 1, "facts": {}}
-    arrays = {name: np.full((1, 3), np.nan, np.float32) for name in ("means", "scales")}
+    arrays = {"scales": np.ones((1, 3)), name: np.full((1, 3), np.nan, np.float32)}
     np.savez(stream, head=np.array(json.dumps(head)), **arrays)
     (tmp_path / "frame_0001.npz").write_bytes(stream.getvalue())
-    with pytest.raises(RunError, match="means holds NaN"):
+    with pytest.raises(RunError, match=f"{name} holds NaN"):
         load_frame(tmp_path, 0)
