@@ -415,7 +415,10 @@ READERS: dict[str, Reader] = {
         lambda f: load_image(f / "a.tif"),
     ),
     "exemplar": Reader(
-        image("a.png"), "a.png", lambda f: read_pixels(f / "a.png", "a"), containers.png
+        image("a.png"),
+        "a.png",
+        lambda f: read_pixels(f / "a.png", str(f / "a.png")),
+        containers.png,
     ),
     "exemplar_parts": Reader(
         image("a.png", labels()),
