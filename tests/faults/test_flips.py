@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -158,6 +159,35 @@ def test_a_record_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> Non
         flip(tmp_path / RECORD, place)
     (tmp_path / RECORD).write_text("[" * 100_000)
     assert read_record(tmp_path / RECORD)[0] == {}
+
+
+@pytest.mark.parametrize("name", ["report", "files", "seconds"])
+def test_a_record_without_all_its_values_is_not_believed(name: str, tmp_path: Path) -> None:
+    def work(folder: Path) -> dict[str, Any]:
+        (folder / "a.ply").write_text("a")
+        return {}
+
+    StageStore(tmp_path).run("s", "key", work)
+    values, _ = read_record(tmp_path / "s" / RECORD)
+    del values[name]
+    write_record(tmp_path / "s" / RECORD, values)  # with a digest that fits
+    result = StageStore(tmp_path).run("s", "key", work)
+    assert not result.resumed and f"without {name}" in result.redone
+    assert StageStore(tmp_path).run("s", "key", work).resumed
+
+
+@pytest.mark.parametrize("seconds", [0, 4e9], ids=["1970", "2096"])
+def test_a_clock_that_was_set_changes_nothing(
+    seconds: float, finished: Path, shot: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    (out / "stages" / f".film.{2**30}.partial.mp4").write_text("of a dead run")
+    for path in out.rglob("*"):
+        os.utime(path, (seconds, seconds))
+    values = run(shot, out)
+    assert all(stage["resumed"] for stage in values["stages"]) and redone(values) == []
+    assert results(out) == results(finished)  # the half-written film is gone
 
 
 def test_other_results_of_a_stage_are_built_on_anew(tmp_path: Path) -> None:
