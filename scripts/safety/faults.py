@@ -1,6 +1,7 @@
 """Flip bits of a run's files, kill it, start it twice, fill its disk: what was noticed and kept.
 
     python scripts/safety/faults.py --enter          # docs/measured/faults.md; minutes of one core
+    python scripts/safety/faults.py --cost --enter   # what digests cost a run
     python scripts/safety/faults.py --flips 50 --kills 5 --doubles 2 --disks 2
 
 The shot, and what is done to it, are those of tests/faults. A flip is made in one file of a run
@@ -243,12 +244,43 @@ def page(series: list[Series], faults: Faults, seconds: float) -> str:
     )
 
 
+def cost(folder: Path) -> str:
+    """What believing nothing costs a run of a few seconds of film, as a table."""
+    film = {"fps": 24, "seconds": 1.0, "size": [320, 240], "what": ["mp4"]}
+    changes = {"fill": {"resolution": 40}, "solve": {"cells": 20}, "output": film}
+    shot = write_shot(folder / "shot", **changes)
+    run(shot, folder / "warm")
+    with (
+        timed(digests, "file_digest") as hashing,
+        timed(digests.Journal, "note") as noting,
+    ):
+        start = time.perf_counter()
+        run(shot, folder / "run")
+        seconds = time.perf_counter() - start
+    size = sum(path.stat().st_size for path in files(folder / "run")) / 1e6
+    rows = {"all": seconds, "digests": sum(hashing), "list": sum(noting) - sum(hashing)}
+    return "\n".join(
+        [
+            f"{len(noting)} files of together {size:.1f} MB.",
+            "",
+            "| part of the run | s | share [%] |",
+            "| --- | --- | --- |",
+            *(f"| {name} | {s:.3f} | {100 * s / seconds:.2f} |" for name, s in rows.items()),
+        ]
+    )
+
+
+def enter_part(name: str, part: str) -> None:
+    PAGE.write_text(enter(PAGE.read_text(encoding="utf-8"), name, part), encoding="utf-8")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--flips", type=int, default=1000)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--doubles", type=int, default=20)
     parser.add_argument("--disks", type=int, default=10)
+    parser.add_argument("--cost", action="store_true", help="measure what digests cost, only")
     parser.add_argument("--enter", action="store_true", help="write the table into docs/measured")
     options = parser.parse_args()
     start = time.monotonic()
@@ -257,6 +289,11 @@ def main() -> int:
         # the page of a run takes longer than these runs, and is made of run.json alone
         mock.patch("gsfluent.run.shot.write_report", lambda out, values: None),
     ):
+        if options.cost:
+            print(part := cost(Path(folder)))
+            if options.enter:
+                enter_part("cost", part)
+            return 0
         faults = Faults(Path(folder))
         series = [
             *faults.flips(options.flips),
@@ -267,8 +304,7 @@ def main() -> int:
         table = page(series, faults, time.monotonic() - start)
     print(table)
     if options.enter:
-        text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(enter(text, "faults", table), encoding="utf-8")
+        enter_part("faults", table)
     return 1 if any(one.wrong for one in series) else 0
 
 
