@@ -25,11 +25,12 @@ DEBUG=1 GSFLUENT_CUDA=0 CFLAGS="$flags" CXXFLAGS="$flags" LDFLAGS="$flags" MAX_J
     "$python" setup.py -q build_ext --build-lib "$folder/package" --build-temp "$folder/objects"
 
 preload="$(gcc -print-file-name=libasan.so):$(gcc -print-file-name=libubsan.so):$(gcc -print-file-name=libstdc++.so)"
-export ASAN_OPTIONS="detect_leaks=0:abort_on_error=0:exitcode=66:allocator_may_return_null=1"
-export UBSAN_OPTIONS="print_stacktrace=1:halt_on_error=1:exitcode=66"
+export ASAN_OPTIONS="detect_leaks=0:exitcode=66:allocator_may_return_null=1"
+export UBSAN_OPTIONS="halt_on_error=1:exitcode=66"
 export PYTHONPATH="$folder/package" OMP_NUM_THREADS="${OMP_NUM_THREADS:-2}"
 # the operators must be those just built
 LD_PRELOAD="$preload" "$python" -P -c "
 import sys, gsfluent
 sys.exit(not gsfluent.__file__.startswith('$folder/'))"
-LD_PRELOAD="$preload" "$python" -P -m pytest -q -p no:cacheprovider --timeout 3000 "$@"
+# -s: what pytest holds back is lost when a report ends it
+LD_PRELOAD="$preload" "$python" -P -m pytest -q -s -p no:cacheprovider --timeout 3000 "$@"
