@@ -24,6 +24,9 @@ prepare() {
   fi
 
   echo "installing into $venv (torch first; the first time takes a few minutes)"
+  if [ "${GSFLUENT_LOCK:-0}" = 1 ]; then # exactly the files that were tested with; what follows finds all it asks for
+    "${pip[@]}" --require-hashes -r requirements.lock || return 1
+  fi
   "$PYTHON" -c 'import torch' 2>/dev/null || "${pip[@]}" 'torch==2.13.0' || return 1
   "${pip[@]}" 'setuptools>=77' wheel ninja pybind11 numpy || return 1
   if [ "$kind" = demo ]; then

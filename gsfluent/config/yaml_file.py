@@ -43,7 +43,9 @@ class _UniqueKeyLoader(yaml.SafeLoader):
             size = 1 + sum(self._sizes.get(id(part), 0) for part in _parts(node))
             if size > limit("yaml_values"):
                 raise _refused(
-                    f"more than {limit('yaml_values')} values with all aliases written out", event
+                    f"more than {limit('yaml_values')} values with all aliases written out; "
+                    "GSFLUENT_MAX_YAML_VALUES allows more",
+                    event,
                 )
             self._sizes[id(node)] = size
         return node

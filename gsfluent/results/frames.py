@@ -23,9 +23,9 @@ from gsfluent.io import atomic_path
 from gsfluent.io.checked.arrays import read_npz
 
 _HALF = ("quats", "opacities", "sh", "damage", "velocity")
+_HALF_MOST = 65504.0
 _SPLATS = ("groups", "ids", "anchor")
 _POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "material")
-_FINITE = ("means", "quats", "scales", "opacities", "sh", "positions")
 _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 _LED = ("led_rows", "led_positions")
 _DUST = "dust_rows"
@@ -126,8 +126,8 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
     try:
         arrays = read_npz(path)
         head = _head(arrays)
-        for name in _FINITE:
-            if not np.isfinite(arrays[name]).all():
+        for name, array in arrays.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise ValueError(f"{name} holds NaN or infinity")
         return SavedFrame(
             index=head["index"],
@@ -200,7 +200,8 @@ def _unreadable(path: Path, error: Exception) -> RunError:
 def _packed(name: str, value: Tensor) -> np.ndarray:
     array = value.detach().cpu().numpy()
     if name in _HALF:
-        return array.astype(np.float16)
+        # what is larger, a speed beyond all sense, would be infinite
+        return array.clip(-_HALF_MOST, _HALF_MOST).astype(np.float16)
     return array.astype(np.float32) if array.dtype == np.float64 else array
 
 

@@ -42,6 +42,7 @@ from gsfluent.results.digests import (
 
 _log = logging.getLogger(__name__)
 _READ_ON = (".ply", ".npz", ".json")
+_KEPT = ("report", "seconds", "cpu_seconds", "peak_memory_bytes", "peak_device_memory_bytes")
 
 
 def fingerprint(*parts: object) -> str:
@@ -146,9 +147,12 @@ class StageStore:
         before, wrong = read_record(folder / RECORD) if _holds_results(folder) else ({}, "")
         same = not self.force and before.get("fingerprint") == key
         if same and before.get("complete"):
-            lost = differing(folder, before["files"])
+            missing = [each for each in ("files", *_KEPT) if each not in before]
+            lost = [] if missing else differing(folder, before["files"])
             wrong = f"{_listed(lost)} missing or different from the digest" if lost else ""
-            if not lost:
+            if missing:
+                wrong = f"{RECORD} is without {missing[0]}"
+            if not wrong:
                 result = _found(name, folder, before)
                 self.results.append(result)
                 _clear(folder, journal, scratch)
@@ -200,12 +204,11 @@ def _holds_results(folder: Path) -> bool:
 
 def _found(name: str, folder: Path, record: dict[str, Any]) -> StageResult:
     """A finished stage, from its record."""
-    names = ("report", "seconds", "cpu_seconds", "peak_memory_bytes", "peak_device_memory_bytes")
     return StageResult(
         name,
         folder,
         record["fingerprint"],
-        **{each: record[each] for each in names},
+        **{each: record[each] for each in _KEPT},
         resumed=True,
         files=record["files"],
     )

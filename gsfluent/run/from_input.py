@@ -18,7 +18,7 @@ from gsfluent import materials
 from gsfluent.config.physgaussian.space import model_file
 from gsfluent.errors import InputError
 from gsfluent.io import atomic_path, kind_of, load_splats
-from gsfluent.spatial.mesh_file import surface_points
+from gsfluent.spatial.mesh_surface import surface_points
 
 _log = logging.getLogger(__name__)
 

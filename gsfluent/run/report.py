@@ -6,7 +6,6 @@ Nothing is computed again, so the page of an old run can be made anew.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 from gsfluent.errors import InputError, MissingPackage
 from gsfluent.figure.page import Page
 from gsfluent.figure.series import Panel, curves
+from gsfluent.io.checked.files import read_json
 
 REPORT = "report.html"
 _KINDS = {"clean": "good", "healed": "warn", "failed": "bad"}
@@ -28,14 +28,11 @@ def read_run(out: Path) -> dict[str, Any]:
         InputError: It is not there, or it is not such a file.
     """
     path = out / "run.json"
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+    if not path.exists():
         raise InputError(
             f"{path}: not there", "name the folder of a run, as `gsfluent run -o` was given it"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error})", "run the shot again") from error
+        )
+    values = read_json(path, "run the shot again")
     if not isinstance(values, dict) or "verdict" not in values:
         raise InputError(f"{path}: not the record of a run", "run the shot again")
     return values

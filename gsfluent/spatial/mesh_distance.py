@@ -5,14 +5,11 @@ from __future__ import annotations
 import dataclasses
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsfluent.errors import InputError
-
-if TYPE_CHECKING:
-    import trimesh
+from gsfluent.spatial.mesh_file import load_mesh
 
 _log = logging.getLogger(__name__)
 
@@ -109,29 +106,6 @@ def signed_distances(
     distance = np.maximum(distance, _LEAST * spacing)  # a node on the surface has a side as well
     signed = np.where(inside.reshape(-1), -distance, distance).reshape(tuple(size))
     return np.asarray(signed, dtype=np.float32)
-
-
-def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """Read a file as one triangle mesh.
-
-    Raises:
-        InputError: The file is missing, unreadable or holds no triangles.
-    """
-    import trimesh
-
-    try:
-        mesh = trimesh.load_mesh(str(path))
-        if not isinstance(mesh, trimesh.Trimesh):
-            mesh = trimesh.util.concatenate(mesh.dump())
-    except Exception as error:  # readers of many formats, each with errors of its own
-        raise InputError(
-            f"{path}: cannot be read as a mesh ({error})",
-            hint="give a file that trimesh reads: obj, glb, stl, ply",
-        ) from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{path}: holds no triangles", hint="give a triangle mesh")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # seams of textures are no openings
-    return mesh
 
 
 def _distance(nodes: np.ndarray, triangles: np.ndarray, spacing: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.io.checked.arrays import read_npy
 
 if TYPE_CHECKING:
     from gsfluent.config import Select
@@ -41,7 +42,12 @@ def select_mask(gaussians: Gaussians, select: Select, frame: Frame) -> Tensor:
         chosen &= distance <= (_TOLERANCE if select.tolerance is None else select.tolerance)
     if select.labels is not None:
         labels = _read_labels(gaussians, select)
-        chosen &= labels.to(gaussians.device) == (1 if select.label is None else select.label)
+        wanted = 1 if select.label is None else select.label
+        if not bool((labels == wanted).any()):
+            raise InputError(
+                f"select: no splat has label {wanted} in {select.labels}", "look at its numbers"
+            )
+        chosen &= labels.to(gaussians.device) == wanted
     if not bool(chosen.any()):
         raise InputError(
             "select: no splat is selected",
@@ -53,25 +59,15 @@ def select_mask(gaussians: Gaussians, select: Select, frame: Frame) -> Tensor:
 def _read_labels(gaussians: Gaussians, select: Select) -> Tensor:
     import numpy as np
 
+    assert select.labels is not None
     try:
-        values = np.load(str(select.labels), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        values = read_npy(select.labels, hint="save it with numpy.save")
+    except InputError as error:
+        raise InputError(f"select.labels: {error.what}", error.hint) from error
+    if values.shape != (gaussians.count,) or values.dtype.kind not in "iub":
         raise InputError(
-            f"select.labels: {select.labels} is not a NumPy file ({error})",
-            "save it with numpy.save",
-        ) from error
-    if (
-        not isinstance(values, np.ndarray)
-        or values.shape != (gaussians.count,)
-        or values.dtype.kind not in "iub"
-    ):
-        got = (
-            f"{values.dtype} {list(values.shape)}"
-            if isinstance(values, np.ndarray)
-            else "an archive"
-        )
-        raise InputError(
-            f"select.labels: must be whole numbers [{gaussians.count}], got {got}",
+            f"select.labels: must be whole numbers [{gaussians.count}], got "
+            f"{values.dtype} {list(values.shape)}",
             "save one number per splat",
         )
     return torch.from_numpy(values.astype(np.int64))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,8 @@ from gsfluent.data import Frame, Solid
 from gsfluent.data.regions import source_key, source_paths
 from gsfluent.errors import InputError
 from gsfluent.io import atomic_path, load_capture, load_splats, write_json
+from gsfluent.io.checked.arrays import read_npz
+from gsfluent.io.checked.files import read_json
 from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.io.splats.load import save_splats
 from gsfluent.pipeline.capture.orient import Orientation, make_frame, orient
@@ -280,18 +281,16 @@ def load_solids(context: RunContext) -> dict[str, Solid]:
 
 
 def _with_labels(solid: Solid, path: Path) -> Solid:
-    import zipfile
-
+    hint = "remove the folder; the next run makes it again"
+    regions = read_npz(path.with_name(path.name + ".npz"), ["regions"], hint)["regions"]
+    table = read_json(path.with_name(path.name + ".json"), hint)
+    if not isinstance(table, dict) or not set(_KEYS) <= set(table):
+        raise InputError(f"{path}.json: not the labels of a run", hint)
+    report = {**solid.report, **{key: table[key] for key in _KEYS}}
     try:
-        with np.load(path.with_name(path.name + ".npz"), allow_pickle=False) as data:
-            regions = torch.from_numpy(data["regions"])
-        table = json.loads(path.with_name(path.name + ".json").read_text(encoding="utf-8"))
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{path}: the labels of the run are damaged ({error})",
-            "remove the folder; the next run makes them again",
-        ) from error
-    return solid.replace(regions=regions, report={**solid.report, **table})
+        return solid.replace(regions=torch.from_numpy(regions), report=report)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}.npz: not the labels of this solid ({error})", hint) from error
 
 
 def context_of(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 import yaml
@@ -14,6 +16,7 @@ from gsfluent.data import SURFACE, Gaussians
 from gsfluent.io import save_splats
 from gsfluent.results.digests import file_digest
 from gsfluent.run.shot import run_shot
+from gsfluent.stages import simulate
 
 FRAMES = 3
 SHOWN = ("video.mp4", "poster.png", "interior.png")
@@ -52,6 +55,26 @@ def write_shot(folder: Path, **changes: Any) -> Path:
 def run(path: Path, out: Path) -> dict[str, Any]:
     """Run a shot without a plan."""
     return run_shot(load_shot(path), out, plan=False)
+
+
+def stop(path: Path, finished: Path, out: Path) -> None:
+    """Leave a run with two of its frames on disk, as Ctrl-C would."""
+    shutil.copytree(finished, out)
+    for name in ("simulate", "render"):
+        shutil.rmtree(out / "stages" / name)
+    save = simulate.save_frame
+
+    def stopping(folder: Path, frame: Any) -> None:
+        if frame.index == 2:
+            raise KeyboardInterrupt
+        save(folder, frame)
+
+    with mock.patch.object(simulate, "save_frame", stopping):
+        try:
+            run(path, out)
+        except KeyboardInterrupt as error:
+            assert "resume" in str(error)
+    assert (out / "stages" / "simulate" / "state.pt").is_file()
 
 
 def results(out: Path) -> dict[str, str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import random
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fault_harm import flip, flips
 from fault_shot import redone, results, run
 
 from gsfluent.errors import RunError
@@ -25,22 +26,8 @@ class Begun(Exception):
     """A stage was not taken up but begun, with these files in its folder."""
 
 
-def flip(path: Path, place: int) -> None:
-    """Flip one bit of a file; ``place`` counts its bits."""
-    data = bytearray(path.read_bytes())
-    data[place // 8] ^= 1 << place % 8
-    path.write_bytes(bytes(data))
-
-
 def begin(folder: Path) -> dict[str, Any]:
     raise Begun(sorted(path.name for path in folder.iterdir()))
-
-
-def flips(source: Path, names: list[str], count: int) -> list[tuple[str, int]]:
-    """As many bits of every file."""
-    chance = random.Random(0)
-    sizes = {name: 8 * (source / name).stat().st_size for name in names}
-    return [(name, chance.randrange(size)) for name, size in sizes.items() for _ in range(count)]
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -172,6 +159,35 @@ def test_a_record_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> Non
         flip(tmp_path / RECORD, place)
     (tmp_path / RECORD).write_text("[" * 100_000)
     assert read_record(tmp_path / RECORD)[0] == {}
+
+
+@pytest.mark.parametrize("name", ["report", "files", "seconds"])
+def test_a_record_without_all_its_values_is_not_believed(name: str, tmp_path: Path) -> None:
+    def work(folder: Path) -> dict[str, Any]:
+        (folder / "a.ply").write_text("a")
+        return {}
+
+    StageStore(tmp_path).run("s", "key", work)
+    values, _ = read_record(tmp_path / "s" / RECORD)
+    del values[name]
+    write_record(tmp_path / "s" / RECORD, values)  # with a digest that fits
+    result = StageStore(tmp_path).run("s", "key", work)
+    assert not result.resumed and f"without {name}" in result.redone
+    assert StageStore(tmp_path).run("s", "key", work).resumed
+
+
+@pytest.mark.parametrize("seconds", [0, 4e9], ids=["1970", "2096"])
+def test_a_clock_that_was_set_changes_nothing(
+    seconds: float, finished: Path, shot: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    (out / "stages" / f".film.{2**30}.partial.mp4").write_text("of a dead run")
+    for path in out.rglob("*"):
+        os.utime(path, (seconds, seconds))
+    values = run(shot, out)
+    assert all(stage["resumed"] for stage in values["stages"]) and redone(values) == []
+    assert results(out) == results(finished)  # the half-written film is gone
 
 
 def test_other_results_of_a_stage_are_built_on_anew(tmp_path: Path) -> None:

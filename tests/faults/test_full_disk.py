@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import errno
-import os
-import resource
 import shutil
-import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from fault_harm import NoDisk, disk_of, little_room
 from fault_shot import redone, results, run
 
 from gsfluent.data import Frame, Gaussians
@@ -27,17 +24,6 @@ from gsfluent.results.frames import load_frame, save_frame
 from gsfluent.results.partition import load_partition, save_partition
 
 ROOM = 600  # bytes
-
-
-@contextmanager
-def little_room(size: int = ROOM) -> Iterator[None]:
-    """No file may grow beyond a size: the system itself refuses the write, as a full disk does."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def tensors(folder: Path, run: Path) -> None:
@@ -92,7 +78,7 @@ WRITERS: list[Callable[[Path, Path], None]] = [
 def test_whatever_is_written_ends_whole_or_not_at_all(
     write: Callable[[Path, Path], None], finished: Path, tmp_path: Path
 ) -> None:
-    with little_room(), pytest.raises(RunError) as caught:
+    with little_room(ROOM), pytest.raises(RunError) as caught:
         write(tmp_path, finished)
     assert str(tmp_path) in caught.value.what and "space" in caught.value.hint
     assert caught.value.kept and list(tmp_path.iterdir()) == []
@@ -137,29 +123,25 @@ def test_a_state_that_does_not_fit_stops_the_run_and_the_next_goes_on(
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of its own, of 300 kB; only root can make one."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)]
-    if os.geteuid() != 0 or shutil.which("mount") is None:
-        pytest.skip("only root can make a file system")
-    made = subprocess.run(words, capture_output=True, text=True, check=False)
-    if made.returncode:
-        pytest.skip(f"no file system can be made here: {made.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
+def small_disk(tmp_path: Path) -> Iterator[tuple[Path, Callable[[int], None]]]:
+    """A file system of its own, of 300 kB, and what makes it larger; only root can make one."""
+    try:
+        with disk_of(tmp_path / "disk", 300_000) as grow:
+            yield tmp_path / "disk", grow
+    except NoDisk as error:
+        pytest.skip(str(error))
 
 
 def test_a_run_on_a_full_disk_goes_on_once_there_is_room(
-    finished: Path, shot: Path, small_disk: Path
+    finished: Path, shot: Path, small_disk: tuple[Path, Callable[[int], None]]
 ) -> None:
-    filler = small_disk / "filler"
+    disk, grow = small_disk
+    filler = disk / "filler"
     filler.write_bytes(bytes(200_000))
-    out = small_disk / "out"
+    out = disk / "out"
     with pytest.raises((RunError, OSError)) as caught:
         run(shot, out)
     assert "space" in str(caught.value).lower() and not list(out.rglob("*partial*"))
     filler.unlink()
-    subprocess.run(["mount", "-o", "remount,size=2m", str(small_disk)], check=True)
+    grow(2_000_000)
     assert redone(run(shot, out)) == [] and results(out) == results(finished)

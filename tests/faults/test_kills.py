@@ -9,12 +9,12 @@ import shutil
 import signal
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from fault_harm import at_once, child_of, die_at, in_child
 from fault_shot import results, run
 
 from gsfluent.config import load_shot
@@ -27,18 +27,6 @@ from gsfluent.results.store import StageStore
 from gsfluent.run.shot import run_shot
 
 FRAMES = 4
-
-
-def in_child(work: Callable[[], int]) -> int:
-    """Do something in a process of its own; returns what :func:`os.waitpid` says of its end."""
-    child = os.fork()
-    if child == 0:
-        code = 9
-        try:
-            code = work()
-        finally:
-            os._exit(code)
-    return os.waitpid(child, 0)[1]
 
 
 def simulate(folder: Path) -> dict[str, Any]:
@@ -63,26 +51,15 @@ def files(out: Path) -> dict[str, str]:
     return {p.name: file_digest(p) for p in folder.iterdir() if p.name != "stage.json"}
 
 
-def killed_at(count: int, *, before: bool) -> Callable[[Path], int]:
-    """A stage whose process is killed at the n-th file, before or after it gets its name."""
+def dies(out: Path, count: int, *, before: bool = True) -> int:
+    """Begin the stage in a process that is killed at its n-th file; how that ended."""
 
-    def work(out: Path) -> int:
-        rename, seen = os.replace, 0
-
-        def dying(source: Any, target: Any) -> None:
-            nonlocal seen
-            seen += 1
-            if seen == count and before:
-                os.kill(os.getpid(), signal.SIGKILL)
-            rename(source, target)
-            if seen == count:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-        os.replace = dying
+    def work() -> int:
+        die_at(count, before=before)
         stage_of(out)
         return 0
 
-    return work
+    return in_child(work)
 
 
 @pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
@@ -92,7 +69,7 @@ def test_a_kill_at_any_file_loses_nothing(before: bool, tmp_path: Path) -> None:
     kills = 0
     for count in range(1, 17):
         out = tmp_path / str(count)
-        end = in_child(lambda count=count, out=out: killed_at(count, before=before)(out))  # type: ignore[misc]
+        end = dies(out, count, before=before)
         kills += os.WIFSIGNALED(end)
         state = out / "stages" / "simulate" / "state.pt"
         saved = int(torch.load(state)["done"]) if state.is_file() else 0
@@ -107,7 +84,7 @@ def test_a_kill_in_the_middle_of_a_killed_run_loses_nothing(tmp_path: Path) -> N
     wanted, out = tmp_path / "whole", tmp_path / "out"
     stage_of(wanted)
     for _ in range(3):  # at the state of a frame, before it has its name: twice the same work
-        assert os.WIFSIGNALED(in_child(lambda: killed_at(8, before=True)(out)))
+        assert os.WIFSIGNALED(dies(out, 8))
     assert stage_of(out).redone == "" and files(out) == files(wanted)
 
 
@@ -124,10 +101,7 @@ def test_the_second_of_two_runs_touches_nothing(
             time.sleep(60)
         return 0
 
-    child = os.fork()
-    if child == 0:
-        first()
-        os._exit(0)
+    child = child_of(first)
     try:
         assert os.read(told, 1) == b"!"
         state = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
@@ -147,11 +121,8 @@ def test_the_second_of_two_runs_touches_nothing(
 
 def test_of_many_that_start_at_once_one_works_at_a_time(tmp_path: Path) -> None:
     inside = tmp_path / "inside"
-    gate = tmp_path / "gate"
 
     def start() -> int:
-        while not gate.exists():
-            time.sleep(0.001)
         try:
             with locked(tmp_path / "out"):
                 os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
@@ -162,19 +133,7 @@ def test_of_many_that_start_at_once_one_works_at_a_time(tmp_path: Path) -> None:
         return 0
 
     for _ in range(5):
-        children = []
-        for _ in range(4):
-            child = os.fork()
-            if child == 0:
-                code = 9
-                try:
-                    code = start()
-                finally:
-                    os._exit(code)
-            children.append(child)
-        gate.touch()
-        ends = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
-        gate.unlink()
+        ends = at_once(start, 4, tmp_path / "gate")
         assert set(ends) <= {0, 3} and 0 in ends
 
 

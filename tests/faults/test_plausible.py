@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from gsfluent.data import Frame
 from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import Simulate
+from gsfluent.results.frames import load_frame, save_frame
 from gsfluent.scene.scene import Scene
 
 SOFT = materials.elastic.override(young_modulus=2e4)
@@ -99,3 +101,9 @@ def test_a_puddle_may_be_flat() -> None:
     run = Simulate(dx=0.03).run_of(dropped(water), 20.0)
     flat = moved(run, lambda x: x * torch.tensor([3.0, 3.0, 1e-3]))
     assert run.watch.implausible(flat, [False], 0.0) == ""
+
+
+def test_a_speed_beyond_all_sense_is_finite_on_disk(finished: Path, tmp_path: Path) -> None:
+    frame = load_frame(finished / "stages" / "simulate", 0)
+    save_frame(tmp_path, dataclasses.replace(frame, velocity=frame.velocity + 1e6))
+    assert load_frame(tmp_path, 0).velocity.min() == 65504.0  # the largest half

@@ -18,8 +18,9 @@ import fuzz_containers as containers
 import numpy as np
 import torch
 import viewer_scene
+from PIL import Image
 
-from gsfluent.config import load_shot
+from gsfluent.config import Select, load_shot
 from gsfluent.config.physgaussian.read import convert
 from gsfluent.data import Frame, Gaussians, Solid
 from gsfluent.errors import InputError
@@ -36,6 +37,11 @@ from gsfluent.pipeline.texture.photo.read import read_pixels
 from gsfluent.results.frames import load_frame, save_frame
 from gsfluent.results.partition import SavedPartition, SavedSplit, load_partition, save_partition
 from gsfluent.results.record import read_frame, shot_of
+from gsfluent.run.report import read_run as read_record
+from gsfluent.spatial.mesh_file import load_mesh, mesh_files
+from gsfluent.spatial.mesh_surface import surface_points
+from gsfluent.stages.select import select_mask
+from gsfluent.stages.solids import _with_labels
 from gsfluent.viewer.model.source import RunSource
 
 SIZE = (24, 18)
@@ -125,8 +131,6 @@ def labels() -> np.ndarray:
 
 
 def picture(path: Path, values: np.ndarray) -> None:
-    from PIL import Image
-
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(values).save(path)
 
@@ -327,6 +331,57 @@ def ply_labels(folder: Path) -> None:
     (folder / "points.ply").write_bytes((head + "end_header\n").encode() + rows.tobytes() + face)
 
 
+def mesh(kind: str) -> Callable[[Path], None]:
+    """A coloured box, with a texture where the format has one."""
+
+    def make(folder: Path) -> None:
+        import trimesh
+
+        folder.mkdir(exist_ok=True)
+        box = trimesh.creation.box((1.0, 2.0, 3.0))
+        if kind in ("obj", "glb"):
+            paint = trimesh.visual.material.PBRMaterial(
+                baseColorTexture=Image.fromarray(colors(8, 6))
+            )
+            box.visual = trimesh.visual.TextureVisuals(box.vertices[:, :2], material=paint)
+        if kind == "gltf":
+            for name, data in trimesh.exchange.gltf.export_gltf(box.scene()).items():
+                (folder / name.replace("model", "a")).write_bytes(data)
+        else:
+            box.export(folder / f"a.{kind}")
+
+    return make
+
+
+def read_mesh(name: str) -> Callable[[Path], Any]:
+    def read(folder: Path) -> list[Any]:
+        whole = load_mesh(folder / name)
+        shown = surface_points(folder / name, 50)
+        return [np.asarray(whole.vertices), mesh_files(folder / name) and shown]
+
+    return read
+
+
+def chosen(folder: Path) -> None:
+    splats(folder)
+    np.save(folder / "labels.npy", np.arange(load_splats(folder / "a.ply").count) % 2)
+
+
+def read_chosen(folder: Path) -> Any:
+    select = Select(labels=folder / "labels.npy", label=1)
+    return select_mask(load_splats(folder / "a.ply"), select, Frame.identity())
+
+
+def regions(folder: Path) -> None:
+    solid(folder)
+    np.savez_compressed(folder / "r.npz", regions=np.ones((3, 4, 5), np.int32))
+    write("r.json", {"regions": {"rind": 0}, "region_sources": [{"labels": "a"}]})(folder)
+
+
+def read_regions(folder: Path) -> Any:
+    return _with_labels(load_solid(folder / "a.ply"), folder / "r").regions
+
+
 READERS: dict[str, Reader] = {
     "ply": Reader(splats, "a.ply", lambda f: load_splats(f / "a.ply")),
     "ply_packed": Reader(
@@ -360,7 +415,10 @@ READERS: dict[str, Reader] = {
         lambda f: load_image(f / "a.tif"),
     ),
     "exemplar": Reader(
-        image("a.png"), "a.png", lambda f: read_pixels(f / "a.png", "a"), containers.png
+        image("a.png"),
+        "a.png",
+        lambda f: read_pixels(f / "a.png", str(f / "a.png")),
+        containers.png,
     ),
     "exemplar_parts": Reader(
         image("a.png", labels()),
@@ -430,6 +488,18 @@ READERS: dict[str, Reader] = {
         "run.json",
         lambda f: shot_of(f).resolved(),
     ),
+    "run_record": Reader(
+        write("run.json", {"verdict": "clean", "stages": [{"name": "fill", "seconds": 1.5}]}),
+        "run.json",
+        read_record,
+    ),
+    "select_labels": Reader(chosen, "labels.npy", read_chosen),
+    "region_labels": Reader(regions, "r.npz", read_regions, containers.archive),
+    "region_table": Reader(regions, "r.json", read_regions),
+    **{
+        f"mesh_{kind}": Reader(mesh(kind), f"a.{kind}", read_mesh(f"a.{kind}"))
+        for kind in ("obj", "stl", "off", "ply", "glb", "gltf")
+    },
     "scene_frame": Reader(
         write("frame.json", Frame.identity().to_dict()), "frame.json", lambda f: read_frame(f)
     ),

@@ -1,4 +1,4 @@
-"""A short round of changed files over every reader; scripts/safety has the long one."""
+"""Changed files for every reader, in seconds; scripts/safety/fuzz.py goes on for hours."""
 
 from __future__ import annotations
 

@@ -29,7 +29,18 @@ from gsfluent.io.checked.limits import LIMITS, limit, unpacked_limit, within
 from gsfluent.io.segmentation import load_segmentation
 from gsfluent.io.segmentation.sam import decode_rle, painted, read_rle
 from gsfluent.io.segmentation.sam import read_json as sam_json
-from gsfluent.io.splats.delta import BLOCK, END, MAGIC, TRAILER, unpack_arrays
+from gsfluent.io.splats.delta import (
+    BLOCK,
+    END,
+    KEY,
+    MAGIC,
+    TRAILER,
+    DeltaFrame,
+    _check_finite,
+    decode,
+    unpack_arrays,
+)  # fmt: skip
+from gsfluent.io.splats.delta_write import Roster, steps, write_delta
 from gsfluent.pipeline.light.environment import of_file
 from gsfluent.pipeline.render.camera import read_path
 from gsfluent.results.frames import load_frame
@@ -160,7 +171,9 @@ def test_numpy_files_that_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert unpacked_limit(1 << 30) == 50 << 30  # large honest files stay readable
 
 
-@pytest.mark.parametrize("shape", ["(1000000000000,)", "(4, -1)", "(3, 4)", f"({'9' * 40},)"])
+@pytest.mark.parametrize(
+    "shape", ["(1000000000000,)", "(4, -1)", "(3, 4)", f"({'9' * 40},)", "(1, ("]
+)
 def test_numpy_headers_that_lie(tmp_path: Path, shape: str) -> None:
     text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     body = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + bytes(64)
@@ -205,6 +218,24 @@ def test_pictures_of_absurd_size(tmp_path: Path, width: int, height: int) -> Non
     refused(lambda: of_file(tmp_path / "a.png"), "above the limit")
     (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\n\n-Y %d +X %d\n" % (height, width) + bytes(64))
     refused(lambda: of_file(tmp_path / "a.hdr"), "above the limit")
+
+
+def test_other_formats_of_absurd_size(tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.tif")
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    (start,) = struct.unpack_from("<I", data, 4)
+    for entry in range(struct.unpack_from("<H", data, start)[0]):
+        tag, kind = struct.unpack_from("<HH", data, start + 2 + 12 * entry)
+        if tag in (256, 257):  # width and height
+            struct.pack_into("<I" if kind == 4 else "<H", data, start + 10 + 12 * entry, 60_000)
+    (tmp_path / "a.tif").write_bytes(data)
+    refused(lambda: load_image(tmp_path / "a.tif"), "above the limit")
+    refused(lambda: of_file(tmp_path / "a.tif"), "above the limit")
+    (tmp_path / "a.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(99))
+    refused(lambda: of_file(tmp_path / "a.exr"), "not a picture")
+    refused(lambda: load_image(tmp_path / "a.exr"), "not an image")
 
 
 def test_a_picture_is_what_it_is_called(tmp_path: Path) -> None:
@@ -329,6 +360,34 @@ def test_a_delta_that_zlib_blows_up(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 )  # fmt: skip
 def test_delta_headers_that_lie(tmp_path: Path, header: dict[str, Any]) -> None:
     refused(lambda: DeltaReader(gsd(tmp_path / "a.gsd", b"", **header)), "the header")
+
+
+def test_delta_frames_that_lie(tmp_path: Path) -> None:
+    count = 3
+    one = np.ones(count)
+    frame = DeltaFrame(
+        0, 0.0, np.arange(count), np.zeros(count, np.int32), np.zeros((count, 3), np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (count, 1)), np.full((count, 3), 0.1, np.float32),
+        one.astype(np.float32), np.zeros((count, 3), np.float32),
+    )  # fmt: skip
+    roster = Roster()
+    roster.meet(frame)
+    write_delta(tmp_path / "a.gsd", [frame], roster, times=[0.0], fps=24.0, step=steps(1e-3),
+                key_every=1)  # fmt: skip
+    reader = DeltaReader(tmp_path / "a.gsd")
+    arrays = reader._payload(reader._frames[0], KEY, 0)
+
+    def read(at: int, value: int) -> None:
+        lying = [array.copy() for array in arrays]
+        lying[at][:] = value
+        state = decode(lying, reader._nothing(), reader._born, reader.step, key=True)
+        _check_finite(state, reader.step)
+
+    for largest in (-1, 4):
+        with pytest.raises(ValueError, match="four components"):
+            read(3, largest)
+    with pytest.raises(ValueError, match="finite place, turn, size or colour"):
+        read(5, 1 << 40)  # scales beyond all numbers
 
 
 # --- captures ---
@@ -495,11 +554,12 @@ def test_honest_aliases_are_read(tmp_path: Path) -> None:
 # --- results ---
 
 
-def test_frames_with_nan_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["means", "damage", "velocity", "led_positions"])
+def test_frames_with_nan_are_refused(name: str, tmp_path: Path) -> None:
     stream = io.BytesIO()
     head = {"index": 0, "time": 0.0, "carried": 1, "facts": {}}
-    arrays = {name: np.full((1, 3), np.nan, np.float32) for name in ("means", "scales")}
+    arrays = {"scales": np.ones((1, 3)), name: np.full((1, 3), np.nan, np.float32)}
     np.savez(stream, head=np.array(json.dumps(head)), **arrays)
     (tmp_path / "frame_0001.npz").write_bytes(stream.getvalue())
-    with pytest.raises(RunError, match="means holds NaN"):
+    with pytest.raises(RunError, match=f"{name} holds NaN"):
         load_frame(tmp_path, 0)

@@ -357,3 +357,25 @@ def test_garbage_in_block_tensors_never_leaves_the_arrays() -> None:
         rows[0, 8] = 1.0
         v, _, _ = ops.grid_update(grid, dx=DX, dt=0.1, blocks=blocks, colliders=rows)
         assert v.shape == (1, good.block_count, 64, 3)
+
+
+@pytest.mark.parametrize("far", [2**31 - 1, -(2**31), 2**29])
+def test_block_coordinates_at_the_ends_of_int32_lose_nothing(far: int) -> None:
+    # signed overflow; the sanitizer build (scripts/safety/sanitize.sh) would say so
+    c = cloud(200)
+    good = ops.build_blocks(c["position"], DX)
+    wrong = good.coords.clone()
+    wrong[::2] = far
+    blocks = good._replace(coords=wrong)
+    # particles of such a block go the slow way, by their positions
+    grid, moments = run_p2g(c, dx=DX, blocks=blocks, contact=True, **loaded(c))
+    want, _ = run_p2g(c, dx=DX, blocks=good, contact=True, **loaded(c))
+    assert torch.allclose(grid, want, atol=1e-12)
+    field = torch.randn(1, good.block_count, 64, 3, dtype=torch.float64)
+    got = ops.g2p(field, c["position"], dx=DX, dt=0.1, blocks=blocks)
+    expected = ops.g2p(field, c["position"], dx=DX, dt=0.1, blocks=good)
+    assert torch.allclose(got[1], expected[1], atol=1e-12)
+    pair = torch.cat([grid, grid])
+    both = torch.cat([moments, moments])
+    v = ops.grid_update(pair, dx=DX, dt=0.1, blocks=blocks, moments=both)[0]
+    assert v.shape == (2, good.block_count, 64, 3) and v.isfinite().all()

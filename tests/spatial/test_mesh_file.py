@@ -11,7 +11,8 @@ from PIL import Image
 
 from gsfluent.colors import linear_to_srgb
 from gsfluent.errors import InputError
-from gsfluent.spatial.mesh_file import is_mesh, mesh_files, surface_points, up_axes
+from gsfluent.spatial.mesh_file import is_mesh, mesh_files, up_axes
+from gsfluent.spatial.mesh_surface import surface_points
 
 
 def painted_box(extents: tuple[float, float, float] = (1.0, 2.0, 3.0)) -> trimesh.Trimesh:

@@ -110,8 +110,8 @@ struct ContactNear {
   GSF_HOST_DEVICE ContactSample<T> operator()(int side, int o) const {
     const int32_t x = local[0] + neighbour_step(o, 0), y = local[1] + neighbour_step(o, 1),
                   z = local[2] + neighbour_step(o, 2);
-    const int32_t b =
-        a.blocks.at(block[0] + block_of(x), block[1] + block_of(y), block[2] + block_of(z));
+    const int32_t b = a.blocks.at(beside(block[0], block_of(x)), beside(block[1], block_of(y)),
+                                  beside(block[2], block_of(z)));
     if (b < 0) return {T(0), {T(0), T(0), T(0)}};
     const int64_t n = int64_t(b) * kBlockNodes + local_index(local_of(x), local_of(y), local_of(z));
     const T mass = a.node(field[side], n)[3];

@@ -13,6 +13,10 @@ constexpr int kMaxFields = 64;
 
 GSF_HOST_DEVICE int32_t block_of(int32_t node) { return node >> 2; }
 GSF_HOST_DEVICE int32_t local_of(int32_t node) { return node & 3; }
+// Block coordinate `step` blocks on; one that wraps is in no table.
+GSF_HOST_DEVICE int32_t beside(int32_t block, int32_t step) {
+  return static_cast<int32_t>(static_cast<uint32_t>(block) + static_cast<uint32_t>(step));
+}
 GSF_HOST_DEVICE int32_t local_index(int32_t i, int32_t j, int32_t k) { return (i * 4 + j) * 4 + k; }
 
 // What build_blocks made, as pointers. Nothing read through it is trusted: every index is checked

@@ -19,8 +19,14 @@ inline int32_t color_stride(int32_t margin) { return (5 + 2 * margin) / kBlockEd
 class Window {
  public:
   Window(const BlockView& view, int64_t block) : view_(view), edge_(6 + 2 * view.margin) {
-    const int32_t* c = view.coords + 3 * block;
-    for (int axis = 0; axis < 3; ++axis) first_[axis] = c[axis] * kBlockEdge - view.margin;
+    // Nothing read through the view is trusted. Two blocks beyond the table there is no more to be
+    // found than 2^31 blocks beyond it, and node coordinates fit.
+    int32_t c[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      c[axis] = std::clamp(view.coords[3 * block + axis], view.origin[axis] - 2,
+                           view.origin[axis] + view.size[axis] + 1);
+      first_[axis] = c[axis] * kBlockEdge - view.margin;
+    }
     // A block its own coordinates do not lead back to would break the colouring; its particles go
     // the slow way.
     sound_ = view.at(c[0], c[1], c[2]) == block;

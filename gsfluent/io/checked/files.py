@@ -80,7 +80,15 @@ def read_json(path: str | Path, hint: str = "export it again", noun: str = "file
         InputError: As :func:`read_text`, no JSON, nested too deeply, or a number of hundreds of
             digits.
     """
-    text = read_text(path, noun=noun)
+    return parse_json(read_text(path, noun=noun), path, hint)
+
+
+def parse_json(text: str, path: str | Path, hint: str = "export it again") -> Any:
+    """The value in a text of JSON that was found in a file.
+
+    Raises:
+        InputError: As :func:`read_json`.
+    """
     try:
         return json.loads(text, parse_int=_whole)
     except RecursionError as error:

@@ -199,9 +199,9 @@ class DeltaReader:
             raise InputError(
                 f"{self.path}: version {version}, this gsfluent reads {VERSION}", "update gsfluent"
             )
-        text = stream.read(size)
-        if len(text) < size:
+        if 16 + size > self._size:  # read() would allocate what is said, not what is there
             raise self._short("inside the header")
+        text = stream.read(size)
         self._body = 16 + size
         try:
             header: dict[str, Any] = json.loads(text)
@@ -240,9 +240,9 @@ class DeltaReader:
             found, number, size, check = BLOCK.unpack(head)
             if (found, number) != (kind, frame):
                 raise self._damaged(name)
+            if at + BLOCK.size + size > self._size:
+                raise self._short(f"inside {name}")
             data = stream.read(size)
-        if len(data) < size:
-            raise self._short(f"inside {name}")
         if zlib.crc32(data) != check:
             raise self._damaged(f"{name} fails its check sum")
         try:

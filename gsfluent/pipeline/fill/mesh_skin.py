@@ -10,7 +10,7 @@ import torch
 
 from gsfluent.data import SURFACE, Gaussians
 from gsfluent.pipeline.fill.skin import facing
-from gsfluent.spatial.mesh_file import surface_points
+from gsfluent.spatial.mesh_surface import surface_points
 
 SPLATS = 60_000
 """Splats of a mesh's skin: those of a trained object of such a size."""

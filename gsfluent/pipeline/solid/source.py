@@ -21,12 +21,8 @@ from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.inside import find_leaks, keep_components
 from gsfluent.pipeline.solid.splats import solid_of_splats
 from gsfluent.spatial.density import GridBox
-from gsfluent.spatial.mesh_distance import (
-    grid_winding,
-    load_mesh,
-    oriented_samples,
-    signed_distances,
-)
+from gsfluent.spatial.mesh_distance import grid_winding, oriented_samples, signed_distances
+from gsfluent.spatial.mesh_file import load_mesh
 from gsfluent.spatial.winding import winding_numbers
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from gsfluent.pipeline.solid.outline import match_outline
 from gsfluent.pipeline.solid.source import find_solid
 from gsfluent.pipeline.solid.tsdf import ring_of_cameras, zoomed
 from gsfluent.pipeline.solid.walls import thin_shells, wall_thickness
-from gsfluent.spatial.mesh_distance import load_mesh
+from gsfluent.spatial.mesh_file import load_mesh
 
 
 def discs(mesh: trimesh.Trimesh, count: int = 30_000) -> Gaussians:
