@@ -10,11 +10,11 @@ from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
 from gsfluent.io.colmap import find_model, read_model
 from gsfluent.io.images import IMAGE_SUFFIXES
+from gsfluent.io.splats.load import READERS
 from gsfluent.io.transforms import read_poses, read_transforms
 from gsfluent.spatial.mesh_file import is_mesh
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
-_SPLATS = (".ply", ".splat", ".spz", ".ksplat", ".sog")
 
 
 def kind_of(path: str | Path) -> str | None:
@@ -29,7 +29,7 @@ def kind_of(path: str | Path) -> str | None:
         return "capture" if posed or find_model(path) is not None else None
     if is_mesh(path):
         return "mesh"
-    if suffix in _SPLATS:
+    if suffix == ".ply" or suffix in READERS:
         return "splats"
     return {".json": "capture", ".yaml": "shot", ".yml": "shot"}.get(suffix)
 

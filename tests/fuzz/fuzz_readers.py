@@ -29,6 +29,7 @@ from gsfluent.io.segmentation import load_masks, load_segmentation
 from gsfluent.io.solid import save_solid
 from gsfluent.io.splats.delta import DeltaFrame
 from gsfluent.io.splats.delta_write import Roster, steps, write_delta
+from gsfluent.io.splats.splat import save_splat
 from gsfluent.pipeline.light.environment import of_file
 from gsfluent.pipeline.render.camera import read_path
 from gsfluent.pipeline.texture.photo.parts import read_parts
@@ -295,6 +296,25 @@ def splats(folder: Path, **options: Any) -> None:
     save_splats(some_gaussians(), folder / "a.ply", **options)
 
 
+def foreign(name: str) -> Callable[[Path], None]:
+    """A splat file that another program wrote; the folder of tests/io is on the path."""
+    source = Path(capture_files.__file__).parent / "foreign" / name
+    return lambda folder: (folder / name).write_bytes(source.read_bytes()) and None
+
+
+def checkpoint(folder: Path) -> None:
+    some = some_gaussians()
+    values = {
+        "means": some.means, "quats": some.quats, "scales": some.scales.log(),
+        "opacities": torch.logit(some.opacities), "sh0": some.sh[:, :1], "shN": some.sh[:, 1:],
+    }  # fmt: skip
+    torch.save({"step": 1, "splats": values}, folder / "a.pt")
+
+
+def read_splats(name: str) -> Callable[[Path], Any]:
+    return lambda folder: load_splats(folder / name)
+
+
 def read_capture(folder: Path) -> list[Any]:
     capture = load_capture(folder)
     # only what is small: that large pictures are refused is tested elsewhere
@@ -332,6 +352,26 @@ READERS: dict[str, Reader] = {
     "ply_packed": Reader(
         lambda f: splats(f, compressed=True), "a.ply", lambda f: load_splats(f / "a.ply")
     ),
+    "splat": Reader(
+        lambda f: save_splat(some_gaussians(), f / "a.splat"), "a.splat", read_splats("a.splat")
+    ),
+    "spz": Reader(
+        foreign("forty.spz"), "forty.spz", read_splats("forty.spz"), containers.gzipped
+    ),
+    "spz_bytes": Reader(foreign("forty.spz"), "forty.spz", read_splats("forty.spz")),
+    **{
+        f"ksplat_{level}": Reader(
+            foreign(f"forty_{level}.ksplat"), f"forty_{level}.ksplat",
+            read_splats(f"forty_{level}.ksplat"),
+        )
+        for level in range(3)
+    },
+    "sog": Reader(
+        foreign("forty.sog"), "forty.sog", read_splats("forty.sog"), containers.archive
+    ),
+    "sog_zip": Reader(foreign("forty.sog"), "forty.sog", read_splats("forty.sog")),
+    "checkpoint": Reader(checkpoint, "a.pt", read_splats("a.pt"), containers.archive),
+    "checkpoint_zip": Reader(checkpoint, "a.pt", read_splats("a.pt")),
     "ply_text": Reader(transforms, "points.ply", read_capture),
     "ply_lists": Reader(capture_and(points=ply_labels), "points.ply", read_capture),
     "solid": Reader(solid, "a.volume.npz", lambda f: load_solid(f / "a.ply"), containers.archive),
