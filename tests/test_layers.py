@@ -23,7 +23,7 @@ CORE = [p for p in CSRC if ROOT / "csrc" / "core" in p.parents]
 # stands for what is in it and below it, as far as that has no line of its own.
 ORDER = (
     "_lazy.py __init__.py lazy.py errors.py geometry.py colors.py progress.py hardware.py "
-    "_load.py _check.py data materials ops metrics.py draw.py spatial demo io scene figure "
+    "_load.py _check.py data materials ops metrics.py draw.py spatial demo io posing scene figure "
     "config/yaml_file.py config config/physgaussian results "
     "pipeline/__init__.py pipeline/stage.py pipeline/capture pipeline/matter pipeline/liquid "
     "pipeline/colliders "

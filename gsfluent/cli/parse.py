@@ -13,6 +13,7 @@ from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_export import Export
 from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
+from gsfluent.cli.verbs_poses import Poses
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
 from gsfluent.cli.verbs_view import View
@@ -20,6 +21,7 @@ from gsfluent.cli.verbs_view import View
 VERBS: dict[str, type[Verb]] = {
     "doctor": Doctor,
     "demo": Demo,
+    "poses": Poses,
     "inspect": Inspect,
     "reconstruct": Reconstruct,
     "fill": Fill,

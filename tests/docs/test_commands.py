@@ -40,7 +40,7 @@ SMALLER: dict[str, list[list[str]]] = {
 }
 """Flags that a command gets to be quick, unless its line has them already."""
 
-NEEDS = {"sdxl-inpainting": "transformers"}
+NEEDS = {"sdxl-inpainting": "transformers", "poses photos": "pycolmap"}
 """What an example names that only an extra can read."""
 
 LOOKS_ONLY = {"doctor", "plan", "metrics"}

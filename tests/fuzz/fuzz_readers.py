@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -321,6 +322,28 @@ def read_capture(folder: Path) -> list[Any]:
     return [capture.cameras, capture.points, capture.point_colors, capture.view(0, 32)]
 
 
+def zipped(folder: Path) -> None:
+    transforms(folder / "raw")
+    with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted((folder / "raw").rglob("*")):
+            archive.write(file, file.relative_to(folder / "raw"))
+
+
+def read_zipped(folder: Path) -> Any:
+    shutil.rmtree(folder / "a_unpacked", ignore_errors=True)
+    return load_capture(folder / "a.zip").cameras
+
+
+def polycam(folder: Path) -> None:
+    photographs(folder / "keyframes")
+    place = folder / "keyframes" / "cameras"
+    place.mkdir()
+    lens = {"fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 9.0, "width": SIZE[0], "height": SIZE[1]}
+    pose = {f"t_{row}{column}": float(row == column) for row in range(3) for column in range(4)}
+    for name in ("0", "1"):
+        (place / f"{name}.json").write_text(json.dumps(pose | lens))
+
+
 def read_labels(name: str) -> Callable[[Path], Any]:
     return lambda folder: [
         view.labels for view in load_segmentation(folder / name, load_capture(folder)).views
@@ -387,6 +410,9 @@ READERS: dict[str, Reader] = {
     },
     "transforms": Reader(transforms, "transforms.json", read_capture),
     "poses": Reader(transforms, "transforms.json", lambda f: load_poses(f / "transforms.json")),
+    "zip_bytes": Reader(zipped, "a.zip", read_zipped),
+    "zip": Reader(zipped, "a.zip", read_zipped, containers.archive),
+    "polycam": Reader(polycam, "keyframes/cameras/0.json", read_capture),
     "photograph": Reader(transforms, "images/0.png", read_capture, containers.png),
     **{
         f"image_{kind}": Reader(

@@ -92,7 +92,7 @@ def test_our_own_splat_and_spz_come_back(tmp_path: Path, truth: Gaussians) -> No
 def trained(truth: Gaussians) -> torch.nn.ParameterDict:
     """The splats as a trainer holds them: quaternions of any length, logits, logarithms."""
     values = {
-        "means": truth.means, "quats": 2 * truth.quats, "scales": truth.scales.log(),
+        "means": truth.means.clone(), "quats": 2 * truth.quats, "scales": truth.scales.log(),
         "opacities": torch.logit(truth.opacities), "sh0": truth.sh[:, :1].clone(),
         "shN": truth.sh[:, 1:].clone(),
     }  # fmt: skip
@@ -166,7 +166,7 @@ def rewritten(path: Path, ending: str, change: Any) -> Path:
 @pytest.mark.parametrize(("name", "data", "said"), [
     ("a.splat", b"", "no rows of 32"), ("a.splat", bytes(33), "no rows of 32"),
     ("a.spz", b"PK", "no .spz"), ("a.spz", gzip.compress(b"NG"), "within its header"),
-    ("a.ksplat", bytes(5000), "version 0.0"), ("a.ksplat", b"\0\1", "version 0.0"),
+    ("a.ksplat", bytes(5000), "version 0.0"), ("a.ksplat", b"\0\1", "damaged"),
     ("a.ksplat", b"\0\1" + bytes(4094), "no section"), ("a.sog", b"PK", "damaged"),
     ("a.pt", b"PK", "no checkpoint"),
 ])  # fmt: skip
