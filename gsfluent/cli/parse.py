@@ -16,7 +16,7 @@ from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
 from gsfluent.cli.verbs_poses import Poses
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
-from gsfluent.cli.verbs_view import View
+from gsfluent.cli.verbs_view import Studio, View
 
 VERBS: dict[str, type[Verb]] = {
     "doctor": Doctor,
@@ -32,6 +32,7 @@ VERBS: dict[str, type[Verb]] = {
     "render": Render,
     "report": Report,
     "view": View,
+    "studio": Studio,
     "export": Export,
     "metrics": Metrics,
     "chart": Chart,

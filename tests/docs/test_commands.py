@@ -64,7 +64,11 @@ COMMANDS = [words[1:] for words in lines() if words[0] == "gsfluent"]
 OTHERS = [
     words for words in lines() if words[0] != "gsfluent" and "fracturebench" not in " ".join(words)
 ]
-SERVES = [words for words in COMMANDS if words[0] == "view" and "--check" not in words]
+SERVES = [
+    words
+    for words in COMMANDS
+    if words[0] == "studio" or (words[0] == "view" and "--check" not in words)
+]
 ENDS = [words for words in COMMANDS if words not in SERVES]
 
 
@@ -117,24 +121,26 @@ def test_page_is_served_until_ctrl_c(
     words: list[str], place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from gsfluent.studio.serve import Studio
     from gsfluent.viewer.app import App
 
+    served: Any = Studio if words[0] == "studio" else App
     monkeypatch.chdir(place)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     answers: list[int] = []
     serving, over = threading.Event(), threading.Event()
-    wait = App.wait
+    wait = served.wait
 
     address = [""]
 
-    def say_so_and_wait(app: App) -> None:
+    def say_so_and_wait(app: Any) -> None:
         address[0] = app.url.replace("localhost", "127.0.0.1")
         serving.set()
         wait(app)
 
-    monkeypatch.setattr(App, "wait", say_so_and_wait)
+    monkeypatch.setattr(served, "wait", say_so_and_wait)
 
     def visit() -> None:
         """Ask for the page as soon as it is served, then press Ctrl-C."""
