@@ -26,7 +26,13 @@ def test_every_block_says_what_it_is() -> None:
         assert set(opened) <= {"bash", "python", "yaml", "json", "text"}, page.name
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def marked(page: Path) -> object:
+    """The page, as slow where it reconstructs, paints or needs a whole run."""
+    slow = page.name in ("first-run.md", *GIVEN)
+    return pytest.param(page, marks=[pytest.mark.slow] if slow else [], id=page.name)
+
+
+@pytest.mark.parametrize("page", [marked(page) for page in PAGES])
 def test_blocks_run(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     if page.name in NEEDS:
         pytest.importorskip(NEEDS[page.name])
