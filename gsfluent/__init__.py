@@ -16,7 +16,17 @@ __version__ = "0.1.0"
 __getattr__, __dir__, __all__ = lazy(
     __name__,
     {
-        "gsfluent": ("ops", "pipeline", "data", "io", "materials", "geometry", "metrics", "errors"),
+        "gsfluent": (
+            "ops",
+            "pipeline",
+            "data",
+            "demo",
+            "io",
+            "materials",
+            "geometry",
+            "metrics",
+            "errors",
+        ),
         "gsfluent.data": ("Gaussians", "Camera", "Capture", "Frame", "Solid", "Particles"),
         "gsfluent.scene.scene": ("Scene",),
         "gsfluent.io": ("load", "save", "load_capture"),

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from types import ModuleType
 
 EXTRAS = {
+    "poses": ("pycolmap",),
     "mesh": ("scikit-image",),
     "viewer": ("viser",),
     "usd": ("usd-core",),

@@ -22,6 +22,7 @@ from gsfluent.io.usd import open_usd
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.mesh import closed_mesh
 from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter, InpaintOptions
+from gsfluent.posing.colmap import find_poses
 from gsfluent.run.report import report_page
 from gsfluent.viewer.guard import Guard
 from gsfluent.viewer.server import start_server
@@ -31,6 +32,10 @@ PROJECT = tomllib.loads(
     (Path(__file__).resolve().parents[1] / "pyproject.toml").read_text(encoding="utf-8")
 )["project"]
 Blocker = Callable[[str], None]
+
+
+def poses(tmp_path: Path) -> None:
+    find_poses(tmp_path, tmp_path / "out")
 
 
 def surface(tmp_path: Path) -> None:
@@ -62,6 +67,7 @@ def inpaint_from_memory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("act", "module", "extra"),
     [
+        (poses, "pycolmap", "poses"),
         (surface, "skimage", "mesh"),
         (page, "viser", "viewer"),
         (stage, "pxr", "usd"),
@@ -141,7 +147,7 @@ def test_every_module_loads_without_the_extras() -> None:
     code = """
 import importlib, pkgutil, sys
 sys.modules |= dict.fromkeys(
-    ["skimage", "viser", "pxr", "transformers", "accelerate", "matplotlib"])
+    ["pycolmap", "skimage", "viser", "pxr", "transformers", "accelerate", "matplotlib"])
 import gsfluent
 names = [m.name for m in pkgutil.walk_packages(gsfluent.__path__, "gsfluent.")]
 for name in names:

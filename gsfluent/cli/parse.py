@@ -13,13 +13,15 @@ from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_export import Export
 from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
+from gsfluent.cli.verbs_poses import Poses
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
-from gsfluent.cli.verbs_view import View
+from gsfluent.cli.verbs_view import Studio, View
 
 VERBS: dict[str, type[Verb]] = {
     "doctor": Doctor,
     "demo": Demo,
+    "poses": Poses,
     "inspect": Inspect,
     "reconstruct": Reconstruct,
     "fill": Fill,
@@ -30,6 +32,7 @@ VERBS: dict[str, type[Verb]] = {
     "render": Render,
     "report": Report,
     "view": View,
+    "studio": Studio,
     "export": Export,
     "metrics": Metrics,
     "chart": Chart,

@@ -67,7 +67,7 @@ class Reconstruct(Verb):
         """Reconstruct and write."""
         from gsfluent.run.single import reconstruct_to
 
-        existing(self.capture, "CAPTURE", folder=True)
+        existing(self.capture, "CAPTURE")
         with self.progress("reconstruct") as progress:
             return reconstruct_to(
                 self.capture,

@@ -1,4 +1,4 @@
-"""The verb that opens a window: view."""
+"""The verbs that open a page: view, studio."""
 
 from __future__ import annotations
 
@@ -85,4 +85,36 @@ class View(Verb):
             device=self.torch_device(),
             browser=self.open,
             **self.given("material", "run", "quality", "slow", "cracks", "seed", "host", "port"),
+        )
+
+
+@dataclass(kw_only=True)
+class Studio(Verb):
+    """From a file to a film on a page in the browser: choose, plan, run, watch, export.
+
+    Examples:
+      gsfluent studio                         # of this folder; prints an address, Ctrl-C ends
+      gsfluent studio objects --port 9000     # of another folder
+      gsfluent studio --no-open               # no browser window is opened
+
+    The page lists the meshes, splats and captures of FOLDER and takes uploads into it. Results of
+    melon.ply go to melon_out, as those of `gsfluent run`. It answers this machine only.
+    """
+
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER")] = Path(".")
+    """Where objects lie and results go."""
+    port: int = 8080
+    """Port; the next free one is taken when it is in use."""
+    open: bool = True
+    """Open the page in the browser."""
+
+    def execute(self) -> dict[str, Any]:
+        """Serve."""
+        from gsfluent.studio.serve import serve_studio
+
+        return serve_studio(
+            existing(self.folder, "FOLDER", folder=True),
+            device=self.torch_device(),
+            browser=self.open,
+            **self.given("seed", "port"),
         )

@@ -63,12 +63,14 @@ class Shot:
 
     capture: Path | None = optional(
         input_path("capture"),
-        "Folder with a COLMAP model or transforms.json (this, splats or mesh).",
+        "Folder with a COLMAP model, transforms.json or Polycam's keyframes, or a zip of one "
+        "(this, splats or mesh).",
         "captures/apple",
     )
     splats: Path | None = optional(
         input_path("splats"),
-        "Trained 3DGS .ply, or a solid that `gsfluent fill` wrote (this, capture or mesh).",
+        "Trained splat: .ply, .splat, .spz, .ksplat, .sog, .pt or .ckpt; or a solid that "
+        "`gsfluent fill` wrote (this, capture or mesh).",
         "melon.ply",
     )
     mesh: Path | None = optional(

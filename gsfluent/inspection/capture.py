@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gsfluent.data import Capture, Frame
 from gsfluent.errors import InputError
 from gsfluent.inspection.picture import Picture, draw
-from gsfluent.io import load_capture, load_splats, save_image
+from gsfluent.io import kind_of, load_capture, load_splats, save_image
 from gsfluent.pipeline.capture.hull import hull_points, inside_masks, masked_views
 from gsfluent.pipeline.capture.orient import (
     DEFAULT_SIZE,
@@ -61,7 +61,7 @@ def inspect(
             f"size must be above 0 metres, got {size}", "give the largest extent in metres"
         )
     path = Path(input)
-    if path.is_file() and path.suffix.lower() == ".ply":
+    if path.is_file() and kind_of(path) == "splats":
         return _inspect_splats(path, out, size)
     return _inspect_capture(path, out, size)
 

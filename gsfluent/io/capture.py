@@ -9,12 +9,14 @@ from gsfluent.data.camera import Camera
 from gsfluent.data.capture import Capture
 from gsfluent.errors import InputError
 from gsfluent.io.colmap import find_model, read_model
+from gsfluent.io.exports.archive import unpacked
+from gsfluent.io.exports.polycam import is_polycam, polycam_frames
 from gsfluent.io.images import IMAGE_SUFFIXES
-from gsfluent.io.transforms import read_poses, read_transforms
+from gsfluent.io.splats.load import READERS
+from gsfluent.io.transforms import capture_of, read_poses, read_transforms
 from gsfluent.spatial.mesh_file import is_mesh
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
-_SPLATS = (".ply", ".splat", ".spz", ".ksplat", ".sog")
 
 
 def kind_of(path: str | Path) -> str | None:
@@ -25,23 +27,24 @@ def kind_of(path: str | Path) -> str | None:
     path = Path(path)
     suffix = path.suffix.lower()
     if os.path.isdir(path):  # no error for names that cannot be one
-        posed = any((path / name).is_file() for name in _TRANSFORMS)
-        return "capture" if posed or find_model(path) is not None else None
+        return "capture" if _posed(path) else None
     if is_mesh(path):
         return "mesh"
-    if suffix in _SPLATS:
+    if suffix == ".ply" or suffix in READERS:
         return "splats"
-    return {".json": "capture", ".yaml": "shot", ".yml": "shot"}.get(suffix)
+    return {".json": "capture", ".zip": "capture", ".yaml": "shot", ".yml": "shot"}.get(suffix)
 
 
 def load_capture(path: str | Path) -> Capture:
     """Read a capture: a folder with a COLMAP model or a ``transforms.json``, or that file itself.
 
-    A COLMAP model (``sparse/0`` and the usual other places) is preferred when both are there.
+    A COLMAP model (``sparse/0`` and the usual other places) is preferred when both are there. A
+    folder of Polycam's raw export is read, too, and a zip of any of them, which is unpacked beside
+    itself.
     Photographs are only located, not decoded; :meth:`Capture.view` reads them.
 
     Args:
-        path: Folder or ``.json`` file.
+        path: Folder, ``.json`` or ``.zip`` file.
 
     Returns:
         The capture, cameras in the order of their image names.
@@ -53,6 +56,8 @@ def load_capture(path: str | Path) -> Capture:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such capture", "check the path")
+    if path.suffix.lower() == ".zip" and not path.is_dir():
+        path = _within(unpacked(path))
     if path.is_file():
         if path.suffix.lower() != ".json":
             raise InputError(
@@ -66,7 +71,23 @@ def load_capture(path: str | Path) -> Capture:
     for name in _TRANSFORMS:
         if (path / name).is_file():
             return read_transforms(path / name)
+    if is_polycam(path):
+        return capture_of(path / "keyframes", polycam_frames(path), path)
     raise _nothing_found(path)
+
+
+def _posed(folder: Path) -> bool:
+    """Whether a folder holds a capture itself."""
+    named = any((folder / name).is_file() for name in _TRANSFORMS)
+    return named or find_model(folder) is not None or is_polycam(folder)
+
+
+def _within(folder: Path) -> Path:
+    """The capture in an unpacked folder: itself, or one folder or two further down."""
+    for place in (folder, *sorted(folder.glob("*/")), *sorted(folder.glob("*/*/"))):
+        if _posed(place):
+            return place
+    return folder
 
 
 def load_poses(path: str | Path) -> list[Camera]:
@@ -114,7 +135,7 @@ def _nothing_found(path: Path) -> InputError:
     if images:
         return InputError(
             f"{path}: {images} images but no poses (no sparse/0 and no transforms.json)",
-            "pose them first, for example with `colmap automatic_reconstructor`, into sparse/0",
+            f"pose them first: gsfluent poses {path} -o capture, or COLMAP into sparse/0",
         )
     return InputError(
         f"{path}: no COLMAP model and no transforms.json here", "pass the folder that holds them"

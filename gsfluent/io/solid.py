@@ -23,10 +23,13 @@ from gsfluent.io.splats.load import load_splats, save_splats
 def load(path: str | Path) -> Gaussians | Solid:
     """Read what :func:`save` wrote: a solid where its volume lies beside the ``.ply``, else splats.
 
+    Splats of other programs are read, too: see :func:`gsfluent.io.load_splats`.
+
     Raises:
         InputError: As :func:`gsfluent.io.load_splats` and :func:`load_solid`.
     """
-    return load_solid(path) if volume_path(path).is_file() else load_splats(path)
+    solid = Path(path).suffix.lower() == ".ply" and volume_path(path).is_file()
+    return load_solid(path) if solid else load_splats(path)
 
 
 def save(thing: Gaussians | Solid, path: str | Path) -> None:

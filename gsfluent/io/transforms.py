@@ -41,8 +41,22 @@ def read_transforms(path: Path) -> Capture:
     Raises:
         InputError: Not JSON, no frames, a frame without pose or image, an unsupported lens.
     """
-    data = _read_json(path)
-    cameras = [_camera(path, data, frame, index) for index, frame in enumerate(_frames(path, data))]
+    return capture_of(path, _read_json(path), path.parent)
+
+
+def capture_of(path: Path, data: dict[str, Any], folder: Path) -> Capture:
+    """The capture that the values of a ``transforms.json`` say.
+
+    Args:
+        path: Where they come from, for messages.
+        data: The values.
+        folder: That the names in them start from.
+
+    Raises:
+        InputError: As :func:`read_transforms`.
+    """
+    frames = _frames(path, data)
+    cameras = [_camera(path, data, frame, index, folder) for index, frame in enumerate(frames)]
     cameras.sort(key=lambda camera: camera.name)
     missing = [
         camera for camera in cameras if camera.image_path is None or not is_file(camera.image_path)
@@ -53,8 +67,8 @@ def read_transforms(path: Path) -> Capture:
             f"{path}: {len(missing)} of {len(cameras)} images are missing, first {first}",
             "restore the images, or delete these frames from the file",
         )
-    points, colors = _points(path, data)
-    return Capture(cameras, points, colors, path.parent, load_view)
+    points, colors = _points(path, data, folder)
+    return Capture(cameras, points, colors, folder, load_view)
 
 
 def read_poses(path: Path) -> list[Camera]:
@@ -68,7 +82,7 @@ def read_poses(path: Path) -> list[Camera]:
         {"file_path": str(index)} | frame if isinstance(frame, dict) else frame
         for index, frame in enumerate(_frames(path, data))
     ]
-    return [_camera(path, data, frame, index) for index, frame in enumerate(frames)]
+    return [_camera(path, data, frame, index, path.parent) for index, frame in enumerate(frames)]
 
 
 def _frames(path: Path, data: dict[str, Any]) -> list[Any]:
@@ -90,7 +104,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int) -> Camera:
+def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int, folder: Path) -> Camera:
     where = f"{path}: frames[{index}]"
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise InputError(f"{where} has no file_path", "name the image of every frame")
@@ -105,7 +119,7 @@ def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int) -> Camer
             f"undistort, or use one of {', '.join(_LENSES)}",
         )
     viewmat = _viewmat(where, frame)
-    named = inside(path.parent, frame["file_path"], where)
+    named = inside(folder, frame["file_path"], where)
     image = _find_image(named)
     width, height = _number(where, settings, "w", 0), _number(where, settings, "h", 0)
     if (width < 1 or height < 1) and image is not None:
@@ -125,7 +139,7 @@ def _camera(path: Path, shared: dict[str, Any], frame: Any, index: int) -> Camer
         _distortion(where, settings),
         name,
         image if image is not None else named,
-        _mask(path, frame, name, where),
+        _mask(folder, frame, name, where),
     )
 
 
@@ -235,13 +249,13 @@ def _find_image(plain: Path) -> Path | None:
     return None
 
 
-def _mask(path: Path, frame: dict[str, Any], name: str, where: str) -> Path | None:
+def _mask(folder: Path, frame: dict[str, Any], name: str, where: str) -> Path | None:
     named = frame.get("mask_path")
     if named is None:
-        return find_mask(path.parent, name)
+        return find_mask(folder, name)
     if not isinstance(named, str):
         raise InputError(f"{where}: mask_path must be text, got {short(named)}", "correct the file")
-    mask = _find_image(inside(path.parent, named, where))
+    mask = _find_image(inside(folder, named, where))
     if mask is None:
         raise InputError(
             f"{where}: mask {short(named, bare=True)} is missing",
@@ -250,7 +264,7 @@ def _mask(path: Path, frame: dict[str, Any], name: str, where: str) -> Path | No
     return mask
 
 
-def _points(path: Path, data: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor]:
+def _points(path: Path, data: dict[str, Any], folder: Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Read the sparse points that ``ply_file_path`` names; none is fine."""
     empty = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3)
     named = data.get("ply_file_path")
@@ -260,7 +274,7 @@ def _points(path: Path, data: dict[str, Any]) -> tuple[torch.Tensor, torch.Tenso
         raise InputError(
             f"{path}: ply_file_path must be text, got {short(named)}", "correct the file"
         )
-    file = inside(path.parent, named, path)
+    file = inside(folder, named, path)
     rows = read_ply(file).get("vertex")
     if rows is None or not {"x", "y", "z"} <= set(rows.dtype.names or ()):
         raise InputError(

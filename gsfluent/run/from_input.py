@@ -164,7 +164,7 @@ def find_input(source: Path) -> tuple[str, Path]:
         raise InputError(f"{source}: holds more than one input ({names})", "name one of them")
     raise InputError(
         f"{source}: holds no capture, splat or mesh",
-        "photographs need poses: run COLMAP on them, or give a transforms.json",
+        f"photographs need poses: gsfluent poses {source} -o capture, or give a transforms.json",
     )
 
 

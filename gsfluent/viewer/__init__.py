@@ -12,6 +12,9 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    serve="view_run",
+    app="App",
+    guard="Guard",
+    serve="has_desktop view_run",
     serve_live="view_live",
+    server="start_server stop_server",
 )

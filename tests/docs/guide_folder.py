@@ -94,14 +94,27 @@ def write_parts(folder: Path, capture: Path) -> None:
     (folder / "segmentation" / "labels.json").write_text(json.dumps({"1": "leaf"}))
 
 
+def helper(path: str) -> Any:
+    """A module of other tests."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, TESTS / path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def write_diffusion(folder: Path) -> None:
     """An inpainting pipeline with random weights, as the tests of the texture stage make it."""
-    path = TESTS / "pipeline" / "texture" / "tiny_diffusers.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    tiny = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tiny)
-    tiny.save_sdxl(folder)
+    helper("pipeline/texture/tiny_diffusers.py").save_sdxl(folder)
+
+
+def write_photographs(folder: Path) -> None:
+    """Photographs without poses."""
+    corner = helper("posing/papered_corner.py")
+    folder.mkdir()
+    for number, eye in enumerate(corner.eyes()):
+        picture = corner.photograph(eye, corner.walls())
+        Image.fromarray(picture).save(folder / f"{number}.png")
 
 
 def write_inputs(folder: Path) -> None:
@@ -111,6 +124,7 @@ def write_inputs(folder: Path) -> None:
     write_box(folder / "scan.obj")
     trimesh.creation.box((0.06, 0.14, 0.06)).export(folder / "vase.glb")
     make_capture("orange", folder / "captures" / "apple", views=9, size=64)
+    write_photographs(folder / "photos")
     write_parts(folder, folder / "captures" / "apple")
     if importlib.util.find_spec("transformers"):  # of the extra `inpaint`
         write_diffusion(folder / "models" / "sdxl-inpainting")

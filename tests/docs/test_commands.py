@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import yaml
+from page_blocks import blocks_of, run_blocks
 
 from gsfluent.cli import main
 from gsfluent.config import Shot, load_shot
@@ -39,18 +40,7 @@ SMALLER: dict[str, list[list[str]]] = {
 }
 """Flags that a command gets to be quick, unless its line has them already."""
 
-SMALLER_PYTHON = [
-    (r'quality="shot"', 'quality="preview"'),
-    (r"seconds=2\b", "seconds=0.15"),
-    (r"height=1\.0", "height=0.02"),
-    (r"Fill\(\)", "Fill(resolution=24)"),
-    (r"resolution=(96|48|32)", "resolution=24"),
-    (r'"tile": 2', '"tile": 2, "slices": 8, "steps": 4'),
-    (r'exemplar="cut\.jpg"', 'exemplar="cut.jpg", quality="preview"'),
-]
-"""The same for the Python examples."""
-
-NEEDS = {"sdxl-inpainting": "transformers"}
+NEEDS = {"sdxl-inpainting": "transformers", "poses photos": "pycolmap"}
 """What an example names that only an extra can read."""
 
 LOOKS_ONLY = {"doctor", "plan", "metrics"}
@@ -58,11 +48,7 @@ LOOKS_ONLY = {"doctor", "plan", "metrics"}
 
 
 def blocks(kind: str) -> list[tuple[Path, str]]:
-    found = []
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        found += [(page, body) for body in re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)]
-    return found
+    return [(page, text) for page in PAGES for text in blocks_of(page, kind)]
 
 
 def lines() -> list[list[str]]:
@@ -78,7 +64,11 @@ COMMANDS = [words[1:] for words in lines() if words[0] == "gsfluent"]
 OTHERS = [
     words for words in lines() if words[0] != "gsfluent" and "fracturebench" not in " ".join(words)
 ]
-SERVES = [words for words in COMMANDS if words[0] == "view" and "--check" not in words]
+SERVES = [
+    words
+    for words in COMMANDS
+    if words[0] == "studio" or (words[0] == "view" and "--check" not in words)
+]
 ENDS = [words for words in COMMANDS if words not in SERVES]
 
 
@@ -131,24 +121,26 @@ def test_page_is_served_until_ctrl_c(
     words: list[str], place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from gsfluent.studio.serve import Studio
     from gsfluent.viewer.app import App
 
+    served: Any = Studio if words[0] == "studio" else App
     monkeypatch.chdir(place)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     answers: list[int] = []
     serving, over = threading.Event(), threading.Event()
-    wait = App.wait
+    wait = served.wait
 
     address = [""]
 
-    def say_so_and_wait(app: App) -> None:
+    def say_so_and_wait(app: Any) -> None:
         address[0] = app.url.replace("localhost", "127.0.0.1")
         serving.set()
         wait(app)
 
-    monkeypatch.setattr(App, "wait", say_so_and_wait)
+    monkeypatch.setattr(served, "wait", say_so_and_wait)
 
     def visit() -> None:
         """Ask for the page as soon as it is served, then press Ctrl-C."""
@@ -204,27 +196,6 @@ def test_install_line_names_what_is_there(words: list[str]) -> None:
         assert word in text if word.startswith("-") else (ROOT / word).exists()
 
 
-PYTHON = [(page, text) for page, text in blocks("python") if page != BENCH]
-
-
-@pytest.mark.parametrize(("page", "text"), PYTHON, ids=lambda x: getattr(x, "name", ""))
-def test_python_runs(
-    page: Path,
-    text: str,
-    place: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(place)
-    skip_without_extra(text)
-    for what, small in SMALLER_PYTHON:
-        text = re.sub(what, small, text)
-    before = files(place)
-    exec(compile(text, str(page), "exec"), {"__name__": "__main__"})
-    changed = [path for path, when in files(place).items() if before.get(path) != when]
-    assert capsys.readouterr().out.strip() or changed
-
-
 @pytest.mark.parametrize(("page", "text"), blocks("yaml"), ids=lambda x: getattr(x, "name", ""))
 def test_shot_is_a_shot(page: Path, text: str, place: Path) -> None:
     values = yaml.safe_load(text)
@@ -263,7 +234,6 @@ def test_any_simulator_takes_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         for line in text.splitlines()
         if page == BENCH and not line.startswith("#")
     )
-    (text,) = (text for page, text in blocks("python") if page == BENCH)
 
     def run(line: str) -> None:
         """Run it here, with paths of the repository as they are from its root."""
@@ -275,12 +245,8 @@ def test_any_simulator_takes_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         words = [str(ROOT / word) if word.startswith("scripts/") else word for word in words]
         subprocess.run([sys.executable, *words[1:]], env=environment, check=True)
 
-    def simulate(x: Any, v: Any, volume: Any, materials: Any, times: Any) -> Any:
-        """A poor simulator: every point flies on."""
-        return x + v * times[:, None, None], v + 0 * times[:, None, None]
-
     run(make)
-    exec(compile(text, BENCH.name, "exec"), {"simulate": simulate})
+    run_blocks(BENCH, tmp_path)
     run(score)
     found = json.loads((tmp_path / "scores.json").read_text())
     assert "bar" in json.dumps(found) and "you" in (tmp_path / "scores.md").read_text()

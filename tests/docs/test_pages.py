@@ -20,6 +20,7 @@ MEASURED = sorted((ROOT / "docs" / "measured").glob("*.md"))
 MARKED = re.compile(r"<!-- ([^\n]+): begin -->\n.*?<!-- \1: end -->", re.DOTALL)
 SHELVES = ("guide", "theory", "measured")
 TABLES = {
+    "formats.md",
     "shot-keys.md",
     "run-json.md",
     "physgaussian.md",

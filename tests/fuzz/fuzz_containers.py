@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import struct
 import zipfile
@@ -33,6 +34,11 @@ def archive(data: bytes) -> tuple[Parts, Join]:
         return stream.getvalue()
 
     return members, join
+
+
+def gzipped(data: bytes) -> tuple[Parts, Join]:
+    """A file that is packed as a whole."""
+    return [gzip.decompress(data)], lambda parts: gzip.compress(parts[0], mtime=0)
 
 
 def png(data: bytes) -> tuple[Parts, Join]:

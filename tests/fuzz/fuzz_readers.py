@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from gsfluent.io.segmentation import load_masks, load_segmentation
 from gsfluent.io.solid import save_solid
 from gsfluent.io.splats.delta import DeltaFrame
 from gsfluent.io.splats.delta_write import Roster, steps, write_delta
+from gsfluent.io.splats.splat import save_splat
 from gsfluent.pipeline.light.environment import of_file
 from gsfluent.pipeline.render.camera import read_path
 from gsfluent.pipeline.texture.photo.parts import read_parts
@@ -299,10 +301,51 @@ def splats(folder: Path, **options: Any) -> None:
     save_splats(some_gaussians(), folder / "a.ply", **options)
 
 
+def foreign(name: str) -> Callable[[Path], None]:
+    """A splat file that another program wrote; the folder of tests/io is on the path."""
+    source = Path(capture_files.__file__).parent / "foreign" / name
+    return lambda folder: (folder / name).write_bytes(source.read_bytes()) and None
+
+
+def checkpoint(folder: Path) -> None:
+    some = some_gaussians()
+    values = {
+        "means": some.means, "quats": some.quats, "scales": some.scales.log(),
+        "opacities": torch.logit(some.opacities), "sh0": some.sh[:, :1], "shN": some.sh[:, 1:],
+    }  # fmt: skip
+    torch.save({"step": 1, "splats": values}, folder / "a.pt")
+
+
+def read_splats(name: str) -> Callable[[Path], Any]:
+    return lambda folder: load_splats(folder / name)
+
+
 def read_capture(folder: Path) -> list[Any]:
     capture = load_capture(folder)
     # only what is small: that large pictures are refused is tested elsewhere
     return [capture.cameras, capture.points, capture.point_colors, capture.view(0, 32)]
+
+
+def zipped(folder: Path) -> None:
+    transforms(folder / "raw")
+    with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted((folder / "raw").rglob("*")):
+            archive.write(file, file.relative_to(folder / "raw"))
+
+
+def read_zipped(folder: Path) -> Any:
+    shutil.rmtree(folder / "a_unpacked", ignore_errors=True)
+    return load_capture(folder / "a.zip").cameras
+
+
+def polycam(folder: Path) -> None:
+    photographs(folder / "keyframes")
+    place = folder / "keyframes" / "cameras"
+    place.mkdir()
+    lens = {"fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 9.0, "width": SIZE[0], "height": SIZE[1]}
+    pose = {f"t_{row}{column}": float(row == column) for row in range(3) for column in range(4)}
+    for name in ("0", "1"):
+        (place / f"{name}.json").write_text(json.dumps(pose | lens))
 
 
 def read_labels(name: str) -> Callable[[Path], Any]:
@@ -387,6 +430,26 @@ READERS: dict[str, Reader] = {
     "ply_packed": Reader(
         lambda f: splats(f, compressed=True), "a.ply", lambda f: load_splats(f / "a.ply")
     ),
+    "splat": Reader(
+        lambda f: save_splat(some_gaussians(), f / "a.splat"), "a.splat", read_splats("a.splat")
+    ),
+    "spz": Reader(
+        foreign("forty.spz"), "forty.spz", read_splats("forty.spz"), containers.gzipped
+    ),
+    "spz_bytes": Reader(foreign("forty.spz"), "forty.spz", read_splats("forty.spz")),
+    **{
+        f"ksplat_{level}": Reader(
+            foreign(f"forty_{level}.ksplat"), f"forty_{level}.ksplat",
+            read_splats(f"forty_{level}.ksplat"),
+        )
+        for level in range(3)
+    },
+    "sog": Reader(
+        foreign("forty.sog"), "forty.sog", read_splats("forty.sog"), containers.archive
+    ),
+    "sog_zip": Reader(foreign("forty.sog"), "forty.sog", read_splats("forty.sog")),
+    "checkpoint": Reader(checkpoint, "a.pt", read_splats("a.pt"), containers.archive),
+    "checkpoint_zip": Reader(checkpoint, "a.pt", read_splats("a.pt")),
     "ply_text": Reader(transforms, "points.ply", read_capture),
     "ply_lists": Reader(capture_and(points=ply_labels), "points.ply", read_capture),
     "solid": Reader(solid, "a.volume.npz", lambda f: load_solid(f / "a.ply"), containers.archive),
@@ -402,6 +465,9 @@ READERS: dict[str, Reader] = {
     },
     "transforms": Reader(transforms, "transforms.json", read_capture),
     "poses": Reader(transforms, "transforms.json", lambda f: load_poses(f / "transforms.json")),
+    "zip_bytes": Reader(zipped, "a.zip", read_zipped),
+    "zip": Reader(zipped, "a.zip", read_zipped, containers.archive),
+    "polycam": Reader(polycam, "keyframes/cameras/0.json", read_capture),
     "photograph": Reader(transforms, "images/0.png", read_capture, containers.png),
     **{
         f"image_{kind}": Reader(

@@ -51,6 +51,11 @@ Read = Callable[[Path], Any]
 # every reader that takes a file by name
 READ: dict[str, Read] = {
     "a.ply": load_splats,
+    "a.splat": load_splats,
+    "a.spz": load_splats,
+    "a.ksplat": load_splats,
+    "a.sog": load_splats,
+    "a.ckpt": load_splats,
     "a.gsd": DeltaReader,
     "a.npy": read_npy,
     "a.npz": read_npz,

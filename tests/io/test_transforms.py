@@ -167,4 +167,4 @@ def test_folders_without_poses_say_what_they_hold(tmp_path: Path, cameras: list[
     files.write_images(tmp_path / "images", cameras)
     with pytest.raises(InputError, match="4 images but no poses") as caught:
         load_capture(tmp_path)
-    assert "colmap" in caught.value.hint
+    assert "gsfluent poses" in caught.value.hint

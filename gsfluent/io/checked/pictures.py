@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,6 +36,7 @@ def opened_image(
     *,
     noun: str = "image",
     missing: str = "check the path",
+    data: bytes | None = None,
 ) -> Iterator[Image.Image]:
     """An image, not yet decoded; whatever is wrong with it inside the block names the file.
 
@@ -43,16 +45,19 @@ def opened_image(
         hint: What to do when it is damaged or of another format.
         noun: What it should be.
         missing: What to do when it is not there.
+        data: The picture itself, where ``path`` is only its name in an archive.
 
     Raises:
         InputError: Missing, empty, damaged, of another format, or above the limit ``pixels``.
     """
     from PIL import Image, UnidentifiedImageError
 
-    if regular_file(path, noun, missing) == 0:
+    size = regular_file(path, noun, missing) if data is None else len(data)
+    if size == 0:
         raise InputError(f"{path}: the file is empty", "export it again")
     try:
-        with Image.open(path, formats=_FORMATS) as image:
+        source = path if data is None else io.BytesIO(data)
+        with Image.open(source, formats=_FORMATS) as image:
             check_pixels(*image.size, path)
             yield image
     except InputError:

@@ -1,8 +1,8 @@
-"""Gaussians in INRIA-layout 3DGS ``.ply`` files.
+"""Gaussians from any splat file, and in INRIA-layout 3DGS ``.ply`` files.
 
-Stored: log scales, logit opacities, quaternions ``wxyz``, ``f_dc`` and ``f_rest`` with the rest
-channel-major (all red, all green, all blue). Kerbl et al. 2023, reference implementation's
-``save_ply``.
+Stored in a ``.ply``: log scales, logit opacities, quaternions ``wxyz``, ``f_dc`` and ``f_rest``
+with the rest channel-major (all red, all green, all blue). Kerbl et al. 2023, reference
+implementation's ``save_ply``.
 """
 
 from __future__ import annotations
@@ -18,13 +18,18 @@ from numpy.typing import NDArray
 from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError
+from gsfluent.io.splats.checkpoint import load_checkpoint
 from gsfluent.io.splats.compressed import (
     decode_compressed,
     encode_compressed,
     float_tensor,
     is_compressed,
 )
+from gsfluent.io.splats.ksplat import load_ksplat
 from gsfluent.io.splats.ply import read_ply, write_ply
+from gsfluent.io.splats.sog import load_sog
+from gsfluent.io.splats.splat import load_splat
+from gsfluent.io.splats.spz import load_spz
 
 logger = logging.getLogger(__name__)
 
@@ -36,9 +41,18 @@ _REQUIRED = (
     "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 )  # fmt: skip
 
+READERS = {
+    ".splat": load_splat, ".spz": load_spz, ".ksplat": load_ksplat, ".sog": load_sog,
+    ".pt": load_checkpoint, ".ckpt": load_checkpoint,
+}  # fmt: skip
+"""Readers by the end of the name; all others are read as ``.ply``."""
+
 
 def load_splats(path: str | Path) -> Gaussians:
-    """Read a 3DGS ``.ply`` (INRIA or SuperSplat's compressed layout) as float32 on the CPU.
+    """Read a splat file as float32 on the CPU.
+
+    A 3DGS ``.ply`` (INRIA or SuperSplat's compressed layout), ``.splat``, ``.spz``, ``.ksplat``,
+    ``.sog``, or a checkpoint of gsplat or splatfacto (``.pt``, ``.ckpt``).
 
     Quaternions are normalised (trained files hold any length), opacities pass a sigmoid (some
     exporters write 400 for opaque) and scales an exponential. ``nx, ny, nz`` become normals unless
@@ -54,6 +68,9 @@ def load_splats(path: str | Path) -> Gaussians:
         InputError: Missing or truncated file, a property missing, no rows, NaN, or a scale of zero.
     """
     path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is not None:
+        return reader(path)
     data = read_ply(path)
     if is_compressed(data):
         return decode_compressed(path, data).validated(str(path))

@@ -13,7 +13,10 @@ import torch
 
 from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
+from gsfluent.errors import InputError
 from gsfluent.io.atomic import atomic_path
+from gsfluent.io.checked.files import read_bytes
+from gsfluent.io.splats.compressed import float_tensor
 
 _ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
@@ -39,3 +42,25 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     rows["rotation"] = np.clip(np.round(quats * 128.0 + 128.0), 0, 255)
     with atomic_path(path) as part:
         part.write_bytes(rows.tobytes())
+
+
+def load_splat(path: str | Path) -> Gaussians:
+    """Read a ``.splat``, as float32 on the CPU.
+
+    Raises:
+        InputError: Missing, not whole rows, or values that no splat can have.
+    """
+    data = read_bytes(path)
+    if not data or len(data) % _ROW.itemsize:
+        raise InputError(
+            f"{path}: {len(data)} bytes are no rows of {_ROW.itemsize}", "export the splat again"
+        )
+    rows = np.frombuffer(data, dtype=_ROW)
+    quats = torch.from_numpy((rows["rotation"].astype(np.float64) - 128.0) / 128.0)
+    return Gaussians.from_colors(
+        float_tensor(rows["position"]),
+        float_tensor(rows["scale"]),
+        float_tensor(rows["rgba"][:, :3] / 255.0),
+        opacities=float_tensor(rows["rgba"][:, 3] / 255.0),
+        quats=geometry.normalize_quaternions(quats).to(torch.float32),
+    ).validated(str(path))

@@ -1,0 +1,5 @@
+"""From photographs without poses, or a video, to a capture: structure from motion by COLMAP."""
+
+from gsfluent._lazy import room
+
+__getattr__, __dir__, __all__ = room(__name__, colmap="find_poses")
