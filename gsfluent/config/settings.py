@@ -322,8 +322,9 @@ class OutputSettings:
         default="orbit",
     )
     backdrop: str = key(
-        choice("studio", "captured"),
-        "What stands behind: the studio, or the surroundings that the capture shows.",
+        choice("studio", "light", "dark", "captured"),
+        "What stands behind: the studio, light or dark, whichever the object is not, or one of "
+        "them; or the surroundings that the capture shows.",
         "captured",
         default="studio",
     )

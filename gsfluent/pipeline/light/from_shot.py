@@ -16,7 +16,13 @@ from gsfluent.config.settings_light import EnvironmentSettings, LightSettings, r
 from gsfluent.config.yaml_file import read_yaml
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light import environment
-from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lamp, Lighting
+from gsfluent.pipeline.light.lamps import (
+    SHININESS,
+    SPECULAR,
+    Lamp,
+    Lighting,
+    studio_light,
+)
 from gsfluent.results.frames import DUST, SavedFrame
 
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
@@ -25,6 +31,9 @@ _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resoluti
 def light_of(shot: Shot) -> Lighting:
     """The shot's light; what it leaves out keeps the default.
 
+    That is the studio's fill and rim beside the key light, unless it gives ``ambient``,
+    ``environment`` or ``lights``.
+
     Raises:
         InputError: A number out of range, or an environment picture that cannot be read.
     """
@@ -32,10 +41,15 @@ def light_of(shot: Shot) -> Lighting:
 
 
 def _lighting(settings: LightSettings) -> Lighting:
-    lamps = [Lamp(**lamp.given()) for lamp in (settings.key, *settings.lights)]
+    # who gives one of these lights the scene himself: nothing that he did not ask for is added
+    own = any(getattr(settings, name) is not None for name in ("ambient", "environment", "lights"))
+    usual = Lighting() if own else studio_light()
+    key, *others = usual.lamps
+    others += [Lamp(**lamp.given()) for lamp in settings.lights or ()]
     shared = {name: value for name, value in settings.given().items() if name in _SHARED}
-    around = None if settings.environment is None else _environment(settings.environment)
-    return Lighting(lamps=tuple(lamps), environment=around, **shared)
+    if settings.environment is not None:
+        shared["environment"] = _environment(settings.environment)
+    return replace(usual, lamps=(replace(key, **settings.key.given()), *others), **shared)
 
 
 def changed(

@@ -20,7 +20,7 @@ from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_backgr
 from gsfluent.pipeline.render.camera import Action, cameras_for
 from gsfluent.pipeline.render.figures import cameras_around
 from gsfluent.pipeline.render.stage import Picture, Render, Room
-from gsfluent.pipeline.render.studio import Studio
+from gsfluent.pipeline.render.studio import Studio, wants_dark
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.results.frames import SavedFrame, count_frames, load_frame
 from gsfluent.results.record import read_frame
@@ -56,7 +56,8 @@ class Film:
         if shot.floor != "none":
             x, y = action.center[:, :2].mean(dim=0).tolist()
             extent = 1.3 * float(action.radius.amax())
-            studio = Studio(0.0, (x, y), float(action.radius[0]), extent)
+            dark = studio_is_dark(first, shot)
+            studio = Studio(0.0, (x, y), float(action.radius[0]), extent, dark)
         needs_capture = shot.capture is not None and isinstance(shot.output.camera, int)
         isolated = out / "stages" / "isolate"
         self.cameras = cameras_for(
@@ -102,6 +103,15 @@ class Film:
         )
         self._room = made.room
         return made
+
+
+def studio_is_dark(frame: SavedFrame, shot: Shot) -> bool:
+    """Whether the studio is the dark one, for the objects of a shot in its first frame."""
+    if shot.output.backdrop in ("light", "dark"):
+        return shot.output.backdrop == "dark"
+    anchor = frame.anchor.long()
+    ours = (anchor >= 0) & _of_objects(frame, shot).to(anchor.device)[anchor.clamp(min=0)]
+    return wants_dark(frame.gaussians.select(ours))
 
 
 def _of_objects(frame: SavedFrame, shot: Shot) -> torch.Tensor:

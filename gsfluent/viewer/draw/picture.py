@@ -17,7 +17,7 @@ from gsfluent.pipeline.light.from_shot import gloss_of, light_of
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.camera import Action, orbit
-from gsfluent.pipeline.render.film import captured_backdrop
+from gsfluent.pipeline.render.film import captured_backdrop, studio_is_dark
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
 from gsfluent.results.frames import SavedFrame
@@ -49,6 +49,7 @@ class PictureMaker:
         self.shot = timeline.source.shot
         self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
         self._backdrop = self._captured()
+        self._dark: bool | None = None  # of the studio; known with the first picture
 
     def first_light(self) -> Lighting:
         """The shot's light, or the usual one."""
@@ -124,7 +125,10 @@ class PictureMaker:
         if self.floor is None:
             return None
         timeline = self.timeline
-        return Studio(self.floor, timeline.middle(), timeline.radius, 1.3 * timeline.extent())
+        if self._dark is None and self.shot is not None:
+            self._dark = studio_is_dark(timeline.frame(0), self.shot)
+        extent = 1.3 * timeline.extent()
+        return Studio(self.floor, timeline.middle(), timeline.radius, extent, bool(self._dark))
 
     def _captured(self) -> Backdrop | None:
         """The photographed surroundings where the shot asks for them and they are there."""

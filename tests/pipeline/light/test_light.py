@@ -23,9 +23,9 @@ from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
 from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.shade import irradiance, to_linear
-from gsfluent.pipeline.light.shadow import transmittance
+from gsfluent.pipeline.light.shadow import FADE, NORMAL_OFFSET, ShadowMaps, transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
@@ -125,6 +125,25 @@ def test_lamp_inside_the_matter_gets_a_cube(skin: Gaussians) -> None:
     assert faces_of(near, bulk(skin)) == (6, 1, 0)
 
 
+def test_a_blocker_counts_in_full_from_some_biases_on() -> None:
+    # a wall at depth 5 fills the map; points behind it face the lamp, k biases away from the wall
+    bias, depth = 0.01, 5.0
+    row = torch.tensor([1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 500.0, 4.9, bias])
+    maps = ShadowMaps(torch.full((1, 64, 64), depth), torch.ones(1, 64, 64), row[None])
+    lamp = torch.zeros(12)
+    lamp[3], lamp[9], lamp[11] = -1.0, 0.05, 1.0
+    k = torch.linspace(0.0, 12.0, 49)
+    points = torch.stack([0 * k, 0 * k, depth + bias * k], 1)
+    toward = torch.tensor([0.0, 0.0, -1.0]).expand_as(points)
+    found = transmittance(points, toward, lamp, maps)
+    # lifted off by one bias, and one bias is the surface itself
+    expected = 1.0 - ((k - NORMAL_OFFSET - 1.0) / FADE).clamp(0.0, 1.0)
+    torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
+    # of what is not in the maps every blocker counts
+    floor = transmittance(points, toward, lamp, maps, biased=0.0)
+    torch.testing.assert_close(floor, (k == 0).float(), atol=1e-6, rtol=0)
+
+
 def test_map_moves_in_whole_texels(skin: Gaussians) -> None:
     # what does not move looks the same from one frame to the next
     lamps = (Lamp(),)
@@ -174,6 +193,30 @@ def test_spinning_lamp_turns_about_the_vertical() -> None:
 def test_bad_lights_are_refused(make: Any) -> None:
     with pytest.raises(InputError, match="light"):
         make()
+
+
+def test_a_shot_that_says_nothing_has_key_fill_and_rim(tmp_path: Path) -> None:
+    (tmp_path / "melon.ply").write_bytes(b"")
+    bare = {k: v for k, v in SHOT.items() if k != "light"}
+    usual = light_of(Shot.from_dict(bare, tmp_path))
+    assert usual == studio_light()
+    key, rim = usual.lamps
+    # a surface that faces the key light keeps its colour; the rim comes from behind
+    towards = torch.tensor([key.toward], dtype=torch.float64)
+    from_key = float(irradiance(usual.around(towards), towards).mean()) + key.intensity
+    assert from_key == pytest.approx(1.0, abs=0.06)
+    assert sum(a * b for a, b in zip(key.toward[:2], rim.toward[:2], strict=True)) < 0
+    # the fill comes from the side that the key light leaves, towards the camera
+    side = torch.tensor([[-1.0, -0.8, 0.0], [1.0, 0.8, 0.0]], dtype=torch.float64)
+    left, behind = irradiance(usual.around(side), normalize(side, dim=1)).mean(1)
+    assert float(left) > 1.5 * float(behind) > 0.3
+    turned = light_of(
+        Shot.from_dict({**bare, "light": {"key": {"direction": [0, 0, 1]}}}, tmp_path)
+    )
+    assert turned.lamps[1:] == (rim,) and turned.environment == usual.environment
+    for own in ({"ambient": 0.3}, {"lights": []}):
+        found = light_of(Shot.from_dict({**bare, "light": own}, tmp_path))
+        assert len(found.lamps) == 1 and found.environment is None
 
 
 def test_short_form_of_light_means_the_same(skin: Gaussians) -> None:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent.data import Camera, Gaussians
+from gsfluent.data import INTERIOR, SURFACE, Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.normals import estimate_normals, grid_for, splat_normals
 from gsfluent.pipeline.light.occlusion import ambient_occlusion
 from gsfluent.pipeline.light.shade import shade_points, surface_points, to_display, to_linear
@@ -22,7 +22,7 @@ from gsfluent.pipeline.light.shadow_maps import bulk, shadow_maps
 from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
 from gsfluent.pipeline.render.holes import Holes, MatterView, small
 from gsfluent.pipeline.render.stage import Render
-from gsfluent.pipeline.render.studio import Studio
+from gsfluent.pipeline.render.studio import Studio, wants_dark
 
 SIZE = 96
 
@@ -108,6 +108,27 @@ def test_shadow_map_darkens_what_lies_behind() -> None:
     assert float(arrives[0]) < 0.05  # under the ball
     assert float(arrives[1]) == 1.0  # beside it
     assert float(arrives[2]) == 1.0  # above it
+
+
+@pytest.mark.parametrize(
+    ("grey", "dark"), [(0.15, False), (0.45, False), (0.7, True), (0.95, True)]
+)
+def test_the_studio_differs_from_what_stands_in_it(grey: float, dark: bool) -> None:
+    bare = ball()
+    thing = bare.with_colors(torch.full((bare.count, 3), grey)).replace(
+        labels=torch.full((bare.count,), SURFACE, dtype=torch.int32)
+    )
+    assert wants_dark(thing) == dark
+    # what fills it says nothing about how it looks
+    inner = thing.replace(labels=torch.full((thing.count,), INTERIOR, dtype=torch.int32))
+    inner = inner.with_colors(torch.full((thing.count, 3), 1.0 - grey))
+    assert wants_dark(Gaussians.cat([thing, inner])) == dark
+    studio = Studio(-0.1, (0.0, 0.0), 0.1, 0.2, wants_dark(thing))
+    camera = Camera.look_at((0.0, -0.8, 0.3), (0, 0, 0), width=64, height=48, fov=30.0)
+    image = Render(camera, studio_light(), studio=studio)(thing).image
+    around = float(torch.cat([image[:4].flatten(), image[-4:].flatten()]).mean())
+    assert abs(around - grey) > 0.2
+    assert (around < 0.4) == dark
 
 
 def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
