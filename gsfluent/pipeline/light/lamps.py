@@ -2,7 +2,7 @@
 
 The captured colour already holds the light of the photographs, so no default is harsh: a surface
 that faces the key light keeps its colour. A film is lit by :func:`studio_light`, whose far side
-loses about a third of its display value. The shading itself is
+loses about a quarter to a third of its display value. The shading itself is
 :mod:`gsfluent.pipeline.light.shade`.
 """
 
@@ -191,10 +191,10 @@ class Lighting:
         return _around(self.ambient, self.environment, like.dtype, like.device)
 
 
-RIM = Lamp(direction=(-0.8, 1.0, 0.45), intensity=0.6, size=12.0)
+RIM = Lamp(direction=(-0.8, 1.0, 0.9), intensity=0.45, size=12.0)
 """From behind: it draws the edge of what is dark, and of what has the floor's colour."""
-_KEY = Lamp(intensity=0.64, size=10.0)
-_FILL_AMBIENT = 0.36
+_KEY = Lamp(intensity=0.62, size=10.0)
+_FILL_AMBIENT = 0.42
 _FILL = (-0.095, -0.075, 0.06)
 """How the light from everywhere rises: from the side of the camera that the key light leaves."""
 

@@ -97,6 +97,7 @@ class Film:
             camera,
             groups=frame.groups,
             gloss=gloss_of(self.shot, frame),
+            plates=frame.anchor < 0,
             backdrop=self.backdrop,
             time=frame.time,
             room=self._room,

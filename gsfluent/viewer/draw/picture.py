@@ -37,6 +37,7 @@ class Drawn:
     gaussians: Gaussians  # Splats, coloured and cut
     groups: Tensor  # Siblings, int32 [N]
     gloss: Tensor | None  # Highlights of each splat, [N, 2], or None
+    plates: Tensor  # Splats of rigid things, bool [N]
     legend: Legend | None  # What the colours mean, or None
 
 
@@ -93,10 +94,11 @@ class PictureMaker:
         drawn = self.splats(frame, look)
         gaussians, gloss, time = drawn.gaussians, drawn.gloss, frame.time
         groups: Tensor | None = drawn.groups
+        plates: Tensor | None = drawn.plates
         if gaussians.count == 0:  # everything is cut away: one splat that nobody sees
             speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
             gaussians = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
-            groups, gloss, time = None, None, 0.0
+            groups, gloss, plates, time = None, None, None, 0.0
         render = Render(
             light=look.light,
             studio=self._studio() if look.floor else None,
@@ -104,22 +106,30 @@ class PictureMaker:
             normal_cell=self.timeline.normal_cell,
         )
         backdrop = self._backdrop if look.floor else None
-        made = render(gaussians, camera, groups=groups, gloss=gloss, backdrop=backdrop, time=time)
+        made = render(
+            gaussians,
+            camera,
+            groups=groups,
+            gloss=gloss,
+            plates=plates,
+            backdrop=backdrop,
+            time=time,
+        )
         values = (made.image * 255.0).round().clamp(0, 255).to(torch.uint8)
         return values.cpu().numpy(), drawn.legend
 
     def splats(self, frame: SavedFrame, look: Look) -> Drawn:
         """The splats of a frame as a look shows them."""
-        gaussians, groups = frame.gaussians, frame.groups
+        gaussians, groups, plates = frame.gaussians, frame.groups, frame.anchor < 0
         gloss = None if self.shot is None else gloss_of(self.shot, frame)
         colors, legend = splat_colors(frame, self.timeline, look.color_by)
         if colors is not None:
             gaussians = gaussians.with_sh_degree(0).with_colors(colors)
         if look.cut is not None:
             kept = ~hidden(gaussians.means, look.cut, self.timeline.survey(frame.index).center)
-            gaussians, groups = gaussians.select(kept), groups[kept]
+            gaussians, groups, plates = gaussians.select(kept), groups[kept], plates[kept]
             gloss = None if gloss is None else gloss[kept]
-        return Drawn(gaussians, groups, gloss, legend)
+        return Drawn(gaussians, groups, gloss, plates, legend)
 
     def _studio(self) -> Studio | None:
         if self.floor is None:

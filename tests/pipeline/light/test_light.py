@@ -204,7 +204,7 @@ def test_a_shot_that_says_nothing_has_key_fill_and_rim(tmp_path: Path) -> None:
     # a surface that faces the key light keeps its colour; the rim comes from behind
     towards = torch.tensor([key.toward], dtype=torch.float64)
     from_key = float(irradiance(usual.around(towards), towards).mean()) + key.intensity
-    assert from_key == pytest.approx(1.0, abs=0.06)
+    assert 1.0 < from_key < 1.1  # of linear radiance: 4 % of the display value
     assert sum(a * b for a, b in zip(key.toward[:2], rim.toward[:2], strict=True)) < 0
     # the fill comes from the side that the key light leaves, towards the camera
     side = torch.tensor([[-1.0, -0.8, 0.0], [1.0, 0.8, 0.0]], dtype=torch.float64)
