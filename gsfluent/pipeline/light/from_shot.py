@@ -106,13 +106,16 @@ def changed(
     return replace(lighting, **{k: v for k, v in shared.items() if v is not None})  # type: ignore[arg-type]
 
 
-def looks_of(shot: Shot) -> dict[str, tuple[float, float]]:
-    """k_s and n_s of every object of a shot; a picture hangs on them, its simulation does not."""
+def looks_of(shot: Shot) -> dict[str, tuple[float, float, float]]:
+    """k_s, n_s and transmission of every object of a shot.
+
+    A picture hangs on them, its simulation does not.
+    """
     made = {
         name: materials.get(settings.material).override(**dict(settings.overrides))
         for name, settings in shot.objects.items()
     }
-    return {name: (each.specular, each.shininess) for name, each in made.items()}
+    return {name: (each.specular, each.shininess, each.transmission) for name, each in made.items()}
 
 
 def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
@@ -126,7 +129,7 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
         return None
     rows, looks, wet = [], looks_of(shot), []
     for name, preset in names:
-        row = looks.get(name, (SPECULAR, SHININESS))
+        row = looks[name][:2] if name in looks else (SPECULAR, SHININESS)
         if name not in looks and preset in materials.names():
             made_of = materials.get(preset)
             row = (made_of.specular, made_of.shininess)
@@ -142,6 +145,18 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
         juice = torch.tensor([*wet, False], device=anchor.device)[looks_like]
         looks_like = torch.where((frame.ids >= DUST) & juice, len(wet) + 1, looks_like)
     return table[looks_like]
+
+
+def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
+    """Transmission of every splat, [N]; None where nothing lets light through."""
+    looks = looks_of(shot)
+    clear = [looks[name][2] if name in looks else 0.0 for name, _ in frame.facts.get("bodies", ())]
+    if not any(clear):
+        return None
+    table = torch.tensor([*clear, 0.0]).to(frame.gaussians.means)
+    anchor = frame.anchor.long()
+    body = frame.body[anchor.clamp(min=0)].long()
+    return table[torch.where(anchor >= 0, body, len(clear))]
 
 
 def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:

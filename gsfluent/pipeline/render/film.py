@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Gaussians
+from gsfluent.draw import draw
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture, load_splats
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.light.albedo import Albedo
-from gsfluent.pipeline.light.from_shot import gloss_of
+from gsfluent.pipeline.light.from_shot import gloss_of, transmission_of
+from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_background, object_radius
@@ -92,16 +95,25 @@ class Film:
 
     def drawn(self, gaussians: Gaussians, frame: SavedFrame, camera: Camera) -> Picture:
         """The picture of splats at the moment of a frame, in any camera."""
+        gloss, clear = gloss_of(self.shot, frame), transmission_of(self.shot, frame)
+        shown = gaussians
+        if clear is not None:
+            shown, gloss = as_seen(gaussians, gloss, clear, camera)
         made = self.render(
-            gaussians,
+            shown,
             camera,
             groups=frame.groups,
-            gloss=gloss_of(self.shot, frame),
+            gloss=gloss,
             plates=frame.anchor < 0,
             backdrop=self.backdrop,
             time=frame.time,
             room=self._room,
         )
+        if clear is not None:
+            # what is seen through glass is no hole in it
+            solid = draw(gaussians, camera, depth=True, groups=frame.groups)
+            assert solid.depth is not None  # asked for
+            made = replace(made, alpha=solid.alpha, depth=solid.depth)
         self._room = made.room
         return made
 

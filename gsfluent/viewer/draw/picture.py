@@ -13,7 +13,8 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.light.from_shot import gloss_of, light_of
+from gsfluent.pipeline.light.from_shot import gloss_of, light_of, transmission_of
+from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.camera import Action, orbit
@@ -38,6 +39,7 @@ class Drawn:
     groups: Tensor  # Siblings, int32 [N]
     gloss: Tensor | None  # Highlights of each splat, [N, 2], or None
     plates: Tensor  # Splats of rigid things, bool [N]
+    clear: Tensor | None  # Share of light that goes through, [N], or None
     legend: Legend | None  # What the colours mean, or None
 
 
@@ -99,6 +101,8 @@ class PictureMaker:
             speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
             gaussians = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
             groups, gloss, plates, time = None, None, None, 0.0
+        elif drawn.clear is not None and look.light is not None:
+            gaussians, gloss = as_seen(gaussians, gloss, drawn.clear, camera)
         render = Render(
             light=look.light,
             studio=self._studio() if look.floor else None,
@@ -122,14 +126,18 @@ class PictureMaker:
         """The splats of a frame as a look shows them."""
         gaussians, groups, plates = frame.gaussians, frame.groups, frame.anchor < 0
         gloss = None if self.shot is None else gloss_of(self.shot, frame)
+        clear = None
         colors, legend = splat_colors(frame, self.timeline, look.color_by)
         if colors is not None:
             gaussians = gaussians.with_sh_degree(0).with_colors(colors)
+        elif self.shot is not None:  # colours that tell something are not looked through
+            clear = transmission_of(self.shot, frame)
         if look.cut is not None:
             kept = ~hidden(gaussians.means, look.cut, self.timeline.survey(frame.index).center)
             gaussians, groups, plates = gaussians.select(kept), groups[kept], plates[kept]
             gloss = None if gloss is None else gloss[kept]
-        return Drawn(gaussians, groups, gloss, plates, legend)
+            clear = None if clear is None else clear[kept]
+        return Drawn(gaussians, groups, gloss, plates, clear, legend)
 
     def _studio(self) -> Studio | None:
         if self.floor is None:

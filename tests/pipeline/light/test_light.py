@@ -22,7 +22,8 @@ from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
-from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of
+from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of, transmission_of
+from gsfluent.pipeline.light.glass import as_seen, see_through
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.shade import irradiance, to_linear
 from gsfluent.pipeline.light.shadow import FADE, NORMAL_OFFSET, ShadowMaps, transmittance
@@ -413,6 +414,58 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     torch.testing.assert_close(gloss_of(shot(tmp_path), loose)[5], wet)  # type: ignore[index]
     loose.facts = {}
     assert gloss_of(shot(tmp_path), loose) is None
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0, 75.0, 88.0])
+def test_a_face_of_glass_is_as_opaque_as_its_angle_says(degrees: float) -> None:
+    angle = math.radians(degrees)
+    eye = torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    flat = torch.tensor([[0.01, 0.01, 0.001], [0.01, 0.01, 0.01], [0.01, 0.01, 0.001]])
+    paint = torch.tensor([[0.2, 0.6, 0.4]]).expand(3, 3).contiguous()
+    bare = Gaussians.from_colors(torch.zeros(3, 3), flat, paint, opacities=1.0)
+    seen = see_through(bare, torch.tensor([0.8, 0.8, 0.0]), eye)
+    mirror = 0.04 + 0.96 * (1.0 - math.cos(angle)) ** 5  # Schlick, index 1.5
+    pane = mirror + 0.2 * (1.0 - mirror)
+    # three splats that overlap make one face
+    assert 1.0 - (1.0 - float(seen.opacities[0])) ** 3 == pytest.approx(pane, rel=1e-3)
+    mixed = (mirror * 0.92 + (pane - mirror) * paint[0]) / pane
+    torch.testing.assert_close(seen.colors()[0], mixed, atol=1e-3, rtol=0)
+    # what fills the inside only tints, what is not clear stays
+    assert float(seen.opacities[1]) == pytest.approx(0.04, rel=1e-3)
+    assert float(seen.opacities[2]) == 1.0
+    torch.testing.assert_close(seen.colors()[1:], paint[1:], atol=1e-6, rtol=0)
+
+
+def test_glass_shows_the_floor_and_keeps_its_rim_and_highlight(skin: Gaussians) -> None:
+    camera = Camera.look_at((0.0, -0.8, 0.0), (0, 0, 0), width=96, height=96, fov=18.0)
+    light = Lighting(lamps=(Lamp(direction=(0.0, -1.0, 0.0), shadow=False),), occlusion=0.0)
+    gloss = torch.tensor([[0.6, 160.0]]).expand(skin.count, 2).contiguous()
+    clear = torch.full((skin.count,), 0.85)
+    dark = skin.with_colors(torch.full((skin.count, 3), 0.1))
+    glass, shine = as_seen(dark, gloss, clear, camera)
+    made = Render(camera, light, background=(0.0, 1.0, 0.0))(glass, gloss=shine)
+    row = made.alpha[48]
+    inside = (made.alpha[48] > 0.02).nonzero()[:, 0]
+    middle, rim = float(row[58]), float(row[inside[0] + 2 : inside[0] + 5].max())
+    assert middle < 0.7 < 0.9 < rim
+    assert float(made.image[48, 58, 1]) > 0.3  # the green behind it
+    assert float(made.image[48, 48].min()) > 0.6  # the lamp, straight ahead
+
+
+def test_materials_say_what_is_clear(tmp_path: Path, skin: Gaussians) -> None:
+    assert transmission_of(shot(tmp_path), frame(skin, skin)) is None
+    pane = frame(skin, skin)
+    pane.facts = {"bodies": [["pane", "glass"]]}
+    pane.anchor = pane.anchor.clone()
+    pane.anchor[3] = -1  # a blade
+    (tmp_path / "melon.ply").write_bytes(b"")
+    objects = {"pane": {"material": "glass"}}
+    found = transmission_of(Shot.from_dict({**SHOT, "objects": objects}, tmp_path), pane)
+    assert found is not None
+    assert float(found[0]) == pytest.approx(materials.get("glass").transmission)
+    assert float(found[3]) == 0.0
+    dull = {"pane": {"material": "glass", "transmission": 0}}
+    assert transmission_of(Shot.from_dict({**SHOT, "objects": dull}, tmp_path), pane) is None
 
 
 @pytest.mark.cuda
