@@ -148,7 +148,10 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
 
 
 def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
-    """Transmission of every splat, [N]; None where nothing lets light through."""
+    """Transmission of every splat, [N]; None where nothing lets light through.
+
+    Dust of what is clear is not: powdered glass scatters.
+    """
     looks = looks_of(shot)
     clear = [looks[name][2] if name in looks else 0.0 for name, _ in frame.facts.get("bodies", ())]
     if not any(clear):
@@ -156,7 +159,8 @@ def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     table = torch.tensor([*clear, 0.0]).to(frame.gaussians.means)
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()
-    return table[torch.where(anchor >= 0, body, len(clear))]
+    solid = (anchor >= 0) & (frame.ids < DUST)
+    return table[torch.where(solid, body, len(clear))]
 
 
 def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:

@@ -458,12 +458,13 @@ def test_materials_say_what_is_clear(tmp_path: Path, skin: Gaussians) -> None:
     pane.facts = {"bodies": [["pane", "glass"]]}
     pane.anchor = pane.anchor.clone()
     pane.anchor[3] = -1  # a blade
+    pane.ids[5] = DUST + 7
     (tmp_path / "melon.ply").write_bytes(b"")
     objects = {"pane": {"material": "glass"}}
     found = transmission_of(Shot.from_dict({**SHOT, "objects": objects}, tmp_path), pane)
     assert found is not None
     assert float(found[0]) == pytest.approx(materials.get("glass").transmission)
-    assert float(found[3]) == 0.0
+    assert float(found[3]) == float(found[5]) == 0.0
     dull = {"pane": {"material": "glass", "transmission": 0}}
     assert transmission_of(Shot.from_dict({**SHOT, "objects": dull}, tmp_path), pane) is None
 

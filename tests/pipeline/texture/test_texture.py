@@ -34,7 +34,7 @@ from gsfluent.pipeline.texture.presets.by_material import inside_of
 from gsfluent.pipeline.texture.presets.plain import TINTED
 from gsfluent.pipeline.texture.presets.procedural import procedural_texture
 from gsfluent.pipeline.texture.synthesis.inclusions import find_inclusions
-from gsfluent.pipeline.texture.volume.domain import SHELL
+from gsfluent.pipeline.texture.volume.domain import SHELL, blend_skin
 
 SIZE = 40
 
@@ -281,6 +281,19 @@ def test_every_inside_of_a_material_is_a_preset() -> None:
     # what is the same throughout has the skin's colour; what has an inside of its own does not
     for name, tinted in (("rock", True), ("steel", True), ("chocolate", True), ("bone", False)):
         assert (inside_of(name) in TINTED) == tinted
+
+
+def test_a_thin_wall_has_an_inside_of_its_own() -> None:
+    domain = _domain(24)
+    wall = replace(domain, inside=domain.depth > 0, depth=np.minimum(domain.depth, 1.7))
+    white = np.ones_like(domain.skin)
+    found = blend_skin(wall, white)
+    assert float(found[wall.depth >= 1.5].min()) == 1.0
+    outer = (domain.depth > 0) & (domain.depth <= 0.5)
+    assert np.allclose(found[outer], domain.skin[outer])
+    # what is massive fades as deep as ever
+    shallow = (domain.depth > 1.4) & (domain.depth < 1.6)
+    assert float(blend_skin(domain, white)[shallow].max()) < 0.7
 
 
 def test_no_smears_where_the_skin_has_a_pattern() -> None:
