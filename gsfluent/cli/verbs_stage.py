@@ -135,7 +135,7 @@ class Texture(Verb):
     """Give the inside of a solid its colours.
 
     Examples:
-      gsfluent texture solid.ply -o textured.ply                       # from the skin's colours
+      gsfluent texture solid.ply -o textured.ply --material rock       # as rock is, in its colour
       gsfluent texture solid.ply -o textured.ply --exemplar cut.jpg    # from a photo of a cut
       gsfluent texture solid.ply -o textured.ply --exemplar apple.jpg --cut across
       gsfluent texture solid.ply -o textured.ply --method diffusion --model PATH --prompt "flesh"
@@ -154,6 +154,8 @@ class Texture(Verb):
     """Photograph of a cut through such an object."""
     preset: str | None = None
     """Procedural recipe: watermelon, apple, orange, bread, wood, marble, bone, ..."""
+    material: str | None = None
+    """Material that chooses the recipe when nothing else is given: bone, glass, chocolate, ..."""
     quality: str | None = None
     """Effort of the exemplar method: preview, fast or full."""
     guide: str | None = None
@@ -182,7 +184,16 @@ class Texture(Verb):
 
         existing(self.solid, "solid.ply", folder=False)
         options = self.given(
-            "method", "exemplar", "preset", "quality", "guide", "cut", "prompt", "model", "resume"
+            "method",
+            "exemplar",
+            "preset",
+            "material",
+            "quality",
+            "guide",
+            "cut",
+            "prompt",
+            "model",
+            "resume",
         )
         if self.exemplar:
             options.setdefault("method", "exemplar")

@@ -183,7 +183,8 @@ class TextureSettings(Section):
 
     method: str | None = optional(
         choice("auto", *_TEXTURE_METHODS),
-        "How the inside gets its colours; by default from the exemplar if there is one.",
+        "How the inside gets its colours; by default from the exemplar if there is one, "
+        "else by the preset, or the one of the material.",
         "exemplar",
     )
     exemplar: Path | None = optional(
@@ -191,7 +192,9 @@ class TextureSettings(Section):
         "Photograph of a cut through such an object; other methods compare with it.",
         "cut.jpg",
     )
-    preset: str | None = optional(text, "Procedural recipe (method procedural).", "watermelon")
+    preset: str | None = optional(
+        text, "Procedural recipe (method procedural); the material's when absent.", "watermelon"
+    )
     prompt: str | None = optional(
         text, "What the inside looks like (method diffusion).", "ripe watermelon flesh"
     )
@@ -236,6 +239,13 @@ class TextureSettings(Section):
         flag, "Fit interior splats coarser than the voxels to slices of the colours.", "true"
     )
 
+    @property
+    def chosen(self) -> str:
+        """The method that the stage will take."""
+        if self.method not in (None, "auto"):
+            return str(self.method)
+        return "exemplar" if self.exemplar else "procedural"
+
     def given(self) -> dict[str, Any]:
         """Return the settings that are set, as keyword arguments of the stage."""
         values = super().given()
@@ -259,9 +269,7 @@ _TEXTURE_READERS = {
 def read_texture(value: Any, place: Place) -> TextureSettings:
     """Read ``texture:`` and refuse keys that the method does not read."""
     settings = section(TextureSettings, value, place)
-    method = settings.method
-    if method in (None, "auto"):
-        method = "exemplar" if settings.exemplar else "procedural" if settings.preset else "profile"
+    method = settings.chosen
     for name, readers in _TEXTURE_READERS.items():
         if getattr(settings, name) is not None and method not in readers:
             raise InputError(
@@ -280,7 +288,9 @@ def read_texture(value: Any, place: Place) -> TextureSettings:
         "procedural": "preset",
         "diffusion": "model",
         "inpaint": "model",
-    }.get(method or "")
+    }.get(method)
+    if needed == "preset" and settings.method in (None, "auto"):
+        return settings  # the material's
     if needed is not None and getattr(settings, needed) is None:
         raise InputError(
             f"{place.inside(needed).path} is missing",
@@ -312,8 +322,9 @@ class OutputSettings:
         default="orbit",
     )
     backdrop: str = key(
-        choice("studio", "captured"),
-        "What stands behind: the studio, or the surroundings that the capture shows.",
+        choice("studio", "light", "dark", "captured"),
+        "What stands behind: the studio, light or dark, whichever the object is not, or one of "
+        "them; or the surroundings that the capture shows.",
         "captured",
         default="studio",
     )

@@ -171,11 +171,10 @@ class LightSettings(Section):
         "Texels along the side of a shadow map; from the picture's size when absent.",
         "1024",
     )
-    lights: tuple[LampSettings, ...] = key(
+    lights: tuple[LampSettings, ...] | None = optional(
         several(_lamp),
         "More lamps beside the key light.",
         "[{position: [0.3, -0.3, 0.6], intensity: 0.3}]",
-        default=(),
     )
     environment: EnvironmentSettings | None = optional(
         _environment,

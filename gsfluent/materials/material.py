@@ -45,6 +45,7 @@ WHOLE: dict[str, tuple[float, float, str]] = {
 LOOKS: dict[str, tuple[float, float, str]] = {
     "specular": (0.0, 10.0, "no unit"),
     "shininess": (1.0, 10_000.0, "no unit"),
+    "transmission": (0.0, 1.0, "no unit"),
 }
 """What only a picture needs: range and unit. No part of a simulation."""
 SHEAR = 0.03
@@ -107,6 +108,7 @@ class Material:
         dust: How much of a break is dust, 0 to 1; sets the most mass that may come loose.
         specular: Strength of its highlights, k_s of Blinn-Phong.
         shininess: Narrowness of its highlights, n_s of Blinn-Phong.
+        transmission: Share of the light that one face lets through where it is seen face on.
         parts: Default parts (for :meth:`gsfluent.Scene.add`), e.g. the rind of a melon.
         sources: Field name -> where the number is from. A field that is not named was chosen by
             eye.
@@ -147,6 +149,7 @@ class Material:
     # not in the repr, from which a simulation is known again
     specular: float = dataclasses.field(default=0.03, repr=False)
     shininess: float = dataclasses.field(default=24.0, repr=False)
+    transmission: float = dataclasses.field(default=0.0, repr=False)
     parts: tuple[Mapping[str, Any], ...] = ()
     sources: Mapping[str, str] = dataclasses.field(default_factory=dict)
 

@@ -141,10 +141,7 @@ def fill_work(
 
 def texture_method(shot: Shot) -> str:
     """The method that the texture stage will take."""
-    texture = shot.texture
-    if texture.method not in (None, "auto"):
-        return str(texture.method)
-    return "exemplar" if texture.exemplar else "procedural" if texture.preset else "profile"
+    return shot.texture.chosen
 
 
 def texture_work(method: str, fill: Mapping[str, float]) -> Features:

@@ -33,7 +33,7 @@ def check_shot(shot: Shot) -> None:
     Reconstruct(**shot.reconstruct.given())
     Fill(**shot.fill.given(1.0))
     texture = shot.texture.given()
-    if texture.get("method", "auto") != "auto":  # which always can be, and warns
+    if texture.get("method", "auto") != "auto":  # which always can be
         Texture(**texture)
     light_of(shot)
     looks_of(shot)

@@ -180,6 +180,8 @@ def texture_stage(context: RunContext) -> None:
     shot = context.shot
     options = shot.texture.given()
     exemplar = content_digest(shot.texture.exemplar) if shot.texture.exemplar else None
+    # a material says what is inside where nothing else does
+    insides = {} if options else {name: o.material for name, o in shot.objects.items()}
 
     def work(folder: Path) -> dict[str, Any]:
         reports = []
@@ -194,6 +196,7 @@ def texture_stage(context: RunContext) -> None:
             # slices finished before a kill are found again: the folder outlives it
             stage = Texture(
                 **options,
+                material=insides.get(name),
                 device=str(context.device),
                 resume=folder / f"{name}.slices",
                 seed=context.seed,
@@ -204,7 +207,7 @@ def texture_stage(context: RunContext) -> None:
             reports.append({k: v for k, v in textured.report.items() if k != "fill"})
         return _merged(reports)
 
-    result = context.do("texture", work, options, exemplar, section="texture")
+    result = context.do("texture", work, options, exemplar, insides, section="texture")
     first = next(iter(shot.objects))
     publish(result, f"{first}.png", context.out / "interior.png")
     context.record.values["outputs"]["interior"] = "interior.png"

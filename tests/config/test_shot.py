@@ -199,7 +199,7 @@ def test_a_time_budget_stands_alone(folder: Path, other: dict[str, Any]) -> None
         ({"texture": {"method": "exemplar"}}, "texture.exemplar is missing"),
         ({"texture": {"method": "procedural"}}, "texture.preset is missing"),
         ({"texture": {"method": "diffusion"}}, "texture.model is missing"),
-        ({"texture": {"model": "x"}}, "texture.model does nothing with method profile"),
+        ({"texture": {"model": "x"}}, "texture.model does nothing with method procedural"),
         ({"texture": {"exemplar": "cut.jpg", "prompt": "x"}}, "texture.prompt does nothing"),
         ({"texture": {"method": "color_copy", "quality": "full"}}, "texture.quality does nothing"),
         ({"fill": {"hollow": -1}}, "fill.hollow must be above 0"),

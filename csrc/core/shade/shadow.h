@@ -16,6 +16,7 @@ constexpr double kMostSpread = 0.25;  // of the map's side
 constexpr double kSure = 0.3;         // opacity from which a blocker counts for the deepest one
 constexpr double kSteepest = 4.0;
 constexpr double kNormalOffset = 1.0;  // biases that a point is lifted off bumpy splats
+constexpr double kFade = 4.0;  // biases past the bias from which on a blocker counts in full
 constexpr double kTinyLength = 1e-12;
 
 // Points of Vogel's spiral over the unit disc, one after the other: turns by the golden angle.
@@ -47,7 +48,7 @@ struct ShadowView {
   int size;
   Vec3<T> plane;  // the surface's normal in the map's camera
   T u, v, x, y;   // slopes and texel of the point
-  T depth, focal, nearest, bias, level, per_depth;
+  T depth, focal, nearest, bias, hardness, level, per_depth;
 
   GSF_HOST_DEVICE T own_depth(T du, T dv) const {
     using std::sqrt;
@@ -57,6 +58,13 @@ struct ShadowView {
     const T room = T(kSteepest) * sqrt(du * du + dv * dv) / per_depth;
     const T along = below < T(-kTinyLength) ? level / below : depth;
     return clamp(along, depth - room, depth + room);
+  }
+  // How far something at depth `found` counts as before the surface, which is `own` deep there.
+  // Translucent layers of a skin lie at other depths for the lamp than for the camera: a step at
+  // the bias would draw its own edge.
+  GSF_HOST_DEVICE T before(T own, T found) const {
+    const T share = (own - bias - found) * hardness;
+    return share > T(0) ? min(share, T(1)) : T(0);  // 0 for NaN
   }
   GSF_HOST_DEVICE int64_t texel(T column, T line) const {
     return int64_t(index_within(line, 0, size - 1)) * size + index_within(column, 0, size - 1);
@@ -102,6 +110,7 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   view.focal = row[12];
   view.nearest = row[13];
   view.bias = biased * row[14];
+  view.hardness = T(1) / max(T(kFade) * view.bias, T(kTinyLength));
   const T safe = max(local.z, T(kTinyLength)), half = T(0.5) * T(a.texels);
   view.u = local.x / safe;
   view.v = local.y / safe;
@@ -127,10 +136,10 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
     du *= search;
     dv *= search;
     const int64_t index = view.texel(view.x + du, view.y + dv);
-    const T share = view.alpha_map[index];
-    if (!(share > T(0))) continue;
-    const T found = view.depth_map[index];
-    if (found < view.own_depth(du, dv) - view.bias) {
+    const T found = view.depth_map[index], opacity = view.alpha_map[index];
+    if (!(opacity > T(0))) continue;
+    const T share = opacity * view.before(view.own_depth(du, dv), found);
+    if (share > T(0)) {
       weight += share;
       total += share * found;
       if (share > T(kSure)) deepest = max(deepest, found);
@@ -150,15 +159,16 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
     spiral.point(i, kFilterTaps, &du, &dv);
     du *= spread;
     dv *= spread;
-    const T limit = view.own_depth(du, dv) - view.bias;
+    const T own = view.own_depth(du, dv);
     const T column = view.x + du - T(0.5), line = view.y + dv - T(0.5);
     const T left = floor(column), top = floor(line), fx = column - left, fy = line - top;
     for (int corner = 0; corner < 4; ++corner) {
       const int dx = corner & 1, dy = corner >> 1;
       const int64_t index = view.texel(left + T(dx), top + T(dy));
       const T share = view.alpha_map[index];
-      if (share > T(0) && view.depth_map[index] < limit)
-        blocked += (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * share;
+      if (share > T(0))
+        blocked += (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * share *
+                   view.before(own, view.depth_map[index]);
     }
   }
   return T(1) - clamp(blocked / T(kFilterTaps), T(0), T(1));

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.ops import collider as columns
+from gsfluent.pipeline.colliders import patches
 from gsfluent.pipeline.colliders.proximity import time_to_meet
+from gsfluent.pipeline.liquid.sheet import CLOSED
 from gsfluent.scene.parts import turned
 from gsfluent.scene.scene import Collider, Scene
 
@@ -30,6 +32,10 @@ BACKED = 6.0
 """Least thickness of a plate [cells]: a node that matter at its face reaches (1.5 cells, and what
 it sank in) must be nearer to the face than to the back, or it is pushed out of the back."""
 _NOTHING = columns.TYPES["nothing"]
+_LATTICE_POINTS = 16_000
+"""About how many splats draw a shape that has no patches of its own."""
+_FLAT = 0.2
+"""Their thickness in widths, so that a thin wall and an edge are not rows of balls."""
 DENSITY_OF_MESH_VALUES = 0.5
 """Spacing of a mesh's distance grid [cells]."""
 
@@ -264,39 +270,55 @@ class RigidSet:
         result: list[float] = (distance - slack).amin(dim=1).tolist()
         return result
 
-    def surfaces(self, rows: Tensor, points: int = 2000) -> tuple[Tensor, Tensor, Tensor]:
-        """Points spread over the surfaces of all colliders but endless planes, to draw them.
+    def surfaces(self, rows: Tensor) -> patches.Patches | None:
+        """Flat splats on the surfaces of all colliders but endless planes, to draw them.
 
         Args:
             rows: Rows, [M, 32].
-            points: About how many per collider; a mesh, which may be hollow, gets eight times that.
 
         Returns:
-            Points [P, 3] and normals [P, 3] in scene metres, and the spacing at each [m], [P].
+            The splats in scene metres, or None when there is nothing to draw.
         """
-        found, normals, spacing = [], [], []
+        found = []
         for collider, one in zip(self._colliders, rows, strict=True):
             if collider is not None and not collider.shown:
                 continue
             row = self._drawn(collider, one)
-            bound = self._bound(row)
-            if not math.isfinite(bound):
-                continue
-            # A ball of this radius has about this many points of a lattice on its surface.
-            fine = 8 if collider is not None and collider.kind == "mesh" else 1
-            step = bound * math.sqrt(12.0 / (fine * points))
-            side = math.ceil(bound / step)
-            axis = torch.arange(-side, side + 1, dtype=rows.dtype, device=rows.device) * step
-            at = row[3:6] + torch.cartesian_prod(axis, axis, axis)
-            distance, normal = ops.collider_distance(at, row[None], self.sdf)
-            near = distance[:, 0].abs() <= 0.5 * step
-            found.append((at - distance * normal[:, 0])[near])
-            normals.append(normal[near, 0])
-            spacing.append(torch.full_like(normals[-1][:, 0], step))
-        if not found:
-            none = rows.new_zeros(0, 3)
-            return none, none, rows.new_zeros(0)
-        return torch.cat(found), torch.cat(normals), torch.cat(spacing)
+            if math.isfinite(self._bound(row)):
+                found.append(self._surface(row))
+        return patches.joined(found) if found else None
+
+    def _surface(self, row: Tensor) -> patches.Patches:
+        kind, radius = int(row[columns.TYPE]), float(row[columns.RADIUS])
+        x, y, z = row[columns.EXTENT : columns.EXTENT + 3].tolist()
+        if kind == columns.TYPES["sphere"]:
+            made = patches.sphere(radius)
+        elif kind == columns.TYPES["box"]:
+            made = patches.box((x, y, z))
+        elif kind == columns.TYPES["cylinder"]:
+            made = patches.cylinder(radius, z)
+        else:
+            return self._projected(row)
+        quaternion = row[columns.ORIENTATION : columns.ORIENTATION + 4]
+        turn = geometry.quaternion_to_matrix(quaternion[None].double())[0]
+        place = row[columns.POINT : columns.POINT + 3].double()
+        made = patches.Patches(*(part.to(row.device) for part in made))
+        return made.moved(turn, place)
+
+    def _projected(self, row: Tensor) -> patches.Patches:
+        """A lattice's points near a surface of any shape, put onto it."""
+        bound = self._bound(row)
+        # A ball of this radius has about this many points of a lattice on its surface.
+        step = bound * math.sqrt(12.0 / _LATTICE_POINTS)
+        side = math.ceil(bound / step)
+        axis = torch.arange(-side, side + 1, dtype=row.dtype, device=row.device) * step
+        at = row[3:6] + torch.cartesian_prod(axis, axis, axis)
+        distance, normal = ops.collider_distance(at, row[None], self.sdf)
+        near = distance[:, 0].abs() <= 0.5 * step
+        normal = normal[near, 0].double()
+        points = (at[near] - distance[near] * normal).double()
+        sizes = points.new_tensor(CLOSED * step) * points.new_tensor([1.0, 1.0, _FLAT])
+        return patches.Patches(points, patches.upright(normal), sizes.expand_as(points))
 
     def _drawn(self, c: Collider | None, row: Tensor) -> Tensor:
         """The row as it was asked for, not as the grid needs it."""

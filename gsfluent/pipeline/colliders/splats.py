@@ -7,16 +7,14 @@ from torch import Tensor
 
 from gsfluent.data import SURFACE, Gaussians, Particles
 from gsfluent.geometry import matrix_to_quaternion
+from gsfluent.pipeline.colliders.patches import FINEST, Patches, rectangle
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.liquid.sheet import CLOSED, ellipsoids
 from gsfluent.scene.scene import Scene
 
-_STEEL = (0.25, 0.25, 0.25)
+_STEEL = (0.40, 0.41, 0.43)
 _OPAQUE = 0.95
 _BLADE = (0.55, 0.57, 0.60)
-_FLAT = 0.2
-"""Thickness of the splats of rigid things, in widths."""
-_PLATE_POINTS = 100
 _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
 _PAINT = {
@@ -72,17 +70,8 @@ def rigid_splats(rigid: RigidSet, rows: Tensor) -> Gaussians | None:
         rigid: The colliders.
         rows: Their rows now, [M, 32].
     """
-    points, normals, spacing = rigid.surfaces(rows)
-    if points.shape[0] == 0:
-        return None
-    # Flat, so that a thin wall and an edge are not rows of balls.
-    sizes = (CLOSED * spacing)[:, None] * spacing.new_tensor([1.0, 1.0, _FLAT])
-    made = _splats(points.float(), sizes.float().contiguous(), _STEEL)
-    # The shortest turn of +z to the normal's line: a flat splat has no sides.
-    x, y, z = torch.where(normals[:, 2:] < 0.0, -normals, normals).unbind(1)
-    w = (0.5 * (1.0 + z)).sqrt()
-    quats = torch.stack([w, -0.5 * y / w, 0.5 * x / w, torch.zeros_like(w)], dim=1).float()
-    return made.replace(quats=quats, normals=normals.float())
+    found = rigid.surfaces(rows)
+    return None if found is None else _flat(found, _STEEL)
 
 
 def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") -> Gaussians | None:
@@ -111,26 +100,20 @@ def blade_splats(scene: Scene, time: float, device: torch.device | str = "cpu") 
             leg += 1
         way = legs[leg] / lengths[leg]
         edge = torch.tensor(blade.edge, dtype=torch.float64)
-        step = blade.width / _PLATE_POINTS
-        across = torch.arange(_PLATE_POINTS + 1, dtype=torch.float64) * step - 0.5 * blade.width
-        back = torch.arange(round(_PLATE_HEIGHT * _PLATE_POINTS) + 1, dtype=torch.float64) * step
-        a, b = (part.reshape(-1, 1) for part in torch.meshgrid(across, back, indexing="ij"))
-        points = (path[leg] + along * way + a * edge - b * way).float().to(device)
         normal = torch.linalg.cross(edge, way)
-        normal = (normal / normal.norm()).float()
-        # as thin as a blade: seen along its plane it must not be a row of balls
-        sizes = torch.full((points.shape[0], 3), CLOSED * step, device=device)
-        sizes[:, 2] = 0.1 * sizes[:, 0]
-        turn = torch.stack([edge.float(), torch.linalg.cross(normal, edge.float()), normal], dim=1)
-        quat = matrix_to_quaternion(turn.double()).float().to(device)
-        splats = _splats(points, sizes, _BLADE)
-        made.append(
-            splats.replace(
-                quats=quat.expand(points.shape[0], 4).contiguous(),
-                normals=normal.to(device).expand_as(points).contiguous(),
-            )
-        )
+        normal = normal / normal.norm()
+        half = 0.5 * blade.width, 0.5 * _PLATE_HEIGHT * blade.width
+        turn = torch.stack([edge, torch.linalg.cross(normal, edge), normal], 1)
+        middle = path[leg] + (along - half[1]) * way
+        plate = rectangle(half, blade.width * FINEST).moved(turn, middle)
+        made.append(_flat(Patches(*(part.to(device) for part in plate)), _BLADE))
     return Gaussians.cat(made) if made else None
+
+
+def _flat(found: Patches, paint: tuple[float, float, float]) -> Gaussians:
+    made = _splats(found.points.float(), found.sizes.float().contiguous(), paint)
+    quats = matrix_to_quaternion(found.turn).float()
+    return made.replace(quats=quats, normals=found.turn[..., 2].float().contiguous())
 
 
 def _splats(position: Tensor, sizes: Tensor, paint: tuple[float, float, float]) -> Gaussians:

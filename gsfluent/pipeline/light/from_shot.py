@@ -16,7 +16,13 @@ from gsfluent.config.settings_light import EnvironmentSettings, LightSettings, r
 from gsfluent.config.yaml_file import read_yaml
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light import environment
-from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lamp, Lighting
+from gsfluent.pipeline.light.lamps import (
+    SHININESS,
+    SPECULAR,
+    Lamp,
+    Lighting,
+    studio_light,
+)
 from gsfluent.results.frames import DUST, SavedFrame
 
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
@@ -25,6 +31,9 @@ _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resoluti
 def light_of(shot: Shot) -> Lighting:
     """The shot's light; what it leaves out keeps the default.
 
+    That is the studio's fill and rim beside the key light, unless it gives ``ambient``,
+    ``environment`` or ``lights``.
+
     Raises:
         InputError: A number out of range, or an environment picture that cannot be read.
     """
@@ -32,10 +41,15 @@ def light_of(shot: Shot) -> Lighting:
 
 
 def _lighting(settings: LightSettings) -> Lighting:
-    lamps = [Lamp(**lamp.given()) for lamp in (settings.key, *settings.lights)]
+    # who gives one of these lights the scene himself: nothing that he did not ask for is added
+    own = any(getattr(settings, name) is not None for name in ("ambient", "environment", "lights"))
+    usual = Lighting() if own else studio_light()
+    key, *others = usual.lamps
+    others += [Lamp(**lamp.given()) for lamp in settings.lights or ()]
     shared = {name: value for name, value in settings.given().items() if name in _SHARED}
-    around = None if settings.environment is None else _environment(settings.environment)
-    return Lighting(lamps=tuple(lamps), environment=around, **shared)
+    if settings.environment is not None:
+        shared["environment"] = _environment(settings.environment)
+    return replace(usual, lamps=(replace(key, **settings.key.given()), *others), **shared)
 
 
 def changed(
@@ -92,13 +106,16 @@ def changed(
     return replace(lighting, **{k: v for k, v in shared.items() if v is not None})  # type: ignore[arg-type]
 
 
-def looks_of(shot: Shot) -> dict[str, tuple[float, float]]:
-    """k_s and n_s of every object of a shot; a picture hangs on them, its simulation does not."""
+def looks_of(shot: Shot) -> dict[str, tuple[float, float, float]]:
+    """k_s, n_s and transmission of every object of a shot.
+
+    A picture hangs on them, its simulation does not.
+    """
     made = {
         name: materials.get(settings.material).override(**dict(settings.overrides))
         for name, settings in shot.objects.items()
     }
-    return {name: (each.specular, each.shininess) for name, each in made.items()}
+    return {name: (each.specular, each.shininess, each.transmission) for name, each in made.items()}
 
 
 def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
@@ -112,7 +129,7 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
         return None
     rows, looks, wet = [], looks_of(shot), []
     for name, preset in names:
-        row = looks.get(name, (SPECULAR, SHININESS))
+        row = looks[name][:2] if name in looks else (SPECULAR, SHININESS)
         if name not in looks and preset in materials.names():
             made_of = materials.get(preset)
             row = (made_of.specular, made_of.shininess)
@@ -128,6 +145,22 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
         juice = torch.tensor([*wet, False], device=anchor.device)[looks_like]
         looks_like = torch.where((frame.ids >= DUST) & juice, len(wet) + 1, looks_like)
     return table[looks_like]
+
+
+def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
+    """Transmission of every splat, [N]; None where nothing lets light through.
+
+    Dust of what is clear is not: powdered glass scatters.
+    """
+    looks = looks_of(shot)
+    clear = [looks[name][2] if name in looks else 0.0 for name, _ in frame.facts.get("bodies", ())]
+    if not any(clear):
+        return None
+    table = torch.tensor([*clear, 0.0]).to(frame.gaussians.means)
+    anchor = frame.anchor.long()
+    body = frame.body[anchor.clamp(min=0)].long()
+    solid = (anchor >= 0) & (frame.ids < DUST)
+    return table[torch.where(solid, body, len(clear))]
 
 
 def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:

@@ -1,8 +1,9 @@
 """Lamps and the light from everywhere: what :class:`gsfluent.pipeline.Render` lights a scene with.
 
-The captured colour already holds the light of the photographs, so the default is mild: a surface
-that faces the key light keeps its colour, the far side loses about a fifth of its display value.
-The shading itself is :mod:`gsfluent.pipeline.light.shade`.
+The captured colour already holds the light of the photographs, so no default is harsh: a surface
+that faces the key light keeps its colour. A film is lit by :func:`studio_light`, whose far side
+loses about a quarter to a third of its display value. The shading itself is
+:mod:`gsfluent.pipeline.light.shade`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ AMBIENT, INTENSITY, SPECULAR, SHININESS = 0.6, 0.55, 0.03, 24.0
 SOFTNESS = 4.0
 """Apparent width [degrees] of a directional lamp: a large lamp of a studio; the sun has 0.53."""
 _BAND0 = 3.5449077018110318  # constant coefficient of an environment that is 1 everywhere
+_BAND1 = 2.0466534158929770  # the three of the next band, where it is the normal's part
 _MOST_SAMPLES = 64
 
 
@@ -187,6 +189,25 @@ class Lighting:
     def around(self, like: Tensor) -> Tensor:
         """Environment and ambient together, [9, 3], as :func:`gsfluent.ops.shade` takes them."""
         return _around(self.ambient, self.environment, like.dtype, like.device)
+
+
+RIM = Lamp(direction=(-0.8, 1.0, 0.9), intensity=0.45, size=12.0)
+"""From behind: it draws the edge of what is dark, and of what has the floor's colour."""
+_KEY = Lamp(intensity=0.62, size=10.0)
+_FILL_AMBIENT = 0.42
+_FILL = (-0.095, -0.075, 0.06)
+"""How the light from everywhere rises: from the side of the camera that the key light leaves."""
+
+
+def studio_light() -> Lighting:
+    """The light of a film that says nothing else: a soft key, a fill and a rim.
+
+    The fill is light from everywhere: it needs no shadow map, and cracks stay dark.
+    """
+    x, y, z = _FILL
+    none = (0.0, 0.0, 0.0)
+    rise = tuple((_BAND1 * part,) * 3 for part in (y, z, x))
+    return Lighting((_KEY, RIM), _FILL_AMBIENT, (none, *rise, none, none, none, none, none))
 
 
 def key_light(

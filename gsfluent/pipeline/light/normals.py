@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import ops
+from gsfluent import geometry, ops
 from gsfluent.data import INTERIOR, SPRAY, Gaussians
 from gsfluent.pipeline.light.occlusion import COARSEST, FULL, PER_CELL, Occupancy, box_frame
 from gsfluent.pipeline.light.shadow_maps import bulk
@@ -126,3 +126,12 @@ def splat_normals(gaussians: Gaussians, grid: Occupancy, eye: Tensor | None = No
         grid.nodes,
         eye=eye,
     )
+
+
+def plate_normals(gaussians: Gaussians, eye: Tensor) -> Tensor:
+    """Shortest axes of Gaussians, turned to the eye [3], unit vectors [N, 3]."""
+    turn = geometry.quaternion_to_matrix(gaussians.quats)
+    shortest = gaussians.scales.argmin(dim=1)[:, None, None].expand(-1, 3, 1)
+    axis = turn.gather(2, shortest)[..., 0]
+    away = ((eye - gaussians.means) * axis).sum(dim=1, keepdim=True) < 0.0
+    return torch.where(away, -axis, axis)

@@ -32,6 +32,10 @@ STEEPEST = 4.0
 # Points are lifted off the surface by this many biases before they look at the lamp: splats are
 # bumps, and at a slant one would shadow the next.
 NORMAL_OFFSET = 1.0
+# A blocker counts in full from this many biases past the bias. The skin of a reconstruction is
+# several translucent layers, of which camera and lamp see different ones: where the distance
+# between them crosses the bias is no edge of anything.
+FADE = 4.0
 _GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
 _TINY = 1e-12
 
@@ -85,6 +89,7 @@ def transmittance(
     u, v = local[..., 0] / safe, local[..., 1] / safe
     level = (plane * local).sum(-1)  # n.p: below zero on a surface that faces the lamp
     per_depth = focal / safe  # texels per metre at the point
+    hardness = 1.0 / (FADE * bias).clamp(min=_TINY)
     base = face * (size * size)
     most = MOST_SPREAD * size
 
@@ -116,7 +121,8 @@ def transmittance(
         du, dv = a * search, b * search
         index = at((x + du).floor(), (y + dv).floor())
         found = flat_depth[index]
-        share = flat_alpha[index] * (found < own_depth(du, dv) - bias)
+        before = (own_depth(du, dv) - bias - found) * hardness
+        share = flat_alpha[index] * before.clamp(0.0, 1.0)
         weight, total = weight + share, total + share * found
         deepest = torch.maximum(deepest, torch.where(share > SURE, found, 0.0))
     mean = total / weight.clamp(min=_TINY)
@@ -134,7 +140,8 @@ def transmittance(
         for dx, wx in ((0.0, 1.0 - fx), (1.0, fx)):
             for dy, wy in ((0.0, 1.0 - fy), (1.0, fy)):
                 index = at(left + dx, top + dy)
-                blocked += wx * wy * flat_alpha[index] * (flat_depth[index] < limit)
+                before = ((limit - flat_depth[index]) * hardness).clamp(0.0, 1.0)
+                blocked += wx * wy * flat_alpha[index] * before
     hit = (depth > 0.0) & (weight > 0.0) & (lamp[10] >= 0.0)
     return torch.where(hit, 1.0 - (blocked / FILTER_TAPS).clamp(0.0, 1.0), 1.0)
 

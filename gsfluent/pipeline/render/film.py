@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Gaussians
+from gsfluent.draw import draw
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture, load_splats
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.light.albedo import Albedo
-from gsfluent.pipeline.light.from_shot import gloss_of
+from gsfluent.pipeline.light.from_shot import gloss_of, transmission_of
+from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_background, object_radius
 from gsfluent.pipeline.render.camera import Action, cameras_for
 from gsfluent.pipeline.render.figures import cameras_around
 from gsfluent.pipeline.render.stage import Picture, Render, Room
-from gsfluent.pipeline.render.studio import Studio
+from gsfluent.pipeline.render.studio import Studio, wants_dark
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.results.frames import SavedFrame, count_frames, load_frame
 from gsfluent.results.record import read_frame
@@ -56,7 +59,8 @@ class Film:
         if shot.floor != "none":
             x, y = action.center[:, :2].mean(dim=0).tolist()
             extent = 1.3 * float(action.radius.amax())
-            studio = Studio(0.0, (x, y), float(action.radius[0]), extent)
+            dark = studio_is_dark(first, shot)
+            studio = Studio(0.0, (x, y), float(action.radius[0]), extent, dark)
         needs_capture = shot.capture is not None and isinstance(shot.output.camera, int)
         isolated = out / "stages" / "isolate"
         self.cameras = cameras_for(
@@ -91,17 +95,36 @@ class Film:
 
     def drawn(self, gaussians: Gaussians, frame: SavedFrame, camera: Camera) -> Picture:
         """The picture of splats at the moment of a frame, in any camera."""
+        gloss, clear = gloss_of(self.shot, frame), transmission_of(self.shot, frame)
+        shown = gaussians
+        if clear is not None:
+            shown, gloss = as_seen(gaussians, gloss, clear, camera)
         made = self.render(
-            gaussians,
+            shown,
             camera,
             groups=frame.groups,
-            gloss=gloss_of(self.shot, frame),
+            gloss=gloss,
+            plates=frame.anchor < 0,
             backdrop=self.backdrop,
             time=frame.time,
             room=self._room,
         )
+        if clear is not None:
+            # what is seen through glass is no hole in it
+            solid = draw(gaussians, camera, depth=True, groups=frame.groups)
+            assert solid.depth is not None  # asked for
+            made = replace(made, alpha=solid.alpha, depth=solid.depth)
         self._room = made.room
         return made
+
+
+def studio_is_dark(frame: SavedFrame, shot: Shot) -> bool:
+    """Whether the studio is the dark one, for the objects of a shot in its first frame."""
+    if shot.output.backdrop in ("light", "dark"):
+        return shot.output.backdrop == "dark"
+    anchor = frame.anchor.long()
+    ours = (anchor >= 0) & _of_objects(frame, shot).to(anchor.device)[anchor.clamp(min=0)]
+    return wants_dark(frame.gaussians.select(ours))
 
 
 def _of_objects(frame: SavedFrame, shot: Shot) -> torch.Tensor:

@@ -21,7 +21,7 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw_at
 from gsfluent.errors import InputError
 from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lighting, pack_lamps
-from gsfluent.pipeline.light.normals import Grid, grid_for, splat_normals
+from gsfluent.pipeline.light.normals import Grid, grid_for, plate_normals, splat_normals
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shadow_maps import Bulk, Lit, bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.backdrop import Backdrop
@@ -120,6 +120,7 @@ class Render(Stage):
         *,
         groups: Tensor | None = None,
         gloss: Tensor | None = None,
+        plates: Tensor | None = None,
         backdrop: Backdrop | None = None,
         time: float = 0.0,
         room: Room | None = None,
@@ -132,6 +133,8 @@ class Render(Stage):
             groups: int32 [N], siblings of which only the nearest shades a pixel; -1 for none.
             gloss: k_s and n_s of Blinn-Phong per splat, [N, 2]; the default plastic when None. Not
                 read when the light says what everything is like.
+            plates: Flat splats whose shortest axis is the normal, bool [N]: those that draw rigid
+                things. All others take theirs from the density of the matter, too.
             backdrop: Captured surroundings before the studio; None for none.
             time: Moment [s], for lamps that move.
             room: ``room`` of the picture before in a film, so that the grid behind normals and
@@ -149,6 +152,8 @@ class Render(Stage):
             lit, room = self._light(gaussians, camera, lighting, groups, room)
             eye = -(view[0][:3, 3] @ view[0][:3, :3])
             extras = splat_normals(gaussians, lit.grid, eye)
+            if plates is not None:
+                extras = torch.where(plates[:, None], plate_normals(gaussians, eye), extras)
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
         seen = draw_at(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsfluent import materials
 from gsfluent.data import INTERIOR, Capture, Solid
 from gsfluent.data.regions import with_inclusions
 from gsfluent.errors import InputError, check_choice
@@ -37,11 +38,8 @@ from gsfluent.pipeline.texture.photo.metrics import (
 )
 from gsfluent.pipeline.texture.photo.profile import surface_profile
 from gsfluent.pipeline.texture.polish import polish_colors
-from gsfluent.pipeline.texture.presets.procedural import (
-    check_preset,
-    preset_names,
-    procedural_texture,
-)
+from gsfluent.pipeline.texture.presets.by_material import PLAIN, inside_of
+from gsfluent.pipeline.texture.presets.procedural import check_preset, procedural_texture
 from gsfluent.pipeline.texture.structure import take_apart, with_structure
 from gsfluent.pipeline.texture.sweep import CUTS
 from gsfluent.pipeline.texture.synthesis.method import SynthesisOptions, exemplar_texture
@@ -70,15 +68,16 @@ class Texture(Stage):
         ``exemplar``: guided patch synthesis from photographs of a cut object (the default when an
         exemplar is given); ``procedural``: a preset; ``diffusion``: slices inpainted by a diffusers
         pipeline; ``inpaint``: slices inpainted by another backend (``inpaint={"backend": ...}``,
-        :class:`.inpaint_options.InpaintOptions`); ``profile``: surface colour fading to its mean
-        (the default with nothing given, with a warning); ``color_copy`` and ``telea``: baselines
-        for comparison.
+        :class:`.inpaint_options.InpaintOptions`); ``profile``, ``color_copy`` and ``telea``:
+        the skin's colours carried inward, baselines for comparison. With nothing given: the preset
+        of the material, or of plain matter in the skin's colour, which the log says.
 
     Args:
         method: One of the above, or ``auto``.
         exemplar: Photograph of the inside (path or array), a list of them, or one or a list per
             axis ``{x: ..., z: ...}``.
         preset: Name of a procedural preset.
+        material: Name of the material preset, which chooses the inside when nothing else does.
         prompt: Text for the diffusion model.
         model: Local folder or hub id of an inpainting pipeline.
         axis: The object's own axis in world coordinates; None takes scene "up", else +z.
@@ -109,6 +108,7 @@ class Texture(Stage):
         *,
         exemplar: object = None,
         preset: str | None = None,
+        material: str | None = None,
         prompt: str = "",
         model: str | Path | None = None,
         axis: tuple[float, float, float] | None = None,
@@ -125,12 +125,14 @@ class Texture(Stage):
         check_choice("texture: method", method, METHODS, "leave it at auto")
         self.synthesis = SynthesisOptions(**synthesis)
         if method == "auto":
-            method = "exemplar" if exemplar is not None else "procedural" if preset else "profile"
-            if method == "profile":
-                logger.warning(
-                    "texture: neither exemplar nor preset given; the inside gets the mean surface "
-                    "colour. Give a photograph of a cut object (exemplar) or a preset (%s)",
-                    ", ".join(preset_names()),
+            method = "procedural" if exemplar is None else "exemplar"
+            if method == "procedural" and preset is None:
+                preset = PLAIN if material is None else inside_of(materials.get(material).name)
+                logger.info(
+                    "texture: neither exemplar nor preset given; %s gets the inside %r; "
+                    "texture: {exemplar: cut.jpg} or {preset: NAME} is what it really has",
+                    material or "the object",
+                    preset,
                 )
         if method == "exemplar" and exemplar is None:
             raise InputError(

@@ -13,11 +13,12 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.light.from_shot import gloss_of, light_of
+from gsfluent.pipeline.light.from_shot import gloss_of, light_of, transmission_of
+from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.camera import Action, orbit
-from gsfluent.pipeline.render.film import captured_backdrop
+from gsfluent.pipeline.render.film import captured_backdrop, studio_is_dark
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
 from gsfluent.results.frames import SavedFrame
@@ -37,6 +38,8 @@ class Drawn:
     gaussians: Gaussians  # Splats, coloured and cut
     groups: Tensor  # Siblings, int32 [N]
     gloss: Tensor | None  # Highlights of each splat, [N, 2], or None
+    plates: Tensor  # Splats of rigid things, bool [N]
+    clear: Tensor | None  # Share of light that goes through, [N], or None
     legend: Legend | None  # What the colours mean, or None
 
 
@@ -49,6 +52,7 @@ class PictureMaker:
         self.shot = timeline.source.shot
         self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
         self._backdrop = self._captured()
+        self._dark: bool | None = None  # of the studio; known with the first picture
 
     def first_light(self) -> Lighting:
         """The shot's light, or the usual one."""
@@ -92,10 +96,13 @@ class PictureMaker:
         drawn = self.splats(frame, look)
         gaussians, gloss, time = drawn.gaussians, drawn.gloss, frame.time
         groups: Tensor | None = drawn.groups
+        plates: Tensor | None = drawn.plates
         if gaussians.count == 0:  # everything is cut away: one splat that nobody sees
             speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
             gaussians = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
-            groups, gloss, time = None, None, 0.0
+            groups, gloss, plates, time = None, None, None, 0.0
+        elif drawn.clear is not None and look.light is not None:
+            gaussians, gloss = as_seen(gaussians, gloss, drawn.clear, camera)
         render = Render(
             light=look.light,
             studio=self._studio() if look.floor else None,
@@ -103,28 +110,43 @@ class PictureMaker:
             normal_cell=self.timeline.normal_cell,
         )
         backdrop = self._backdrop if look.floor else None
-        made = render(gaussians, camera, groups=groups, gloss=gloss, backdrop=backdrop, time=time)
+        made = render(
+            gaussians,
+            camera,
+            groups=groups,
+            gloss=gloss,
+            plates=plates,
+            backdrop=backdrop,
+            time=time,
+        )
         values = (made.image * 255.0).round().clamp(0, 255).to(torch.uint8)
         return values.cpu().numpy(), drawn.legend
 
     def splats(self, frame: SavedFrame, look: Look) -> Drawn:
         """The splats of a frame as a look shows them."""
-        gaussians, groups = frame.gaussians, frame.groups
+        gaussians, groups, plates = frame.gaussians, frame.groups, frame.anchor < 0
         gloss = None if self.shot is None else gloss_of(self.shot, frame)
+        clear = None
         colors, legend = splat_colors(frame, self.timeline, look.color_by)
         if colors is not None:
             gaussians = gaussians.with_sh_degree(0).with_colors(colors)
+        elif self.shot is not None:  # colours that tell something are not looked through
+            clear = transmission_of(self.shot, frame)
         if look.cut is not None:
             kept = ~hidden(gaussians.means, look.cut, self.timeline.survey(frame.index).center)
-            gaussians, groups = gaussians.select(kept), groups[kept]
+            gaussians, groups, plates = gaussians.select(kept), groups[kept], plates[kept]
             gloss = None if gloss is None else gloss[kept]
-        return Drawn(gaussians, groups, gloss, legend)
+            clear = None if clear is None else clear[kept]
+        return Drawn(gaussians, groups, gloss, plates, clear, legend)
 
     def _studio(self) -> Studio | None:
         if self.floor is None:
             return None
         timeline = self.timeline
-        return Studio(self.floor, timeline.middle(), timeline.radius, 1.3 * timeline.extent())
+        if self._dark is None and self.shot is not None:
+            self._dark = studio_is_dark(timeline.frame(0), self.shot)
+        extent = 1.3 * timeline.extent()
+        return Studio(self.floor, timeline.middle(), timeline.radius, extent, bool(self._dark))
 
     def _captured(self) -> Backdrop | None:
         """The photographed surroundings where the shot asks for them and they are there."""

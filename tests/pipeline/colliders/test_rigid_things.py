@@ -11,9 +11,11 @@ import torch
 from simulation_shapes import ellipsoid
 
 from gsfluent import materials, ops
-from gsfluent.data import Frame
+from gsfluent.data import Camera, Frame
+from gsfluent.draw import draw
 from gsfluent.errors import InputError
 from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.colliders.splats import rigid_splats
 from gsfluent.pipeline.matter.points import build_matter
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
@@ -220,13 +222,43 @@ def test_surfaces_to_draw_lie_on_the_shapes(mesh_file: Path) -> None:
     scene = Scene()
     scene.add_collider("sphere", radius=0.2, at=(0, 0, 1))
     scene.add_collider("mesh", mesh=mesh_file, scale=1e-3, at=(1, 0, 1))
+    scene.add_collider("box", size=(0.3, 0.2, 0.04), turn=(0, 30, 0), at=(0, 1, 1))
+    scene.add_collider("cylinder", radius=0.1, length=0.3, turn=(40, 0, 0), at=(0, 2, 1))
     rigid = RigidSet(scene, 0.04)
-    points, normals, spacing = rigid.surfaces(rigid.start)
+    drawn = rigid.surfaces(rigid.start)
+    assert drawn is not None
+    points, normals = drawn.points, drawn.turn[..., 2]
     d, n = ops.collider_distance(points, rigid.start[1:], rigid.sdf)
     assert d.abs().min(dim=1).values.max() < 0.01
-    ball = points[:, 0] < 0.5
-    assert torch.allclose(normals[ball], n[ball, 0], atol=1e-6)
-    assert 300 < int(ball.sum()) < 4000 and float(spacing.max()) < 0.1
+    shape = d.abs().argmin(dim=1)
+    exact = (d.abs().min(dim=1).values < 1e-6) & (shape != 1)
+    assert torch.equal(exact, shape != 1)  # all but the mesh, whose distances are interpolated
+    assert torch.allclose(normals[shape == 0], n[shape == 0, 0], atol=1e-6)
+    for number in range(4):
+        mine = shape == number
+        assert 300 < int(mine.sum()) < 20_000
+        # a rotation: no mirrored splat
+        assert torch.allclose(torch.linalg.det(drawn.turn[mine]), torch.ones(()).double())
+
+
+def test_a_plate_is_closed_and_ends_at_its_edges() -> None:
+    scene = Scene(floor=None)
+    scene.add_collider("box", size=(0.3, 0.2, 0.04))
+    rigid = RigidSet(scene, 0.04)
+    splats = rigid_splats(rigid, rigid.start)
+    assert splats is not None
+    above = Camera.look_at(
+        (0, 0, 2.0), (0, 0, 0), width=240, height=160, fov=8.5, up=(0.0, 1.0, 0.0)
+    )
+    alpha = draw(splats, above).alpha
+    # where a ray through the middle of each pixel meets the plane of the upper face
+    pixel = (2.0 - 0.02) / float(above.K[0, 0])
+    x = (torch.arange(240) + 0.5 - float(above.K[0, 2])) * pixel
+    y = (torch.arange(160) + 0.5 - float(above.K[1, 2])) * pixel
+    inward = torch.minimum(0.15 - x.abs()[None, :], 0.1 - y.abs()[:, None])
+    assert float(alpha[inward > 0.001].min()) > 0.99
+    # within a pixel and a half of the edge it is gone
+    assert float(alpha[inward < -1.5 * pixel].max()) < 0.02
 
 
 def test_frames_show_plate_bullet_and_liquid() -> None:

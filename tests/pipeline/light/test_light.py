@@ -22,10 +22,11 @@ from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
-from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of
-from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
+from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of, transmission_of
+from gsfluent.pipeline.light.glass import as_seen, see_through
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.shade import irradiance, to_linear
-from gsfluent.pipeline.light.shadow import transmittance
+from gsfluent.pipeline.light.shadow import FADE, NORMAL_OFFSET, ShadowMaps, transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
@@ -125,6 +126,25 @@ def test_lamp_inside_the_matter_gets_a_cube(skin: Gaussians) -> None:
     assert faces_of(near, bulk(skin)) == (6, 1, 0)
 
 
+def test_a_blocker_counts_in_full_from_some_biases_on() -> None:
+    # a wall at depth 5 fills the map; points behind it face the lamp, k biases away from the wall
+    bias, depth = 0.01, 5.0
+    row = torch.tensor([1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 500.0, 4.9, bias])
+    maps = ShadowMaps(torch.full((1, 64, 64), depth), torch.ones(1, 64, 64), row[None])
+    lamp = torch.zeros(12)
+    lamp[3], lamp[9], lamp[11] = -1.0, 0.05, 1.0
+    k = torch.linspace(0.0, 12.0, 49)
+    points = torch.stack([0 * k, 0 * k, depth + bias * k], 1)
+    toward = torch.tensor([0.0, 0.0, -1.0]).expand_as(points)
+    found = transmittance(points, toward, lamp, maps)
+    # lifted off by one bias, and one bias is the surface itself
+    expected = 1.0 - ((k - NORMAL_OFFSET - 1.0) / FADE).clamp(0.0, 1.0)
+    torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
+    # of what is not in the maps every blocker counts
+    floor = transmittance(points, toward, lamp, maps, biased=0.0)
+    torch.testing.assert_close(floor, (k == 0).float(), atol=1e-6, rtol=0)
+
+
 def test_map_moves_in_whole_texels(skin: Gaussians) -> None:
     # what does not move looks the same from one frame to the next
     lamps = (Lamp(),)
@@ -174,6 +194,30 @@ def test_spinning_lamp_turns_about_the_vertical() -> None:
 def test_bad_lights_are_refused(make: Any) -> None:
     with pytest.raises(InputError, match="light"):
         make()
+
+
+def test_a_shot_that_says_nothing_has_key_fill_and_rim(tmp_path: Path) -> None:
+    (tmp_path / "melon.ply").write_bytes(b"")
+    bare = {k: v for k, v in SHOT.items() if k != "light"}
+    usual = light_of(Shot.from_dict(bare, tmp_path))
+    assert usual == studio_light()
+    key, rim = usual.lamps
+    # a surface that faces the key light keeps its colour; the rim comes from behind
+    towards = torch.tensor([key.toward], dtype=torch.float64)
+    from_key = float(irradiance(usual.around(towards), towards).mean()) + key.intensity
+    assert 1.0 < from_key < 1.1  # of linear radiance: 4 % of the display value
+    assert sum(a * b for a, b in zip(key.toward[:2], rim.toward[:2], strict=True)) < 0
+    # the fill comes from the side that the key light leaves, towards the camera
+    side = torch.tensor([[-1.0, -0.8, 0.0], [1.0, 0.8, 0.0]], dtype=torch.float64)
+    left, behind = irradiance(usual.around(side), normalize(side, dim=1)).mean(1)
+    assert float(left) > 1.5 * float(behind) > 0.3
+    turned = light_of(
+        Shot.from_dict({**bare, "light": {"key": {"direction": [0, 0, 1]}}}, tmp_path)
+    )
+    assert turned.lamps[1:] == (rim,) and turned.environment == usual.environment
+    for own in ({"ambient": 0.3}, {"lights": []}):
+        found = light_of(Shot.from_dict({**bare, "light": own}, tmp_path))
+        assert len(found.lamps) == 1 and found.environment is None
 
 
 def test_short_form_of_light_means_the_same(skin: Gaussians) -> None:
@@ -370,6 +414,59 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     torch.testing.assert_close(gloss_of(shot(tmp_path), loose)[5], wet)  # type: ignore[index]
     loose.facts = {}
     assert gloss_of(shot(tmp_path), loose) is None
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0, 75.0, 88.0])
+def test_a_face_of_glass_is_as_opaque_as_its_angle_says(degrees: float) -> None:
+    angle = math.radians(degrees)
+    eye = torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    flat = torch.tensor([[0.01, 0.01, 0.001], [0.01, 0.01, 0.01], [0.01, 0.01, 0.001]])
+    paint = torch.tensor([[0.2, 0.6, 0.4]]).expand(3, 3).contiguous()
+    bare = Gaussians.from_colors(torch.zeros(3, 3), flat, paint, opacities=1.0)
+    seen = see_through(bare, torch.tensor([0.8, 0.8, 0.0]), eye)
+    mirror = 0.04 + 0.96 * (1.0 - math.cos(angle)) ** 5  # Schlick, index 1.5
+    pane = mirror + 0.2 * (1.0 - mirror)
+    # three splats that overlap make one face
+    assert 1.0 - (1.0 - float(seen.opacities[0])) ** 3 == pytest.approx(pane, rel=1e-3)
+    mixed = (mirror * 0.92 + (pane - mirror) * paint[0]) / pane
+    torch.testing.assert_close(seen.colors()[0], mixed, atol=1e-3, rtol=0)
+    # what fills the inside only tints, what is not clear stays
+    assert float(seen.opacities[1]) == pytest.approx(0.04, rel=1e-3)
+    assert float(seen.opacities[2]) == 1.0
+    torch.testing.assert_close(seen.colors()[1:], paint[1:], atol=1e-6, rtol=0)
+
+
+def test_glass_shows_the_floor_and_keeps_its_rim_and_highlight(skin: Gaussians) -> None:
+    camera = Camera.look_at((0.0, -0.8, 0.0), (0, 0, 0), width=96, height=96, fov=18.0)
+    light = Lighting(lamps=(Lamp(direction=(0.0, -1.0, 0.0), shadow=False),), occlusion=0.0)
+    gloss = torch.tensor([[0.6, 160.0]]).expand(skin.count, 2).contiguous()
+    clear = torch.full((skin.count,), 0.85)
+    dark = skin.with_colors(torch.full((skin.count, 3), 0.1))
+    glass, shine = as_seen(dark, gloss, clear, camera)
+    made = Render(camera, light, background=(0.0, 1.0, 0.0))(glass, gloss=shine)
+    row = made.alpha[48]
+    inside = (made.alpha[48] > 0.02).nonzero()[:, 0]
+    middle, rim = float(row[58]), float(row[inside[0] + 2 : inside[0] + 5].max())
+    assert middle < 0.7 < 0.9 < rim
+    assert float(made.image[48, 58, 1]) > 0.3  # the green behind it
+    assert float(made.image[48, 48].min()) > 0.6  # the lamp, straight ahead
+
+
+def test_materials_say_what_is_clear(tmp_path: Path, skin: Gaussians) -> None:
+    assert transmission_of(shot(tmp_path), frame(skin, skin)) is None
+    pane = frame(skin, skin)
+    pane.facts = {"bodies": [["pane", "glass"]]}
+    pane.anchor = pane.anchor.clone()
+    pane.anchor[3] = -1  # a blade
+    pane.ids[5] = DUST + 7
+    (tmp_path / "melon.ply").write_bytes(b"")
+    objects = {"pane": {"material": "glass"}}
+    found = transmission_of(Shot.from_dict({**SHOT, "objects": objects}, tmp_path), pane)
+    assert found is not None
+    assert float(found[0]) == pytest.approx(materials.get("glass").transmission)
+    assert float(found[3]) == float(found[5]) == 0.0
+    dull = {"pane": {"material": "glass", "transmission": 0}}
+    assert transmission_of(Shot.from_dict({**SHOT, "objects": dull}, tmp_path), pane) is None
 
 
 @pytest.mark.cuda

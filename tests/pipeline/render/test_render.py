@@ -10,11 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent.data import Camera, Gaussians
+from gsfluent.data import INTERIOR, SURFACE, Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
-from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps
-from gsfluent.pipeline.light.normals import estimate_normals, grid_for, splat_normals
+from gsfluent.lab.truth import light as truth
+from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
+from gsfluent.pipeline.light.normals import (
+    estimate_normals,
+    grid_for,
+    plate_normals,
+    splat_normals,
+)
 from gsfluent.pipeline.light.occlusion import ambient_occlusion
 from gsfluent.pipeline.light.shade import shade_points, surface_points, to_display, to_linear
 from gsfluent.pipeline.light.shadow import transmittance
@@ -22,7 +28,7 @@ from gsfluent.pipeline.light.shadow_maps import bulk, shadow_maps
 from gsfluent.pipeline.render.camera import Action, cameras_for, orbit
 from gsfluent.pipeline.render.holes import Holes, MatterView, small
 from gsfluent.pipeline.render.stage import Render
-from gsfluent.pipeline.render.studio import Studio
+from gsfluent.pipeline.render.studio import Studio, wants_dark
 
 SIZE = 96
 
@@ -110,6 +116,27 @@ def test_shadow_map_darkens_what_lies_behind() -> None:
     assert float(arrives[2]) == 1.0  # above it
 
 
+@pytest.mark.parametrize(
+    ("grey", "dark"), [(0.15, False), (0.45, False), (0.7, True), (0.95, True)]
+)
+def test_the_studio_differs_from_what_stands_in_it(grey: float, dark: bool) -> None:
+    bare = ball()
+    thing = bare.with_colors(torch.full((bare.count, 3), grey)).replace(
+        labels=torch.full((bare.count,), SURFACE, dtype=torch.int32)
+    )
+    assert wants_dark(thing) == dark
+    # what fills it says nothing about how it looks
+    inner = thing.replace(labels=torch.full((thing.count,), INTERIOR, dtype=torch.int32))
+    inner = inner.with_colors(torch.full((thing.count, 3), 1.0 - grey))
+    assert wants_dark(Gaussians.cat([thing, inner])) == dark
+    studio = Studio(-0.1, (0.0, 0.0), 0.1, 0.2, wants_dark(thing))
+    camera = Camera.look_at((0.0, -0.8, 0.3), (0, 0, 0), width=64, height=48, fov=30.0)
+    image = Render(camera, studio_light(), studio=studio)(thing).image
+    around = float(torch.cat([image[:4].flatten(), image[-4:].flatten()]).mean())
+    assert abs(around - grey) > 0.2
+    assert (around < 0.4) == dark
+
+
 def test_ball_over_floor_casts_a_shadow_where_geometry_says() -> None:
     light = key_light(direction=(1.0, 0.0, 1.0), ambient=0.3, intensity=1.0)
     studio = Studio(0.0, (0.0, 0.0), 0.2, 0.2)
@@ -176,6 +203,28 @@ def test_flat_splats_on_a_solid_add_their_axis_to_the_density() -> None:
     bent = (normals[:, 2] - plain[:, 2]).mean()
     assert float(bent) > 0.05  # toward the axis
     assert float((normals * plain).sum(1).min()) > 0.9  # the density leads
+
+
+def test_the_normal_of_a_plate_is_its_shortest_axis_and_faces_the_eye() -> None:
+    # beside a solid, whose density bends the normals of what is near
+    solid = ball()
+    plate = truth.surface_splats(truth.Ball((0.0, 0.0, 0.1), 0.102), 4000, 0.5)
+    both = Gaussians.cat([solid, plate])
+    flat = torch.arange(both.count) >= solid.count
+    eye = torch.tensor([0.3, -1.0, 0.4])
+    found = plate_normals(plate, eye)
+    outward = (plate.means - torch.tensor([0.0, 0.0, 0.1])) / 0.102
+    toward = ((eye - plate.means) * outward).sum(1) > 0
+    torch.testing.assert_close(found[toward], outward[toward], atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[~toward], -outward[~toward], atol=1e-5, rtol=0)
+    camera = front()
+    picture = Render(camera, key_light())(both, plates=flat)
+    points, _ = surface_points(picture.depth, camera.viewmat.float(), camera.K.float())
+    here = torch.nn.functional.normalize(points - torch.tensor([0.0, 0.0, 0.1]), dim=-1)
+    assert picture.blended is not None
+    seen = torch.nn.functional.normalize(picture.blended[..., :3], dim=-1)
+    middle = (picture.alpha > 0.99) & (here[..., 1] < -0.5)
+    assert float((seen * here).sum(-1)[middle].min()) > 0.998
 
 
 def test_sheet_of_flat_splats_faces_the_eye() -> None:

@@ -67,7 +67,7 @@ def test_a_thing_that_is_not_shown_has_no_surface_and_a_heavy_one_cannot_vanish(
     scene = Scene()
     scene.add_collider("box", size=(0.4, 0.4, 0.4), shown=False)
     rigid = RigidSet(scene, DX)
-    assert rigid.surfaces(rigid.start)[0].shape == (0, 3)
+    assert rigid.surfaces(rigid.start) is None
     with pytest.raises(InputError, match="there all the time"):
         scene.add_collider("sphere", radius=0.1, mass=1.0, vanishes=1.0)
     with pytest.raises(InputError, match="vanishes at 1 s, before it appears at 2 s"):
@@ -119,13 +119,13 @@ def test_a_blade_is_drawn_behind_its_edge_and_goes_back_the_way_it_came() -> Non
     for time, low in ((0.0, 0.5), (1.1, 0.4), (1.3, 0.2), (2.1, 0.2), (2.3, 0.4)):
         plate = blade_splats(scene, time)
         assert plate is not None
-        assert float(plate.means[:, 2].min()) == pytest.approx(low, abs=1e-6)
-        assert float(plate.means[:, 1].abs().max()) == pytest.approx(0.1, abs=1e-6)
+        # the middles of its outermost splats, half their width from the edge
+        assert float(plate.means[:, 2].min()) == pytest.approx(low, abs=3e-4)
+        assert float(plate.means[:, 1].abs().max()) == pytest.approx(0.1, abs=3e-4)
         assert plate.normals is not None and float(plate.normals[:, 0].abs().min()) > 0.999
         # thin across the plate
-        assert float(plate.covariances()[:, 0].max()) < 0.02 * float(
-            plate.covariances()[:, 2].min()
-        )
+        across, along = plate.covariances()[:, 0], plate.covariances()[:, 2]
+        assert bool((across < 0.02 * along).all())
     assert blade_splats(scene, 2.41) is None
     along = blade_splats(scene, 1.6)  # on the second leg, 0.2 m along it
-    assert along is not None and float(along.means[:, 0].max()) == pytest.approx(0.2, abs=1e-6)
+    assert along is not None and float(along.means[:, 0].max()) == pytest.approx(0.2, abs=3e-4)

@@ -11,6 +11,7 @@ import torch
 from interior_shapes import ellipsoid_shell
 from scipy import ndimage
 
+from gsfluent import materials
 from gsfluent.data import INTERIOR, SURFACE, Solid
 from gsfluent.errors import InputError
 from gsfluent.pipeline.fill.stage import Fill
@@ -29,9 +30,11 @@ from gsfluent.pipeline.texture.photo.metrics import (
     volume_slices,
 )
 from gsfluent.pipeline.texture.photo.profile import match_colors
+from gsfluent.pipeline.texture.presets.by_material import inside_of
+from gsfluent.pipeline.texture.presets.plain import TINTED
 from gsfluent.pipeline.texture.presets.procedural import procedural_texture
 from gsfluent.pipeline.texture.synthesis.inclusions import find_inclusions
-from gsfluent.pipeline.texture.volume.domain import SHELL
+from gsfluent.pipeline.texture.volume.domain import SHELL, blend_skin
 
 SIZE = 40
 
@@ -246,16 +249,61 @@ def test_preset_follows_the_given_axis(melon: tuple[Solid, np.ndarray, InteriorT
     assert ratio_z[2] == min(ratio_z) and ratio_x[0] == min(ratio_x)
 
 
-def test_nothing_given_warns_and_uses_the_surface(
+def test_nothing_given_is_plain_matter_in_the_colour_of_the_skin(
     melon: tuple[Solid, np.ndarray, InteriorTexture], caplog: pytest.LogCaptureFixture
 ) -> None:
     solid, _, _ = melon
-    with caplog.at_level("WARNING"):
+    with caplog.at_level("INFO"):
         result = Texture()(solid)
-    assert "neither exemplar nor preset" in caplog.text
-    assert result.report["method"] == "profile"
-    mean = result.color[result.occupancy].mean(0)
-    assert torch.allclose(mean, torch.tensor([0.2, 0.4, 0.15]), atol=0.03)
+    assert "gets the inside 'plain'" in caplog.text
+    assert (result.report["method"], result.report["preset"]) == ("procedural", "plain")
+    inner = result.color[result.occupancy]
+    assert torch.allclose(inner.mean(0), torch.tensor([0.2, 0.4, 0.15]), atol=0.03)
+    assert float(inner.std(0).amax()) > 0.005
+
+
+def test_the_material_says_what_is_inside(
+    melon: tuple[Solid, np.ndarray, InteriorTexture], caplog: pytest.LogCaptureFixture
+) -> None:
+    solid, _, _ = melon
+    with caplog.at_level("INFO"):
+        found = Texture(material="watermelon")(solid)
+    assert "watermelon gets the inside 'watermelon'" in caplog.text
+    assert torch.equal(found.color, Texture(preset="watermelon")(solid).color)
+    assert Texture(preset="wood", material="bone").preset == "wood"
+    with pytest.raises(InputError, match="unobtainium"):
+        Texture(material="unobtainium")
+
+
+def test_every_inside_of_a_material_is_a_preset() -> None:
+    solids = [name for name in materials.names() if materials.get(name).law != "fluid"]
+    assert {inside_of(name) for name in solids} <= set(preset_names())
+    # what is the same throughout has the skin's colour; what has an inside of its own does not
+    for name, tinted in (("rock", True), ("steel", True), ("chocolate", True), ("bone", False)):
+        assert (inside_of(name) in TINTED) == tinted
+
+
+def test_a_thin_wall_has_an_inside_of_its_own() -> None:
+    domain = _domain(24)
+    wall = replace(domain, inside=domain.depth > 0, depth=np.minimum(domain.depth, 1.7))
+    white = np.ones_like(domain.skin)
+    found = blend_skin(wall, white)
+    assert float(found[wall.depth >= 1.5].min()) == 1.0
+    outer = (domain.depth > 0) & (domain.depth <= 0.5)
+    assert np.allclose(found[outer], domain.skin[outer])
+    # what is massive fades as deep as ever
+    shallow = (domain.depth > 1.4) & (domain.depth < 1.6)
+    assert float(blend_skin(domain, white)[shallow].max()) < 0.7
+
+
+def test_no_smears_where_the_skin_has_a_pattern() -> None:
+    domain = _domain()
+    stripes = np.zeros_like(domain.skin)
+    angle = np.arctan2(*np.moveaxis(np.indices(domain.inside.shape)[:2] - 20.0, 0, 0))
+    stripes[np.cos(8 * angle) > 0] = 1.0
+    texture = procedural_texture(replace(domain, skin=stripes), "plain", 0)
+    deep = domain.depth > 3.0
+    assert texture.rgb[deep].std() < 0.06
 
 
 def test_masks_of_photographs(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsfluent.errors import check_choice
-from gsfluent.pipeline.texture.presets import food, matter
+from gsfluent.pipeline.texture.presets import food, matter, plain
 from gsfluent.pipeline.texture.presets.tools import Preset
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture, axis_frame
 
@@ -27,7 +27,19 @@ _MATTER = (
     matter.stuffing,
     matter.wood,
 )
-PRESETS: dict[str, Preset] = {preset.__name__: preset for preset in (*_FOOD, *_MATTER)}
+_PLAIN = (
+    plain.ceramic,
+    plain.chocolate,
+    plain.clear,
+    plain.egg,
+    plain.foam,
+    plain.grain,
+    plain.plain,
+    plain.plaster,
+    plain.pumpkin,
+    plain.stone,
+)
+PRESETS: dict[str, Preset] = {preset.__name__: preset for preset in (*_FOOD, *_MATTER, *_PLAIN)}
 
 
 def preset_names() -> list[str]:
@@ -59,6 +71,8 @@ def procedural_texture(domain: InteriorDomain, preset: str, seed: int) -> Interi
         part = slice(start, start + _CHUNK)
         points = (index[part] + 0.5 - middle) / scale @ frame.T
         color[part], key[part] = PRESETS[preset](points, depth[part], seed)
+    if preset in plain.TINTED:
+        color *= np.median(domain.skin[domain.shell], axis=0) / plain.GREY
     rgb = np.zeros((*domain.inside.shape, 3), np.float32)
     rgb[domain.inside] = color.clip(0.0, 1.0)
     labels = np.zeros(domain.inside.shape, np.int32)

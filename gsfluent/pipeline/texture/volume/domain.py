@@ -163,8 +163,10 @@ def smoothstep(x: np.ndarray) -> np.ndarray:
 def blend_skin(domain: InteriorDomain, rgb: np.ndarray) -> np.ndarray:
     """Fade from the surface colour to the interior colour over the outermost voxels.
 
-    Without it the skin reads as a sticker on the cut face.
+    Without it the skin reads as a sticker on the cut face. A wall of a few voxels has an inside,
+    too, and fades sooner.
     """
-    weight = smoothstep((domain.depth - 0.5) / (BLEND - 0.5))[..., None]
+    end = min(BLEND, max(1.0, 0.6 * domain.max_depth))
+    weight = smoothstep((domain.depth - 0.5) / (end - 0.5))[..., None]
     mixed = domain.skin * (1.0 - weight) + rgb * weight
     return np.where(domain.inside[..., None], mixed, 0.0).astype(np.float32)
