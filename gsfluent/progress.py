@@ -119,6 +119,32 @@ def quiet_logs(name: str, level: int = logging.WARNING) -> Iterator[None]:
         log.setLevel(before)
 
 
+class _Heard(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.said: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        said = record.getMessage()
+        if said not in self.said:
+            self.said.append(said)
+
+
+@contextmanager
+def heard_warnings(name: str) -> Iterator[list[str]]:
+    """Collect the warnings that a logger and those below it give, each sentence once.
+
+    Args:
+        name: Of the logger.
+    """
+    log, heard = logging.getLogger(name), _Heard()
+    log.addHandler(heard)
+    try:
+        yield heard.said
+    finally:
+        log.removeHandler(heard)
+
+
 Progress = Callable[[int, int, str], None]
 """``progress(done, total, note)``: called by a stage as it goes; ``None`` means nobody listens."""
 

@@ -33,7 +33,7 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
     Returns:
         By name what :func:`gsfluent.pipeline.solid.walls.thin_shells` reports in scene metres, and
         ``solve_cells``: the ``solve.cells`` with which the thinnest walls have
-        :data:`WALL_CELLS` cells; None where they have.
+        :data:`WALL_CELLS` cells, and ``note``, the warning; None where they have.
     """
     found = {}
     for body in scene.bodies:
@@ -53,11 +53,16 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
             # measured from the corner of the grid, in metres
             local = torch.tensor(report["middle"]) - field.origin
             report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
-        report["solve_cells"] = None
+        report["solve_cells"] = report["note"] = None
         if report["warning"]:
             report["solve_cells"] = cells_for(scene, dx / report["cells_needed"])
-            report["hint"] = f"{setting(report['solve_cells'])}: {report['hint']}"
-            _log.warning("%s: %s; hint: %s", body.name, report["warning"], report["hint"])
+            asked = setting(report["solve_cells"])
+            report["hint"] = f"{asked}: {report['hint']}"
+            report["note"] = (
+                f"{body.name}: {report['warning']}, too few to break as walls do; hint: {asked} "
+                f"gives them {WALL_CELLS:g} cells"
+            )
+            _log.warning("%s", report["note"])
         found[body.name] = report
     return found
 
@@ -109,12 +114,7 @@ def notes_of(
         unbroken: Of :meth:`gsfluent.stages.strikes.Strikes.unbroken`.
         pull: Strength of gravity [m/s^2].
     """
-    notes = [
-        f"{name}: {report['warning']}, too few to break as walls do; "
-        f"{setting(report['solve_cells'])} gives them {WALL_CELLS:g} cells"
-        for name, report in thin.items()
-        if report["warning"]
-    ]
+    notes = [report["note"] for report in thin.values() if report["note"]]
     notes.extend(weak)
     for row in unbroken:
         speed, needed = row["speed"], row["speed_needed"]

@@ -162,10 +162,8 @@ def test_notes_are_whole_sentences_and_honest() -> None:
     )
     (note,) = notes_of({}, [], [row | {"speed": 5.0}], 0.0)
     assert "nothing broke; strike harder still, plaster is" in note and "fall" not in note
-    assert notes_of({"head": {"warning": None}}, [], [], 9.81) == []
-    thin = {"warning": "9 % of it is thin", "solve_cells": 60}
-    (note,) = notes_of({"head": thin}, [], [], 9.81)
-    assert note.startswith("head: 9 % of it is thin") and "solve.cells: 60" in note
+    thin = {"head": {"note": None}, "arm": {"note": "arm: 9 % of it is thin"}}
+    assert notes_of(thin, [], [], 9.81) == ["arm: 9 % of it is thin"]
 
 
 def test_a_grid_that_lowers_the_strength_says_so_with_the_cells_that_would_do() -> None:
