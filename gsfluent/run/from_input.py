@@ -13,11 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsfluent import materials
 from gsfluent.config.physgaussian.space import model_file
+from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import atomic_path, kind_of, load_splats
+from gsfluent.io import atomic_path, kind_of, load_capture, load_splats
+from gsfluent.pipeline.capture.orient import camera_up, orient, upright_rotation
+from gsfluent.spatial.front import front_side
 from gsfluent.spatial.mesh_file import surface_points
 
 _log = logging.getLogger(__name__)
@@ -31,6 +35,9 @@ _GRAVITY = 9.81
 _LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down as well
 _AFTER = 1.2  # seconds of film after the landing
 _SAMPLE = 2000  # points of a surface that are asked for their colour
+_VIEWED, _FEW = 20_000, 200  # points that are looked at for the front, and fewest that tell
+_SOLID = 0.3  # opacity from which a splat counts
+_AROUND = 0.3  # mean of the directions to the photographers below which they stood all around
 
 _WORDS = {
     "fruit.watermelon": "watermelon melon",
@@ -92,9 +99,13 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     if material is None:
         material, why = guess_material(key, path, source)
         _log.info("material: %s, guessed from %s; --material NAME says better", material, why)
+    front, side = guess_front(key, path)
+    _log.info("front: %s; front: in the shot says better", side)
     events, seconds, fall = _fall(materials.get(material))
     _log.info("event: %s", fall)
     values: dict[str, Any] = {key: str(path.resolve())}
+    if front is not None:
+        values["front"] = front
     values["objects"] = {"object": {"material": material}}
     if material in _INSIDE:
         values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
@@ -192,8 +203,61 @@ def guess_material(key: str, path: Path, source: Path) -> tuple[str, str]:
         colors = found.colors
     else:
         splats = load_splats(path)
-        colors = splats.colors().clamp(0.0, 1.0).double().numpy()[splats.opacities.numpy() > 0.3]
+        colors = splats.colors().clamp(0.0, 1.0).double().numpy()[splats.opacities.numpy() > _SOLID]
     return _by_color(np.median(colors, axis=0))
+
+
+def guess_front(key: str, path: Path) -> tuple[list[float] | None, str]:
+    """The direction towards who looks at the front of an input, and what it was guessed from.
+
+    Photographers stand before the front: the middle of where they stood. Of a splat or a mesh, the
+    side with the most to see.
+
+    Args:
+        key: ``mesh``, ``splats`` or ``capture``.
+        path: The file or folder.
+
+    Returns:
+        Three numbers in the axes of the input, or None where a run's own guess is as good; and
+        words.
+
+    Raises:
+        InputError: The input cannot be read.
+    """
+    if key == "capture":
+        capture = load_capture(path)
+        up = orient(None, capture).up if len(capture.points) else camera_up(capture.cameras)
+        ahead = np.stack([camera.forward().double().numpy() for camera in capture.cameras])
+        ahead -= (ahead @ up)[:, None] * up
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+        middle = -ahead.mean(axis=0)
+        if (length := float(np.linalg.norm(middle))) < _AROUND:
+            return None, "where the first photograph was taken, since they go all around"
+        return _rounded(middle / length), "the side from which most photographs were taken"
+    if key == "mesh":
+        found = surface_points(path, _VIEWED)
+        splats = Gaussians.from_colors(
+            torch.from_numpy(found.points).float(), torch.full((len(found.points),), 1e-3),
+            torch.from_numpy(found.colors).float(),
+        )  # fmt: skip
+    else:
+        splats = load_splats(path)
+        splats = splats.select(splats.opacities > _SOLID)
+        splats = splats.select(torch.arange(splats.count) % max(1, splats.count // _VIEWED) == 0)
+    if splats.count < _FEW:
+        return None, "that by the custom of its axes, since there are too few points to judge"
+    up = orient(splats, up="auto", mesh=path if key == "mesh" else None).up
+    usual = -upright_rotation(up)[1]
+    points = splats.means.double().numpy()
+    colors = splats.colors().clamp(0.0, 1.0).double().numpy()
+    way, more = front_side(points, colors, up, usual)
+    if more == 1.0:
+        return None, "that by the custom of its axes, since no side shows clearly more"
+    return _rounded(way), f"the side with the most to see ({more:.2g} times the usual front)"
+
+
+def _rounded(way: np.ndarray) -> list[float]:
+    return [round(float(part), 4) + 0.0 for part in way]
 
 
 def _by_color(color: np.ndarray) -> tuple[str, str]:

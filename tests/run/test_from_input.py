@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 import trimesh
 
 from gsfluent import materials
 from gsfluent.config import load_shot
 from gsfluent.errors import InputError
-from gsfluent.run.from_input import find_input, made_shot
+from gsfluent.io import save_image
+from gsfluent.run.from_input import find_input, guess_front, made_shot
 
 
 def mesh(path: Path, color: tuple[int, int, int] | None = None) -> Path:
@@ -80,3 +84,55 @@ def test_folders(tmp_path: Path) -> None:
         find_input(tmp_path / "photographs")
     with pytest.raises(InputError, match="neither a shot"):
         find_input(tmp_path / "photographs" / "1.jpg")
+
+
+def painted(path: Path, side: tuple[float, float, float]) -> Path:
+    """A grey ball with squares on the side that looks along ``side``."""
+    ball = trimesh.creation.icosphere(4)
+    facing = ball.vertices @ side > 0.6
+    squares = (np.floor(ball.vertices * 4.0).sum(axis=1) % 2).astype(bool)
+    colors = np.full((len(ball.vertices), 4), [120, 120, 120, 255], dtype=np.uint8)
+    colors[facing & squares] = [240, 20, 20, 255]
+    ball.visual.vertex_colors = colors
+    ball.export(path)
+    return path
+
+
+def test_the_painted_side_is_the_front(tmp_path: Path) -> None:
+    side = np.array([math.cos(0.5), 0.0, -math.sin(0.5)])  # beside the custom of +z
+    found, why = guess_front("mesh", painted(tmp_path / "a.glb", tuple(side)))
+    assert found is not None and "most to see" in why
+    assert np.dot(found, side) > math.cos(math.radians(20.0))
+    shot = load_shot(made_shot(tmp_path / "a.glb", tmp_path / "out"))
+    assert shot.front == pytest.approx(tuple(found))
+
+
+def test_what_looks_alike_from_all_sides_keeps_the_custom(tmp_path: Path) -> None:
+    found, why = guess_front("mesh", mesh(tmp_path / "b.glb", (120, 75, 40)))
+    assert found is None and "custom" in why
+    assert guess_front("mesh", painted(tmp_path / "c.glb", (0.0, 0.0, 1.0)))[0] is None
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_photographers_stand_before_the_front(tmp_path: Path, around: bool) -> None:
+    turns = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    turns = turns if around else np.linspace(0.3, 1.5, 12)
+    frames = []
+    for number, turn in enumerate(turns):
+        eye = np.array([3.0 * math.cos(turn), 3.0 * math.sin(turn), 1.0])
+        back = eye / np.linalg.norm(eye)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+        name = f"{number}.png"
+        save_image(torch.zeros(12, 16, 3), tmp_path / name)
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    values = {"fl_x": 16.0, "fl_y": 16.0, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    found, _ = guess_front("capture", tmp_path)
+    if around:
+        assert found is None
+    else:
+        middle = [math.cos(0.9), math.sin(0.9), 0.0]
+        assert found is not None and np.dot(found, middle) > 0.99
