@@ -33,6 +33,15 @@ def plan_text(plan: Mapping[str, Any]) -> str:
         *table([["ok" if row["kept"] else "!", row["bound"], f"{row['side']} "
                   f"{1000 * row['dx']:.3g} mm", row["why"]] for row in plan["bounds"]]),
         "",
+        "what breaks",
+        *table(
+            [[row["object"], row["material"], _speed("lands with", row["lands_with"]),
+              _speed("breaks from", row["breaks_from"]), _height(row["height"]),
+              "breaks" if row["breaks"] else f"whole; {row['hint']} would break it"
+              if row["hint"] else "whole"]
+             for row in plan["breaking"]]
+        ),
+        "",
         "stages",
         *table(
             [[name, seconds_text(row["seconds"]), _bytes(row["memory_bytes"])]
@@ -66,6 +75,14 @@ def table(rows: list[list[str]], right: tuple[int, ...] = ()) -> list[str]:
     with console.capture() as drawn:
         console.print(grid)
     return [f"  {line}".rstrip() for line in drawn.get().splitlines()]
+
+
+def _speed(said: str, value: float | None) -> str:
+    return f"{said} {'-' if value is None else f'{value:.2g} m/s'}"
+
+
+def _height(value: float | None) -> str:
+    return "" if value is None else f"({value:.2g} m)"
 
 
 def seconds_text(value: float | None) -> str:

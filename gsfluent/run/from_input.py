@@ -16,13 +16,22 @@ import numpy as np
 import torch
 
 from gsfluent import materials
+from gsfluent.config import Shot
 from gsfluent.config.physgaussian.space import model_file
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import atomic_path, kind_of, load_capture, load_splats
-from gsfluent.pipeline.capture.orient import camera_up, orient, upright_rotation
+from gsfluent.pipeline.capture.orient import (
+    DEFAULT_SIZE,
+    camera_up,
+    make_frame,
+    orient,
+    upright_rotation,
+)
+from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.spatial.front import front_side
 from gsfluent.spatial.mesh_file import surface_points
+from gsfluent.stages.breaking import SURE, breaks_from
 
 _log = logging.getLogger(__name__)
 
@@ -30,7 +39,6 @@ FILE = "shot.yaml"
 SETTINGS: dict[str, dict[str, Any]] = {"solve": {"quality": "preview"}, "output": {}}
 """How a shot that nobody has written is simulated and filmed."""
 
-_MARGIN = 1.5  # times the speed from which the material is estimated to break
 _GRAVITY = 9.81
 _LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down as well
 _AFTER = 1.2  # seconds of film after the landing
@@ -99,9 +107,10 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     if material is None:
         material, why = guess_material(key, path, source)
         _log.info("material: %s, guessed from %s; --material NAME says better", material, why)
-    front, side = guess_front(key, path)
+    splats = _sampled(key, path)
+    front, side = guess_front(key, path, splats)
     _log.info("front: %s; front: in the shot says better", side)
-    events, seconds, fall = _fall(materials.get(material))
+    events, seconds, fall = _fall(materials.get(material), _size(key, path, splats))
     _log.info("event: %s", fall)
     values: dict[str, Any] = {key: str(path.resolve())}
     if front is not None:
@@ -207,7 +216,32 @@ def guess_material(key: str, path: Path, source: Path) -> tuple[str, str]:
     return _by_color(np.median(colors, axis=0))
 
 
-def guess_front(key: str, path: Path) -> tuple[list[float] | None, str]:
+def _sampled(key: str, path: Path) -> Gaussians | None:
+    """Some splats on the surface of an input; None for photographs."""
+    if key == "capture":
+        return None
+    if key == "mesh":
+        found = surface_points(path, _VIEWED)
+        return Gaussians.from_colors(
+            torch.from_numpy(found.points).float(), torch.full((len(found.points),), 1e-3),
+            torch.from_numpy(found.colors).float(),
+        )  # fmt: skip
+    splats = load_splats(path)
+    solid = splats.opacities > _SOLID
+    splats = splats.select(solid) if int(solid.sum()) >= _FEW else splats
+    return splats.select(torch.arange(splats.count) % max(1, splats.count // _VIEWED) == 0)
+
+
+def _size(key: str, path: Path, splats: Gaussians | None) -> float:
+    """Largest extent that the object will have in the scene [m]."""
+    if splats is None:
+        return DEFAULT_SIZE
+    frame = make_frame(splats, None, Shot.from_dict({key: str(path.resolve())}))
+    placed = frame.apply(splats.means.double())
+    return float((placed.amax(dim=0) - placed.amin(dim=0)).max())
+
+
+def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[float] | None, str]:
     """The direction towards who looks at the front of an input, and what it was guessed from.
 
     Photographers stand before the front: the middle of where they stood. Of a splat or a mesh, the
@@ -216,6 +250,7 @@ def guess_front(key: str, path: Path) -> tuple[list[float] | None, str]:
     Args:
         key: ``mesh``, ``splats`` or ``capture``.
         path: The file or folder.
+        splats: Some of those on the surface; None for photographs.
 
     Returns:
         Three numbers in the axes of the input, or None where a run's own guess is as good; and
@@ -224,7 +259,7 @@ def guess_front(key: str, path: Path) -> tuple[list[float] | None, str]:
     Raises:
         InputError: The input cannot be read.
     """
-    if key == "capture":
+    if splats is None:
         capture = load_capture(path)
         up = orient(None, capture).up if len(capture.points) else camera_up(capture.cameras)
         ahead = np.stack([camera.forward().double().numpy() for camera in capture.cameras])
@@ -234,16 +269,6 @@ def guess_front(key: str, path: Path) -> tuple[list[float] | None, str]:
         if (length := float(np.linalg.norm(middle))) < _AROUND:
             return None, "where the first photograph was taken, since they go all around"
         return _rounded(middle / length), "the side from which most photographs were taken"
-    if key == "mesh":
-        found = surface_points(path, _VIEWED)
-        splats = Gaussians.from_colors(
-            torch.from_numpy(found.points).float(), torch.full((len(found.points),), 1e-3),
-            torch.from_numpy(found.colors).float(),
-        )  # fmt: skip
-    else:
-        splats = load_splats(path)
-        splats = splats.select(splats.opacities > _SOLID)
-        splats = splats.select(torch.arange(splats.count) % max(1, splats.count // _VIEWED) == 0)
     if splats.count < _FEW:
         return None, "that by the custom of its axes, since there are too few points to judge"
     up = orient(splats, up="auto", mesh=path if key == "mesh" else None).up
@@ -276,19 +301,19 @@ def _by_color(color: np.ndarray) -> tuple[str, str]:
     return ("fruit.apple", "its bright colour") if saturation > 0.5 else ("plaster", "its colour")
 
 
-def _fall(material: materials.Material) -> tuple[list[dict[str, Any]], float, str]:
+def _fall(material: materials.Material, size: float) -> tuple[list[dict[str, Any]], float, str]:
     """Events that break a material, how long the film is [s], and why in words."""
-    limit = material.breaking_speed
+    limit = breaks_from(material, size, size / QUALITY[SETTINGS["solve"]["quality"]])
     if not math.isfinite(limit):
         height, why = 1.0, f"a drop from 1 m ({material.name} does not break)"
         return [{"type": "drop", "height": height}], _seconds(height, 0.0), why
-    needed = (_MARGIN * limit) ** 2 / (2.0 * _GRAVITY)
+    needed = (SURE * limit) ** 2 / (2.0 * _GRAVITY)
     height = round(min(max(needed, _LOW), _HIGH), 2)
     events: list[dict[str, Any]] = [{"type": "drop", "height": height}]
     about = f"{material.name} is estimated to break from {limit:.2g} m/s"
     if needed <= _HIGH:
         return events, _seconds(height, 0.0), f"a drop from {height:g} m ({about})"
-    speed = round(math.sqrt((_MARGIN * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
+    speed = round(math.sqrt((SURE * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
     events.append({"type": "throw", "velocity": [0.0, 0.0, -speed]})
     return (
         events,
