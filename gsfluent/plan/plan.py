@@ -311,8 +311,7 @@ def _costs(
 
 
 def _breaking(prospect: Prospect, outlook: Outlook, dx: float) -> list[dict[str, Any]]:
-    """:func:`gsfluent.stages.breaking.breaking_rows` of all objects; of what nothing lets free,
-    nothing."""
+    """:func:`gsfluent.stages.breaking.breaking_rows` of all objects that are not led."""
     pull = math.hypot(*prospect.scene.gravity)
     movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}
     rows = []

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 
-from gsfluent import materials
 from gsfluent.cli import main
 from gsfluent.data import Gaussians
 from gsfluent.io.splats.load import save_splats
