@@ -119,7 +119,7 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     if material in _INSIDE:
         values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
     output = {"seconds": seconds, **SETTINGS["output"]}
-    values |= {"events": events, "solve": SETTINGS["solve"], "output": output}
+    values |= SETTINGS | {"events": events, "output": output}
     text = yaml.safe_dump(values, sort_keys=False)
     target = out / FILE
     out.mkdir(parents=True, exist_ok=True)
@@ -303,7 +303,7 @@ def _by_color(color: np.ndarray) -> tuple[str, str]:
 
 def _fall(material: materials.Material, size: float) -> tuple[list[dict[str, Any]], float, str]:
     """Events that break a material, how long the film is [s], and why in words."""
-    limit = breaks_from(material, size, size / QUALITY[SETTINGS["solve"]["quality"]])
+    limit = breaks_from(material, size, size / QUALITY["preview"])
     if not math.isfinite(limit):
         height, why = 1.0, f"a drop from 1 m ({material.name} does not break)"
         return [{"type": "drop", "height": height}], _seconds(height, 0.0), why

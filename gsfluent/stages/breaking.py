@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -122,12 +123,18 @@ def _hint(body: Body, limit: float, lands: float, pull: float, dx: float) -> str
     return ", or ".join(said)
 
 
-def _weaker(length: float, lands: float, dx: float) -> str:
-    """The toughest preset that such a landing surely breaks; empty without any."""
-    found = {
+@functools.lru_cache(maxsize=8)  # a second of work, and the same for every part of a body
+def _presets(length: float, dx: float) -> dict[str, float]:
+    """From which speed bodies of the presets break that can."""
+    return {
         name: breaks_from(materials.get(name), length, dx)
         for name in materials.names()
         if materials.get(name).law == "nacc"
     }
+
+
+def _weaker(length: float, lands: float, dx: float) -> str:
+    """The toughest preset that such a landing surely breaks; empty without any."""
+    found = _presets(length, dx) if lands > 0.0 else {}
     fit = {name: speed for name, speed in found.items() if SURE * speed <= lands}
     return max(fit, key=fit.__getitem__) if fit else ""

@@ -186,7 +186,7 @@ def make_frame(
     return Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
 
 
-def below_support(points: Array, normal: Array, offset: float) -> Array:
+def below_support(points: Array, normal: Array, offset: float) -> NDArray[np.bool_]:
     """Which points [N, 3] lie below a support plane, bool [N]; none where it cannot be theirs.
 
     A plane is believed that leaves most of the points above it. What lies within a hundredth of
@@ -195,7 +195,9 @@ def below_support(points: Array, normal: Array, offset: float) -> Array:
     height = points @ normal - offset
     reach = float(np.quantile(height, 0.99)) if len(height) else 0.0
     below = height < -0.01 * max(reach, 0.0)
-    return below if reach > 0.0 and below.mean() < _UNDER else np.zeros(len(points), dtype=bool)
+    if reach <= 0.0 or below.mean() >= _UNDER:
+        return np.zeros(len(points), dtype=np.bool_)
+    return np.asarray(below)
 
 
 def upright_rotation(up: Array, cameras: list[Camera] | None = None, front: Any = None) -> Array:

@@ -25,7 +25,9 @@ class Support:
     offset: float  # Of the plane along it
 
     @staticmethod
-    def of(gaussians: Gaussians, capture: Capture | None, down: np.ndarray | None) -> Support | None:
+    def of(
+        gaussians: Gaussians, capture: Capture | None, down: np.ndarray | None
+    ) -> Support | None:
         """Find it among the sparse points of a capture; None where they show none.
 
         Args:
