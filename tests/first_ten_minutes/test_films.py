@@ -62,11 +62,6 @@ def compressed_splat(folder: Path) -> Path:
     return folder / "thing.compressed.ply"
 
 
-def folder_of_a_splat(folder: Path) -> Path:
-    splat(folder)
-    return folder
-
-
 def model_folder(folder: Path) -> Path:
     """A model of the INRIA trainer, as PhysGaussian takes it, without a config."""
     return write_model(folder / "model")
@@ -153,7 +148,7 @@ def colmap(folder: Path) -> Path:
 
 @pytest.mark.parametrize(
     "make",
-    [splat, compressed_splat, folder_of_a_splat, model_folder, textured_mesh, transforms, colmap],
+    [splat, compressed_splat, model_folder, textured_mesh, transforms, colmap],
 )
 def test_one_command_makes_a_film(
     make: Maker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
