@@ -50,11 +50,6 @@ def breaks_from(material: Material, length: float, dx: float | None = None) -> f
     return _SHARE * cut * waves**_WAVES * math.sqrt(1.0 + _ZONE * zone / length)
 
 
-def body_breaks_from(body: Body, dx: float | None = None) -> float:
-    """The same for a body: that of its weakest part [m/s]."""
-    return min(breaks_from(material, _length(body), dx) for material in body.materials)
-
-
 def _length(body: Body) -> float:
     low, high = body.bounds()
     return float((high - low).max())

@@ -23,7 +23,7 @@ from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.pipeline.solid.walls import WALL_CELLS
 from gsfluent.results.record import RunRecord
 from gsfluent.scene.scene import Scene
-from gsfluent.stages.breaking import body_breaks_from
+from gsfluent.stages.breaking import breaks_from
 from gsfluent.stages.findings import (
     cells_for,
     cells_for_walls,
@@ -69,7 +69,9 @@ def test_a_fall_that_breaks_nothing_is_told_with_its_speed(drop: float, tmp_path
     (found,) = watch(scene, tmp_path, math.sqrt(2 * drop / 9.81) + 0.1).unbroken()
     assert (found["body"], found["met"], found["material"]) == ("ball", "floor", "hard")
     assert found["speed"] == pytest.approx(math.sqrt(2 * 9.81 * drop), rel=0.1)
-    assert found["speed_needed"] == body_breaks_from(scene.bodies[0], DX) > found["speed"]
+    low, high = scene.bodies[0].bounds()
+    assert found["speed_needed"] == breaks_from(HARD, float((high - low).max()), DX)
+    assert found["speed_needed"] > found["speed"]
 
 
 def test_what_lies_there_or_falls_past_was_not_struck(tmp_path: Path) -> None:
