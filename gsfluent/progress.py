@@ -7,8 +7,10 @@ forms the caller sees. Both write to stderr, so that stdout stays free for ``--j
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -117,6 +119,98 @@ def quiet_logs(name: str, level: int = logging.WARNING) -> Iterator[None]:
         yield
     finally:
         log.setLevel(before)
+
+
+class _Heard(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.said: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        said = record.getMessage()
+        if said not in self.said:
+            self.said.append(said)
+
+
+@contextmanager
+def heard_warnings(name: str) -> Iterator[list[str]]:
+    """Collect the warnings that a logger and those below it give, each sentence once.
+
+    Args:
+        name: Of the logger.
+    """
+    log, heard = logging.getLogger(name), _Heard()
+    log.addHandler(heard)
+    try:
+        yield heard.said
+    finally:
+        log.removeHandler(heard)
+
+
+class _Pulse(logging.Handler):
+    """Remembers when something was last said."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.last = time.monotonic()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.last = time.monotonic()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Watched:
+    """A reporter of which it is known when it last drew."""
+
+    inner: Reporter
+    pulse: _Pulse
+
+    def task(self, name: str) -> Progress:
+        """The callback of the reporter, watched."""
+        report = self.inner.task(name)
+
+        def watched(done: int, total: int, text: str) -> None:
+            report(done, total, text)
+            # a log says itself when it has said something; a bar draws at once
+            if not isinstance(self.inner, LineReporter):
+                self.pulse.last = time.monotonic()
+
+        return watched
+
+
+@contextmanager
+def heartbeat(
+    name: str, says: Callable[[], str], seconds: float = _SECONDS_BETWEEN_LINES
+) -> Iterator[Callable[[Reporter], Reporter]]:
+    """Say something whenever nothing has been said for a while.
+
+    Args:
+        name: Of the logger that counts, and that is spoken to.
+        says: Makes the line.
+        seconds: Longest silence.
+
+    Returns:
+        Takes a reporter and gives one whose drawing counts as saying something.
+    """
+    log, pulse, over = logging.getLogger(name), _Pulse(), threading.Event()
+
+    def beat() -> None:
+        wait = seconds
+        while not over.wait(wait):
+            wait = seconds - (time.monotonic() - pulse.last)
+            if wait <= 0.05 * seconds:
+                log.info("%s", says())
+                wait = seconds
+
+    log.addHandler(pulse)
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield lambda reporter: _Watched(reporter, pulse)
+    finally:
+        over.set()
+        thread.join()
+        log.removeHandler(pulse)
 
 
 Progress = Callable[[int, int, str], None]

@@ -14,13 +14,13 @@ def plan_text(plan: Mapping[str, Any]) -> str:
     """The plan as lines of text."""
     calibrated = plan["calibrated"]
     size = " x ".join(f"{100 * side:.3g}" for side in plan["size_m"])
-    total = _seconds(plan["seconds"]) if calibrated else "not calibrated"
+    total = seconds_text(plan["seconds"]) if calibrated else "not calibrated"
     lines = [
         f"{total} and {_bytes(plan['memory_bytes'])} on {plan['device']}; {size} cm "
         f"({plan['assumed']})",
         "",
         "passes",
-        *_table([["+" if row["needed"] else "-", row["pass"], row["why"]]
+        *table([["+" if row["needed"] else "-", row["pass"], row["why"]]
                  for row in plan["passes"]]),
         "",
         f"grid: {plan['cells']} cells along the largest body, dx = {1000 * plan['dx']:.3g} mm, "
@@ -30,14 +30,23 @@ def plan_text(plan: Mapping[str, Any]) -> str:
         f"      waves at {plan['wave_speed']:.3g} m/s, strikes at {plan['impact_speed']:.3g} m/s",
         "",
         f"bounds of dx: {plan['binding']} binds",
-        *_table([["ok" if row["kept"] else "!", row["bound"], f"{row['side']} "
+        *table([["ok" if row["kept"] else "!", row["bound"], f"{row['side']} "
                   f"{1000 * row['dx']:.3g} mm", row["why"]] for row in plan["bounds"]]),
         "",
+        "what breaks",
+        *table(
+            [[row["object"], row["material"], _speed("lands with", row["lands_with"]),
+              _speed("breaks from", row["breaks_from"]), _height(row["height"]),
+              "breaks" if row["breaks"] else f"whole; {row['hint']} would break it"
+              if row["hint"] else "whole"]
+             for row in plan["breaking"]]
+        ),
+        "",
         "stages",
-        *_table(
-            [[name, _seconds(row["seconds"]), _bytes(row["memory_bytes"])]
+        *table(
+            [[name, seconds_text(row["seconds"]), _bytes(row["memory_bytes"])]
              for name, row in plan["stages"].items()]
-            + [["in all", _seconds(plan["seconds"]), _bytes(plan["memory_bytes"])]],
+            + [["in all", seconds_text(plan["seconds"]), _bytes(plan["memory_bytes"])]],
             right=(1, 2),
         ),
     ]  # fmt: skip
@@ -53,22 +62,31 @@ def plan_text(plan: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _table(rows: list[list[str]], right: tuple[int, ...] = ()) -> list[str]:
+def table(rows: list[list[str]], right: tuple[int, ...] = ()) -> list[str]:
     """Rows in columns."""
     if not rows:
         return ["  none"]
-    table = Table.grid(padding=(0, 2, 0, 0))
+    grid = Table.grid(padding=(0, 2, 0, 0))
     for column in range(len(rows[0])):
-        table.add_column(justify="right" if column in right else "left", no_wrap=True)
+        grid.add_column(justify="right" if column in right else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*map(Text, row))
+        grid.add_row(*map(Text, row))
     console = Console(width=sum(map(len, map("".join, rows))) + 100)
     with console.capture() as drawn:
-        console.print(table)
+        console.print(grid)
     return [f"  {line}".rstrip() for line in drawn.get().splitlines()]
 
 
-def _seconds(value: float | None) -> str:
+def _speed(said: str, value: float | None) -> str:
+    return f"{said} {'-' if value is None else f'{value:.2g} m/s'}"
+
+
+def _height(value: float | None) -> str:
+    return "" if value is None else f"({value:.2g} m)"
+
+
+def seconds_text(value: float | None) -> str:
+    """Seconds with what can be trusted of them."""
     if value is None:
         return "-"
     return f"{value:.2g} s" if value < 10 else f"{value:.0f} s"

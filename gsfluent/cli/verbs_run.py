@@ -89,6 +89,12 @@ class Run(Verb):
                 facts=facts, unlock=self.unlock,
             )  # fmt: skip
 
+    def text(self, result: dict[str, Any]) -> str | None:
+        """How it ended; of a shot that was only written, all of it."""
+        from gsfluent.cli.run_table import run_text
+
+        return run_text(result, self.out) if "verdict" in result else None
+
 
 @dataclass(kw_only=True)
 class Demo(Verb):
@@ -135,6 +141,12 @@ class Demo(Verb):
                 reporter=report,
                 **self.given("size", "seed", "force", "unlock"),
             )
+
+    def text(self, result: dict[str, Any]) -> str | None:
+        """How it ended; of photographs alone, where they are."""
+        from gsfluent.cli.run_table import run_text
+
+        return run_text(result, self.out) if "verdict" in result else None
 
 
 @dataclass(kw_only=True)

@@ -70,6 +70,14 @@ class SolveSettings:
         "Cells along the longest side of the largest solid, instead of those of `quality`.",
         "32",
     )
+    max_points: int = key(
+        whole(0, 8_000_000),
+        "Where walls are thinner than three cells of `quality`, the cells are made as fine as "
+        "that takes, up to so many material points and eight times the cells of `quality`; 0 "
+        "leaves them. `cells` is never changed.",
+        "1000000",
+        default=300_000,
+    )
     cfl: float = key(
         number(0.05, 0.9), "Courant number of the automatic time step.", "0.7", default=0.5
     )

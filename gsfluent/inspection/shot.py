@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsfluent import materials
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
 from gsfluent.inspection.parts import PartMap, body_parts, solid_regions
@@ -17,7 +17,8 @@ from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.progress import Reporter
 from gsfluent.results.lock import locked
-from gsfluent.scene.scene import Scene
+from gsfluent.stages.breaking import breaking_rows, landing_speed
+from gsfluent.stages.simulate import build_scene
 from gsfluent.stages.solids import context_of, load_solids, make_solids
 
 
@@ -45,7 +46,8 @@ def inspect_shot(
 
     Returns:
         ``objects``: per object the rows of :class:`PartMap` as ``parts``, ``sources`` (what the
-        photographs said), ``warnings``, ``picture`` and, where a segmentation has several labels,
+        photographs said), ``breaking`` (:func:`gsfluent.stages.breaking.breaking_rows`, of a fall
+        onto the floor), ``warnings``, ``picture`` and, where a segmentation has several labels,
         ``labels_picture`` of them all.
 
     Raises:
@@ -54,19 +56,17 @@ def inspect_shot(
     context = context_of(shot, run, device, seed, reporter)
     with locked(run):
         make_solids(context)
-    scene = Scene(floor=None)
-    solids = load_solids(context)
-    for name, settings in shot.objects.items():
-        material = materials.get(settings.material).override(**dict(settings.overrides))
-        parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
-        scene.add(solids[name], material, frame=context.frame, parts=parts, name=name)
-    dx = grid_spacing(scene, QUALITY[shot.solve.quality])
-    objects = {}
-    for body in scene.bodies:
+    scene = build_scene(shot, load_solids(context), context.frame)
+    dx = grid_spacing(scene, shot.solve.cells or QUALITY[shot.solve.quality])
+    objects, pull = {}, math.hypot(*scene.gravity)
+    bodies = [body for body in scene.bodies if body.solid is not None]
+    for body in bodies:
         path = out
-        if out is not None and len(scene.bodies) > 1:
+        if out is not None and len(bodies) > 1:
             path = out.with_name(f"{out.stem}_{body.name}{out.suffix}")
-        objects[body.name] = _shown(body_parts(body, dx), path, body.name, all_labels=True)
+        shown = _shown(body_parts(body, dx), path, body.name, all_labels=True)
+        rows = breaking_rows(body, landing_speed(body, scene), pull, dx)
+        objects[body.name] = shown | {"breaking": rows}
     return {"kind": "shot", "run": str(run), "objects": objects}
 
 

@@ -61,6 +61,8 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
         raise InputError(made["refused"], made["hint"])
     if model is None:
         _log.info("plan: this machine is not calibrated (gsfluent plan does it): no times")
+    for warning in made["warnings"]:
+        _log.warning("%s", warning)
     section = {"calibrated": made["calibrated"], "predicted": predicted_of(made)}
     section |= {"binding": made["binding"], "warnings": made["warnings"]}
     context.record.values["plan"] = section | ({} if chosen is None else {"chosen": chosen})

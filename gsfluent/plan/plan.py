@@ -9,6 +9,7 @@ foreseen in closed form (:mod:`gsfluent.plan.motion`); a cost model measured on 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,8 @@ from gsfluent.plan.work import (
 )
 from gsfluent.progress import Progress
 from gsfluent.scene.scene import Scene
-from gsfluent.stages.findings import cells_for, lowered, setting
+from gsfluent.stages.breaking import breaking_rows
+from gsfluent.stages.findings import cells_for, cells_for_walls, lowered, setting, walls_note
 from gsfluent.stages.simulate import build_scene
 
 
@@ -94,6 +96,11 @@ class Prospect:
         """Material points of each body."""
         return [max(1, round(b.volume * POINTS_PER_CELL / dx**3)) for b in self.scene.bodies]
 
+    @functools.cached_property
+    def wall_cells(self) -> tuple[int, int]:
+        """Cells along the largest body that walls get, and that they want."""
+        return cells_for_walls(self.scene, self.shot.solve.quality, self.shot.solve.max_points)
+
     def outlook(self, dx: float) -> Outlook:
         """What happens on a grid of spacing ``dx``."""
         # the run simulates until its last frame, not until the end
@@ -130,7 +137,8 @@ def plan_shot(
 
     Returns:
         ``passes`` (name, needed, why), ``bounds``, ``binding`` and ``budget``, ``dx``, ``cells``,
-        ``dt``, ``substeps``, ``particles``, ``active_blocks``, ``stages`` (seconds and
+        ``breaking`` (:func:`gsfluent.stages.breaking.breaking_rows`), ``dt``, ``substeps``,
+        ``particles``, ``active_blocks``, ``stages`` (seconds and
         memory_bytes by name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``,
         ``size_m``, ``assumed``, ``warnings``, ``calibrated``, ``model`` (when it was measured,
         corrections by runs), ``device`` and ``work`` (features by stage); ``refused``, why a run
@@ -154,7 +162,9 @@ def plan_shot(
     bounds, binding = bounds_of(
         prospect.scene.bodies, dx, strike=outlook.strike_speed, budget=least
     )
+    breaking = _breaking(prospect, outlook, dx)
     warnings = [*prospect.warnings, *_warnings(prospect, outlook, dx, sum(counts))]
+    warnings += _unbroken(breaking)
     if texture_method(shot) in NOT_PREDICTED:
         warnings.append(
             f"texture: what {texture_method(shot)} costs hangs on the model you bring and is not "
@@ -183,6 +193,7 @@ def plan_shot(
         "grid_from": outlook.grid_from,
         "impact_speed": outlook.strike_speed,
         "wave_speed": outlook.wave,
+        "breaking": breaking,
         "particles": sum(counts),
         "particles_per_cell": POINTS_PER_CELL,
         "active_blocks": outlook.blocks,
@@ -231,7 +242,9 @@ def cells_of(prospect: Prospect, model: CostModel | None) -> int:
     """
     solve = prospect.shot.solve
     if solve.seconds_per_frame is None or model is None:
-        return solve.cells or QUALITY[solve.quality]
+        if solve.cells is not None:
+            return solve.cells
+        return prospect.wall_cells[0]
     return choose_cells(lambda cells: prospect.frame_seconds(model, cells), solve.seconds_per_frame)
 
 
@@ -297,6 +310,36 @@ def _costs(
     return {"seconds": None if unknown else round(cost.seconds, 3), "memory_bytes": cost.bytes}
 
 
+def _breaking(prospect: Prospect, outlook: Outlook, dx: float) -> list[dict[str, Any]]:
+    """:func:`gsfluent.stages.breaking.breaking_rows` of all objects that are not led."""
+    pull = math.hypot(*prospect.scene.gravity)
+    movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}
+    rows = []
+    for number, body in enumerate(prospect.scene.bodies):
+        mover = movers[number]
+        if body.solid is None or mover.driven:
+            continue
+        rows += breaking_rows(body, mover.speed or None, pull, dx)
+    return rows
+
+
+def _unbroken(rows: list[dict[str, Any]]) -> list[str]:
+    """What meets something brittle enough to break, and too slowly for any part of it."""
+    found = []
+    for name in dict.fromkeys(row["object"] for row in rows):
+        brittle = [row for row in rows if row["object"] == name and row["breaks_from"] is not None]
+        if not brittle or any(row["breaks"] for row in brittle):
+            continue
+        weakest = min(brittle, key=lambda row: float(row["breaks_from"]))
+        if weakest["lands_with"] is not None:
+            found.append(
+                f"{name}: meets something at {weakest['lands_with']:.2g} m/s, but "
+                f"{weakest['material']} breaks from about {weakest['breaks_from']:.2g} m/s; hint: "
+                f"{weakest['hint']}"
+            )
+    return found
+
+
 def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -> list[str]:
     """What a user should mend before an hour is spent."""
     shot, scene = prospect.shot, prospect.scene
@@ -316,18 +359,9 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
             f"{particles} material points, more than the {MAX_PARTICLES} that a run takes; hint: "
             "fewer solve.cells"
         )
-    movers = {mover.body: mover for mover in outlook.movers if mover.body is not None}
-    for number, body in enumerate(scene.bodies):
+    for body in scene.bodies:
         if body.solid is None:
             continue
-        mover = movers[number]
-        limit = body.breaking_speed
-        if math.isfinite(limit) and 0.0 < mover.speed < limit and not mover.driven:
-            weakest = min(body.materials, key=lambda material: material.breaking_speed)
-            found.append(
-                f"{body.name}: meets something at {mover.speed:.2g} m/s, but {weakest.name} "
-                f"breaks from about {limit:.2g} m/s; hint: raise the drop or lower its strength"
-            )
         thin = thickness(body)
         if thin < THIN_CELLS * dx:
             wall = cells_for(scene, thin / WALL_CELLS)
@@ -338,6 +372,10 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
                 f"{breaks if thin < WALL_CELLS * dx else ''}"
                 f"{setting(cells_for(scene, thin / THIN_CELLS))} lets it bend"
             )
+    solve = shot.solve
+    if solve.cells is None and solve.seconds_per_frame is None and solve.error is None:
+        if note := walls_note(solve.quality, *prospect.wall_cells, solve.max_points):
+            found.append(note)
     found.extend(lowered(scene, dx))
     if outlook.grid_seconds <= 0.0:
         found.append(

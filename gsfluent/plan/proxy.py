@@ -7,7 +7,13 @@ the sparse points say how large the object is, and an ellipsoid is its proxy.
 from __future__ import annotations
 
 import dataclasses
+import json
+import logging
 import math
+import os
+import shutil
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,22 +22,28 @@ from torch import Tensor
 
 from gsfluent.config import Shot
 from gsfluent.data import SURFACE, Capture, Frame, Gaussians, Solid, View
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, RunError
 from gsfluent.inspection.capture import inspect
-from gsfluent.io import load_capture, load_splats
+from gsfluent.io import load_capture, load_splats, write_json
+from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.pipeline.capture.hull import hull_grid, masked_views
 from gsfluent.pipeline.capture.orient import DEFAULT_SIZE, look_at_point, make_frame
 from gsfluent.pipeline.fill.mesh_skin import SPLATS, mesh_gaussians
 from gsfluent.pipeline.fill.stage import Fill
 from gsfluent.pipeline.reconstruct.recipe import recipe_for
+from gsfluent.plan.cost import cache_folder
+from gsfluent.results.store import content_digest, fingerprint
 from gsfluent.spatial.voxels import nearest_empty
-from gsfluent.stages.known import extended, known_solid, parted
+from gsfluent.stages.known import extended, is_solid, known_solid, parted, source_digest
 from gsfluent.stages.select import select_mask
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+_log = logging.getLogger(__name__)
+
 _VOXELS = 48
+_FACTS, _MOST = "proxy.json", 8  # file beside the solids, and proxies that are kept
 _MESH_SPLATS = 5000  # enough for the box and the axes of a mesh
 _MARGIN = 8
 """Pixels that training keeps around a mask."""
@@ -65,37 +77,97 @@ class Proxy:
 def proxy(shot: Shot, warnings: list[str]) -> Proxy:
     """Solids to plan a shot with.
 
+    Those of splats and meshes are kept in the user's cache: a plan, the run after it and the run
+    that is taken up again fill them once.
+
     Raises:
         InputError: The input cannot be read, or an object selects nothing of it.
     """
     if shot.splats is not None or shot.mesh is not None:
-        if shot.mesh is not None:
-            gaussians = mesh_gaussians(shot.mesh, _MESH_SPLATS)
-        else:
-            assert shot.splats is not None
-            gaussians = load_splats(shot.splats).validated(shot.splats.name)
-        frame = make_frame(gaussians, None, shot)
-        options = shot.fill.given(frame.scale) | {"resolution": _VOXELS}
-        masks = {}
-        taken = torch.zeros(gaussians.count, dtype=torch.bool)
-        for name, settings in shot.objects.items():
-            masks[name] = select_mask(gaussians, settings.select, frame) & ~taken
-            taken |= masks[name]
-        whole = known_solid(shot, gaussians, options | {"finer": False})
-        if whole is not None:
-            masks = {
-                name: extended(mask, gaussians, whole.gaussians) for name, mask in masks.items()
-            }
-            known = {name: _grey(solid) for name, solid in parted(whole, masks).items()}
-            told = "the solid as it is" if shot.mesh is None else f"the mesh at {_VOXELS} voxels"
-            count = gaussians.count if shot.mesh is None else SPLATS
-            return Proxy(known, frame, told, splats=count)
-        solids = {
-            name: _grey(Fill(**options, refine_views=0)(gaussians.select(mask)))
-            for name, mask in masks.items()
-        }
-        what = f"the splat, filled at {_VOXELS} voxels"
-        return Proxy(solids, frame, what, splats=gaussians.count)
+        if is_solid(shot.splats):  # nothing is filled
+            return _of_surface(shot)
+        folder = cache_folder() / "proxies" / _key(shot)
+        found = _kept(folder, list(shot.objects))
+        if found is None:
+            found = _of_surface(shot)
+            _keep(found, folder)
+        return found
+    return _of_photographs(shot, warnings)
+
+
+def _key(shot: Shot) -> str:
+    """Fingerprint of all that a proxy of splats or a mesh hangs on."""
+    placing = (shot.scale, shot.size, shot.up, shot.front, shot.floor, shot.origin)
+    selections = {name: repr(o.select) for name, o in shot.objects.items()}
+    labels = [content_digest(o.select.labels) for o in shot.objects.values() if o.select.labels]
+    inputs = [source_digest(shot), repr(shot.fill), repr(placing), selections, labels]
+    return fingerprint("proxy", _VOXELS, inputs)
+
+
+def _kept(folder: Path, names: list[str]) -> Proxy | None:
+    """The proxy that lies in a folder of the cache, if a whole one does."""
+    try:
+        facts = json.loads((folder / _FACTS).read_text(encoding="utf-8"))
+        frame = Frame.from_dict(facts["frame"])
+        solids = {name: load_solid(folder / f"{i}.ply") for i, name in enumerate(names)}
+        found = Proxy(solids, frame, facts["assumed"], splats=facts["splats"])
+        os.utime(folder)  # those looked at last are kept
+    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return None
+    return found
+
+
+def _keep(made: Proxy, folder: Path) -> None:
+    """Put a proxy into the cache, whole or not at all, and drop those not looked at for long."""
+    facts = {"frame": made.frame.to_dict(), "assumed": made.assumed, "splats": made.splats}
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as place:
+            part = Path(place) / folder.name
+            part.mkdir()
+            for i, solid in enumerate(made.solids.values()):
+                save_solid(solid, part / f"{i}.ply")
+            write_json(part / _FACTS, facts)
+            shutil.rmtree(folder, ignore_errors=True)
+            part.replace(folder)
+        others = [path for path in folder.parent.iterdir() if not path.name.startswith(".")]
+        for old in sorted(others, key=lambda path: path.stat().st_mtime)[:-_MOST]:
+            shutil.rmtree(old, ignore_errors=True)
+    except (OSError, RunError) as error:  # a cache is no reason to stop
+        _log.debug("proxy not kept: %s", error)
+
+
+def _of_surface(shot: Shot) -> Proxy:
+    """Proxies from splats, or a mesh."""
+    if shot.mesh is not None:
+        gaussians = mesh_gaussians(shot.mesh, _MESH_SPLATS)
+    else:
+        assert shot.splats is not None
+        gaussians = load_splats(shot.splats).validated(shot.splats.name)
+    frame = make_frame(gaussians, None, shot)
+    options = shot.fill.given(frame.scale) | {"resolution": _VOXELS}
+    masks = {}
+    taken = torch.zeros(gaussians.count, dtype=torch.bool)
+    for name, settings in shot.objects.items():
+        masks[name] = select_mask(gaussians, settings.select, frame) & ~taken
+        taken |= masks[name]
+    whole = known_solid(shot, gaussians, options | {"finer": False})
+    if whole is not None:
+        masks = {name: extended(mask, gaussians, whole.gaussians) for name, mask in masks.items()}
+        known = {name: _grey(solid) for name, solid in parted(whole, masks).items()}
+        told = "the solid as it is" if shot.mesh is None else f"the mesh at {_VOXELS} voxels"
+        count = gaussians.count if shot.mesh is None else SPLATS
+        return Proxy(known, frame, told, splats=count)
+    solids = {
+        name: _grey(Fill(**options, refine_views=0)(gaussians.select(mask)))
+        for name, mask in masks.items()
+    }
+    what = f"the splat, filled at {_VOXELS} voxels"
+    return Proxy(solids, frame, what, splats=gaussians.count)
+
+
+def _of_photographs(shot: Shot, warnings: list[str]) -> Proxy:
+    """Proxies from the photographs of a capture."""
     if shot.capture is None:
         raise InputError("the shot has no capture, splats or mesh", "name one input")
     # what is wrong with a capture is an error; what is not in it is a warning

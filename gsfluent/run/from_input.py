@@ -13,12 +13,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsfluent import materials
+from gsfluent.config import Shot
 from gsfluent.config.physgaussian.space import model_file
+from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
-from gsfluent.io import atomic_path, kind_of, load_splats
+from gsfluent.io import atomic_path, kind_of, load_capture, load_splats
+from gsfluent.pipeline.capture.orient import (
+    DEFAULT_SIZE,
+    camera_up,
+    make_frame,
+    orient,
+    upright_rotation,
+)
+from gsfluent.pipeline.simulate.stage import QUALITY
+from gsfluent.spatial.front import front_side
 from gsfluent.spatial.mesh_surface import surface_points
+from gsfluent.stages.breaking import SURE, breaks_from
 
 _log = logging.getLogger(__name__)
 
@@ -26,11 +39,13 @@ FILE = "shot.yaml"
 SETTINGS: dict[str, dict[str, Any]] = {"solve": {"quality": "preview"}, "output": {}}
 """How a shot that nobody has written is simulated and filmed."""
 
-_MARGIN = 1.5  # times the speed from which the material is estimated to break
 _GRAVITY = 9.81
 _LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down as well
 _AFTER = 1.2  # seconds of film after the landing
 _SAMPLE = 2000  # points of a surface that are asked for their colour
+_VIEWED, _FEW = 20_000, 200  # points that are looked at for the front, and fewest that tell
+_SOLID = 0.3  # opacity from which a splat counts
+_AROUND = 0.3  # mean of the directions to the photographers below which they stood all around
 
 _WORDS = {
     "fruit.watermelon": "watermelon melon",
@@ -92,14 +107,19 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     if material is None:
         material, why = guess_material(key, path, source)
         _log.info("material: %s, guessed from %s; --material NAME says better", material, why)
-    events, seconds, fall = _fall(materials.get(material))
+    splats = _sampled(key, path)
+    front, side = guess_front(key, path, splats)
+    _log.info("front: %s; front: in the shot says better", side)
+    events, seconds, fall = _fall(materials.get(material), _size(key, path, splats))
     _log.info("event: %s", fall)
     values: dict[str, Any] = {key: str(path.resolve())}
+    if front is not None:
+        values["front"] = front
     values["objects"] = {"object": {"material": material}}
     if material in _INSIDE:
         values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
     output = {"seconds": seconds, **SETTINGS["output"]}
-    values |= {"events": events, "solve": SETTINGS["solve"], "output": output}
+    values |= SETTINGS | {"events": events, "output": output}
     text = yaml.safe_dump(values, sort_keys=False)
     target = out / FILE
     out.mkdir(parents=True, exist_ok=True)
@@ -192,8 +212,77 @@ def guess_material(key: str, path: Path, source: Path) -> tuple[str, str]:
         colors = found.colors
     else:
         splats = load_splats(path)
-        colors = splats.colors().clamp(0.0, 1.0).double().numpy()[splats.opacities.numpy() > 0.3]
+        colors = splats.colors().clamp(0.0, 1.0).double().numpy()[splats.opacities.numpy() > _SOLID]
     return _by_color(np.median(colors, axis=0))
+
+
+def _sampled(key: str, path: Path) -> Gaussians | None:
+    """Some splats on the surface of an input; None for photographs."""
+    if key == "capture":
+        return None
+    if key == "mesh":
+        found = surface_points(path, _VIEWED)
+        return Gaussians.from_colors(
+            torch.from_numpy(found.points).float(), torch.full((len(found.points),), 1e-3),
+            torch.from_numpy(found.colors).float(),
+        )  # fmt: skip
+    splats = load_splats(path)
+    solid = splats.opacities > _SOLID
+    splats = splats.select(solid) if int(solid.sum()) >= _FEW else splats
+    return splats.select(torch.arange(splats.count) % max(1, splats.count // _VIEWED) == 0)
+
+
+def _size(key: str, path: Path, splats: Gaussians | None) -> float:
+    """Largest extent that the object will have in the scene [m]."""
+    if splats is None:
+        return DEFAULT_SIZE
+    frame = make_frame(splats, None, Shot.from_dict({key: str(path.resolve())}))
+    placed = frame.apply(splats.means.double())
+    return float((placed.amax(dim=0) - placed.amin(dim=0)).max())
+
+
+def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[float] | None, str]:
+    """The direction towards who looks at the front of an input, and what it was guessed from.
+
+    Photographers stand before the front: the middle of where they stood. Of a splat or a mesh, the
+    side with the most to see.
+
+    Args:
+        key: ``mesh``, ``splats`` or ``capture``.
+        path: The file or folder.
+        splats: Some of those on the surface; None for photographs.
+
+    Returns:
+        Three numbers in the axes of the input, or None where a run's own guess is as good; and
+        words.
+
+    Raises:
+        InputError: The input cannot be read.
+    """
+    if splats is None:
+        capture = load_capture(path)
+        up = orient(None, capture).up if len(capture.points) else camera_up(capture.cameras)
+        ahead = np.stack([camera.forward().double().numpy() for camera in capture.cameras])
+        ahead -= (ahead @ up)[:, None] * up
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+        middle = -ahead.mean(axis=0)
+        if (length := float(np.linalg.norm(middle))) < _AROUND:
+            return None, "where the first photograph was taken, since they go all around"
+        return _rounded(middle / length), "the side from which most photographs were taken"
+    if splats.count < _FEW:
+        return None, "that by the custom of its axes, since there are too few points to judge"
+    up = orient(splats, up="auto", mesh=path if key == "mesh" else None).up
+    usual = -upright_rotation(up)[1]
+    points = splats.means.double().numpy()
+    colors = splats.colors().clamp(0.0, 1.0).double().numpy()
+    way, more = front_side(points, colors, up, usual)
+    if more == 1.0:
+        return None, "that by the custom of its axes, since no side shows clearly more"
+    return _rounded(way), f"the side with the most to see ({more:.2g} times the usual front)"
+
+
+def _rounded(way: np.ndarray) -> list[float]:
+    return [round(float(part), 4) + 0.0 for part in way]
 
 
 def _by_color(color: np.ndarray) -> tuple[str, str]:
@@ -212,19 +301,19 @@ def _by_color(color: np.ndarray) -> tuple[str, str]:
     return ("fruit.apple", "its bright colour") if saturation > 0.5 else ("plaster", "its colour")
 
 
-def _fall(material: materials.Material) -> tuple[list[dict[str, Any]], float, str]:
+def _fall(material: materials.Material, size: float) -> tuple[list[dict[str, Any]], float, str]:
     """Events that break a material, how long the film is [s], and why in words."""
-    limit = material.breaking_speed
+    limit = breaks_from(material, size, size / QUALITY["preview"])
     if not math.isfinite(limit):
         height, why = 1.0, f"a drop from 1 m ({material.name} does not break)"
         return [{"type": "drop", "height": height}], _seconds(height, 0.0), why
-    needed = (_MARGIN * limit) ** 2 / (2.0 * _GRAVITY)
+    needed = (SURE * limit) ** 2 / (2.0 * _GRAVITY)
     height = round(min(max(needed, _LOW), _HIGH), 2)
     events: list[dict[str, Any]] = [{"type": "drop", "height": height}]
     about = f"{material.name} is estimated to break from {limit:.2g} m/s"
     if needed <= _HIGH:
         return events, _seconds(height, 0.0), f"a drop from {height:g} m ({about})"
-    speed = round(math.sqrt((_MARGIN * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
+    speed = round(math.sqrt((SURE * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
     events.append({"type": "throw", "velocity": [0.0, 0.0, -speed]})
     return (
         events,

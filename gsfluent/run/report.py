@@ -64,6 +64,8 @@ def report_page(out: Path, values: Values) -> Page:
         page.video(video, "the shot as it was asked for")
     if (inside := outputs.get("interior")) and (out / inside).is_file():
         page.picture(out / inside, "cuts through the filled and textured object")
+    if warnings := values.get("warnings"):
+        page.heading("Warnings").listing([str(w) for w in warnings], kind="warn")
     _summary(page, values)
     _choice(page, out, values)
     _plan(page, values.get("plan"))
@@ -151,7 +153,6 @@ def _plan(page: Page, plan: Any) -> None:
             "No times were foreseen: `gsfluent plan` measures what work costs on this machine, once"
         )
     page.table(["quantity", "predicted", "actual", "actual / predicted"], rows)
-    page.listing([str(w) for w in plan.get("warnings") or []], kind="warn")
 
 
 def _compared(predicted: Any, actual: Any, of: str = "") -> list[tuple[str, Any, Any, Any]]:

@@ -20,7 +20,7 @@ from gsfluent.choose.shot import choose_stage
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
 from gsfluent.plan.in_run import foresee_run, judge_plan
-from gsfluent.progress import LineReporter, Reporter
+from gsfluent.progress import LineReporter, Reporter, heard_warnings, heartbeat
 from gsfluent.results.lock import locked
 from gsfluent.results.record import RunRecord
 from gsfluent.results.store import StageResult, StageStore
@@ -109,14 +109,24 @@ def run_in(
         if choose_stage(context):  # the plan was made with other cells
             foreseen = foresee_run(context, plan=plan)
 
+    def at_work() -> str:
+        took = time.perf_counter() - start
+        stage = store.results[-1].name if store.results else "plan"
+        planned = None if foreseen is None else foreseen.plan["seconds"]
+        left = "" if planned is None else f", about {max(planned - took, 0.0):.0f} s left"
+        return f"{stage}: at work, {took:.0f} s since the start{left}"
+
     try:
         check_shot(shot)
-        foreseen = foresee_run(context, plan=plan)
-        run_stages(context, settle)
+        with heard_warnings("gsfluent") as heard, heartbeat("gsfluent", at_work) as watched:
+            context.reporter = watched(context.reporter)
+            foreseen = foresee_run(context, plan=plan)
+            run_stages(context, settle)
         if after is not None:
             record.values.update(after(context))
         judge_plan(context, foreseen)
     except BaseException as error:
+        _withdraw_film(context)
         _record_failure(record, error, store)
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(_resume_text(error, out, store)) from error
@@ -129,20 +139,39 @@ def run_in(
             "run the same command again to go on; GSFLUENT_DEBUG=1 shows the traceback",
         ) from error
     record.values["outputs"]["report"] = REPORT
+    record.values["warnings"] = _warnings(shot, record.values, heard)
     values = record.finish(store.results)
     write_report(out, values)
-    _log.info(
-        "%s in %.1f s: %s (%s)",
-        out,
-        time.perf_counter() - start,
-        values["verdict"],
-        values["reason"],
-    )
+    reason = (values["simulation"] or {}).get("reason") or values["reason"].split("; ")[0]
+    _log.info("%s in %.1f s: %s (%s)", out, time.perf_counter() - start, values["verdict"], reason)
+    for warning in values["warnings"]:
+        _log.info("  ! %s", warning)
     if values["verdict"] == "failed":
         raise RunError(
             values["reason"], _kept(out, store), "try solve.quality: hero, or softer material"
         )
     return values
+
+
+def _warnings(shot: Shot, values: Mapping[str, Any], heard: list[str]) -> list[str]:
+    """All that was warned of, each matter once: what was found counts, not what was foreseen."""
+    notes = list((values["simulation"] or {}).get("notes") or [])
+    foreseen = set((values.get("plan") or {}).get("warnings") or [])
+    # of the objects the simulation has told what became of them
+    bodies = tuple(f"{name}: " for name in shot.objects)
+    kept = [said for said in heard if not (said in foreseen and said.startswith(bodies))]
+    return [*(said for said in kept if said not in notes), *notes]
+
+
+def _withdraw_film(context: RunContext) -> None:
+    """Leave no film of an earlier run beside the record of one that has made none.
+
+    The render stage keeps its own; where it still holds, the next run shows it again.
+    """
+    for key, name in (("video", "video.mp4"), ("poster", "poster.png")):
+        if key not in context.record.values["outputs"]:
+            with suppress(OSError):
+                (context.out / name).unlink(missing_ok=True)
 
 
 def _record_failure(record: RunRecord, error: BaseException, store: StageStore) -> None:

@@ -4,11 +4,12 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    breaking="SURE breaking_rows breaks_from landing_speed",
     chain="run_stages",
     check="check_shot",
     context="RunContext",
-    findings="cells_for lowered setting thin_walls",
-    known="extended known_solid parted source_digest",
+    findings="cells_for cells_for_walls lowered setting summary thin_walls walls_note",
+    known="extended is_solid known_solid parted source_digest",
     select="select_mask",
     show="render_again",
     simulate="build_scene moving_settings saved solver_options",

@@ -11,11 +11,11 @@ import torch
 
 from gsfluent.data import SURFACE
 from gsfluent.pipeline.matter.brittle import kept_strength
-from gsfluent.pipeline.matter.points import grid_spacing
+from gsfluent.pipeline.matter.points import POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.walls import WALL_CELLS, thin_shells
-from gsfluent.scene.scene import Scene
+from gsfluent.scene.scene import Body, Scene
 
 _log = logging.getLogger(__name__)
 
@@ -33,33 +33,96 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
     Returns:
         By name what :func:`gsfluent.pipeline.solid.walls.thin_shells` reports in scene metres, and
         ``solve_cells``: the ``solve.cells`` with which the thinnest walls have
-        :data:`WALL_CELLS` cells; None where they have.
+        :data:`WALL_CELLS` cells, and ``note``, the warning; None where they have.
     """
     found = {}
     for body in scene.bodies:
         if body.solid is None:
             continue
-        scale, splats = body.frame.scale, body.solid.gaussians
-        assert splats.labels is not None  # a solid has labels
-        skin = splats.select(splats.labels.eq(SURFACE))
-        field = SignedDistance.of_solid(body.solid)
-        report = thin_shells(
-            field.replace(values=field.values * scale, voxel=field.voxel * scale),
-            dx,
-            gaussian_size=scale * float(skin.scales.amax(1).median()) if skin.count else None,
-            unit=" m",
-        )
+        report = _walls(body, dx)
         if report["middle"] is not None:
             # measured from the corner of the grid, in metres
-            local = torch.tensor(report["middle"]) - field.origin
-            report["middle"] = body.frame.apply(field.origin + local / scale).tolist()
-        report["solve_cells"] = None
+            origin = SignedDistance.of_solid(body.solid).origin
+            local = torch.tensor(report["middle"]) - origin
+            report["middle"] = body.frame.apply(origin + local / body.frame.scale).tolist()
+        report["solve_cells"] = report["note"] = None
         if report["warning"]:
             report["solve_cells"] = cells_for(scene, dx / report["cells_needed"])
-            report["hint"] = f"{setting(report['solve_cells'])}: {report['hint']}"
-            _log.warning("%s: %s; hint: %s", body.name, report["warning"], report["hint"])
+            asked = setting(report["solve_cells"])
+            report["hint"] = f"{asked}: {report['hint']}"
+            report["note"] = (
+                f"{body.name}: {report['warning']}, too few to break as walls do; hint: {asked} "
+                f"gives them {WALL_CELLS:g} cells"
+            )
+            _log.warning("%s", report["note"])
         found[body.name] = report
     return found
+
+
+FINER = 8
+"""How many times finer than a quality says cells are made for walls, at most."""
+
+
+def cells_for_walls(scene: Scene, quality: str, most: int) -> tuple[int, int]:
+    """Cells along the largest solid with which walls have :data:`WALL_CELLS` cells.
+
+    Args:
+        scene: The scene.
+        quality: Name of a quality, whose cells are the fewest.
+        most: Most material points; with 0 the cells are those of the quality.
+
+    Returns:
+        ``(cells, wanted)``: as many as ``most`` and :data:`FINER` allow, and as the walls want.
+    """
+    least = QUALITY[quality]
+    if not most or all(body.solid is None for body in scene.bodies):
+        return least, least
+    dx = grid_spacing(scene, least)
+    finer = max(
+        (_walls(body, dx)["cells_needed"] for body in scene.bodies if body.solid is not None),
+        default=1.0,
+    )
+    wanted = cells_for(scene, dx / finer)
+    volume = sum(body.volume for body in scene.bodies)
+    held = int(grid_spacing(scene, 1) * (most / (POINTS_PER_CELL * volume)) ** (1.0 / 3.0))
+    return max(least, min(wanted, held, FINER * least)), wanted
+
+
+def walls_note(quality: str, cells: int, wanted: int, most: int) -> str:
+    """What finer cells for walls cost and what they do not reach; empty where nothing is finer."""
+    least = QUALITY[quality]
+    if wanted <= least:
+        return ""
+    times = cells / least
+    said = (
+        f"walls thinner than {WALL_CELLS:g} cells: {cells} cells instead of the {least} of "
+        f"quality: {quality}, {times**3:.2g} times the points and {times:.2g} times the steps"
+    )
+    if cells == least:
+        said = f"walls thinner than {WALL_CELLS:g} cells, and no finer cells are allowed"
+    if cells < wanted:
+        said += (
+            f"; {wanted} would hold them, more than solve.max_points: {most} and {FINER} times "
+            f"the cells of the quality allow; hint: solve.cells: {wanted}, or a thicker object"
+        )
+    else:
+        said += f"; hint: solve.cells: {least} if they may bend as one"
+    return said
+
+
+def _walls(body: Body, dx: float) -> dict[str, Any]:
+    """Of the walls of a solid, in scene metres; see :func:`thin_walls`."""
+    assert body.solid is not None  # asked for solids only
+    scale, splats = body.frame.scale, body.solid.gaussians
+    assert splats.labels is not None  # a solid has labels
+    skin = splats.select(splats.labels.eq(SURFACE))
+    field = SignedDistance.of_solid(body.solid)
+    return thin_shells(
+        field.replace(values=field.values * scale, voxel=field.voxel * scale),
+        dx,
+        gaussian_size=scale * float(skin.scales.amax(1).median()) if skin.count else None,
+        unit=" m",
+    )
 
 
 def lowered(scene: Scene, dx: float) -> list[str]:
@@ -109,21 +172,16 @@ def notes_of(
         unbroken: Of :meth:`gsfluent.stages.strikes.Strikes.unbroken`.
         pull: Strength of gravity [m/s^2].
     """
-    notes = [
-        f"{name}: {report['warning']}, too few to break as walls do; "
-        f"{setting(report['solve_cells'])} gives them {WALL_CELLS:g} cells"
-        for name, report in thin.items()
-        if report["warning"]
-    ]
+    notes = [report["note"] for report in thin.values() if report["note"]]
     notes.extend(weak)
     for row in unbroken:
         speed, needed = row["speed"], row["speed_needed"]
         fall = f" (a fall of {needed**2 / (2.0 * pull):.2g} m)" if pull > 0.0 else ""
         but = "" if speed < needed else "strike harder still, "
+        hint = f"; hint: {row['hint']}" if row["hint"] else ""
         notes.append(
             f"{row['body']} met {row['met']} at {speed:.2g} m/s and nothing broke; {but}"
-            f"{row['material']} is estimated to break from about {needed:.2g} m/s{fall}, "
-            "which is right to an order of magnitude only"
+            f"{row['material']} is estimated to break from about {needed:.2g} m/s{fall}{hint}"
         )
     return notes
 

@@ -24,7 +24,14 @@ from gsfluent.results.partition import save_partition
 from gsfluent.results.store import content_digest
 from gsfluent.scene.scene import Body, Scene
 from gsfluent.stages.context import RunContext
-from gsfluent.stages.findings import lowered, notes_of, summary, thin_walls
+from gsfluent.stages.findings import (
+    cells_for_walls,
+    lowered,
+    notes_of,
+    summary,
+    thin_walls,
+    walls_note,
+)
 from gsfluent.stages.solids import load_solids
 from gsfluent.stages.strikes import FILE as STRIKES
 from gsfluent.stages.strikes import Strikes
@@ -114,17 +121,23 @@ def solver_options(shot: Shot) -> SolverOptions:
 def simulate_stage(context: RunContext) -> None:
     """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
     shot = context.shot
-    solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl]
+    solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl, shot.solve.max_points]
     settings = [moving_settings(shot), solve, shot.output.cracks]
 
     def work(folder: Path) -> dict[str, Any]:
         scene = build_scene(shot, load_solids(context), context.frame)
-        cells = shot.solve.cells
+        cells, quality = shot.solve.cells, shot.solve.quality
+        finer = ""
+        if cells is None:
+            cells, wanted = cells_for_walls(scene, quality, shot.solve.max_points)
+            finer = walls_note(quality, cells, wanted, shot.solve.max_points)
+            if finer:
+                _log.warning("%s", finer)
         stage = Simulate(
-            quality=shot.solve.quality,
+            quality=quality,
             seed=context.seed,
             device=context.device,
-            dx=None if cells is None else grid_spacing(scene, cells),
+            dx=grid_spacing(scene, cells),
             options=solver_options(shot),
             repair=shot.output.cracks,
         )
@@ -161,7 +174,8 @@ def simulate_stage(context: RunContext) -> None:
             # after the frame: a state on disk always has its picture
             frames.save(state)
         unbroken, report = strikes.unbroken(), frames.report
-        notes = notes_of(thin, weak, unbroken, math.hypot(*scene.gravity))
+        notes = [finer] if finer else []
+        notes += notes_of(thin, weak, unbroken, math.hypot(*scene.gravity))
         for note in notes[-len(unbroken) :] if unbroken else ():
             _log.warning("%s", note)
         _log.info("simulate: %s", summary(report["per_frame"]))

@@ -19,6 +19,7 @@ from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.simulate.groups import LANDING
 from gsfluent.pipeline.simulate.stage import SimulationFrame
 from gsfluent.scene.scene import Scene
+from gsfluent.stages.breaking import breaking_rows
 
 FILE = "strikes.json"
 WHOLE = 1e-3
@@ -76,14 +77,15 @@ class Strikes:
 
         Returns:
             By body: ``body``, ``material`` (its weakest), ``met`` (by what it was struck
-            fastest), ``speed`` [m/s] and ``speed_needed``
-            (:attr:`gsfluent.scene.scene.Body.breaking_speed`) [m/s].
+            fastest), ``speed`` [m/s], ``speed_needed``
+            (:func:`gsfluent.stages.breaking.breaks_from`) [m/s] and ``hint``.
         """
         brittle = {
             number: body
             for number, body in enumerate(self.scene.bodies)
             if math.isfinite(body.breaking_speed)
         }
+        dx = self.matter.dx
         if any(self.broken[number] >= WHOLE for number in brittle):
             return []
         found = []
@@ -92,14 +94,17 @@ class Strikes:
             if not strikes:
                 continue
             hardest = max(strikes, key=lambda strike: float(strike["speed"]))
-            weakest = min(body.materials, key=lambda material: material.breaking_speed)
+            rows = breaking_rows(body, hardest["speed"], float(self.gravity.norm()), dx)
+            finite = [row for row in rows if row["breaks_from"] is not None]
+            weakest = min(finite, key=lambda row: float(row["breaks_from"]))
             found.append(
                 {
                     "body": body.name,
-                    "material": weakest.name,
+                    "material": weakest["material"],
                     "met": hardest["with"],
                     "speed": hardest["speed"],
-                    "speed_needed": body.breaking_speed,
+                    "speed_needed": weakest["breaks_from"],
+                    "hint": weakest["hint"],
                 }
             )
         return found

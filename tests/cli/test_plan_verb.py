@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 
-from gsfluent import materials
 from gsfluent.cli import main
 from gsfluent.data import Gaussians
 from gsfluent.io.splats.load import save_splats
@@ -68,20 +67,18 @@ def test_it_measures_once_and_on_request(
 def test_the_tables_say_what_binds_and_what_to_mend(
     shot: Path, measured: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # too slow for the rind too, which is the weakest part: 0.43 m/s would do, 0.24 is what it gets
-    weak = "parts: [{name: rind, where: {depth_below: 0.01}, tensile_strength: 1e4}]"
+    # too slow for the rind too, which is the weakest part: 0.24 m/s is what it gets
+    weak = "parts: [{name: rind, where: {depth_below: 0.01}, fracture_energy: 1.0}]"
     text = shot.read_text().replace("height: 0.01", "height: 0.003")
     shot.write_text(text.replace("fruit.watermelon}", f"fruit.watermelon, {weak}}}"))
-    rind = materials.fruit.watermelon.override(tensile_strength=1e4).breaking_speed
     assert main(["plan", str(shot), "--device", "cpu"]) == 0
     text = capsys.readouterr().out
-    for line in ("passes", "bounds of dx: ", "stages", "warnings", "in all"):
+    for line in ("passes", "bounds of dx: ", "stages", "warnings", "in all", "what breaks"):
         assert f"\n{line}" in text or f"\n  {line}" in text, line
     assert "  +  damage variable" in text and "  -  blades" in text
-    assert (
-        f"watermelon/rind breaks from about {rind:.2g} m/s" in text
-        and "hint: raise the drop" in text
-    )
+    assert "watermelon/rind breaks from about" in text and "hint: a drop from " in text
+    row = next(line for line in text.splitlines() if "watermelon/rind" in line)
+    assert "lands with 0.24 m/s" in row and "breaks from" in row and "would break it" in row
     # how many cells the thinnest part has, and how many make it bend
     assert re.search(r"thinnest, [\d.]+ cells of [\d.]+ mm, under 4; hint: .*solve.cells: ", text)
     assert " lets it bend" in text

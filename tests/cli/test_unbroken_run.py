@@ -52,13 +52,20 @@ def test_it_is_told_everywhere(hard: Path, capsys: pytest.CaptureFixture[str]) -
     assert walls["warning"] in thin and f"solve.cells: {walls['solve_cells']} " in thin
     assert walls["solve_cells"] == math.ceil(8 * walls["cells_needed"]) > 16
     assert "nothing broke" in struck and f"{found['speed_needed']:.2g} m/s" in struck
-    said = capsys.readouterr().err.splitlines()
+    shown, told = capsys.readouterr()
+    said = told.splitlines()
+    # told where it was found, and again in the list at the end, each once
+    assert record["warnings"][-2:] == [thin, struck]
+    assert len(set(record["warnings"])) == len(record["warnings"])
+    assert said[-len(record["warnings"]) :] == [f"  ! {note}" for note in record["warnings"]]
     for note in (thin, struck):
-        assert note in record["reason"] and note in said[-1]
-    assert any(line.endswith(struck) for line in said[:-1])  # the warning, where it was found
+        assert note in record["reason"] and note in said[:-2]
     assert any("simulate: 1 piece" in line and "0 % broken" in line for line in said)
     page = (out / "report.html").read_text()
     assert f'<p class="warn">clean: {record["reason"]}' in page and "Nothing broke" in page
+    assert "Warnings" in page
+    # a table ends the run, the record stays in its file
+    assert "clean: " in shown and str(out / "video.mp4") in shown and len(shown.splitlines()) < 20
 
 
 def test_thin_walls_are_told_before_anything_moves(

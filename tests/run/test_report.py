@@ -82,9 +82,9 @@ def test_plan_stands_against_fact(tmp_path: Path) -> None:
             "memory_bytes": 3_000_000,
             "stages": {"fill": {"seconds": 1.0}},
         },
-        "warnings": ["too <thin>"],
     }
-    text = report_page(tmp_path, record(plan=plan)).render()
+    values = record(plan=plan, warnings=["too <thin>"])
+    text = report_page(tmp_path, values).render()
     assert "1.234" in text and "fill: seconds" in text and "too &lt;thin&gt;" in text
     assert "memory [MB]" in text and ">1.5<" in text and "measures what work costs" in text
     assert "texture: seconds" not in text  # it did not run, so nothing can be said

@@ -10,7 +10,8 @@ __getattr__, __dir__, __all__ = room(
         "inside_masks lattice masked_views visual_hull"
     ),
     orient=(
-        "DEFAULT_SIZE Orientation look_at_point make_frame near_points orient upright_rotation"
+        "DEFAULT_SIZE Orientation below_support camera_up look_at_point make_frame near_points "
+        "orient upright_rotation"
     ),
     views="TrainView cropped halved read_views",
 )

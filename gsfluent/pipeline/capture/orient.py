@@ -43,6 +43,9 @@ _LEVEL = 0.05
 _TILT = np.cos(np.radians(30.0))
 """A support plane may lean this far from what the cameras say is up."""
 
+_UNDER = 0.4
+"""Share of the points of an object from which a plane above them is not what it stands on."""
+
 _OPAQUE = 0.1
 """Splats fainter than this do not count for an object's extent."""
 
@@ -149,7 +152,11 @@ def make_frame(
         None if shot is None or isinstance(shot.front, str) else shot.front,
     )
     points = _object_points(gaussians, None)
-    points = points[~cluster(points).floaters] @ rotation.T
+    points = points[~cluster(points).floaters]
+    if stance.floor_from == "support plane":
+        # nobody saw what reconstruction leaves below the plane that the object stands on
+        points = points[~below_support(points, stance.up, stance.floor)]
+    points = points @ rotation.T
     low, high = robust_box(points)
     extent = float((high - low).max())
     if not extent > 0:
@@ -177,6 +184,20 @@ def make_frame(
     if shot is not None and shot.origin == "input":
         base = np.array([0.0, 0.0, 0.0 if shot.floor == "none" else ground])
     return Frame(torch.from_numpy(rotation), torch.from_numpy(-scale * base), scale)
+
+
+def below_support(points: Array, normal: Array, offset: float) -> NDArray[np.bool_]:
+    """Which points [N, 3] lie below a support plane, bool [N]; none where it cannot be theirs.
+
+    A plane is believed that leaves most of the points above it. What lies within a hundredth of
+    their height of it stands on it.
+    """
+    height = points @ normal - offset
+    reach = float(np.quantile(height, 0.99)) if len(height) else 0.0
+    below = height < -0.01 * max(reach, 0.0)
+    if reach <= 0.0 or below.mean() >= _UNDER:
+        return np.zeros(len(points), dtype=np.bool_)
+    return np.asarray(below)
 
 
 def upright_rotation(up: Array, cameras: list[Camera] | None = None, front: Any = None) -> Array:

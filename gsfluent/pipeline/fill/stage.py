@@ -16,6 +16,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.fill.interior import Matter, populate
 from gsfluent.pipeline.fill.refine import refine_opacity
 from gsfluent.pipeline.fill.skin import skin_gaussians
+from gsfluent.pipeline.fill.support import Support
 from gsfluent.pipeline.solid.evidence import Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.hollow import cavity_volume
@@ -149,20 +150,25 @@ class Fill(Stage):
         Returns:
             The solid; ``report`` holds ``method`` and ``why``, ``interior_gaussians``, ``volume``
             and ``cavity_volume`` (world units cubed), ``leaks`` and ``leak_list`` (centre and
-            area of each), ``closed_side``, ``wall`` (median and 5 % thickness), ``hollow``,
+            area of each), ``below_support`` (share that was cut off below the plane on which the
+            object stood), ``closed_side``, ``wall`` (median and 5 % thickness), ``hollow``,
             ``hollow_fraction``, ``unusable_gaussians`` (degenerate, left out) and ``seconds``.
 
         Raises:
             InputError: Values are not finite, or no inside was found.
         """
         began = time.perf_counter()
-        known = None
+        known = support = None
         if gaussians is not None:
+            if solid is None:
+                support = Support.of(gaussians, capture, self.options.down)
+            gaussians = gaussians if support is None else support.above(gaussians)
             known = Evidence.of(gaussians, capture, self.resolution)
             gaussians = known.splats.validated("fill")
         total = 5
         report_progress(progress, 0, total, "inside")
         field = self._inside(known, capture, solid)
+        field = field if support is None else support.cut(field)
         report_progress(progress, 2, total, "depth")
         if gaussians is None:
             gaussians = skin_gaussians(field, capture)

@@ -1,0 +1,62 @@
+"""From which speed a body breaks: scaling laws that must hold, and what is suggested."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from simulation_scenes import at
+from simulation_shapes import ellipsoid
+
+from gsfluent import materials
+from gsfluent.scene.scene import Scene
+from gsfluent.stages.breaking import SURE, breaking_rows, breaks_from, landing_speed
+
+DX = 0.01
+
+
+def test_energy_pays_for_the_break() -> None:
+    plaster = materials.plaster
+    speed = breaks_from(plaster, 0.1)
+    # of a larger body there is more matter behind every cut
+    assert breaks_from(plaster, 0.4) == pytest.approx(0.5 * speed, rel=0.1)
+    tough = plaster.override(fracture_energy=4.0 * plaster.fracture_energy)
+    assert breaks_from(tough, 0.1) == pytest.approx(2.0 * speed, rel=0.1)
+    # softened for the sake of the step it breaks at nearly the same speed
+    hard = plaster.override(softening=1.0)
+    assert breaks_from(hard, 0.1) == pytest.approx(speed, rel=0.3)
+
+
+def test_what_holds_together_never_breaks_and_hand_made_softening_keeps_its_old_estimate() -> None:
+    assert breaks_from(materials.rubber, 0.1) == math.inf
+    by_hand = materials.plaster.override(alpha0=-0.01)
+    assert breaks_from(by_hand, 0.1) == by_hand.breaking_speed
+
+
+def test_rows_name_what_would_break_it() -> None:
+    scene = Scene()
+    scene.add(ellipsoid((0.05,) * 3, voxels=20), "plaster", frame=at(0, 0, 0.05), name="ball")
+    scene.add(ellipsoid((0.05,) * 3, voxels=20), "rubber", frame=at(1, 0, 0.15), name="toy")
+    ball, toy = scene.bodies
+    low, high = ball.bounds()
+    limit = breaks_from(ball.material, float((high - low).max()), DX)
+    assert landing_speed(toy, scene) == pytest.approx(math.sqrt(2 * 9.81 * 0.1), rel=0.02)
+    (row,) = breaking_rows(ball, 1.0, 9.81, DX)
+    assert row["breaks_from"] == limit > 1.0 and not row["breaks"]
+    assert row["height"] == pytest.approx(limit**2 / 19.62)
+    assert f"a drop from {(SURE * limit) ** 2 / 19.62:.2g} m" in row["hint"]
+    assert "a bullet of radius" in row["hint"]
+    (row,) = breaking_rows(ball, 1.1 * limit, 9.81, DX)
+    assert row["breaks"] and row["hint"] == ""
+    (row,) = breaking_rows(toy, 3.0, 9.81, DX)
+    assert row["breaks_from"] is row["height"] is None and not row["breaks"]
+    # the toughest of those that such a landing breaks, and nothing else helps rubber
+    weaker = materials.get(row["hint"].removeprefix("material: "))
+    assert SURE * breaks_from(weaker, 0.1, DX) <= 3.0
+
+
+def test_nothing_is_suggested_that_would_not_break() -> None:
+    scene = Scene()
+    scene.add(ellipsoid((0.05,) * 3, voxels=20), "rubber", frame=at(0, 0, 0.05), name="toy")
+    (row,) = breaking_rows(scene.bodies[0], None, 9.81, DX)
+    assert row["hint"] == "" and row["lands_with"] is None
