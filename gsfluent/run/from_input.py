@@ -29,7 +29,7 @@ from gsfluent.pipeline.capture.orient import (
     upright_rotation,
 )
 from gsfluent.pipeline.simulate.stage import QUALITY
-from gsfluent.spatial.front import front_side
+from gsfluent.run.front import front_side
 from gsfluent.spatial.mesh_surface import surface_points
 from gsfluent.stages.breaking import SURE, breaks_from
 

@@ -6,7 +6,6 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     blue_noise="blue_cylinder",
     density="GridBox choose_grid density_field",
-    front="front_side",
     mesh_distance="grid_winding mesh_body oriented_samples signed_distances",
     mesh_file="ENDINGS in_metres is_mesh load_mesh mesh_files up_axes",
     mesh_surface="surface_points",
