@@ -1,8 +1,8 @@
 """One command without a written shot, from what people have to a film.
 
 The looks of the film and the errors on the way are tested elsewhere; here it is that each kind of
-input gets there: splats, a model folder, a textured mesh. Sizes are tiny. A PhysGaussian folder with its config:
-tests/cli/test_physgaussian_run.py.
+input gets there: splats, a model folder, a textured mesh. Sizes are tiny. A PhysGaussian folder
+with its config: tests/cli/test_physgaussian_run.py.
 """
 
 from __future__ import annotations
