@@ -1,8 +1,8 @@
 """One command without a written shot, from what people have to a film.
 
 The looks of the film and the errors on the way are tested elsewhere; here it is that each kind of
-input gets there. Sizes are tiny. A PhysGaussian folder with its config:
-tests/cli/test_physgaussian_run.py.
+input gets there: splats, a model folder, a textured mesh. Sizes are tiny. A PhysGaussian folder
+with its config: tests/cli/test_physgaussian_run.py.
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ from physgaussian_model import write_model
 from PIL import Image
 
 import gsfluent.run.from_input as from_input
-from gsfluent import geometry
 from gsfluent.cli import main
 from gsfluent.config import load_shot
-from gsfluent.data import Camera, Gaussians
+from gsfluent.data import Gaussians
 from gsfluent.io import save_splats
 
 FRAMES = 4
@@ -80,75 +79,9 @@ def textured_mesh(folder: Path) -> Path:
     return folder / "crate.obj"
 
 
-def photographs(folder: Path) -> list[Camera]:
-    """Photographs of a ball in half light from a ring, RGBA; the cameras know their names."""
-    folder.mkdir(parents=True)
-    cameras = []
-    for number in range(10):
-        turn = 2.0 * math.pi * number / 10
-        up = 0.5 if number % 2 else 1.2
-        eye = (2.0 * math.cos(turn), 2.0 * math.sin(turn), up)
-        camera = Camera.look_at(
-            eye, (0.0, 0.0, 0.0), width=64, height=48, fov=30.0, name=f"{number}.png"
-        )
-        cameras.append(camera)
-        y, x = np.meshgrid(np.arange(48) + 0.5, np.arange(64) + 0.5, indexing="ij")
-        lens, pose = camera.K.double().numpy(), camera.viewmat.double().numpy()
-        ray = np.stack([(x - lens[0, 2]) / lens[0, 0], (y - lens[1, 2]) / lens[1, 1],
-                        np.ones_like(x)], axis=-1) @ pose[:3, :3]  # fmt: skip
-        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-        at = np.asarray(eye)
-        along = -(ray @ at)
-        inside = along**2 - (at @ at - RADIUS**2)
-        hit = at + (along - np.sqrt(np.maximum(inside, 0.0)))[..., None] * ray
-        color = 0.5 + 0.4 * hit / RADIUS
-        rgba = np.concatenate([color, (inside > 0.0)[..., None]], axis=-1).clip(0.0, 1.0)
-        Image.fromarray((255 * rgba).astype(np.uint8)).save(folder / camera.name)
-    return cameras
-
-
-def transforms(folder: Path) -> Path:
-    """A capture of nerfstudio's kind."""
-    capture = folder / "capture"
-    frames = []
-    for camera in photographs(capture / "images"):
-        pose = torch.linalg.inv(camera.viewmat.double())
-        pose[:3, 1:3] *= -1.0  # OpenGL looks along -z
-        frames.append(
-            {"file_path": f"images/{camera.name}", "transform_matrix": pose.tolist(),
-             "fl_x": float(camera.K[0, 0]), "fl_y": float(camera.K[1, 1]),
-             "cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2]), "w": 64, "h": 48}
-        )  # fmt: skip
-    (capture / "transforms.json").write_text(json.dumps({"frames": frames}))
-    return capture
-
-
-def colmap(folder: Path) -> Path:
-    """A capture with a COLMAP model in text."""
-    capture = folder / "capture"
-    cameras = photographs(capture / "images")
-    model = capture / "sparse" / "0"
-    model.mkdir(parents=True)
-    lens = cameras[0].K
-    (model / "cameras.txt").write_text(
-        f"1 PINHOLE 64 48 {lens[0, 0]} {lens[1, 1]} {lens[0, 2]} {lens[1, 2]}\n"
-    )
-    lines = []
-    for number, camera in enumerate(cameras, 1):
-        quat = geometry.matrix_to_quaternion(camera.viewmat[:3, :3]).tolist()
-        pose = " ".join(f"{value:.9f}" for value in [*quat, *camera.viewmat[:3, 3].tolist()])
-        lines += [f"{number} {pose} 1 {camera.name}", ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    points = shell().means[::15].tolist()
-    (model / "points3D.txt").write_text(
-        "".join(f"{i + 1} {x} {y} {z} 200 100 100 0.5\n" for i, (x, y, z) in enumerate(points))
-    )
-    return capture
-
-
 @pytest.mark.parametrize(
     "make",
-    [splat, compressed_splat, model_folder, textured_mesh, transforms, colmap],
+    [splat, compressed_splat, model_folder, textured_mesh],
 )
 def test_one_command_makes_a_film(
     make: Maker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -156,9 +89,6 @@ def test_one_command_makes_a_film(
     place = tmp_path / "in"
     place.mkdir()
     out = tmp_path / "out"
-    if make in (transforms, colmap):
-        recipe = {"iterations": 40, "image_size": 48, "max_gaussians": 600}
-        from_input.SETTINGS["reconstruct"] = recipe
     assert main(["run", str(make(place)), "-o", str(out)]) == 0
     shown, said = capsys.readouterr()
     frames, _ = imageio_ffmpeg.count_frames_and_secs(str(out / "video.mp4"))
