@@ -112,7 +112,17 @@ class CostModel:
     # counts exactly).
     memory: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
 
+    @classmethod
+    def unmeasured(cls, device: torch.device | str) -> CostModel:
+        """A model of this machine that knows nothing yet, for runs to teach."""
+        return cls(machine=machine_key(device), seconds={})
+
     # --- asking ---
+
+    @property
+    def measured(self) -> bool:
+        """Whether the probe made it, and not finished runs."""
+        return bool(self.made)
 
     @property
     def device(self) -> str:

@@ -15,14 +15,33 @@ from typing import Any
 
 import torch
 
+from gsfluent.config.settings import EXPORTS
 from gsfluent.errors import GsfluentError
-from gsfluent.plan.cost import Cost, CostModel, framing, stepping
+from gsfluent.plan.cost import LAW_SETS, Cost, CostModel, framing, stepping
+from gsfluent.plan.fit import Sample, fit
 from gsfluent.plan.work import mean_splats
 
 _log = logging.getLogger(__name__)
 
 STAGES = ("reconstruct", "isolate", "fill", "texture", "simulate", "render", "export")
 """Stages that have a cost, in their order."""
+
+_GROWS = {
+    "reconstruct": ("start", "step_splats", "step_pixels"),
+    "isolate": ("start", "splats"),
+    "fill": ("start", "voxels", "inner"),
+    "texture": ("start", "exemplar_voxels", "procedural_voxels"),
+    "simulate": ("start", "composed_point_steps", "frame_gaussians"),
+    "render": ("start", "frame_pixels", "frame_gaussians"),
+    "export": tuple(f"{kind}_gaussians" for kind in EXPORTS),
+}
+"""What a stage's time is taken to grow with where one run is all that is known of it."""
+_ALIKE = {
+    "simulate": tuple(f"point_steps_{laws}" for laws in LAW_SETS),
+    "texture": ("exemplar_voxels", "procedural_voxels"),
+    "export": _GROWS["export"],
+}
+"""Kinds of work of which one run shows one or a few."""
 
 Work = dict[str, dict[str, float]]
 
@@ -188,27 +207,43 @@ def _ratio(predicted: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str,
 
 
 def learn(
-    model: CostModel,
+    model: CostModel | None,
     plan: Mapping[str, Any],
     values: Mapping[str, Any],
     device: torch.device | str,
     folder: Path | None = None,
 ) -> CostModel:
-    """Correct the stored model of a device by a finished run.
+    """Correct the stored model of a device by a finished run; without one, the run makes the first.
 
     Returns:
         The corrected model, which has been stored.
     """
     # another run may have taught the stored model since
-    model = CostModel.load(device, folder) or model
+    model = CostModel.load(device, folder) or model or CostModel.unmeasured(device)
     section = compare(plan, values)
     work = actual_work(plan["work"], values)
     for name, took in section["actual"]["stages"].items():
-        if name in model.seconds and plan["stages"][name]["seconds"] is not None:
+        if name not in model.seconds and not model.measured:
+            model.seconds[name] = _costs(name, work[name], took["seconds"])
+        elif name in model.seconds and plan["stages"][name]["seconds"] is not None:
             said = model.stage(name, work[name], corrected=False)
             model.learn(name, said, Cost(took["seconds"], took["memory_bytes"]))
     try:
-        model.save(device, folder)
+        if "simulate" in model.seconds:  # it is asked for the cells of a time budget
+            model.save(device, folder)
     except (GsfluentError, OSError) as error:
         _log.warning("the cost model could not be stored: %s", error)
     return model
+
+
+def _costs(name: str, work: Mapping[str, float], seconds: float) -> dict[str, float]:
+    """Costs of a stage by one run of it, in equal parts on what it grows with.
+
+    What was not in that run, as other kernels or other kinds of files, costs what was.
+    """
+    features = [key for key in _GROWS[name] + _ALIKE.get(name, ()) if work.get(key, 0.0) > 0.0]
+    if not features or not seconds > 0.0:
+        return {}
+    costs, _ = fit([Sample(name, work, seconds)], sorted(set(features)))
+    known = [costs[key] for key in _ALIKE.get(name, ()) if key in costs]
+    return dict.fromkeys(_ALIKE.get(name, ()), sum(known) / max(len(known), 1)) | costs

@@ -60,7 +60,7 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
     if made["refused"]:
         raise InputError(made["refused"], made["hint"])
     if model is None:
-        _log.info("plan: this machine is not calibrated (gsfluent plan does it): no times")
+        _log.info("plan: no times yet: this run will teach them (gsfluent plan measures them)")
     for warning in made["warnings"]:
         _log.warning("%s", warning)
     section = {"calibrated": made["calibrated"], "predicted": predicted_of(made)}
@@ -83,11 +83,10 @@ def judge_plan(context: RunContext, foreseen: Foresight | None) -> None:
     values["stages"] = [stage.summary() for stage in context.store.results]
     section = compare(foreseen.plan, values)
     values["plan"] = {**values["plan"], **section}
-    if foreseen.model is not None:
-        learn(foreseen.model, foreseen.plan, values, context.device)
-        took, said = section["actual"]["seconds"], section["predicted"]["seconds"]
-        if said and took is not None:
-            _log.info("planned %.1f s, took %.1f s", said, took)
+    learn(foreseen.model, foreseen.plan, values, context.device)
+    took, said = section["actual"]["seconds"], section["predicted"]["seconds"]
+    if said and took is not None:
+        _log.info("planned %.1f s, took %.1f s", said, took)
 
 
 def _chosen(context: RunContext) -> dict[str, Any]:

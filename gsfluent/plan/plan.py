@@ -56,11 +56,13 @@ def cost_model(
 ) -> CostModel:
     """The cost model of a device: the stored one, or a new one from the probe, which is stored.
 
+    One that runs have made is not enough here.
+
     Raises:
         RunError: The disk is full.
     """
     found = None if recalibrate else CostModel.load(device, folder)
-    if found is not None:
+    if found is not None and found.measured:
         return found
     from gsfluent.plan.probe import calibrate
 
@@ -170,7 +172,9 @@ def plan_shot(
             f"texture: what {texture_method(shot)} costs hangs on the model you bring and is not "
             "predicted; hint: texture.method: exemplar is"
         )
-    refused, hint = _too_long(prospect, outlook, dx, stages["simulate"]["seconds"], sum(counts))
+    # what one run has taught is no reason to refuse another
+    sure = stages["simulate"]["seconds"] if model is not None and model.measured else None
+    refused, hint = _too_long(prospect, outlook, dx, sure, sum(counts))
     if refused:
         warnings.append(f"gsfluent run refuses this shot: {refused}; hint: {hint}")
     first = next(body for body in prospect.scene.bodies if body.solid is not None)
@@ -272,7 +276,7 @@ def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:
 def _about(model: CostModel) -> dict[str, Any]:
     """When a model was measured, and what runs have taught it."""
     return {
-        "measured": model.made,
+        "measured": model.made or "by finished runs",
         "corrections": {name: model.correction(name) for name in model.ratios},
         "runs": max((len(ratios) for ratios in model.ratios.values()), default=0),
         "fit_errors": dict(model.errors),
@@ -303,7 +307,7 @@ def _costs(
     model: CostModel | None, name: str, features: dict[str, float], shot: Shot, kind: str
 ) -> dict[str, Any]:
     """Seconds and bytes of a stage; seconds are None where nobody can know them."""
-    if model is None:
+    if model is None or name not in model.seconds:
         return {"seconds": None, "memory_bytes": memory_of(name, features, kind)}
     cost: Cost = model.stage(name, features)
     unknown = name == "texture" and texture_method(shot) in NOT_PREDICTED

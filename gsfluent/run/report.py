@@ -150,7 +150,7 @@ def _plan(page: Page, plan: Any) -> None:
     page.heading("Plan against fact")
     if plan.get("calibrated") is False:
         page.text(
-            "No times were foreseen: `gsfluent plan` measures what work costs on this machine, once"
+            "No times were foreseen: `gsfluent plan` measures what work costs on this machine; runs teach it too"
         )
     page.table(["quantity", "predicted", "actual", "actual / predicted"], rows)
 

@@ -119,7 +119,24 @@ def test_a_run_without_a_calibration_says_so_and_measures_nothing(
     assert section["calibrated"] is False
     assert section["predicted"]["seconds"] is None and section["actual"]["seconds"] > 0.0
     assert section["predicted"]["substeps"] > 0
-    assert not (tmp_path / "cache").exists()
+    # the run has taught what it did: the next plan has times, and those that it took
+    taught = CostModel.load("cpu")
+    assert taught is not None and not taught.measured and not taught.ratios
+    plan = plan_shot(shot, model=taught)
+    assert plan["calibrated"] and plan["model"]["measured"] == "by finished runs"
+    for name, took in section["actual"]["stages"].items():
+        assert 0.2 < plan["stages"][name]["seconds"] / took["seconds"] < 5.0
+    with pytest.raises(AssertionError, match="must not measure"):
+        cost_model("cpu")  # who asks for the probe gets it
+
+
+def test_a_stage_that_no_run_has_had_has_no_time(shot: Shot, stored: Path) -> None:
+    known = model()
+    known.made = ""
+    del known.seconds["texture"]
+    plan = plan_shot(shot, model=known)
+    assert plan["stages"]["texture"]["seconds"] is None and plan["seconds"] is None
+    assert plan["simulate_seconds"] > 0.0
 
 
 def test_a_damaged_calibration_is_measured_anew(
