@@ -150,7 +150,8 @@ def _plan(page: Page, plan: Any) -> None:
     page.heading("Plan against fact")
     if plan.get("calibrated") is False:
         page.text(
-            "No times were foreseen: `gsfluent plan` measures what work costs on this machine; runs teach it too"
+            "No times were foreseen: `gsfluent plan` measures what work costs on this machine, "
+            "and runs teach it"
         )
     page.table(["quantity", "predicted", "actual", "actual / predicted"], rows)
 
