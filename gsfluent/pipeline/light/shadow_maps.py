@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import geometry, ops
-from gsfluent.data import Gaussians
+from gsfluent.data import SPRAY, Gaussians
 from gsfluent.pipeline.light.lamps import Lamp, Vector
 from gsfluent.pipeline.light.occlusion import Occupancy
 from gsfluent.pipeline.light.shade import MAP
@@ -100,10 +100,13 @@ def shadow_maps(
 
     Lamps, ``faces`` and matter are what :meth:`gsfluent.pipeline.light.lamps.Lighting.drawn`,
     :func:`faces_of` and :func:`bulk` give; of siblings (``groups`` int32 [N]) only the nearest
-    shades.
+    shades. Grains of a spray shade nothing: they are finer than a texel, which would be all dark.
     """
     if not any(faces):
         return None
+    opacities = gaussians.opacities
+    if gaussians.labels is not None:
+        opacities = torch.where(gaussians.labels == SPRAY, 0.0, opacities)
     rows = []
     for lamp, count in zip(lamps, faces, strict=True):
         if count == 0:
@@ -120,14 +123,14 @@ def shadow_maps(
     viewmat = torch.cat([cameras[:, :12], bottom], 1).view(-1, 4, 4)
     seen = ops.rasterize(
         gaussians.means,
-        gaussians.opacities,
+        opacities,
         viewmat,
         intrinsics.reshape(-1, 3, 3),
         size,
         size,
         quats=gaussians.quats,
         scales=gaussians.scales,
-        colors=gaussians.opacities[:, None],  # not looked at; the rasterizer wants some
+        colors=opacities[:, None],  # not looked at; the rasterizer wants some
         groups=groups,
         near=_NEAR,
     )

@@ -128,14 +128,17 @@ def _shown(action: Action) -> Tensor:
 
 def _follow(action: Action, shown: Tensor) -> Tensor:
     """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
-    smooth = _smooth(action.center, _SMOOTH_FRAMES)
-    lag = smooth - action.center
     # what is still whole has its farthest point beyond the nine tenths
     least = torch.where(action.radius <= 1.02 * action.radius[0], action.reach, 0.0)
     room = _LAG * torch.maximum(shown - torch.maximum(1.5 * action.radius, least), 0.05 * shown)
-    length = lag.norm(dim=1).clamp(min=1e-12)
-    held = action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
-    return _smooth(held, 0.5)
+
+    def held(track: Tensor) -> Tensor:
+        lag = track - action.center
+        length = lag.norm(dim=1).clamp(min=1e-12)
+        return action.center + lag * torch.minimum(room / length, torch.ones_like(length))[:, None]
+
+    # smoothing moves what is fast by more than the room
+    return held(_smooth(held(_smooth(action.center, _SMOOTH_FRAMES)), 0.5))
 
 
 def _smooth(track: Tensor, sigma: float) -> Tensor:

@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from gsfluent import materials
 from gsfluent.config import Shot
-from gsfluent.data import Camera, Gaussians
+from gsfluent.data import SPRAY, Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
@@ -119,6 +119,17 @@ def test_cube_and_single_map_of_a_point_lamp_agree(skin: Gaussians) -> None:
         found.append(transmittance(points, up, row, maps, biased=0.0))
     assert float(found[0].min()) < 0.05 and float(found[0].max()) == 1.0
     assert float((found[0] - found[1]).abs().mean()) < 0.01
+
+
+def test_grains_of_a_spray_shade_nothing(skin: Gaussians) -> None:
+    lamps = (Lamp(direction=(0.3, -0.4, 1.0)),)
+    faces = faces_of(lamps, matter := bulk(skin))
+    grains = skin.replace(means=1.3 * skin.means, scales=0.1 * skin.scales).labelled(SPRAY)
+    alone = shadow_maps(skin, lamps, faces, 128, matter)
+    both = shadow_maps(Gaussians.cat([skin, grains]), lamps, faces, 128, matter)
+    shading = shadow_maps(Gaussians.cat([skin, grains.labelled(0)]), lamps, faces, 128, matter)
+    assert alone is not None and both is not None and shading is not None
+    assert torch.equal(both.alpha, alone.alpha) and not torch.equal(shading.alpha, alone.alpha)
 
 
 def test_lamp_inside_the_matter_gets_a_cube(skin: Gaussians) -> None:

@@ -262,8 +262,10 @@ def test_hole_fraction_counts_what_shows_through() -> None:
     assert 0.5 * expected < holed < expected
 
 
-def test_orbit_keeps_the_action_in_frame() -> None:
-    falling = [ball(center=(0.0, 0.0, 1.0 - 0.1 * i)).means for i in range(6)]
+@pytest.mark.parametrize("step", [0.1, 0.9])
+def test_orbit_keeps_the_action_in_frame(step: float) -> None:
+    """Also of a ball that is thrown by nine radii a frame."""
+    falling = [ball(center=(0.0, 0.0, 1.0 - step * i)).means for i in range(6)]
     cameras = orbit(Action.of(falling), (SIZE, SIZE))
     assert len(cameras) == 6
     for camera, points in zip(cameras, falling, strict=True):
