@@ -99,6 +99,8 @@ def _filled(work: Work, report: Mapping[str, Any], splats: float) -> float:
     if features is None or "interior_gaussians" not in report:
         return 0.0
     objects = report.get("objects") or [report]
+    if any("grid" not in one for one in objects):  # a solid that came filled
+        return features["splats"] + float(report["interior_gaussians"])
     boxes = [float(math.prod(one["grid"])) for one in objects]
     placed = [float(one["interior_gaussians"] + one.get("pruned", 0)) for one in objects]
     features |= {

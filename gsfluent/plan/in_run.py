@@ -83,7 +83,10 @@ def judge_plan(context: RunContext, foreseen: Foresight | None) -> None:
     values["stages"] = [stage.summary() for stage in context.store.results]
     section = compare(foreseen.plan, values)
     values["plan"] = {**values["plan"], **section}
-    learn(foreseen.model, foreseen.plan, values, context.device)
+    try:
+        learn(foreseen.model, foreseen.plan, values, context.device)
+    except Exception as error:  # advice again: a finished run does not fail for it
+        _log.info("the run taught the plan nothing: %s: %s", type(error).__name__, error)
     took, said = section["actual"]["seconds"], section["predicted"]["seconds"]
     if said and took is not None:
         _log.info("planned %.1f s, took %.1f s", said, took)

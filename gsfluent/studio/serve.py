@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import logging
 import threading
+import time
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -102,7 +103,9 @@ class Studio:
 
     def wait(self) -> None:
         """Serve until Ctrl-C."""
-        self._end.wait()
+        # asleep, not in a lock: Ctrl-C inside Event.wait may leave with the lock's own error
+        while not self._end.is_set():
+            time.sleep(_TICK)
 
     def close(self) -> None:
         """Stop what is at work, and stop serving."""

@@ -262,8 +262,9 @@ class App:
 
     def wait(self) -> None:
         """Serve until :meth:`close` or Ctrl-C."""
-        while not self._done.wait(0.5):
-            continue
+        # asleep, not in a lock: Ctrl-C inside Event.wait may leave with the lock's own error
+        while not self._done.is_set():
+            time.sleep(0.2)
 
     def _paint(self, viewer: int, budget: float) -> bool:
         """Draw for one browser; returns whether the picture has its full size."""

@@ -199,7 +199,7 @@ def test_select_by_place_color_and_label(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"whole numbers \[200\], got int64 \[5\]"):
         select_mask(gaussians, Select(labels=tmp_path / "short.npy"), frame)
     (tmp_path / "bad.npy").write_bytes(b"no")
-    with pytest.raises(InputError, match="is not a NumPy file"):
+    with pytest.raises(InputError, match="the NumPy file is damaged"):
         select_mask(gaussians, Select(labels=tmp_path / "bad.npy"), frame)
 
 
