@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import html
-import logging
 import threading
 import time
-import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,10 +26,9 @@ from gsfluent.studio.job import DONE, FAILED, RUNNING
 from gsfluent.viewer.app import App
 from gsfluent.viewer.guard import Guard
 from gsfluent.viewer.model.source import RunSource
-from gsfluent.viewer.serve import has_desktop
+from gsfluent.viewer.serve import stay
 from gsfluent.viewer.server import start_server, stop_server
 
-_log = logging.getLogger(__name__)
 _HOST = "127.0.0.1"  # who may start programs here is who works at this machine
 _TICK = 0.5  # seconds between two looks at the command
 _LINES = 6  # of its log that are shown
@@ -204,12 +201,7 @@ def serve_studio(
     """
     studio = Studio(Desk(folder, str(device), seed), device, port)
     try:
-        _log.info("studio: %s (Ctrl-C ends)", studio.url)
-        if browser and has_desktop():
-            webbrowser.open(studio.url)
-        studio.wait()
-    except KeyboardInterrupt:
-        _log.info("studio: ended")
+        stay(studio, browser=browser, name="studio")
     finally:
         studio.close()
     return {"url": studio.url, "folder": str(folder)}

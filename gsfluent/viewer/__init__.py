@@ -14,7 +14,7 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     app="App",
     guard="Guard",
-    serve="has_desktop view_run",
+    serve="stay view_run",
     serve_live="view_live",
     server="start_server stop_server",
 )

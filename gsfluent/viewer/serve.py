@@ -7,7 +7,7 @@ import os
 import sys
 import webbrowser
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
@@ -57,15 +57,26 @@ def view_run(
     return result
 
 
-def stay(app: App, *, browser: bool) -> None:
+class Page(Protocol):
+    """What is served at an address."""
+
+    @property
+    def url(self) -> str:
+        """The address."""
+
+    def wait(self) -> None:
+        """Serve until Ctrl-C."""
+
+
+def stay(page: Page, *, browser: bool, name: str = "viewer") -> None:
     """Say the address, open a browser where one could show, and serve until Ctrl-C."""
     try:
-        _log.info("viewer: %s (Ctrl-C ends)", app.url)
+        _log.info("%s: %s (Ctrl-C ends)", name, page.url)
         if browser and has_desktop():
-            webbrowser.open(app.url)
-        app.wait()
+            webbrowser.open(page.url)
+        page.wait()
     except KeyboardInterrupt:
-        _log.info("viewer: ended")
+        _log.info("%s: ended", name)
 
 
 def has_desktop() -> bool:

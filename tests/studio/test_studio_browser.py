@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import drivers, opened
 
 import gsfluent as gf
 from gsfluent.config import load_shot
@@ -24,12 +25,6 @@ pytest.importorskip("viser", reason="the viewer's extra is not installed")
 from gsfluent.studio.desk import DROP, EVENTS, GUESS, SUGGESTED, THROW, Desk
 from gsfluent.studio.job import DONE, FAILED, RUNNING, STOPPED, Job
 from gsfluent.studio.serve import Studio
-
-FLAGS = (
-    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update", "--use-gl=angle",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=1000,900",
-)  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -119,22 +114,12 @@ def test_only_its_own_page_is_answered(desk: Desk) -> None:
 
 @pytest.fixture
 def page(desk: Desk, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Studio, Any]]:
-    webdriver = pytest.importorskip("selenium.webdriver", reason="no selenium")
-    service = pytest.importorskip("selenium.webdriver.chrome.service")
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("no chromium and chromedriver on this machine")
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
+    drivers()  # before anything is served
     studio = Studio(desk, torch.device("cpu"), 0)
-    chrome = webdriver.Chrome(options=options, service=service.Service(driver))
     try:
-        chrome.get(studio.url)
-        yield studio, chrome
+        with opened(studio.url, tmp_path_factory.mktemp("profile"), height=900) as chrome:
+            yield studio, chrome
     finally:
-        chrome.quit()
         studio.close()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import drivers, opened
 from live_ball import ball
 
 from gsfluent.io import save_solid
@@ -17,10 +17,8 @@ from gsfluent.io import save_solid
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 pytest.importorskip("selenium", reason="no selenium to drive a browser with")
 
-from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
-from test_viewer_browser import FLAGS, greens, reds, until
+from test_viewer_browser import greens, reds, until
 
 from gsfluent.live.player import AT_REST, RUNNING, LivePlayer
 from gsfluent.live.scene import open_stage
@@ -32,9 +30,7 @@ from gsfluent.viewer.panels.poke import PokePanel
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LivePlayer, App, Any]]:
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("no chromium and chromedriver on this machine")
+    drivers()  # before anything is served
     home = tmp_path_factory.mktemp("live")
     save_solid(ball(), home / "ball.ply")
     stage = open_stage(home / "ball.ply", material="fruit.watermelon")
@@ -42,18 +38,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[LivePlayer,
     player = LivePlayer(session, stage.shot)
     panel = PokePanel(player, home)
     app = App(LiveSource(player, "ball", stage.shot), torch.device("cpu"), port=0, panels=[panel])
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    chrome = webdriver.Chrome(options=options, service=Service(driver))
     player.start()
     panel.start()
     try:
-        chrome.get(app.url)
-        yield player, app, chrome
+        with opened(app.url, tmp_path_factory.mktemp("profile")) as chrome:
+            yield player, app, chrome
     finally:
-        chrome.quit()
         panel.close()
         player.close()
         app.close()

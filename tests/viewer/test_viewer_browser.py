@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -11,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import drivers, opened
 from viewer_scene import FRAMES, write_run
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 selenium = pytest.importorskip("selenium", reason="no selenium to drive a browser with")
 
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.chrome.service import Service  # noqa: E402
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 
@@ -25,40 +23,18 @@ from gsfluent.results.frames import frame_path  # noqa: E402
 from gsfluent.viewer.app import App  # noqa: E402
 from gsfluent.viewer.model.source import RunSource  # noqa: E402
 
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--window-size=1000,640",
-)
-
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[App, Any]]:
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("no chromium and chromedriver on this machine")
+    drivers()  # before anything is served
     out = write_run(tmp_path_factory.mktemp("run") / "ball")
     # after the last frame a damaged one
     frame_path(out / "stages" / "simulate", FRAMES).write_bytes(b"cut short")
     app = App(RunSource(out), torch.device("cpu"), port=0)
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    chrome = webdriver.Chrome(options=options, service=Service(driver))
     try:
-        chrome.get(app.url)
-        yield app, chrome
+        with opened(app.url, tmp_path_factory.mktemp("profile")) as chrome:
+            yield app, chrome
     finally:
-        chrome.quit()
         app.close()
 
 
