@@ -26,22 +26,22 @@ _log = logging.getLogger(__name__)
 STAGES = ("reconstruct", "isolate", "fill", "texture", "simulate", "render", "export")
 """Stages that have a cost, in their order."""
 
-_GROWS = {
+_GROWS: dict[str, tuple[str, ...]] = {
     "reconstruct": ("start", "step_splats", "step_pixels"),
     "isolate": ("start", "splats"),
     "fill": ("start", "voxels", "inner"),
-    "texture": ("start", "exemplar_voxels", "procedural_voxels"),
+    "texture": ("start",),
     "simulate": ("start", "composed_point_steps", "frame_gaussians"),
     "render": ("start", "frame_pixels", "frame_gaussians"),
-    "export": tuple(f"{kind}_gaussians" for kind in EXPORTS),
+    "export": (),
 }
 """What a stage's time is taken to grow with where one run is all that is known of it."""
 _ALIKE = {
     "simulate": tuple(f"point_steps_{laws}" for laws in LAW_SETS),
     "texture": ("exemplar_voxels", "procedural_voxels"),
-    "export": _GROWS["export"],
+    "export": tuple(f"{kind}_gaussians" for kind in EXPORTS),
 }
-"""Kinds of work of which one run shows one or a few."""
+"""The same, of kinds of work of which one run shows one or a few."""
 
 Work = dict[str, dict[str, float]]
 
@@ -243,9 +243,10 @@ def _costs(name: str, work: Mapping[str, float], seconds: float) -> dict[str, fl
 
     What was not in that run, as other kernels or other kinds of files, costs what was.
     """
-    features = [key for key in _GROWS[name] + _ALIKE.get(name, ()) if work.get(key, 0.0) > 0.0]
+    kinds = _ALIKE.get(name, ())
+    features = [key for key in _GROWS[name] + kinds if work.get(key, 0.0) > 0.0]
     if not features or not seconds > 0.0:
         return {}
-    costs, _ = fit([Sample(name, work, seconds)], sorted(set(features)))
-    known = [costs[key] for key in _ALIKE.get(name, ()) if key in costs]
-    return dict.fromkeys(_ALIKE.get(name, ()), sum(known) / max(len(known), 1)) | costs
+    costs, _ = fit([Sample(name, work, seconds)], features)
+    known = [costs[key] for key in kinds if key in costs]
+    return dict.fromkeys(kinds, sum(known) / max(len(known), 1)) | costs
