@@ -4,10 +4,11 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    behind="Behind",
     digests="Journal require_intact",
     frames=(
         "DUST SavedFrame count_frames frame_head frame_path frame_rate frame_time load_frame "
-        "save_frame"
+        "packed_frame save_frame write_frame"
     ),
     lock="locked",
     partition="FILE SavedBody SavedPartition SavedSplit load_partition save_partition",

@@ -92,11 +92,16 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
     Raises:
         RunError: The disk is full.
     """
+    return write_frame(folder, frame.index, packed_frame(frame))
+
+
+def packed_frame(frame: SavedFrame) -> dict[str, np.ndarray]:
+    """The arrays of a frame's file; they are its own, whatever becomes of the tensors."""
     arrays: dict[str, np.ndarray] = {}
     for name in ("means", "quats", "scales", "opacities", "sh"):
         arrays[name] = _packed(name, getattr(frame.gaussians, name))
     if frame.gaussians.labels is not None:
-        arrays["labels"] = frame.gaussians.labels.cpu().numpy().astype(np.int8)
+        arrays["labels"] = frame.gaussians.labels.to(torch.int8).cpu().numpy()
     for name in (*_SPLATS, *_POINTS):
         arrays[name] = _packed(name, getattr(frame, name))
     if frame.led is not None:
@@ -110,7 +115,16 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
         "facts": frame.facts,
     }
     arrays["head"] = np.array(json.dumps(head))
-    path = frame_path(folder, frame.index)
+    return arrays
+
+
+def write_frame(folder: Path, index: int, arrays: dict[str, np.ndarray]) -> Path:
+    """Write what :func:`packed_frame` made, atomically.
+
+    Raises:
+        RunError: The disk is full.
+    """
+    path = frame_path(folder, index)
     with atomic_path(path) as part, part.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
     return path
@@ -198,11 +212,13 @@ def _unreadable(path: Path, error: Exception) -> RunError:
 
 
 def _packed(name: str, value: Tensor) -> np.ndarray:
-    array = value.detach().cpu().numpy()
-    if name in _HALF:
-        # what is larger, a speed beyond all sense, would be infinite
-        return array.clip(-_HALF_MOST, _HALF_MOST).astype(np.float16)
-    return array.astype(np.float32) if array.dtype == np.float64 else array
+    value = value.detach()
+    if name in _HALF:  # what is larger, a speed beyond all sense, would be infinite
+        value = value.clamp(-_HALF_MOST, _HALF_MOST).half()
+    elif value.dtype == torch.float64:
+        value = value.float()
+    array = value.cpu().numpy()
+    return array.copy() if array.base is not None and not value.is_cuda else array
 
 
 def _tensor(array: np.ndarray) -> Tensor:

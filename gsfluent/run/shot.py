@@ -189,5 +189,5 @@ def _resume_text(error: KeyboardInterrupt, out: Path, store: StageStore) -> str:
     cause = str(error) or "interrupted by Ctrl-C"
     return (
         f"{cause}\n  kept: {_kept(out, store)}\n  resume: run the same command again;"
-        " finished stages and simulated frames are not redone"
+        " finished stages are not redone, nor frames but for the last seconds' work"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_s
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
-from gsfluent.results.frames import SavedFrame, count_frames, save_frame
+from gsfluent.results.behind import Behind
+from gsfluent.results.frames import SavedFrame, count_frames, packed_frame, write_frame
 from gsfluent.results.partition import FILE as PARTITION
 from gsfluent.results.partition import save_partition
 from gsfluent.results.store import content_digest
@@ -38,6 +40,9 @@ from gsfluent.stages.strikes import Strikes
 
 _log = logging.getLogger(__name__)
 _STATE = "state.pt"
+PATIENCE = 20.0
+"""A state that took a second to write is written again after so many: a run spends a twentieth of
+its time on it at most, and loses no more than that when it is stopped."""
 _STEEL_ROWS = 2**40
 
 
@@ -159,20 +164,35 @@ def simulate_stage(context: RunContext) -> None:
             for old in (STRIKES, PARTITION):  # of other settings
                 (folder / old).unlink(missing_ok=True)
         strikes = Strikes(scene, frames.run.matter, folder)
-        written: tuple[int, int] | None = None
-        for frame in frames:
-            save_frame(folder, saved(frame, scene))
-            strikes.see(frame)
-            assert frames.history is not None  # a run of a shot carries splats
-            partition = frames.history.partition()
-            if partition is not None:
-                # both only grow, and all else of it stays
-                grown = len(partition.splits), len(partition.crumbs)
-                if grown != written:
-                    save_partition(folder, partition)
-                written = grown
-            # after the frame: a state on disk always has its picture
-            frames.save(state)
+        history, written = frames.history, (-1, -1)
+        assert history is not None  # a run of a shot carries splats
+
+        def keep(ended: bool = False) -> None:
+            """What is known so far, when all frames are on disk."""
+            nonlocal written
+            behind.wait()
+            strikes.keep(ended)
+            partition = history.partition()
+            # both only grow, and all else of it stays
+            grown = (
+                (-1, -1) if partition is None else (len(partition.splits), len(partition.crumbs))
+            )
+            if partition is not None and grown != written:
+                save_partition(folder, partition)
+            written = grown
+
+        saved_at, cost = time.monotonic(), 0.0
+        with Behind() as behind:
+            for frame in frames:
+                behind.do(write_frame, folder, frame.index, packed_frame(saved(frame, scene)))
+                strikes.see(frame)
+                begun = time.monotonic()
+                if begun - saved_at >= PATIENCE * cost:
+                    keep()
+                    frames.save(state)
+                    saved_at = time.monotonic()
+                    cost = saved_at - begun
+            keep(ended=True)
         unbroken, report = strikes.unbroken(), frames.report
         notes = [finer] if finer else []
         notes += notes_of(thin, weak, unbroken, math.hypot(*scene.gravity))

@@ -1,6 +1,6 @@
 """How fast the bodies of a run were met by something, and how much of each broke.
 
-Kept frame by frame, beside the frames, so that a run that is taken up again knows what came before.
+Kept beside the frames, so that a run that is taken up again knows what came before.
 """
 
 from __future__ import annotations
@@ -56,21 +56,31 @@ class Strikes:
             self.rows, self.met, self.broken = kept["rows"], kept["met"], kept["broken"]
 
     def see(self, frame: SimulationFrame) -> None:
-        """Take in the next frame, and keep what is known so far on disk.
+        """Take in the next frame."""
+        # a run may have stopped between writing this file and its own state
+        self.rows = [row for row in self.rows if row["index"] < frame.index]
+        self.met = [strike for strike in self.met if strike["frame"] < frame.index]
+        row = self._row(frame)
+        if self.rows and self.rows[-1]["index"] == frame.index - 1:
+            self.met += self._between(self.rows[-1], row)
+        self.rows.append(row)
+        shares = [body["broken"] for body in row["bodies"]]
+        self.broken = [max(pair) for pair in zip(self.broken, shares, strict=True)]
+
+    def keep(self, ended: bool = False) -> None:
+        """Write what is known so far, to go on from here or from where this was called before.
+
+        Args:
+            ended: Nothing goes on from here: only the last row is kept, however often this was
+                called.
 
         Raises:
             RunError: The disk is full.
         """
-        # a run may have stopped between writing this file and its own state
-        self.rows = [row for row in self.rows if row["index"] < frame.index][-1:]
-        self.met = [strike for strike in self.met if strike["frame"] < frame.index]
-        row = self._row(frame)
-        if self.rows and self.rows[0]["index"] == frame.index - 1:
-            self.met += self._between(self.rows[0], row)
-        self.rows.append(row)
-        shares = [body["broken"] for body in row["bodies"]]
-        self.broken = [max(pair) for pair in zip(self.broken, shares, strict=True)]
+        if ended:
+            self.rows = self.rows[-1:]
         write_json(self.path, {"rows": self.rows, "met": self.met, "broken": self.broken})
+        self.rows = self.rows[-1:]
 
     def unbroken(self) -> list[dict[str, Any]]:
         """Brittle bodies that were struck, in a run in which none of them broke; else nothing.

@@ -15,6 +15,7 @@ from gsfluent.config import load_shot
 from gsfluent.data import SURFACE, Gaussians
 from gsfluent.io import save_splats
 from gsfluent.results.digests import file_digest
+from gsfluent.results.frames import SavedFrame
 from gsfluent.run.shot import run_shot
 from gsfluent.stages import simulate
 
@@ -62,14 +63,16 @@ def stop(path: Path, finished: Path, out: Path) -> None:
     shutil.copytree(finished, out)
     for name in ("simulate", "render"):
         shutil.rmtree(out / "stages" / name)
-    save = simulate.save_frame
+    packed = simulate.packed_frame
 
-    def stopping(folder: Path, frame: Any) -> None:
+    def stopping(frame: SavedFrame) -> Any:
         if frame.index == 2:
             raise KeyboardInterrupt
-        save(folder, frame)
+        return packed(frame)
 
-    with mock.patch.object(simulate, "save_frame", stopping):
+    # its state is that of the last frame, however long it took to write
+    patient = mock.patch.object(simulate, "PATIENCE", 0.0)
+    with patient, mock.patch.object(simulate, "packed_frame", stopping):
         try:
             run(path, out)
         except KeyboardInterrupt as error:

@@ -22,6 +22,7 @@ from gsfluent.pipeline.render.video import write_video
 from gsfluent.results.digests import Journal, write_record
 from gsfluent.results.frames import load_frame, save_frame
 from gsfluent.results.partition import load_partition, save_partition
+from gsfluent.stages import simulate
 
 ROOM = 600  # bytes
 
@@ -113,6 +114,7 @@ def test_a_state_that_does_not_fit_stops_the_run_and_the_next_goes_on(
             save(values, stream)
 
     monkeypatch.setattr(torch, "save", filling)
+    monkeypatch.setattr(simulate, "PATIENCE", 0.0)
     with pytest.raises(RunError, match=r"state\.pt: cannot be written") as caught:
         run(shot, out)
     assert "free space" in caught.value.hint and "enforce" not in str(caught.value)

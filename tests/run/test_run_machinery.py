@@ -15,6 +15,7 @@ import torch
 from gsfluent.data import INTERIOR, TRANSITION, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.render.video import to_bytes, write_video
+from gsfluent.results.behind import Behind
 from gsfluent.results.digests import file_digest
 from gsfluent.results.frames import SavedFrame, count_frames, load_frame, save_frame
 from gsfluent.results.record import RunRecord
@@ -253,3 +254,28 @@ def test_record_takes_the_verdict_of_the_simulation(tmp_path: Path, verdict: str
     made.values["simulation"] = {"verdict": verdict, "reason": "because"}
     assert made.finish([])["verdict"] == verdict
     assert json.loads((tmp_path / "run.json").read_text())["reason"] == "because"
+
+
+def test_what_is_written_behind_the_work_keeps_its_order_and_its_errors() -> None:
+    done: list[int] = []
+
+    def write(number: int) -> None:
+        if number == 3:
+            raise RunError("the disk is full", "nothing", "free space")
+        done.append(number)
+
+    with Behind() as behind:
+        for number in range(3):
+            behind.do(write, number)
+        behind.wait()
+        assert done == [0, 1, 2]
+        behind.do(write, 3)
+        with pytest.raises(RunError, match="the disk is full"):
+            behind.wait()
+    with pytest.raises(RunError, match="the disk is full"), Behind() as behind:
+        behind.do(write, 3)
+    with pytest.raises(KeyboardInterrupt), Behind() as behind:
+        behind.do(write, 4)
+        behind.do(write, 3)
+        raise KeyboardInterrupt
+    assert done == [0, 1, 2, 4]

@@ -13,13 +13,13 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsfluent import geometry, ops
-from gsfluent.data import TRANSITION, Gaussians
+from gsfluent.data import TRANSITION, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.pipeline.cracks.chunk_faces import (
     ChunkCuts,
@@ -31,13 +31,14 @@ from gsfluent.pipeline.cracks.chunk_faces import (
 )
 from gsfluent.pipeline.cracks.cuts import cut_at
 from gsfluent.pipeline.cracks.dust import Dust
+from gsfluent.pipeline.cracks.followers import WIDE, Followers, neighbours, turns
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
-from gsfluent.pipeline.matter.links import PARTED
 from gsfluent.pipeline.matter.pieces import CHIP
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude
+from gsfluent.pipeline.partition.threshold import CHIP as PIECE
 from gsfluent.pipeline.partition.tree import Partition, ranked
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
 from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
@@ -46,9 +47,6 @@ OPACITY = 0.97
 """Opacity of a face element where the gap is wide."""
 CLOSED, SHOWN = 0.1, 0.3
 """Gaps [voxels] up to which nothing shows, and from which on cuts and faces are all there."""
-WIDE = 1.5
-"""Width of the blend of neighbouring points where matter is broken, in point spacings: what is
-left of the crack band is rougher than a face."""
 FIRM = 5
 """Of its neighbours at rest so many must hang together with a point, or it is crumb."""
 STRAY, BAND = 1.0, 4.0
@@ -59,23 +57,6 @@ LUMP = 64
 MOST = 32_000
 """Pieces that a region is split into at once, at most."""
 _NUMBERS = 1 << 54  # ids of face elements begin here, beyond those of births
-_FINE = 2.0**20
-
-
-class _Followers(NamedTuple):
-    """Points that are led by firm ones.
-
-    Attributes:
-        rows: Which, int64 [R].
-        near: The firm points around each, int64 [R, K].
-        lone: Columns of these that are none, bool [R, K].
-        key: What all this was found for.
-    """
-
-    rows: Tensor
-    near: Tensor
-    lone: Tensor
-    key: Tensor
 
 
 class Chunks:
@@ -111,6 +92,7 @@ class Chunks:
         """Go on from :meth:`state` of another run of the same scene; from nothing when empty."""
         device = self._body.device
         self._partitions: dict[int, Partition] = {}
+        self._solids: dict[int, Solid] = {}
         self._events: list[dict[str, Any]] = []
         self._regions, self._steps = len(self._scene.bodies), 0
         self._chunk = self._body.clone()
@@ -120,17 +102,24 @@ class Chunks:
         self._dust = Dust(self._scene, self.base.matter)
         self._gone = torch.zeros_like(self._may)
         self._ash = torch.full_like(self.base.owner, -1)
-        self._follow: _Followers | None = None
-        self._unbroken: _Followers | None = None
+        self._follow: Followers | None = None
+        self._unbroken: Followers | None = None
         self._unit: Tensor | None = None
         self._faces: ChunkFaces | None = None
         self._cuts: list[ChunkCuts] = []
         self._region = self.base.body.clone()
         self._owner = self.base.owner
         self._links = self.base.links
-        for event in state.get("splits", ()):
-            rows, rank = event["rows"].to(device), event["rank"].to(device)
+        done = list(state.get("splits", ()))
+        while done:
+            event = done.pop(0)
             self._steps = int(event.get("frame", 0))
+            if "melted" in event:
+                group = [event, *done[: int(event["melted"]) - 1]]
+                del done[: len(group) - 1]
+                self._melt([(int(e["region"]), e["rows"].to(device)) for e in group])
+                continue
+            rows, rank = event["rows"].to(device), event["rank"].to(device)
             self._split(int(event["region"]), rows, rank, int(event.get("dust", -1)))
         self._steps = int(state.get("steps", 0))
         if state:
@@ -217,31 +206,42 @@ class Chunks:
     def _look(self, unit: Tensor) -> None:
         """Split regions whose points belong to several pieces, and see which points drive them.
 
-        Dust is a piece of its own: one label for all of it in a region.
+        Dust is a piece of its own: one label for all of it in a region. A chip is not divided, it
+        goes with most of its points, or is dust when most of them are.
         """
         count = unit.shape[0]
         while True:
-            label = torch.where((unit < 0) & ~self._gone, count, unit)
-            counted = self._may & (label >= 0)
+            label = torch.where(unit < 0, count, unit)
+            counted = self._may & ~self._gone
             pair, many = torch.unique(
                 self._chunk[counted] * (count + 1) + label[counted], return_counts=True
             )
             chunk, piece = pair // (count + 1), pair % (count + 1)
             enough = (many >= CHIP) | (piece == count)
             times = torch.bincount(chunk[enough], minlength=self._regions)
-            dusty = torch.bincount(chunk[piece == count], minlength=self._regions)
-            torn = ((times > 1) | (dusty > 0)).nonzero()[:, 0].tolist()
-            if not torn:
+            size, dusty = (torch.zeros_like(times) for _ in range(2))
+            size.index_add_(0, chunk, many)
+            dusty.index_add_(0, chunk, torch.where(piece == count, many, 0))
+            chip = size < PIECE
+            chip[: len(self._scene.bodies)] = False  # a small body is none
+            torn = (((times > 1) | (dusty > 0)) & ~chip).nonzero()[:, 0].tolist()
+            melted = (chip & (2 * dusty > size)).nonzero()[:, 0].tolist()
+            if not torn and not melted:
                 break
             for region in torn:
                 units, members = (x[enough & (chunk == region)] for x in (piece, many))
                 if units.numel() > MOST:  # labels are small numbers; the rest goes where it lay
                     units = units[members.argsort(descending=True, stable=True)[:MOST]]
-                mine = self._may & (self._chunk == region)
+                mine = counted & (self._chunk == region)
                 rows = (mine & torch.isin(label, units)).nonzero()[:, 0]
                 names, rank = ranked(label[rows], self.base.matter.rest[rows])
                 dust = (names == count).nonzero()
                 self._split(region, rows, rank, int(dust[0]) if len(dust) else -1)
+            if melted:
+                counted &= ~self._gone  # what was split may have led its dust to a chip
+                mine = (counted & torch.isin(self._chunk, self._numbers(melted))).nonzero()[:, 0]
+                of = self._chunk[mine]
+                self._melt([(region, mine[of == region]) for region in melted])
         # a region moves with the piece that most of its points belong to
         most = torch.zeros(self._regions, dtype=torch.int64, device=unit.device)
         most.scatter_reduce_(0, chunk, many, "amax")
@@ -259,9 +259,7 @@ class Chunks:
         body = int(self._body[rows[0]])
         partition = self._partitions.get(body)
         rest, rank = matter.rest, rank.long()
-        solid = self._scene.bodies[body].solid
-        assert solid is not None  # _may sees to it
-        solid = solid.to(rest.device)
+        solid = self._solid(body)
         if partition is None:
             a, b = matter.ranges[body]
             partition = Partition(
@@ -309,6 +307,58 @@ class Chunks:
         old = [] if self._faces is None else [self._faces]
         self._faces = ChunkFaces.joined([*old, made])
 
+    def _melt(self, chips: list[tuple[int, Tensor]]) -> None:
+        """Chips have become dust: regions, and the points of each. All at once: there are hundreds.
+
+        Nothing is cut anew: the voxels stay theirs.
+        """
+        for region, rows in chips:
+            rank = torch.zeros_like(rows, dtype=torch.int32)
+            event = {"region": region, "rows": rows, "rank": rank, "dust": 0}
+            self._events.append({**event, "frame": self._steps, "melted": len(chips)})
+        bodies = [int(body) for body in self._body[torch.stack([rows[0] for _, rows in chips])]]
+        for body in sorted(set(bodies)):
+            mine = [chip for chip, its in zip(chips, bodies, strict=True) if its == body]
+            thrown = torch.cat([rows for _, rows in mine])
+            ids = self._numbers([region for region, _ in mine])
+            of = ids.repeat_interleave(self._numbers([len(rows) for _, rows in mine]))
+            self._gone = self._gone.index_fill(0, thrown, True)
+            colors = functools.partial(colors_at, self._partitions[body], self._solid(body))
+            self._dust.add(thrown, colors)
+            within = torch.isin(self._chunk, ids)
+            firm = self._may & ~self._gone & (self._body == body) & ~within
+            self._led_by(within.nonzero()[:, 0], firm.nonzero()[:, 0])
+            splats = torch.isin(self._region, ids).nonzero()[:, 0]
+            near = self._thrown(self.base.gaussians.means[splats], self._region[splats], thrown, of)
+            self._ash = self._ash.index_copy(0, splats, near)
+            faces = self._faces
+            assert faces is not None  # a chip was cut off
+            burnt = torch.isin(faces.region, ids).nonzero()[:, 0]
+            near = self._thrown(faces.means[burnt], faces.region[burnt], thrown, of)
+            self._faces = dataclasses.replace(
+                faces,
+                owner=faces.owner.index_copy(0, burnt, near),
+                ash=faces.ash.index_copy(0, burnt, near),
+            )
+
+    def _thrown(self, places: Tensor, region: Tensor, rows: Tensor, of: Tensor) -> Tensor:
+        """Nearest of the points thrown by each place's own region, which has some."""
+        if places.shape[0] == 0:
+            return rows[:0]
+        rest, spacing = self.base.matter.rest, self.base.matter.spacing[int(self._body[rows[0]])]
+        return rows[nearest_in_group(rest[rows], of, places, region, 1, spacing)[1][:, 0]]
+
+    def _numbers(self, values: list[int]) -> Tensor:
+        return torch.tensor(values, dtype=torch.int64, device=self._chunk.device)
+
+    def _solid(self, body: int) -> Solid:
+        """The solid of a body, where its points are."""
+        solid = self._scene.bodies[body].solid
+        assert solid is not None  # _may sees to it
+        if body not in self._solids:
+            self._solids[body] = solid.to(self.base.matter.rest.device)
+        return self._solids[body]
+
     def _across(
         self, places: Tensor, region: Tensor, rows: Tensor, ash: int, thrown: Tensor
     ) -> Tensor:
@@ -331,6 +381,10 @@ class Chunks:
         if rows.numel() == 0:  # of any other chunk
             rest = self._may & ~self._gone & (self._body == body) & (self._chunk != ash)
             rows = rest.nonzero()[:, 0]
+        self._led_by(lone, rows)
+
+    def _led_by(self, lone: Tensor, rows: Tensor) -> None:
+        """Some points go on with the chunk of the nearest of some rows, where there are any."""
         if lone.numel() and rows.numel():
             near = self._beside(self.base.matter.rest[lone], rows)
             self._chunk = self._chunk.index_copy(0, lone, self._chunk[near])
@@ -380,24 +434,8 @@ class Chunks:
             self._links = base
             return
         near, lone = base.near.clone(), torch.zeros_like(base.near, dtype=torch.bool)
-        near[stale], lone[stale] = self._neighbours(stale, torch.ones_like(self._may))
+        near[stale], lone[stale] = neighbours(base, chunk, stale, torch.ones_like(self._may))
         self._links = base.rewired(near, lone)
-
-    def _neighbours(self, rows: Tensor, among: Tensor) -> tuple[Tensor, Tensor]:
-        """Nearest points of the own chunk, int64 [R, K], and the columns that are none, bool.
-
-        A point whose chunk has nobody has itself.
-        """
-        rest, chunk = self.base.links.rest, self._chunk
-        width = self.base.links.near.shape[1]
-        its = among.nonzero()[:, 0]
-        cell = 1.5 * float(self.base.links.spacing[rows].mean())
-        found = nearest_in_group(rest[its], chunk[its], rest[rows], chunk[rows], width, cell)[1]
-        lone = found < 0
-        near = its[found.clamp(min=0)] if its.numel() else found
-        near = torch.where(lone, torch.where(lone[:, :1], rows[:, None], near[:, :1]), near)
-        lone[:, 0] = False
-        return near, lone
 
     def _carry(self, points: Points | None = None) -> Carry:
         """The binding as it is now."""
@@ -424,7 +462,11 @@ class Chunks:
         chunk[:count] = torch.where(self._may, self._chunk.to(chunk.dtype), chunk[:count])
         position = points.position
         shapeless = (broken | loose)[:, None, None]
-        turn = self._turns(position[:count]).to(points.map)
+        drive = self._drives & self._may
+        turn = turns(
+            self._chunk[drive], self._regions, self.base.matter.rest[drive],
+            position[:count][drive], self.base.links.spacing[drive],
+        )[self._chunk].to(points.map)  # fmt: skip
         moved, rotation = points.map.clone(), points.rotation.clone()
         moved[:count] = torch.where(shapeless, turn, moved[:count])
         rotation[:count] = torch.where(shapeless, turn, rotation[:count])
@@ -457,7 +499,7 @@ class Chunks:
         if rows.numel() == 0:
             return found
         self._unbroken = self._following(self._unbroken, rows, held & ~broken)
-        apart = (self._placed(self._unbroken, position, moved) - position[rows]).norm(dim=1)
+        apart = (self._unbroken.placed(self._links, position, moved) - position[rows]).norm(dim=1)
         rest, spacing = self.base.links.rest, self._links.spacing[rows]
         close = (rest[self._unbroken.near[:, 0]] - rest[rows]).norm(dim=1) <= BAND * spacing
         return found.index_copy(0, rows, close & (apart > STRAY * spacing))
@@ -469,56 +511,14 @@ class Chunks:
         if rows.numel() == 0:
             return position
         self._follow = self._following(self._follow, rows, leads)
-        return position.index_copy(0, rows, self._placed(self._follow, position, moved))
+        return position.index_copy(0, rows, self._follow.placed(self._links, position, moved))
 
-    def _following(self, before: _Followers | None, rows: Tensor, leads: Tensor) -> _Followers:
+    def _following(self, before: Followers | None, rows: Tensor, leads: Tensor) -> Followers:
         """The leading points around some rows; those found before if nothing has changed."""
         key = torch.stack([self._chunk, leads.long()])
         if before is not None and torch.equal(rows, before.rows) and torch.equal(key, before.key):
             return before
-        return _Followers(rows, *self._neighbours(rows, leads), key)
-
-    def _placed(self, follow: _Followers, position: Tensor, moved: Tensor) -> Tensor:
-        """Where the points that lead carry the places of those that follow [m], [R, 3]."""
-        rows, near, lone, _ = follow
-        rest, spacing = self.base.links.rest, self._links.spacing
-        # on one side of a crack: that of the nearest
-        first = near[:, :1]
-        before = (rest[near] - rest[first]).norm(dim=2).clamp(min=0.5 * spacing[rows, None])
-        after = (position[near] - position[first]).norm(dim=2)
-        parted = lone | (after > PARTED * before)
-        links = self._links
-        place, _ = ops.carry_place(
-            rest[rows],
-            rows,
-            links.near.index_copy(0, rows, near),
-            torch.zeros_like(links.near, dtype=torch.bool).index_copy(0, rows, parted),
-            rest,
-            position[: rest.shape[0]],
-            moved[: rest.shape[0]],
-            WIDE * spacing,
-        )
-        return place
-
-    def _turns(self, now: Tensor) -> Tensor:
-        """Rotation of each point's chunk: the best fit (Kabsch 1976), [N, 3, 3].
-
-        Sums go in whole numbers, which have no order.
-        """
-        drives = self._drives & self._may
-        chunk, scale = self._chunk[drives], self.base.links.spacing[drives].double()[:, None]
-        many = torch.bincount(chunk, minlength=self._regions).clamp(min=1).double()[:, None]
-        arms = []
-        for place in (self.base.matter.rest[drives].double(), now[drives].double()):
-            whole = (place / scale * _FINE).round().long()
-            total = whole.new_zeros(self._regions, 3).index_add_(0, chunk, whole)
-            center = total.double() / (_FINE * many)
-            arms.append(place / scale - center[chunk])
-        square = (arms[1][:, :, None] * arms[0][:, None] * _FINE).round().long()
-        total = square.new_zeros(self._regions, 3, 3).index_add_(0, chunk, square)
-        size = total.double().abs().amax(dim=(1, 2), keepdim=True).clamp(min=1.0)
-        turn, _ = ops.polar_clamped((total.double() / size).contiguous(), 0.3, 2.0)
-        return turn[self._chunk]
+        return Followers(rows, *neighbours(self.base.links, self._chunk, rows, leads), key)
 
     # --- pictures ---
 

@@ -144,9 +144,12 @@ class Dust:
         Args:
             position: Where the material points are [m], [N, 3].
         """
-        floor = self._scene.floor
-        parts = [part.drawn(position, self._way, self.share, floor) for part in self._grains]
-        return Births.joined([part for part in parts if part.ids.numel()])
+        if not self._grains:
+            return None
+        if len(self._grains) > 1:  # a hard landing sheds dust hundreds of times
+            self._grains = [Grains.joined(self._grains)]
+        made = self._grains[0].drawn(position, self._way, self.share, self._scene.floor)
+        return made if made.ids.numel() else None
 
 
 class Grains:
@@ -174,6 +177,13 @@ class Grains:
     def volume(self) -> Tensor:
         """Volume of each [m^3], float64 [G]: of the ellipsoid of :data:`SIGMA`."""
         return 4.0 / 3.0 * math.pi * (self.scales.double() / SIGMA).prod(dim=1)
+
+    @staticmethod
+    def joined(parts: list[Grains]) -> Grains:
+        """All of some, which have colours."""
+        return Grains(
+            **{name: torch.cat([vars(p)[name] for p in parts]) for name in vars(parts[0])}
+        )
 
     def at(self, rest: Tensor, color: Callable[[Tensor], Tensor]) -> Grains:
         """With the colours of their places; ``rest``: of their points [m], [G, 3]."""

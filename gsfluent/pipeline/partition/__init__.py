@@ -7,5 +7,6 @@ __getattr__, __dir__, __all__ = room(
     chips="hashed",
     mesh="PieceMesh Surfaces",
     roughness="amplitude",
+    threshold="CHIP",
     tree="Partition Split ranked",
 )

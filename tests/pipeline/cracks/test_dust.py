@@ -146,6 +146,42 @@ def test_a_run_with_dust_can_be_taken_up(bound: Carry) -> None:
     assert torch.equal(want.carry.owner, got.carry.owner)
 
 
+def chips(bound: Carry, dusty: int):
+    """Two halves with two chips of 20 points at their tops, which have shed some of these."""
+    unit = halves(bound)
+    high = bound.matter.rest[:, 2].argsort(descending=True)
+    right = (bound.matter.rest[:, 0] > 0.0)[high]
+    for own in (high[right][:20], high[~right][:20]):
+        unit[own] = own[-1]
+        unit[own[:dusty]] = -1
+    return moment(bound, unit, apart(bound, 0.1))
+
+
+def test_a_chip_is_not_divided_and_melts_when_most_of_it_is_dust(bound: Carry) -> None:
+    history, other = Repair().begin(bound), Repair().begin(bound)
+    for h in (history, other):
+        h.step(chips(bound, 0))
+    whole = history._gaps
+    partition = whole._partitions[0]
+    assert len(whole._events) == len(partition.splits) == 1 and whole._regions == 4
+    assert history.step(chips(bound, 8)).dust is None
+    assert len(whole._events) == 1
+    many = len(other.step(chips(bound, 12)).births.ids)  # the same without the step between
+    cracks = history.step(chips(bound, 12))
+    assert len(cracks.births.ids) == many
+    # nothing was cut anew, all points of both are dust, and a run that is taken up has the same
+    assert len(whole._events) == 3 and len(partition.splits) == 1
+    assert int(whole._gone.sum()) == 40 and torch.equal(whole._ash, other._gaps._ash)
+    assert set(whole._chunk.unique().tolist()) == {0, 1}
+    again = Repair().begin(bound)
+    again.restore(history.state())
+    want, got = (h.step(chips(bound, 12)) for h in (history, again))
+    for name in ("ids", "anchor"):
+        assert torch.equal(*(getattr(c.births, name) for c in (want, got)))
+    assert torch.equal(again._gaps._chunk, whole._chunk)
+    assert torch.equal(again._gaps._ash, whole._ash)
+
+
 def test_no_dust_no_grains(bound: Carry) -> None:
     history = Repair().begin(bound)
     cracks = history.step(moment(bound, halves(bound), apart(bound, 0.1)))
