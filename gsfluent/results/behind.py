@@ -53,5 +53,4 @@ class Behind:
 
     def _settle(self, most: int) -> None:
         while len(self._given) > most:
-            self._given[0].result()
-            self._given.popleft()
+            self._given.popleft().result()

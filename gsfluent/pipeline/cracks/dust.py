@@ -33,8 +33,11 @@ BETA = 3.5
 """Grains are as frequent as their size to the power of minus this, in solids."""
 FINEST, COARSEST = 1.0 / 8.0, 1.0 / 2.0
 """Smallest and largest grain, in edges of a point."""
-DROP = 1.0 / 4.0
-"""Smallest drop: juice does not become powder."""
+DROP, GRAIN = 3e-3, 1.5e-3
+"""Smallest drop and grain of powder [m], whatever the grid: juice does not become mist. Where that
+is more than a point, only some of the points have one."""
+SHARE = 1.0 / 40.0
+"""Smallest grain, at most, as a share of the edge of a cube of the body's volume."""
 MOST = 400_000
 """Grains of a body, about; where its dust would have more, the smallest ones are larger."""
 SCATTER = 0.2
@@ -106,9 +109,12 @@ class Dust:
         points = torch.bincount(body, minlength=len(bodies)).cpu()
         share = torch.tensor([b.material.dust for b in bodies], dtype=torch.float64)
         expected = dust_limit(share, points) * points
-        least = [finest(float(count)) for count in expected]
-        wet = [materials.wet(body.material.name) for body in bodies]
-        return [max(a, DROP) if drops else a for a, drops in zip(least, wet, strict=True)]
+        found = []
+        for body, many, own in zip(bodies, expected.tolist(), points.tolist(), strict=True):
+            size = DROP if materials.wet(body.material.name) else GRAIN
+            wanted = size / self._matter.spacing[len(found)]
+            found.append(max(finest(many), min(wanted, SHARE * own ** (1.0 / 3.0))))
+        return found
 
     def step(self, position: Tensor, led: Tensor) -> None:
         """Go on to the next frame.
@@ -221,19 +227,27 @@ class Grains:
 def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
     """Grains of points: sizes by the law, volumes that sum to each point's.
 
+    Where a grain is larger than a point, as many points have one as makes the volumes right on
+    average.
+
     Args:
         rows: The points, int64 [K].
         edge: Edges of the cubes of their volumes [m], [K].
         least: Smallest grain, in edges.
         wet: Drops, or else powder.
     """
-    count = per_point(least)
+    many = per_point(least)
+    if many < 1.0:
+        has = 0.5 + 0.5 * hashed((rows * 0x9E3779B1) & 0xFFFFFFFF, 13) < many
+        rows, edge = rows[has], edge[has]
+    count = max(1, round(many))
     number = torch.arange(count, device=rows.device)
     seed = ((rows[:, None] * 0x9E3779B1) & 0xFFFFFFFF) ^ ((number * 0x85EBCA6B) & 0xFFFFFFFF)
     # one size in each of as many strata, so that every point has some of all
     drawn = 0.5 + 0.5 * hashed(seed, 0)
     size = quantile((number + drawn) / count, least)
-    size = size * (size.pow(3).sum(dim=1, keepdim=True) * (math.pi / 6.0)).pow(-1.0 / 3.0)
+    if many >= 1.0:
+        size = size * (size.pow(3).sum(dim=1, keepdim=True) * (math.pi / 6.0)).pow(-1.0 / 3.0)
     size = size.reshape(-1)
     seed, row = seed.reshape(-1), rows.repeat_interleave(count)
     height, angle = hashed(seed, 1), math.pi * hashed(seed, 2)
@@ -278,12 +292,12 @@ def _largest(least: float) -> float:
     return max(COARSEST, 1.6 * least)
 
 
-def per_point(least: float) -> int:
+def per_point(least: float) -> float:
     """Grains of the law that have the volume of a point: as balls, on average."""
     low, high = least, _largest(least)
     cubes = (high ** (4.0 - BETA) - low ** (4.0 - BETA)) / (4.0 - BETA)
     many = (low ** (1.0 - BETA) - high ** (1.0 - BETA)) / (BETA - 1.0)
-    return min(_ROOM, max(1, round(6.0 / math.pi * many / cubes)))
+    return min(float(_ROOM), 6.0 / math.pi * many / cubes)
 
 
 def finest(points: float) -> float:

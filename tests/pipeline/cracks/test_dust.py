@@ -25,9 +25,23 @@ def test_volumes_sum_to_those_of_the_points(least: float, wet: bool) -> None:
     made = grains(rows, edge, least, wet)
     for row, own in zip(rows.tolist(), edge.double().tolist(), strict=True):
         assert float(made.volume[made.row == row].sum()) == pytest.approx(own**3, rel=1e-6)
-    inside = made.offset.abs().amax(dim=1) <= 0.5 * edge.repeat_interleave(per_point(least)) * 1.001
+    inside = (
+        made.offset.abs().amax(dim=1)
+        <= 0.5 * edge.repeat_interleave(round(per_point(least))) * 1.001
+    )
     assert bool(inside.all())
     assert float(made.toward.norm(dim=1).max()) <= 1.0 + 1e-6
+
+
+def test_grains_larger_than_a_point_have_its_volume_on_average() -> None:
+    rows, edge = torch.arange(60_000), torch.full((60_000,), 2e-3)
+    made = grains(rows, edge, 1.5, wet=True)
+    size = (6.0 / torch.pi * made.volume).pow(1.0 / 3.0)
+    assert float(size.min()) > 2.9e-3 and float(size.max()) < 5e-3
+    assert 0 < len(made.row) < 0.5 * len(rows) and len(made.row.unique()) == len(made.row)
+    assert float(made.volume.sum()) == pytest.approx(len(rows) * 2e-3**3, rel=0.02)
+    some = grains(rows[::7], edge[::7], 1.5, wet=True)
+    assert torch.equal(some.row, made.row[made.row % 7 == 0])  # a row has its own, or none
 
 
 @pytest.mark.parametrize("least", [0.125, 0.2])
