@@ -110,8 +110,8 @@ class Dust:
         share = torch.tensor([b.material.dust for b in bodies], dtype=torch.float64)
         expected = dust_limit(share, points) * points
         found = []
-        for body, many, own in zip(bodies, expected.tolist(), points.tolist(), strict=True):
-            size = DROP if materials.wet(body.material.name) else GRAIN
+        for its, many, own in zip(bodies, expected.tolist(), points.tolist(), strict=True):
+            size = DROP if materials.wet(its.material.name) else GRAIN
             wanted = size / self._matter.spacing[len(found)]
             found.append(max(finest(many), min(wanted, SHARE * own ** (1.0 / 3.0))))
         return found
