@@ -109,7 +109,7 @@ class Dust:
         points = torch.bincount(body, minlength=len(bodies)).cpu()
         share = torch.tensor([b.material.dust for b in bodies], dtype=torch.float64)
         expected = dust_limit(share, points) * points
-        found = []
+        found: list[float] = []
         for its, many, own in zip(bodies, expected.tolist(), points.tolist(), strict=True):
             size = DROP if materials.wet(its.material.name) else GRAIN
             wanted = size / self._matter.spacing[len(found)]
