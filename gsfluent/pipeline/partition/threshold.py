@@ -199,12 +199,22 @@ def displaced(
     first = torch.full((count,), -1, dtype=torch.int16, device=near.device)
     second = first.clone()
     one, two = torch.zeros(count, device=near.device), torch.zeros(count, device=near.device)
+    row = torch.full(smooth.first.shape, -1, dtype=torch.int32, device=near.device)
+    row[near.unbind(dim=1)] = torch.arange(count, dtype=torch.int32, device=near.device)
+    far = math.ceil(float((place - near).abs().amax())) + 1 if count else 0
     for label, field in enumerate(found):
         if field is None:
             continue
         start = torch.tensor(field.low, device=near.device)
         end = start + torch.tensor(field.share.shape, device=near.device)
-        rows = ((place > start - 1) & (place < end)).all(dim=1).nonzero()[:, 0]
+        # only what may have come from around the box is asked: there may be thousands of chips
+        span = tuple(
+            slice(max(a - far, 0), a + n + far)
+            for a, n in zip(field.low, field.share.shape, strict=True)
+        )
+        rows = row[span].reshape(-1)
+        rows = rows[rows >= 0].long()
+        rows = rows[((place[rows] > start - 1) & (place[rows] < end)).all(dim=1)]
         # far from the label its share is nothing
         around = (place[rows] - start).round().long().clamp(min=0)
         x, y, z = torch.minimum(around, end - start - 1).unbind(dim=1)
