@@ -299,12 +299,10 @@ def _join(
     if sides is not None:
         known = known & ~cut_apart(sides[rows], sides[beside.clamp(min=0)])
     piece = torch.where(known, unit[beside.clamp(min=0)], -1)
-    for label in torch.unique(piece[known]).tolist():
-        its = piece == label
-        points = (unit == label).nonzero()[:, 0]
-        scale = float(web.spacing[web.body[points[0]]])
-        place = _moved(web.rest[points], position[points], web.rest[rows[its]], scale)
-        away[its] = _length(place, position[rows[its]])
+    near = known.nonzero()[:, 0]
+    if near.numel():
+        place = _moved(web, unit, position, piece[near], web.rest[rows[near]])
+        away[near] = _length(place, position[rows[near]])
     spacing = web.spacing[web.body[rows]]
     stays = known & (away <= NEAR * spacing)
     apart = _length(position[beside.clamp(min=0)], position[rows])
@@ -341,28 +339,52 @@ def _surplus(
     return surplus
 
 
-def _moved(rest: Tensor, now: Tensor, places: Tensor, scale: float) -> Tensor:
-    """Where places at rest [P, 3] would be, had they moved with points as a rigid body.
+def _moved(web: Web, unit: Tensor, position: Tensor, label: Tensor, places: Tensor) -> Tensor:
+    """Where places at rest [M, 3] would be, had they moved with their pieces as rigid bodies.
 
-    The best rotation by the covariance (Kabsch 1976), in whole numbers of ``scale / 2^20``.
+    The best rotation by the covariance (Kabsch 1976), in whole numbers of ``spacing / 2^20``, which
+    have no order.
+
+    Args:
+        web: The points at rest.
+        unit: Piece of each, int64 [N].
+        position: Where they are [m], [N, 3].
+        label: Piece of each place, int64 [M].
+        places: [m], [M, 3].
     """
-    count = rest.shape[0]
+    names, of = torch.unique(label, return_inverse=True)
+    slot = torch.searchsorted(names, unit).clamp(max=len(names) - 1)
+    points = (names[slot] == unit).nonzero()[:, 0]
+    slot = slot[points]
+    order = torch.argsort(slot, stable=True)
+    points, slot = points[order], slot[order]
+    count = torch.bincount(slot, minlength=len(names))
+    ends = torch.cumsum(count, 0)
+    spacing = web.spacing[web.body[points]].double()
+    scale = spacing[ends - count]  # of one body, of one spacing
 
-    def whole(values: Tensor) -> Tensor:
-        return (values * (_FINE / scale)).round().long()
+    def total(values: Tensor) -> Tensor:
+        """Sums by piece of values that are whole numbers when they are finer, int64."""
+        whole = (values * (_FINE / spacing)).round().long()
+        sums = torch.cumsum(whole, 0)[ends - 1]
+        return torch.diff(sums, prepend=torch.zeros_like(sums[:1]))
 
-    origin = [whole(x.double()).sum(dim=0).cpu().double() / count * (scale / _FINE)
-              for x in (rest, now)]  # fmt: skip
-    arms = [x.double() - o.to(x.device) for x, o in zip((rest, now), origin, strict=True)]
+    arms, middles = [], []
+    for x in (web.rest[points].double(), position[points].double()):
+        sums = torch.stack([total(x[:, axis]) for axis in range(3)], dim=1)
+        middle = sums.double() / count[:, None] * (scale / _FINE)[:, None]
+        middles.append(middle)
+        arms.append(x - middle[slot])
     square = torch.stack(
-        [whole(arms[1][:, i] * arms[0][:, j] / scale).sum() for i in range(3) for j in range(3)]
+        [total(arms[1][:, i] * arms[0][:, j] / spacing) for i in range(3) for j in range(3)], dim=1
     )
-    u, _, vh = torch.linalg.svd(square.cpu().double().reshape(3, 3))
-    turn = torch.ones(3, dtype=torch.float64)
-    turn[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
-    rotation = ((u * turn) @ vh).tolist()
-    x, y, z = (places.double() - origin[0].to(places.device)).unbind(dim=1)
-    center = origin[1].tolist()
-    moved = [center[i] + (rotation[i][0] * x + rotation[i][1] * y + rotation[i][2] * z)
-             for i in range(3)]  # fmt: skip
+    u, _, vh = torch.linalg.svd(square.cpu().double().reshape(-1, 3, 3))
+    turn = torch.ones(len(names), 1, 3, dtype=torch.float64)
+    turn[:, 0, 2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
+    rotation = ((u * turn) @ vh).to(places.device)[of]
+    x, y, z = (places.double() - middles[0][of]).unbind(dim=1)
+    moved = [
+        middles[1][of, i] + (rotation[:, i, 0] * x + rotation[:, i, 1] * y + rotation[:, i, 2] * z)
+        for i in range(3)
+    ]
     return torch.stack(moved, dim=1)
