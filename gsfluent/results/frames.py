@@ -138,11 +138,8 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
     """
     path = frame_path(folder, index)
     try:
-        arrays = read_npz(path)
+        arrays = _finite(read_npz(path))
         head = _head(arrays)
-        for name, array in arrays.items():
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise ValueError(f"{name} holds NaN or infinity")
         return SavedFrame(
             index=head["index"],
             time=head["time"],
@@ -155,6 +152,26 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
         )
     except _DAMAGE as error:
         raise _unreadable(path, error) from error
+
+
+def frame_positions(folder: Path, index: int) -> Tensor:
+    """The material points of a frame [m], [P, 3], without reading the rest of it.
+
+    Raises:
+        RunError: It is missing or damaged.
+    """
+    path = frame_path(folder, index)
+    try:
+        return _tensor(_finite(read_npz(path, ("positions",)))["positions"])
+    except _DAMAGE as error:
+        raise _unreadable(path, error) from error
+
+
+def _finite(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name} holds NaN or infinity")
+    return arrays
 
 
 def count_frames(folder: Path) -> int:

@@ -45,15 +45,14 @@ def render_stage(context: RunContext) -> None:
 
         def pictures() -> Iterator[np.ndarray]:
             nonlocal drawing
-            for index in range(len(film)):
-                frame = film.frame(index)
+            for frame in film.frames():
                 start = time.perf_counter()
                 made = film.picture(frame)
                 picture = to_bytes(made.image)
                 drawing += time.perf_counter() - start
-                figures.add(frame, film.cameras[index], made.alpha, made.depth)
+                figures.add(frame, film.cameras[frame.index], made.alpha, made.depth)
                 counts.append(int(frame.facts.get("fragments", 1)))
-                report_progress(progress, index + 1, len(film), "")
+                report_progress(progress, frame.index + 1, len(film), "")
                 yield picture
 
         write_video(
@@ -130,9 +129,9 @@ def render_again(
         raise InputError(f"-o {target}", "name a .mp4 file, or give --frame N for one .png")
 
     def pictures() -> Iterator[np.ndarray]:
-        for index in range(len(film)):
-            yield to_bytes(film.picture(film.frame(index)).image)
-            report_progress(progress, index + 1, len(film), "")
+        for frame in film.frames():
+            yield to_bytes(film.picture(frame).image)
+            report_progress(progress, frame.index + 1, len(film), "")
 
     count = write_video(target, pictures(), fps=shot.output.video_fps, size=shot.output.size)
     seconds = (time.perf_counter() - start) / count

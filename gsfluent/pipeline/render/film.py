@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from gsfluent.pipeline.render.figures import cameras_around
 from gsfluent.pipeline.render.stage import Picture, Render, Room
 from gsfluent.pipeline.render.studio import Studio, wants_dark
 from gsfluent.pipeline.solid.field import SignedDistance
-from gsfluent.results.frames import SavedFrame, count_frames, load_frame
+from gsfluent.results.frames import SavedFrame, count_frames, frame_positions, load_frame
 from gsfluent.results.record import read_frame
 
 # The pieces need a moment to part before a picture of them tells anything.
@@ -53,7 +55,7 @@ class Film:
             raise InputError(f"{out}: no simulated frames", "run the shot first: gsfluent run")
         first = load_frame(self.folder, 0)
         positions = [first.positions]
-        positions += [load_frame(self.folder, index).positions for index in range(1, count)]
+        positions += [frame_positions(self.folder, index) for index in range(1, count)]
         action = Action.of(positions, _of_objects(first, shot))
         studio = None
         if shot.floor != "none":
@@ -87,6 +89,16 @@ class Film:
     def frame(self, index: int) -> SavedFrame:
         """Frame ``index`` on the film's device."""
         return load_frame(self.folder, index).to(self.device)
+
+    def frames(self) -> Iterator[SavedFrame]:
+        """All frames in order; while one is drawn, the next is read."""
+        with ThreadPoolExecutor(max_workers=1) as pool:
+            ahead = pool.submit(self.frame, 0)
+            for index in range(len(self)):
+                frame = ahead.result()
+                if index + 1 < len(self):
+                    ahead = pool.submit(self.frame, index + 1)
+                yield frame
 
     def picture(self, frame: SavedFrame) -> Picture:
         """The picture of a frame in the film's camera."""
