@@ -102,6 +102,7 @@ def test_command_does_what_it_says(
     skip_without_extra(" ".join(words))
     monkeypatch.chdir(place)
     monkeypatch.setitem(run_demo.SIZES, "preview", TINY_DEMO)
+    monkeypatch.setitem(from_input.SETTINGS, "fill", {"resolution": 24})
     monkeypatch.setitem(from_input.SETTINGS, "solve", {"cells": 8})
     monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5})
     before = files(place)
