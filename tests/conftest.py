@@ -53,7 +53,7 @@ def _small_cuts() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _small_truth() -> Iterator[None]:
-    """A drawn capture brings a volume and a cut of its inside: in few pixels, not in 2 s of work."""
+    """A drawn capture brings a volume and a cut of its inside: in few pixels, else 2 s of work."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(capture, "save_truth", partial(capture.save_truth, resolution=48))
         patch.setattr(capture, "cut_photograph", partial(capture.cut_photograph, size=128))
