@@ -139,7 +139,8 @@ def _remembered(work: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
     @functools.lru_cache(maxsize=256)
     def known(*cells: tuple[bytes, torch.Size]) -> Tensor:
-        return work(*(torch.frombuffer(bytearray(c), dtype=torch.float64).view(s) for c, s in cells))
+        values = (torch.frombuffer(bytearray(data), dtype=torch.float64) for data, _ in cells)
+        return work(*(v.view(shape) for v, (_, shape) in zip(values, cells, strict=True)))
 
     def asked(*given: Tensor) -> Tensor:
         if not 0 < len(given[0]) <= _KNOWN_ROWS:
