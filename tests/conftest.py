@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 # before torch starts its threads: spinning barriers crawl on a busy machine (see gsfluent/cli)
@@ -55,8 +54,8 @@ def _small_cuts() -> Iterator[None]:
 def _small_truth() -> Iterator[None]:
     """A drawn capture brings a volume and a cut of its inside: in few pixels, else 2 s of work."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(capture, "save_truth", partial(capture.save_truth, resolution=48))
-        patch.setattr(capture, "cut_photograph", partial(capture.cut_photograph, size=128))
+        patch.setattr(capture.save_truth, "__defaults__", (48,))
+        patch.setattr(capture.cut_photograph, "__defaults__", (128,))
         yield
 
 
