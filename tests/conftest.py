@@ -13,6 +13,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import pytest
 import torch
 
+from gsfluent.demo import capture
+from gsfluent.pipeline.simulate.stage import QUALITY
+
 REPO = Path(__file__).resolve().parent.parent
 
 
@@ -36,6 +39,42 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Calibrations of the machine that tests run on are neither read nor taught by them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _small_cuts() -> Iterator[None]:
+    """The four cuts that every textured solid leaves, in few pixels: 1 s of work each time else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsfluent.pipeline.render.cuts._HEIGHT", 72)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _small_truth() -> Iterator[None]:
+    """A drawn capture brings a volume and a cut of its inside: in few pixels, else 2 s of work."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(capture.save_truth, "__defaults__", (48,))
+        patch.setattr(capture.cut_photograph, "__defaults__", (128,))
+        yield
+
+
+@pytest.fixture(scope="module")
+def small_quality() -> Iterator[None]:
+    """Where a shot leaves voxels and cells to its quality, few of both."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsfluent.pipeline.fill.stage._PICTURE", 48)
+        patch.setitem(QUALITY, "preview", 12)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _share_bytecode(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Where Python writes no bytecode, every new process would compile torch anew: one does."""
+    with pytest.MonkeyPatch.context() as patch:
+        if sys.dont_write_bytecode:
+            patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
+            patch.setenv("PYTHONPYCACHEPREFIX", str(tmp_path_factory.mktemp("bytecode")))
         yield
 
 

@@ -28,6 +28,11 @@ def shell(count: int = 1500) -> Gaussians:
     return Gaussians.from_colors(means, scales, colors, opacities=0.95, label=SURFACE)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _small(small_quality: None) -> None:
+    """What runs from the command line does is not how fine it is."""
+
+
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shell as a .ply file."""

@@ -147,7 +147,7 @@ def test_another_material_keeps_the_solid(finished: Path, ball: Path, tmp_path: 
 
 def test_ctrl_c_keeps_the_frames_and_run_goes_on(ball: Path, tmp_path: Path) -> None:
     output = {"fps": 60, "seconds": 0.5, "size": [96, 64]}
-    shot = write_shot(tmp_path / "shot.yaml", ball, output=output)
+    shot = write_shot(tmp_path / "shot.yaml", ball, output=output, solve={"cells": 12})
     out = tmp_path / "out"
     frames = out / "stages" / "simulate"
     words = [sys.executable, "-m", "gsfluent", "run", str(shot), "-o", str(out)]

@@ -96,14 +96,16 @@ def files(folder: Path) -> dict[Path, int]:
 def test_command_does_what_it_says(
     words: list[str],
     place: Path,
+    small_quality: None,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     skip_without_extra(" ".join(words))
     monkeypatch.chdir(place)
     monkeypatch.setitem(run_demo.SIZES, "preview", TINY_DEMO)
+    monkeypatch.setitem(from_input.SETTINGS, "fill", {"resolution": 24})
     monkeypatch.setitem(from_input.SETTINGS, "solve", {"cells": 8})
-    monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5})
+    monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5, "seconds": 0.8})
     before = files(place)
     assert main(smaller(words)) == 0
     said = capsys.readouterr().out

@@ -70,9 +70,9 @@ CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
     "fps 1": (filmed(fps=1, seconds=1.0), {SOUND, REFUSED}),
     "fps 1e4": (filmed(fps=1e4, seconds=3e-4), {SOUND}),
     "fps 1e6": (filmed(fps=1e6), {REFUSED}),
-    "10 000 events": (
+    "7 000 events": (
         {"events": [{"type": "throw", "velocity": [0, 0, 0.1], "spin": [0, 0, 1],
-                     "at": 1e-5 * n} for n in range(10_000)]},
+                     "at": 1e-5 * n} for n in range(7_000)]},
         {REFUSED},
     ),
     "200 events": (
@@ -88,6 +88,12 @@ CASES: dict[str, tuple[dict[str, Any], set[str]]] = {
     ),
     "an object twice": (boxes(a=[[-2, -2, -2], [2, 2, 2]], b=[[-2, -2, -2], [2, 2, 2]]), {REFUSED}),
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _coarse_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans fill what they look at with as few voxels as these runs."""
+    monkeypatch.setattr("gsfluent.plan.proxy._VOXELS", 16)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -33,10 +33,11 @@ RADIUS = 0.3
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Few frames, few steps of training, a cache of its own."""
+    """Few voxels, few cells, few frames, a cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     output = {"fps": 20, "seconds": FRAMES / 20, "size": [64, 48]}
-    monkeypatch.setattr(from_input, "SETTINGS", {"solve": {"cells": 8}, "output": output})
+    small = {"fill": {"resolution": 24}, "solve": {"cells": 8}, "output": output}
+    monkeypatch.setattr(from_input, "SETTINGS", small)
 
 
 def shell() -> Gaussians:

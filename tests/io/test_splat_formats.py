@@ -164,11 +164,15 @@ def rewritten(path: Path, ending: str, change: Any) -> Path:
 
 
 @pytest.mark.parametrize(("name", "data", "said"), [
-    ("a.splat", b"", "no rows of 32"), ("a.splat", bytes(33), "no rows of 32"),
-    ("a.spz", b"PK", "no .spz"), ("a.spz", gzip.compress(b"NG"), "within its header"),
-    ("a.ksplat", bytes(5000), "version 0.0"), ("a.ksplat", b"\0\1", "damaged"),
-    ("a.ksplat", b"\0\1" + bytes(4094), "no section"), ("a.sog", b"PK", "damaged"),
-    ("a.pt", b"PK", "no checkpoint"),
+    pytest.param("a.splat", b"", "no rows of 32", id="splat-empty"),
+    pytest.param("a.splat", bytes(33), "no rows of 32", id="splat-torn"),
+    pytest.param("a.spz", b"PK", "no .spz", id="spz-zip"),
+    pytest.param("a.spz", gzip.compress(b"NG"), "within its header", id="spz-torn"),
+    pytest.param("a.ksplat", bytes(5000), "version 0.0", id="ksplat-zeros"),
+    pytest.param("a.ksplat", b"\0\1", "damaged", id="ksplat-torn"),
+    pytest.param("a.ksplat", b"\0\1" + bytes(4094), "no section", id="ksplat-empty"),
+    pytest.param("a.sog", b"PK", "damaged", id="sog-torn"),
+    pytest.param("a.pt", b"PK", "no checkpoint", id="pt-torn"),
 ])  # fmt: skip
 def test_what_is_no_such_file(tmp_path: Path, name: str, data: bytes, said: str) -> None:
     (tmp_path / name).write_bytes(data)

@@ -15,8 +15,8 @@ def script():
 
 
 def test_methods_are_told_apart_and_work_is_kept(script, tmp_path, monkeypatch, capsys):
-    options = ["--object", "melon", "--cells", "12", "--resolution", "40", "--finer", "3"]
-    options += ["--size", "200", "--frames", "48,49", "--cache", str(tmp_path / "cache")]
+    options = ["--object", "melon", "--cells", "12", "--resolution", "32", "--finer", "3"]
+    options += ["--size", "144", "--frames", "48,49", "--cache", str(tmp_path / "cache")]
     options += ["--sheets", str(tmp_path / "sheets"), "--json", str(tmp_path / "all.json")]
 
     def run(*more: str) -> str:

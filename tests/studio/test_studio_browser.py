@@ -29,8 +29,9 @@ from gsfluent.studio.serve import Studio
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(from_input.SETTINGS, "fill", {"resolution": 24})
     monkeypatch.setitem(from_input.SETTINGS, "solve", {"cells": 8})
-    monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5})
+    monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5, "seconds": 0.8})
 
 
 @pytest.fixture

@@ -302,7 +302,7 @@ def test_real_plush_dog(data_root: Path) -> None:
 
     path = data_root / "splats" / "plush_dog" / "point_cloud_29999_clean.ply"
     dog = load_splats(path)
-    filled = Fill(64)(dog)
+    filled = Fill(40)(dog)
     report = filled.report
     assert report["interior_gaussians"] > 2000
     box = torch.tensor([float(v) for v in filled.occupancy.shape]).prod() * filled.voxel**3
@@ -328,7 +328,7 @@ def test_masks_say_how_far_the_skin_lies_from_the_centres_of_the_splats(tmp_path
     shares = {}
     for photographs in (None, capture):
         known = photographs is not None
-        solid = Fill(48, match_masks=known, refine_views=0)(sunk, photographs)
+        solid = Fill(36, match_masks=known, refine_views=0)(sunk, photographs)
         guess = solid.contains(points.float())
         shares[photographs is None] = float((guess & true).sum() / (guess | true).sum())
     assert solid.report["skin_offset"] > 0.2

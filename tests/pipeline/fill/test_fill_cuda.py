@@ -46,9 +46,9 @@ def test_density_on_the_gpu_is_that_on_the_cpu_and_the_same_every_time() -> None
 
 
 def test_a_solid_filled_on_the_gpu_is_the_one_filled_on_the_cpu() -> None:
-    gaussians = _shell(30_000)
-    solid = Fill(resolution=64)(gaussians)
-    moved = Fill(resolution=64)(gaussians.to("cuda"))
+    gaussians = _shell(12_000)
+    solid = Fill(resolution=48)(gaussians)
+    moved = Fill(resolution=48)(gaussians.to("cuda"))
     assert moved.occupancy.device.type == "cuda"
     assert moved.gaussians.device.type == "cuda"
     same = moved.occupancy.cpu() == solid.occupancy

@@ -249,7 +249,7 @@ def test_photographs_of_a_filled_melon_stay_what_they_are(tmp_path: Path) -> Non
         melon.surface_color(points),
         opacities=0.9,
     )
-    filled = Fill(40, refine_image_size=96)(splats, capture)
+    filled = Fill(32, refine_image_size=96)(splats, capture)
     inner = filled.gaussians.select(filled.gaussians.labels == INTERIOR)
     assert float((~melon.inside(inner.means.double())).double().mean()) < 0.005
     errors = []

@@ -17,7 +17,7 @@ from gsfluent.pipeline.partition.tree import Partition, ranked
 SHAPES = {"ball": ball(False), "shell": ball(True), "cube": cube()}
 
 
-def partition_of(solid: Solid, spacing: float = EDGE / 14) -> tuple[Partition, torch.Tensor]:
+def partition_of(solid: Solid, spacing: float = EDGE / 11) -> tuple[Partition, torch.Tensor]:
     rest, spacing = points_of(solid, spacing)
     return Partition(solid, Frame.identity(), rest, spacing, 0, 0.25), rest
 
@@ -64,7 +64,7 @@ def keys(vertices: np.ndarray) -> set[bytes]:
     return {row.tobytes() for row in np.ascontiguousarray(vertices)}
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     shape=st.sampled_from(sorted(SHAPES)),
     seed=st.integers(0, 10**6),
@@ -84,7 +84,7 @@ def test_pieces_are_closed_and_fill_the_solid(shape: str, seed: int, counts: lis
     assert whole.volume == pytest.approx(sum(volumes), rel=1e-9)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 10**6), labels=st.integers(2, 6), holes=st.booleans())
 def test_any_labels_whatsoever_give_closed_meshes(seed: int, labels: int, holes: bool) -> None:
     # every face of the grid with four unlike corners occurs here, and every corner of pieces

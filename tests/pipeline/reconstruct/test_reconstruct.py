@@ -75,7 +75,7 @@ def test_views_are_cropped_without_moving_the_projection(capture: Capture) -> No
 
 
 def test_small_reconstruction_reaches_its_bar_and_resumes(capture: Capture, tmp_path: Path) -> None:
-    settings = {"iterations": 300, "image_size": 80, "start_gaussians": 4000, "seed": 1}
+    settings = {"iterations": 200, "image_size": 80, "start_gaussians": 2000, "seed": 1}
     seen: list[int] = []
     gaussians = Reconstruct(**settings)(
         capture, progress=lambda done, total, note: seen.append(done)
@@ -83,7 +83,7 @@ def test_small_reconstruction_reaches_its_bar_and_resumes(capture: Capture, tmp_
     report = gaussians.report
     assert report["psnr"] > 25.0 and report["ssim"] > 0.85 and report["psnr_inside"] > 22.0
     assert report["held_out"] == 3 and report["images"] == 24
-    assert report["gaussians"] == gaussians.count and seen[-1] == 300
+    assert report["gaussians"] == gaussians.count and seen[-1] == 200
     # Interrupted after 100 steps and resumed, it ends where the uninterrupted run ends.
     file = tmp_path / "state.pt"
     stage = Reconstruct(**settings, checkpoint=file, checkpoint_every=100)
@@ -115,7 +115,7 @@ def test_count_stays_under_the_cap_and_isotropic_kernels_are_round(capture: Capt
 
 
 def test_a_capture_without_masks_is_learned_whole_and_the_object_isolated(table: Capture) -> None:
-    stage = Reconstruct(iterations=200, image_size=64, start_gaussians=3000, separate=False)
+    stage = Reconstruct(iterations=150, image_size=64, start_gaussians=2000, separate=False)
     gaussians = stage(table)
     report = gaussians.report
     assert report["start"] == "sparse points" and report["psnr_region"] == "whole image"

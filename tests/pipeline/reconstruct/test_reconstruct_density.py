@@ -186,7 +186,7 @@ def test_fewer_gaussians_for_a_lower_target(capture: Capture) -> None:
     counts = {}
     for wanted in (24.0, None):
         stage = Reconstruct(
-            300, image_size=64, start_gaussians=1500, target_psnr=wanted, gradient_threshold=2e-4
+            300, image_size=48, start_gaussians=800, target_psnr=wanted, gradient_threshold=2e-4
         )
         report = stage(capture).report
         counts[wanted] = report["gaussians"]
@@ -213,7 +213,7 @@ def test_exposure_is_the_identity_where_photographs_agree() -> None:
 
 
 def test_exposure_of_consistent_photographs_stays_small(capture: Capture) -> None:
-    settings = {"iterations": 200, "image_size": 48, "start_gaussians": 1000}
+    settings = {"iterations": 120, "image_size": 48, "start_gaussians": 600}
     plain = Reconstruct(**settings)(capture).report
     learned = Reconstruct(**settings, exposure=True)(capture).report
     assert learned["psnr"] == pytest.approx(plain["psnr"], abs=0.4)

@@ -303,8 +303,8 @@ def test_a_stage_keeps_nothing_of_the_scenes_it_was_given():
 def test_a_bullet_gives_momentum_to_what_it_hits():
     scene = Scene(floor=None, gravity=(0, 0, 0))
     scene.add(ellipsoid((0.04,) * 3), materials.fruit.watermelon)
-    scene.bullet(start=(0.3, 0, 0), toward=(0, 0, 0), speed=40.0, radius=0.006, at=0.0)
-    simulate = Simulate(dx=0.006)
+    scene.bullet(start=(0.3, 0, 0), toward=(0, 0, 0), speed=40.0, radius=0.008, at=0.0)
+    simulate = Simulate(dx=0.008)
     simulation = simulate(scene, fps=100, seconds=0.03)
     frames = list(simulation)
     apple, bullet = simulate.prepare(scene).ranges
@@ -382,7 +382,7 @@ def test_far_debris_leaves_the_grid_and_still_balances_momentum():
     material = materials.fruit.apple.override(variation=0.0)
     scene.add(ellipsoid((0.05,) * 3), material)
     scene.drop(0.001)
-    simulation = Simulate(dx=0.02, splats=False, step_hook=throw)(scene, fps=20, seconds=0.7)
+    simulation = Simulate(dx=0.02, splats=False, step_hook=throw)(scene, fps=20, seconds=0.3)
     *_, last = simulation
     report = simulation.report
     assert report["skipped"]["stray_points"] == 10

@@ -73,7 +73,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize(("name", "resolution"), [("torus", 96), ("box", 64), ("ball", 48)])
+@pytest.mark.parametrize(("name", "resolution"), [("torus", 72), ("box", 48), ("ball", 40)])
 @pytest.mark.parametrize(
     ("method", "least", "volume"),
     # discs overhang edges and look thicker than the surface that they lie on
@@ -86,7 +86,7 @@ def test_known_shapes_are_found(
     if method == "mesh":
         field = find_solid(mesh=mesh, resolution=resolution)
     else:
-        field = find_solid(discs(mesh, 15_000), method=method, resolution=resolution)
+        field = find_solid(discs(mesh, 10_000), method=method, resolution=resolution)
     assert overlap(field, inside) >= least
     assert field.volume == pytest.approx(true, rel=volume)
     assert field.source == method and field.report["seconds"] > 0
