@@ -39,6 +39,11 @@ def running_on(
         _engine.pop()
 
 
+def place() -> torch.device:
+    """Where :func:`running_on` says, the CPU outside it."""
+    return _place[-1] if _place else torch.device("cpu")
+
+
 class World:
     """A scene in motion.
 

@@ -16,13 +16,13 @@ from gsfluent.io.atomic import write_tensors
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
-VERSION = 8
+VERSION = 9
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
 _POINTS = (
     "position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit", "ever",
     "lowest", "alpha_seen", "time_seen",
 )  # fmt: skip
-_WHOLE = ("impulse", "colliders", "work", "dissipated", "cut_links")
+_WHOLE = ("given", "impulse", "colliders", "work", "dissipated", "cut_links")
 _SAVED = {"loose": "stray"}
 """Names in the file that are not those of the fields: files outlive names."""
 
@@ -72,6 +72,7 @@ class State(NamedTuple):
         time_seen: When that was [s], float64 [N].
         cut_links: Links at rest that are cut for good, bool [L], in the order of
             :func:`gsfluent.pipeline.matter.fragments.rest_links`.
+        given: Impulse [N s] and torque about its point [N m s] that each grip gave, [G, 6].
         pushed: How many of the scene's impulses have been given.
     """
 
@@ -97,11 +98,18 @@ class State(NamedTuple):
     alpha_seen: Tensor
     time_seen: Tensor
     cut_links: Tensor
+    given: Tensor
     pushed: int = 0
 
     @staticmethod
-    def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...], links: int = 0) -> State:
-        """The state at time 0, with so many links at rest."""
+    def start(
+        matter: Matter,
+        colliders: Tensor,
+        landed: tuple[bool, ...],
+        links: int = 0,
+        grips: int = 0,
+    ) -> State:
+        """The state at time 0, with so many links at rest and so many grips."""
         p = matter.particles
         none = torch.zeros(p.count, dtype=torch.bool, device=p.device)
         zero = torch.zeros((), dtype=torch.float64, device=p.device)
@@ -128,6 +136,7 @@ class State(NamedTuple):
             alpha_seen=p.alpha,
             time_seen=torch.zeros(p.count, dtype=torch.float64, device=p.device),
             cut_links=torch.zeros(links, dtype=torch.bool, device=p.device),
+            given=torch.zeros(grips, 6, dtype=torch.float64, device=p.device),
         )
 
     def adopting(self, before: State) -> State:
