@@ -16,13 +16,13 @@ from gsfluent.io.atomic import write_tensors
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
-VERSION = 9
+VERSION = 8
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
 _POINTS = (
     "position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit", "ever",
     "lowest", "alpha_seen", "time_seen",
 )  # fmt: skip
-_WHOLE = ("given", "impulse", "colliders", "work", "dissipated", "cut_links")
+_WHOLE = ("impulse", "colliders", "work", "dissipated", "cut_links")
 _SAVED = {"loose": "stray"}
 """Names in the file that are not those of the fields: files outlive names."""
 
@@ -165,6 +165,8 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "tensors": {
             _SAVED.get(name, name): getattr(state, name).cpu() for name in _POINTS + _WHOLE
         },
+        # a state without grips is that of versions before
+        **({"given": state.given.cpu()} if state.given.numel() else {}),
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
@@ -207,6 +209,7 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
         step=int(values["step"]),
         landed=tuple(bool(v) for v in values["landed"]),
         pushed=int(values["kicked"]),
+        given=values.get("given", rounded.new_zeros(0, 6, dtype=torch.float64)),
         **tensors,
     )
     return state, values["extra"]
