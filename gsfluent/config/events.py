@@ -168,7 +168,99 @@ class Collide:
     )
 
 
-Event = Drop | Throw | Bullet | Blade | Press | Pour | Collide
+@dataclasses.dataclass(frozen=True)
+class Grip:
+    """``type: grip`` - points that are held, or driven as one rigid body."""
+
+    box: tuple[Vector, Vector] = key(
+        several_of(vector(3), 2, 2),
+        "Two corners of the box whose points are gripped, from the start [m].",
+        "[[-0.1, -0.1, 0], [0.1, 0.1, 0.02]]",
+    )
+    displacement: Vector = key(
+        vector(3), "How far they are moved [m].", "[0, 0, 0.01]", default=(0.0, 0.0, 0.0)
+    )
+    turn: Vector = key(
+        vector(3),
+        "How far they are turned: degrees about the axis that the numbers point along.",
+        "[0, 0, 30]",
+        default=(0.0, 0.0, 0.0),
+    )
+    about: Vector | None = optional(
+        vector(3),
+        "What they are turned about, and the moment is about [m]; their middle when absent.",
+        "[0, 0, 0]",
+    )
+    duration: float | None = optional(
+        number(above=0.0), "How long the way takes [s]; needed where there is one.", "0.5"
+    )
+    object: str | None = optional(text, "Whose points; all objects' when absent.", "bar")
+    at: float = key(number(0.0), "When the way begins [s].", "0.2", default=0.0)
+    until: float | None = optional(
+        number(above=0.0), "When they are let go [s]; never when absent.", "1.5"
+    )
+    name: str | None = optional(text, "Its name in run.json.", "jaw")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Ends:
+    """What both ends of an object are gripped by."""
+
+    duration: float = key(number(above=0.0), "How long that takes [s].", "0.5")
+    depth: float | None = optional(
+        number(above=0.0), "How deep both ends are gripped [m]; 15 % of the length when absent.",
+        "0.02",
+    )  # fmt: skip
+    object: str | None = optional(text, "Which object; the only one when absent.", "bar")
+    at: float = key(number(0.0), "When it begins [s].", "0.2", default=0.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pull(_Ends):
+    """``type: pull`` - hold one end of an object and move the other along the line between them."""
+
+    distance: float = key(number(), "How far it is pulled [m]; pressed when negative.", "0.01")
+    direction: Vector = key(
+        read_direction,
+        "From the end that is held to the one that is pulled: along x, y or z.",
+        "[1, 0, 0]",
+        default=(0.0, 0.0, 1.0),
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Twist(_Ends):
+    """``type: twist`` - hold one end of an object and turn the other about the line between."""
+
+    angle: float = key(number(), "How far it is turned [degrees].", "30")
+    axis: Vector = key(
+        read_direction,
+        "From the end that is held to the one that is turned: along x, y or z.",
+        "[1, 0, 0]",
+        default=(0.0, 0.0, 1.0),
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bend(_Ends):
+    """``type: bend`` - turn both ends of an object against each other."""
+
+    angle: float = key(number(), "Angle between the ends, half of it each [degrees].", "20")
+    axis: Vector = key(
+        read_direction,
+        "What the second end is turned about, the first against it.",
+        "[0, 0, 1]",
+        default=(0.0, 1.0, 0.0),
+    )
+    direction: Vector = key(
+        read_direction,
+        "From the first end to the second: along x, y or z, across `axis`.",
+        "[0, 0, 1]",
+        default=(1.0, 0.0, 0.0),
+    )
+
+
+Event = Drop | Throw | Bullet | Blade | Press | Pour | Collide | Grip | Pull | Twist | Bend
 EVENTS: dict[str, type[Event]] = {
     "drop": Drop,
     "throw": Throw,
@@ -177,6 +269,10 @@ EVENTS: dict[str, type[Event]] = {
     "press": Press,
     "pour": Pour,
     "collide": Collide,
+    "grip": Grip,
+    "pull": Pull,
+    "twist": Twist,
+    "bend": Bend,
 }
 
 

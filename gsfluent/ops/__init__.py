@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy(
     {
         "gsfluent.ops.mpm": ("Blocks", "build_blocks", "p2g", "grid_update", "g2p"),
         "gsfluent.ops.collider": ("collider_row", "collider_distance", "advance_colliders"),
+        "gsfluent.ops.grip": ("grip_rows",),
         "gsfluent.ops.blade": ("blade_rows", "blade_sides", "merged_fields"),
         "gsfluent.ops.plasticity": ("return_mapping", "elastic_energy", "wave_speed"),
         "gsfluent.ops.differentiable": (

@@ -109,6 +109,10 @@ class Solver(SolverState):
         epsilon: Its regularisation.
         implicit: Whether alpha is solved implicitly.
         irreversible: Whether broken points lose their cohesion for good.
+        frame: Velocity of the grid [m/s], which changes no law of motion but what the grid loses.
+            With colliders 0. Default: without them that of the matter, each body by its mass, so
+            that what happens does not depend on who watches (docs/theory/mpm.md). Positions and
+            velocities are given and read as they are for the observer.
 
     Raises:
         TypeError: Wrong type or dtype.
@@ -145,6 +149,7 @@ class Solver(SolverState):
         epsilon: float = 0.1,
         implicit: bool = True,
         irreversible: bool = True,
+        frame: Sequence[float] | None = None,
     ) -> None:
         op = "Solver"
         check_tensor(op, "position", position, shape=(None, 3))
@@ -207,6 +212,9 @@ class Solver(SolverState):
                 check_tensor(op, "sdf", sdf, shape=(None,), dtype=torch.float32)
                 b.sdf = sdf.to(self.device).contiguous()
         self._buffers = b
+        self.frame = self._frame(velocity, mass, body, frame, b.colliders.numel() > 0)
+        if bool(self.frame.any()):
+            velocity = (velocity.double() - self.frame).to(velocity)
         zero = velocity.new_zeros
         values = {
             "velocity": velocity,

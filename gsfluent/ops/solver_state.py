@@ -7,6 +7,7 @@ order changes from build to build; here they come back in the order they were gi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -18,6 +19,8 @@ from gsfluent.ops.solver_buffers import INDEX
 
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
+REST = 1e-3
+"""Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
 
 
 class SolverState:
@@ -29,6 +32,7 @@ class SolverState:
         count: Points N.
         dx: Node spacing [m].
         fields: Velocity fields.
+        frame: Velocity of the grid [m/s], float64 [3].
         irreversible: Whether broken points lose their cohesion for good.
         implicit, k, epsilon: Options of the return map.
     """
@@ -38,6 +42,7 @@ class SolverState:
     count: int
     dx: float
     fields: int
+    frame: Tensor
     irreversible: bool
     implicit: bool
     k: float
@@ -50,6 +55,36 @@ class SolverState:
     _law_set: int
 
     # --- loading ---
+
+    def _frame(
+        self,
+        velocity: Tensor,
+        mass: Tensor,
+        body: Tensor | None,
+        given: Sequence[float] | None,
+        rests: bool,
+    ) -> Tensor:
+        """Velocity of the grid: as given, none, or the one in which most matter hardly moves."""
+        none = torch.zeros(3, dtype=torch.float64, device=self.device)
+        if given is not None:
+            asked = torch.tensor([float(v) for v in given], dtype=torch.float64)
+            if asked.shape != (3,) or not bool(torch.isfinite(asked).all()):
+                raise ValueError(f"Solver: frame must be three finite numbers, got {given}")
+            if rests and bool(asked.any()):
+                raise ValueError(f"Solver: frame must be 0 where there are colliders, got {given}")
+            return asked.to(self.device)
+        if rests or not bool(torch.isfinite(velocity).all()):  # what is refused later
+            return none
+        # on the CPU sums have an order
+        m, v = mass.double().cpu(), velocity.double().cpu()
+        index = torch.zeros_like(m, dtype=torch.int64) if body is None else body.long().cpu()
+        if int(index.min()) < 0:
+            return none
+        whole = torch.bincount(index, m)
+        momentum = torch.stack([torch.bincount(index, m * v[:, i]) for i in range(3)], dim=1)
+        # by mass once more: a bullet does not move the grid through what it hits
+        mean = (whole @ momentum) / (whole @ whole)
+        return mean.to(self.device) if mean.norm() > REST * v.norm(dim=1).max() else none
 
     def _rows(
         self, material: Tensor | None, mass: Tensor, volume: Tensor
@@ -260,7 +295,10 @@ class SolverState:
         word = self._words()
         local = torch.stack([word & 7, word >> 3 & 7, word >> 6 & 7], dim=1)
         cell = 4 * self._owners()[:, :3] - 1 + local
-        return self._restored((cell.double() + 0.5 + self._rowwise("offset").double()) * self.dx)
+        place = (cell.double() + 0.5 + self._rowwise("offset").double()) * self.dx
+        if bool(self.frame.any()):
+            place = place + self.frame * self.time
+        return self._restored(place)
 
     @property
     def body(self) -> Tensor:
@@ -270,7 +308,10 @@ class SolverState:
     @property
     def velocity(self) -> Tensor:
         """Velocities [m/s], [N, 3]."""
-        return self._restored(self._rowwise("velocity"))
+        velocity = self._rowwise("velocity")
+        if bool(self.frame.any()):
+            velocity = (velocity.double() + self.frame).to(velocity)
+        return self._restored(velocity)
 
     @property
     def affine(self) -> Tensor:

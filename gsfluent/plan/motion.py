@@ -202,7 +202,10 @@ def _body(number: int, body: Body, gravity: Tensor) -> Mover:
 
 def _thing(thing: Collider) -> Mover:
     at = torch.tensor(thing.point, dtype=torch.float64)
-    if thing.kind == "box":
+    if thing.box is not None:
+        low, high = torch.tensor(thing.box, dtype=torch.float64)
+        at, reach = 0.5 * (low + high), 0.5 * (high - low)
+    elif thing.kind == "box":
         reach = torch.tensor([0.5 * math.hypot(*thing.size)] * 3, dtype=torch.float64)
         if thing.orientation == (1.0, 0.0, 0.0, 0.0):
             reach = 0.5 * torch.tensor(thing.size, dtype=torch.float64)

@@ -70,6 +70,7 @@ def report_page(out: Path, values: Values) -> Page:
     _choice(page, out, values)
     _plan(page, values.get("plan"))
     _motion(page, simulation.get("per_frame") or {}, simulation)
+    _grips(page, simulation.get("per_frame") or {}, simulation.get("grips") or [])
     _pictures(page, values)
     _stages(page, values.get("stages") or [])
     _left_out(page, simulation.get("skipped") or {})
@@ -216,6 +217,27 @@ def _motion(page: Page, frames: Values, simulation: Values) -> None:
         Panel("Grid", "blocks in use", {"blocks": frames.get("active_blocks", [])}, whole=True),
     ]  # fmt: skip
     _curves(page, "Motion", time, "time [s]", panels, "dashed: the largest value that passes")
+
+
+def _grips(page: Page, frames: Values, grips: Sequence[Values]) -> None:
+    """What held and drove points needed for it."""
+    rows = frames.get("grips") or []
+    if not grips or not rows:
+        return
+    names = [str(row["name"]) for row in grips]
+    sizes = {
+        what: {name: _sizes([frame[name][what] for frame in rows]) for name in names}
+        for what in ("force", "moment")
+    }
+    _curves(
+        page, "Grips", frames.get("time") or [], "time [s]",
+        [Panel("Force of each grip", "N", sizes["force"]),
+         Panel("Moment of each grip", "N m", sizes["moment"])],
+        "means over a frame; moments about the point of the grip",
+    )  # fmt: skip
+    head = ["grip", "largest force [N]", "at [s]", "largest moment [N m]", "at [s]"]
+    keys = ("name", "force", "force_at", "moment", "moment_at")
+    page.table(head, [[row[key] for key in keys] for row in grips])
 
 
 def _curves(

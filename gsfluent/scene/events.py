@@ -1,4 +1,4 @@
-"""What happens to the bodies of a scene: drop, throw, collide, bullet, pour."""
+"""What happens to the bodies of a scene: drop, throw, collide, bullet, pour; and all events."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from gsfluent import materials
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
-from gsfluent.scene.colliders import RigidThings
+from gsfluent.scene.grips import Grips
 from gsfluent.scene.parts import (
     Body,
     Collider,
@@ -27,11 +27,12 @@ from gsfluent.scene.parts import (
     vector,
 )
 
-EVENTS = ("drop", "throw", "bullet", "blade", "press", "pour", "collide")
+EVENTS = ("drop", "throw", "bullet", "blade", "press", "pour", "collide", "grip", "pull",
+          "twist", "bend")  # fmt: skip
 _FILE_NAMES = {"from": "start"}  # keys of a shot file that cannot be names in Python
 
 
-class Events(RigidThings):
+class Events(Grips):
     """The part of :class:`gsfluent.Scene` that places, moves and strikes its bodies."""
 
     floor: float | None

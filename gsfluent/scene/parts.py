@@ -177,7 +177,7 @@ class Collider:
 
     Args:
         name: Unique name.
-        kind: ``plane``, ``sphere``, ``box``, ``capsule``, ``cylinder`` or ``mesh``.
+        kind: ``plane``, ``sphere``, ``box``, ``capsule``, ``cylinder``, ``mesh`` or ``grip``.
         point: Plane point or centre [m] at time ``start``; of a mesh: where its own origin is.
         normal: Normal out of a plane.
         radius: Of sphere, capsule, cylinder; of a plane: 0, or that of its disc [m].
@@ -199,6 +199,9 @@ class Collider:
         appears: From when it is there [s].
         vanishes: Until when it is there [s].
         shown: Whether it is drawn.
+        box: Of a grip: two corners [m]; it is grown from the points between them at the start.
+        of: Of a grip: names of the bodies whose points those are.
+        centred: Of a grip: ``point`` is the centre of mass of its points.
     """
 
     name: str
@@ -222,6 +225,9 @@ class Collider:
     appears: float = 0.0
     vanishes: float = math.inf
     shown: bool = True
+    box: tuple[Vector, Vector] | None = None
+    of: tuple[str, ...] = ()
+    centred: bool = False
 
     def there(self, time: float) -> bool:
         """Whether it is there at a time [s]."""

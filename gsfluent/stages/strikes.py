@@ -192,7 +192,7 @@ class Strikes:
         colliders = {collider.name: collider for collider in self.scene.colliders}
         for i, thing in enumerate(before["things"]):
             now, name = after["things"][i], self._names[i]
-            if not now["there"]:
+            if not now["there"] or (name in colliders and colliders[name].kind == "grip"):
                 continue
             velocity = thing["velocity"]
             if not thing["there"]:  # it came to be in between

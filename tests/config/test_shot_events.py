@@ -24,6 +24,10 @@ SHOTS: list[dict[str, Any]] = [
     {"type": "pour", "from": [0, 0, 1], "speed": 1, "radius": 0.02, "volume": 1e-3,
      "material": "jelly"},
     {"type": "collide", "objects": ["a", "b"], "speed": 5, "direction": [1, 0, 0], "distance": 0},
+    {"type": "grip", "box": [[0, 0, 0], [1, 1, 1]], "turn": [0, 0, 9], "duration": 2, "at": 0.1},
+    {"type": "pull", "distance": 0.1, "duration": 1, "object": "a", "at": 0.1},
+    {"type": "twist", "angle": 9, "duration": 1, "object": "b"},
+    {"type": "bend", "angle": 9, "duration": 1, "object": "b", "depth": 0.01},
 ]  # fmt: skip
 
 
@@ -58,7 +62,10 @@ def test_events_reach_the_scene(folder: Path, event: dict[str, Any]) -> None:
         "pour": scene.bodies[2:],
     }
     kind = event["type"]
-    if kind in made:
+    if kind in ("grip", "pull", "twist", "bend"):
+        assert [thing.kind for thing in scene.colliders] == ["grip"] * (1 if kind == "grip" else 2)
+        assert all(thing.start == shown["at"] for thing in scene.colliders)
+    elif kind in made:
         (thing,) = made[kind]
         assert thing.start == shown.get("at", 0.0)
     elif kind == "drop":

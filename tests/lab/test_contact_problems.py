@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsfluent.lab.problems.contact import contact, friction
+from gsfluent.lab.problems.contact import contact, friction, observer
+from gsfluent.lab.world.driver import running_on
 from gsfluent.lab.world.registry import Result
 
 
@@ -33,6 +34,12 @@ def test_oblique_frictionless_balls_leave_without_spin() -> None:
 def test_one_velocity_field_spins_them() -> None:
     (result,) = contact.oblique_spheres(radius=5.0, turns=1, one_field=True)
     assert not result.passed and result.value > 0.3  # solver.md 3.10: +0.34 to +0.51
+
+
+def test_an_impact_does_not_depend_on_who_watches_but_on_a_grid_that_stays() -> None:
+    holds(observer.moving_observer())
+    with running_on("cpu", "ops"):  # their grid does not move along
+        assert observer.moving_observer().value > 1.2
 
 
 def test_head_on_balls_follow_hertz() -> None:

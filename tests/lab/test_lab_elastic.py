@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsfluent.lab.problems.contact import discs
-from gsfluent.lab.problems.elastic import axes, beams, statics, transfer, vortex, waves
+from gsfluent.lab.problems.elastic import axes, beams, driven, statics, transfer, vortex, waves
 from gsfluent.lab.world import registry
 from gsfluent.lab.world.driver import World, running_on
 from gsfluent.lab.world.shapes import ball, parameters
@@ -17,7 +17,7 @@ FAST = [
     p.name
     for p in registry.problems("fast")
     if p.function.__module__
-    in {m.__name__ for m in (axes, transfer, waves, statics, beams, discs, vortex)}
+    in {m.__name__ for m in (axes, transfer, waves, statics, beams, driven, discs, vortex)}
 ]
 
 

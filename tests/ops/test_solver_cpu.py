@@ -224,6 +224,7 @@ def test_a_point_may_cross_blocks_its_home_did_not_reach() -> None:
         solver = ops.Solver(
             start, v, given["mass"][:1], given["volume"][:1], dx=0.02, law=given["law"],
             params=given["params"], gravity=(0.0, 0.0, 0.0), dt=1e-3,
+            frame=(0.0, 0.0, 0.0),
         )  # fmt: skip
         solver.advance(steps=200)
         assert solver.counters()["builds"] > 10

@@ -23,6 +23,8 @@ NAN = math.nan
         ({"gradient_limit": 0.0}, "gradient_limit"),
         ({"epsilon": 1.0}, "epsilon"),
         ({"k": -1.0}, "k must"),
+        ({"frame": (0.0, NAN, 0.0)}, "frame must be three finite"),
+        ({"frame": (1.0, 0.0, 0.0)}, "frame must be 0 where there are colliders"),
         ({"colliders": torch.full((1, 32), NAN)}, "colliders row 0"),
         ({"params": torch.tensor([[NAN, 1.0, 0, 0, 0, 0, 1e3, 0]])}, "mu"),
         ({"params": torch.tensor([[1e4, -1.0, 0, 0, 0, 0, 1e3, 0]])}, "kappa"),
@@ -33,6 +35,26 @@ def test_arguments_out_of_range_are_refused(change: dict[str, Any], match: str) 
     given = scene(cells=2, dtype=torch.float32)
     with pytest.raises(ValueError, match=match):
         ops.Solver(**(given | change))
+
+
+def test_the_grid_goes_along_with_the_heaviest_body_and_the_state_is_the_observers() -> None:
+    given = scene(cells=4) | {"colliders": None, "gravity": (0.0, 0.0, 0.0)}
+    half = torch.arange(len(given["mass"])) < len(given["mass"]) // 8  # a light body of its own
+    given["body"] = (~half).int()
+    given["velocity"] = torch.zeros_like(given["velocity"])
+    given["velocity"][:, 1] = 2.0
+    given["velocity"][half, 0] = 30.0
+    solver = ops.Solver(**given)
+    light, heavy = (float(given["mass"][rows].sum()) for rows in (half, ~half))
+    share = light**2 / (light**2 + heavy**2)
+    assert solver.frame.tolist() == pytest.approx([30.0 * share, 2.0, 0.0])
+    torch.testing.assert_close(solver.velocity, given["velocity"])
+    still = ops.Solver(**given, frame=(0.0, 0.0, 0.0))
+    for each in (solver, still):
+        each.advance(1e-4)
+    torch.testing.assert_close(solver.position, still.position, atol=1e-3 * solver.dx, rtol=0)
+    moved = (given["mass"][:, None] * (solver.velocity - given["velocity"])).sum(dim=0)
+    assert float(moved.abs().max()) < 1e-12 * heavy
 
 
 def test_the_largest_field_runs_and_the_next_is_refused() -> None:

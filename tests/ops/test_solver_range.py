@@ -126,7 +126,7 @@ def test_all_points_at_one_node_with_the_largest_momentum_fit(count: int) -> Non
         torch.full((count,), mass),
         torch.full((count,), DX**3 / 8),
         dx=DX, law=torch.zeros(1, dtype=torch.int32), params=torch.tensor([elastic_row(1e6)]),
-        gravity=(0.0, 0.0, 0.0),
+        gravity=(0.0, 0.0, 0.0), frame=(0.0, 0.0, 0.0),
     )  # fmt: skip
     solver.advance(steps=1)
     clock = solver.clock()

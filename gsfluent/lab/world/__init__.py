@@ -4,7 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    driver="World",
+    driver="World place",
     drives="Drives damage",
     invariants="KINDS Limits OfWorld State Violation check first_violation observe search",
     registry="Result compare problem",

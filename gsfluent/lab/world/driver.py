@@ -39,6 +39,11 @@ def running_on(
         _engine.pop()
 
 
+def place() -> torch.device:
+    """Where :func:`running_on` says, the CPU outside it."""
+    return _place[-1] if _place else torch.device("cpu")
+
+
 class World:
     """A scene in motion.
 
@@ -72,6 +77,7 @@ class World:
             ``"ops"``: p2g, grid_update, g2p and return_mapping step by step. None: the solver
             where it can do the job, which is without ``force`` and ``period``.
         irreversible: Broken NACC material does not regain its cohesion.
+        frame: Velocity of the solver's grid [m/s]; None: the solver's choice. ``"ops"`` has none.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
     Raises:
@@ -118,6 +124,7 @@ class World:
         device: str | torch.device | None = None,
         engine: Literal["solver", "ops"] | None = None,
         irreversible: bool = True,
+        frame: Sequence[float] | None = None,
         **return_map: Any,
     ):
         if dt is not None and not 0.0 < dt < math.inf:
@@ -166,6 +173,7 @@ class World:
             period=(period[0], period[1], period[2]),
             irreversible=irreversible,
             return_map=return_map,
+            frame=None if frame is None else (frame[0], frame[1], frame[2]),
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()
         obstacle = why_not(self.scene, force is not None)

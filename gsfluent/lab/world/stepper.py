@@ -49,6 +49,7 @@ class Scene:
     period: tuple[float | None, float | None, float | None]
     irreversible: bool
     return_map: dict[str, Any]
+    frame: tuple[float, float, float] | None = None
 
 
 def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:

@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from gsfluent import geometry, ops
+from gsfluent.data import Particles
 from gsfluent.ops import collider as columns
 from gsfluent.pipeline.colliders import patches
+from gsfluent.pipeline.colliders.grips import Reactions, grip_row, reactions
 from gsfluent.pipeline.colliders.proximity import time_to_meet
 from gsfluent.pipeline.liquid.sheet import CLOSED
 from gsfluent.scene.parts import turned
@@ -47,14 +49,22 @@ class RigidSet:
         scene: The scene; its floor is the first row.
         dx: Grid spacing [m].
         device: Device of the rows.
+        particles: The points at the start, for grips; without them there are none.
 
     Attributes:
         start: Rows at time 0, float64 [M, 32].
         sdf: Values of all distance grids, float32 [S], or None.
         names: Name of each row.
+        grips: Rows that are grips.
     """
 
-    def __init__(self, scene: Scene, dx: float, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        dx: float,
+        device: torch.device | str = "cpu",
+        particles: Particles | None = None,
+    ) -> None:
         self.dx = dx
         self.floor = scene.floor
         self._gravity = scene.gravity
@@ -74,7 +84,14 @@ class RigidSet:
             self.names.append("floor")
             self._colliders.append(None)
         for collider in scene.colliders:
-            rows.append(self._row(collider))
+            if collider.kind != "grip":
+                rows.append(self._row(collider))
+            elif particles is not None:
+                row, values = grip_row(collider, scene, particles, dx, self._grid_values)
+                rows.append(row)
+                self._add_grid(values)
+            else:
+                rows.append(ops.collider_row("nothing"))
             self.names.append(collider.name)
             self._colliders.append(collider)
         self.start = (
@@ -86,6 +103,9 @@ class RigidSet:
         self.start = self.scheduled(self.start, 0.0).to(device)
         self._motion, self._begin = self._motion.to(device), self._begin.to(device)
         self.sdf = torch.cat(self._grids).to(device) if self._grids else None
+        self.grips = [
+            i for i, c in enumerate(self._colliders) if c is not None and c.kind == "grip"
+        ]
         self._pull = math.hypot(*scene.gravity)
         self._free = [
             i for i, c in enumerate(self._colliders) if c is not None and c.mass is not None
@@ -177,6 +197,9 @@ class RigidSet:
     def speeds(self, rows: Tensor) -> Tensor:
         """Largest speed of each collider's matter [m/s], [M]."""
         lever = torch.where(rows[:, 0] == 0, 0.0, rows[:, 26:29].norm(dim=1) + rows[:, 9])
+        if self.sdf is not None:  # there the extent counts values
+            grid = torch.maximum(-rows[:, 6:9], rows[:, 6:9] + (rows[:, 26:29] - 1) * rows[:, 9:10])
+            lever = torch.where(rows[:, 0] == columns.TYPES["sdf"], grid.norm(dim=1), lever)
         return rows[:, 10:13].norm(dim=1) + rows[:, 20:23].norm(dim=1) * lever
 
     def speed(self, rows: Tensor) -> Tensor:
@@ -184,11 +207,13 @@ class RigidSet:
         return self.speeds(rows).max() if self.count else rows.new_zeros(())
 
     def moving(self, rows: Tensor) -> Tensor:
-        """Colliders that move, that gravity is about to move, or that will go: rows, [K, 32].
+        """Colliders that move, that gravity is about to move, that will go, grips: rows, [K, 32].
 
-        What leans on something that will go must not sleep: nobody would wake it.
+        What leans on something that will go must not sleep: nobody would wake it. What a grip holds
+        must not, as nobody would book the reaction.
         """
         active = self.speeds(rows) > 0.0
+        active[self.grips] |= rows[self.grips, columns.TYPE] != _NOTHING
         for i, c in enumerate(self._colliders):
             if c is not None and math.isfinite(c.vanishes):
                 active[i] |= rows[i, columns.TYPE] != _NOTHING
@@ -406,9 +431,7 @@ class RigidSet:
         body = mesh_body(c.mesh, c.scale, DENSITY_OF_MESH_VALUES * self.dx)
         values = torch.from_numpy(body.values).flatten()
         pad = -values.shape[0] % columns.SDF_ALIGN
-        self._grids.append(torch.nn.functional.pad(values, (0, pad)))
-        offset = self._grid_values
-        self._grid_values += values.shape[0] + pad
+        offset = self._add_grid(torch.nn.functional.pad(values, (0, pad)))
         turn = geometry.quaternion_to_matrix(torch.tensor([c.orientation]).double())[0]
         axes = torch.from_numpy(body.axes.copy())
         extra = {
@@ -420,6 +443,18 @@ class RigidSet:
             "offset": offset,
         }
         return body.volume, body.inertia.tolist(), extra
+
+    def _add_grid(self, values: Tensor) -> int:
+        """Put values, as many as :data:`SDF_ALIGN` divides, behind the others; where they begin."""
+        offset = self._grid_values
+        self._grids.append(values)
+        self._grid_values += values.shape[0]
+        return offset
+
+    def reactions(self, rows: Tensor, given: Tensor, seconds: float) -> Reactions:
+        """What the grips did in a span of time: see :func:`.grips.reactions`."""
+        names = [self.names[i] for i in self.grips]
+        return reactions(names, self._begin[self.grips], rows[self.grips], given, seconds)
 
     def _reach(self, i: int, rows: Tensor) -> float:
         """How far free body i can reach below its point [m]."""

@@ -72,6 +72,7 @@ class State(NamedTuple):
         time_seen: When that was [s], float64 [N].
         cut_links: Links at rest that are cut for good, bool [L], in the order of
             :func:`gsfluent.pipeline.matter.fragments.rest_links`.
+        given: Impulse [N s] and torque about its point [N m s] that each grip gave, [G, 6].
         pushed: How many of the scene's impulses have been given.
     """
 
@@ -97,11 +98,18 @@ class State(NamedTuple):
     alpha_seen: Tensor
     time_seen: Tensor
     cut_links: Tensor
+    given: Tensor
     pushed: int = 0
 
     @staticmethod
-    def start(matter: Matter, colliders: Tensor, landed: tuple[bool, ...], links: int = 0) -> State:
-        """The state at time 0, with so many links at rest."""
+    def start(
+        matter: Matter,
+        colliders: Tensor,
+        landed: tuple[bool, ...],
+        links: int = 0,
+        grips: int = 0,
+    ) -> State:
+        """The state at time 0, with so many links at rest and so many grips."""
         p = matter.particles
         none = torch.zeros(p.count, dtype=torch.bool, device=p.device)
         zero = torch.zeros((), dtype=torch.float64, device=p.device)
@@ -128,6 +136,7 @@ class State(NamedTuple):
             alpha_seen=p.alpha,
             time_seen=torch.zeros(p.count, dtype=torch.float64, device=p.device),
             cut_links=torch.zeros(links, dtype=torch.bool, device=p.device),
+            given=torch.zeros(grips, 6, dtype=torch.float64, device=p.device),
         )
 
     def adopting(self, before: State) -> State:
@@ -156,6 +165,8 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "tensors": {
             _SAVED.get(name, name): getattr(state, name).cpu() for name in _POINTS + _WHOLE
         },
+        # a state without grips is that of versions before
+        **({"given": state.given.cpu()} if state.given.numel() else {}),
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
@@ -198,6 +209,7 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
         step=int(values["step"]),
         landed=tuple(bool(v) for v in values["landed"]),
         pushed=int(values["kicked"]),
+        given=values.get("given", rounded.new_zeros(0, 6, dtype=torch.float64)),
         **tensors,
     )
     return state, values["extra"]

@@ -60,6 +60,7 @@ class Composed:
         device = self.peak.device
         self.impulse = torch.zeros(3, dtype=torch.float64, device=device)
         self.work = torch.zeros((), dtype=torch.float64, device=device)
+        self.given = self.work.new_zeros(len(rigid.grips), 6)
         self._blocks: ops.Blocks | None = None
         self._travelled = self._speed = self._limit = 0.0
         self._refresh = 0
@@ -191,6 +192,8 @@ class Composed:
         if impulse.numel():
             self.impulse = self.impulse + impulse.sum(dim=0)
         self.work = self.work + self.rigid.work(rows, impulse, torque)
+        if grips := self.rigid.grips:
+            self.given = self.given + torch.cat([impulse, torque], dim=1)[grips]
         count = self.rigid.count
         self.colliders = self.rigid.advance(
             self.colliders, self.time, dt, impulse[:count], torque[:count]

@@ -123,6 +123,7 @@ class Resident:
         self.colliders = state.colliders
         self.impulse = torch.zeros(3, dtype=torch.float64, device=p.device)
         self.work = torch.zeros((), dtype=torch.float64, device=p.device)
+        self.given = self.work.new_zeros(len(rigid.grips), 6)
         self._seen = self._solver.counters()
         self._where: Tensor | None = None
         counters.fields_max = max(counters.fields_max, used.shape[0])
@@ -192,6 +193,8 @@ class Resident:
         given, turned = solver.impulse - pushed, solver.torque - twisted
         moved = solver.colliders
         self.impulse = self.impulse + given.sum(dim=0)
+        if grips := self._rigid.grips:
+            self.given = self.given + torch.cat([given, turned], dim=1)[grips]
         self.work = self.work + self._rigid.work_between(self.colliders, moved, given, turned)
         self.colliders = self._rigid.settled(moved, self.time)
         if not torch.equal(self.colliders, moved):

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.pipeline.colliders.grips import strongest
 from gsfluent.pipeline.liquid.nozzle import pours
 from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.matter.fields import breakable, cut_bodies
@@ -75,6 +76,7 @@ class Run:
         self.seconds = 0.0
         self.failure = ""
         self._pieces: tuple[State, Pieces] | None = None
+        self._gripped = self.state.time, self.state.given
 
     def _set(self, scene: Scene, matter: Matter) -> None:
         self.scene, self.matter = scene, matter
@@ -238,6 +240,12 @@ class Run:
             "non_finite": now.non_finite,
             "momentum_error": self.ledger.error(state, now),
         }
+        if self.stepper.rigid.grips:
+            since, given = self._gripped
+            stats["grips"] = self.stepper.rigid.reactions(
+                state.colliders, state.given - given, state.time - since
+            )
+            self._gripped = state.time, state.given
         self.per_frame.append(stats)
         return now, pieces, stats
 
@@ -280,6 +288,7 @@ class Run:
                 hint="use the same fps, or start without resume",
             )
         self.state = state
+        self._gripped = state.time, state.given
         self.stepper.resume(Counters(**extra["counters"]))
         self.stepper.field_limit = int(extra["field_limit"])
         self.stepper.dt_scale = float(extra["dt_scale"])
@@ -340,6 +349,7 @@ class Run:
                 "block_searches": max(c.steps - c.block_builds, 0),
                 "elastic_only_fraction": 1.0 - c.plastic / max(c.particle_steps, 1),
             },
+            "grips": strongest(per_frame.get("grips", []), per_frame.get("time", [])),
             "per_frame": per_frame,
         }
 

@@ -71,7 +71,7 @@ class Stepper:
         device = matter.particles.device
         self._gravity = torch.tensor(scene.gravity, dtype=torch.float64)
         self._pull = float(self._gravity.norm())
-        self.rigid = RigidSet(scene, matter.dx, device)
+        self.rigid = RigidSet(scene, matter.dx, device, matter.particles)
         self.blades = BladeSet(scene, matter.dx)
         self.liquids = Liquids(scene, matter)
         self.leaving = Leaving(
@@ -113,7 +113,9 @@ class Stepper:
         """Return the state at time 0, of matter with so many links at rest."""
         flies = self.options.free_flight
         landed = tuple(not flies or pours(body) for body in self.scene.bodies)
-        state = State.start(self.matter, self.rigid.start, landed, links)
+        state = State.start(
+            self.matter, self.rigid.start, landed, links, grips=len(self.rigid.grips)
+        )
         state = self.liquids.begun(state)
         self._take(state)
         state = self._land(state)[0]
@@ -220,7 +222,7 @@ class Stepper:
         return self.blades.splits(whole[held], state.cut[held]).numel() == 0
 
     def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:
-        pushed, worked = engine.impulse, engine.work
+        pushed, worked, gave = engine.impulse, engine.work, engine.given
         taken = engine.advance(until, steps)
         self.counters.flight_body_steps += taken * sum(g.body is not None for g in self._groups)
         state = self._moved(
@@ -229,6 +231,7 @@ class Stepper:
                 colliders=engine.colliders,
                 impulse=state.impulse + (engine.impulse - pushed),
                 work=state.work + (engine.work - worked),
+                given=state.given + (engine.given - gave),
             ),
             engine.time,
             engine.read(),

@@ -31,7 +31,7 @@ def projectile() -> Iterator[Result]:
     for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
         world = World(
             points, speed, volume=1e-6, dx=0.02, law=0, params=parameters(1e5, 0.3, 1000.0),
-            gravity=gravity, dt=5e-4, dtype=dtype,
+            gravity=gravity, dt=5e-4, dtype=dtype, frame=(0.0, 0.0, 0.0),
         ).run(steps=100)  # fmt: skip
         t = world.time
         flight = v * t + 0.5 * g * t * (t + world.dt)
