@@ -48,7 +48,10 @@ def test_a_proxy_is_made_once(made: list[Shot], tmp_path: Path) -> None:
     assert len(made) == 3
 
 
-def test_a_damaged_one_is_made_anew_and_old_ones_go(made: list[Shot], tmp_path: Path) -> None:
+def test_a_damaged_one_is_made_anew_and_old_ones_go(
+    made: list[Shot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_VOXELS", 16)
     path = tmp_path / "box.stl"
     trimesh.creation.box((1.0, 1.0, 1.0)).export(path)
     shot = Shot.from_dict({"mesh": str(path)})
