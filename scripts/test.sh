@@ -28,6 +28,9 @@ case ${1:-} in
     "$PYTHON" -m ruff check .
     "$PYTHON" -m ruff format --check .
     "$PYTHON" -m mypy
-    clang_format --dry-run -Werror ;;
+    clang_format --dry-run -Werror
+    # two processes of one thread each: most tests are too small for two threads
+    export OMP_NUM_THREADS=1
+    set -- -n 2 --dist loadfile ;;
 esac
 exec "$PYTHON" -m pytest "$@"

@@ -9,7 +9,7 @@ import pytest
 from fault_shot import run, stop, write_shot
 
 
-@pytest.fixture(autouse=True, scope="session")
+@pytest.fixture(autouse=True, scope="package")
 def _no_page() -> Iterator[None]:
     """The page of a run, which takes longer than these runs, is not what is tested here."""
     with pytest.MonkeyPatch.context() as patch:
@@ -17,13 +17,13 @@ def _no_page() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shot."""
     return write_shot(tmp_path_factory.mktemp("shot"))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def finished(shot: Path, _no_page: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its undisturbed run."""
     out = tmp_path_factory.mktemp("finished") / "out"
@@ -31,7 +31,7 @@ def finished(shot: Path, _no_page: None, tmp_path_factory: pytest.TempPathFactor
     return out
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def stopped(shot: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was stopped with two of its frames on disk."""
     out = tmp_path_factory.mktemp("stopped") / "out"
