@@ -145,6 +145,7 @@ class Engine(Protocol):
         colliders: Rows of the colliders as of ``time``, float64 [M, 32].
         impulse: Impulse of all colliders on the points since the start [N s], float64 [3].
         work: Most energy that colliders can have given since the start [J], float64 [].
+        cut: Sides of blades its points lie on, int32 [M].
         blocks: Blocks of the grid in use.
     """
 
@@ -152,6 +153,7 @@ class Engine(Protocol):
     colliders: Tensor
     impulse: Tensor
     work: Tensor
+    cut: Tensor
 
     @property
     def blocks(self) -> int:
