@@ -235,8 +235,8 @@ class Solver(SolverState):
         self._load(position, values, row, body)
         if parent is not None or cut is not None:
             for name, given in (("parent", parent), ("cut", cut)):
-                check_tensor(op, name, given, shape=(self.fields,), dtype=torch.int32)
-                setattr(b, name, given.to(self.device).contiguous())
+                rows = check_tensor(op, name, given, shape=(self.fields,), dtype=torch.int32)
+                setattr(b, name, rows.to(self.device).contiguous())
         heaviest = float(mass.max())
         bits = min(52, 62 - max(0, math.ceil(math.log2(0.43 * n))))
         self._write(

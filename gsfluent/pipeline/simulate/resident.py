@@ -218,7 +218,10 @@ class Resident:
             return 1.0
         matter, solver = self._matter, self._solver
         wave = ops.wave_speed(
-            solver.strain, law=matter.law, params=matter.params, material=self._constants["material"]
+            solver.strain,
+            law=matter.law,
+            params=matter.params,
+            material=self._constants["material"],
         )
         speed, fastest = float(solver.velocity.norm(dim=1).max()), float(wave.max())
         return (fastest + speed) / (fastest + max(speed, driven)) if fastest + speed > 0 else 1.0
