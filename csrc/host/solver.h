@@ -54,6 +54,8 @@ enum SolverBuffer : int {
   kSdfBuffer,
   kImpulseUnits,
   kImpulse,
+  kParent,
+  kCut,
   kSolverBuffers
 };
 
@@ -149,6 +151,8 @@ struct SolverOps {
         {"sdf", b[kSdfBuffer].numel(), 1, ScalarType::Float, true},
         {"impulse_units", s.collider_count, kImpulseSums, i64, true},
         {"impulse", s.collider_count, kImpulseSums, ScalarType::Double, true},
+        {"parent", ints[kFields], 1, i32, true},
+        {"cut", ints[kFields], 1, i32, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -173,6 +177,8 @@ struct SolverOps {
                         b[kImpulse].numel() == s.collider_count * kImpulseSums &&
                         b[kImpulseUnits].numel() == s.collider_count * kImpulseSums,
                     "solver: colliders, collider_state and impulse must have the same rows");
+    STD_TORCH_CHECK(b[kParent].numel() == b[kCut].numel(),
+                    "solver: parent and cut must have the same rows");
     const bool any_law = ints[kLawSet] != 0;
     STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),
                     "solver: these laws need alpha and peak");
@@ -222,6 +228,8 @@ struct SolverOps {
     s.sdf_count = b[kSdfBuffer].numel();
     s.impulse_units = static_cast<int64_t*>(any_at(kImpulseUnits));
     s.impulse = static_cast<double*>(any_at(kImpulse));
+    s.parent = int_at(kParent);
+    s.cut = int_at(kCut);
     return s;
   }
 

@@ -116,7 +116,8 @@ class SolveSettings:
     deterministic: bool = key(
         flag,
         "Insist on the same bits from the same input on the same device. The solver gives them "
-        "anyway; a blade at work on a GPU does not, and is refused then.",
+        "anyway; on a GPU a free rigid body lighter than what it meets does not, and is refused "
+        "then.",
         "true",
         default=False,
     )

@@ -95,6 +95,9 @@ class Solver(SolverState):
         deformation: Total deformation gradient, [N, 3, 3]; given, it is tracked.
         body: Velocity field of each point, int32 [N]; points of different fields feel each other by
             contact only. Default: one field.
+        parent: Body of each field, int32 [K], where blades cut; with ``cut``. Fields of one body
+            move as one, except on opposite sides of a blade. Default: each field is its own body.
+        cut: Sides of each field, int32 [K]; see :func:`gsfluent.ops.blade_sides`.
         gravity: Acceleration [m/s^2].
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
@@ -136,6 +139,8 @@ class Solver(SolverState):
         affine: Tensor | None = None,
         deformation: Tensor | None = None,
         body: Tensor | None = None,
+        parent: Tensor | None = None,
+        cut: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         colliders: Tensor | None = None,
         sdf: Tensor | None = None,
@@ -236,6 +241,10 @@ class Solver(SolverState):
         if deformation is not None:
             values["deformation"] = deformation.reshape(n, 9)
         self._load(position, values, row, body)
+        if parent is not None or cut is not None:
+            for name, given in (("parent", parent), ("cut", cut)):
+                rows = check_tensor(op, name, given, shape=(self.fields,), dtype=torch.int32)
+                setattr(b, name, rows.to(self.device).contiguous())
         heaviest = float(mass.max())
         bits = min(52, 62 - max(0, math.ceil(math.log2(0.43 * n))))
         self._write(

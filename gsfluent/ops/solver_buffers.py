@@ -85,6 +85,8 @@ class Buffers:
     sdf: Tensor
     impulse_units: Tensor
     impulse: Tensor
+    parent: Tensor
+    cut: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""
@@ -174,7 +176,8 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
     for name in ("id", "entry", "place"):
         values[name] = zeros(count, dtype=torch.int32)
     values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
-    for name in ("law", "home_start0", "home_count0", "home_start1", "home_count1"):
+    whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut")
+    for name in whole:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):
         values[name] = zeros(0, 4, dtype=torch.int32)

@@ -82,7 +82,6 @@ class Outlook:
     speed: float  # Speed of what moves fastest on the grid [m/s], mean
     struck: float  # Time of the first strike [s]
     strike_speed: float  # Fastest closing speed [m/s]
-    composed_seconds: float  # Time in which a blade is at work [s]
     # Whether something strikes fast enough to break what it strikes, or cuts or tears it.
     shatters: bool
 
@@ -143,11 +142,7 @@ def foresee(
         most = max(most, stored)
     weight = steps * _TICKS / left if left > 0.0 else 1.0
     begun = frames * left / seconds if seconds > 0 else 0.0
-    cutting = sum(
-        max(0.0, min(seconds, mover.until) - max(start, mover.since))
-        for mover in things
-        if mover.parts
-    )
+    cuts = any(m.parts and min(seconds, m.until) > max(start, m.since) for m in things)
     strikes = [m for m in bodies if math.isfinite(m.strikes)]
     return Outlook(
         movers=(*bodies, *things),
@@ -162,8 +157,7 @@ def foresee(
         speed=speed_sum / weight,
         struck=min((m.strikes for m in strikes), default=math.inf),
         strike_speed=max((m.speed for m in strikes), default=0.0),
-        composed_seconds=cutting,
-        shatters=cutting > 0.0
+        shatters=cuts
         or any(m.speed >= n > 0.0 or m.driven for m, n in zip(bodies, limits, strict=True)),
     )
 

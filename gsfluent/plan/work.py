@@ -174,12 +174,11 @@ def simulate_work(
     seconds = max(outlook.grid_from + outlook.grid_seconds, 1e-12)
     broken = max(0.0, 1.0 - outlook.struck / seconds) if math.isfinite(outlook.struck) else 0.0
     fields = len(scene.bodies) + (1 if "nacc" in laws and outlook.shatters else 0)
-    composed = outlook.substeps * outlook.composed_seconds / max(outlook.grid_seconds, 1e-12)
     return (
         {"start": 1.0}
         | stepping(
             outlook.points, outlook.blocks, outlook.substeps,
-            fields=fields, laws=law_set(laws), composed_steps=composed,
+            fields=fields, laws=law_set(laws),
         )
         | framing(frames, gaussians, points, brittle=breaks, broken=broken)
         | {"blocks_most": outlook.blocks_most, "points": points, "gaussians": gaussians,
@@ -273,8 +272,6 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
          f"matter that yields ({', '.join(sorted(laws - {'elastic'}))})", "no matter yields"),
         ("rigid things", bool(scene.colliders), things, "only the floor" if rests else "none"),
         ("blades", bool(scene.blades), _names(scene.blades), "nothing is cut"),
-        ("composed steps", outlook.composed_seconds > 0.0,
-         f"a blade is at work for {outlook.composed_seconds:.3g} s", "no blade is at work"),
         ("sleep", rests, "what comes to rest leaves the grid", "nothing to rest on"),
         ("repair", breaks and shot.output.cracks != "none", f"cracks open ({shot.output.cracks})",
          "cracks are not drawn" if breaks else "nothing can crack"),

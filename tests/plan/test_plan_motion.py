@@ -102,12 +102,13 @@ def test_only_what_breaks_flies_apart() -> None:
     assert blocks[0] == pytest.approx(100.0) and blocks[1] > 150.0
 
 
-def test_a_blade_needs_composed_steps_while_it_is_at_work() -> None:
+def test_a_blade_parts_what_it_cuts_once_it_is_at_work() -> None:
     scene = Scene()
     scene.add(ellipsoid((0.05,) * 3), APPLE, frame=at(0, 0, 0.05))
     scene.add_event({"type": "blade", "path": [[0, 0, 0.2], [0, 0, -0.05]], "width": 0.2,
                      "speed": 1.0, "at": 0.1})  # fmt: skip
-    assert foresee(scene, DX, 1.0, 30, [4000]).composed_seconds == pytest.approx(0.25, abs=1e-6)
+    assert foresee(scene, DX, 1.0, 30, [4000]).shatters
+    assert not foresee(scene, DX, 0.05, 2, [4000]).shatters
 
 
 # --- bounds ---

@@ -23,6 +23,12 @@ enum BladeColumn {
 constexpr int kBladeColumns = 16;
 constexpr int kMaxBlades = 15;
 
+// Whether sides a and b lie on opposite sides of some blade.
+GSF_HOST_DEVICE bool cut_apart(int32_t a, int32_t b) {
+  const uint32_t p = static_cast<uint32_t>(a), q = static_cast<uint32_t>(b);
+  return ((((p << 1) & q) | ((q << 1) & p)) & 0x2aaaaaaau) != 0;
+}
+
 // Coordinates in the sheet of a leg: x = start + along way + across edge + height normal.
 template <typename T>
 struct BladePlace {

@@ -220,6 +220,16 @@ GSF_HOST_DEVICE T collider_signed_distance(const T* row, const float* sdf, const
   return d;
 }
 
+// Lower bound of the distance from x to all that a valid collider holds: its signed distance; of a
+// face, which holds nothing beyond its rim, the distance of a box about what is under it.
+template <typename T>
+GSF_HOST_DEVICE T collider_clearance(const T* row, const float* sdf, const Vec3<T>& x) {
+  Vec3<T> normal;
+  if (row[kType] != T(kFace)) return collider_signed_distance(row, sdf, x, normal);
+  const Vec3<T> p = turn(row + kOrientation, x - load_vec3(row + kPoint), true);
+  return box_distance(p, row + kExtent, normal);
+}
+
 // Radius of a ball about the collider's point that holds all of it [m]; infinite for a plane.
 template <typename T>
 GSF_HOST_DEVICE T collider_bound(const T* row) {

@@ -188,15 +188,34 @@ GSF_HOST_DEVICE Vec3<T> node_position(const GridUpdateArgs<T>& a, int64_t node) 
 
 // Whether no node of a block can touch a valid collider: distances change by at most 1 per metre,
 // and no node is further than sqrt(3) 1.5 dx from the middle. Not for sweeping colliders, which
-// reach as far as nodes move, nor for faces, which end at their rim.
+// reach as far as nodes move.
 template <typename T>
 GSF_HOST_DEVICE bool block_clear(const GridUpdateArgs<T>& a, const T* row, int64_t block) {
-  if (row[kSweep] != T(0) || row[kType] == T(kFace)) return false;
+  if (row[kSweep] != T(0)) return false;
   const Vec3<T> low = node_position(a, block * kBlockNodes);
   const T half = T(1.5) * a.dx;
-  Vec3<T> normal;
-  return collider_signed_distance(row, a.sdf, low + Vec3<T>{half, half, half}, normal) >
-         T(2.61) * a.dx;
+  return collider_clearance(row, a.sdf, low + Vec3<T>{half, half, half}) > T(2.61) * a.dx;
+}
+
+// Sides that all fields share which move with field f at this node. Where one of them is not parted
+// the body is whole: a face that pushed there would be undone by the merging, step after step.
+template <typename T>
+GSF_HOST_DEVICE int32_t group_cut(const GridUpdateArgs<T>& a, int64_t node, int32_t f) {
+  if (a.cut == nullptr || a.merged == nullptr) return a.cut_of(f);
+  uint64_t present = 0;
+  for (int32_t g = 0; g < a.fields; ++g)
+    present |= uint64_t(a.node(g, node)[3] > mass_floor<T>() ? 1 : 0) << g;
+  const uint64_t group = merged_group(a, present, f);
+  int32_t cut = ~int32_t(0);
+  for (int32_t g = 0; g < a.fields; ++g)
+    if (group >> g & 1u) cut &= a.cut[g];
+  return cut;
+}
+
+// Whether collider `row` acts on field f at this node.
+template <typename T>
+GSF_HOST_DEVICE bool acts_at(const GridUpdateArgs<T>& a, const T* row, int64_t node, int32_t f) {
+  return row[kOnlyCut] == T(0) || collider_acts_on(row, group_cut(a, node, f));
 }
 
 // Mass of the fields at one node that touch a valid collider `row` [kg].
@@ -206,7 +225,7 @@ GSF_HOST_DEVICE double touching_mass(const GridUpdateArgs<T>& a, const T* row, i
   double total = 0.0;
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
-    if (!(mass > mass_floor<T>()) || !collider_acts_on(row, a.cut_of(f))) continue;
+    if (!(mass > mass_floor<T>()) || !acts_at(a, row, node, f)) continue;
     Vec3<T> normal;
     T share;
     if (collider_touch(row, a.sdf, x, load_vec3(a.out(f, node)), a.dx, a.dt, normal, share))
@@ -223,7 +242,7 @@ GSF_HOST_DEVICE void collide_node(const GridUpdateArgs<T>& a, const T* row, T gi
   const Vec3<T> x = node_position(a, node);
   for (int32_t f = 0; f < a.fields; ++f) {
     const T mass = a.node(f, node)[3];
-    if (!(mass > mass_floor<T>()) || !collider_acts_on(row, a.cut_of(f))) continue;
+    if (!(mass > mass_floor<T>()) || !acts_at(a, row, node, f)) continue;
     T* p = a.out(f, node);
     Vec3<T> v = load_vec3(p);
     if (!collide_with(row, a.sdf, give, x, mass, a.dx, a.dt, v, sums)) continue;

@@ -39,31 +39,74 @@ GSF_HOST_DEVICE int near_block(int local, int o, int& there) {
   return block;
 }
 
-// Contact between every pair of the fields at one node, in ascending field (Gauss-Seidel); returns
-// how many pairs touched. near(field, o) = ContactSample of neighbour o, see core/mpm/contact.h:
-// sums of other nodes, which must not be cleared before all contacts of the step are done.
-template <typename T, typename Near>
+// Which of the fields at one node move as one with the a-th, transitively, as bits. number(f) =
+// number of the f-th.
+template <typename T, typename Number>
+GSF_HOST_DEVICE uint32_t node_group(const SolverView<T>& s, int fields, const bool* heavy,
+                                    const Number& number, int a) {
+  uint32_t group = 1u << a, before = 0;
+  while (s.parent != nullptr && group != before) {
+    before = group;
+    for (int f = 0; f < fields; ++f)
+      for (int g = 0; g < fields; ++g)
+        if (heavy[g] && (before >> f & 1u) != 0 && s.moves_with(number(f), number(g)))
+          group |= 1u << g;
+  }
+  return group;
+}
+
+// Sides that all fields share which move with the a-th at this node. Where one of them is not
+// parted the body is whole: a face that pushed there would be undone by the merging, step after
+// step.
+template <typename T, typename Number>
+GSF_HOST_DEVICE int32_t node_cut(const SolverView<T>& s, int fields, const bool* heavy,
+                                 const Number& number, int a) {
+  if (s.cut == nullptr) return 0;
+  const uint32_t group = node_group(s, fields, heavy, number, a);
+  int32_t cut = ~int32_t(0);
+  for (int f = 0; f < fields; ++f)
+    if (group >> f & 1u) cut &= s.cut_of(number(f));
+  return cut;
+}
+
+// Contact between every pair of the fields at one node that do not move as one, in ascending field
+// (Gauss-Seidel), then the common velocity of those that do; returns how many pairs touched.
+// near(field, o) = ContactSample of neighbour o, see core/mpm/contact.h: sums of other nodes, which
+// must not be cleared before all contacts of the step are done.
+template <typename T, typename Number, typename Mass, typename Near>
 GSF_HOST_DEVICE int node_contact(const SolverView<T>& s, int fields, const bool* heavy,
-                                 const Near& near, Vec3<T>* velocity) {
+                                 const Number& number, const Mass& mass, const Near& near,
+                                 Vec3<T>* velocity) {
   int touched = 0;
   for (int a = 0; a < fields; ++a) {
     if (!heavy[a]) continue;
+    const uint32_t with_a = node_group(s, fields, heavy, number, a);
     for (int b = a + 1; b < fields; ++b) {
-      if (!heavy[b]) continue;
+      if (!heavy[b] || (with_a >> b & 1u) != 0) continue;
       const auto pair = [&](int side, int o) { return near(side == 0 ? a : b, o); };
       touched += contact_pair<T>(pair, s.contact, velocity[a], velocity[b]) ? 1 : 0;
     }
   }
+  if (s.parent == nullptr) return touched;
+  uint32_t done = 0;
+  for (int a = 0; a < fields; ++a) {
+    if (!heavy[a] || (done >> a & 1u) != 0) continue;
+    const uint32_t group = node_group(s, fields, heavy, number, a);
+    done |= group;
+    merge_group<T>(
+        group, [&](int f) { return T(mass(f)); }, [&](int f) { return velocity[f]; },
+        [&](int f, const Vec3<T>& v) { velocity[f] = v; });
+  }
   return touched;
 }
 
-// Applies collider k to one node of one field; adds to sums what the matter got: impulse [N s],
-// torque about the collider's point [N m s], touched mass [kg].
+// Applies collider k to one node of one field with these sides; adds to sums what the matter got:
+// impulse [N s], torque about the collider's point [N m s], touched mass [kg].
 template <typename T>
 GSF_HOST_DEVICE void node_collide(const SolverView<T>& s, int64_t k, const Vec3<T>& x, double mass,
-                                  T dt, Vec3<T>& v, double* sums) {
+                                  int32_t cut, T dt, Vec3<T>& v, double* sums) {
   const T* row = s.colliders + k * kColliderColumns;
-  if (!collider_valid(row, s.sdf_count)) return;
+  if (!collider_valid(row, s.sdf_count) || !collider_acts_on(row, cut)) return;
   // The mass a free collider touched a step ago stands for what it touches now.
   const T give = collider_give(row, T(s.impulse[k * kImpulseSums + 6]));
   if (collide_with(row, s.sdf, give, x, T(mass), s.dx, dt, v, sums)) sums[6] += mass;
@@ -81,8 +124,7 @@ GSF_HOST_DEVICE bool collider_near(const SolverView<T>& s, int64_t k, const Vec3
   const T ahead = row[kSweep] != T(0)
                       ? norm(load_vec3(row + kVelocity)) * T(max(s.clock->dt, s.clock->dt_next))
                       : T(0);
-  Vec3<T> normal;
-  return collider_signed_distance(row, s.sdf, middle, normal) <= T(5) * s.dx + ahead;
+  return collider_clearance(row, s.sdf, middle) <= T(5) * s.dx + ahead;
 }
 
 // Middle of a block.

@@ -14,6 +14,7 @@
 
 #include <cstdint>
 
+#include "core/collider/blade.h"
 #include "core/material/nacc.h"
 #include "core/mpm/contact.h"
 
@@ -168,7 +169,8 @@ struct SolverView {
   T* home_bound;         // [H] largest momentum one particle can give to one node [kg m/s]
   T* home_mass;          // [H] largest particle mass [kg]
   int32_t* slot_coord;   // [S, 4] block and field
-  int32_t* slot_shared;  // [S] 1: its site holds several fields; 2 (CUDA): next to such; 0
+  int32_t* slot_shared;  // [S] 1: its site holds several fields (CPU: that part); 2 (CUDA): next to
+                         // such; 0
   int32_t* site_slots;   // [S, kSiteFields] slots of a site in ascending field, -1 after the last
   void* sums;            // [S, 64, 4] momentum and mass: int64 units on CUDA, double on the CPU
   // [S, 64, kContactMoments], where slot_shared: int64 units on CUDA, T on the CPU; null: one field
@@ -190,10 +192,17 @@ struct SolverView {
   int64_t* impulse_units;  // [K, kImpulseSums] of this step, in units (CUDA)
   double* impulse;  // [K, kImpulseSums] impulse [N s] and torque [N m s] since the load, then
                     // the mass touched in the last step [kg]
+  // blades: fields of one body move as one, except on opposite sides of a blade; or null: no blade
+  const int32_t* parent;  // [fields] body of each field
+  const int32_t* cut;     // [fields] its sides (core/collider/blade.h)
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {
     return meta_row(meta) < uint64_t(row_count) ? meta_row(meta) : 0;
+  }
+  GSF_HOST_DEVICE int32_t cut_of(int32_t field) const { return cut != nullptr ? cut[field] : 0; }
+  GSF_HOST_DEVICE bool moves_with(int32_t a, int32_t b) const {
+    return parent != nullptr && parent[a] == parent[b] && !cut_apart(cut[a], cut[b]);
   }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }

@@ -153,6 +153,14 @@ class Builder {
     return true;
   }
 
+  // Whether contact is possible between slots [first, end) of a site: not all move as one.
+  bool parting(size_t first, size_t end) const {
+    for (size_t a = first; a < end; ++a)
+      for (size_t b = a + 1; b < end; ++b)
+        if (!s_.moves_with(key_field(slots_[a]), key_field(slots_[b]))) return true;
+    return false;
+  }
+
   static uint64_t neighbour_key(uint64_t key, int n) {
     return block_key(key_block(key, 0) + n / 9 - 1, key_block(key, 1) + n / 3 % 3 - 1,
                      key_block(key, 2) + n % 3 - 1, key_field(key));
@@ -258,16 +266,17 @@ class Builder {
     for (size_t first = 0, end = 0; first < slots_.size(); first = end) {
       while (end < slots_.size() && slots_[end] >> kFieldBits == slots_[first] >> kFieldBits) ++end;
       int32_t* site = s.site_slots + kSiteFields * clock_.sites;
+      const int parts = parting(first, end) ? 1 : 0;
       for (int i = 0; i < kSiteFields; ++i)
         site[i] = first + i < end ? static_cast<int32_t>(first + i) : -1;
       for (size_t slot = first; slot < end; ++slot) {
         for (int axis = 0; axis < 3; ++axis)
           s.slot_coord[4 * slot + axis] = key_block(slots_[slot], axis);
         s.slot_coord[4 * slot + 3] = key_field(slots_[slot]);
-        s.slot_shared[slot] = end - first > 1 ? 1 : 0;
+        s.slot_shared[slot] = parts;
       }
       clock_.sites += 1;
-      clock_.shared_sites += end - first > 1 ? 1 : 0;
+      clock_.shared_sites += parts;
     }
     clock_.homes = static_cast<int64_t>(next_.size());
     clock_.slots = static_cast<int64_t>(slots_.size());

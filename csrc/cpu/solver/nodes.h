@@ -89,9 +89,8 @@ class NodePass {
     for (int64_t k = 0; k < s_.collider_count; ++k) {
       const T* row = s_.colliders + k * kColliderColumns;
       if (!collider_valid(row, s_.sdf_count)) continue;
-      Vec3<T> normal;
       // Nodes lie within sqrt(27) / 2 of the centre; what sweeps may come from anywhere.
-      const bool far = collider_signed_distance(row, s_.sdf, center, normal) > T(2.8) * s_.dx;
+      const bool far = collider_clearance(row, s_.sdf, center) > T(2.8) * s_.dx;
       if (!far || row[kSweep] != T(0)) site.near[site.colliders++] = static_cast<int32_t>(k);
     }
     return site;
@@ -117,12 +116,14 @@ class NodePass {
       mass[a] = sum.mass;
       present += heavy[a] ? 1 : 0;
     }
+    const auto number = [&](int f) { return s_.slot_coord[4 * int64_t(site.slots[f]) + 3]; };
     int64_t contacts = 0;
-    if (present > 1 && contact_.any()) {
+    if (present > 1) {
       const auto near = [&](int field, int o) {
         return contact_.sample(site.slots[field], local, o);
       };
-      contacts = node_contact(s_, fields, heavy, near, velocity) > 0 ? 1 : 0;
+      const auto weight = [&](int field) { return mass[field]; };
+      contacts = node_contact(s_, fields, heavy, number, weight, near, velocity) > 0 ? 1 : 0;
     }
     if (site.colliders > 0 && present > 0) {
       const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
@@ -130,7 +131,8 @@ class NodePass {
         const int32_t k = site.collider(i);
         for (int a = 0; a < fields; ++a)
           if (heavy[a])
-            node_collide(s_, k, x, mass[a], dt, velocity[a], impulse + kImpulseSums * k);
+            node_collide(s_, k, x, mass[a], node_cut(s_, fields, heavy, number, a), dt, velocity[a],
+                         impulse + kImpulseSums * k);
       }
     }
     for (int a = 0; a < fields; ++a) {

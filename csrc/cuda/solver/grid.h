@@ -83,13 +83,14 @@ struct HeldSums {
 // all). Out of line: few nodes come here.
 template <typename T>
 __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& held, uint64_t near,
-                                             bool active, Vec3<T> x, double mass, Vec3<T> v, T dt) {
+                                             bool active, Vec3<T> x, double mass, int32_t cut,
+                                             Vec3<T> v, T dt) {
   for (; near != 0; near &= near - 1) {
     const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
     const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
     for (int64_t k = first; k < end; ++k) {
       double sums[kImpulseSums] = {};
-      if (active) node_collide(s, k, x, mass, dt, v, sums);
+      if (active) node_collide(s, k, x, mass, cut, dt, v, sums);
       if (!__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
       const double units_of[3] = {1.0 / sum_unit(s, 0), 1.0 / sum_unit(s, 3), 1.0 / sum_unit(s, 6)};
       for (int i = 0; i < kImpulseSums; ++i) {
@@ -209,12 +210,18 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
     present += heavy[f] ? 1 : 0;
   }
   int touched = 0;
-  if (present > 1) touched = node_contact(s, count, heavy, near_nodes, velocity);
+  const auto number = [&](int f) { return s.slot_coord[4 * int64_t(slots[f]) + 3]; };
+  if (present > 1) {
+    const auto mass = [&](int f) {
+      return read_sums(s, int64_t(slots[f]) * kBlockNodes + local).mass;
+    };
+    touched = node_contact(s, count, heavy, number, mass, near_nodes, velocity);
+  }
   for (int f = 0; f < count; ++f) {
     const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
     if (near != 0)
-      velocity[f] =
-          collide_near(s, held, near, heavy[f], x, read_sums(s, node).mass, velocity[f], dt);
+      velocity[f] = collide_near(s, held, near, heavy[f], x, read_sums(s, node).mass,
+                                 node_cut(s, count, heavy, number, f), velocity[f], dt);
     store_velocity(s, node, velocity[f]);
   }
   if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
@@ -252,7 +259,8 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
   if (near != 0) {
     const Vec3<T> x =
         node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
-    v = collide_near(s, held, near, heavy, x, sums.mass, v, dt);
+    const int32_t cut = s.cut_of(s.slot_coord[4 * slot + 3]);
+    v = collide_near(s, held, near, heavy, x, sums.mass, cut, v, dt);
   }
   store_velocity(s, node, v);
 }

@@ -24,9 +24,15 @@ from gsfluent.scene.scene import Blade, Scene
 REACH = 3.0
 """Distance from the sheet [cells] within which matter gets a side: the reach of two kernels (1.5
 each), so that matter without a side shares no node with matter of the other side."""
+BEHIND = 2.0
+"""Distance at which the faces follow the edge [cells]: matter ahead of it reaches nodes 1.5 behind
+it, where the body is whole, and half a look is 0.5."""
 TAPER = 0.25
 """Rise of the wedge of a thick blade per length behind its edge."""
 MAX_FIELDS = 64
+"""Fields of the composed operators at most."""
+_CORNER = 1e-9
+"""Share of a leg within which an edge is at its end."""
 
 
 class Fields(NamedTuple):
@@ -80,8 +86,13 @@ class BladeSet:
         return blade.start, blade.start + _length(blade) / blade.speed
 
     def next_change(self, time: float) -> float:
-        """The next time after ``time`` at which a blade starts or ends [s], or infinity."""
+        """The next time after ``time`` at which a blade starts, turns or ends [s], or infinity."""
         times = [t for number in range(len(self)) for t in self.ends(number)]
+        for blade in self.blades:
+            passed = itertools.accumulate(
+                math.dist(a, b) for a, b in itertools.pairwise(blade.path)
+            )
+            times += [blade.start + length / blade.speed for length in passed]
         return min((t for t in times if t > time), default=math.inf)
 
     def speed(self, time: float) -> float:
@@ -150,23 +161,33 @@ class BladeSet:
         same = parent[:, None] == parent[None, :]
         return torch.unique(parent[(same & cut_apart(sides[:, None], sides[None, :])).any(dim=1)])
 
-    def fields(self, body: Tensor, cut: Tensor) -> Fields:
+    def fields(
+        self, body: Tensor, cut: Tensor, *, pushed: bool | None = None, most: int = MAX_FIELDS
+    ) -> Fields:
         """Number the fields: every pair of a body and its sides that occurs.
 
         Sides matter only in bodies that have matter on both sides of a blade, or that the faces of
         a thick blade must know.
 
+        Args:
+            body: Body of each point, int [N].
+            cut: Its sides, int32 [N].
+            pushed: Whether faces must know the sides; by default, when a blade is thick.
+            most: Fields at most.
+
         Raises:
-            InputError: More than 64 fields.
+            InputError: More fields.
         """
-        if not any(blade.thickness > 0.0 for blade in self.blades):
+        if pushed is None:
+            pushed = any(blade.thickness > 0.0 for blade in self.blades)
+        if not pushed:
             cut = torch.where(torch.isin(body, self.splits(body, cut)), cut, 0)
         key = body.to(torch.int64) << 32 | cut.to(torch.int64)
         found, field = torch.unique(key, return_inverse=True)
-        if found.shape[0] > MAX_FIELDS:
+        if found.shape[0] > most:
             raise InputError(
                 f"simulate: {found.shape[0]} parts on different sides of blades are more than "
-                f"{MAX_FIELDS}",
+                f"{most}",
                 hint="use fewer blades or bodies",
             )
         parent, sides = (found >> 32).to(torch.int32), (found & 0xFFFFFFFF).to(torch.int32)
@@ -175,19 +196,20 @@ class BladeSet:
     def faces(self, time: float) -> Tensor:
         """Collider rows of the thick blades at a time, float64 [F, 32].
 
-        Per side of each leg that the edge has entered: a wedge that rises behind the edge, and the
-        slab behind it. A blade that has passed its path is drawn out and has none.
+        Per side of each leg that the edge has entered: a wedge that rises :data:`BEHIND` the edge,
+        and the slab behind it. A blade that has passed its path is drawn out and has none.
         """
         rows = []
         for number, blade in enumerate(self.blades):
             start, end = self.ends(number)
-            if blade.thickness <= 0.0 or not start < time < end:
+            if blade.thickness <= 0.0 or not start < time <= end:
                 continue
-            swept = blade.speed * (time - start)
+            swept = blade.speed * (time - start) - BEHIND * self.dx
             for a, b in itertools.pairwise(blade.path):
                 length = math.dist(a, b)
-                if swept > 0.0:
-                    rows += self._leg(number, blade, a, b, min(swept, length), swept <= length)
+                if swept > _CORNER * length:
+                    leads = swept <= (1.0 + _CORNER) * length
+                    rows += self._leg(number, blade, a, b, min(swept, length), leads)
                 swept -= length
         return torch.stack(rows) if rows else torch.zeros(0, 32, dtype=torch.float64)
 

@@ -1,7 +1,7 @@
 """The grid step by step, by the composable operators: the other engine of the simulation.
 
-For what the resident solver does not know (blades at work, pieces that are partly cut, free bodies
-lighter than what they meet), and to compare it with. A step is p2g, grid update, g2p and the return
+For what the resident solver does not know (free bodies lighter than what they meet), and to compare
+it with. A step is p2g, grid update, g2p and the return
 map; the contact pass is left out while no two fields meet, and the search for blocks while the old
 ones hold every point.
 """
@@ -245,7 +245,7 @@ class Composed:
         self._fields = int(self._unit.max()) + 1
         if len(self._blades):
             fields = self._blades.fields(self._unit, self.cut)
-            if fields.total > self._fields:
+            if bool((fields.cut != 0).any()):
                 self._body, self._fields = fields.field, fields.total
                 self._merged, self._sides = fields.merged, fields.cut
         self.counters.fields_max = max(self.counters.fields_max, self._fields)

@@ -146,6 +146,7 @@ class Engine(Protocol):
         impulse: Impulse of all colliders on the points since the start [N s], float64 [3].
         work: Most energy that colliders can have given since the start [J], float64 [].
         given: Impulse and torque of each grip since the start [N s, N m s], float64 [G, 6].
+        cut: Sides of blades its points lie on, int32 [M].
         blocks: Blocks of the grid in use.
     """
 
@@ -154,6 +155,7 @@ class Engine(Protocol):
     impulse: Tensor
     work: Tensor
     given: Tensor
+    cut: Tensor
 
     @property
     def blocks(self) -> int:

@@ -2,7 +2,10 @@
 
 :class:`Resident` keeps the points in one :class:`gsfluent.ops.Solver`, which takes many steps per
 call. :class:`gsfluent.pipeline.simulate.composed.Composed` takes one step at a time with the
-composable operators; it is the reference, and it alone knows blades at work and light free bodies.
+composable operators; it is the reference, and it alone knows light free bodies.
+
+A blade at work is looked at once per cell that its edge moves: what it parts gets its side, and the
+solver goes on with the fields and the faces that follow.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ from gsfluent import ops
 from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
+from gsfluent.ops.solver_buffers import MAX_FIELDS
+from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State, at_rows
@@ -28,6 +33,8 @@ CROWDED = 3
 """Reason of a SolverError: more fields share a block than it has room for."""
 
 
+POINT, VELOCITY = slice(3, 6), slice(10, 13)
+"""Columns of a collider's row."""
 LOOK = 8
 """Steps between two looks at how fast matter is, while a collider is much faster."""
 STEADY = 0.9
@@ -92,7 +99,7 @@ class Resident:
         position, peak, field = (
             at_rows(value, rows) for value in (state.position, state.peak, state.field)
         )
-        used, field = torch.unique(field, return_inverse=True)
+        field = torch.unique(field, return_inverse=True)[1]
         law, params = matter.law, matter.params
         if not options.law_kernels:  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
@@ -104,41 +111,63 @@ class Resident:
             LAWS["nacc"],
         }
         self._damage = not set(law.tolist()) <= {LAWS["elastic"]}  # as the solver decides it
-        self._solver = _guarded(
-            p.velocity,
-            lambda: ops.Solver(
-                position, p.velocity, p.mass, p.volume,
-                dx=matter.dx, law=law, params=params, material=p.material,
-                strain=p.strain, alpha=p.alpha, peak=peak, affine=p.affine,
-                deformation=p.deformation, body=field.to(torch.int32), gravity=scene.gravity,
-                colliders=state.colliders if state.colliders.shape[0] else None, sdf=rigid.sdf,
-                friction=scene.friction, cfl=options.cfl,
-                irreversible=options.irreversible, **options.return_map,
-            ),
+        constants = dict(
+            mass=p.mass, volume=p.volume, dx=matter.dx, law=law, params=params,
+            material=p.material, gravity=scene.gravity, sdf=rigid.sdf, friction=scene.friction,
+            cfl=options.cfl, irreversible=options.irreversible, **options.return_map,
         )  # fmt: skip
+        self._constants: dict[str, Any] = constants
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = dt_scale
-        self._material = p.material
         self._start = self.time = state.time
         self.colliders = state.colliders
         self.impulse = torch.zeros(3, dtype=torch.float64, device=p.device)
         self.work = torch.zeros((), dtype=torch.float64, device=p.device)
         self.given = self.work.new_zeros(len(rigid.grips), 6)
+        self._blades = BladeSet(scene, matter.dx)
+        self._unit, self.cut = field.to(torch.int32), at_rows(state.cut, rows)
+        self._faces = self.colliders[:0]
+        """Rows of the faces of blades at work, after those of the colliders."""
+        self._look(position.to(p.dtype))
+        self._begin(Points(position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation))
+
+    def _begin(self, points: Points) -> None:
+        """Load points into a solver, with the fields and the faces of now."""
+        body, parent, cut = self._unit, None, None
+        if len(self._blades):
+            pushed = self._faces.shape[0] > 0
+            fields = self._blades.fields(body, self.cut, pushed=pushed, most=MAX_FIELDS)
+            if bool((fields.cut != 0).any()):
+                body, parent, cut = fields.field, fields.parent, fields.cut
+        rows = torch.cat([self.colliders, self._faces])
+        self._solver = _guarded(
+            points.velocity,
+            lambda: ops.Solver(
+                **points._asdict(), body=body, parent=parent, cut=cut,
+                colliders=rows if rows.shape[0] else None, **self._constants,
+            ),
+        )  # fmt: skip
+        self._start = self.time
         self._seen = self._solver.counters()
         self._where: Tensor | None = None
-        counters.fields_max = max(counters.fields_max, used.shape[0])
+        self._counters.fields_max = max(self._counters.fields_max, self._solver.fields)
 
     def advance(self, until: float, steps: int) -> int:
         """See :class:`Engine`."""
-        before = self._seen["step"]
+        counters = self._counters
+        before = counters.steps
         depth = FLOOR_DEPTH * self._matter.dx
-        while self.time < until and self._seen["step"] - before < steps:
+        while self.time < until and counters.steps - before < steps:
+            if self.time >= self._due and self._look(self._position().to(self._solver.dtype)):
+                self._begin(self.read())
+            stop = min(until, self._due)
             pace = self._pace()
             self._solver.dt_scale = self._dt_scale * pace
             wait = self._rigid.floor_wait(self.colliders, depth)
-            left = steps - int(self._seen["step"] - before)
-            self._go(min(until, self.time + wait), left if pace > STEADY else min(left, LOOK))
-        taken, counters = int(self._seen["step"] - before), self._counters
+            left = steps - (counters.steps - before)
+            steady = pace > STEADY or self._faces.shape[0] > 0  # a blade is looked at anyway
+            self._go(min(stop, self.time + wait), left if steady else min(left, LOOK))
+        taken = counters.steps - before
         sites = int(self._seen["sites"])
         counters.law_kernel_steps += taken if self._special else 0
         counters.undamaged_steps += 0 if self._damage else taken
@@ -146,6 +175,28 @@ class Resident:
         counters.contact_block_steps += taken * int(self._seen["shared_sites"])
         counters.box_steps += taken * max(sites, _box(self._position(), self._matter.dx))
         return taken
+
+    def _look(self, position: Tensor) -> bool:
+        """Part what the blades pass until the next look; return whether that changed anything.
+
+        Until then the edge moves a cell at most; what it passes gets its side when the edge is half
+        of that away, before or behind.
+        """
+        blades, now, cut = self._blades, self.time, self.cut
+        faces, self._due = self._faces[:0], blades.next_change(now)
+        if len(blades):
+            span = self._matter.dx / max(blade.speed for blade in blades.blades)
+            half = 0.0
+            if blades.speed(now) > 0.0:
+                self._due = min(self._due, now + span)
+                half = 0.5 * (self._due - now)
+                faces = blades.faces(self._due).to(self._faces)
+                # They are where they should be when the look ends, and move there until then.
+                faces[:, POINT] -= (self._due - now) * faces[:, VELOCITY]
+            cut = blades.look(position, cut, now - span, now + half)
+        same = not (faces.shape[0] or self._faces.shape[0]) and torch.equal(cut, self.cut)
+        self.cut, self._faces = cut, faces
+        return not same
 
     @property
     def blocks(self) -> int:
@@ -160,12 +211,18 @@ class Resident:
 
     def _pace(self) -> float:
         """Factor on the time step: what drives matter may be faster than any of it yet."""
-        driven = float(self._rigid.speed(self.colliders))
+        rigid, faces = self._rigid, self._faces
+        driven = float(rigid.speed(self.colliders))
+        if faces.shape[0]:
+            driven = max(driven, float(faces[:, VELOCITY].norm(dim=1).max()))
         if driven == 0.0:
             return 1.0
         matter, solver = self._matter, self._solver
         wave = ops.wave_speed(
-            solver.strain, law=matter.law, params=matter.params, material=self._material
+            solver.strain,
+            law=matter.law,
+            params=matter.params,
+            material=self._constants["material"],
         )
         speed, fastest = float(solver.velocity.norm(dim=1).max()), float(wave.max())
         return (fastest + speed) / (fastest + max(speed, driven)) if fastest + speed > 0 else 1.0
@@ -188,17 +245,23 @@ class Resident:
         else:
             self.time = stop
         self._count()
-        if not self._rigid.count:
+        rigid, count = self._rigid, self._rigid.count
+        if not count + self._faces.shape[0]:
             return
         given, turned = solver.impulse - pushed, solver.torque - twisted
         moved = solver.colliders
         self.impulse = self.impulse + given.sum(dim=0)
-        if grips := self._rigid.grips:
+        if grips := rigid.grips:
             self.given = self.given + torch.cat([given, turned], dim=1)[grips]
-        self.work = self.work + self._rigid.work_between(self.colliders, moved, given, turned)
-        self.colliders = self._rigid.settled(moved, self.time)
+        self.work = self.work + rigid.work(moved[count:], given[count:], turned[count:])
+        self._faces = moved[count:]
+        moved = moved[:count]
+        self.work = self.work + rigid.work_between(
+            self.colliders, moved, given[:count], turned[:count]
+        )
+        self.colliders = rigid.settled(moved, self.time)
         if not torch.equal(self.colliders, moved):
-            solver.set_colliders(self.colliders)
+            solver.set_colliders(torch.cat([self.colliders, self._faces]))
 
     def _wrong(self, kind: str) -> Tensor:
         """The points at fault: not finite, among the fastest, or where most fields meet."""

@@ -40,6 +40,8 @@ from gsfluent.scene.scene import Scene
 
 FINE = 8.0
 """Below this distance of their boxes [cells] the points of two things are compared themselves."""
+SIDES = 3
+"""Fields of one piece at a blade: above it, below it, and ahead of its edge."""
 HASTE = 1.5
 """How much faster than now matter on the grid may get before the next look."""
 
@@ -155,9 +157,10 @@ class Stepper:
     def _renumber(self, state: State, on_grid: Tensor) -> State:
         if not self.options.separate_fragments or not bool(on_grid.any()):
             return state
+        limit = max(2, self.field_limit // SIDES) if self._cuts(state) else self.field_limit
         field = number_fields(
             state.unit, state.position, self.matter.particles.mass, on_grid, self.matter.dx,
-            self.field_limit, MOST if self._resident_now(state) else FIELDS,
+            limit, MOST if self._resident_now(state) else FIELDS,
         )  # fmt: skip
         return state if torch.equal(field, state.field) else state._replace(field=field)
 
@@ -183,8 +186,8 @@ class Stepper:
             if make is Composed and self._ordered:
                 raise InputError(
                     f"simulate: from t = {state.time:.4g} s on the scene needs operators whose "
-                    "sums have no order on a GPU (a blade at work, or a free body lighter than "
-                    "what it meets), but deterministic was asked for",
+                    "sums have no order on a GPU (a free body is lighter than what it meets), but "
+                    "deterministic was asked for",
                     hint="leave out solve.deterministic, or run on the CPU",
                 )
             if not isinstance(self._engine, make):
@@ -207,19 +210,20 @@ class Stepper:
             return wrong
         return torch.zeros_like(state.loose).index_copy(0, self._rows, wrong)
 
-    def _resident_now(self, state: State) -> bool:
-        """Whether the resident solver can go on from here: with no blade at work."""
-        wanted = self.options.resident and self.options.contact_proximity
-        if not (wanted and resident_can(state.colliders, self.rigid, self.matter)):
-            return False
+    def _cuts(self, state: State) -> bool:
+        """Whether a blade is at work, or something is cut in part: its sides are fields too."""
         if len(self.blades) == 0:
-            return True
-        if self.blades.speed(state.time) > 0.0:
             return False
-        # On powder a cut leaves nothing to hold; what shares a field has to lie on one side.
+        if self.blades.speed(state.time) > 0.0:
+            return True
         whole = state.unit if self.options.separate_fragments else state.field
         held = state.unit >= 0
-        return self.blades.splits(whole[held], state.cut[held]).numel() == 0
+        return self.blades.splits(whole[held], state.cut[held]).numel() > 0
+
+    def _resident_now(self, state: State) -> bool:
+        """Whether the resident solver can go on from here."""
+        wanted = self.options.resident and self.options.contact_proximity
+        return wanted and resident_can(state.colliders, self.rigid, self.matter)
 
     def _on_grid(self, state: State, engine: Engine, until: float, steps: int) -> State:
         pushed, worked, gave = engine.impulse, engine.work, engine.given
@@ -236,7 +240,7 @@ class Stepper:
             engine.time,
             engine.read(),
         )
-        if isinstance(engine, Composed) and len(self.blades):
+        if len(self.blades):
             rows = self._rows
             cut = engine.cut if rows is None else state.cut.index_copy(0, rows, engine.cut)
             state = state._replace(cut=cut)

@@ -125,10 +125,9 @@ class Block:
         self.touched = 0
         self.impulse = torch.zeros(3, dtype=torch.float64)
 
-    def step(self, blades: BladeSet | None = None) -> None:
+    def step(self, blades: BladeSet | None = None, rows: Tensor | None = None) -> None:
         body = torch.zeros(len(self.x), dtype=torch.int32)
         now = self.time + self.dt
-        rows = None
         if blades is not None:
             self.cut = blades.look(self.x, self.cut, self.time, now)
             rows = blades.faces(now)
@@ -235,6 +234,44 @@ def test_a_thick_blade_opens_the_cut_by_its_thickness() -> None:
     assert block.cut.ne(0).any() and block.impulse.norm() > 0
 
 
+def test_the_solver_is_the_operators_with_sides_and_faces() -> None:
+    """A body cut halfway, its halves thrown together, and faces that push each its own side."""
+    block = cut_block(0.5, 0)
+    block.v = torch.where(block.left[:, None], 2.0, -2.0) * torch.tensor([1.0, 0.3, 0.1])
+    block.v = block.v.double()
+    block.v[:, 2] += block.x[:, 0]
+    rows = knife(0.5, 0.4 * DX, speed=4.0).faces(0.12)
+    assert rows.shape[0] == 4
+    fields = BladeSet(Scene(), DX).fields(torch.zeros(len(block.x), dtype=torch.int32), block.cut)
+    assert fields.total == 3
+
+    def solver(order: Tensor) -> ops.Solver:
+        return ops.Solver(
+            block.x[order], block.v[order], block.mass[order], block.volume[order], dx=DX,
+            law=block.law, params=block.params, body=fields.field[order], parent=fields.parent,
+            cut=fields.cut, colliders=rows, gravity=ZERO, friction=0.3, dt=block.dt,
+        )  # fmt: skip
+
+    order = torch.randperm(len(block.x), generator=torch.Generator().manual_seed(0))
+    one, other = solver(torch.arange(len(order))), solver(order)
+    one.advance(steps=3)
+    other.advance(steps=3)
+    assert torch.equal(one.position[order], other.position)
+    moving = rows.clone()
+    for _ in range(3):
+        block.step(rows=moving)
+        moving[:, 3:6] += block.dt * moving[:, 10:13]
+    assert block.touched > 0 and block.impulse.norm() > 0
+    torch.testing.assert_close(one.position, block.x, rtol=0, atol=1e-12)
+    torch.testing.assert_close(one.velocity, block.v, rtol=0, atol=1e-9)
+    torch.testing.assert_close(one.impulse.sum(dim=0), block.impulse, rtol=1e-9, atol=1e-9)
+    with pytest.raises(TypeError, match="cut must"):
+        ops.Solver(
+            block.x, block.v, block.mass, block.volume, dx=DX, law=block.law, params=block.params,
+            body=fields.field, parent=fields.parent,
+        )  # fmt: skip
+
+
 # --- in a simulation ---
 
 
@@ -242,6 +279,8 @@ def sliced(
     depth: float,
     thickness: float = 0.0,
     material: materials.Material = SOFT,
+    *,
+    resident: bool = True,
     **scene_options: object,
 ) -> Run:
     """A ball of radius 0.1 in free space, cut along x = 0 from above."""
@@ -252,7 +291,8 @@ def sliced(
         [(0, 0, 0.45), (0, 0, 0.45 - depth)], width=0.4, edge=(0, 1, 0), speed=4.0, at=0.02,
         thickness=thickness,
     )  # fmt: skip
-    return Run(scene, build_matter(scene, 0.04), 25.0, SolverOptions(max_rollbacks=3))
+    options = SolverOptions(max_rollbacks=3, resident=resident)
+    return Run(scene, build_matter(scene, 0.04), 25.0, options)
 
 
 def test_a_simulated_blade_makes_two_pieces_that_part() -> None:
@@ -301,16 +341,49 @@ def test_a_thick_blade_pushes_the_halves_apart_and_its_work_is_booked() -> None:
     assert float(run.state.work) >= stats["kinetic"] > 0.0
 
 
-def test_after_the_cut_the_resident_solver_goes_on() -> None:
-    """Powder of both sides does not hold the halves together."""
+def test_powder_of_both_sides_does_not_hold_the_halves_together() -> None:
     run = sliced(0.35, 0.03, materials.fruit.apple.override(alpha0=-0.02))
-    composed = []
     for frame in range(1, 8):
         assert run.advance_to(frame, None), run.failure
         _, pieces, stats = run.record(frame)
-        composed.append(run.stepper.counters.composed_steps)
     assert stats["damaged_fraction"] > 0.02 and pieces.count >= 2
     broken = run.state.ever
     assert bool((run.state.cut[broken] == 1).any() and (run.state.cut[broken] == 2).any())
-    # The blade is done at 0.02 + 0.35 / 4 s, within frame 3.
-    assert 0 < composed[2] == composed[-1] < run.stepper.counters.steps
+    assert run.stepper.counters.composed_steps == 0 < run.stepper.counters.steps
+
+
+@pytest.mark.parametrize("depth", [0.15, 0.35], ids=["halfway", "through"])
+def test_both_engines_cut_alike(depth: float) -> None:
+    """They differ by when they look: every step, or once per cell that the edge moves."""
+    runs = []
+    for resident in (True, False):
+        run = sliced(depth, 0.03, resident=resident)
+        right = run.matter.rest[:, 0] > 0
+        for frame in range(1, 5):
+            assert run.advance_to(frame, None), run.failure
+            _, pieces, stats = run.record(frame)
+        assert run.report()["verdict"] == "clean", run.report()["reason"]
+        assert run.ledger.worst < 1e-4
+        counters = run.stepper.counters
+        assert counters.composed_steps == (0 if resident else counters.steps)
+        p = run.state.particles
+        given = float((p.mass * p.velocity[:, 0])[right].sum())
+        runs.append((run.state, pieces, stats["kinetic"], given))
+    (fast, made, kinetic, pushed), (slow, expected, *others) = runs
+    assert made.count == expected.count == (1 if depth < 0.2 else 2)
+    torch.testing.assert_close(made.mass_fractions, expected.mass_fractions, rtol=0, atol=0.01)
+    assert float((fast.cut != slow.cut).double().mean()) < 0.01
+    assert (fast.position - slow.position).norm(dim=1).mean() < 0.2 * 0.04
+    if depth > 0.2:
+        assert [kinetic, pushed] == pytest.approx(others, rel=0.2)
+
+
+def test_what_begins_to_stand_is_cut_without_a_roll_back() -> None:
+    """Its weight begins to act, which raises its energy while it has hardly any."""
+    scene = Scene()
+    scene.add(ellipsoid((0.125, 0.105, 0.105)), "fruit.watermelon")
+    scene.blade([(0, 0, 0.23), (0, 0, 0.1)], width=0.4, edge=(0, 1, 0), speed=4.0, thickness=0.01)
+    run = Run(scene, build_matter(scene, 0.25 / 22), 25.0)
+    assert run.advance_to(1, None), run.failure
+    assert run.report()["rollbacks"] == 0 and bool((run.state.cut != 0).any())
+    assert float(run.state.work) > 0.0
