@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from gsfluent.errors import RunError
-from gsfluent.io.process import is_alive
+from gsfluent.process import is_alive
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PARTIAL = re.compile(r"^\..*\.(\d+)\.partial")
