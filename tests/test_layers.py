@@ -34,7 +34,7 @@ ORDER = (
     "pipeline/partition "
     "pipeline/render pipeline/cracks pipeline/simulate "
     "export stages inspection live viewer/model viewer/draw viewer/panels viewer plan choose run "
-    "sweep studio lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers "
+    "sweep dataset studio lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers "
     "lab/charts lab/stability lab cli __main__.py"
 ).split()
 # a scorer without torch: nothing of gsfluent but itself, and what asks it names it

@@ -30,7 +30,7 @@ import torch
 import gsfluent
 from gsfluent.errors import RunError
 from gsfluent.io import atomic_path
-from gsfluent.io.atomic import watching
+from gsfluent.io.atomic import link_or_copy, watching
 from gsfluent.results.digests import (
     RECORD,
     WRITTEN,
@@ -236,15 +236,8 @@ def _alone(shared: Path, key: str) -> Iterator[None]:
 
 
 def _link_tree(source: Path, target: Path) -> None:
-    """The files of a folder once more: hard links where possible; none is written in place."""
-
-    def link(old: str, new: str) -> None:
-        try:
-            os.link(old, new)
-        except OSError:
-            shutil.copyfile(old, new)
-
-    shutil.copytree(source, target, copy_function=link)
+    """The files of a folder once more."""
+    shutil.copytree(source, target, copy_function=link_or_copy)
 
 
 def _replace_tree(source: Path, target: Path) -> None:
@@ -353,7 +346,4 @@ def publish(result: StageResult, name: str, target: Path) -> None:
             "run the same command again; it does this stage anew",
         )
     with atomic_path(target) as part:
-        try:
-            os.link(source, part)
-        except OSError:
-            shutil.copyfile(source, part)
+        link_or_copy(source, part)
