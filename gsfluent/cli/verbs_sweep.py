@@ -38,6 +38,8 @@ class Sweep(Verb):
     """Of a shot: how many seeds, from 0 on."""
     jobs: int | None = None
     """Shots at a time; as many as there are cores for when absent."""
+    on: Literal["local", "slurm"] = "local"
+    """Where shots run: processes of this machine, or jobs of a SLURM cluster (extra `slurm`)."""
     keep: Literal["all", "film"] | None = None
     """What stays of a shot: all, or film and figures without the frames."""
     minutes: float | None = None
@@ -66,7 +68,7 @@ class Sweep(Verb):
         with self.reporter() as report:
             return run_sweep(
                 sweep, self.out, device=device, seed=self.seed, jobs=self.jobs, retry=self.retry,
-                reporter=report,
+                on=self.on, reporter=report,
             )  # fmt: skip
 
 

@@ -88,7 +88,7 @@ def map(
             Other errors are final, since they would come again.
         minutes: Longest time of a call.
         retry: Try again what has failed finally.
-        on: ``local``, ``slurm``, or ``ray=ADDRESS``.
+        on: ``local``, or ``slurm``: a job of the cluster for every call (extra ``slurm``).
         progress: Called with (done, total, note), about once a second.
 
     Returns:
@@ -269,8 +269,12 @@ def _engine(
     """What places the tasks.
 
     Raises:
-        InputError: No such engine.
+        InputError: No such engine, or not here.
     """
     if on == "local":
         return LocalPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
-    raise InputError(f"--on {on}: no such engine", "give local")
+    if on == "slurm":
+        from gsfluent.sweep.slurm import SlurmPool
+
+        return SlurmPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
+    raise InputError(f"--on {on}: no such engine", "give local or slurm")
