@@ -116,7 +116,7 @@ def map(
             work.through(engine)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(
-                f"{stop or 'interrupted by Ctrl-C'}\n  kept: {work.done} of {len(names)} in "
+                f"{str(stop) or 'interrupted by Ctrl-C'}\n  kept: {work.done} of {len(names)} in "
                 f"{place.shots}\n  resume: run the same command again"
             ) from stop
         finally:

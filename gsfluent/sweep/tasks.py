@@ -146,7 +146,7 @@ def tasks_of(
     folder = sweep.shot.resolve().parent
     common = Common(dict(values), folder, device, seed, out / "stages", sweep.keep)
     draws = draw(sweep.vary, sweep.sample, sweep.count, seed)
-    wanted = fingerprint("tasks", values, str(folder), draws, device, seed)
+    wanted = fingerprint("tasks", values, str(folder), draws, device, seed, sweep.keep)
     found = _known(out / FILE, wanted)
     if found is None:
         digests: dict[str, str] = {}
@@ -158,7 +158,8 @@ def tasks_of(
                 what = ", ".join(f"{name} {value}" for name, value in changes.items())
                 raise InputError(f"shot {index} ({what}): {error.what}", error.hint) from error
             own_seed = seed if own is None else own
-            found.append([index, own_seed, *_digests(shot, own_seed, seed, device, digests)])
+            where = [seed, device.partition(":")[0], sweep.keep]
+            found.append([index, own_seed, *_digests(shot, own_seed, where, digests)])
             report_progress(progress, index + 1, len(draws), "looked through")
         write_json(out / FILE, {"key": wanted, "inputs": digests, "tasks": found})
     tasks: dict[str, Task] = {}
@@ -184,7 +185,7 @@ def _known(path: Path, wanted: str) -> list[Any] | None:
 
 
 def _digests(
-    shot: Shot, seed: int, solids_seed: int, device: str, known: dict[str, str]
+    shot: Shot, seed: int, where: list[Any], known: dict[str, str]
 ) -> tuple[str, str, str]:
     """Names of a shot, of its object and of its solids; the content of files, not their paths."""
     source = _source(shot)
@@ -193,7 +194,7 @@ def _digests(
             known[str(path)] = content_digest(path)
     thing = fingerprint([known[str(path)] for path in source])[:_ID]
     values = _by_content(shot.resolved(), known)
-    where = [thing, solids_seed, device.partition(":")[0]]
+    where = [thing, *where]
     name = fingerprint("shot", values, seed, where)[:_ID]
     solids = {key: values.get(key) for key in _OF_SOLIDS}
     objects = {

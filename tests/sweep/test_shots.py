@@ -65,6 +65,10 @@ def test_shots_are_named_by_what_goes_in(place: Path) -> None:
     for name in ("shot.yaml", "ball.ply"):
         (moved / name).write_bytes((place / name).read_bytes())
     assert [task.id for task in tasks(moved, vary=vary)] == [task.id for task in first]
+    # one without its frames is another: what dropped them cannot give them back
+    assert {task.id for task in tasks(place, keep="film", vary=vary)}.isdisjoint(
+        t.id for t in first
+    )
     assert {task.id for task in tasks(place, seed=1, vary=vary)}.isdisjoint(t.id for t in first)
 
 
