@@ -34,7 +34,7 @@ class _Worker:
     pipe: Connection
     task: str = ""  # Its task; empty while it has none
     since: float = 0.0  # When it got it
-    ready: bool = False  # Whether it has said that it runs
+    ready: bool = False  # Whether it has said that it has begun with it
 
 
 class LocalPool:
@@ -74,7 +74,7 @@ class LocalPool:
     def start(self, name: str, item: Any) -> None:
         """Hand out a task; there is room for one."""
         worker = next((w for w in self._workers if not w.task), None) or self._spawn()
-        worker.task, worker.since = name, time.monotonic()
+        worker.task, worker.since, worker.ready = name, time.monotonic(), False
         with contextlib.suppress(OSError):  # it has just died, which `ended` will find
             worker.pipe.send((name, item))
 
@@ -94,7 +94,8 @@ class LocalPool:
             if state is not None:
                 found.append((worker.task, state))
                 worker.task = ""
-        self._workers = [w for w in self._workers if w.process.is_alive()]
+        # one that has just died with its task is looked at again, and not forgotten
+        self._workers = [w for w in self._workers if w.task or w.process.is_alive()]
         return found
 
     def close(self) -> None:
