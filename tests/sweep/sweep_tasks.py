@@ -38,6 +38,11 @@ def dies_once(item: Path, folder: Path) -> str:
     return (folder / "half.txt").read_text()
 
 
+def touches_and_waits(item: Path, folder: Path) -> None:
+    item.touch()
+    time.sleep(600)
+
+
 def never_ends(item: int, folder: Path) -> None:
     print("waiting", flush=True)
     time.sleep(600)

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sweep_tasks
@@ -18,10 +19,11 @@ from sweep_tasks import dies_once, names, never_ends, odd_ones_fail, slow_square
 
 from gsfluent.errors import InputError
 from gsfluent.sweep import claims
-from gsfluent.sweep.attempt import DONE, HELD, attempt
+from gsfluent.sweep.attempt import DONE, FAILED, HELD, attempt
 from gsfluent.sweep.claims import SILENCE, claimed
 from gsfluent.sweep.engine import map
 from gsfluent.sweep.folder import SweepFolder, myself, write_words
+from gsfluent.sweep.pool import LocalPool
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -126,6 +128,27 @@ def test_a_failing_task_harms_no_other_and_is_listed(tmp_path: Path) -> None:
 def test_a_killed_task_is_tried_again_and_goes_on(tmp_path: Path) -> None:
     (found,) = map(dies_once, [tmp_path / "killed"], tmp_path / "out", ids=["one"], jobs=1)
     assert (found.value, found.tries) == ("half", 2)  # from what the first try had left
+
+
+def test_a_process_that_dies_while_the_pool_looks_is_not_forgotten(tmp_path: Path) -> None:
+    place, begun = SweepFolder(tmp_path), tmp_path / "begun"
+    place.make()
+    pool = LocalPool(tmp_path, sweep_tasks.touches_and_waits, jobs=1, minutes=None)
+    pool.start("one", begun)
+    while not begun.exists():
+        assert pool.ended(0.02) == []
+    state = pool._state
+
+    def looked(worker: Any) -> str | None:
+        found = state(worker)
+        worker.process.kill()  # after it was found alive
+        worker.process.join()
+        return found
+
+    pool._state = looked  # type: ignore[method-assign]
+    assert pool.ended(0.0) == []
+    assert pool.ended(0.0) == [("one", FAILED)]
+    pool.close()
 
 
 def test_a_task_that_is_killed_each_time_is_given_up(tmp_path: Path) -> None:
