@@ -6,6 +6,7 @@ of :meth:`gsfluent.sweep.folder.SweepFolder.finish` still lets only one of them 
 
 from __future__ import annotations
 
+import fcntl
 import os
 import secrets
 import threading
@@ -66,29 +67,36 @@ def _take(path: Path, mine: dict[str, Any]) -> bool:
     part = path.with_name(f".{path.name}.{mine['token']}")
     write_words(part, mine)
     try:
-        for _ in range(3):
-            try:
-                os.link(part, path)  # fails where there is one, on network file systems too
-                return True
-            except FileExistsError:
-                seen = read_words(path)
-                if not is_stale(path, part.stat().st_mtime):
-                    return False
-                _set_aside(path, seen)
-        return False
+        if _linked(part, path):
+            return True
+        with _alone(path.parent):
+            if not is_stale(path, part.stat().st_mtime):
+                return False
+            path.unlink(missing_ok=True)
+            return _linked(part, path)
     finally:
         part.unlink(missing_ok=True)
 
 
-def _set_aside(path: Path, seen: dict[str, Any] | None) -> None:
-    """Remove a stale claim, and none that another has made in its place meanwhile."""
-    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    with suppress(FileNotFoundError):
-        path.rename(aside)
-        if read_words(aside) != seen:
-            with suppress(FileExistsError):
-                os.link(aside, path)
-        aside.unlink()
+def _linked(part: Path, path: Path) -> bool:
+    """Whether a claim could be made: a link fails where there is one, on network systems too."""
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        return False
+    return True
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Let one process at a time retake claims, where the file system has locks."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def _beat(path: Path, over: threading.Event) -> None:
