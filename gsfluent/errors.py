@@ -14,6 +14,7 @@ EXTRAS = {
     "usd": ("usd-core",),
     "inpaint": ("transformers", "accelerate"),
     "figures": ("matplotlib",),
+    "slurm": ("submitit",),
 }
 """Packages that gsfluent does without until they are asked for: extra -> names on the index."""
 

@@ -24,6 +24,7 @@ from gsfluent.pipeline.solid.mesh import closed_mesh
 from gsfluent.pipeline.texture.inpaint.diffusers import DiffusersInpainter, InpaintOptions
 from gsfluent.posing.colmap import find_poses
 from gsfluent.run.report import report_page
+from gsfluent.sweep.slurm import SlurmPool
 from gsfluent.viewer.guard import Guard
 from gsfluent.viewer.server import start_server
 
@@ -64,6 +65,10 @@ def inpaint_from_memory(tmp_path: Path) -> None:
     DiffusersInpainter(tmp_path, InpaintOptions(memory="balanced"))
 
 
+def cluster(tmp_path: Path) -> None:
+    SlurmPool(tmp_path, open, jobs=1, minutes=None, threads=1)
+
+
 @pytest.mark.parametrize(
     ("act", "module", "extra"),
     [
@@ -71,6 +76,7 @@ def inpaint_from_memory(tmp_path: Path) -> None:
         (surface, "skimage", "mesh"),
         (page, "viser", "viewer"),
         (stage, "pxr", "usd"),
+        (cluster, "submitit", "slurm"),
         (prompt, "transformers", "inpaint"),
         (inpaint, "transformers", "inpaint"),
         (inpaint, "diffusers", "inpaint"),
@@ -147,7 +153,8 @@ def test_every_module_loads_without_the_extras() -> None:
     code = """
 import importlib, pkgutil, sys
 sys.modules |= dict.fromkeys(
-    ["pycolmap", "skimage", "viser", "pxr", "transformers", "accelerate", "matplotlib"])
+    ["pycolmap", "skimage", "viser", "pxr", "transformers", "accelerate", "matplotlib",
+     "submitit"])
 import gsfluent
 names = [m.name for m in pkgutil.walk_packages(gsfluent.__path__, "gsfluent.")]
 for name in names:

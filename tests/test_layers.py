@@ -23,7 +23,8 @@ CORE = [p for p in CSRC if ROOT / "csrc" / "core" in p.parents]
 # stands for what is in it and below it, as far as that has no line of its own.
 ORDER = (
     "_lazy.py __init__.py lazy.py errors.py geometry.py colors.py progress.py hardware.py "
-    "_load.py _check.py data materials ops metrics.py draw.py io/checked spatial demo io posing "
+    "process.py _load.py _check.py data materials ops metrics.py draw.py io/checked spatial "
+    "demo io posing "
     "scene figure config/yaml_file.py config config/physgaussian results "
     "pipeline/__init__.py pipeline/stage.py pipeline/capture pipeline/matter pipeline/liquid "
     "pipeline/colliders "
@@ -33,8 +34,8 @@ ORDER = (
     "pipeline/partition "
     "pipeline/render pipeline/cracks pipeline/simulate "
     "export stages inspection live viewer/model viewer/draw viewer/panels viewer plan choose run "
-    "studio lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers lab/charts "
-    "lab/stability lab cli __main__.py"
+    "sweep dataset studio lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers "
+    "lab/charts lab/stability lab cli __main__.py"
 ).split()
 # a scorer without torch: nothing of gsfluent but itself, and what asks it names it
 ALONE = "fracturebench"

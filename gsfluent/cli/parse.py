@@ -13,9 +13,9 @@ from gsfluent.cli.common import Verb
 from gsfluent.cli.verbs_export import Export
 from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
-from gsfluent.cli.verbs_poses import Poses
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
-from gsfluent.cli.verbs_stage import Fill, Mesh, Reconstruct, Texture
+from gsfluent.cli.verbs_stage import Fill, Mesh, Poses, Reconstruct, Texture
+from gsfluent.cli.verbs_sweep import Dataset, Sweep
 from gsfluent.cli.verbs_view import Studio, View
 
 VERBS: dict[str, type[Verb]] = {
@@ -29,6 +29,8 @@ VERBS: dict[str, type[Verb]] = {
     "mesh": Mesh,
     "plan": Plan,
     "run": Run,
+    "sweep": Sweep,
+    "dataset": Dataset,
     "render": Render,
     "report": Report,
     "view": View,

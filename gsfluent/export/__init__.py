@@ -4,5 +4,6 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    frames="NOBODY FrameSequence Moment",
     write="ExportOptions export write_exports",
 )

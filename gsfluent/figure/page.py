@@ -29,6 +29,8 @@ figure { margin: 1rem 0; } figcaption { font-size: .9rem; opacity: .8; }
 figure img, figure video { max-width: 100%; height: auto; }
 figure .paper { background: #ffffff; display: inline-block; max-width: 100%; }
 figure svg { max-width: 100%; height: auto; }
+.sheet { display: grid; gap: .6rem; grid-template-columns: repeat(auto-fill, minmax(11rem, 1fr)); }
+.sheet figure { margin: 0; }
 code { background: var(--soft); padding: .05rem .3rem; }
 """
 _KINDS = ("", "good", "bad", "warn")
@@ -128,6 +130,21 @@ class Page:
         data = base64.b64encode(path.read_bytes()).decode()
         kind, words = kinds[path.suffix.lower()], html.escape(caption or path.stem)
         return self._figure(f'<img alt="{words}" src="data:image/{kind};base64,{data}">', caption)
+
+    def sheet(self, pictures: Iterable[tuple[str, str, str]]) -> Page:
+        """Add small pictures side by side that lie beside the page.
+
+        Args:
+            pictures: Name of each, of what it leads to, and its caption.
+        """
+        cells = (
+            f'<figure><a href="{html.escape(target, quote=True)}"><img loading="lazy" alt="" '
+            f'src="{html.escape(name, quote=True)}"></a>'
+            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+            for name, target, caption in pictures
+        )
+        self._parts.append(f'<div class="sheet">{"".join(cells)}</div>')
+        return self
 
     def video(self, name: str, caption: str = "") -> Page:
         """Add a video that lies beside the page under this name."""

@@ -21,7 +21,7 @@ from typing import Any
 
 from gsfluent.errors import RunError
 from gsfluent.io.atomic import remove_partials
-from gsfluent.io.process import is_alive
+from gsfluent.process import boot, is_alive
 
 _log = logging.getLogger(__name__)
 LOCK = "run.lock"
@@ -88,10 +88,10 @@ def _take(handle: int, path: Path, *, sure: bool, unlock: bool) -> None:
     Raises:
         RunError: The last holder may be alive.
     """
-    words, host, boot = _words(handle), socket.gethostname(), _boot()
+    words, host, kernel = _words(handle), socket.gethostname(), boot()
     if words:
         # a container has a host name of its own, and the kernel of its host
-        if host != words.get("host") and (not boot or boot != words.get("boot")):
+        if host != words.get("host") and (not kernel or kernel != words.get("boot")):
             if not unlock:
                 hint = f"if that run has ended, say --unlock, or remove {path}"
                 raise _held(path, words, hint)
@@ -100,18 +100,16 @@ def _take(handle: int, path: Path, *, sure: bool, unlock: bool) -> None:
         _log.warning("%s: taken over from %s, which has ended without a word", path, _who(words))
     now = time.time()
     started = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(now))
-    mine = {"process": os.getpid(), "host": host, "started": started, "seconds": now, "boot": boot}
+    mine = {
+        "process": os.getpid(),
+        "host": host,
+        "started": started,
+        "seconds": now,
+        "boot": kernel,
+    }
     os.ftruncate(handle, 0)
     os.pwrite(handle, (json.dumps(mine) + "\n").encode(), 0)
     os.fsync(handle)
-
-
-def _boot() -> str:
-    """A name of the running kernel; empty where there is none."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
 
 
 def _lives(words: dict[str, Any]) -> bool:

@@ -10,6 +10,7 @@ their digests; a stage of which one differs is done anew, and the run says so.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import logging
@@ -29,7 +30,7 @@ import torch
 import gsfluent
 from gsfluent.errors import RunError
 from gsfluent.io import atomic_path
-from gsfluent.io.atomic import watching
+from gsfluent.io.atomic import link_or_copy, watching
 from gsfluent.results.digests import (
     RECORD,
     WRITTEN,
@@ -119,11 +120,20 @@ class StageResult:
 
 
 class StageStore:
-    """Runs stages or finds them finished."""
+    """Runs stages or finds them finished.
 
-    def __init__(self, root: Path, *, force: bool = False) -> None:
+    Args:
+        root: Where their folders lie.
+        force: Do finished stages anew.
+        shared: Folder of finished stages by fingerprint, for many stores: what lies there is
+            linked and not done, what is done is left there, and of several stores at work on
+            the same stage one does it. None for no such folder; may be changed between stages.
+    """
+
+    def __init__(self, root: Path, *, force: bool = False, shared: Path | None = None) -> None:
         self.root = root
         self.force = force
+        self.shared = shared
         self.results: list[StageResult] = []
 
     def run(
@@ -142,6 +152,22 @@ class StageStore:
                 an earlier try with the same fingerprint left, which is as that try wrote it.
             scratch: Files that only an unfinished stage needs; they are removed in the end.
         """
+        if self.shared is None:
+            return self._run(name, key, work, scratch)
+        with _alone(self.shared, key):
+            common = self.shared / key
+            if common.is_dir() and not (self.root / name).exists():
+                _link_tree(common, self.root / name)
+            result = self._run(name, key, work, scratch)
+            inside = not any(file.startswith("../") for file in result.files)
+            if result.files and inside and not (result.resumed and common.is_dir()):
+                _replace_tree(self.root / name, common)
+        return result
+
+    def _run(
+        self, name: str, key: str, work: Callable[[Path], dict[str, Any]], scratch: Sequence[str]
+    ) -> StageResult:
+        """:meth:`run` of a stage that nobody else wants."""
         folder = self.root / name
         journal = Journal(folder, self.root.parent)
         before, wrong = read_record(folder / RECORD) if _holds_results(folder) else ({}, "")
@@ -194,6 +220,36 @@ class StageStore:
         if complete:
             _clear(folder, journal, scratch)
         return result
+
+
+@contextmanager
+def _alone(shared: Path, key: str) -> Iterator[None]:
+    """Keep a shared stage to this process; where a file system has no locks, two may do it."""
+    shared.mkdir(parents=True, exist_ok=True)
+    handle = os.open(shared / f"{key}.lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _link_tree(source: Path, target: Path) -> None:
+    """The files of a folder once more."""
+    shutil.copytree(source, target, copy_function=link_or_copy)
+
+
+def _replace_tree(source: Path, target: Path) -> None:
+    """Put the files of a folder where others look for them, all at once."""
+    part = target.with_name(f".{target.name}.{os.getpid()}")
+    shutil.rmtree(part, ignore_errors=True)
+    _link_tree(source, part)
+    shutil.rmtree(target, ignore_errors=True)  # what was damaged
+    try:
+        part.rename(target)
+    except OSError:  # another was quicker where there are no locks
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _holds_results(folder: Path) -> bool:
@@ -290,7 +346,4 @@ def publish(result: StageResult, name: str, target: Path) -> None:
             "run the same command again; it does this stage anew",
         )
     with atomic_path(target) as part:
-        try:
-            os.link(source, part)
-        except OSError:
-            shutil.copyfile(source, part)
+        link_or_copy(source, part)

@@ -47,6 +47,8 @@ def run_shot(
     facts: Mapping[str, Any] | None = None,
     plan: bool = True,
     unlock: bool = False,
+    shared: Path | None = None,
+    solids_seed: int | None = None,
 ) -> dict[str, Any]:
     """Run a shot into a folder.
 
@@ -62,6 +64,10 @@ def run_shot(
         facts: What is known before and belongs into ``run.json``.
         plan: Plan the run first, and put plan and fact beside each other into ``run.json``.
         unlock: Take the folder although a run on another machine has not given it back.
+        shared: Folder of solids that many runs share, see
+            :class:`gsfluent.results.store.StageStore`.
+        solids_seed: Seed of the solids, so that runs with other seeds share them; ``seed`` when
+            absent.
 
     Returns:
         The content of ``run.json``.
@@ -75,7 +81,7 @@ def run_shot(
     with locked(out, unlock=unlock):
         return run_in(
             shot, out, device=device, seed=seed, force=force, reporter=reporter, before=before,
-            after=after, facts=facts, plan=plan,
+            after=after, facts=facts, plan=plan, shared=shared, solids_seed=solids_seed,
         )  # fmt: skip
 
 
@@ -91,21 +97,25 @@ def run_in(
     after: AfterRun | None = None,
     facts: Mapping[str, Any] | None = None,
     plan: bool = True,
+    shared: Path | None = None,
+    solids_seed: int | None = None,
 ) -> dict[str, Any]:
     """:func:`run_shot` in a folder that is locked already."""
     device = torch.device(device)
-    store = StageStore(out / "stages", force=force)
+    store = StageStore(out / "stages", force=force, shared=shared)
     if before is not None:
         store.results.append(before)
     record = RunRecord(out / "run.json", shot.resolved(), device, seed)
     record.values.update(facts or {})
-    context = RunContext(shot, out, device, seed, store, record, reporter or LineReporter())
+    first = seed if solids_seed is None else solids_seed
+    context = RunContext(shot, out, device, first, store, record, reporter or LineReporter())
     start = time.perf_counter()
 
     foreseen = None
 
     def settle(context: RunContext) -> None:
         nonlocal foreseen
+        context.seed, store.shared = seed, None
         if choose_stage(context):  # the plan was made with other cells
             foreseen = foresee_run(context, plan=plan)
 

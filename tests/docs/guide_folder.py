@@ -131,3 +131,10 @@ def write_inputs(folder: Path) -> None:
     write_model(folder / "model")
     (folder / "phys.json").write_text(json.dumps(PHYSGAUSSIAN))
     (folder / "shot.yaml").write_text(yaml.safe_dump(SHOT, sort_keys=False))
+    fruit = {key: SHOT[key] for key in ("fill", "texture", "solve")}
+    fruit |= {"splats": "melon.ply", "size": 0.25, "events": [{"type": "drop", "height": 0.02}]}
+    fruit["output"] = {"fps": 20, "seconds": 0.1, "size": [64, 48]}
+    (folder / "fruit.yaml").write_text(yaml.safe_dump(fruit))
+    (folder / "fruits.yaml").write_text(
+        yaml.safe_dump({"shot": "fruit.yaml", "vary": {"seed": [3]}})
+    )

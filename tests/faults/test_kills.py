@@ -20,7 +20,7 @@ from fault_shot import results, run
 from gsfluent.config import load_shot
 from gsfluent.errors import InputError, RunError
 from gsfluent.io.atomic import atomic_path, write_json, write_tensors
-from gsfluent.io.process import is_alive
+from gsfluent.process import is_alive
 from gsfluent.results.digests import file_digest
 from gsfluent.results.lock import LOCK, locked
 from gsfluent.results.store import StageStore

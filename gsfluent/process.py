@@ -1,4 +1,4 @@
-"""Which processes of this machine are alive, and since when."""
+"""Which processes of this machine are alive, and since when; a name for the running kernel."""
 
 from __future__ import annotations
 
@@ -36,3 +36,11 @@ def _begun(pid: int) -> float | None:
         return int(boot) + int(after[19]) / os.sysconf("SC_CLK_TCK")
     except (OSError, ValueError, IndexError):
         return None
+
+
+def boot() -> str:
+    """A name of the running kernel; empty where there is none."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return ""

@@ -1,0 +1,129 @@
+"""Verbs of many shots: sweep, dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from gsfluent.cli.common import Out, Verb, existing
+from gsfluent.errors import InputError
+
+
+@dataclass(kw_only=True)
+class Sweep(Verb):
+    """Run many shots that differ in a few keys: every one once, stopped and resumed at will.
+
+    Examples:
+      gsfluent sweep sweep.yaml -o drops               # what the file says; again: goes on
+      gsfluent sweep sweep.yaml -o drops --plan        # how many shots, how long
+      gsfluent sweep shot.yaml -o drops --vary events.drop.height=0.5,1,2 --seeds 10
+      gsfluent sweep shot.yaml -o drops --vary solve.cells=40,60 gravity.2=-9.81,-1.62
+      gsfluent sweep sweep.yaml -o drops --retry       # what has failed, once more
+
+    Solids are made once and shared. A shot that fails stops no other. Several machines may work in
+    the same folder. Leaves table.csv, sheet.html, failures.jsonl and shots/ID, each a folder as
+    `gsfluent run` makes it; --seed is that of the solids. docs/guide/sweep.md has the file's keys.
+    """
+
+    sweep: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SWEEP.yaml")]
+    """The sweep file; or a shot file, with --vary or --seeds."""
+    out: Out
+    """Folder for the results; made when missing."""
+    vary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=A,B,C")] = ()
+    """Of a shot: keys by their path and the values they take; all combinations are run."""
+    seeds: int | None = None
+    """Of a shot: how many seeds, from 0 on."""
+    jobs: int | None = None
+    """Shots at a time; as many as there are cores for when absent."""
+    on: Literal["local", "slurm"] = "local"
+    """Where shots run: processes of this machine, or jobs of a SLURM cluster (extra `slurm`)."""
+    keep: Literal["all", "film"] | None = None
+    """What stays of a shot: all, or film and figures without the frames."""
+    minutes: float | None = None
+    """Longest time of a shot."""
+    retry: bool = False
+    """Try again what has failed."""
+    plan: bool = False
+    """Only say how many shots, how long, how much memory."""
+
+    def execute(self) -> dict[str, Any]:
+        """Run what is left of the sweep."""
+        from gsfluent.sweep.shots import plan_sweep, run_sweep
+        from gsfluent.sweep.tasks import read_sweep
+
+        if self.seeds is not None and self.seeds < 1:
+            raise InputError(f"--seeds {self.seeds}", "give at least 1")
+        path = existing(self.sweep, "SWEEP.yaml", folder=False)
+        sweep = read_sweep(path, _axes(self.vary), self.seeds)
+        if self.keep is not None:
+            sweep = replace(sweep, keep=self.keep)
+        if self.minutes is not None:
+            sweep = replace(sweep, each=replace(sweep.each, minutes=self.minutes))
+        device = self.torch_device()
+        if self.plan:
+            return plan_sweep(sweep, self.out, device=device, seed=self.seed, jobs=self.jobs)
+        with self.reporter() as report:
+            return run_sweep(
+                sweep, self.out, device=device, seed=self.seed, jobs=self.jobs, retry=self.retry,
+                on=self.on, reporter=report,
+            )  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class Dataset(Verb):
+    """Turn a sweep into training data: films, depth, flow, labels, events and figures.
+
+    Examples:
+      gsfluent dataset drops -o data                              # WebDataset, tars of 1 GB
+      gsfluent dataset drops -o data --format webdataset huggingface
+      gsfluent dataset drops -o data --shares 0.6 0.2 0.2         # of the objects
+
+    No object is in two splits. The same command goes on where it was stopped, and adds shots that
+    have come since. docs/guide/sweep.md reads the result with PyTorch alone.
+    """
+
+    sweep: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SWEEP")]
+    """Folder that `gsfluent sweep` wrote."""
+    out: Out
+    """Folder of the data set; made when missing."""
+    format: tuple[Literal["webdataset", "huggingface"], ...] = ("webdataset",)
+    """What is written, each into a folder of its name."""
+    shares: tuple[float, float, float] = (0.8, 0.1, 0.1)
+    """Shares of the objects that train, validation and test get."""
+    jobs: int | None = None
+    """Samples at a time; as many as there are cores when absent."""
+
+    def execute(self) -> dict[str, Any]:
+        """Make the samples and pack them."""
+        from gsfluent.dataset.write import write_dataset
+
+        existing(self.sweep, "SWEEP", folder=True)
+        with self.progress("samples") as progress:
+            return write_dataset(
+                self.sweep, self.out, self.format, device=self.torch_device(), shares=self.shares,
+                jobs=self.jobs, progress=progress,
+            )  # fmt: skip
+
+
+def _axes(words: tuple[str, ...]) -> dict[str, list[Any]]:
+    """Values by key of ``KEY=A,B,C``; each is read as in a shot file.
+
+    Raises:
+        InputError: Not of that form, or a key twice.
+    """
+    import yaml
+
+    axes: dict[str, list[Any]] = {}
+    for word in words:
+        name, equals, values = word.partition("=")
+        try:
+            items = yaml.safe_load(f"[{values}]")
+        except yaml.YAMLError:
+            items = None
+        if not equals or not name or not items or name in axes:
+            raise InputError(f"--vary {word}", "give KEY=A,B,C, each key once")
+        axes[name] = items
+    return axes

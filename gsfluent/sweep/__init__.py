@@ -1,0 +1,11 @@
+"""Many tasks, each once; shots that differ, their table and their contact sheet."""
+
+from gsfluent._lazy import room
+
+__getattr__, __dir__, __all__ = room(
+    __name__,
+    engine="Outcome map",
+    folder="SweepFolder",
+    shots="plan_sweep run_sweep",
+    tasks="read_sweep",
+)

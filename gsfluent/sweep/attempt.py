@@ -1,0 +1,107 @@
+"""One try at a task, in whatever process: claimed, done apart, published by one rename."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gsfluent.errors import GsfluentError
+from gsfluent.sweep.claims import claimed
+from gsfluent.sweep.folder import LOG, SweepFolder, last_lines
+
+DONE, HELD, FAILED = "done", "held", "failed"
+"""How a try ends: the task is done, another is at work on it, or it went wrong and is noted."""
+
+Function = Callable[[Any, Path], Any]
+"""``function(item, folder)``: files go into the folder, what it returns is JSON."""
+
+_PASSING = (errno.EAGAIN, errno.EIO, errno.ENOMEM, errno.ESTALE, errno.ETIMEDOUT)
+
+
+def attempt(root: Path, name: str, function: Function, item: Any) -> str:
+    """Try a task, unless it is done or somebody else's.
+
+    Args:
+        root: Folder of the sweep.
+        name: Of the task.
+        function: What it does.
+        item: Given to it.
+
+    Returns:
+        ``DONE``, ``HELD`` or ``FAILED``.
+
+    Raises:
+        OSError: Not even the failure could be written down.
+    """
+    place = SweepFolder(root)
+    with claimed(place.claim(name)) as ours:
+        # after the claim: whoever held it before may have finished
+        if place.is_done(name):
+            return DONE
+        if not ours:
+            return HELD
+        start, tries = time.time(), len(place.failures(name).get(name, ()))
+        folder = place.begin(name)
+        try:
+            with _spoken_into(folder / LOG):
+                value = function(item, folder)
+            row = {"id": name, "value": value, "tries": tries + 1, "host": socket.gethostname()}
+            place.finish(name, folder, row | {"seconds": time.time() - start})
+            return DONE
+        except Exception as error:
+            place.fail(name, _record(error, folder))
+            shutil.rmtree(folder, ignore_errors=True)
+            return FAILED
+
+
+def is_passing(error: BaseException) -> bool:
+    """Whether an error is of the moment: another try may find more memory or a better network."""
+    if isinstance(error, OSError) and error.errno in _PASSING:
+        return True
+    if error.__cause__ is not None and is_passing(error.__cause__):
+        return True
+    memory = type(error).__name__ == "OutOfMemoryError"  # torch's, which costs its import to name
+    return memory or isinstance(error, MemoryError | ConnectionError | TimeoutError)
+
+
+def _record(error: Exception, folder: Path) -> dict[str, Any]:
+    said = last_lines(folder)
+    if not isinstance(error, GsfluentError):  # whose words say all that a user can mend
+        said += traceback.format_exception(error)[-1 - _FRAMES :]
+    return {
+        "kind": type(error).__name__,
+        "message": str(error),
+        "again": is_passing(error),
+        "log": [line.rstrip() for line in said],
+    }
+
+
+_FRAMES = 6
+
+
+@contextmanager
+def _spoken_into(path: Path) -> Iterator[None]:
+    """Send all that this process says to a file, what compiled code says before it dies too."""
+    kept = os.dup(1), os.dup(2)
+    with path.open("ab") as stream:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os.dup2(stream.fileno(), 1)
+        os.dup2(stream.fileno(), 2)
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            for handle, number in zip(kept, (1, 2), strict=True):
+                os.dup2(handle, number)
+                os.close(handle)

@@ -1,0 +1,61 @@
+"""Functions that tests hand to processes of a sweep; they import no torch, so they start fast."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from gsfluent.sweep.engine import map
+
+
+def square(item: int, folder: Path) -> int:
+    (folder / "number.txt").write_text(str(item * item))
+    return item * item
+
+
+def slow_square(item: int, folder: Path) -> int:
+    time.sleep(0.05)
+    return square(item, folder)
+
+
+def odd_ones_fail(item: int, folder: Path) -> int:
+    print("looked at", item, flush=True)
+    if item % 2:
+        raise ValueError(f"{item} is odd")
+    return item
+
+
+def dies_once(item: Path, folder: Path) -> str:
+    """Kill this process, unless that has been done before; the folder shows what a kill leaves."""
+    print("about to", flush=True)
+    if not item.exists():
+        item.touch()
+        (folder / "half.txt").write_text("half")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return (folder / "half.txt").read_text()
+
+
+def touches_and_waits(item: Path, folder: Path) -> None:
+    item.touch()
+    time.sleep(600)
+
+
+def never_ends(item: int, folder: Path) -> None:
+    print("waiting", flush=True)
+    time.sleep(600)
+
+
+def names(count: int) -> list[str]:
+    return [f"n{i}" for i in range(count)]
+
+
+def drive(folder: str, count: int) -> None:
+    """A driver of its own, to be killed."""
+    map(slow_square, range(count), folder, ids=names(count), jobs=2, tries=99)
+
+
+if __name__ == "__main__":
+    drive(sys.argv[1], int(sys.argv[2]))
