@@ -75,7 +75,6 @@ class SolverState:
             return asked.to(self.device)
         if rests or not bool(torch.isfinite(velocity).all()):  # what is refused later
             return none
-        # on the CPU sums have an order
         m, v = mass.double().cpu(), velocity.double().cpu()
         index = torch.zeros_like(m, dtype=torch.int64) if body is None else body.long().cpu()
         if int(index.min()) < 0:
@@ -84,7 +83,12 @@ class SolverState:
         momentum = torch.stack([torch.bincount(index, m * v[:, i]) for i in range(3)], dim=1)
         # by mass once more: a bullet does not move the grid through what it hits
         mean = (whole @ momentum) / (whole @ whole)
-        return mean.to(self.device) if mean.norm() > REST * v.norm(dim=1).max() else none
+        fastest = float(v.norm(dim=1).max())
+        if not float(mean.norm()) > REST * fastest:
+            return none
+        # without the digits that hang on the order of the points
+        unit = math.ldexp(1.0, math.frexp(fastest)[1] - 24)
+        return (unit * torch.round(mean / unit)).to(self.device)
 
     def _rows(
         self, material: Tensor | None, mass: Tensor, volume: Tensor

@@ -63,6 +63,21 @@ def test_what_broke_is_drawn_and_told_where_the_run_has_kept_it(tmp_path: Path) 
         assert words in drawn
 
 
+def test_what_grips_took_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    values = record()
+    values["simulation"]["per_frame"]["grips"] = [
+        {"jaw": {"force": [0.0, 0.0, f], "moment": [3.0 * f, 4.0 * f, 0.0]}}
+        for f in (0.0, 7.0, 2.0)
+    ]
+    values["simulation"]["grips"] = [
+        {"name": "jaw", "force": 7.0, "force_at": 0.1, "moment": 35.0, "moment_at": 0.1}
+    ]
+    text = report_page(tmp_path, values).render()
+    for words in ("Grips", "Force of each grip", "jaw", ">7<", ">35<"):
+        assert words in text
+
+
 @pytest.mark.parametrize(("verdict", "kind"), [("healed", "warn"), ("failed", "bad")])
 def test_what_went_wrong_is_coloured(verdict: str, kind: str, tmp_path: Path) -> None:
     text = report_page(tmp_path, record(verdict=verdict, simulation=None)).render()
