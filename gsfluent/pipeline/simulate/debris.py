@@ -184,33 +184,35 @@ class RigidChips:
     ) -> None:  # fmt: skip
         self.index, self._mass = index, mass.double()
         weight = self._mass[:, None]
-        count = int(index.max()) + 1
-        self.mass = self._sum(self._mass, count)
-        self.center = self._sum(weight * position, count) / self.mass[:, None]
-        self.speed = self._sum(weight * velocity.double(), count) / self.mass[:, None]
+        sizes = torch.bincount(index)
+        number = torch.arange(int(sizes.max()), device=index.device)
+        self._there = number < sizes[:, None]
+        place = (torch.cumsum(sizes, 0) - sizes)[:, None] + number
+        self._slots = torch.argsort(index, stable=True)[place.clamp(max=len(index) - 1)]
+        self.mass = self._sum(self._mass)
+        self.center = self._sum(weight * position) / self.mass[:, None]
+        self.speed = self._sum(weight * velocity.double()) / self.mass[:, None]
         self.arm = position - self.center[index]
         c = affine.double()
         curl = torch.stack(
             [c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], dim=1
         )
         turning = torch.linalg.cross(self.arm, velocity.double() - self.speed[index])
-        self.momentum = self._sum(weight * (turning + 0.25 * dx * dx * curl), count)
+        self.momentum = self._sum(weight * (turning + 0.25 * dx * dx * curl))
         square = self.arm[:, :, None] * self.arm[:, None]
-        square = self._sum(weight[..., None] * square, count)
+        square = self._sum(weight[..., None] * square)
         eye = torch.eye(3, dtype=torch.float64, device=index.device)
         trace = square.diagonal(dim1=1, dim2=2).sum(dim=1)
         trace = trace + 0.5 * dx * dx * self.mass
         self.inertia = trace[:, None, None] * eye - square
 
-    def _sum(self, values: Tensor, count: int) -> Tensor:
+    def _sum(self, values: Tensor) -> Tensor:
         """Sums over the points of each chip, one point of each at a time: in a fixed order."""
-        total = values.new_zeros(count, *values.shape[1:])
-        order = torch.argsort(self.index, stable=True)
-        sizes = torch.bincount(self.index, minlength=count)
-        first = torch.cumsum(sizes, 0) - sizes
-        for k in range(int(sizes.max())):
-            there = (sizes > k).nonzero()[:, 0]
-            total[there] = total[there] + values[order[first[there] + k]]
+        there = self._there.view(*self._there.shape, *[1] * (values.dim() - 1))
+        held = torch.where(there, values[self._slots], 0.0)
+        total = torch.zeros_like(held[:, 0])
+        for one in held.unbind(dim=1):
+            total = total + one
         return total
 
     def turned(self, rotation: Tensor | None) -> Tensor:
