@@ -243,7 +243,7 @@ def test_a_ball_on_the_floor_from_end_to_end(tmp_path: Path) -> None:
     result = choose(scene, shot, 0.2, probing=probing)
     assert result == choose(scene, shot, 0.2, probing=probing) | {
         "settings": result["settings"], "probe": result["probe"], "chosen": result["chosen"],
-        "enough": result["enough"],
+        "enough": result["enough"], "seconds_from": result["seconds_from"],
     }  # the same but for the times  # fmt: skip
     assert result["met"] and result["chosen"]["high"] <= 0.25
     # an elastic ball breaks nothing: the floor is not chance

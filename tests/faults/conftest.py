@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fault_shot import run, stop, write_shot
+from fault_shot import no_report, run, stop, write_shot
 
 
-@pytest.fixture(autouse=True, scope="package")
-def _no_page() -> Iterator[None]:
+@pytest.fixture(autouse=True)
+def _no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page of a run, which takes longer than these runs, is not what is tested here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsfluent.run.shot.write_report", lambda out, values: None)
-        yield
+    monkeypatch.setattr("gsfluent.run.shot.write_report", no_report)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shot."""
     return write_shot(tmp_path_factory.mktemp("shot"))
 
 
-@pytest.fixture(scope="package")
-def finished(shot: Path, _no_page: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def finished(shot: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its undisturbed run."""
     out = tmp_path_factory.mktemp("finished") / "out"
     assert run(shot, out)["verdict"] == "clean"
     return out
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def stopped(shot: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was stopped with two of its frames on disk."""
     out = tmp_path_factory.mktemp("stopped") / "out"

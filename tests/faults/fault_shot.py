@@ -53,9 +53,14 @@ def write_shot(folder: Path, **changes: Any) -> Path:
     return path
 
 
+def no_report(out: Path, values: dict[str, Any]) -> None:
+    """Of a run whose page nobody reads."""
+
+
 def run(path: Path, out: Path) -> dict[str, Any]:
-    """Run a shot without a plan."""
-    return run_shot(load_shot(path), out, plan=False)
+    """Run a shot without a plan and a page."""
+    with mock.patch("gsfluent.run.shot.write_report", no_report):
+        return run_shot(load_shot(path), out, plan=False)
 
 
 def stop(path: Path, finished: Path, out: Path) -> None:

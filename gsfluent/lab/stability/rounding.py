@@ -32,6 +32,7 @@ def far(cells: float, mach: float, dtype: torch.dtype, variant: str, place: Plac
         world = World(
             points + cells * DX, velocity, volume=volume, dx=DX, law=0,
             params=row, dt=0.5 * DX / c, dtype=dtype, engine=engine, device=place.device,
+            frame=(0.0, 0.0, 0.0),  # as where something rests; one that moves along loses nothing
         )  # fmt: skip
     except ValueError as error:
         return refused(steps, error)

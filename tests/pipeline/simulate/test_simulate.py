@@ -188,7 +188,7 @@ def test_energy_from_nowhere_is_noticed():
     assert report["verdict"] in ("healed", "failed") and "energy rose" in report["reason"]
 
 
-@pytest.mark.parametrize(("cells", "well"), [(0.005, True), (0.05, False)])
+@pytest.mark.parametrize(("cells", "well"), [(0.2, True), (0.5, False)])
 def test_a_body_at_rest_may_be_lifted_by_less_than_its_cells_can_tell(cells, well):
     """What it rests on wakes it: nothing moves yet, so no kinetic energy says what is much."""
     scene = Scene()
