@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,7 @@ from typing import Any
 
 import torch
 
-from gsfluent.data import SURFACE
+from gsfluent.data import SURFACE, Solid
 from gsfluent.pipeline.matter.brittle import kept_strength
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
@@ -113,10 +114,15 @@ def walls_note(quality: str, cells: int, wanted: int, most: int) -> str:
 def _walls(body: Body, dx: float) -> dict[str, Any]:
     """Of the walls of a solid, in scene metres; see :func:`thin_walls`."""
     assert body.solid is not None  # asked for solids only
-    scale, splats = body.frame.scale, body.solid.gaussians
+    return dict(_shells(body.solid, body.frame.scale, dx))
+
+
+@functools.lru_cache(maxsize=4)  # the cells are chosen by what is then said of them
+def _shells(solid: Solid, scale: float, dx: float) -> dict[str, Any]:
+    splats = solid.gaussians
     assert splats.labels is not None  # a solid has labels
     skin = splats.select(splats.labels.eq(SURFACE))
-    field = SignedDistance.of_solid(body.solid)
+    field = SignedDistance.of_solid(solid)
     return thin_shells(
         field.replace(values=field.values * scale, voxel=field.voxel * scale),
         dx,
