@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.materials import LARGEST, STEEPEST, Field, Material
+from gsfluent.materials import LARGEST, STEEPEST, Field, Material, phase_field
 from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, BAND_CELLS, softening_energies
 
 STEP = 0.04
@@ -87,6 +87,8 @@ def kept_strength(material: Material, dx: float) -> float:
         material: Of any law; a parameter that varies in space counts where it keeps least.
         dx: Node spacing [m].
     """
+    if material.law == "phase_field":
+        return phase_field.kept(material, dx)[1]
     if material.law != "nacc" or material.energy_by_hand or material.prefer == "strength":
         return 1.0
     columns = (material.parameters(), material.start_alpha, material.fracture_energy)
