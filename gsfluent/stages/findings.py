@@ -64,6 +64,11 @@ FINER = 8
 """How many times finer than a quality says cells are made for walls, at most."""
 
 
+MOSTLY = 0.25
+"""Share of its surface on thin walls from which a body is refined for them: a bowl, and no apple
+with a ragged rim, which would take twelve times the points."""
+
+
 def cells_for_walls(scene: Scene, quality: str, most: int) -> tuple[int, int]:
     """Cells along the largest solid with which walls have :data:`WALL_CELLS` cells.
 
@@ -79,10 +84,8 @@ def cells_for_walls(scene: Scene, quality: str, most: int) -> tuple[int, int]:
     if not most or all(body.solid is None for body in scene.bodies):
         return least, least
     dx = grid_spacing(scene, least)
-    finer = max(
-        (_walls(body, dx)["cells_needed"] for body in scene.bodies if body.solid is not None),
-        default=1.0,
-    )
+    reports = [_walls(body, dx) for body in scene.bodies if body.solid is not None]
+    finer = max((r["cells_needed"] for r in reports if r["share"] >= MOSTLY), default=1.0)
     wanted = cells_for(scene, dx / finer)
     volume = sum(body.volume for body in scene.bodies)
     held = int(grid_spacing(scene, 1) * (most / (POINTS_PER_CELL * volume)) ** (1.0 / 3.0))
