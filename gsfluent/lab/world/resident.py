@@ -92,7 +92,7 @@ class Resident:
         scene, strain = self.scene, self.solver.strain
         result = ops.return_mapping(
             strain, self.solver.alpha, strain.new_zeros(strain.shape[0], 3, 3), law=scene.law,
-            params=scene.params, material=scene.material, dt=1.0, **scene.return_map,
+            params=scene.params, material=scene.material, dt=1e-9, **scene.return_map,
         )  # fmt: skip
         return result[2]
 

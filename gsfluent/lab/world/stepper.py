@@ -123,7 +123,7 @@ class Stepper:
         self._travelled = 0.0
         # the stress of the first step belongs to the strain given: a step without motion, of a
         # length that only viscosity reads
-        self.stress = self._map(torch.zeros_like(affine), 1.0)[2]
+        self.stress = self._map(torch.zeros_like(affine), 1e-9)[2]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
