@@ -14,7 +14,8 @@ namespace gsf {
 inline constexpr double kWeakening = 0.02;
 
 // Laws a kernel is compiled for: fewer laws, fewer registers.
-enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2 };
+// kDamageField: elastic, NACC and phase_field (on the CPU).
+enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2, kDamageField = 3 };
 
 // Weights at offset o in [0, 1): the stencil of grid.h with f = o + 1/2. `base` stays unset.
 template <typename T>
@@ -118,11 +119,14 @@ struct StepFlags {
   bool lost;    // past the end of its window
 };
 
-template <typename T>
+template <bool kWithField = false, typename T>
 GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
   MaterialRow<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
   if (s.irreversible && s.law[row] == kNacc)
     m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
+  if constexpr (kWithField) {
+    if (s.law[row] == kPhaseField) m.cohesion = clamp(peak + T(kBrokenDamage), T(0), T(1));
+  }
   return m;
 }
 
@@ -241,10 +245,10 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     if (waves) wave2 = elastic_wave_squared(r, state);
   } else {
     const T alpha = before.alpha, peak = before.peak;
-    const MaterialRow<T> material = material_now(s, row, peak);
+    const MaterialRow<T> material = material_now<kLaws == kDamageField>(s, row, peak);
     const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
-    const ReturnMapped<T> out =
-        return_mapping(before.strain, alpha, increment, law, material, s.options, dt);
+    const ReturnMapped<T> out = return_mapping<kLaws == kDamageField>(
+        before.strain, alpha, increment, law, material, s.options, dt);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -254,9 +258,14 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
       s.alpha[p] = out.alpha;
       if (out.alpha > peak && law == kNacc) s.peak[p] = out.alpha;
     }
+    bool loses = law == kNacc;
     whole = max(out.alpha, peak) < T(0) || law != kNacc;
+    if constexpr (kLaws == kDamageField) {
+      loses = loses || law == kPhaseField;
+      if (law == kPhaseField) whole = peak < T(0);
+    }
     stress = out.stress;
-    if (law == kNacc && material.exponent > T(0))
+    if (loses && material.exponent > T(0))
       stress = unloading_share(material.exponent, r[kPaceColumn], stress, c) * stress;
     if (waves) wave2 = wave_speed_squared(law, material, out.strain);
   }
@@ -288,7 +297,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
 
 // Start of a call: the slope holds m C (the last step of the call before wrote it with dt_next =
 // 0). `measure` only reads speeds; otherwise the stress of the coming step is taken into the slope.
-template <typename T>
+template <bool kWithField = false, typename T>
 GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool measure, T dt,
                                     Largest& largest) {
   const uint32_t meta = load_meta(s, p);
@@ -314,10 +323,11 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     return;
   }
   const Mat3<T> none{};
-  const MaterialRow<T> material = material_now(s, row, peak);
-  ReturnMapped<T> state =
-      return_mapping(load_strain(s, p), alpha, none, s.law[row], material, s.options, dt);
-  if (s.law[row] == kNacc && material.exponent > T(0))
+  const MaterialRow<T> material = material_now<kWithField>(s, row, peak);
+  ReturnMapped<T> state = return_mapping<kWithField>(load_strain(s, p), alpha, none, s.law[row],
+                                                     material, s.options, dt);
+  const bool loses = s.law[row] == kNacc || (kWithField && s.law[row] == kPhaseField);
+  if (loses && material.exponent > T(0))
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;
   T slope[9];

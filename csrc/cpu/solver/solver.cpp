@@ -21,7 +21,9 @@ template <typename T>
 class Stepper {
  public:
   Stepper(const SolverView<T>& s, int laws)
-      : s_(s), laws_(laws), contact_(s), homes_(s, contact_), nodes_(s, contact_) {}
+      : s_(s), laws_(laws), contact_(s), homes_(s, contact_), nodes_(s, contact_) {
+    if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
+  }
 
   // Everything that follows from the blocks; again after each build.
   void plan() {
@@ -33,13 +35,14 @@ class Stepper {
     contact_.make();
     homes_.plan();
     nodes_.plan();
+    if (fields_) fields_->plan();
   }
 
   void step() {
     SolverClock& c = *s_.clock;
     Counts all = homes_.to_nodes(touched_);
     nodes_.run(static_cast<T>(c.dt), touched_);
-    all.add(homes_.from_nodes(laws_));
+    all.add(fields_ ? fields_->from_nodes(homes_) : homes_.from_nodes(laws_));
     c.plastic += all.plastic;
     c.guarded += all.guarded;
     c.inverted += all.inverted;
@@ -56,17 +59,21 @@ class Stepper {
   ContactPlan<T> contact_;
   HomePass<T> homes_;
   NodePass<T> nodes_;
+  std::unique_ptr<FieldPass<T>> fields_;
   std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
 };
 
 template <typename T>
-void prime_particles(const SolverView<T>& s, bool measure) {
+void prime_particles(const SolverView<T>& s, bool measure, int laws) {
   SolverClock& c = *s.clock;
   const T dt = static_cast<T>(c.dt);
-  const Counts all =
-      parallel_counts(s.count, kParticleGrain, [&](int64_t begin, int64_t end, Counts& counts) {
-        for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, counts.largest);
-      });
+  const Counts all = laws == kDamageField
+                         ? FieldPass<T>::prime(s, measure)
+                         : parallel_counts(s.count, kParticleGrain,
+                                           [&](int64_t begin, int64_t end, Counts& counts) {
+                                             for (int64_t p = begin; p < end; ++p)
+                                               prime_particle(s, p, measure, dt, counts.largest);
+                                           });
   if (measure)
     give_largest(all.largest, c);
   else
@@ -77,13 +84,13 @@ struct Cpu {
   using Scope = CpuScope;
 
   template <typename T>
-  static void prime(const SolverView<T>& s, int, const Scope&) {
+  static void prime(const SolverView<T>& s, int laws, const Scope&) {
     SolverClock& c = *s.clock;
     if (s.row_count == 0) return;
-    prime_particles(s, true);
+    prime_particles(s, true, laws);
     start_clock(c, double(s.dx));
     if (c.done != 0 || c.reason != kFine) return;
-    prime_particles(s, false);
+    prime_particles(s, false, laws);
     choose_unit(c);
   }
 
