@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,7 +93,8 @@ def kept_strength(material: Material, dx: float) -> float:
         return 1.0
     columns = (material.parameters(), material.start_alpha, material.fracture_energy)
     row, alpha0, energy = (torch.as_tensor(c, dtype=torch.float64) for c in columns)
-    shape = torch.broadcast_shapes(row.shape[:-1], alpha0.shape, energy.shape)
+    # not torch's, which imports SymPy
+    shape = np.broadcast_shapes(row.shape[:-1], alpha0.shape, energy.shape)
     rows = row.expand(*shape, 8).reshape(-1, 8)
     table = torch.cat(
         [rows, alpha0.expand(shape).reshape(-1, 1), energy.expand(shape).reshape(-1, 1)], dim=1
