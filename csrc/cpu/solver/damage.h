@@ -110,25 +110,34 @@ class DamagePass {
     return true;
   }
 
-  // f(node row or -1, weight) for the 27 nodes of particle p of home h.
+  // Row of every node of the window of home h, -1 where it takes no part.
+  struct Window {
+    int32_t row[kWindowNodes];
+  };
+  Window window(int64_t h) const {
+    Window w;
+    for (int i = 0, at = 0; i < kWindowEdge; ++i)
+      for (int j = 0; j < kWindowEdge; ++j)
+        for (int k = 0; k < kWindowEdge; ++k, ++at) {
+          const int block = (window_block(i) * 3 + window_block(j)) * 3 + window_block(k);
+          const int32_t slot = s_.neighbour[kNeighbours * h + block];
+          const int32_t n = slot >= 0 && slot < s_.clock->slots ? number_[slot] : -1;
+          const int local = local_index(window_local(i), window_local(j), window_local(k));
+          w.row[at] = n >= 0 ? n * kBlockNodes + local : -1;
+        }
+    return w;
+  }
+  // f(node row, weight) for those of the 27 nodes of particle p that take part.
   template <typename F>
-  void for_nodes(int64_t h, int64_t p, const F& f) const {
+  void for_nodes(const Window& window, int64_t p, const F& f) const {
     const Stencil<T> stencil = stencil_at(s_.offset + 3 * p);
-    int l[3];
-    for (int axis = 0; axis < 3; ++axis) l[axis] = std::min(meta_cell(s_.meta[p], axis), kLastCell);
+    const int32_t* row = window.row + window_node(s_.meta[p]);
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j) {
         const T w = stencil.w[0][i] * stencil.w[1][j];
         for (int k = 0; k < 3; ++k) {
-          const int32_t slot =
-              s_.neighbour[kNeighbours * h +
-                           (window_block(l[0] + i) * 3 + window_block(l[1] + j)) * 3 +
-                           window_block(l[2] + k)];
-          const int32_t n = slot >= 0 && slot < s_.clock->slots ? number_[slot] : -1;
-          if (n >= 0)
-            f(int64_t(n) * kBlockNodes + local_index(window_local(l[0] + i), window_local(l[1] + j),
-                                                     window_local(l[2] + k)),
-              w * stencil.w[2][k]);
+          const int32_t n = row[(i * kWindowEdge + j) * kWindowEdge + k];
+          if (n >= 0) f(n, w * stencil.w[2][k]);
         }
       }
   }
@@ -141,7 +150,8 @@ class DamagePass {
     nodes_.assign(slots_.size() * kBlockNodes, Node{});
     for (const std::vector<int32_t>& homes : homes_)
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; ++i)
+        for (int64_t i = begin; i < end; ++i) {
+          const Window nodes = window(homes[i]);
           for_particles(homes[i], [&](int64_t p) {
             const uint32_t row = s_.row_of(s_.meta[p]);
             if (s_.law[row] != kPhaseField) return;
@@ -150,7 +160,7 @@ class DamagePass {
             const double drive = std::min(double(s_.alpha[p]) + 1.0, kDriveMax),
                          d = damage_of(s_.peak[p]);
             const Node given{v * d, v * drive, v * 2.0 * length * length, v};
-            for_nodes(homes[i], p, [&](int64_t n, T weight) {
+            for_nodes(nodes, p, [&](int64_t n, T weight) {
               Node& node = nodes_[n];
               const double w = weight;
               node.damage += w * given.damage;
@@ -159,6 +169,7 @@ class DamagePass {
               node.volume += w * given.volume;
             });
           });
+        }
       });
   }
 
@@ -227,14 +238,16 @@ class DamagePass {
   void gather() {
     for (const std::vector<int32_t>& homes : homes_)
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
-        for (int64_t i = begin; i < end; ++i)
+        for (int64_t i = begin; i < end; ++i) {
+          const Window nodes = window(homes[i]);
           for_particles(homes[i], [&](int64_t p) {
             if (!is_phase(p)) return;
             T found(0);
-            for_nodes(homes[i], p, [&](int64_t n, T w) { found += w * T(field_[n]); });
+            for_nodes(nodes, p, [&](int64_t n, T w) { found += w * T(field_[n]); });
             const T d = std::max(damage_of(s_.peak[p]), std::min(found, T(1)));
             if (d > T(0)) s_.peak[p] = std::max(s_.peak[p], d - T(kBrokenDamage));
           });
+        }
       });
   }
 
