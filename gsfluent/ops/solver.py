@@ -25,9 +25,9 @@ from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
 from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
-from gsfluent.ops.solver_state import UNBROKEN, SolverState
+from gsfluent.ops.solver_state import DAMAGE_FIELD, MORE_LAWS, UNBROKEN, SolverState
 
-ELASTIC, NACC = LAWS["elastic"], LAWS["nacc"]
+ELASTIC, NACC, PHASE = LAWS["elastic"], LAWS["nacc"], LAWS["phase_field"]
 CFL_MOST = 0.5
 """Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
 RADIUS_MOST = 0.5
@@ -92,9 +92,10 @@ class Solver(SolverState):
             with the density [kg/m^3] in column 6.
         material: Row of each point, int32 [N]; default: row 0.
         strain: Strain ``b - I``, [N, 6]; default: none.
-        alpha: Log plastic volume ratio (NACC), [N]; default: zero.
-        peak: Largest alpha so far, [N]; default: ``alpha``. Only NACC points have one: the others
-            read -1.
+        alpha: Log plastic volume ratio (NACC) or history (phase field, -1 when fresh), [N];
+            default: zero.
+        peak: Largest alpha so far, [N]; default: ``alpha``. Phase-field points: d - 0.95, or -1
+            where undamaged, the default. Points of other laws read -1.
         affine: APIC matrix C [1/s], [N, 3, 3]; default: zero.
         deformation: Total deformation gradient, [N, 3, 3]; given, it is tracked.
         body: Velocity field of each point, int32 [N]; points of different fields feel each other by
@@ -205,14 +206,20 @@ class Solver(SolverState):
         self._params, self._law = params.to(velocity), law.to(self.device)
         check_params(op, self._law, self._params)
         laws = set(law.tolist())
-        if LAWS["phase_field"] in laws:
-            raise ValueError(
-                f"{op}: law phase_field (9) is not in the resident solver yet; step it by p2g, "
-                "grid_update, g2p, damage_solve and return_mapping"
-            )
         self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
         if bool(compiled_apart(self._law, self._params).any()):
-            self._law_set = 3
+            self._law_set = MORE_LAWS
+        if PHASE in laws:
+            self._law_set = DAMAGE_FIELD
+            if self.device.type != "cpu" or not laws <= {ELASTIC, NACC, PHASE}:
+                raise ValueError(
+                    f"{op}: law phase_field (9) works on the CPU beside laws 0 and 1 only, got "
+                    f"{sorted(laws)} on {self.device}; step it by p2g, grid_update, g2p, "
+                    "damage_solve and return_mapping"
+                )
+            codes = {int(c) >> 2 for c in self._params[self._law == PHASE, 5].tolist()}
+            if len(codes) > 1:
+                raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -247,13 +254,11 @@ class Solver(SolverState):
             "strain": strain if strain is not None else zero(n, 6),
         }
         start = alpha if alpha is not None else zero(n)
-        breaks = b.law[row] == NACC
-        scalars = {
-            "alpha": start,
-            "peak": torch.where(
-                breaks, peak if peak is not None else start, torch.full_like(start, UNBROKEN)
-            ),
-        }
+        none = torch.full_like(start, UNBROKEN)
+        scalars = {"alpha": start, "peak": torch.where(b.law[row] == NACC, start, none)}
+        if peak is not None:
+            breaks = (b.law[row] == NACC) | (b.law[row] == PHASE)
+            scalars["peak"] = torch.where(breaks, peak, none)
         self._unused = {} if self._law_set > 0 else scalars
         if self._law_set > 0:
             values.update(scalars)

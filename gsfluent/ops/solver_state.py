@@ -19,6 +19,8 @@ from gsfluent.ops.solver_buffers import INDEX
 
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
+MORE_LAWS, DAMAGE_FIELD = 3, 4
+"""Sets of laws that have kernels on the CPU only: ``LawSet`` of ``csrc/core/solver/particle.h``."""
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
 
@@ -364,7 +366,7 @@ class SolverState:
         strain, broken = self._rowwise("strain").contiguous(), self._law_set > 0
         alpha = b.alpha if broken else strain.new_zeros(self.count)
         law, params = b.law, b.rows[:, :8].contiguous()
-        if broken and self.irreversible:
+        if broken and (self.irreversible or self._law_set == DAMAGE_FIELD):
             (law, params), material = weakened(law, params, row, b.peak), None
         _, _, stress, _ = return_mapping(
             strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,

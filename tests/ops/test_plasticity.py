@@ -241,7 +241,7 @@ def test_unknown_law_is_refused_also_after_an_in_place_change() -> None:
     s = states(4)
     law, params = torch.tensor([1], dtype=torch.int32), tables()["params"][1:2].clone()
     return_mapping(*s["args"], law=law, params=params)
-    law[0] = 7
+    law[0] = 11
     with pytest.raises(ValueError, match="law must be one of 0"):
         return_mapping(*s["args"], law=law, params=params)
     law[0] = 1

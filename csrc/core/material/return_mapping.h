@@ -27,8 +27,8 @@ struct ReturnMapped {
 
 // One constitutive step: strain pushed forward by A = dt grad v, then returned to the surface.
 // An unknown law or a state that is not finite becomes stress-free and counts as invalid.
-// kFields: whether phase_field is among the laws (not in the resident solver on CUDA).
-template <bool kFields = true, typename T>
+// kWithField: whether phase_field is among the laws (not in the resident solver on CUDA).
+template <bool kWithField = true, typename T>
 GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
                                                const Mat3<T>& increment, int law,
                                                const MaterialRow<T>& m, const NaccOptions<T>& o,
@@ -37,7 +37,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
   const Sym3<T> zero = {T(0), T(0), T(0), T(0), T(0), T(0)};
   ReturnMapped<T> out{zero, zero, alpha, false, false, false, false};
   const Sym3<T> e = update_strain(strain, increment);
-  if (!finite(e) || !finite(alpha) || !is_law(law) || (!kFields && law == kPhaseField)) {
+  if (!finite(e) || !finite(alpha) || !is_law(law) || (!kWithField && law == kPhaseField)) {
     // A lost state becomes stress-free debris: it must not reach its neighbours through the grid.
     out.alpha = finite(alpha) ? alpha : T(0);
     out.invalid = true;
@@ -64,7 +64,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
   LawResult<T> r;
   if (law == kDruckerPrager)
     r = drucker_prager(m, e, alpha, out.inverted);
-  else if (kFields && law == kPhaseField)
+  else if (kWithField && law == kPhaseField)
     r = phase_field(m, e, alpha, out.inverted);
   else if (law == kVonMises)
     r = von_mises(m, e, alpha, out.inverted);
@@ -86,16 +86,16 @@ struct ReturnFlags {
 
 // One particle of the return_mapping op. A row or law that does not exist counts the particle as
 // invalid and leaves it stress-free; nothing is read outside the tables.
-template <typename T>
+template <bool kWithField = true, typename T>
 GSF_HOST_DEVICE ReturnFlags return_mapping_particle(const ReturnMappingArgs<T>& a, int64_t i) {
   const int64_t row = a.material != nullptr ? a.material[i] : (a.rows == 1 ? 0 : i);
   const bool known = row >= 0 && row < a.rows;
   MaterialRow<T> material{};
   if (known) material = load_material(a.params + kParamColumns * row);
   const NaccOptions<T> options{a.k, a.epsilon, a.implicit_alpha};
-  const ReturnMapped<T> r =
-      return_mapping(load_sym3(a.strain + 6 * i), a.alpha[i], load_mat3(a.increment + 9 * i),
-                     known ? a.law[row] : -1, material, options, a.dt);
+  const ReturnMapped<T> r = return_mapping<kWithField>(
+      load_sym3(a.strain + 6 * i), a.alpha[i], load_mat3(a.increment + 9 * i),
+      known ? a.law[row] : -1, material, options, a.dt);
   store_sym3(a.strain_out + 6 * i, r.strain);
   store_sym3(a.stress_out + 6 * i, r.stress);
   a.alpha_out[i] = r.alpha;

@@ -15,7 +15,8 @@ inline constexpr double kWeakening = 0.02;
 
 // Laws a kernel is compiled for: fewer laws, fewer registers.
 // kMoreLaws: those of more_laws.h too; on the CPU only (cpu/solver/solver_more.cpp).
-enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2, kMoreLaws = 3 };
+// kDamageField: elastic, NACC and phase_field; on the CPU only (cpu/solver/solver_fields.cpp).
+enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2, kMoreLaws = 3, kDamageField = 4 };
 
 // Weights at offset o in [0, 1): the stencil of grid.h with f = o + 1/2. `base` stays unset.
 template <typename T>
@@ -119,11 +120,14 @@ struct StepFlags {
   bool lost;    // past the end of its window
 };
 
-template <typename T>
+template <bool kWithField = false, typename T>
 GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row, T peak) {
   MaterialRow<T> m = load_material(s.rows + int64_t(row) * kRowColumns);
   if (s.irreversible && s.law[row] == kNacc)
     m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
+  if constexpr (kWithField) {
+    if (s.law[row] == kPhaseField) m.cohesion = clamp(peak + T(kBrokenDamage), T(0), T(1));
+  }
   return m;
 }
 
@@ -174,8 +178,8 @@ GSF_HOST_DEVICE ReturnMapped<T> law_step(const Sym3<T>& strain, T alpha, const M
                                          T dt) {
   if constexpr (kLaws == kMoreLaws)
     return return_mapping_more(strain, alpha, increment, law, m, o, dt);
-  else  // phase_field is refused by the solver
-    return return_mapping<false>(strain, alpha, increment, law, m, o, dt);
+  else
+    return return_mapping<kLaws == kDamageField>(strain, alpha, increment, law, m, o, dt);
 }
 template <typename T, int kLaws>
 GSF_HOST_DEVICE T law_wave_squared(int law, const MaterialRow<T>& m, const Sym3<T>& strain) {
@@ -210,7 +214,7 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
 // Whether a step looks at wave speeds and gradients: every step for liquids and other laws whose
 // wave speed may rise by half in one step, else every kWaveSteps (CFL 0.5 leaves room).
 GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
-  return laws >= kAnyLaw || c.step % kWaveSteps == 0;
+  return laws == kAnyLaw || laws == kMoreLaws || c.step % kWaveSteps == 0;
 }
 
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
@@ -260,7 +264,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     if (waves) wave2 = elastic_wave_squared(r, state);
   } else {
     const T alpha = before.alpha, peak = before.peak;
-    const MaterialRow<T> material = material_now(s, row, peak);
+    const MaterialRow<T> material = material_now<kLaws == kDamageField>(s, row, peak);
     const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
     const ReturnMapped<T> out =
         law_step<T, kLaws>(before.strain, alpha, increment, law, material, s.options, dt);
@@ -273,9 +277,14 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
       s.alpha[p] = out.alpha;
       if (out.alpha > peak && law == kNacc) s.peak[p] = out.alpha;
     }
+    bool loses = law == kNacc;
     whole = max(out.alpha, peak) < T(0) || law != kNacc;
+    if constexpr (kLaws == kDamageField) {
+      loses = loses || law == kPhaseField;
+      if (law == kPhaseField) whole = peak < T(0);
+    }
     stress = out.stress;
-    if (law == kNacc && material.exponent > T(0))
+    if (loses && material.exponent > T(0))
       stress = unloading_share(material.exponent, r[kPaceColumn], stress, c) * stress;
     if (waves) wave2 = law_wave_squared<T, kLaws>(law, material, out.strain);
   }
@@ -333,12 +342,13 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     return;
   }
   const Mat3<T> none{};
-  const MaterialRow<T> material = material_now(s, row, peak);
+  const MaterialRow<T> material = material_now<kLaws == kDamageField>(s, row, peak);
   // What flows with a viscosity does so in steps: between them its stress is that of its strain.
   const T span = kLaws == kMoreLaws ? T(0) : dt;
   ReturnMapped<T> state =
       law_step<T, kLaws>(load_strain(s, p), alpha, none, s.law[row], material, s.options, span);
-  if (s.law[row] == kNacc && material.exponent > T(0))
+  const bool loses = s.law[row] == kNacc || (kLaws == kDamageField && s.law[row] == kPhaseField);
+  if (loses && material.exponent > T(0))
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;
   T slope[9];

@@ -68,6 +68,11 @@ class HomePass {
     return laws == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>();
   }
 
+  template <int kLaws>
+  Counts from_nodes() const {
+    return s_.deformation != nullptr ? from_nodes<kLaws, true>() : from_nodes<kLaws, false>();
+  }
+
  private:
   // Particles of home h, clamped to those there are.
   struct Range {
@@ -242,10 +247,6 @@ class HomePass {
     }
   };
 
-  template <int kLaws>
-  Counts from_nodes() const {
-    return s_.deformation != nullptr ? from_nodes<kLaws, true>() : from_nodes<kLaws, false>();
-  }
   template <int kLaws, bool kTrack>
   Counts from_nodes() const {
     const SolverClock& c = *s_.clock;

@@ -26,7 +26,9 @@ class Stepper {
         contact_(s),
         surface_(s),
         homes_(s, contact_, surface_),
-        nodes_(s, contact_, surface_) {}
+        nodes_(s, contact_, surface_) {
+    if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
+  }
 
   // Everything that follows from the blocks; again after each build.
   void plan() {
@@ -39,13 +41,14 @@ class Stepper {
     surface_.make();
     homes_.plan();
     nodes_.plan();
+    if (fields_) fields_->plan();
   }
 
   void step() {
     SolverClock& c = *s_.clock;
     Counts all = homes_.to_nodes(touched_);
     nodes_.run(static_cast<T>(c.dt), touched_);
-    all.add(homes_.from_nodes(laws_));
+    all.add(fields_ ? fields_->from_nodes(homes_) : homes_.from_nodes(laws_));
     c.plastic += all.plastic;
     c.guarded += all.guarded;
     c.inverted += all.inverted;
@@ -63,6 +66,7 @@ class Stepper {
   SurfacePlan<T> surface_;
   HomePass<T> homes_;
   NodePass<T> nodes_;
+  std::unique_ptr<FieldPass<T>> fields_;
   std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
 };
 
@@ -71,10 +75,15 @@ void prime_particles(const SolverView<T>& s, int laws, bool measure) {
   SolverClock& c = *s.clock;
   const T dt = static_cast<T>(c.dt);
   const Counts all =
-      parallel_counts(s.count, kParticleGrain, [&](int64_t begin, int64_t end, Counts& counts) {
-        if (laws == kMoreLaws) return prime_more(s, begin, end, measure, dt, counts.largest);
-        for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, counts.largest);
-      });
+      laws == kDamageField
+          ? FieldPass<T>::prime(s, measure)
+          : parallel_counts(s.count, kParticleGrain,
+                            [&](int64_t begin, int64_t end, Counts& counts) {
+                              if (laws == kMoreLaws)
+                                return prime_more(s, begin, end, measure, dt, counts.largest);
+                              for (int64_t p = begin; p < end; ++p)
+                                prime_particle(s, p, measure, dt, counts.largest);
+                            });
   if (measure)
     give_largest(all.largest, c);
   else

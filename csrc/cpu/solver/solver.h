@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <memory>
 #include <vector>
 
 #include "core/solver/particle.h"
@@ -22,6 +23,27 @@ void solver_build(const SolverView<T>& s);
 template <typename T>
 void prime_more(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
                 Largest& largest);
+template <typename T>
+class HomePass;
+template <typename T>
+class DamagePass;
+struct Counts;
+
+// Phase-field matter (solver_fields.cpp, a file of its own: what gcc inlines elsewhere stays as it
+// is).
+template <typename T>
+class FieldPass {
+ public:
+  explicit FieldPass(const SolverView<T>& s);
+  ~FieldPass();
+  void plan();  // again after each build
+  // The damage field, then HomePass::from_nodes.
+  Counts from_nodes(const HomePass<T>& homes);
+  static Counts prime(const SolverView<T>& s, bool measure);
+
+ private:
+  std::unique_ptr<DamagePass<T>> damage_;
+};
 
 // What a slot holds in this step.
 enum Touched : uint8_t { kTouchedSums = 1, kTouchedMoments = 2, kTouchedPush = 4 };

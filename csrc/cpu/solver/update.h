@@ -94,14 +94,32 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
            (det_identity_plus(increment) > P(0));
   Int whole = Int{} - 1;  // not broken
   P loss(0);
+  Int phase{};
+  P damage(0), history(0), all(0);
+  if constexpr (kLaws == kDamageField) {
+    phase =
+        -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kPhaseField)); });
+    if (mask_bits(phase) != 0) {
+      const P peak = packet.load1(s.peak);
+      damage = clamp(peak + P(kBrokenDamage), P(0), P(1));
+      history = packet.load1(s.alpha);
+      // without a spectral split, and what the series hold
+      const P split =
+          pack_of<T>([&](int lane) { return T(int(s.rows[row_of(lane) * kRowColumns + 5]) & 3); });
+      plain &= ~phase | ((split < P(1.5)) & (n2 <= P(0.25)) & (abs(j2m1) < P(kSeriesVolume)));
+      all = select<T>(split > P(0.5), P(1), P(0));
+      whole = ~phase | (peak < P(0));
+      loss = select<T>(phase, row[7], P(0));
+    }
+  }
   if constexpr (kLaws != kElasticOnly) {
-    Int nacc{}, elastic{};
+    Int nacc{}, elastic = phase;
     if (packet.same_rows()) {
       nacc -= s.law[row_of(0)] == int(kNacc) ? 1 : 0;
-      elastic -= s.law[row_of(0)] == int(kElastic) ? 1 : 0;
+      elastic |= -Int{} - (s.law[row_of(0)] == int(kElastic) ? 1 : 0);
     } else {
       nacc = -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kNacc)); });
-      elastic =
+      elastic |=
           -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kElastic)); });
     }
     plain &= nacc | elastic;
@@ -110,12 +128,26 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       P cohesion = row[3];
       if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
       plain &= ~nacc | (surely_elastic(row, cohesion, alpha, j2m1, n2) & (alpha <= peak));
-      whole = ~nacc | (peak < P(0));
-      loss = select<T>(nacc, row[7], P(0));
+      whole &= ~nacc | (peak < P(0));
+      loss = select<T>(nacc, row[7], loss);
     }
   }
 
   Sym3<P> stress = add_diagonal(row[0] * d, P(0.5) * row[1] * j2m1);
+  if constexpr (kLaws == kDamageField) {
+    if (mask_bits(phase) != 0) {
+      const PhaseState<P> now = phase_state(row[0], row[1], damage, all, d, unit_det_shift_small(d),
+                                            j2m1, [](P x) { return volume_series(x); });
+      const auto mix = [&](P& to, P from) { to = select<T>(phase, from, to); };
+      mix(stress.xx, now.stress.xx);
+      mix(stress.yy, now.stress.yy);
+      mix(stress.zz, now.stress.zz);
+      mix(stress.xy, now.stress.xy);
+      mix(stress.xz, now.stress.xz);
+      mix(stress.yz, now.stress.yz);
+      history = max(history, min(now.active / row[2], P(kDriveMax)) - P(1));
+    }
+  }
   if (kLaws != kElasticOnly && mask_bits(loss > P(0)) != 0)
     stress = unloading_share(loss, row[kPaceColumn], stress, c) * stress;
   P slope[9];
@@ -152,6 +184,11 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const int lane = __builtin_ctz(left);
       s.meta[packet.index[lane]] = static_cast<uint32_t>(moved[lane]);
     }
+    if constexpr (kLaws == kDamageField)
+      for (uint32_t left = done & mask_bits(phase); left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        s.alpha[packet.index[lane]] = history[lane];
+      }
     if constexpr (kTrack) {
       Mat3<P> f;
       packet.load9(s.deformation, f.m);

@@ -20,8 +20,9 @@ def why_not(scene: Scene, forced: bool) -> str:
         return "a force changes velocities between steps"
     if any(scene.period):
         return "it has no periodic axes"
-    if bool((scene.law == LAWS["phase_field"]).any()):
-        return "a damage field is solved between steps"
+    laws = {int(law) for law in scene.law.tolist()}
+    if LAWS["phase_field"] in laws and (scene.law.is_cuda or max(laws - {9}, default=0) > 1):
+        return "phase_field works on the CPU beside elastic and nacc only"
     if scene.cfl > 1.0:
         return "its cfl is at most 1"
     return ""

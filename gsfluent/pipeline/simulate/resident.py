@@ -66,8 +66,9 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         rigid: The colliders.
         matter: The points, for the heaviest density and the grid spacing.
     """
-    if matter.has_field:  # its field is solved between steps
-        return False
+    known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
+    if matter.has_field and (matter.law.is_cuda or not bool(torch.isin(matter.law, known).all())):
+        return False  # not there yet
     if not rigid.frees:
         return True
     mass = rows[:, columns.MASS]
@@ -128,7 +129,9 @@ class Resident:
         )
         field = torch.unique(field, return_inverse=True)[1]
         law, params = matter.law, matter.params
-        if not options.law_kernels:  # a row that no point has asks for the kernel of all laws
+        if (
+            not options.law_kernels and not matter.has_field
+        ):  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
             spare = params[:1].clone()
             spare[:, 7] = 0.0  # there a loss of nacc, which is no exponent of a fluid

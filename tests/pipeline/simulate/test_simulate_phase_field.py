@@ -32,7 +32,7 @@ def test_a_hard_landing_cracks_and_costs_energy() -> None:
     frames = [f for f in simulation if f.index in (0, 36, 40)]
     report = simulation.report
     assert report["verdict"] == "clean" and report["momentum_error"] < 1e-5
-    assert report["composed_steps"] == report["substeps"] > 0
+    assert report["composed_steps"] == 0 < report["substeps"]
     before, struck, after = (f.energy for f in frames)
     assert before["surface"] == 0.0 < struck["surface"] <= after["surface"] * 1.01
     assert float(frames[-1].broken.float().mean()) > 0.01

@@ -1,0 +1,271 @@
+// The damage field of phase-field matter on the CPU: node sums of the points near damage, red-black
+// SOR within bounds, and back to the points. gsfluent/ops/damage.py says what; docs/theory/
+// phase-field.md why. Sums are in double, in an order that hangs on neither threads nor loading.
+#pragma once
+
+#include "cpu/solver/homes.h"
+
+namespace gsf::cpu {
+
+constexpr double kOmega = 1.5;
+constexpr int kSweeps = 4;
+constexpr double kActiveDrive = 0.5, kActiveDriveAt2 = 1e-3;
+
+template <typename T>
+class DamagePass {
+ public:
+  explicit DamagePass(const SolverView<T>& s) : s_(s) {
+    at2_ = false;
+    for (int64_t row = 0; row < s.row_count; ++row)
+      if (s.law[row] == kPhaseField)
+        at2_ = (int(load_material(s.rows + row * kRowColumns).damage) & kModelAt2) != 0;
+    active_ = T((at2_ ? kActiveDriveAt2 : kActiveDrive) - 1.0);
+  }
+
+  // Again after each build.
+  void plan() {
+    const SolverClock& c = *s_.clock;
+    keys_.resize(c.slots);
+    for (int64_t i = 0; i < c.slots; ++i) {
+      const int32_t* b = s_.slot_coord + 4 * i;
+      keys_[i] = block_key(b[0], b[1], b[2], b[3]);
+    }
+    const HomeList<T>& list = s_.homes();
+    for (auto& color : colors_) color.clear();
+    for (int64_t h = 0; h < c.homes; ++h) {
+      const int32_t* b = list.coord + 4 * h;
+      colors_[(b[0] & 1) * 4 + (b[1] & 1) * 2 + (b[2] & 1)].push_back(static_cast<int32_t>(h));
+    }
+  }
+
+  // One solve; peaks of the points after it.
+  void run() {
+    if (!find_active()) return;
+    scatter();
+    prepare();
+    relax();
+    gather();
+  }
+
+ private:
+  bool is_phase(int64_t p) const { return s_.law[s_.row_of(s_.meta[p])] == kPhaseField; }
+  static T damage_of(T peak) { return gsf::clamp(peak + T(kBrokenDamage), T(0), T(1)); }
+  int32_t slot_at(const int32_t* b, int dx, int dy, int dz) const {
+    const uint64_t wanted = block_key(b[0] + dx, b[1] + dy, b[2] + dz, b[3]);
+    const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
+    return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
+  }
+  template <typename F>
+  void for_particles(int64_t h, const F& f) const {
+    const HomeList<T>& list = s_.homes();
+    const int64_t begin = std::clamp<int64_t>(list.start[h], 0, s_.count);
+    const int64_t end = begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin);
+    for (int64_t p = begin; p < end; ++p) f(p);
+  }
+
+  // Slots of points with damage or near their threshold, and those around them.
+  bool find_active() {
+    const SolverClock& c = *s_.clock;
+    number_.assign(c.slots, -1);
+    std::atomic<bool> any{false};
+    parallel_for(c.homes, kHomeGrain, [&](int64_t begin, int64_t end) {
+      for (int64_t h = begin; h < end; ++h)
+        for_particles(h, [&](int64_t p) {
+          if (!(s_.alpha[p] > active_ || s_.peak[p] > T(-kBrokenDamage)) || !is_phase(p)) return;
+          int n = 0;
+          for (int axis = 0; axis < 3; ++axis) n = 3 * n + ((meta_cell(s_.meta[p], axis) + 3) >> 2);
+          const int32_t slot = s_.neighbour[kNeighbours * h + n];
+          if (slot < 0 || slot >= c.slots) return;
+          std::atomic_ref<int32_t>(number_[slot]).store(0, std::memory_order_relaxed);
+          any.store(true, std::memory_order_relaxed);
+        });
+    });
+    if (!any) return false;
+    slots_.clear();
+    std::vector<int32_t> seeds;
+    for (int64_t i = 0; i < c.slots; ++i)
+      if (number_[i] == 0) seeds.push_back(static_cast<int32_t>(i));
+    for (const int32_t seed : seeds)
+      for (int n = 0; n < kNeighbours; ++n) {
+        const int32_t slot =
+            slot_at(s_.slot_coord + 4 * int64_t(seed), n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1);
+        if (slot >= 0) number_[slot] = 0;
+      }
+    for (int64_t i = 0; i < c.slots; ++i)
+      if (number_[i] == 0) {
+        number_[i] = static_cast<int32_t>(slots_.size());
+        slots_.push_back(static_cast<int32_t>(i));
+      }
+    for (int color = 0; color < kColors; ++color) {
+      homes_[color].clear();
+      for (const int32_t h : colors_[color]) {
+        bool meets = false;
+        for (int n = 0; n < kNeighbours && !meets; ++n) {
+          const int32_t slot = s_.neighbour[kNeighbours * int64_t(h) + n];
+          meets = slot >= 0 && slot < c.slots && number_[slot] >= 0;
+        }
+        if (meets) homes_[color].push_back(h);
+      }
+    }
+    return true;
+  }
+
+  // Row of every node of the window of home h, -1 where it takes no part.
+  struct Window {
+    int32_t row[kWindowNodes];
+  };
+  Window window(int64_t h) const {
+    Window w;
+    for (int i = 0, at = 0; i < kWindowEdge; ++i)
+      for (int j = 0; j < kWindowEdge; ++j)
+        for (int k = 0; k < kWindowEdge; ++k, ++at) {
+          const int block = (window_block(i) * 3 + window_block(j)) * 3 + window_block(k);
+          const int32_t slot = s_.neighbour[kNeighbours * h + block];
+          const int32_t n = slot >= 0 && slot < s_.clock->slots ? number_[slot] : -1;
+          const int local = local_index(window_local(i), window_local(j), window_local(k));
+          w.row[at] = n >= 0 ? n * kBlockNodes + local : -1;
+        }
+    return w;
+  }
+  // f(node row, weight) for those of the 27 nodes of particle p that take part.
+  template <typename F>
+  void for_nodes(const Window& window, int64_t p, const F& f) const {
+    const Stencil<T> stencil = stencil_at(s_.offset + 3 * p);
+    const int32_t* row = window.row + window_node(s_.meta[p]);
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        const T w = stencil.w[0][i] * stencil.w[1][j];
+        for (int k = 0; k < 3; ++k) {
+          const int32_t n = row[(i * kWindowEdge + j) * kWindowEdge + k];
+          if (n >= 0) f(n, w * stencil.w[2][k]);
+        }
+      }
+  }
+
+  struct Node {
+    double damage, drive, stiff, volume;  // sums; volumes in units of dx^2 / 4
+  };
+
+  void scatter() {
+    nodes_.assign(slots_.size() * kBlockNodes, Node{});
+    for (const std::vector<int32_t>& homes : homes_)
+      parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) {
+          const Window nodes = window(homes[i]);
+          for_particles(homes[i], [&](int64_t p) {
+            const uint32_t row = s_.row_of(s_.meta[p]);
+            if (s_.law[row] != kPhaseField) return;
+            const T* r = s_.rows + int64_t(row) * kRowColumns;
+            const double v = r[kStressColumn], length = double(r[4]) * double(s_.inv_dx);
+            const double drive = std::min(double(s_.alpha[p]) + 1.0, kDriveMax),
+                         d = damage_of(s_.peak[p]);
+            const Node given{v * d, v * drive, v * 2.0 * length * length, v};
+            for_nodes(nodes, p, [&](int64_t n, T weight) {
+              Node& node = nodes_[n];
+              const double w = weight;
+              node.damage += w * given.damage;
+              node.drive += w * given.drive;
+              node.stiff += w * given.stiff;
+              node.volume += w * given.volume;
+            });
+          });
+        }
+      });
+  }
+
+  // Edges towards the six neighbours of every node, the right side, and the first guess.
+  void prepare() {
+    const int64_t count = static_cast<int64_t>(slots_.size());
+    edge_.assign(nodes_.size(), Edge{});
+    field_.assign(nodes_.size(), 0.0);
+    parallel_for(count, 1, [&](int64_t begin, int64_t end) {
+      for (int64_t b = begin; b < end; ++b) {
+        const int32_t* coord = s_.slot_coord + 4 * int64_t(slots_[b]);
+        int32_t face[6];  // slots beyond the faces: x+, x-, y+, y-, z+, z-
+        for (int f = 0; f < 6; ++f) {
+          const int step = f % 2 == 0 ? 1 : -1;
+          face[f] =
+              slot_at(coord, f / 2 == 0 ? step : 0, f / 2 == 1 ? step : 0, f / 2 == 2 ? step : 0);
+        }
+        for (int local = 0; local < kBlockNodes; ++local) {
+          const int64_t n = b * kBlockNodes + local;
+          const Node& node = nodes_[n];
+          if (!(node.volume > 0.0)) continue;
+          Edge& e = edge_[n];
+          field_[n] = node.damage / node.volume;
+          e.right = at2_ ? node.drive : node.drive - node.volume;
+          double whole = at2_ ? node.drive + 2.0 * node.volume : node.drive;
+          for (int f = 0; f < 6; ++f) {
+            const int shift = 4 - f / 2 * 2;  // of the axis in the local index
+            const int at = local >> shift & 3, to = f % 2 == 0 ? at + 1 : at - 1;
+            const int there = (local & ~(3 << shift)) | (to & 3) << shift;
+            const int32_t slot = to >= 0 && to < 4 ? slots_[b] : face[f];
+            if (slot < 0) continue;
+            if (number_[slot] < 0) {  // undamaged beyond
+              whole += node.stiff;
+              continue;
+            }
+            const int64_t m = int64_t(number_[slot]) * kBlockNodes + there;
+            if (!(nodes_[m].volume > 0.0)) continue;
+            e.near[f] = static_cast<int32_t>(m);
+            e.weight[f] = 0.5 * (node.stiff + nodes_[m].stiff);
+            whole += e.weight[f];
+          }
+          e.inverse = whole > 0.0 ? 1.0 / whole : 0.0;
+        }
+      }
+    });
+  }
+
+  void relax() {
+    const int64_t count = static_cast<int64_t>(slots_.size());
+    for (int sweep = 0; sweep < 2 * kSweeps; ++sweep)
+      parallel_for(count, 8, [&](int64_t begin, int64_t end) {
+        for (int64_t b = begin; b < end; ++b)
+          for (int local = 0; local < kBlockNodes; ++local) {
+            // blocks are four wide: the parity of a node is that of its place in the block
+            if (((local >> 4) + (local >> 2) + local) % 2 != sweep % 2) continue;
+            const Edge& e = edge_[b * kBlockNodes + local];
+            if (e.inverse == 0.0) continue;
+            double sum = e.right;
+            for (int f = 0; f < 6; ++f) sum += e.weight[f] * field_[e.near[f]];
+            double& d = field_[b * kBlockNodes + local];
+            d = std::clamp(d + kOmega * (sum * e.inverse - d), 0.0, 1.0);
+          }
+      });
+  }
+
+  void gather() {
+    for (const std::vector<int32_t>& homes : homes_)
+      parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) {
+          const Window nodes = window(homes[i]);
+          for_particles(homes[i], [&](int64_t p) {
+            if (!is_phase(p)) return;
+            T found(0);
+            for_nodes(nodes, p, [&](int64_t n, T w) { found += w * T(field_[n]); });
+            const T d = std::max(damage_of(s_.peak[p]), std::min(found, T(1)));
+            if (d > T(0)) s_.peak[p] = std::max(s_.peak[p], d - T(kBrokenDamage));
+          });
+        }
+      });
+  }
+
+  struct Edge {
+    double weight[6] = {}, right = 0.0, inverse = 0.0;
+    int32_t near[6] = {};
+  };
+
+  const SolverView<T>& s_;
+  bool at2_;
+  T active_;  // alpha from which a point takes part
+  std::vector<uint64_t> keys_;
+  std::vector<int32_t> colors_[kColors], homes_[kColors];  // homes by colour; those that take part
+  std::vector<int32_t> number_;                            // [slots] row of an active slot, or -1
+  std::vector<int32_t> slots_;                             // active slots
+  std::vector<Node> nodes_;
+  std::vector<Edge> edge_;
+  std::vector<double> field_;
+};
+
+}  // namespace gsf::cpu
