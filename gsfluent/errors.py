@@ -15,6 +15,7 @@ EXTRAS = {
     "inpaint": ("transformers", "accelerate"),
     "figures": ("matplotlib",),
     "slurm": ("submitit",),
+    "ray": ("ray",),
 }
 """Packages that gsfluent does without until they are asked for: extra -> names on the index."""
 

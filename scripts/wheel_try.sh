@@ -49,7 +49,7 @@ for word; do
   echo "doctor passes, $said; $(du -sm "$place/venv" | cut -f1) MB installed"
   if [ "$demo" = 1 ]; then
     alone gsfluent demo --size preview --device cpu -o "$place/demo" > "$place/demo.txt" || { cat "$place/demo.txt"; exit 1; }
-    grep -E '^(verdict|reason|  (psnr|interior_error|fragments))' "$place/demo.txt"
+    grep -E '^ +(verdict|broke|in all) ' "$place/demo.txt"
     [ -s "$place/demo/video.mp4" ]
   fi
   [ "${KEEP:-0}" = 1 ] && echo "kept: $place" || rm -rf "$place"

@@ -38,8 +38,9 @@ class Sweep(Verb):
     """Of a shot: how many seeds, from 0 on."""
     jobs: int | None = None
     """Shots at a time; as many as there are cores for when absent."""
-    on: Literal["local", "slurm"] = "local"
-    """Where shots run: processes of this machine, or jobs of a SLURM cluster (extra `slurm`)."""
+    on: Annotated[str, tyro.conf.arg(metavar="local|slurm|ray[=HOST:PORT]")] = "local"
+    """Where shots run: processes of this machine, jobs of a SLURM cluster (extra `slurm`), or a Ray
+    cluster that runs already (extra `ray`)."""
     keep: Literal["all", "film"] | None = None
     """What stays of a shot: all, or film and figures without the frames."""
     minutes: float | None = None

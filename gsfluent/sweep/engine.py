@@ -82,13 +82,14 @@ def map(
         folder: Where the results go: ``shots/ID``.
         ids: Names of the items, letters, digits, ``_`` and ``-``; digests of function and item
             when absent.
-        jobs: Calls at a time; one per core when absent.
+        jobs: Calls at a time; one per core when absent, of a Ray cluster for all of its cores.
         threads: Threads of a process.
         tries: How often a call is tried that a signal, a lost machine or want of memory ended.
             Other errors are final, since they would come again.
         minutes: Longest time of a call.
         retry: Try again what has failed finally.
-        on: ``local``, or ``slurm``: a job of the cluster for every call (extra ``slurm``).
+        on: ``local``; ``slurm``: a job of the cluster for every call (extra ``slurm``); ``ray`` or
+            ``ray=HOST:PORT``: a Ray cluster that runs (extra ``ray``).
         progress: Called with (done, total, note), about once a second.
 
     Returns:
@@ -101,9 +102,8 @@ def map(
     """
     items, place = list(items), SweepFolder(Path(folder).absolute())
     names = _names(function, items, ids)
-    jobs = (os.cpu_count() or 1) if jobs is None else jobs
     for key, value in (("jobs", jobs), ("tries", tries), ("threads", threads)):
-        if value < 1:
+        if value is not None and value < 1:
             raise InputError(f"sweep: {key} is {value}", "give at least 1")
     if minutes is not None and not minutes > 0:
         raise InputError(f"sweep: minutes is {minutes}", "give a time above 0, or none")
@@ -264,17 +264,31 @@ def _names(function: Function, items: Sequence[Any], ids: Sequence[str] | None) 
 
 
 def _engine(
-    on: str, root: Path, function: Function, *, jobs: int, minutes: float | None, threads: int
+    on: str,
+    root: Path,
+    function: Function,
+    *,
+    jobs: int | None,
+    minutes: float | None,
+    threads: int,
 ) -> Engine:
     """What places the tasks.
 
     Raises:
         InputError: No such engine, or not here.
     """
+    kind, _, address = on.partition("=")
+    if kind == "ray":
+        from gsfluent.sweep.ray_pool import RayPool
+
+        return RayPool(
+            root, function, jobs=jobs, minutes=minutes, threads=threads, address=address or "auto"
+        )
+    jobs = jobs or os.cpu_count() or 1
     if on == "local":
         return LocalPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
     if on == "slurm":
         from gsfluent.sweep.slurm import SlurmPool
 
         return SlurmPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
-    raise InputError(f"--on {on}: no such engine", "give local or slurm")
+    raise InputError(f"--on {on}: no such engine", "give local, slurm, ray or ray=HOST:PORT")

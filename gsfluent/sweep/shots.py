@@ -62,7 +62,8 @@ def run_sweep(
     """
     tasks = tasks_of(sweep, out, device=str(device), seed=seed, progress=reporter.task("look"))
     each = sweep.each
-    jobs = jobs or max((os.cpu_count() or 1) // each.cpus, 1)
+    if jobs is None and not on.startswith("ray"):  # which knows the processors of its machines
+        jobs = max((os.cpu_count() or 1) // each.cpus, 1)
     settings: dict[str, Any] = {"jobs": jobs, "threads": each.cpus, "on": on, "retry": retry}
     open_ = [task for task in tasks if not (out / "shots" / task.id).exists()]
     first = {task.solids: task for task in open_}

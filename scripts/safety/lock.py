@@ -43,12 +43,15 @@ def main() -> int:
 
 
 def wanted() -> list[str]:
-    """Requirements of the build, of the package and of all extras."""
+    """Requirements of the build, of the package and of the extras that developers have."""
     with (ROOT / "pyproject.toml").open("rb") as stream:
         project = tomllib.load(stream)
-    extras = project["project"]["optional-dependencies"].values()
+    extras = project["project"]["optional-dependencies"]
     found = [*project["build-system"]["requires"], *project["project"]["dependencies"]]
-    found += [one for extra in extras for one in extra if not one.startswith("gsfluent[")]
+    for one in extras["dev"]:
+        name, _, some = one.partition("[")
+        names = some.rstrip("]").split(",") if name == "gsfluent" else []
+        found += [each for extra in names for each in extras[extra]] if names else [one]
     return list(dict.fromkeys(found))
 
 

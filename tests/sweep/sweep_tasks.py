@@ -52,10 +52,13 @@ def names(count: int) -> list[str]:
     return [f"n{i}" for i in range(count)]
 
 
-def drive(folder: str, count: int) -> None:
+def drive(folder: str, count: int, on: str = "local") -> None:
     """A driver of its own, to be killed."""
-    map(slow_square, range(count), folder, ids=names(count), jobs=2, tries=99)
+    # not of __main__, which is another module elsewhere
+    from sweep_tasks import slow_square
+
+    map(slow_square, range(count), folder, ids=names(count), jobs=2, tries=99, on=on)
 
 
 if __name__ == "__main__":
-    drive(sys.argv[1], int(sys.argv[2]))
+    drive(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])
