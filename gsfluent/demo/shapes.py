@@ -8,8 +8,9 @@ from torch import Tensor
 
 from gsfluent.demo.objects import DemoObject
 
-_STEPS = 100
 _STRIDE = 0.6  # share of the distance that a ray walks: distances of bent shapes are too long
+_LEAST = 1e-3  # share of the box that a ray walks at least: one that grazes a face would never end
+_HALVINGS = 20  # between the last place outside and the first inside
 _SLOPE = 1e-5  # m, half the step of a difference quotient
 
 
@@ -90,18 +91,30 @@ def walk(obj: DemoObject, origin: Tensor, direction: Tensor) -> tuple[Tensor, Te
     far = torch.maximum(a, b).amin(dim=1)
     rows = torch.nonzero(far > near)[:, 0]
     t, end = near[rows], far[rows]
-    fine = 1e-5 * float((high - low).max())
+    extent = float((high - low).max())
+    fine, least = 1e-5 * extent, _LEAST * extent
     hit = torch.zeros_like(rows, dtype=torch.bool)
+    before = t.clone()
+
+    def left(of: Tensor, along: Tensor) -> Tensor:
+        return obj.level(start + along[:, None] * unit[rows[of]])
+
     going = torch.arange(len(rows))
-    for _ in range(_STEPS):
-        if going.numel() == 0:
-            break
-        left = obj.level(start + t[going, None] * unit[rows[going]])
-        on = left < fine
+    while going.numel() > 0:
+        away = left(going, t[going])
+        on = away < fine
         hit[going[on]] = True
-        going = going[~on]
-        t[going] += _STRIDE * left[~on]
+        going, away = going[~on], away[~on]
+        before[going] = t[going]
+        t[going] += (_STRIDE * away).clamp_min(least)
         going = going[t[going] < end[going]]
+    # the least stride may end inside, so the surface is looked for behind it
+    inside = torch.nonzero(hit & (t > before))[:, 0]
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (before[inside] + t[inside])
+        under = left(inside, middle) < fine
+        t[inside] = torch.where(under, middle, t[inside])
+        before[inside] = torch.where(under, before[inside], middle)
     index = rows[hit]
     return index, (start + t[hit, None] * unit[index]).to(direction.dtype)
 

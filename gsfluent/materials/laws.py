@@ -16,6 +16,7 @@ LAWS = {
     "fluid": 4,
     "rigid": 5,
     "corotated": 6,
+    "phase_field": 9,
 }
 """Constitutive laws and their numbers in :func:`gsfluent.ops.return_mapping`."""
 
@@ -37,12 +38,14 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "tensile_strength": (0.0, math.inf, "Pa"),
     "compressive_strength": (0.0, math.inf, "Pa"),
     "fracture_energy": (0.0, math.inf, "J/m^2"),
+    "toughness": (0.0, math.inf, "J/m^2"),
+    "length": (0.0, math.inf, "m"),
 }
 """Parameter -> lowest value, highest value, unit."""
 
 POSITIVE = (
     "young_modulus", "density", "grain", "bulk_modulus", "reference_volume", "softening",
-    "tensile_strength", "compressive_strength", "fracture_energy",
+    "tensile_strength", "compressive_strength", "fracture_energy", "toughness", "length",
 )  # fmt: skip
 """Parameters that must be above their lowest value."""
 
@@ -50,6 +53,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "law": tuple(LAWS),
     "prefer": ("toughness", "strength"),
     "hysteresis": ("pressed", "both"),
+    "split": ("volumetric", "none", "spectral"),
+    "model": ("at1", "at2"),
 }
 """What of a material is a word, and which words there are."""
 
@@ -57,6 +62,9 @@ HANDBOOK = ("tensile_strength", "compressive_strength", "fracture_energy")
 """What fixes cohesion, hardening and alpha0 of nacc matter on a grid, all three together."""
 DERIVED = ("cohesion", "hardening", "alpha0")
 """What they fix; given by hand, each takes the place of what would be derived."""
+
+BREAKS = ("nacc", "phase_field")
+"""Laws of matter that can break."""
 
 PARAMETERS = tuple(RANGES)
 """The fields of a material that may vary in space."""
@@ -78,8 +86,12 @@ READS: dict[str, tuple[str, ...]] = {
     "von_mises": (*_SOLID, "yield_stress", "hardening_modulus"),
     "fluid": ("bulk_modulus", "density", "viscosity", "tait_exponent"),
     "rigid": ("density",),
+    "phase_field": (*_SOLID, "toughness", "length", "tensile_strength"),
 }
 """Law -> the parameters it reads; any other is refused, because it would do nothing."""
+
+OPTIONAL = {"phase_field": ("length", "tensile_strength")}
+"""Law -> parameters that the grid finds where they are left out."""
 
 DEFAULTS: dict[str, dict[str, float]] = {
     "nacc": {
@@ -123,6 +135,9 @@ def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
     elif law == "drucker_prager":
         # |dev tau| = sqrt(2/3) q = 3 alpha_DP p
         strength, cohesion = math.sqrt(2.0 / 27.0) * slope, at("cohesion_pressure")
+    elif law == "phase_field":  # threshold, length and code: materials.phase_field
+        strength, hardening, damage = at("threshold"), at("length"), at("code")
+        exponent = 1.0 - at("restitution") ** 2
     elif law == "von_mises":
         strength, hardening = at("yield_stress"), at("hardening_modulus")
     columns = (mu, kappa, strength, cohesion, hardening, damage, density, exponent)

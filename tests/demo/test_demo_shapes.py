@@ -218,3 +218,29 @@ def test_silhouettes_leave_no_cone_on_level_faces(name: str) -> None:
     views = ring_cameras(melon, 40, on_table=False)
     heights = torch.stack([-(v[:3, :3].T @ v[:3, 3]) for v in views])[:, 2]
     assert len(heights.mul(1e6).round().unique()) == 3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rays_that_graze_a_face_are_no_bites_in_the_silhouette(name: str) -> None:
+    """What a ray meets two thousandths deep is seen, from eyes level with the top and the base."""
+    obj = demo.make_object(name, 0)
+    views = ring_cameras(obj, 40, on_table=False)
+    reach = 2.0 * max(obj.axes)
+    level = [
+        view
+        for view in views
+        if min(abs(float(-(view[:3, :3].T @ view[:3, 3])[2]) - h) for h in (0.0, 2 * obj.axes[2]))
+        < 1e-6
+    ]
+    for view in level[:2] or views[20:21]:
+        eye = -(view[:3, :3].T @ view[:3, 3])
+        axis = torch.linspace(-0.3, 0.3, 40)
+        y, x = torch.meshgrid(axis, axis, indexing="ij")
+        ray = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3) @ view[:3, :3].float()
+        seen = torch.zeros(len(ray), dtype=torch.bool)
+        seen[obj.intersect(eye, ray)[0]] = True
+        unit = (ray / ray.norm(dim=1, keepdim=True)).double()
+        along = float((eye - obj.center).norm()) + torch.linspace(-reach, reach, 300).double()
+        points = eye + along[None, :, None] * unit[:, None]
+        deepest = obj.depth(points.reshape(-1, 3)).view(len(ray), -1).amax(dim=1)
+        assert not bool((~seen & (deepest > 2e-3 * reach)).any())

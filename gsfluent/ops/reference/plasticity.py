@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.ops.reference import laws as other
+from gsfluent.ops.reference import phase_field as phase
 from gsfluent.ops.reference.nacc import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -183,7 +184,10 @@ def return_mapping(
             t = _trial(e[rows], inverted[rows])
             pulled = strain_from_isochoric(t.d, t.log_j)
             kept = torch.where(t.guarded[:, None], pulled, t.e)
-            r = other.LAWS[number](kept, t.log_j, t.guarded, alpha[rows], own)
+            if number == phase.PHASE:
+                r = phase.phase_field(t.e, t.d, t.n, t.j2m1, t.guarded, alpha[rows], own)
+            else:
+                r = other.LAWS[number](kept, t.log_j, t.guarded, alpha[rows], own)
         new_strain = new_strain.index_copy(0, rows, r.strain)
         stress = stress.index_copy(0, rows, r.stress)
         alpha = alpha.index_copy(0, rows, r.alpha)
@@ -210,7 +214,12 @@ def elastic_energy(strain: Tensor, m: Material, laws: Tensor | None = None) -> T
         if number > 1:
             rows = (laws == number).nonzero()[:, 0]
             own = Material(*(column[rows] for column in m))
-            energy = energy.index_copy(0, rows, other.energy(number, strain[rows], own))
+            found = (
+                phase.energy(strain[rows], own)
+                if number == phase.PHASE
+                else other.energy(number, strain[rows], own)
+            )
+            energy = energy.index_copy(0, rows, found)
     return energy
 
 

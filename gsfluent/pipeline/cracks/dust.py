@@ -2,9 +2,10 @@
 
 A point of dust is as large as the grid is fine, which no grain of the real thing is. So it is drawn
 as grains, as frequent as their size to the power -3.5 (Villermaux 2025), in the colours of the
-places that they come from. Their volumes sum to that of the point. They leave with it: a point that
-has gone a way relative to the chunk that it came from has scattered its grains by a fifth of that.
-What is left behind is a pit in the chunk (:mod:`gsfluent.pipeline.cracks.chunks`).
+places that they come from, drops nearer to that of the whole body. Their volumes sum to that of
+the point. They leave with it: a point that has gone a way relative to the chunk that it came from
+has scattered its grains by a fifth of that. What is left behind is a pit in the chunk
+(:mod:`gsfluent.pipeline.cracks.chunks`). Drops that reach the floor spread on it.
 
 All that is random about a grain is hashed from the row of its point and its number, so it is the
 same in every frame, on every device and after a resume. A run without dust has no grains.
@@ -53,8 +54,17 @@ OPACITY = 0.97
 WET = (1.8, 1.0, 1.0)
 POWDER = (1.0, 0.8, 0.45)
 """Proportions of drops, which are drawn out along their way, and of grains of powder, at most."""
+SPREAD = 2.0
+"""How many times wider a drop is that has landed; milk and water spread 2 to 4 times on impact
+(Pasandideh-Fard et al. 1996) and draw back again."""
+LANDED, FALLING = 1.2, 2.4
+"""Height of a point above the floor [its edges] at which its grains lie on it, and from which they
+know nothing of it: the grid feels the floor from a cell and a half away."""
+JUICE = 0.85
+"""Share of the body's mean colour in that of a drop: juice is mixed, wherever it came from."""
 STILL = 1e-3
 """A point that has gone less than this since the last frame [edges] lies still."""
+_ASKED = 4096  # points of a body that are asked for its mean colour, about
 _ROOM = 1 << 10  # numbers of grains for each point
 
 
@@ -71,6 +81,7 @@ class Dust:
         self.edge = matter.particles.volume.clamp(min=0.0).pow(1.0 / 3.0)
         self.rows = torch.zeros(0, dtype=torch.int64, device=self.edge.device)
         self._grains: list[Grains] = []
+        self._mean: dict[int, Tensor] = {}
         # of every point: the way that it has gone from its chunk, and where it was
         self._way = self.edge.new_zeros((len(self.edge), 3))
         self._last = self.edge.new_full((len(self.edge), 3), torch.nan)
@@ -99,7 +110,18 @@ class Dust:
             mine = rows[body == number]
             wet = materials.wet(self._scene.bodies[number].material.name)
             made = grains(mine, self.edge[mine], self._finest[number], wet)
-            self._grains.append(made.at(self._matter.rest[made.row], color))
+            made = made.at(self._matter.rest[made.row], color)
+            if wet and made.color is not None:
+                made.color = torch.lerp(made.color, self._juice(number, color), JUICE)
+            self._grains.append(made)
+
+    def _juice(self, number: int, color: Callable[[Tensor], Tensor]) -> Tensor:
+        """Mean colour of a body, [3]."""
+        if number not in self._mean:
+            a, b = self._matter.ranges[number]
+            step = max(1, (b - a) // _ASKED)
+            self._mean[number] = color(self._matter.rest[a:b:step]).mean(dim=0)
+        return self._mean[number]
 
     @functools.cached_property
     def _finest(self) -> list[float]:
@@ -154,7 +176,7 @@ class Dust:
             return None
         if len(self._grains) > 1:  # a hard landing sheds dust hundreds of times
             self._grains = [Grains.joined(self._grains)]
-        made = self._grains[0].drawn(position, self._way, self.share, self._scene.floor)
+        made = self._grains[0].drawn(position, self.edge, self._way, self.share, self._scene.floor)
         return made if made.ids.numel() else None
 
 
@@ -167,6 +189,7 @@ class Grains:
         offset: Place in the cell of the point [m], [G, 3].
         toward: Where it scatters to, of a length up to 1, [G, 3].
         lag: How far it stays behind, 0 to 1, [G].
+        wet: Whether it is a drop, bool [G].
         quats: Orientations, [G, 4].
         scales: Standard deviations [m], [G, 3].
         color: RGB in 0..1, [G, 3].
@@ -174,10 +197,10 @@ class Grains:
 
     def __init__(
         self, row: Tensor, number: Tensor, offset: Tensor, toward: Tensor, lag: Tensor,
-        quats: Tensor, scales: Tensor, color: Tensor | None = None,
+        wet: Tensor, quats: Tensor, scales: Tensor, color: Tensor | None = None,
     ) -> None:  # fmt: skip
         self.row, self.number, self.offset, self.toward = row, number, offset, toward
-        self.lag, self.quats, self.scales, self.color = lag, quats, scales, color
+        self.lag, self.wet, self.quats, self.scales, self.color = lag, wet, quats, scales, color
 
     @property
     def volume(self) -> Tensor:
@@ -197,7 +220,12 @@ class Grains:
         return self
 
     def drawn(
-        self, position: Tensor, way: Tensor, share: Callable[[Tensor], Tensor], floor: float | None
+        self,
+        position: Tensor,
+        edge: Tensor,
+        way: Tensor,
+        share: Callable[[Tensor], Tensor],
+        floor: float | None,
     ) -> Births:
         """Those of points that have left, as splats."""
         assert self.color is not None  # at
@@ -208,20 +236,56 @@ class Grains:
         reach = SCATTER * gone.norm(dim=1)
         off = self.offset[some] + reach[:, None] * self.toward[some]
         off = off - LAG * self.lag[some, None] * gone
-        if floor is not None:  # what lies on the floor is no heap
+        quats, scales = self.quats[some], self.scales[some]
+        if floor is not None:
+            # what lies on the floor is no heap
             height = (here[:, 2] - floor).clamp(min=0.0)
             most = off[:, 2].abs().clamp(min=1e-9)
             off[:, 2] *= torch.minimum(height / torch.maximum(most, reach), torch.ones_like(most))
+            lies = (FALLING - height / edge[row].clamp(min=1e-12)) / (FALLING - LANDED)
+            lies = lies.clamp(0.0, 1.0)
+            quats, scales = _spread(quats, scales, torch.where(self.wet[some], lies, 0.0))
+            down = floor + _half_height(quats, scales) - (here + off)[:, 2]
+            off[:, 2] += lies * down
         gaussians = Gaussians(
             means=here + off,
-            quats=self.quats[some],
-            scales=self.scales[some],
+            quats=quats,
+            scales=scales,
             opacities=opacity[some],
             sh=geometry.rgb_to_sh0(self.color[some])[:, None],
             labels=torch.full_like(row, SPRAY, dtype=torch.int32),
-            normals=geometry.quaternion_to_matrix(self.quats[some])[..., 2],
+            normals=geometry.quaternion_to_matrix(quats)[..., 2],
         )
         return Births(gaussians, DUST + row * _ROOM + self.number[some], row)
+
+
+def _spread(quats: Tensor, scales: Tensor, lies: Tensor) -> tuple[Tensor, Tensor]:
+    """Drops that have landed by a share ``lies`` [G], 0 to 1: flatter and wider, as much of each.
+
+    Args:
+        quats: Orientations in flight, [G, 4].
+        scales: Standard deviations in flight [m], [G, 3].
+        lies: The share.
+    """
+    mean = scales.prod(dim=1, keepdim=True).pow(1.0 / 3.0)
+    long = (scales[:, :1] / mean).pow(0.5)  # what was drawn out lies as an oval
+    flat = mean * torch.cat(
+        [SPREAD * long, SPREAD / long, long.new_full(long.shape, SPREAD**-2)], 1
+    )
+    first = geometry.quaternion_to_matrix(quats)[..., 0]
+    turn = 0.5 * torch.atan2(first[:, 1], first[:, 0])
+    none = torch.zeros_like(turn)
+    level = torch.stack([turn.cos(), none, none, turn.sin()], dim=1)
+    level = level * torch.where((level * quats).sum(dim=1) < 0.0, -1.0, 1.0)[:, None]
+    turned = torch.nn.functional.normalize(torch.lerp(quats, level, lies[:, None]), dim=1)
+    shape = torch.exp(torch.lerp(scales.log(), flat.log(), lies[:, None]))
+    some = lies[:, None] > 0.0  # the others keep their bits
+    return torch.where(some, turned, quats), torch.where(some, shape, scales)
+
+
+def _half_height(quats: Tensor, scales: Tensor) -> Tensor:
+    """Half of the vertical extent of grains [m], [G]."""
+    return (geometry.quaternion_to_matrix(quats)[:, 2] * scales / SIGMA).norm(dim=1)
 
 
 def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
@@ -267,9 +331,12 @@ def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
         quats = torch.nn.functional.normalize(quats + 1e-6, dim=1)
     size = size * edge.double().repeat_interleave(count)
     scales = (SIGMA * 0.5) * size[:, None] * shape
-    found = (offset, out, lag, quats, scales)
+    offset, out, lag, quats, scales = (
+        value.to(torch.float32) for value in (offset, out, lag, quats, scales)
+    )
     number = number.repeat(len(rows))
-    return Grains(row, number, *(value.to(torch.float32) for value in found))
+    drops = torch.full_like(row, wet, dtype=torch.bool)
+    return Grains(row, number, offset, out, lag, drops, quats, scales)
 
 
 def _along(toward: Tensor) -> Tensor:

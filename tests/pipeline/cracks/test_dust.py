@@ -6,7 +6,17 @@ import pytest
 import torch
 from test_chunks import apart, binding, drawn, halves, moment
 
-from gsfluent.pipeline.cracks.dust import BETA, COARSEST, MOST, finest, grains, per_point
+from gsfluent import geometry
+from gsfluent.pipeline.cracks.dust import (
+    BETA,
+    COARSEST,
+    MOST,
+    SIGMA,
+    SPREAD,
+    finest,
+    grains,
+    per_point,
+)
 from gsfluent.pipeline.cracks.stage import Repair
 from gsfluent.pipeline.matter.carry import Carry
 from gsfluent.results.frames import DUST
@@ -71,6 +81,32 @@ def test_a_row_has_its_grains_whatever_is_around() -> None:
             assert torch.equal(*pair)
     first, second = (one.offset[one.row == row] for row in (5, 31))
     assert not torch.allclose(first, second)
+
+
+@pytest.mark.parametrize("wet", [True, False])
+def test_drops_spread_on_the_floor_and_grains_lie_on_it(wet: bool) -> None:
+    """Volumes stay; what is high has the bits that it had in flight; nothing is below the floor."""
+    rows, floor = torch.arange(3), 0.25
+    edge = torch.full((3,), 6e-3)
+    place = torch.tensor([[0.0, 0.0, 0.004], [0.1, 0.0, 0.011], [0.2, 0.0, 0.2]])
+    place[:, 2] += floor
+    way = torch.tensor([0.03, 0.0, -0.02]).expand(3, 3)
+    made = grains(rows, edge, 0.25, wet)
+    made = made.at(place[made.row], torch.zeros_like)
+    drawn = made.drawn(place, edge, way, lambda row: torch.ones_like(edge)[row], floor).gaussians
+    volume = drawn.scales.double().prod(dim=1)
+    assert torch.allclose(volume, made.scales.double().prod(dim=1), rtol=1e-5)
+    lying, between, high = (made.row == k for k in range(3))
+    assert torch.equal(drawn.scales[high], made.scales[high])
+    assert torch.equal(drawn.quats[high], made.quats[high])
+    half = geometry.quaternion_to_matrix(drawn.quats)[:, 2] * drawn.scales / SIGMA
+    bottom = drawn.means[:, 2] - half.norm(dim=1) - floor
+    assert float(bottom[lying].abs().max()) < 1e-6
+    assert float(bottom[between | high].min()) > -1e-3
+    ratio = drawn.scales[lying].amax(dim=1) / drawn.scales[lying].amin(dim=1)
+    assert float(ratio.min()) >= SPREAD**3 - 1e-3 if wet else float(ratio.max()) < 3.0
+    if wet:
+        assert float(drawn.normals[lying][:, 2].abs().min()) > 1.0 - 1e-5
 
 
 def test_much_dust_has_larger_grains() -> None:
