@@ -116,7 +116,6 @@ class Fit(Verb):
       gsfluent fit shot.yaml --points track.npz --learn melon.young_modulus melon.velocity -o out
       gsfluent fit shot.yaml --clouds frames/ --learn melon.young_modulus melon.poisson_ratio -o out
       gsfluent fit shot.yaml --force press.csv --learn block.young_modulus -o out
-      gsfluent run out/fitted.yaml -o result
 
     The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
     What the motion does not show is called unidentified and given as a bound. A fit that was

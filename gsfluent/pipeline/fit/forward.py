@@ -69,6 +69,9 @@ class Forward:
                     f"fit: {body.name!r} is shot or poured", "learn from objects that are there"
                 )
             points = sample_points(body.solid, step / body.frame.scale, seed=seed, jitter=0.0)
+            # a lattice that meets the faces of voxels takes more on one side than on the other
+            middle = body.solid.voxel_centers().double().cpu().mean(dim=0)
+            points = points + (middle - points.mean(dim=0))
             count = points.shape[0]
             layers = [body.material, *(part.material(body.material) for part in body.parts)]
             index = torch.zeros(count, dtype=torch.int64)
