@@ -23,6 +23,7 @@ __getattr__, __dir__, __all__ = lazy(
             "demo",
             "io",
             "materials",
+            "targets",
             "geometry",
             "metrics",
             "errors",

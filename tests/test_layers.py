@@ -33,9 +33,9 @@ ORDER = (
     "pipeline/texture/volume pipeline/texture/presets pipeline/texture/photo "
     "pipeline/texture/synthesis pipeline/texture/inpaint pipeline/texture "
     "pipeline/partition "
-    "pipeline/render pipeline/cracks pipeline/simulate "
+    "pipeline/render pipeline/cracks pipeline/simulate targets pipeline/fit "
     "export stages inspection live viewer/model viewer/draw viewer/panels viewer plan choose run "
-    "sweep dataset studio lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers "
+    "sweep fit dataset studio lab/world lab/truth lab/textbook lab/problems lab/frozen lab/peers "
     "lab/charts lab/stability lab cli __main__.py"
 ).split()
 # a scorer without torch: nothing of gsfluent but itself, and what asks it names it
@@ -121,8 +121,8 @@ def test_a_folder_can_be_overlooked(folder: Path) -> None:
 
 # libraries: all that has no underscore may be taken; the other rooms name it in their __init__
 LIBRARIES = (
-    ". ops ops/reference data io materials config pipeline pipeline/texture cli demo figure "
-    "fracturebench fracturebench/scenes"
+    ". ops ops/reference data targets io materials config pipeline pipeline/texture cli demo "
+    "figure fracturebench fracturebench/scenes"
 ).split()
 
 

@@ -15,7 +15,7 @@ from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
 from gsfluent.cli.verbs_stage import Fill, Mesh, Poses, Reconstruct, Texture
-from gsfluent.cli.verbs_sweep import Dataset, Sweep
+from gsfluent.cli.verbs_sweep import Dataset, Fit, Sweep
 from gsfluent.cli.verbs_view import Studio, View
 
 VERBS: dict[str, type[Verb]] = {
@@ -32,6 +32,7 @@ VERBS: dict[str, type[Verb]] = {
     "sweep": Sweep,
     "dataset": Dataset,
     "carry": Carry,
+    "fit": Fit,
     "render": Render,
     "report": Report,
     "view": View,

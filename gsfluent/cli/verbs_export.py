@@ -123,11 +123,10 @@ class Carry(Verb):
       gsfluent carry melon.ply --by blender.glb --up y -o out # an animated mesh
       gsfluent carry melon.ply --by frames/ --fps 30 -o out   # a .ply, .obj or .npy per frame
       gsfluent carry melon.ply --by cache.usdc -o out         # USD; also .vtk.series and .pvd
-      gsfluent export out --to ply-seq,usd                    # and on to any viewer
-      gsfluent render out --light=1,-1,2 --camera turntable
 
     Splats are moved, stretched and turned, their colours too. At frame --rest the carriers must be
-    where the splats lie. The folder is like that of `gsfluent run`. docs/guide/carry.md.
+    where the splats lie. The folder is like that of `gsfluent run`:
+    render, export and view go on from it. docs/guide/carry.md.
     """
 
     splats: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SPLATS")]

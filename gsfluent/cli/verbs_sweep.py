@@ -1,4 +1,4 @@
-"""Verbs of many shots: sweep, dataset."""
+"""Verbs of many runs: sweep, dataset, fit."""
 
 from __future__ import annotations
 
@@ -107,6 +107,74 @@ class Dataset(Verb):
                 self.sweep, self.out, self.format, device=self.torch_device(), shares=self.shares,
                 jobs=self.jobs, progress=progress,
             )  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class Fit(Verb):
+    """Learn from motion what a thing is made of: stiffness, yield stress, viscosity, velocity.
+
+    Examples:
+      gsfluent fit shot.yaml --points track.npz --learn melon.young_modulus melon.velocity -o out
+      gsfluent fit shot.yaml --clouds frames/ --learn melon.young_modulus melon.poisson_ratio -o out
+      gsfluent fit shot.yaml --force press.csv --learn block.young_modulus -o out
+
+    The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
+    What the motion does not show is called unidentified and given as a bound. A fit that was
+    stopped goes on. Leaves fit.json, fitted.yaml and fit.html. docs/guide/fit.md.
+    """
+
+    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
+    """The shot file."""
+    out: Out
+    """Folder for the results; made when missing."""
+    learn: tuple[str, ...]
+    """What, each as OBJECT.NUMBER; velocity and angular_velocity are three."""
+    points: Path | None = None
+    """Tracked points [T, K, 3] in the scene's metres: a file or folder as of `gsfluent carry`."""
+    clouds: Path | None = None
+    """Clouds or splats without names: a folder with a file per frame."""
+    force: Path | None = None
+    """A table with columns displacement [m] and force [N] of the one collider that moves."""
+    sigma: float | None = None
+    """Standard deviation of what was seen [m, N]."""
+    fps: float | None = None
+    """Frames per second of files without times; 24 when absent."""
+    starts: int = 4
+    """Starts of the search."""
+    cells: int = 8
+    """Cells along the longest side of the largest object; give thin things more."""
+    grids: Literal[1, 2] = 2
+    """2: fit on a grid finer by 1.5, too; their difference joins the bands."""
+    jobs: int | None = None
+    """Searches at a time; as many as there are cores when absent."""
+    on: Literal["local", "slurm"] = "local"
+    """Where searches run."""
+
+    def execute(self) -> dict[str, Any]:
+        """Learn."""
+        from gsfluent.config import load_shot
+        from gsfluent.fit.job import fit_to
+
+        for name in ("points", "clouds", "force"):
+            if getattr(self, name) is not None:
+                existing(getattr(self, name), f"--{name}")
+        shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        with self.reporter() as report:
+            return fit_to(
+                shot, self.out, self.learn, device=self.torch_device(), reporter=report,
+                **self.given("points", "clouds", "force", "sigma", "fps", "starts", "cells"),
+                **self.given("grids", "jobs", "on", "seed"),
+            )  # fmt: skip
+
+    def text(self, result: dict[str, Any]) -> str | None:
+        """Every number with its band, or why there is none."""
+        lines = []
+        for key, number in result["parameters"].items():
+            bound = result["unidentified"].get(key)
+            said = f"unidentified: {bound}" if bound else f"{number['value']} (sd {number['sd']})"
+            lines.append(f"{key}: {said}")
+        lines += [f"  ! {warning}" for warning in result["warnings"]]
+        return "\n".join([*lines, f"{self.out / result['outputs']['shot']}"])
 
 
 def _axes(words: tuple[str, ...]) -> dict[str, list[Any]]:

@@ -250,6 +250,14 @@ class Material:
                 raise InputError(f"material {self.name!r}: {wrong}", hint="mend the number")
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What travels to another process: a view of ``sources`` cannot."""
+        return self.__dict__ | {"sources": dict(self.sources)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """See :meth:`__getstate__`."""
+        self.__dict__.update(state, sources=MappingProxyType(state["sources"]))
+
     @property
     def by_handbook(self) -> bool:
         """Whether strengths and fracture energy are given, from which the grid derives the rest."""

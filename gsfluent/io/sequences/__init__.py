@@ -2,4 +2,6 @@
 
 from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = room(__name__, read="read_sequence", sequence="Sequence")
+__getattr__, __dir__, __all__ = room(
+    __name__, read="read_clouds read_sequence", sequence="Sequence"
+)

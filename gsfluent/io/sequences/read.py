@@ -103,6 +103,25 @@ def _folder(path: Path, fps: float | None) -> Sequence:
     return checked(path, stacked(path, [points for points, _ in read]), None, read[0][1], fps)
 
 
+def read_clouds(path: str | Path) -> list[NDArray[np.float64]]:
+    """Points of every frame, of which there may be more or fewer from frame to frame.
+
+    Args:
+        path: A folder with a ``.npy``, ``.ply`` (points, splats or a mesh) or ``.obj`` per frame,
+            in the order of their numbers; or any sequence of :func:`read_sequence`.
+
+    Raises:
+        InputError: No such frames.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return list(read_sequence(path).positions)
+    files = [f for f in path.iterdir() if f.suffix.lower() in (".npy", ".ply", ".obj")]
+    if not files:
+        raise InputError(f"{path}: no clouds in this folder", "give a .npy or .ply per frame")
+    return [np.asarray(_frame(file)[0], np.float64) for file in sorted(files, key=_natural)]
+
+
 def _natural(path: Path) -> list[Any]:
     """Sorts frame_2 before frame_10."""
     return [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", path.name)]

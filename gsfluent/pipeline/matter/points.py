@@ -88,7 +88,7 @@ class Matter:
         return self.of_law(*materials.BREAKS)
 
 
-def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
+def sample_points(solid: Solid, spacing: float, *, seed: int = 0, jitter: float = 0.5) -> Tensor:
     """Sample a solid's matter on a jittered lattice.
 
     One point per lattice cell of edge ``spacing``, moved at random by up to a quarter of it along
@@ -99,6 +99,8 @@ def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
         spacing: Distance between points [world units].
         seed: Seed of the jitter, which is fixed in object space: the same solid gives the same
             points.
+        jitter: Width of the jitter in spacings; without any, what cannot break moves with less
+            noise of its sampling.
 
     Returns:
         Points [N, 3] in world coordinates, float64, ordered along x, then y, then z.
@@ -120,8 +122,8 @@ def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
     )
     for i in range(int(counts[0])):  # slab by slab: memory stays small for fine lattices
         cell = torch.cat([torch.full((*lattice.shape[:2], 1), i), lattice], dim=-1).reshape(-1, 3)
-        jitter = torch.rand(cell.shape, generator=generator, dtype=torch.float64) - 0.5
-        points = start + (cell + 0.5 + 0.5 * jitter) * spacing
+        noise = torch.rand(cell.shape, generator=generator, dtype=torch.float64) - 0.5
+        points = start + (cell + 0.5 + jitter * noise) * spacing
         found.append(points[solid.contains(points.to(solid.occupancy.device)).cpu()])
     result = torch.cat(found)
     if result.shape[0] == 0:
@@ -414,6 +416,23 @@ def _approach(body: Body, scene: Scene) -> tuple[Tensor, Tensor]:
     velocity = torch.tensor(body.velocity, dtype=torch.float64) - gravity * body.start
     shift = -(velocity * body.start + 0.5 * gravity * body.start**2)
     return shift, velocity
+
+
+def start_of(
+    body: Body, scene: Scene, points: Tensor, mass: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where points of a body's own coordinates are at time 0, and how they move.
+
+    Args:
+        body: The body.
+        scene: Its scene, for gravity.
+        points: Float64 [N, 3].
+        mass: [kg], [N].
+
+    Returns:
+        Position [N, 3], velocity [N, 3] and velocity gradient [3, 3], in scene metres.
+    """
+    return _start(body, scene, _placed(body, points), mass)
 
 
 def _start(body: Body, scene: Scene, placed: Tensor, mass: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,0 +1,69 @@
+"""Targets from files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsfluent.config import Shot
+from gsfluent.errors import InputError
+from gsfluent.io.checked.files import read_text
+from gsfluent.io.sequences import read_clouds, read_sequence
+from gsfluent.targets.force import Force
+from gsfluent.targets.points import Clouds, Points
+from gsfluent.targets.target import Target
+
+FPS = 24.0
+"""Frames per second of clouds that do not say."""
+
+
+def read_target(
+    kind: str, path: Path, *, sigma: float | None, fps: float | None, shot: Shot
+) -> Target:
+    """Read what was seen.
+
+    Args:
+        kind: ``points``: a sequence [T, K, 3] of the same points. ``clouds``: a folder of ``.ply``
+            or ``.npy`` clouds or splats, which need no common order. ``force``: a CSV with the
+            columns displacement [m] and force [N].
+        path: The file or folder.
+        sigma: Standard deviation, see the target; its default when None.
+        fps: Frames per second where the file has no times.
+        shot: Has the collider that a force acts on.
+
+    Raises:
+        InputError: Not such a file, or what it holds is no target.
+    """
+    more: dict[str, Any] = {} if sigma is None else {"sigma": sigma}
+    if kind == "points":
+        seen = read_sequence(path, fps)
+        return Points(seen.positions, times=seen.times.tolist(), **more)
+    if kind == "clouds":
+        return Clouds(read_clouds(path), fps=fps or FPS, **more)
+    moving = [c for c in shot.colliders if any(getattr(c, "velocity", (0.0,)))]
+    if len(moving) != 1:
+        raise InputError(f"--force: the shot has {len(moving)} moving colliders", "give it one")
+    table = _table(path)
+    speed = float(np.linalg.norm(getattr(moving[0], "velocity", (0.0,))))
+    return Force(table[:, 0].tolist(), table[:, 1].tolist(), speed=speed, **more)
+
+
+def _table(path: Path) -> np.ndarray:
+    """Numbers of the columns displacement and force, [T, 2].
+
+    Raises:
+        InputError: No such columns, or no numbers.
+    """
+    lines = [line for line in read_text(path, noun="table").splitlines() if line.strip()]
+    head = [word.strip().lower() for word in lines[0].split(",")] if lines else []
+    try:
+        columns = [head.index("displacement"), head.index("force")]
+        rows = [[float(line.split(",")[c]) for c in columns] for line in lines[1:]]
+        return np.asarray(rows, np.float64).reshape(-1, 2)
+    except (ValueError, IndexError) as error:
+        raise InputError(
+            f"{path}: no table of displacement and force ({error})",
+            "a first line displacement,force, then numbers in metres and newtons",
+        ) from error

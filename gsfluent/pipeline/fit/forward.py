@@ -1,0 +1,240 @@
+"""The motion of a scene as a function of numbers: the resident solver in float64.
+
+Points lie on an unshaken lattice, the time step is the same for all runs of a linearisation, and
+the solver's sums do not hang on their order: so differences of 1e-4 are clean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.data import Gaussians
+from gsfluent.errors import InputError
+from gsfluent.materials import LAWS, Material
+from gsfluent.ops import SolverError
+from gsfluent.pipeline.colliders.rigid import RigidSet
+from gsfluent.pipeline.fit.parameters import OFFSET, VECTORS
+from gsfluent.pipeline.matter.points import (
+    POINTS_PER_CELL,
+    body_frame,
+    sample_points,
+    select,
+    start_of,
+)
+from gsfluent.scene.scene import Scene
+from gsfluent.targets.target import Motion, Setting
+
+CFL = 0.4
+HASTE = 1.3
+"""Margin of the time step for waves that matter under pressure carries faster."""
+MOST_STEPS = 200_000
+
+
+class TooFast(Exception):
+    """The time step was too long for what these numbers do."""
+
+
+class Forward:
+    """A scene on a grid, to be run again and again.
+
+    Args:
+        scene: Bodies of laws that do not break, rigid colliders that stand or move steadily.
+        times: Of the frames [s], ascending from 0.
+        dx: Grid spacing [m].
+        seed: Of the point positions, as far as anything is random.
+
+    Raises:
+        InputError: A body breaks, is a bullet or a liquid jet, or a collider is driven.
+    """
+
+    def __init__(self, scene: Scene, times: list[float], dx: float, seed: int = 0) -> None:
+        self.scene, self.times, self.dx = scene, times, dx
+        self.runs = 0
+        step = dx / POINTS_PER_CELL ** (1 / 3)
+        self._bodies: list[dict[str, Any]] = []
+        rows, row, laws = [], 0, []
+        places, velocities, affines, masses, volumes = [], [], [], [], []
+        self.ranges: list[tuple[int, int]] = []
+        done = 0
+        for body in scene.bodies:
+            if body.solid is None or body.start != 0.0 or body.held:
+                raise InputError(
+                    f"fit: {body.name!r} is shot or poured", "learn from objects that are there"
+                )
+            points = sample_points(body.solid, step / body.frame.scale, seed=seed, jitter=0.0)
+            # a lattice that meets the faces of voxels takes more on one side than on the other
+            middle = body.solid.voxel_centers().double().cpu().mean(dim=0)
+            points = points + (middle - points.mean(dim=0))
+            count = points.shape[0]
+            layers = [body.material, *(part.material(body.material) for part in body.parts)]
+            index = torch.zeros(count, dtype=torch.int64)
+            for number, part in enumerate(body.parts, 1):
+                index[select(part, body, points)] = number
+            for material in layers:
+                if material.law in ("nacc", "rigid"):
+                    raise InputError(
+                        f"fit: {body.name!r} has law {material.law}",
+                        "give it a law that does not break: elastic, von_mises, fluid, ...",
+                    )
+                laws.append(LAWS[material.law])
+            density = torch.tensor([float(m.parameters()[..., 6].mean()) for m in layers])
+            volume = torch.full((count,), body.volume / count, dtype=torch.float64)
+            mass = volume * density.double()[index]
+            position, velocity, affine = start_of(body, scene, points, mass)
+            places.append(position.double())
+            velocities.append(velocity.double())
+            affines.append(affine.double().expand(count, 3, 3))
+            masses.append(mass)
+            volumes.append(volume)
+            rows.append(index + row)
+            self._bodies.append({"body": body, "layers": layers, "first": row})
+            self.ranges.append((done, done + count))
+            row += len(layers)
+            done += count
+        self.rest = torch.cat(places)
+        self._velocity, self._affine = torch.cat(velocities), torch.cat(affines)
+        self._mass, self._volume = torch.cat(masses), torch.cat(volumes)
+        self._material = torch.cat(rows).to(torch.int32)
+        self._laws = torch.tensor(laws, dtype=torch.int32)
+        self.rigid = RigidSet(scene, dx)
+        if self.rigid.frees or self.rigid.grips or scene.blades:
+            raise InputError(
+                "fit: a free collider, a grip or a blade is in the scene",
+                "learn from floors and from colliders that stand or move steadily",
+            )
+        self.floor = scene.floor
+        self.solid = not set(laws) & {LAWS["fluid"], LAWS["drucker_prager"]}
+
+    def setting(self) -> Setting:
+        """What a target may know of the scene."""
+        splats = []
+        for entry in self._bodies:
+            body = entry["body"]
+            if body.solid.gaussians.count:
+                placed = body.solid.gaussians.to("cpu", torch.float32)
+                splats.append(placed.transformed(body_frame(body, self.scene)))
+        return Setting(
+            rest=self.rest, solid=self.solid, dx=self.dx, floor=self.floor,
+            splats=Gaussians.cat(splats) if splats else None, colliders=self.rigid.names,
+            velocity=self.rigid.start[:, 10:13],
+        )  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return self.rest.shape[0]
+
+    def step(self, values: Mapping[str, Any]) -> float:
+        """A time step that these numbers can take [s]."""
+        wave = max(m.wave_speed for m in self._materials(values))
+        speed = float(self.start(values)[1].norm(dim=1).max())
+        pull = math.hypot(*self.scene.gravity)
+        speed += pull * min(self.times[-1], 1.0)
+        speed = max(speed, float(self.rigid.speed(self.rigid.start)))
+        return CFL * self.dx / (HASTE * wave + speed)
+
+    def run(self, values: Mapping[str, Any], frames: int, dt: float) -> Motion:
+        """Move the scene.
+
+        Args:
+            values: Numbers by key; what is not named is as in the scene.
+            frames: How many of the frames.
+            dt: Longest time step [s]; divided so that frames are met.
+
+        Raises:
+            TooFast: The step was too long.
+        """
+        self.runs += 1
+        materials = self._materials(values)
+        params = torch.stack([m.parameters() for m in materials])
+        alpha = torch.tensor([float(m.start_alpha) for m in materials], dtype=torch.float64)
+        position, velocity, affine = self.start(values)
+        lift = position.new_tensor([0.0, 0.0, float(values.get(OFFSET, 0.0)) * self.dx])
+        rows = self.rigid.start
+        # a step of the solver kicks first, then drifts: half a kick less makes it second order
+        first = next((t for t in self.times if t > 0.0), dt)
+        kick = 0.5 * first / max(1, math.ceil(first / dt - 1e-9))
+        velocity = velocity - kick * velocity.new_tensor(self.scene.gravity)
+        solver = ops.Solver(
+            position + lift, velocity.contiguous(), self._mass, self._volume, dx=self.dx,
+            law=self._laws, params=params, material=self._material,
+            alpha=alpha[self._material.long()], affine=affine.contiguous(),
+            deformation=torch.eye(3, dtype=torch.float64).repeat(self.count, 1, 1),
+            body=self._fields(), gravity=self.scene.gravity,
+            colliders=rows if rows.shape[0] else None, sdf=self.rigid.sdf,
+            friction=self.scene.friction, dt=dt,
+        )  # fmt: skip
+        shown: list[tuple[Tensor, ...]] = []
+        now, steps = 0.0, 0
+        for time in self.times[:frames]:
+            span = time - now
+            if span > 0.0:
+                parts = max(1, math.ceil(span / dt - 1e-9))
+                steps += parts
+                if steps > MOST_STEPS:
+                    raise TooFast
+                solver._write(dt_fixed=span / parts)
+                try:
+                    solver.advance(steps=parts)
+                except (SolverError, ValueError) as error:
+                    raise TooFast from error
+                now = time
+            place = solver.position.double() - lift
+            map = solver.deformation
+            assert map is not None  # tracked from the start
+            if not bool(torch.isfinite(place).all()):
+                raise TooFast
+            impulse = solver.impulse if rows.shape[0] else place.new_zeros(0, 3)
+            shown.append((place, map.double().clone(), impulse))
+        where, maps, pushes = (torch.stack(part) for part in zip(*shown, strict=True))
+        change = maps.mT @ maps - torch.eye(3, dtype=torch.float64)  # twice Green's strain
+        return Motion(where, maps, pushes, 0.5 * change.abs().amax())
+
+    def _materials(self, values: Mapping[str, Any]) -> list[Material]:
+        """Materials of all layers with these numbers; parts keep their own."""
+        found: list[Material] = []
+        for entry in self._bodies:
+            body = entry["body"]
+            changes = {
+                name: values[f"{body.name}.{name}"]
+                for name in body.material.reads
+                if f"{body.name}.{name}" in values
+            }
+            first = dataclasses.replace(body.material, **changes) if changes else body.material
+            found += [first, *entry["layers"][1:]]
+        return found
+
+    def start(self, values: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions, velocities and their gradients at time 0 with these numbers."""
+        velocity, affine = self._velocity, self._affine
+        for (a, b), entry in zip(self.ranges, self._bodies, strict=True):
+            body = entry["body"]
+            for name in VECTORS:
+                key = f"{body.name}.{name}"
+                if key not in values:
+                    continue
+                more = velocity.new_tensor(values[key]) - velocity.new_tensor(getattr(body, name))
+                velocity, affine = velocity.clone(), affine.clone()
+                if name == "velocity":
+                    velocity[a:b] += more
+                    continue
+                mass = self._mass[a:b, None]
+                arm = self.rest[a:b] - (mass * self.rest[a:b]).sum(dim=0) / mass.sum()
+                x, y, z = more.tolist()
+                spin = velocity.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+                velocity[a:b] += arm @ spin.T
+                affine[a:b] += spin
+        return self.rest, velocity, affine
+
+    def _fields(self) -> Tensor | None:
+        if len(self.ranges) == 1:
+            return None
+        sizes = torch.tensor([b - a for a, b in self.ranges])
+        return torch.arange(len(sizes)).repeat_interleave(sizes).to(torch.int32)

@@ -1,0 +1,286 @@
+"""Levenberg-Marquardt on forward differences, in stages of time.
+
+Levenberg 1944, Marquardt 1963; residuals beyond three standard deviations count by their size
+alone (Huber 1964). Bands: the inverse of ``J^T W J`` and the prior where the motion fits to its
+noise, else the clustered sandwich of Liang and Zeger 1986 by frame, since what the model gets wrong
+it gets wrong for all points of a frame alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsfluent.pipeline.fit.forward import Forward, TooFast
+from gsfluent.pipeline.fit.parameters import Unknowns
+from gsfluent.targets.target import Motion, Observer
+
+Array = NDArray[np.float64]
+Tell = Callable[[str], None]
+HUBER = 3.0
+MOST = 0.5
+"""Longest step of a free coordinate."""
+DAMPING = (1e-2, 5.0)
+"""First damping, and the factor by which it changes."""
+CLOSE = 2e-4
+"""A step this short, in free coordinates, ends a stage."""
+SHARES = (0.25, 0.5, 0.75, 1.0)
+"""Of the frames, stage by stage."""
+
+
+@dataclasses.dataclass
+class Fitted:
+    """What a search has found.
+
+    Attributes:
+        free: Free coordinates.
+        cost: Half the sum of squares, Huber's beyond three, prior included.
+        rms: Root of the mean square of the residuals, in standard deviations.
+        information: ``J^T W J`` of the motion alone, [P, P].
+        covariance: With the prior; of what does not fit the sandwich, [P, P].
+        per_frame: Root mean square residual of each frame.
+        runs: Of the solver.
+        strain: Largest strain of any point at the last frame.
+    """
+
+    free: Array
+    cost: float
+    rms: float
+    information: Array
+    covariance: Array
+    per_frame: list[float]
+    runs: int
+    strain: float
+
+
+class Problem:
+    """A scene, a target and what is learnt.
+
+    Args:
+        forward: The scene on its grid.
+        observer: The target, bound to it.
+        unknowns: What is learnt.
+        step: Difference of the free coordinates.
+        fixed: Values that hold besides.
+    """
+
+    def __init__(
+        self,
+        forward: Forward,
+        observer: Observer,
+        unknowns: Unknowns,
+        step: float,
+        fixed: dict[str, Any] | None = None,
+    ) -> None:
+        self.forward, self.observer, self.unknowns = forward, observer, unknowns
+        self.step, self.fixed = step, fixed or {}
+
+    def motion(self, free: Array, frames: int, dt: float) -> Motion:
+        """Run these coordinates."""
+        return self.forward.run(self.fixed | self.unknowns.values(free), frames, dt)
+
+    def dt(self, free: Array) -> float:
+        """A time step for a linearisation about them."""
+        return self.forward.step(self.fixed | self.unknowns.values(free))
+
+    def seen(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
+        """Residuals and their frames."""
+        gap, frame = self.observer.residuals(motion, frames, pairs)
+        return gap.double().numpy(), frame.numpy()
+
+
+def weights(residual: Array) -> Array:
+    """Huber's weights."""
+    return HUBER / np.maximum(np.abs(residual), HUBER)
+
+
+def cost_of(residual: Array) -> float:
+    """Huber's cost."""
+    size = np.abs(residual)
+    return float(np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).sum())
+
+
+def search(
+    problem: Problem,
+    start: Array,
+    frames: int,
+    *,
+    active: NDArray[np.bool_] | None = None,
+    rounds: int = 12,
+    tell: Tell | None = None,
+) -> Fitted:
+    """Search from a start on the first frames.
+
+    Args:
+        problem: What is searched.
+        start: Free coordinates.
+        frames: How many frames count.
+        active: Coordinates that may change; all when None.
+        rounds: Most linearisations.
+        tell: Told of each.
+
+    Raises:
+        TooFast: The start cannot be run at any step tried.
+    """
+    unknowns = problem.unknowns
+    active = np.ones(len(unknowns), bool) if active is None else active
+    rows = np.flatnonzero(active)
+    prior = 1.0 / unknowns.spread**2
+    free, damping, runs = start.copy(), DAMPING[0], problem.forward.runs
+    scale = 1.0
+    for round_ in range(rounds + 1):
+        free, dt, motion = _run(problem, free, frames)
+        pairs = problem.observer.pair(motion)
+        residual, frame = problem.seen(motion, frames, pairs)
+        if len(residual) == 0:
+            break
+        # what does not fit is noise of its size, so that outliers stay outliers
+        scale = max(1.0, 1.4826 * float(np.median(np.abs(residual))))
+        residual = residual / scale
+        here = cost_of(residual) + 0.5 * float((prior * (free - unknowns.start) ** 2).sum())
+        jacobian = _jacobian(problem, free, frames, dt, pairs, residual, rows, scale)
+        weight = weights(residual)
+        normal = (jacobian * weight[:, None]).T @ jacobian
+        slope = jacobian.T @ (weight * residual) + (prior * (free - unknowns.start))[rows]
+        whole = normal + np.diag(prior[rows])
+        if round_ == rounds:
+            break
+        moved, better = 0.0, False
+        while damping < 1e8:
+            step = -np.linalg.solve(whole + damping * np.diag(np.diag(whole)), slope)
+            step *= min(1.0, MOST / max(float(np.abs(step).max()), 1e-300))
+            trial = free.copy()
+            trial[rows] += step
+            try:
+                found = problem.seen(problem.motion(trial, frames, dt), frames, pairs)[0] / scale
+                there = cost_of(found)
+                there += 0.5 * float((prior * (trial - unknowns.start) ** 2).sum())
+            except TooFast:
+                there = np.inf
+            if there < here:
+                free, moved, better = trial, float(np.abs(step).max()), True
+                damping = max(damping / DAMPING[1], 1e-8)
+                break
+            if float(np.abs(step).max()) < CLOSE:
+                break
+            damping *= DAMPING[1]
+        if tell is not None:
+            tell(f"{frames} frames, cost {min(here, there if better else here):.4g}")
+        if not better or moved < CLOSE:
+            break
+    if len(residual) == 0:
+        size = len(unknowns)
+        return Fitted(free, 0.0, 0.0, np.zeros((size, size)), np.diag(unknowns.spread**2), [],
+                      problem.forward.runs - runs, float(motion.strain))  # fmt: skip
+    return Fitted(
+        free=free,
+        cost=here,
+        rms=scale * float(np.sqrt(np.mean(residual**2))),
+        information=_spread(normal, rows, len(unknowns)),
+        covariance=_covariance(jacobian, weight * residual, weight, frame, prior, rows),
+        per_frame=[
+            scale * float(np.sqrt(np.mean(residual[frame == k] ** 2)))
+            if (frame == k).any()
+            else 0.0
+            for k in range(frames)
+        ],
+        runs=problem.forward.runs - runs,
+        strain=float(motion.strain),
+    )
+
+
+def _run(problem: Problem, free: Array, frames: int) -> tuple[Array, float, Motion]:
+    """Run the middle of a linearisation, at a step that all runs about it can take."""
+    dt = problem.dt(free)
+    for _ in range(5):
+        try:
+            return free, dt, problem.motion(free, frames, dt)
+        except TooFast:
+            dt *= 0.5
+    raise TooFast
+
+
+def _jacobian(
+    problem: Problem, free: Array, frames: int, dt: float, pairs: Any, residual: Array,
+    rows: NDArray[np.int64], scale: float,
+) -> Array:  # fmt: skip
+    """By forward differences; a coordinate whose step fails is stepped back."""
+    columns = []
+    for row in rows:
+        for sign in (1.0, -1.0):
+            trial = free.copy()
+            trial[row] += sign * problem.step
+            try:
+                found = problem.seen(problem.motion(trial, frames, dt), frames, pairs)[0] / scale
+            except TooFast:
+                continue
+            columns.append((found - residual) / (sign * problem.step))
+            break
+        else:
+            columns.append(np.zeros_like(residual))
+    return np.stack(columns, axis=1)
+
+
+def _spread(part: Array, rows: NDArray[np.int64], size: int) -> Array:
+    whole = np.zeros((size, size))
+    whole[np.ix_(rows, rows)] = part
+    return whole
+
+
+def _covariance(
+    jacobian: Array, score: Array, weight: Array, frame: NDArray[np.int64], prior: Array,
+    rows: NDArray[np.int64],
+) -> Array:  # fmt: skip
+    """Covariance of the free coordinates; see the head of the file."""
+    bread = np.linalg.inv((jacobian * weight[:, None]).T @ jacobian + np.diag(prior[rows]))
+    groups = np.unique(frame)
+    sums = np.stack([jacobian[frame == k].T @ score[frame == k] for k in groups])
+    sums = sums - sums.mean(axis=0)  # the prior's pull is no noise
+    more = len(groups) / max(len(groups) - 1, 1)
+    sandwich = bread @ (more * sums.T @ sums) @ bread
+    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(bread), 1.0))
+    whole = np.diag(1.0 / prior)
+    whole[np.ix_(rows, rows)] = bread * ratio[:, None] * ratio[None, :]
+    return whole
+
+
+def contact_frame(problem: Problem, free: Array) -> int:
+    """Frames before anything comes within two cells of the floor, at least one."""
+    forward = problem.forward
+    if forward.floor is None:
+        return len(forward.times)
+    low = float(forward.rest[:, 2].min()) - forward.floor
+    values = problem.fixed | problem.unknowns.values(free)
+    speed = float(forward.start(values)[1][:, 2].min())
+    pull = forward.scene.gravity[2]
+    for k, time in enumerate(forward.times):
+        if low + speed * time + 0.5 * pull * time**2 < 2.0 * forward.dx:
+            return max(k, 1)
+    return len(forward.times)
+
+
+def in_stages(
+    problem: Problem, start: Array, *, shares: tuple[float, ...] = SHARES, tell: Tell | None = None
+) -> Fitted:
+    """Velocities on the frames before contact, then all numbers on more and more frames.
+
+    All frames at once get stuck where the first rebound is wrong.
+    """
+    frames, free = len(problem.forward.times), start
+    moving = problem.unknowns.motion_only()
+    before = contact_frame(problem, free)
+    if moving.any() and before >= 3:
+        free = search(problem, free, before, active=moving, rounds=6, tell=tell).free
+    runs = problem.forward.runs
+    found = None
+    counts = sorted({max(2, round(share * frames)) for share in shares})
+    for count in counts:
+        last = count == counts[-1] and shares[-1] == 1.0
+        found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
+        free = found.free
+    assert found is not None
+    return dataclasses.replace(found, runs=problem.forward.runs - runs)
