@@ -104,6 +104,7 @@ def main() -> int:
     parser.add_argument("-o", "--out", type=Path, default=Path("out/shots"))
     parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--label", default="", help="what the table is of, such as: before")
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     device = options.device
@@ -121,7 +122,7 @@ def main() -> int:
     if options.markdown:
         page = options.markdown
         old = page.read_text() if page.exists() else "# What whole shots cost\n"
-        page.write_text(enter(old, f"shots {device}", table.rstrip()))
+        page.write_text(enter(old, f"shots {device} {options.label}".rstrip(), table.rstrip()))
     sys.stdout.write(table)
     return 0
 

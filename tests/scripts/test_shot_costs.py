@@ -29,3 +29,8 @@ def test_the_overhead_is_the_stage_over_its_steps() -> None:
     table = shots.markdown([row, short], "cpu", 10.0)
     assert "| ball | 50,000 | 2,000 | 1.0 (2.0) | 3.0 (6.0) | 3.0 |" in table
     assert "| short | 50,000 | 2,000 |  | 3.0 (6.0) | 3.0 |" in table
+
+
+def test_the_cost_of_a_turned_splat_has_a_row_for_every_operator() -> None:
+    rows = load_script("stages/carry").table(64).splitlines()
+    assert len(rows) == 6 and all(float(row.split("|")[2]) > 0.0 for row in rows[2:])

@@ -9,6 +9,7 @@ broken, or it would cost as much as the film; without light, from the direction-
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -115,7 +116,7 @@ class FilmFigures:
     def __init__(
         self, first: SavedFrame, around: Sequence[Camera] = (), *, every: int = EVERY
     ) -> None:
-        self._raw, self._around, self._every = RawCarry(first), list(around), every
+        self._first, self._around, self._every = first, list(around), every
         volume = first.volumes
         self._spacing = float(volume.clamp(min=0.0).pow(1 / 3).median()) if len(volume) else 0.0
         self._last: _Last | None = None
@@ -124,6 +125,11 @@ class FilmFigures:
             name + end: [] for name in _FIGURES for end in ("_before", "")
         }
         self._values["transition_gaussians"] = []
+
+    @functools.cached_property
+    def _raw(self) -> RawCarry:
+        """Made when something has broken: without that nobody asks."""
+        return RawCarry(self._first)
 
     @torch.no_grad()
     def add(self, frame: SavedFrame, camera: Camera, alpha: Tensor, depth: Tensor) -> None:
