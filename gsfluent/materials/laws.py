@@ -18,6 +18,7 @@ LAWS = {
     "corotated": 6,
     "yeoh": 7,
     "ogden": 8,
+    "phase_field": 9,
 }
 """Constitutive laws and their numbers in :func:`gsfluent.ops.return_mapping`."""
 
@@ -47,12 +48,14 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "ogden_alpha2": (-20.0, 20.0, "no unit"),
     "ogden_mu3": (-math.inf, math.inf, "Pa"),
     "ogden_alpha3": (-20.0, 20.0, "no unit"),
+    "toughness": (0.0, math.inf, "J/m^2"),
+    "length": (0.0, math.inf, "m"),
 }
 """Parameter -> lowest value, highest value, unit."""
 
 POSITIVE = (
     "young_modulus", "density", "grain", "bulk_modulus", "reference_volume", "softening",
-    "tensile_strength", "compressive_strength", "fracture_energy",
+    "tensile_strength", "compressive_strength", "fracture_energy", "toughness", "length",
 )  # fmt: skip
 """Parameters that must be above their lowest value."""
 
@@ -60,6 +63,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "law": tuple(LAWS),
     "prefer": ("toughness", "strength"),
     "hysteresis": ("pressed", "both"),
+    "split": ("volumetric", "none", "spectral"),
+    "model": ("at1", "at2"),
 }
 """What of a material is a word, and which words there are."""
 
@@ -67,6 +72,9 @@ HANDBOOK = ("tensile_strength", "compressive_strength", "fracture_energy")
 """What fixes cohesion, hardening and alpha0 of nacc matter on a grid, all three together."""
 DERIVED = ("cohesion", "hardening", "alpha0")
 """What they fix; given by hand, each takes the place of what would be derived."""
+
+BREAKS = ("nacc", "phase_field")
+"""Laws of matter that can break."""
 
 PARAMETERS = tuple(RANGES)
 """The fields of a material that may vary in space."""
@@ -97,8 +105,12 @@ READS: dict[str, tuple[str, ...]] = {
         "ogden_mu3",
         "ogden_alpha3",
     ),
+    "phase_field": (*_SOLID, "toughness", "length", "tensile_strength"),
 }
 """Law -> the parameters it reads; any other is refused, because it would do nothing."""
+
+OPTIONAL = {"phase_field": ("length", "tensile_strength")}
+"""Law -> parameters that the grid finds where they are left out."""
 
 DEFAULTS: dict[str, dict[str, float]] = {
     "nacc": {
@@ -166,6 +178,9 @@ def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
     elif law == "drucker_prager":
         # |dev tau| = sqrt(2/3) q = 3 alpha_DP p
         strength, cohesion = math.sqrt(2.0 / 27.0) * slope, at("cohesion_pressure")
+    elif law == "phase_field":  # threshold, length and code: materials.phase_field
+        strength, hardening, damage = at("threshold"), at("length"), at("code")
+        exponent = 1.0 - at("restitution") ** 2
     elif law == "von_mises":
         strength, hardening = at("yield_stress"), at("hardening_modulus")
         damage = at("plastic_viscosity")

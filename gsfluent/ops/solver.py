@@ -195,6 +195,11 @@ class Solver(SolverState):
         self._params, self._law = params.to(velocity), law.to(self.device)
         check_params(op, self._law, self._params)
         laws = set(law.tolist())
+        if LAWS["phase_field"] in laws:
+            raise ValueError(
+                f"{op}: law phase_field (9) is not in the resident solver yet; step it by p2g, "
+                "grid_update, g2p, damage_solve and return_mapping"
+            )
         self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
         if bool(compiled_apart(self._law, self._params).any()):
             self._law_set = 3

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from gsfluent.data import SURFACE, Solid
+from gsfluent.materials import Material, phase_field
 from gsfluent.pipeline.matter.brittle import kept_strength
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
@@ -22,6 +23,8 @@ _log = logging.getLogger(__name__)
 
 LOWERED = 0.9
 """Share of the strength from which on nobody is told that the grid has lowered it."""
+THIN_BODY = 8.0
+"""Phase-field lengths of a body from which its toughness decides how it breaks."""
 
 
 def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
@@ -141,9 +144,13 @@ def lowered(scene: Scene, dx: float) -> list[str]:
         scene: The scene.
         dx: Grid spacing [m].
     """
-    found = {}
+    found: dict[tuple[str, str], str] = {}
     for body in scene.bodies:
         for material in body.materials:
+            if material.law == "phase_field":
+                said = bound_length(body.name, material, body.volume ** (1 / 3), dx)
+                found |= {(body.name, material.name): said} if said else {}
+                continue
             kept = kept_strength(material, dx)
             if kept < LOWERED:
                 found[body.name, material.name] = (
@@ -154,6 +161,35 @@ def lowered(scene: Scene, dx: float) -> list[str]:
                     "keeps the strength and makes cracks tougher"
                 )
     return list(found.values())
+
+
+def bound_length(name: str, material: Material, size: float, dx: float) -> str:
+    """What a grid makes of a phase-field material where something gives way; else empty.
+
+    Args:
+        name: Of the body.
+        material: Of law ``phase_field``.
+        size: Of the body, the cube root of its volume [m].
+        dx: Grid spacing [m].
+    """
+    length, strong, tough = phase_field.kept(material, dx)
+    said = f"{name}: cracks of {material.name} are {4000 * length:.3g} mm wide"
+    if strong < LOWERED:
+        return (
+            f"{said}, two cells of {1000 * dx:.3g} mm bind: {_percent(strong)} of the strength are "
+            "left; hint: finer cells, or prefer: strength, which makes cracks tougher"
+        )
+    if tough * LOWERED > 1.0:
+        return (
+            f"{said}, two cells of {1000 * dx:.3g} mm bind: a crack takes {tough:.3g} times its "
+            "toughness; hint: finer cells, or prefer: toughness"
+        )
+    if size < THIN_BODY * length:
+        return (
+            f"{said} in a body of {1000 * size:.3g} mm: its strength decides and not its "
+            "toughness; hint: give tensile_strength, or finer cells"
+        )
+    return ""
 
 
 def cells_for(scene: Scene, dx: float) -> int:

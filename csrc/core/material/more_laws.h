@@ -7,14 +7,16 @@
 
 namespace gsf {
 
-// Numbers that follow those of `Law`.
-enum MoreLaw : int { kYeoh = 7, kOgden = 8, kMoreLawCount = 9 };
+// Numbers that `Law` leaves out.
+enum MoreLaw : int { kYeoh = 7, kOgden = 8 };
+
+GSF_HOST_DEVICE bool is_rubber(int law) { return law == kYeoh || law == kOgden; }
 
 // Whether laws.h does not know it. Columns of a row of von Mises: `damage` is the plastic viscosity
 // [Pa s], and `hardening` may be below zero.
 template <typename T>
 GSF_HOST_DEVICE bool compiled_apart(int law, const MaterialRow<T>& m) {
-  return law >= kLawCount || (law == kVonMises && (m.damage > T(0) || m.hardening < T(0)));
+  return is_rubber(law) || (law == kVonMises && (m.damage > T(0) || m.hardening < T(0)));
 }
 
 // --- Yeoh: W = C10 x + C20 x^2 + C30 x^3, x = J^(-2/3) tr b - 3, C10 = mu / 2 ---
@@ -103,7 +105,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping_more(const Sym3<T>& strain, T alp
                                                     const MaterialRow<T>& m,
                                                     const NaccOptions<T>& o, T dt) {
   const Sym3<T> e = update_strain(strain, increment);
-  if (!compiled_apart(law, m) || law >= kMoreLawCount || !finite(e) || !finite(alpha))
+  if (!compiled_apart(law, m) || !finite(e) || !finite(alpha))
     return return_mapping(strain, alpha, increment, law, m, o, dt);
   const bool inverted = !(det_identity_plus(increment) > T(0));
   const LawResult<T> r = law == kYeoh    ? yeoh(m, e, alpha, inverted)
@@ -174,7 +176,7 @@ GSF_HOST_DEVICE T ogden_wave_squared(const MaterialRow<T>& m, const Sym3<T>& e) 
 
 template <typename T>
 GSF_HOST_DEVICE T wave_speed_squared_more(int law, const MaterialRow<T>& m, const Sym3<T>& strain) {
-  if (law < kLawCount || law >= kMoreLawCount) return wave_speed_squared(law, m, strain);
+  if (!is_rubber(law)) return wave_speed_squared(law, m, strain);
   if (!finite(strain)) return T(0);
   return law == kYeoh ? yeoh_wave_squared(m, strain) : ogden_wave_squared(m, strain);
 }

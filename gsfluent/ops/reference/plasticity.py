@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.ops.reference import laws as other
+from gsfluent.ops.reference import phase_field as phase
 from gsfluent.ops.reference import rubber
 from gsfluent.ops.reference.nacc import (
     ALPHA_MAX,
@@ -185,7 +186,9 @@ def return_mapping(
             pulled = strain_from_isochoric(t.d, t.log_j)
             kept = torch.where(t.guarded[:, None], pulled, t.e)
             state = kept, t.log_j, t.guarded, alpha[rows], own
-            if number == other.METAL:
+            if number == phase.PHASE:
+                r = phase.phase_field(t.e, t.d, t.n, t.j2m1, t.guarded, alpha[rows], own)
+            elif number == other.METAL:
                 r = other.von_mises(*state, dt)
             else:
                 r = (other.LAWS | rubber.LAWS)[number](*state)
@@ -215,8 +218,12 @@ def elastic_energy(strain: Tensor, m: Material, laws: Tensor | None = None) -> T
         if number > 1:
             rows = (laws == number).nonzero()[:, 0]
             own = Material(*(column[rows] for column in m))
-            of = rubber.energy if number in rubber.LAWS else other.energy
-            energy = energy.index_copy(0, rows, of(number, strain[rows], own))
+            if number == phase.PHASE:
+                found = phase.energy(strain[rows], own)
+            else:
+                of = rubber.energy if number in rubber.LAWS else other.energy
+                found = of(number, strain[rows], own)
+            energy = energy.index_copy(0, rows, found)
     return energy
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import LAWS, UNBROKEN
 from gsfluent.pipeline.matter.pieces import Pieces, Web
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -124,8 +125,11 @@ def weld(matter: Matter, web: Web, state: State, pieces: Pieces) -> State:
     fits = (after == held).all(dim=1) & (kept == wanted) & (alpha[rows] >= wanted)
     at = at.index_put((rows,), fits)
     alpha = torch.where(at, strong, alpha)
+    # what is undamaged in a phase field has a peak of -1
+    phase = matter.law[matter.particles.material.long()] == LAWS["phase_field"]
+    peak = torch.where(phase, UNBROKEN, strong.to(state.peak))
     return state._replace(
         particles=state.particles.replace(alpha=alpha),
-        peak=torch.where(at, strong.to(state.peak), state.peak),
+        peak=torch.where(at, peak, state.peak),
         alpha_seen=torch.where(at, alpha, state.alpha_seen),
     )
