@@ -67,7 +67,8 @@ MaterialRow<T> material(T mu, T kappa, T strength, T cohesion, T hardening, T da
 template <typename T>
 py::dict one_particle(const Array<T>& strain, T alpha, const Array<T>& increment, int law,
                       const MaterialRow<T>& m, T k, T epsilon, bool implicit, T dt) {
-  if (law < 0 || law >= kLawCount) throw std::invalid_argument("law must be 0 to 9");
+  if (!is_law(law) && law != kYeoh && law != kOgden)
+    throw std::invalid_argument("law must be 0 to 9");
   const ReturnMapped<T> r = return_mapping_more(load_sym3(expect(strain, "strain", {6})), alpha,
                                                 load_mat3(expect(increment, "increment", {3, 3})),
                                                 law, m, NaccOptions<T>{k, epsilon, implicit}, dt);

@@ -38,16 +38,16 @@ BASE: dict[str, Material] = {
         "test", law="fluid", density=1000.0, bulk_modulus=1e5, viscosity=2.0, tait_exponent=7.0
     ),
     "rigid": Material("test", law="rigid", density=1000.0),
-    "yeoh": Material("test", law="yeoh", yeoh_c20=2e4, yeoh_c30=2e5, **SOLID),
-    "ogden": Material(
-        "test", law="ogden", ogden_alpha1=1.3, ogden_mu2=4e3, ogden_alpha2=8.0, ogden_mu3=-4e3,
-        ogden_alpha3=-3.0, **SOLID,
-    ),
     "phase_field": Material(
         "test", law="phase_field", toughness=20.0, length=0.12, tensile_strength=4e3, **SOLID
     ),
     "phase_field by strength": Material(
         "test", law="phase_field", toughness=60.0, tensile_strength=3e3, **SOLID
+    ),
+    "yeoh": Material("test", law="yeoh", yeoh_c20=2e4, yeoh_c30=2e5, **SOLID),
+    "ogden": Material(
+        "test", law="ogden", ogden_alpha1=1.3, ogden_mu2=4e3, ogden_alpha2=8.0, ogden_mu3=-4e3,
+        ogden_alpha3=-3.0, **SOLID,
     ),
     "nacc by handbook": Material(
         "test", law="nacc", tensile_strength=4e3, compressive_strength=2e4, fracture_energy=60.0,

@@ -10,13 +10,12 @@ namespace gsf {
 // Numbers that `Law` leaves out.
 enum MoreLaw : int { kYeoh = 7, kOgden = 8 };
 
-GSF_HOST_DEVICE bool is_rubber(int law) { return law == kYeoh || law == kOgden; }
-
 // Whether laws.h does not know it. Columns of a row of von Mises: `damage` is the plastic viscosity
 // [Pa s], and `hardening` may be below zero.
 template <typename T>
 GSF_HOST_DEVICE bool compiled_apart(int law, const MaterialRow<T>& m) {
-  return is_rubber(law) || (law == kVonMises && (m.damage > T(0) || m.hardening < T(0)));
+  return law == kYeoh || law == kOgden ||
+         (law == kVonMises && (m.damage > T(0) || m.hardening < T(0)));
 }
 
 // --- Yeoh: W = C10 x + C20 x^2 + C30 x^3, x = J^(-2/3) tr b - 3, C10 = mu / 2 ---
@@ -176,7 +175,7 @@ GSF_HOST_DEVICE T ogden_wave_squared(const MaterialRow<T>& m, const Sym3<T>& e) 
 
 template <typename T>
 GSF_HOST_DEVICE T wave_speed_squared_more(int law, const MaterialRow<T>& m, const Sym3<T>& strain) {
-  if (!is_rubber(law)) return wave_speed_squared(law, m, strain);
+  if (law != kYeoh && law != kOgden) return wave_speed_squared(law, m, strain);
   if (!finite(strain)) return T(0);
   return law == kYeoh ? yeoh_wave_squared(m, strain) : ogden_wave_squared(m, strain);
 }
