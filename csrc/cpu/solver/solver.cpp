@@ -21,7 +21,12 @@ template <typename T>
 class Stepper {
  public:
   Stepper(const SolverView<T>& s, int laws)
-      : s_(s), laws_(laws), contact_(s), homes_(s, contact_), nodes_(s, contact_) {}
+      : s_(s),
+        laws_(laws),
+        contact_(s),
+        surface_(s),
+        homes_(s, contact_, surface_),
+        nodes_(s, contact_, surface_) {}
 
   // Everything that follows from the blocks; again after each build.
   void plan() {
@@ -31,6 +36,7 @@ class Stepper {
                     "solver: the clock counts more blocks than there is room for");
     touched_.assign(c.slots, 0);
     contact_.make();
+    surface_.make();
     homes_.plan();
     nodes_.plan();
   }
@@ -54,6 +60,7 @@ class Stepper {
   const SolverView<T>& s_;
   const int laws_;
   ContactPlan<T> contact_;
+  SurfacePlan<T> surface_;
   HomePass<T> homes_;
   NodePass<T> nodes_;
   std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
