@@ -20,7 +20,7 @@ enum Law : int {
   kLawCount = 10,
 };
 
-// Numbers without a law are skipped.
+// Numbers 7 and 8 are rubber, compiled apart (more_laws.h).
 GSF_HOST_DEVICE bool is_law(int law) { return law >= 0 && law < kLawCount && law != 7 && law != 8; }
 
 // A row of `params`; what the columns hold depends on the law.

@@ -1,0 +1,1 @@
+"""Heat: conduction and melting with known answers."""

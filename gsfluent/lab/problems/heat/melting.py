@@ -1,0 +1,101 @@
+"""Conduction and melting of a bar of material points, against closed forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.lab.world.driver import place
+from gsfluent.lab.world.registry import Result, compare, problem
+from gsfluent.lab.world.shapes import box
+from gsfluent.materials.heat import thermal
+
+LENGTH = 0.06  # of the bar [m]
+DENSITY = 1000.0
+CELLS = (6, 12, 24)  # along the bar, two points each
+
+
+class Bar:
+    """A bar of points along x, ``cells`` of a grid long and half of one wide."""
+
+    def __init__(self, cells: int, row: Tensor) -> None:
+        self.spacing = 0.5 * LENGTH / cells
+        points = box([0.0, 0.0, 0.0], [LENGTH, self.spacing, self.spacing], self.spacing)
+        self.links, self.faces = (part.to(place()) for part in
+                                  ops.lattice_links(points, self.spacing))  # fmt: skip
+        self.x = points[:, 0].double().to(place())
+        self.mass = torch.full_like(self.x, DENSITY * self.spacing**3)
+        self.rows = row[None].to(self.x)
+
+    def warmed(self, enthalpy: Tensor, seconds: float, held: float | None = None) -> Tensor:
+        """Enthalpy after a time; the end at x = 0 lies on a wall held at ``held``."""
+        wall = None
+        if held is not None:
+            at = (self.x < self.spacing).nonzero()[:, 0]
+            wall = at, torch.full_like(self.x[at], held)
+        return ops.conduct(
+            enthalpy, mass=self.mass, links=self.links, spacing=self.spacing, rows=self.rows,
+            dt=seconds, wall=wall,
+        )  # fmt: skip
+
+
+def conduction_error(cells: int) -> float:
+    """Largest error of a cosine that fades in a bar of ice closed at both ends, over its rest."""
+    ice = thermal("ice").row()
+    bar = Bar(cells, ice)
+    wave = math.pi / LENGTH
+    rate = float(ice[0] / (DENSITY * ice[2])) * wave**2
+    start = torch.cos(wave * bar.x)
+    cold = ops.enthalpy(-10.0 + start, rows=bar.rows)
+    after = bar.warmed(cold, 1.0 / rate)
+    left = ops.temperature(after, rows=bar.rows)[0] + 10.0
+    return float((left - math.exp(-1.0) * start).abs().max()) / math.exp(-1.0)
+
+
+def stefan_number(warm: float, row: Tensor) -> float:
+    """Lambda of Neumann's front ``2 lambda sqrt(a t)`` of a solid at its melting point."""
+    stefan = float(row[3]) * warm / float(row[6])
+    low, high = 0.0, 3.0
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        grown = math.sqrt(math.pi) * middle * math.exp(middle**2) * math.erf(middle)
+        low, high = (middle, high) if grown < stefan else (low, middle)
+    return low
+
+
+def stefan_front(cells: int) -> float:
+    """Front of ice at 0 degrees C that melts on a wall of 20, half of the bar, over Neumann's."""
+    ice = thermal("ice").row()
+    bar, warm = Bar(cells, ice), 20.0
+    number = stefan_number(warm, ice)
+    seconds = (0.25 * LENGTH / number) ** 2 / float(ice[1] / (DENSITY * ice[3]))
+    start = torch.zeros_like(bar.x)
+    after = bar.warmed(start, seconds, held=warm)
+    share = ops.temperature(after, rows=bar.rows)[1]
+    return float(share.mean()) * LENGTH / (0.5 * LENGTH)
+
+
+@problem(tier="fast")
+def heat_conduction() -> Iterator[Result]:
+    """A cosine of temperature fades in a bar: error at 12 cells, and the order of convergence."""
+    coarse, middle, fine = (conduction_error(cells) for cells in CELLS)
+    source = "Fourier: exp(-a pi^2 t / L^2)"
+    yield compare("error of a fading cosine, 12 cells", middle, 0.0, tolerance=0.01, source=source)
+    yield compare(
+        "order of conduction, 6 to 24 cells", math.log2(coarse / fine) / 2.0, 2.0, tolerance=0.05,
+        source=source, note=f"errors {coarse:.2g}, {middle:.2g}, {fine:.2g}",
+    )  # fmt: skip
+
+
+@problem(tier="fast")
+def melting_front() -> Iterator[Result]:
+    """Stefan's problem: ice at 0 degrees C on a wall of 20 degrees C, half of a bar melted."""
+    for cells in CELLS:
+        yield compare(
+            f"front of melting ice / Neumann's, {cells} cells", stefan_front(cells), 1.0,
+            tolerance=0.03, source="Neumann's solution (Carslaw and Jaeger 1959, 11.2)",
+        )  # fmt: skip
