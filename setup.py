@@ -1,9 +1,12 @@
-"""Build the compiled half of gsfluent: `_C` (CPU), `_C_cuda` (when possible), `_core` (pybind11).
+"""Build the compiled half of gsfluent: `_C` (CPU), `_C_cuda` (when possible), `_core` (for tests).
 
 Environment:
     GSFLUENT_CUDA   auto (default: CUDA when torch has CUDA and a toolkit is found) | 0 |
                     1 (also a cross build on CPU-only torch)
     GSFLUENT_ARCH   CUDA architectures, comma separated (default 90)
+    GSFLUENT_CORE   auto (default: `_core` in checkouts, not in wheels, which it would tie to one
+                    Python) | 0 | 1
+    GSFLUENT_RELEASE  1 leaves line numbers out of the kernels and compresses them
     GSFLUENT_MARCH  CPU architecture for -march (default x86-64-v3 on x86-64; empty elsewhere)
     DEBUG           1 builds with -O1 -g
 """
@@ -12,13 +15,16 @@ import os
 import platform
 from pathlib import Path
 
-import pybind11
 import torch
 from setuptools import Extension, setup
 from torch.utils import cpp_extension
 
 ROOT = Path(__file__).resolve().parent
 DEBUG = os.environ.get("DEBUG") == "1"
+RELEASE = os.environ.get("GSFLUENT_RELEASE") == "1"
+CORE = os.environ.get("GSFLUENT_CORE", "auto")
+if CORE not in ("auto", "0", "1"):
+    raise SystemExit(f"GSFLUENT_CORE must be auto, 0 or 1, got {CORE!r}")
 
 # Stable ABI, oldest supported torch 2.11: one binary serves every later torch
 # (docs/design/0001-stable-abi.md).
@@ -98,7 +104,7 @@ def cuda_extension() -> list:
                     "-DUSE_CUDA",
                     "-std=c++20",
                     "-O3",
-                    "-lineinfo",
+                    *(["-Xfatbin=-compress-all"] if RELEASE else ["-lineinfo"]),
                     "--expt-relaxed-constexpr",
                     # float32 quotients and roots to 2 ulp: the exact ones branch, and the kernels
                     # are bound by instructions; tests hold them to the CPU's
@@ -117,8 +123,10 @@ def cuda_extension() -> list:
 
 def core_extension() -> list:
     """pybind11 face of csrc/core (one particle, one splat, one fit) for tests and the lab."""
-    if not (ROOT / "csrc" / "bindings.cpp").exists():
+    if CORE == "0":
         return []
+    import pybind11
+
     return [
         Extension(
             "gsfluent._core",
@@ -131,7 +139,18 @@ def core_extension() -> list:
     ]
 
 
+class BuildExtension(cpp_extension.BuildExtension):
+    """torch's, which leaves `_core` out of everything but checkouts."""
+
+    def run(self) -> None:
+        if CORE == "auto" and not (self.inplace or self.editable_mode):
+            self.extensions = [e for e in self.extensions if e.name != "gsfluent._core"]
+        super().run()
+
+
 setup(
     ext_modules=[cpu_extension(), *cuda_extension(), *core_extension()],
-    cmdclass={"build_ext": cpp_extension.BuildExtension.with_options(no_python_abi_suffix=False)},
+    cmdclass={"build_ext": BuildExtension},
+    # without `_core` nothing in a wheel hangs on the version of Python
+    options={} if CORE == "1" else {"bdist_wheel": {"py_limited_api": "cp311"}},
 )

@@ -31,16 +31,29 @@ def _load_cpu() -> None:
     torch.ops.load_library(str(path))
 
 
-def _load_cuda() -> bool:
+def _load_cuda() -> str:
+    """Load the library for GPUs; why not, empty when it is loaded."""
+    if torch.version.cuda is None:
+        return "this torch has no CUDA; install a CUDA torch"
     path = _find("_C_cuda")
-    if path is None or torch.version.cuda is None:
-        return False
-    torch.ops.load_library(str(path))
-    return True
+    if path is None:
+        return "gsfluent was built without its CUDA kernels; reinstall with GSFLUENT_CUDA=1"
+    try:
+        torch.ops.load_library(str(path))
+    except OSError as error:
+        if "libcudart" not in str(error):
+            raise
+        # this torch brought the runtime of another major version
+        return (
+            f"torch has CUDA {torch.version.cuda}, gsfluent's kernels another ({error}); "
+            "install a torch of that CUDA, or build gsfluent from its source"
+        )
+    return ""
 
 
 _load_cpu()
-HAS_CUDA_KERNELS: bool = _load_cuda()
+NO_CUDA_KERNELS: str = _load_cuda()
+HAS_CUDA_KERNELS: bool = not NO_CUDA_KERNELS
 
 
 def has_cuda() -> bool:

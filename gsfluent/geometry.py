@@ -198,18 +198,27 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 
 
 def trilinear(grid: Tensor, place: Tensor) -> Tensor:
-    """Values [N] of a grid [X, Y, Z] between its points, at places [N, 3] in steps; 0 outside."""
-    size = torch.tensor(grid.shape, device=place.device)
-    base = place.floor()
-    fraction, base = place - base, base.to(torch.int64)
+    """Values [N] of a grid [X, Y, Z] between its points, at places [N, 3] in steps; 0 outside.
+
+    One operation at a time, which rounds alike on every device.
+    """
+    flat = grid.reshape(-1)
+    axes = []
+    for axis, stride in enumerate((grid.shape[1] * grid.shape[2], grid.shape[2], 1)):
+        base = place[:, axis].floor()
+        fraction, most = place[:, axis] - base, grid.shape[axis] - 1
+        low, ends = base.to(torch.int64), []
+        for index, share in ((low, 1 - fraction), (low + 1, fraction)):
+            held = index.clamp(0, most)
+            # what lies outside has no share
+            ends.append((held * stride, share * (held == index)))
+        axes.append(ends)
     total = grid.new_zeros(len(place))
-    for corner in range(8):
-        step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=place.device)
-        index = base + step
-        inside = ((index >= 0) & (index < size)).all(dim=1)
-        weight = torch.where(step.bool(), fraction, 1 - fraction).prod(dim=1) * inside
-        index = torch.minimum(index.clamp_min(0), size - 1)
-        total += weight.to(grid) * grid[index[:, 0], index[:, 1], index[:, 2]]
+    for a, u in axes[0]:
+        for b, v in axes[1]:
+            corner, share = a + b, u * v
+            for c, w in axes[2]:
+                total += (share * w).to(grid) * flat.index_select(0, corner + c)
     return total
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ import tyro
 
 from gsfluent.errors import InputError
 from gsfluent.progress import Progress, Reporter, reporter
+
+_log = logging.getLogger(__name__)
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
@@ -68,10 +71,12 @@ def choose_device(name: str, *, seed: int = 0) -> Any:
     """
     import torch
 
-    from gsfluent._load import HAS_CUDA_KERNELS, has_cuda
+    from gsfluent._load import NO_CUDA_KERNELS, has_cuda
 
     torch.manual_seed(seed)
     if name == "auto":
+        if NO_CUDA_KERNELS and torch.cuda.is_available():
+            _log.warning("the CPU works, not the GPU: %s", NO_CUDA_KERNELS)
         return torch.device("cuda" if has_cuda() else "cpu")
     try:
         device = torch.device(name)
@@ -80,13 +85,9 @@ def choose_device(name: str, *, seed: int = 0) -> Any:
     if device is None or device.type not in ("cpu", "cuda"):
         raise InputError(f"--device {name}", "give auto, cpu, cuda or cuda:0, cuda:1, ...")
     if device.type == "cuda":
-        if torch.version.cuda is None:
-            raise InputError(
-                f"--device {name}: this torch has no CUDA", "install a CUDA torch, or use cpu"
-            )
-        if not HAS_CUDA_KERNELS:
-            hint = "reinstall with GSFLUENT_CUDA=1, or use cpu"
-            raise InputError(f"--device {name}: gsfluent was built without its CUDA kernels", hint)
+        if NO_CUDA_KERNELS:
+            what, _, hint = NO_CUDA_KERNELS.rpartition("; ")
+            raise InputError(f"--device {name}: {what}", f"{hint}, or use cpu")
         count = torch.cuda.device_count()
         if count == 0 or (device.index or 0) >= count:
             raise InputError(f"--device {name}: torch sees {count} GPUs", "use auto or cpu")

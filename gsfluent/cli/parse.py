@@ -10,7 +10,7 @@ import tyro
 
 from gsfluent import __version__
 from gsfluent.cli.common import Verb
-from gsfluent.cli.verbs_export import Export
+from gsfluent.cli.verbs_export import Carry, Export
 from gsfluent.cli.verbs_lab import Chart, Stability
 from gsfluent.cli.verbs_look import Doctor, Inspect, Metrics, Plan
 from gsfluent.cli.verbs_run import Demo, Render, Report, Run
@@ -31,6 +31,7 @@ VERBS: dict[str, type[Verb]] = {
     "run": Run,
     "sweep": Sweep,
     "dataset": Dataset,
+    "carry": Carry,
     "render": Render,
     "report": Report,
     "view": View,

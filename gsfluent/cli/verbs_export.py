@@ -1,4 +1,4 @@
-"""The verb that hands a finished simulation to other programs."""
+"""Verbs between other programs and us: export hands on, carry takes motion from them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gsfluent.cli.common import Verb, existing, parse_size
+from gsfluent.cli.common import Out, Verb, existing, parse_size
 from gsfluent.errors import InputError
 
 
@@ -112,3 +112,67 @@ class Export(Verb):
                 device=self.torch_device(),
                 progress=progress,
             )
+
+
+@dataclass(kw_only=True)
+class Carry(Verb):
+    """Let the moving points or meshes of another program carry a splat model.
+
+    Examples:
+      gsfluent carry melon.ply --by cloth.npz -o out          # positions [T, N, 3], faces, times
+      gsfluent carry melon.ply --by blender.glb --up y -o out # an animated mesh
+      gsfluent carry melon.ply --by frames/ --fps 30 -o out   # a .ply, .obj or .npy per frame
+      gsfluent carry melon.ply --by cache.usdc -o out         # USD; also .vtk.series and .pvd
+      gsfluent export out --to ply-seq,usd                    # and on to any viewer
+      gsfluent render out --light=1,-1,2 --camera turntable
+
+    Splats are moved, stretched and turned, their colours too. At frame --rest the carriers must be
+    where the splats lie. The folder is like that of `gsfluent run`. docs/guide/carry.md.
+    """
+
+    splats: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SPLATS")]
+    """Splat model in any format."""
+    by: Path
+    """What moves: a file, or a folder with a file per frame."""
+    out: Out
+    """Folder for the results; made when missing."""
+    rest: int = 0
+    """Frame in which the carriers are where the splats lie (0 is the first)."""
+    fps: float | None = None
+    """Frames per second of a sequence without times; 24 when absent."""
+    up: Literal["z", "y", "-y"] = "z"
+    """Axis of the sequence that is +z of the splats."""
+    scale: float = 1.0
+    """Units of the splats in a unit of the sequence."""
+    floor: bool = False
+    """Draw a studio with its floor at z = 0."""
+    film: bool = True
+    """Make video.mp4, which also measures holes."""
+    size: str = "640x480"
+    """Of the film."""
+    camera: str = "orbit"
+    """orbit, turntable, dolly or a path (docs/guide/export.md)."""
+    force: bool = False
+    """Do all anew."""
+
+    def execute(self) -> dict[str, Any]:
+        """Carry."""
+        from gsfluent.run.carried import carry_to
+
+        existing(self.splats, "SPLATS")
+        existing(self.by, "--by")
+        with self.reporter() as report:
+            return carry_to(
+                self.splats, self.by, self.out, device=self.torch_device(), reporter=report,
+                size=parse_size(self.size),
+                **self.given("rest", "fps", "up", "scale", "floor", "film", "camera", "force"),
+            )  # fmt: skip
+
+    def text(self, result: dict[str, Any]) -> str | None:
+        """What became of the splats."""
+        report = result["simulation"]
+        lines = [
+            f"{report['splats']} splats, {report['carriers']} carriers, {report['frames']} frames"
+        ]
+        lines += [f"  ! {note}" for note in report["notes"]]
+        return "\n".join([*lines, f"{self.out / 'report.html'}"])

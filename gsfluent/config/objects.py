@@ -300,7 +300,9 @@ def _parameters(
     from gsfluent import materials
 
     read = {
-        name: (text if name in materials.WORDS else number())(value, place.inside(name))
+        name: value
+        if name == "length" and value == "auto"
+        else (text if name in materials.WORDS else number())(value, place.inside(name))
         for name, value in settings.items()
     }
     try:

@@ -72,9 +72,9 @@ class SolveSettings:
     )
     max_points: int = key(
         whole(0, 8_000_000),
-        "Where walls are thinner than three cells of `quality`, the cells are made as fine as "
-        "that takes, up to so many material points and eight times the cells of `quality`; 0 "
-        "leaves them. `cells` is never changed.",
+        "Where a quarter of a body stands on walls thinner than three cells of `quality`, the "
+        "cells are made as fine as that takes, up to so many material points and eight times the "
+        "cells of `quality`; 0 leaves them. `cells` is never changed.",
         "1000000",
         default=300_000,
     )

@@ -21,7 +21,7 @@ from torch import Tensor
 
 import gsfluent
 from gsfluent import ops
-from gsfluent._load import HAS_CUDA_KERNELS
+from gsfluent._load import NO_CUDA_KERNELS
 from gsfluent.errors import EXTRAS
 from gsfluent.ops._memory import available_memory
 
@@ -65,7 +65,7 @@ def examine(device: torch.device, *, every_device: bool = True) -> dict[str, Any
             "memory_available_bytes": available_memory(),
         },
         "disk_free_bytes": shutil.disk_usage(".").free,
-        "cuda_library": "loaded" if HAS_CUDA_KERNELS else "not built, or torch has no CUDA",
+        "cuda_library": NO_CUDA_KERNELS or "loaded",
         "gpus": [_describe_gpu(i) for i in range(torch.cuda.device_count())],
         "libraries": {name: _version(name) for name in _LIBRARIES},
         "extras": {extra: {name: _version(name) for name in EXTRAS[extra]} for extra in EXTRAS},

@@ -21,11 +21,22 @@ from types import SimpleNamespace
 from typing import Any
 
 from gsfluent.errors import InputError
-from gsfluent.materials.laws import DEFAULTS, HANDBOOK, LAWS, PARAMETERS, RANGES, READS, WORDS
+from gsfluent.materials import phase_field
+from gsfluent.materials.laws import (
+    BREAKS,
+    DEFAULTS,
+    HANDBOOK,
+    LAWS,
+    PARAMETERS,
+    RANGES,
+    READS,
+    WORDS,
+)
 from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, WHOLE, Field, Material, nearest
 from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
 
 __all__ = [
+    "BREAKS",
     "DEFAULTS",
     "HANDBOOK",
     "LARGEST",
@@ -45,6 +56,7 @@ __all__ = [
     "fruit",
     "get",
     "names",
+    "phase_field",
     "wet",
 ]
 

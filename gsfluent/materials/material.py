@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from gsfluent.errors import InputError
-from gsfluent.materials import laws
+from gsfluent.materials import laws, phase_field
 from gsfluent.materials.laws import (
+    BREAKS,
     DEFAULTS,
     DERIVED,
     HANDBOOK,
     LAWS,
+    OPTIONAL,
     PARAMETERS,
     POSITIVE,
     RANGES,
@@ -54,6 +56,8 @@ and so little that what is pressed hard cracks before it is powder (a plaster ba
 is whole, with 0.5 it is crushed)."""
 _PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness", "hysteresis": "pressed"}
 """What only brittle matter reads, as it is in other matter."""
+_PLAIN_FIELD = {"split": "volumetric", "model": "at1"}
+"""What only phase_field reads."""
 UNBROKEN = -1.0
 """``alpha`` of the points of laws that do not use it: below zero, so never counted as broken."""
 
@@ -71,40 +75,60 @@ class Material:
         poisson_ratio: Lateral contraction nu, in (-1, 0.495].
         density: Mass per volume [kg/m^3].
         law: ``elastic`` (neo-Hookean) and ``corotated`` (fixed corotated) never break, ``nacc``
-            breaks, ``drucker_prager`` is sand, ``von_mises`` is metal or clay, ``fluid`` pours,
-            ``rigid`` does not deform.
-        tensile_strength: nacc: uniaxial strength of the real thing in tension [Pa].
+            and ``phase_field`` break, ``drucker_prager`` is sand, ``von_mises`` is metal or clay,
+            ``fluid`` pours, ``rigid`` does not deform, ``yeoh`` and ``ogden`` are rubber that
+            stiffens.
+        tensile_strength: nacc, phase_field: uniaxial strength of the real thing in tension [Pa].
         compressive_strength: nacc: its uniaxial strength in compression [Pa].
         fracture_energy: nacc: energy that a crack takes per area, G_c [J/m^2]. The three are given
             together or not at all; cohesion, hardening and alpha0 then follow from them and the
             grid (:mod:`gsfluent.pipeline.matter.brittle`), and one of those given by hand takes
             the place of what would follow.
+        toughness: phase_field: energy that a crack takes per area, G_c [J/m^2].
+        length: phase_field: half of the half width of a crack, l [m]; left out or ``auto`` it is
+            what toughness and tensile strength ask for, and at least two cells.
         cohesion: nacc: tensile over compressive strength, beta in CD-MPM.
         hardening: nacc: how fast strength grows with compaction, xi in CD-MPM.
         friction_angle: nacc, drucker_prager: internal friction [degrees].
         alpha0: nacc: log plastic volume ratio at the start; negative is intact.
         shear_damage: nacc: how much plastic shear counts as damage, eta; 0 is the plain model.
         yield_stress: von_mises: stress [Pa] in a tension test at which flow begins.
-        hardening_modulus: von_mises: growth of the yield stress per plastic strain [Pa].
+        hardening_modulus: von_mises: growth of the yield stress per plastic strain [Pa]; below 0
+            it falls, to zero at most.
+        plastic_viscosity: von_mises: stress beyond yield per rate of flow [Pa s]; 0 flows at once.
         cohesion_pressure: drucker_prager: tensile pressure [Pa] that the grains hold; 0 is dry.
         bulk_modulus: fluid: density times the square of its speed of sound [Pa].
         viscosity: fluid: dynamic viscosity [Pa s].
         tait_exponent: fluid: gamma of p = K/gamma (J^-gamma - 1).
-        variation: nacc: relative scatter of strength in space (standard deviation of a smooth
-            random factor on ``alpha0``); natural solids have weak and strong places, and that
+        yeoh_c20: yeoh: second coefficient of W [Pa]; the first is half of the shear modulus.
+        yeoh_c30: yeoh: third coefficient of W [Pa].
+        ogden_alpha1: ogden: exponent of the first term, whose modulus is what the others leave of
+            the shear modulus (2 mu is the sum of mu_p alpha_p).
+        ogden_mu2: ogden: modulus of the second term [Pa], of W = sum mu_p / alpha_p (...).
+        ogden_alpha2: ogden: its exponent.
+        ogden_mu3: ogden: modulus of the third term [Pa].
+        ogden_alpha3: ogden: its exponent.
+        variation: nacc, phase_field: relative scatter of strength in space (standard deviation of
+            a smooth random factor on it); natural solids have weak and strong places, and that
             decides where cracks run and how many pieces survive a harder landing.
         grain: Length over which the strength varies [m].
-        weibull_modulus: nacc: Weibull modulus of the strength, small for scattered; 0 for none.
+        weibull_modulus: nacc, phase_field: Weibull modulus of the strength, small for scattered; 0
+            for none.
         reference_volume: Volume of the specimens whose median strength is given [m^3].
-        prefer: nacc: what a grid keeps that is too coarse for both. ``toughness`` keeps the
-            fracture energy and lowers the strength (Bazant and Oh 1983), ``strength`` keeps the
-            strength, and a crack takes more energy than it should.
+        prefer: nacc, phase_field: what a grid keeps that is too coarse for both. ``toughness``
+            keeps the fracture energy and lowers the strength (Bazant and Oh 1983), ``strength``
+            keeps the strength, and a crack takes more energy than it should.
+        split: phase_field: what drives a crack. ``volumetric``: shear and opening (Amor et al.);
+            ``none``: all that is stored, for tension alone; ``spectral``: principal extensions
+            (Miehe et al.), for matter in compression.
+        model: phase_field: ``at1`` is elastic up to its strength, ``at2`` softens from the start.
         softening: How many times softer than the real thing ``young_modulus`` is, for the sake of
             the time step. Strengths are divided by its root: the speed at which it breaks and the
             number of pieces stay (Bazant's size number E G_c / s^2 L does not change).
         restitution: Speed after over before of a body that lands on a hard floor and stays whole.
-        hysteresis: nacc: whether what springs back loses energy where it is ``pressed``, as dry
-            matter, or in tension too (``both``), as wet tissue: cracks there are fed with less.
+        hysteresis: nacc, phase_field: whether what springs back loses energy where it is
+            ``pressed``, as dry matter, or in tension too (``both``), as wet tissue: cracks there
+            are fed with less.
         dust: How much of a break is dust, 0 to 1; sets the most mass that may come loose.
         specular: Strength of its highlights, k_s of Blinn-Phong.
         shininess: Narrowness of its highlights, n_s of Blinn-Phong.
@@ -126,6 +150,8 @@ class Material:
     tensile_strength: Field | None = None
     compressive_strength: Field | None = None
     fracture_energy: Field | None = None
+    toughness: Field | None = None
+    length: Field | None = None
     cohesion: Field | None = None
     hardening: Field | None = None
     friction_angle: Field | None = None
@@ -137,12 +163,22 @@ class Material:
     bulk_modulus: Field | None = None
     viscosity: Field | None = None
     tait_exponent: Field | None = None
+    plastic_viscosity: Field | None = None
+    yeoh_c20: Field | None = None
+    yeoh_c30: Field | None = None
+    ogden_alpha1: Field | None = None
+    ogden_mu2: Field | None = None
+    ogden_alpha2: Field | None = None
+    ogden_mu3: Field | None = None
+    ogden_alpha3: Field | None = None
     variation: float = 0.0
     grain: float = 0.025
     weibull_modulus: float = 0.0
     reference_volume: float = 1e-6
     prefer: str = "toughness"
     hysteresis: str = "pressed"
+    split: str = "volumetric"
+    model: str = "at1"
     softening: float = 1.0
     restitution: float = 1.0
     dust: float = 0.5
@@ -162,6 +198,8 @@ class Material:
                     f"material {self.name!r}: unknown {field} {word!r}",
                     hint=nearest(str(word), words),
                 )
+        if isinstance(self.length, str) and self.length == "auto":
+            object.__setattr__(self, "length", None)
         reads, defaults = READS[self.law], DEFAULTS.get(self.law, {})
         for field in RANGES:
             if getattr(self, field) is not None and field not in reads:
@@ -170,7 +208,7 @@ class Material:
                     hint=f"remove it, or use law {_readers(field)}",
                 )
         missing = [name for name in HANDBOOK if getattr(self, name) is None]
-        if missing and len(missing) < len(HANDBOOK):
+        if self.law == "nacc" and missing and len(missing) < len(HANDBOOK):
             raise InputError(
                 f"material {self.name!r}: {', '.join(HANDBOOK)} go together, but "
                 f"{', '.join(missing)} is missing",
@@ -179,7 +217,8 @@ class Material:
         by_handbook = not missing
         for field, (low, high, unit) in RANGES.items():
             value = getattr(self, field)
-            if value is None and (field in HANDBOOK or (by_handbook and field in DERIVED)):
+            left = field in HANDBOOK or field in OPTIONAL.get(self.law, ())
+            if value is None and (left or (by_handbook and field in DERIVED)):
                 continue
             if value is None and field in defaults:
                 shear = by_handbook and field == "shear_damage"
@@ -195,12 +234,20 @@ class Material:
             if isinstance(value, Tensor):
                 raise InputError(f"material {self.name!r}: {field} must be one number")
             _check_number(self.name, field, value, low, high, unit)
-        for field, nothing in _PLAIN.items() if self.law != "nacc" else ():
+        unread = _PLAIN if self.law not in BREAKS else {}
+        for field, nothing in (
+            unread | (_PLAIN_FIELD if self.law != "phase_field" else {})
+        ).items():
             if getattr(self, field) != nothing:
+                readers = BREAKS if field in _PLAIN else ("phase_field",)
                 raise InputError(
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
-                    hint="remove it, or use law nacc",
+                    hint=f"remove it, or use law {' or '.join(readers)}",
                 )
+        if self.law in ("von_mises", "yeoh", "ogden"):
+            wrong = laws.unstable(self.law, self.parameters())
+            if wrong:
+                raise InputError(f"material {self.name!r}: {wrong}", hint="mend the number")
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     @property
@@ -239,8 +286,14 @@ class Material:
         if law != self.law and law in LAWS:
             dropped = [f for f in PARAMETERS if f not in READS[law] and f not in changes]
             changes = {**dict.fromkeys(dropped), **changes}
-            if law != "nacc":
-                changes = {**_PLAIN, "parts": (), **changes}
+            if law not in BREAKS:
+                changes = {**_PLAIN, **changes}
+            if law != "nacc":  # what parts change are parameters of nacc
+                changes = {"parts": (), **changes}
+            if law == "phase_field" and self.fracture_energy is not None:
+                changes = {"toughness": self.fracture_energy, **changes}
+            else:
+                changes = {**_PLAIN_FIELD, **changes}
         if "variation" in changes:
             changes = {"weibull_modulus": 0.0, **changes}
         changes = self._softened(changes)
@@ -251,7 +304,9 @@ class Material:
         """Changes with stiffness and softening in step: they are those of one real thing."""
         stiff, soft = changes.get("young_modulus"), changes.get("softening")
         mine = self.young_modulus
-        if not isinstance(mine, int | float) or not self.by_handbook:
+        if not isinstance(mine, int | float) or not (
+            self.by_handbook or self.toughness is not None
+        ):
             return changes
         if soft is None and isinstance(stiff, int | float) and stiff > 0.0:
             return {**changes, "softening": max(1.0, self.softening * mine / stiff)}
@@ -284,6 +339,8 @@ class Material:
     @property
     def failure_strain(self) -> float:
         """Smallest volumetric strain at which tension breaks it; infinite when it never breaks."""
+        if self.law == "phase_field":
+            return phase_field.failure_strain(self)
         if self.law != "nacc":
             return math.inf
         by_hand = [f for f in DERIVED if getattr(self, f) is not None]
@@ -303,7 +360,7 @@ class Material:
         dimension (docs/theory/fracture.md): right to an order of magnitude, since an edge or a
         corner gathers strain and a soft thing spreads it.
         """
-        return self.wave_speed * self.failure_strain if self.law == "nacc" else math.inf
+        return self.wave_speed * self.failure_strain if self.law in BREAKS else math.inf
 
     @property
     def start_alpha(self) -> Field:
@@ -326,6 +383,8 @@ class Material:
         """
         at = sample or _tensor
         values = self._nacc(at) if self.law == "nacc" else {}
+        if self.law == "phase_field":  # what a grid makes of it: materials.phase_field
+            values = phase_field.columns(self, at, 0.0)
         row = laws.row(
             self.law, lambda field: values[field] if field in values else self._at(field, at)
         )

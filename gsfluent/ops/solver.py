@@ -24,7 +24,7 @@ from gsfluent.errors import GsfluentError, InputError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
-from gsfluent.ops.plasticity import LAWS, check_params
+from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
 from gsfluent.ops.solver_state import UNBROKEN, SolverState
 
 ELASTIC, NACC = LAWS["elastic"], LAWS["nacc"]
@@ -205,7 +205,14 @@ class Solver(SolverState):
         self._params, self._law = params.to(velocity), law.to(self.device)
         check_params(op, self._law, self._params)
         laws = set(law.tolist())
+        if LAWS["phase_field"] in laws:
+            raise ValueError(
+                f"{op}: law phase_field (9) is not in the resident solver yet; step it by p2g, "
+                "grid_update, g2p, damage_solve and return_mapping"
+            )
         self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
+        if bool(compiled_apart(self._law, self._params).any()):
+            self._law_set = 3
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap

@@ -369,7 +369,7 @@ class SolverState:
         _, _, stress, _ = return_mapping(
             strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,
             material=material, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
-            dt=self.dt or 1.0,
+            dt=1e-9,  # of a step without motion: what flows with a viscosity stays
         )  # fmt: skip
         return self._restored(stress)
 

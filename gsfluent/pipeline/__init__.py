@@ -20,6 +20,7 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.pipeline.simulate.stage": ("Simulate",),
         "gsfluent.pipeline.cracks.stage": ("Repair",),
         "gsfluent.pipeline.render.stage": ("Render",),
+        "gsfluent.pipeline.carrying.stage": ("Carry",),
         "gsfluent.pipeline.light.lamps": ("Lamp", "Lighting"),
         "gsfluent.pipeline.light.bake": ("bake_light",),
         "gsfluent.pipeline.solid.field": ("SignedDistance",),

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from gsfluent.errors import InputError
+from gsfluent.materials import BREAKS
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL
 from gsfluent.scene.scene import Body
 
@@ -73,7 +74,7 @@ def bounds_of(
             why = f"{body.name}: pieces of about {_length(piece)}, {PIECE_CELLS:g} cells each"
             need("fragment size", piece, PIECE_CELLS, why)
         material = body.material
-        if material.variation > 0.0 and material.grain > 0.0 and material.law == "nacc":
+        if material.variation > 0.0 and material.grain > 0.0 and material.law in BREAKS:
             why = f"{body.name}: strength varies over {_length(material.grain)}, "
             need("damage length", material.grain, PIECE_CELLS, f"{why}{PIECE_CELLS:g} cells")
     found.sort(key=lambda bound: bound.dx)
@@ -110,7 +111,7 @@ def fragment_size(body: Body, strike: float) -> float | None:
     ``n^(2/3)`` times smaller than the body.
     """
     material = body.material
-    if material.law != "nacc" or strike <= 0.0:
+    if material.law not in BREAKS or strike <= 0.0:
         return None
     limit = material.breaking_speed
     if not math.isfinite(limit) or strike <= limit:

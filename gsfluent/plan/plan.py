@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from gsfluent.config import Shot
+from gsfluent.materials import BREAKS
 from gsfluent.pipeline.matter.points import MAX_PARTICLES, POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.pipeline.solid.walls import WALL_CELLS
@@ -385,6 +386,8 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
         found.append(
             "nothing meets anything before the end; hint: a longer output.seconds, or another event"
         )
-    if "nacc" not in laws_of(scene) and any(e.__class__.__name__ == "Bullet" for e in shot.events):
+    if not laws_of(scene) & set(BREAKS) and any(
+        e.__class__.__name__ == "Bullet" for e in shot.events
+    ):
         found.append("nothing is brittle, so the bullet breaks nothing; hint: another material")
     return found

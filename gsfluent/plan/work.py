@@ -15,6 +15,7 @@ import torch
 
 from gsfluent.config import Shot
 from gsfluent.data import Solid
+from gsfluent.materials import BREAKS
 from gsfluent.pipeline.fill.stage import fill_resolution
 from gsfluent.pipeline.light.from_shot import light_of
 from gsfluent.pipeline.reconstruct.recipe import recipe_for
@@ -170,10 +171,11 @@ def simulate_work(
         points: All material points.
     """
     laws = laws_of(scene)
-    breaks = cracks and "nacc" in laws and outlook.shatters
+    brittle = bool(laws & set(BREAKS))
+    breaks = cracks and brittle and outlook.shatters
     seconds = max(outlook.grid_from + outlook.grid_seconds, 1e-12)
     broken = max(0.0, 1.0 - outlook.struck / seconds) if math.isfinite(outlook.struck) else 0.0
-    fields = len(scene.bodies) + (1 if "nacc" in laws and outlook.shatters else 0)
+    fields = len(scene.bodies) + (1 if brittle and outlook.shatters else 0)
     return (
         {"start": 1.0}
         | stepping(
@@ -244,7 +246,8 @@ def laws_of(scene: Scene) -> set[str]:
 def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]]:
     """The passes: ``pass``, ``needed`` and ``why``."""
     laws = laws_of(scene)
-    breaks = "nacc" in laws
+    breaks = bool(laws & set(BREAKS))
+    brittle = f"brittle matter ({', '.join(sorted(laws & set(BREAKS)))})"
     several = len(scene.bodies) > 1
     flies = outlook.grid_from > 0.0
     gridded = outlook.grid_seconds > 0.0
@@ -267,7 +270,7 @@ def passes_of(shot: Shot, scene: Scene, outlook: Outlook) -> list[dict[str, Any]
          "something touches something from the start"),
         ("contact fields", gridded and (several or (breaks and outlook.shatters)), fields,
          "one body that stays in one piece: one velocity field"),
-        ("damage variable", gridded and breaks, "brittle matter (nacc)", "no brittle matter"),
+        ("damage variable", gridded and breaks, brittle, "no brittle matter"),
         ("return map", gridded and bool(laws - {"elastic"}),
          f"matter that yields ({', '.join(sorted(laws - {'elastic'}))})", "no matter yields"),
         ("rigid things", bool(scene.colliders), things, "only the floor" if rests else "none"),

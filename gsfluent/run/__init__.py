@@ -4,6 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    carried="carry_to",
     demo="SIZES photograph_demo run_demo",
     from_input="made_shot",
     report="read_run write_report",

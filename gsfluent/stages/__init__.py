@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = room(
     findings="cells_for cells_for_walls lowered setting summary thin_walls walls_note",
     known="extended is_solid known_solid parted source_digest",
     select="select_mask",
-    show="render_again",
+    show="render_again render_stage",
     simulate="build_scene moving_settings saved solver_options",
     solids="context_of load_solids make_solids",
 )

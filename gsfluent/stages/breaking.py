@@ -35,6 +35,8 @@ def breaks_from(material: Material, length: float, dx: float | None = None) -> f
         dx: Node spacing [m]: a coarse grid keeps less strength; the real strength without.
     """
     start = material.breaking_speed
+    if material.law == "phase_field" and dx is not None:
+        return start * kept_strength(material, dx)
     if not material.by_handbook or material.energy_by_hand or not math.isfinite(start):
         return start
 

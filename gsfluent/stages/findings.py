@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from gsfluent.data import SURFACE, Solid
+from gsfluent.materials import Material, phase_field
 from gsfluent.pipeline.matter.brittle import kept_strength
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, grid_spacing
 from gsfluent.pipeline.simulate.stage import QUALITY
@@ -22,6 +23,8 @@ _log = logging.getLogger(__name__)
 
 LOWERED = 0.9
 """Share of the strength from which on nobody is told that the grid has lowered it."""
+THIN_BODY = 8.0
+"""Phase-field lengths of a body from which its toughness decides how it breaks."""
 
 
 def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
@@ -64,6 +67,11 @@ FINER = 8
 """How many times finer than a quality says cells are made for walls, at most."""
 
 
+MOSTLY = 0.25
+"""Share of its surface on thin walls from which a body is refined for them: a bowl, and no apple
+with a ragged rim, which would take twelve times the points."""
+
+
 def cells_for_walls(scene: Scene, quality: str, most: int) -> tuple[int, int]:
     """Cells along the largest solid with which walls have :data:`WALL_CELLS` cells.
 
@@ -79,10 +87,8 @@ def cells_for_walls(scene: Scene, quality: str, most: int) -> tuple[int, int]:
     if not most or all(body.solid is None for body in scene.bodies):
         return least, least
     dx = grid_spacing(scene, least)
-    finer = max(
-        (_walls(body, dx)["cells_needed"] for body in scene.bodies if body.solid is not None),
-        default=1.0,
-    )
+    reports = [_walls(body, dx) for body in scene.bodies if body.solid is not None]
+    finer = max((r["cells_needed"] for r in reports if r["share"] >= MOSTLY), default=1.0)
     wanted = cells_for(scene, dx / finer)
     volume = sum(body.volume for body in scene.bodies)
     held = int(grid_spacing(scene, 1) * (most / (POINTS_PER_CELL * volume)) ** (1.0 / 3.0))
@@ -138,9 +144,13 @@ def lowered(scene: Scene, dx: float) -> list[str]:
         scene: The scene.
         dx: Grid spacing [m].
     """
-    found = {}
+    found: dict[tuple[str, str], str] = {}
     for body in scene.bodies:
         for material in body.materials:
+            if material.law == "phase_field":
+                said = bound_length(body.name, material, body.volume ** (1 / 3), dx)
+                found |= {(body.name, material.name): said} if said else {}
+                continue
             kept = kept_strength(material, dx)
             if kept < LOWERED:
                 found[body.name, material.name] = (
@@ -151,6 +161,35 @@ def lowered(scene: Scene, dx: float) -> list[str]:
                     "keeps the strength and makes cracks tougher"
                 )
     return list(found.values())
+
+
+def bound_length(name: str, material: Material, size: float, dx: float) -> str:
+    """What a grid makes of a phase-field material where something gives way; else empty.
+
+    Args:
+        name: Of the body.
+        material: Of law ``phase_field``.
+        size: Of the body, the cube root of its volume [m].
+        dx: Grid spacing [m].
+    """
+    length, strong, tough = phase_field.kept(material, dx)
+    said = f"{name}: cracks of {material.name} are {4000 * length:.3g} mm wide"
+    if strong < LOWERED:
+        return (
+            f"{said}, two cells of {1000 * dx:.3g} mm bind: {_percent(strong)} of the strength are "
+            "left; hint: finer cells, or prefer: strength, which makes cracks tougher"
+        )
+    if tough * LOWERED > 1.0:
+        return (
+            f"{said}, two cells of {1000 * dx:.3g} mm bind: a crack takes {tough:.3g} times its "
+            "toughness; hint: finer cells, or prefer: toughness"
+        )
+    if size < THIN_BODY * length:
+        return (
+            f"{said} in a body of {1000 * size:.3g} mm: its strength decides and not its "
+            "toughness; hint: give tensile_strength, or finer cells"
+        )
+    return ""
 
 
 def cells_for(scene: Scene, dx: float) -> int:

@@ -117,6 +117,18 @@ def write_photographs(folder: Path) -> None:
         Image.fromarray(picture).save(folder / f"{number}.png")
 
 
+def write_moving(folder: Path) -> None:
+    """Points around the shell that turn, as arrays, as a file per frame and as a mesh."""
+    rest = shell(200).means.double().numpy()
+    turns = [np.array([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])
+             for a in (0.0, 0.2)]  # fmt: skip
+    frames = np.stack([rest @ turn.T for turn in turns])
+    np.savez(folder / "cloth.npz", positions=frames, fps=24.0)
+    (folder / "frames").mkdir()
+    for number, points in enumerate(frames):
+        np.save(folder / "frames" / f"frame_{number}.npy", points)
+
+
 def write_inputs(folder: Path) -> None:
     """Everything that a user brings."""
     save(shell(), folder / "melon.ply")
@@ -128,6 +140,7 @@ def write_inputs(folder: Path) -> None:
     write_parts(folder, folder / "captures" / "apple")
     if importlib.util.find_spec("transformers"):  # of the extra `inpaint`
         write_diffusion(folder / "models" / "sdxl-inpainting")
+    write_moving(folder)
     write_model(folder / "model")
     (folder / "phys.json").write_text(json.dumps(PHYSGAUSSIAN))
     (folder / "shot.yaml").write_text(yaml.safe_dump(SHOT, sort_keys=False))

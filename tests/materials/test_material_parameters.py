@@ -31,12 +31,24 @@ BASE: dict[str, Material] = {
         "test", law="drucker_prager", friction_angle=30.0, cohesion_pressure=200.0, **SOLID
     ),
     "von_mises": Material(
-        "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3, **SOLID
+        "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3,
+        plastic_viscosity=200.0, **SOLID,
     ),
     "fluid": Material(
         "test", law="fluid", density=1000.0, bulk_modulus=1e5, viscosity=2.0, tait_exponent=7.0
     ),
     "rigid": Material("test", law="rigid", density=1000.0),
+    "phase_field": Material(
+        "test", law="phase_field", toughness=20.0, length=0.12, tensile_strength=4e3, **SOLID
+    ),
+    "phase_field by strength": Material(
+        "test", law="phase_field", toughness=60.0, tensile_strength=3e3, **SOLID
+    ),
+    "yeoh": Material("test", law="yeoh", yeoh_c20=2e4, yeoh_c30=2e5, **SOLID),
+    "ogden": Material(
+        "test", law="ogden", ogden_alpha1=1.3, ogden_mu2=4e3, ogden_alpha2=8.0, ogden_mu3=-4e3,
+        ogden_alpha3=-3.0, **SOLID,
+    ),
     "nacc by handbook": Material(
         "test", law="nacc", tensile_strength=4e3, compressive_strength=2e4, fracture_energy=60.0,
         friction_angle=40.0, **SOLID,
@@ -65,6 +77,8 @@ def fall(material: Material) -> Tensor:
     if material.by_handbook:  # only a grid makes something of a fracture energy
         found, alphas = brittle_rows(material, of_one_point, torch.ones(1).double(), DX)
         row, start = found[0], float(alphas[0])
+    if material.law == "phase_field":
+        row = materials.phase_field.rows(material, of_one_point, torch.ones(1).double(), DX)[0]
     rows = torch.stack([row, materials.elastic.parameters()])
     count = len(cube)
     kind = torch.cat([torch.zeros(count), torch.ones(count)]).int()
@@ -92,6 +106,8 @@ def fall(material: Material) -> Tensor:
 
 def base_of(law: str, field: str) -> str:
     """Strengths and energy take the place of what the other base gives by hand."""
+    if law == "phase_field":
+        return "phase_field by strength" if field == "tensile_strength" else law
     return "nacc by handbook" if field in materials.HANDBOOK else law
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -112,3 +114,14 @@ def test_cuda_matches_cpu(mixed: Tensor, dtype: torch.dtype) -> None:
     f = mixed[(s[:, 1] - s[:, 2]) / s[:, 0] > 1e-2].to(dtype)
     for got, want in zip(polar_clamped(f.cuda()), polar_clamped(f), strict=True):
         assert (got.cpu() - want).abs().max() < (2e-3 if dtype == torch.float32 else 1e-10)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_a_row_gives_does_not_depend_on_its_place(mixed: Tensor, dtype: torch.dtype) -> None:
+    flat = torch.randn(9, 3, 1, dtype=torch.float64) @ torch.randn(9, 1, 3, dtype=torch.float64)
+    odd = torch.stack([torch.zeros(3, 3), torch.full((3, 3), math.nan), torch.eye(3)]).double()
+    given = torch.cat([mixed, flat, odd]).to(dtype)
+    for got, again in zip(
+        polar_clamped(given), polar_clamped(given.flip(0)[:-3].contiguous()), strict=True
+    ):
+        assert torch.equal(again, got.flip(0)[:-3])

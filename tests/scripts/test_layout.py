@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = sorted({path.parent for path in (ROOT / "scripts").rglob("*.py")})
-ON_TOP = {"demo.sh", "lab.sh", "setup.sh", "test.sh"}
+ON_TOP = {"demo.sh", "lab.sh", "setup.sh", "test.sh", "wheel.sh", "wheel_try.sh"}
 NAMED = re.compile(r"\bscripts/[\w/]+\.(?:py|sh)\b")
 
 

@@ -25,6 +25,7 @@ from gsfluent.results.record import RunRecord
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.breaking import breaks_from
 from gsfluent.stages.findings import (
+    MOSTLY,
     cells_for,
     cells_for_walls,
     lowered,
@@ -186,6 +187,23 @@ def test_walls_get_the_cells_that_they_want_within_bounds() -> None:
     ball(thick, "ball", 0.0, 0.1)
     assert cells_for_walls(thick, "preview", 10**7) == (20, 20)
     assert walls_note("preview", 20, 20, 10**7) == ""
+
+
+def test_a_thin_rim_of_a_thick_body_is_told_but_makes_no_finer_cells(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    solid = ellipsoid((0.1, 0.1, 0.09), voxels=64)
+    rim = solid.occupancy.clone()
+    width, _, height = rim.shape
+    core = (torch.arange(width) - 0.5 * width).abs()[:, None, None] < 0.3 * width
+    level = (torch.arange(height) - 0.5 * height).abs() < 1.5
+    rim &= core | level
+    scene = Scene()
+    scene.add(solid.replace(occupancy=rim), HARD, frame=at(0, 0, 0.1), name="rimmed")
+    assert cells_for_walls(scene, "preview", 10**7) == (20, 20)
+    with caplog.at_level(logging.WARNING):
+        report = thin_walls(scene, grid_spacing(scene, 20))["rimmed"]
+    assert 0.05 < report["share"] < MOSTLY and "solve.cells" in caplog.text
 
 
 def test_notes_are_whole_sentences_and_honest() -> None:

@@ -72,9 +72,9 @@ GSF_HOST_DEVICE void covariance_axes(const CovarianceAxesArgs<T>& a, int64_t i) 
 }
 
 // A Gaussian that rides: turned by the rotation as it is where the map hardly stretches, else
-// covariance A S A^T by the axes of A R diag(s).
-template <typename T>
-GSF_HOST_DEVICE void carry_axes(const CarryAxesArgs<T>& a, int64_t i) {
+// covariance A S A^T by the axes of A R diag(s), which stretched(A R diag(s)) sees to.
+template <typename T, typename Stretched>
+GSF_HOST_DEVICE void carry_axes(const CarryAxesArgs<T>& a, int64_t i, const Stretched& stretched) {
   using std::abs;
   const T* s = a.rest_scales + 3 * i;
   T *quat = a.quats + 4 * i, *scales = a.scales + 3 * i;
@@ -87,12 +87,18 @@ GSF_HOST_DEVICE void carry_axes(const CarryAxesArgs<T>& a, int64_t i) {
   for (int r = 0; r < 3; ++r)
     for (int c = 0; c < 3; ++c) root(r, c) *= s[c];
   if (change > a.rigid && finite(root)) {
-    ellipsoid_axes(root, T(kLeastAxis), quat, scales);
+    stretched(root);
     return;
   }
   const Mat3<T> turned = matmul(turn, axes);
   quat_from_rotation(finite(turned) ? turned : axes, quat);
   for (int k = 0; k < 3; ++k) scales[k] = s[k];
+}
+template <typename T>
+GSF_HOST_DEVICE void carry_axes(const CarryAxesArgs<T>& a, int64_t i) {
+  carry_axes(a, i, [&](const Mat3<T>& root) {
+    ellipsoid_axes(root, T(kLeastAxis), a.quats + 4 * i, a.scales + 3 * i);
+  });
 }
 
 // Where a place at rest has gone: with the neighbours of its point that have not parted, each by

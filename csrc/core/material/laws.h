@@ -16,8 +16,12 @@ enum Law : int {
   kFluid = 4,
   kRigid = 5,
   kCorotated = 6,
-  kLawCount = 7,
+  kPhaseField = 9,
+  kLawCount = 10,
 };
+
+// Numbers without a law are skipped.
+GSF_HOST_DEVICE bool is_law(int law) { return law >= 0 && law < kLawCount && law != 7 && law != 8; }
 
 // A row of `params`; what the columns hold depends on the law.
 template <typename T>
@@ -25,11 +29,12 @@ struct MaterialRow {
   T mu;         // shear modulus [Pa]
   T kappa;      // bulk modulus [Pa]
   T strength;   // nacc: M | drucker_prager: alpha_DP | von_mises: sigma_y [Pa] | fluid: eta [Pa s]
-  T cohesion;   // nacc: beta | drucker_prager: tensile pressure [Pa]
-  T hardening;  // nacc: xi | von_mises: hardening modulus [Pa]
-  T damage;     // nacc: eta, shear damage
+                // phase_field: threshold of psi+ [Pa]
+  T cohesion;   // nacc: beta | drucker_prager: tensile pressure [Pa] | phase_field: damage d
+  T hardening;  // nacc: xi | von_mises: hardening modulus [Pa] | phase_field: length [m]
+  T damage;     // nacc: eta, shear damage | phase_field: split and model (phase_field.h)
   T density;    // [kg/m^3]
-  T exponent;   // fluid: gamma, 7 when 0 | nacc: loss, by restitution (loss.h)
+  T exponent;   // fluid: gamma, 7 when 0 | nacc, phase_field: loss, by restitution (loss.h)
 };
 
 inline constexpr double kFluidExponent = 7.0;

@@ -5,6 +5,7 @@
 #include "core/material/args.h"
 #include "core/material/laws.h"
 #include "core/material/nacc.h"
+#include "core/material/phase_field.h"
 #include "core/material/wave_speed.h"
 
 namespace gsf {
@@ -26,7 +27,8 @@ struct ReturnMapped {
 
 // One constitutive step: strain pushed forward by A = dt grad v, then returned to the surface.
 // An unknown law or a state that is not finite becomes stress-free and counts as invalid.
-template <typename T>
+// kFields: whether phase_field is among the laws (not in the resident solver on CUDA).
+template <bool kFields = true, typename T>
 GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
                                                const Mat3<T>& increment, int law,
                                                const MaterialRow<T>& m, const NaccOptions<T>& o,
@@ -35,7 +37,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
   const Sym3<T> zero = {T(0), T(0), T(0), T(0), T(0), T(0)};
   ReturnMapped<T> out{zero, zero, alpha, false, false, false, false};
   const Sym3<T> e = update_strain(strain, increment);
-  if (!finite(e) || !finite(alpha) || law < 0 || law >= kLawCount) {
+  if (!finite(e) || !finite(alpha) || !is_law(law) || (!kFields && law == kPhaseField)) {
     // A lost state becomes stress-free debris: it must not reach its neighbours through the grid.
     out.alpha = finite(alpha) ? alpha : T(0);
     out.invalid = true;
@@ -62,6 +64,8 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
   LawResult<T> r;
   if (law == kDruckerPrager)
     r = drucker_prager(m, e, alpha, out.inverted);
+  else if (kFields && law == kPhaseField)
+    r = phase_field(m, e, alpha, out.inverted);
   else if (law == kVonMises)
     r = von_mises(m, e, alpha, out.inverted);
   else if (law == kFluid)

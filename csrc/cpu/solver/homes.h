@@ -64,6 +64,7 @@ class HomePass {
   // Updates every particle from the velocities of its nodes.
   Counts from_nodes(int laws) const {
     if (laws == kElasticOnly) return from_nodes<kElasticOnly>();
+    if (laws == kMoreLaws) return from_nodes_more();
     return laws == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>();
   }
 
@@ -253,6 +254,9 @@ class HomePass {
       for (int64_t h = begin; h < end; ++h) home_from_nodes<kLaws, kTrack>(h, dt, dt_next, counts);
     });
   }
+
+  // In solver_more.cpp, so that the loops here stay as they are compiled.
+  Counts from_nodes_more() const;
 
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;

@@ -67,11 +67,12 @@ class Stepper {
 };
 
 template <typename T>
-void prime_particles(const SolverView<T>& s, bool measure) {
+void prime_particles(const SolverView<T>& s, int laws, bool measure) {
   SolverClock& c = *s.clock;
   const T dt = static_cast<T>(c.dt);
   const Counts all =
       parallel_counts(s.count, kParticleGrain, [&](int64_t begin, int64_t end, Counts& counts) {
+        if (laws == kMoreLaws) return prime_more(s, begin, end, measure, dt, counts.largest);
         for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, counts.largest);
       });
   if (measure)
@@ -84,13 +85,13 @@ struct Cpu {
   using Scope = CpuScope;
 
   template <typename T>
-  static void prime(const SolverView<T>& s, int, const Scope&) {
+  static void prime(const SolverView<T>& s, int laws, const Scope&) {
     SolverClock& c = *s.clock;
     if (s.row_count == 0) return;
-    prime_particles(s, true);
+    prime_particles(s, laws, true);
     start_clock(c, double(s.dx));
     if (c.done != 0 || c.reason != kFine) return;
-    prime_particles(s, false);
+    prime_particles(s, laws, false);
     choose_unit(c);
   }
 

@@ -18,6 +18,11 @@ namespace gsf::cpu {
 template <typename T>
 void solver_build(const SolverView<T>& s);
 
+// prime_particle of particles [begin, end) of a scene with laws of more_laws.h.
+template <typename T>
+void prime_more(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
+                Largest& largest);
+
 // What a slot holds in this step.
 enum Touched : uint8_t { kTouchedSums = 1, kTouchedMoments = 2, kTouchedPush = 4 };
 

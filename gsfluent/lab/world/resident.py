@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.lab.world.stepper import Scene
+from gsfluent.ops.plasticity import LAWS
 
 
 def why_not(scene: Scene, forced: bool) -> str:
@@ -19,6 +20,8 @@ def why_not(scene: Scene, forced: bool) -> str:
         return "a force changes velocities between steps"
     if any(scene.period):
         return "it has no periodic axes"
+    if bool((scene.law == LAWS["phase_field"]).any()):
+        return "a damage field is solved between steps"
     if scene.cfl > 1.0:
         return "its cfl is at most 1"
     return ""
@@ -90,7 +93,7 @@ class Resident:
         scene, strain = self.scene, self.solver.strain
         result = ops.return_mapping(
             strain, self.solver.alpha, strain.new_zeros(strain.shape[0], 3, 3), law=scene.law,
-            params=scene.params, material=scene.material, dt=1.0, **scene.return_map,
+            params=scene.params, material=scene.material, dt=1e-9, **scene.return_map,
         )  # fmt: skip
         return result[2]
 

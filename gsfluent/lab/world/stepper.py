@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.ops.damage import DamageField
 from gsfluent.ops.plasticity import weakened
 from gsfluent.ops.reference import spring
 
@@ -167,6 +168,9 @@ class Stepper:
         self.position, self.velocity, self.affine = position, velocity, affine
         self.strain, self.alpha, self.deformation = strain, alpha, deformation
         self.peak = alpha
+        self.cracks = DamageField(scene.law, scene.params, scene.material)
+        if self.cracks.exists and any(scene.period):
+            raise ValueError("World: phase_field knows no periodic axes")
         rows = 0 if scene.colliders is None else scene.colliders.shape[0]
         self.impulse = torch.zeros(rows, 3, dtype=torch.float64, device=position.device)
         self.time, self.steps = 0.0, 0
@@ -175,11 +179,11 @@ class Stepper:
         self._travelled = 0.0
         # the stress of the first step belongs to the strain given: a step without motion, of a
         # length that only viscosity reads
-        self.stress = self._map(torch.zeros_like(affine), 1.0)[2]
+        self.stress = self._map(torch.zeros_like(affine), 1e-9)[2]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
-        if scene.irreversible and bool((self.peak > 0).any()):
+        if self.cracks.exists or (scene.irreversible and bool((self.peak > 0).any())):
             return *weakened(scene.law, scene.params, scene.material, self.peak), None
         return scene.law, scene.params, scene.material
 
@@ -202,6 +206,10 @@ class Stepper:
         body = None if scene.body is None else take(scene.body)
         blocks = self._find_blocks(place, dt, fresh=rows is not None)
         contact = scene.fields > 1
+        if self.cracks.exists:
+            self.peak = self.cracks.step(
+                self.alpha, self.peak, place, scene.volume, dx=scene.dx, blocks=blocks, body=body
+            )
         grid, moments = ops.p2g(
             place, take(self.velocity), take(self.affine), take(scene.mass),
             dx=scene.dx, blocks=blocks, dt=dt, stress=take(self.stress),
@@ -230,7 +238,7 @@ class Stepper:
         self.deformation = None if f is None else f[:count]
         self.strain, self.alpha, self.stress, info = self._map(dt * self.affine, dt)
         self.info += info
-        self.peak = torch.maximum(self.peak, self.alpha)
+        self.peak = self.cracks.grown(self.peak, self.alpha)
         self.impulse += impulse
         self.time += dt
         self.steps += 1

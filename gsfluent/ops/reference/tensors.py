@@ -96,6 +96,8 @@ class _Spectral(torch.autograd.Function):
             y = 0.5 * torch.log1p(x.clamp(min=-1.0 + 1e-6))
         elif kind == "sqrt":  # sqrt(I + m) - I
             y = x / (1.0 + (1.0 + x).clamp(min=0.0).sqrt())
+        elif kind == "tension":  # max(ln(I + m) / 2, 0)
+            y = 0.5 * torch.log1p(x.clamp(min=0.0))
         else:  # exp(m) - I
             y = torch.expm1(x)
         return (vectors * y[:, None, :]) @ vectors.mT, x, vectors
@@ -116,6 +118,13 @@ class _Spectral(torch.autograd.Function):
             z = (high - low) / base
             slope = 0.5 * torch.where(z > 0, torch.log1p(z) / torch.where(z > 0, z, 1.0), 1.0)
             slope = slope / base
+        elif ctx.kind == "tension":
+            low, high = torch.minimum(i, j), torch.maximum(i, j)
+            z, apart = (high - low) / (1.0 + low).clamp(min=1e-6), high - low
+            both = torch.log1p(z) / torch.where(z > 0, z, 1.0) / (1.0 + low).clamp(min=1e-6)
+            both = 0.5 * torch.where(z > 0, both, 1.0 / (1.0 + low).clamp(min=1e-6))
+            one = 0.5 * torch.log1p(high.clamp(min=0.0)) / torch.where(apart > 0, apart, 1.0)
+            slope = torch.where(low >= 0, both, torch.where(high > 0, one, 0.0))
         elif ctx.kind == "sqrt":
             slope = 1.0 / ((1.0 + i).clamp(min=1e-12).sqrt() + (1.0 + j).clamp(min=1e-12).sqrt())
         else:
@@ -127,5 +136,9 @@ class _Spectral(torch.autograd.Function):
 
 
 def spectral(sym: Tensor, kind: str) -> Tensor:
-    """``log``: ln(I + e) / 2, ``sqrt``: sqrt(I + e) - I, ``exp``: exp(e) - I; e and f(e) [N, 6]."""
+    """f(e) of strains e, [N, 6].
+
+    ``log``: ln(I + e) / 2; ``tension``: its positive part; ``sqrt``: sqrt(I + e) - I; ``exp``:
+    exp(e) - I.
+    """
     return to_sym(_Spectral.apply(to_matrix(sym), kind)[0])

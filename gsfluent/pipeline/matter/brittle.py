@@ -12,10 +12,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.materials import LARGEST, STEEPEST, Field, Material
+from gsfluent.materials import LARGEST, STEEPEST, Field, Material, phase_field
 from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, BAND_CELLS, softening_energies
 
 STEP = 0.04
@@ -86,11 +87,14 @@ def kept_strength(material: Material, dx: float) -> float:
         material: Of any law; a parameter that varies in space counts where it keeps least.
         dx: Node spacing [m].
     """
+    if material.law == "phase_field":
+        return phase_field.kept(material, dx)[1]
     if material.law != "nacc" or material.energy_by_hand or material.prefer == "strength":
         return 1.0
     columns = (material.parameters(), material.start_alpha, material.fracture_energy)
     row, alpha0, energy = (torch.as_tensor(c, dtype=torch.float64) for c in columns)
-    shape = torch.broadcast_shapes(row.shape[:-1], alpha0.shape, energy.shape)
+    # not torch's, which imports SymPy
+    shape = np.broadcast_shapes(row.shape[:-1], alpha0.shape, energy.shape)
     rows = row.expand(*shape, 8).reshape(-1, 8)
     table = torch.cat(
         [rows, alpha0.expand(shape).reshape(-1, 1), energy.expand(shape).reshape(-1, 1)], dim=1

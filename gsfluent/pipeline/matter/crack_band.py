@@ -126,21 +126,20 @@ def softening_energies(params: Tensor, alpha: Tensor, *, steps: int = 400) -> Te
     stretch = -1.5 * alpha + 3.0 * elastic.clamp(max=0.5)
     strain, a = torch.zeros(count, 6, dtype=torch.float64), alpha.clone()
     stress, work = torch.zeros_like(strain), torch.zeros_like(alpha)
-    energy = torch.full_like(alpha, math.nan)
+    left, spent = strain, torch.full_like(alpha, math.nan)  # where the strength of each went
     increment = torch.zeros(count, 3, 3, dtype=torch.float64)
     increment[:, 0, 0] = torch.expm1(stretch / steps)
     for _ in range(steps):
         before = stress[:, 0]
         strain, a, stress, _ = ops.return_mapping(strain, a, increment, law=law, params=params)
         work = work + 0.5 * (before + stress[:, 0]) * stretch / steps
-        gone = (a >= 0.0) & energy.isnan()
+        gone = (a >= 0.0) & spent.isnan()
         if bool(gone.any()):
-            energy = torch.where(
-                gone, work - ops.elastic_energy(strain, law=law, params=params), energy
-            )
-            if not bool(energy.isnan().any()):
+            left = torch.where(gone[:, None], strain, left)
+            spent = torch.where(gone, work, spent)
+            if not bool(spent.isnan().any()):
                 break
-    return energy
+    return spent - ops.elastic_energy(left, law=law, params=params)
 
 
 def fracture_energy(params: Tensor, alpha: float, *, dx: float) -> float:

@@ -16,11 +16,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsfluent import materials
+from gsfluent import materials, ops
 from gsfluent.data import Frame, Particles, Solid
 from gsfluent.data.regions import SOURCES, region_mask
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
+from gsfluent.ops.plasticity import weakened
 from gsfluent.pipeline.matter.brittle import brittle_rows, distinct_rows
 from gsfluent.scene.parts import quaternion_to, turned
 from gsfluent.scene.scene import Body, Part, Scene
@@ -69,9 +70,22 @@ class Matter:
         return torch.isin(law, wanted.to(law.dtype))
 
     @functools.cached_property
+    def has_field(self) -> bool:
+        """Whether any row is of phase-field matter."""
+        return bool((self.law == materials.LAWS["phase_field"]).any())
+
+    def stored(self, strain: Tensor, material: Tensor, peak: Tensor) -> Tensor:
+        """Elastic energy per volume of points with these strains, rows and peaks [J/m^3], [N]."""
+        law, params, row = self.law, self.params, material
+        if not self.has_field:
+            return ops.elastic_energy(strain, law=law, params=params, material=row)
+        law, params = weakened(law, params, row, peak)
+        return ops.elastic_energy(strain, law=law, params=params)
+
+    @functools.cached_property
     def brittle(self) -> Tensor:
-        """Points that can break, bool [N]: only in NACC is alpha a measure of damage."""
-        return self.of_law("nacc")
+        """Points that can break, bool [N]: only there is peak a measure of damage."""
+        return self.of_law(*materials.BREAKS)
 
 
 def sample_points(solid: Solid, spacing: float, *, seed: int = 0) -> Tensor:
@@ -309,6 +323,10 @@ def _parameters(
             params[index], alpha[index] = brittle_rows(material, at, factor, dx)
             if material.weibull_modulus == 0.0:
                 alpha[index] = alpha[index] * (1.0 + noise[index])
+        elif material.law == "phase_field":
+            factor = _weakness(material, points[index] * body.frame.scale, seed, dx)
+            params[index] = materials.phase_field.rows(material, at, factor, dx)
+            alpha[index] = at(material.start_alpha)
         else:
             params[index], alpha[index] = material.parameters(at), at(material.start_alpha)
     return params, law, alpha

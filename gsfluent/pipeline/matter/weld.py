@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import LAWS, UNBROKEN
 from gsfluent.pipeline.matter.pieces import Pieces, Web
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -119,13 +120,16 @@ def weld(matter: Matter, web: Web, state: State, pieces: Pieces) -> State:
     wanted, held = strong[rows], strain[rows]
     after, kept, _, _ = ops.return_mapping(
         held, wanted, strain.new_zeros(rows.shape[0], 3, 3), law=matter.law,
-        params=matter.params.to(strain), material=matter.particles.material[rows],
+        params=matter.params.to(strain), material=matter.particles.material[rows], dt=1.0,
     )  # fmt: skip
     fits = (after == held).all(dim=1) & (kept == wanted) & (alpha[rows] >= wanted)
     at = at.index_put((rows,), fits)
     alpha = torch.where(at, strong, alpha)
+    # what is undamaged in a phase field has a peak of -1
+    phase = matter.law[matter.particles.material.long()] == LAWS["phase_field"]
+    peak = torch.where(phase, UNBROKEN, strong.to(state.peak))
     return state._replace(
         particles=state.particles.replace(alpha=alpha),
-        peak=torch.where(at, strong.to(state.peak), state.peak),
+        peak=torch.where(at, peak, state.peak),
         alpha_seen=torch.where(at, alpha, state.alpha_seen),
     )

@@ -1,4 +1,4 @@
-"""Sums over boxes of voxels, and trilinear values: the same bits on every device and in any order.
+"""Sums over boxes of voxels: the same bits on every device and in any order.
 
 Three box filters one after another are a Gaussian to a few per cent (their kernel is a quadratic
 B-spline along each axis). On indicators they count whole numbers, so no rounding comes in.
@@ -71,35 +71,4 @@ def _window(field: Tensor, width: int, axis: int) -> Tensor:
         part = part.narrow(axis, 0, length) + part.narrow(axis, size, length)
         size *= 2
     assert total is not None  # width is at least 1
-    return total
-
-
-def trilinear(field: Tensor, place: Tensor) -> Tensor:
-    """Trilinear values at places in voxels, where a centre lies at its index; 0 outside.
-
-    Args:
-        field: [X, Y, Z].
-        place: [M, 3].
-
-    Returns:
-        [M]. One operation at a time, which rounds alike on every device.
-    """
-    flat = field.reshape(-1)
-    axes = []
-    for axis, stride in enumerate((field.shape[1] * field.shape[2], field.shape[2], 1)):
-        base = place[:, axis].floor()
-        t, most = place[:, axis] - base, field.shape[axis] - 1
-        index, ends = base.long(), []
-        for step, share in ((0, 1.0 - t), (1, t)):
-            at = index + step
-            held = at.clamp(0, most)
-            # what lies outside has no share: the value there counts as 0
-            ends.append((held * stride, torch.where(held == at, share, 0.0)))
-        axes.append(ends)
-    total = torch.zeros_like(place[:, 0])
-    for a, u in axes[0]:
-        for b, v in axes[1]:
-            corner, w = a + b, u * v
-            for c, share in axes[2]:
-                total = total + w * share * flat[corner + c]
     return total

@@ -18,8 +18,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent.geometry import trilinear
 from gsfluent.pipeline.matter.fragments import components
-from gsfluent.pipeline.partition.blur import blur, box_width, reach, trilinear
+from gsfluent.pipeline.partition.blur import blur, box_width, reach
 from gsfluent.pipeline.partition.chips import chip_fields
 from gsfluent.pipeline.partition.field import Field, boxes, grown
 from gsfluent.pipeline.partition.roughness import displacements

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Frame, Solid
-from gsfluent.pipeline.partition.blur import box_width, reach, trilinear
+from gsfluent.geometry import trilinear
+from gsfluent.pipeline.partition.blur import box_width, reach
 from gsfluent.pipeline.partition.threshold import (
     CHIP,
     FAR,

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Particles
-from gsfluent.materials import LAWS
+from gsfluent.materials import BREAKS, LAWS
+from gsfluent.ops.damage import DamageField
 from gsfluent.ops.plasticity import unloading_share, weakened
 from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.proximity import proximity_pairs
@@ -27,6 +28,8 @@ FIELDS = 8
 """Fields this engine can afford: each one has every node."""
 GRADIENT_LIMIT = 0.3
 """Largest ``dt |grad v|`` of intact matter in one step."""
+INSTANT = 1e-9
+"""Step [s] of the stress that points begin with: what flows with a viscosity has not flown yet."""
 REFRESH = 5
 """Steps between two looks at speeds and stiffness (each one waits for the device)."""
 
@@ -66,12 +69,19 @@ class Composed:
         self._refresh = 0
         self._proximity = False
         self._lost: Tensor | int = 0
-        self._loses = bool((matter.params[matter.law == LAWS["nacc"], 7] > 0).any())
+        brittle = torch.isin(matter.law, matter.law.new_tensor([LAWS[name] for name in BREAKS]))
+        self._loses = bool((matter.params[brittle, 7] > 0).any())
+        self._cracks = DamageField(matter.law, matter.params, self.points.material)
         self._info = torch.zeros(4, dtype=torch.int64, device=device)
         p = self.points
+        row: Tensor | None = p.material
+        law, params = matter.law, matter.params
+        if self._cracks.exists:
+            law, params = weakened(law, params, p.material, self.peak)
+            row = None
         _, _, self.stress, _ = ops.return_mapping(
-            p.strain, p.alpha, torch.zeros_like(p.affine), law=matter.law, params=matter.params,
-            material=p.material, dt=1.0, **self._map,
+            p.strain, p.alpha, torch.zeros_like(p.affine), law=law, params=params,
+            material=row, dt=INSTANT, **self._map,
         )  # fmt: skip
 
     def advance(self, until: float, steps: int) -> int:
@@ -144,7 +154,7 @@ class Composed:
         self._limit = step
         self._row: Tensor | None = p.material
         self._params, self._law = matter.params, matter.law
-        if self.options.irreversible and bool((peak > 0).any()):
+        if self._cracks.exists or (self.options.irreversible and bool((peak > 0).any())):
             self._law, self._params = weakened(matter.law, matter.params, p.material, peak)
             self._row = None
 
@@ -174,6 +184,13 @@ class Composed:
             velocity_grid, p.position, dx=dx, dt=dt, blocks=blocks, body=body,
             deformation=p.deformation, velocity=p.velocity, return_skipped=True,
         )  # fmt: skip
+        if self._cracks.exists:
+            self.peak = self._cracks.step(
+                p.alpha, self.peak, p.position, p.volume, dx=dx, blocks=blocks, body=body
+            )
+            self._law, self._params = weakened(
+                self.matter.law, self.matter.params, p.material, self.peak
+            )
         strain, alpha, self.stress, info = ops.return_mapping(
             p.strain, p.alpha, dt * affine,
             law=self._law, params=self._params, material=self._row, dt=dt, **self._map,
@@ -188,7 +205,8 @@ class Composed:
             position=position, velocity=velocity, affine=affine, deformation=deformation,
             strain=strain, alpha=alpha,
         )  # fmt: skip
-        self.peak = torch.where(self._brittle, torch.maximum(self.peak, alpha), self.peak)
+        grown = self._cracks.grown(self.peak, alpha)
+        self.peak = torch.where(self._brittle, grown, self.peak)
         if impulse.numel():
             self.impulse = self.impulse + impulse.sum(dim=0)
         self.work = self.work + self.rigid.work(rows, impulse, torque)

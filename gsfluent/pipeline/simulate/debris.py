@@ -146,9 +146,7 @@ def _stiffened(state: State, matter: Matter, rows: Tensor) -> State:
     p = state.particles
     mass, velocity, affine = p.mass[rows], p.velocity[rows], p.affine[rows]
     before = kinetic_energy(mass, velocity, affine, matter.dx)
-    density = ops.elastic_energy(
-        p.strain[rows], law=matter.law, params=matter.params, material=p.material[rows]
-    )
+    density = matter.stored(p.strain[rows], p.material[rows], state.peak[rows])
     stored = (density.double() * p.volume[rows].double()).sum()
     index = torch.unique(state.unit[rows], return_inverse=True)[1]
     body = RigidChips(mass, state.position[rows], velocity, affine, index, matter.dx)

@@ -12,7 +12,6 @@ import math
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.pipeline.colliders.proximity import boxes, proximity_pairs, time_to_meet
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.matter.fragments import components
@@ -197,9 +196,7 @@ class Leaving:
         room = gap - LANDING * matter.dx
         if time_to_meet(room, flight.speed_at(state.time), float(self.gravity.norm())) < frame / 2:
             return state
-        density = ops.elastic_energy(
-            points.strain, law=matter.law, params=matter.params, material=points.material
-        )
+        density = matter.stored(points.strain, points.material, state.peak[rows])
         lost = (
             kinetic_energy(points.mass, points.velocity, points.affine, matter.dx) - flight.kinetic
         )

@@ -247,7 +247,7 @@ def _account(run: Run, rows: Tensor, held: list[float], *, sign: float) -> None:
     part = dataclasses.replace(matter, particles=matter.particles.select(rows))
     there = state._replace(
         particles=state.particles.select(rows), position=state.position[rows],
-        peak=state.peak[rows], ever=state.ever[rows],
+        peak=state.peak[rows], ever=state.ever[rows], field=state.field[rows],
     )  # fmt: skip
     now = figures_of(part, there, run.scene.gravity)
     run.watch.energy += sign * now.total

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.ops.damage import DamageField
+from gsfluent.ops.reference.phase_field import BROKEN
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.simulate.engine import Unhealthy
@@ -399,6 +401,7 @@ class Figures:
         damaged_fraction: Share of the mass that ever broke.
         alpha_max: Largest alpha so far.
         non_finite: Points with a value that is not finite.
+        surface: Energy of the cracks of phase-field matter.
     """
 
     kinetic: float
@@ -409,6 +412,7 @@ class Figures:
     damaged_fraction: float
     alpha_max: float
     non_finite: int
+    surface: float = 0.0
 
     @property
     def total(self) -> float:
@@ -425,9 +429,10 @@ def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]
     mass, volume = particles.mass.to(wide), particles.volume.to(wide)
     second = 0.25 * matter.dx**2
     kinetic = 0.5 * (mass * ((v**2).sum(dim=1) + second * (c**2).sum(dim=(1, 2)))).sum()
-    density = ops.elastic_energy(
-        strain, law=matter.law, params=matter.params, material=particles.material
-    )
+    surface = torch.zeros((), dtype=wide, device=x.device)
+    if matter.has_field:
+        surface = _crack_energy(matter, state)
+    density = matter.stored(strain, particles.material, peak)
     elastic = (density.to(wide) * volume).sum()
     pull = torch.tensor(gravity, dtype=wide, device=x.device)
     potential = -(mass * (x @ pull)).sum()
@@ -442,8 +447,24 @@ def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]
             torch.stack([kinetic, elastic, potential]),
             momentum,
             turning,
-            torch.stack([damaged, peak.max().to(wide), (~finite).sum().to(wide)]),
+            torch.stack([damaged, peak.max().to(wide), (~finite).sum().to(wide), surface]),
         ]
     ).tolist()
-    kinetic, elastic, height, px, py, pz, lx, ly, lz, damaged, most, bad = values
-    return Figures(kinetic, elastic, height, (px, py, pz), (lx, ly, lz), damaged, most, int(bad))
+    kinetic, elastic, height, px, py, pz, lx, ly, lz, damaged, most, bad, cost = values
+    return Figures(
+        kinetic, elastic, height, (px, py, pz), (lx, ly, lz), damaged, most, int(bad), cost
+    )
+
+
+def _crack_energy(matter: Matter, state: State) -> Tensor:
+    """What the cracks of phase-field matter cost [J], float64 []."""
+    p = state.particles
+    if not bool((state.peak > -BROKEN).any()):
+        return torch.zeros((), dtype=torch.float64, device=p.device)
+    position = state.position.to(p.velocity)
+    _, field = torch.unique(state.field, return_inverse=True)
+    cracks = DamageField(matter.law, matter.params, matter.particles.material)
+    return cracks.energy(
+        p.alpha, state.peak, position, matter.particles.volume, dx=matter.dx,
+        blocks=ops.build_blocks(position, matter.dx), body=field.to(torch.int32),
+    )  # fmt: skip

@@ -66,6 +66,8 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         rigid: The colliders.
         matter: The points, for the heaviest density and the grid spacing.
     """
+    if matter.has_field:  # its field is solved between steps
+        return False
     if not rigid.frees:
         return True
     mass = rows[:, columns.MASS]

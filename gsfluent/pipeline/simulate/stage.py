@@ -60,7 +60,8 @@ class SimulationFrame:
         damage: Damage of each point, 0 intact to 1 broken, [N]; 0 where the law has no damage.
         fragments: Piece of each point, of broken ones, too, int32 [N]; -1 for loose matter and for
             what flows (see :class:`Fragments`).
-        energy: ``kinetic``, ``elastic``, ``dissipated``, ``gravity`` [J].
+        energy: ``kinetic``, ``elastic``, ``dissipated``, ``gravity`` [J]; of phase-field matter
+            also ``surface``, what its cracks cost.
         stats: The figures of run.json's ``per_frame`` for this frame.
         pieces: Sizes of the pieces.
         broken: Points that ever broke, bool [N].
@@ -352,6 +353,7 @@ def frame_of(
             "elastic": now.elastic,
             "dissipated": stats["dissipated"],
             "gravity": now.gravity,
+            **({"surface": now.surface} if run.matter.has_field else {}),
         },
         stats=stats,
         pieces=pieces,

@@ -1,0 +1,143 @@
+// Phase-field fracture: what one point does between two damage solves. Bourdin, Francfort and
+// Marigo 2000; the split of Amor, Marigo and Maurini 2009 or Miehe, Hofacker and Welschinger 2010,
+// and Miehe's history. docs/theory/phase-field.md.
+//
+//   energy   g(d) psi+ + psi-,   g = (1 - k)(1 - d)^2 + k
+//   alpha    H / psi_t - 1, the largest psi+ so far over the threshold: below zero while nothing
+//            can be damaged (AT1)
+//
+// The damage d comes with the row (column `cohesion`): it is a field, and the solver's to find.
+#pragma once
+
+#include "core/material/laws.h"
+
+namespace gsf {
+
+inline constexpr double kResidualStiffness = 1e-4;  // k
+inline constexpr double kBrokenDamage = 0.95;       // d of a broken point: peak = d - 0.95
+inline constexpr double kDriveMax = 1e4;            // of H / psi_t: 1 - d is 1e-4 there
+// Broken matter forgets what it has opened and sheared beyond these, as torn liquid does: the
+// stiffness that is left must not pull across an open crack.
+inline constexpr double kBrokenVolumeMax = 0.44;  // J^2 - 1 of J = 1.2
+inline constexpr double kBrokenShearMax = 0.5;    // |d|
+
+// Column `damage` of a row: split, and 4 for AT2.
+enum EnergySplit : int { kSplitVolumetric = 0, kSplitNone = 1, kSplitSpectral = 2 };
+inline constexpr int kModelAt2 = 4;
+template <typename T>
+GSF_HOST_DEVICE int split_of(const MaterialRow<T>& m) {
+  return int(m.damage) & 3;
+}
+
+// (J^2 - 1) - ln J^2 by its series, for |J^2 - 1| below a tenth.
+inline constexpr double kSeriesVolume = 0.1;
+template <typename T>
+GSF_HOST_DEVICE T volume_series(T x) {
+  T sum = T(1.0 / 16.0);
+  for (int n = 15; n >= 2; --n) sum = T(1.0 / double(n)) - x * sum;
+  return x * x * sum;
+}
+
+// Root y of det((1 + y) I + d) = 1 for |d| up to a half, by three Newton steps (core/sym3.h).
+template <typename T>
+GSF_HOST_DEVICE T unit_det_shift_small(const Sym3<T>& d) {
+  const T h = T(0.5) * norm2(d);
+  const T c = h - det(d);
+  T y = c / (T(3) - h);
+  for (int i = 0; i < 4; ++i) {
+    const T f = ((y + T(3)) * y + (T(3) - h)) * y - c;
+    y -= f / ((T(3) * y + T(6)) * y + (T(3) - h));
+  }
+  return y;
+}
+
+// Without branches, for numbers and for packs of them: psi+ and the Kirchhoff stress of the splits
+// `volumetric` (all = 0) and `none` (all = 1).
+template <typename T>
+struct PhaseState {
+  T active;  // psi+
+  Sym3<T> stress;
+};
+template <typename T, typename Volume>
+GSF_HOST_DEVICE PhaseState<T> phase_state(T mu, T kappa, T damage, T all, const Sym3<T>& d, T shift,
+                                          T j2m1, const Volume& volume_energy) {
+  const T whole = T(1) - damage;
+  const T g = T(1.0 - kResidualStiffness) * whole * whole + T(kResidualStiffness);
+  const T open = max(j2m1, T(0)), pressed = min(j2m1, T(0));
+  const T counted = open + all * pressed;
+  return {T(1.5) * mu * shift + T(0.25) * kappa * volume_energy(counted),
+          add_diagonal(g * mu * d, T(0.5) * kappa * (g * counted + (T(1) - all) * pressed))};
+}
+
+// Split by the principal Hencky strains h: psi+ = mu sum <h_i>^2 + lambda/2 <tr h>^2.
+template <typename T>
+GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m, const Sym3<T>& e) {
+  using std::log1p;
+  const Vec3<T> found = eigenvalues_jacobi(e);
+  const T least = T(kEigenvalueMin - 1.0);
+  const T x[3] = {max(found.x, least), max(found.y, least), max(found.z, least)};
+  T h[3], up[3], all[2], tension[2];
+  for (int i = 0; i < 3; ++i) {
+    h[i] = T(0.5) * log1p(x[i]);
+    up[i] = max(h[i], T(0));
+  }
+  for (int i = 0; i < 2; ++i) {  // divided differences of h and of <h>, largest eigenvalue first
+    const T apart = x[i] - x[i + 1], b = T(1) + x[i + 1];
+    all[i] = T(0.5) * log1p_over(apart / b) / b;
+    tension[i] = h[i + 1] >= T(0) ? all[i] : (apart > T(0) ? up[i] / apart : T(0));
+  }
+  const T span = x[0] - x[2];
+  const T all2 = span > T(0) ? (all[0] - all[1]) / span : T(0);
+  const T tension2 = span > T(0) ? (tension[0] - tension[1]) / span : T(0);
+  // Newton's polynomial f1 + f12 (e - x1) + f123 (e - x1)(e - x2).
+  const Sym3<T> first = add_diagonal(e, -x[0]);
+  const Sym3<T> second = square(first) + (x[0] - x[1]) * first;
+  const Sym3<T> log_v = add_diagonal(all[0] * first + all2 * second, h[0]);
+  const Sym3<T> plus = add_diagonal(tension[0] * first + tension2 * second, up[0]);
+  const T whole = T(1) - m.cohesion;
+  const T g = T(1.0 - kResidualStiffness) * whole * whole + T(kResidualStiffness);
+  const T lambda = m.kappa - T(2.0 / 3.0) * m.mu;
+  const T log_j = h[0] + h[1] + h[2], open = max(log_j, T(0)), pressed = min(log_j, T(0));
+  const T squares = up[0] * up[0] + up[1] * up[1] + up[2] * up[2];
+  const Sym3<T> stress = T(2) * m.mu * ((g - T(1)) * plus + log_v);
+  return {m.mu * squares + T(0.5) * lambda * open * open,
+          add_diagonal(stress, lambda * (g * open + pressed))};
+}
+
+template <typename T>
+GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym3<T>& e, T alpha,
+                                              bool inverted) {
+  using std::log1p;
+  ElasticState<T> s = elastic_state(e, inverted);
+  LawResult<T> out{s.e, s.e, alpha, false, s.guarded};
+  if (m.cohesion >= T(kBrokenDamage)) {
+    if (s.j2m1 > T(kBrokenVolumeMax)) {
+      s.j2m1 = T(kBrokenVolumeMax);
+      out.plastic = true;
+    }
+    if (s.n > T(kBrokenShearMax)) {
+      s.d = (T(kBrokenShearMax) / s.n) * s.d;
+      s.n = T(kBrokenShearMax);
+      out.plastic = true;
+    }
+  }
+  if (s.guarded || out.plastic) out.strain = strain_from_isochoric(s.d, log_volume(s));
+  PhaseState<T> now;
+  if (split_of(m) == kSplitSpectral) {
+    now = phase_state_spectral(m, out.strain);
+  } else {
+    const T shift = s.n < T(0.5) ? unit_det_shift_small(s.d) : unit_det_shift(s.d);
+    const auto volume = [](T x) {
+      const bool small = x < T(kSeriesVolume) && x > T(-kSeriesVolume);
+      return small ? volume_series(x) : x - log1p(x);
+    };
+    const T all = split_of(m) == kSplitNone ? T(1) : T(0);
+    now = phase_state(m.mu, m.kappa, m.cohesion, all, s.d, shift, s.j2m1, volume);
+  }
+  out.stress = now.stress;
+  const T drive = m.strength > T(0) ? now.active / m.strength : T(0);
+  out.alpha = max(alpha, min(drive, T(kDriveMax)) - T(1));
+  return out;
+}
+
+}  // namespace gsf

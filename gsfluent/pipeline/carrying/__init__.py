@@ -1,0 +1,5 @@
+"""Splats carried by the points or the mesh of any program."""
+
+from gsfluent._lazy import room
+
+__getattr__, __dir__, __all__ = room(__name__, stage="CarriedFrame Carry")
