@@ -8,7 +8,7 @@
 #include <string>
 #include <vector>
 
-#include "core/material/return_mapping.h"
+#include "core/material/more_laws.h"
 #include "core/mvee/lens.h"
 #include "core/mvee/mvee.h"
 #include "core/raster/order_free.h"
@@ -67,10 +67,11 @@ MaterialRow<T> material(T mu, T kappa, T strength, T cohesion, T hardening, T da
 template <typename T>
 py::dict one_particle(const Array<T>& strain, T alpha, const Array<T>& increment, int law,
                       const MaterialRow<T>& m, T k, T epsilon, bool implicit, T dt) {
-  if (!is_law(law)) throw std::invalid_argument("law must be 0 to 6, or 9");
-  const ReturnMapped<T> r = return_mapping(load_sym3(expect(strain, "strain", {6})), alpha,
-                                           load_mat3(expect(increment, "increment", {3, 3})), law,
-                                           m, NaccOptions<T>{k, epsilon, implicit}, dt);
+  if (!is_law(law) && law != kYeoh && law != kOgden)
+    throw std::invalid_argument("law must be 0 to 9");
+  const ReturnMapped<T> r = return_mapping_more(load_sym3(expect(strain, "strain", {6})), alpha,
+                                                load_mat3(expect(increment, "increment", {3, 3})),
+                                                law, m, NaccOptions<T>{k, epsilon, implicit}, dt);
   py::dict d;
   d["strain"] = to_array(r.strain);
   d["stress"] = to_array(r.stress);
@@ -96,7 +97,7 @@ void bind(py::module_ m) {
   m.def(
       "wave_speed_squared",
       [](const Array<T>& strain, int law, const MaterialRow<T>& material) {
-        return wave_speed_squared(law, material, load_sym3(expect(strain, "strain", {6})));
+        return wave_speed_squared_more(law, material, load_sym3(expect(strain, "strain", {6})));
       },
       arg("strain"), arg("law"), arg("material"),
       "Square of the fastest wave speed of one particle [m^2/s^2] (core/material/wave_speed.h).");

@@ -56,6 +56,7 @@ enum SolverBuffer : int {
   kImpulse,
   kParent,
   kCut,
+  kContactRadius,
   kSolverBuffers
 };
 
@@ -153,6 +154,7 @@ struct SolverOps {
         {"impulse", s.collider_count, kImpulseSums, ScalarType::Double, true},
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
+        {"radius", n, 1, real, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -230,6 +232,7 @@ struct SolverOps {
     s.impulse = static_cast<double*>(any_at(kImpulse));
     s.parent = int_at(kParent);
     s.cut = int_at(kCut);
+    s.radius = real_at(kContactRadius);
     return s;
   }
 

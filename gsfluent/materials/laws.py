@@ -16,6 +16,8 @@ LAWS = {
     "fluid": 4,
     "rigid": 5,
     "corotated": 6,
+    "yeoh": 7,
+    "ogden": 8,
     "phase_field": 9,
 }
 """Constitutive laws and their numbers in :func:`gsfluent.ops.return_mapping`."""
@@ -30,7 +32,8 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "alpha0": (-10.0, 0.5, "no unit"),
     "shear_damage": (0.0, 10.0, "no unit"),
     "yield_stress": (0.0, math.inf, "Pa"),
-    "hardening_modulus": (0.0, math.inf, "Pa"),
+    "hardening_modulus": (-math.inf, math.inf, "Pa"),
+    "plastic_viscosity": (0.0, math.inf, "Pa s"),
     "cohesion_pressure": (0.0, math.inf, "Pa"),
     "bulk_modulus": (0.0, math.inf, "Pa"),
     "viscosity": (0.0, math.inf, "Pa s"),
@@ -38,6 +41,13 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "tensile_strength": (0.0, math.inf, "Pa"),
     "compressive_strength": (0.0, math.inf, "Pa"),
     "fracture_energy": (0.0, math.inf, "J/m^2"),
+    "yeoh_c20": (-math.inf, math.inf, "Pa"),
+    "yeoh_c30": (0.0, math.inf, "Pa"),
+    "ogden_alpha1": (-20.0, 20.0, "no unit"),
+    "ogden_mu2": (-math.inf, math.inf, "Pa"),
+    "ogden_alpha2": (-20.0, 20.0, "no unit"),
+    "ogden_mu3": (-math.inf, math.inf, "Pa"),
+    "ogden_alpha3": (-20.0, 20.0, "no unit"),
     "toughness": (0.0, math.inf, "J/m^2"),
     "length": (0.0, math.inf, "m"),
 }
@@ -83,9 +93,18 @@ READS: dict[str, tuple[str, ...]] = {
         *HANDBOOK,
     ),
     "drucker_prager": (*_SOLID, "friction_angle", "cohesion_pressure"),
-    "von_mises": (*_SOLID, "yield_stress", "hardening_modulus"),
+    "von_mises": (*_SOLID, "yield_stress", "hardening_modulus", "plastic_viscosity"),
     "fluid": ("bulk_modulus", "density", "viscosity", "tait_exponent"),
     "rigid": ("density",),
+    "yeoh": (*_SOLID, "yeoh_c20", "yeoh_c30"),
+    "ogden": (
+        *_SOLID,
+        "ogden_alpha1",
+        "ogden_mu2",
+        "ogden_alpha2",
+        "ogden_mu3",
+        "ogden_alpha3",
+    ),
     "phase_field": (*_SOLID, "toughness", "length", "tensile_strength"),
 }
 """Law -> the parameters it reads; any other is refused, because it would do nothing."""
@@ -102,10 +121,34 @@ DEFAULTS: dict[str, dict[str, float]] = {
         "shear_damage": 0.0,
     },
     "drucker_prager": {"friction_angle": 35.0, "cohesion_pressure": 0.0},
-    "von_mises": {"hardening_modulus": 0.0},
+    "von_mises": {"hardening_modulus": 0.0, "plastic_viscosity": 0.0},
     "fluid": {"viscosity": 0.0, "tait_exponent": 7.0},
+    "ogden": {"ogden_mu2": 0.0, "ogden_alpha2": 2.0, "ogden_mu3": 0.0, "ogden_alpha3": 2.0},
 }
 """Law -> parameters that may be left out, and their values then."""
+
+
+def unstable(law: str, row: Tensor) -> str:
+    """What of a row of parameters [..., 8] would make matter that pushes itself apart, or ""."""
+    mu, _, strength, cohesion, hardening, damage, _, exponent = row.unbind(dim=-1)
+    if law == "von_mises" and bool((hardening <= -3.0 * mu).any()):
+        return "hardening_modulus must be above -3 times the shear modulus"
+    if law == "yeoh":
+        falls = (strength < 0.0) & (8.0 * strength**2 >= 12.0 * mu * cohesion)
+        if bool(falls.any()):
+            return (
+                "yeoh_c20 is so far below 0 that the modulus falls to nothing: its square must "
+                "be below 1.5 times the shear modulus times yeoh_c30"
+            )
+    if law == "ogden":
+        rest = cohesion * hardening, damage * exponent
+        if bool((rest[0] < 0.0).any() or (rest[1] < 0.0).any()):
+            return "ogden_mu2 and ogden_alpha2, and ogden_mu3 and ogden_alpha3, must have one sign"
+        if bool((strength == 0.0).any()):
+            return "ogden_alpha1 must not be 0"
+        if bool((rest[0] + rest[1] >= 2.0 * mu).any()):
+            return "the terms of ogden_mu2 and ogden_mu3 must leave some of the shear modulus"
+    return ""
 
 
 def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
@@ -140,5 +183,11 @@ def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
         exponent = 1.0 - at("restitution") ** 2
     elif law == "von_mises":
         strength, hardening = at("yield_stress"), at("hardening_modulus")
+        damage = at("plastic_viscosity")
+    elif law == "yeoh":
+        strength, cohesion = at("yeoh_c20"), at("yeoh_c30")
+    elif law == "ogden":
+        strength, cohesion, hardening = at("ogden_alpha1"), at("ogden_mu2"), at("ogden_alpha2")
+        damage, exponent = at("ogden_mu3"), at("ogden_alpha3")
     columns = (mu, kappa, strength, cohesion, hardening, damage, density, exponent)
     return torch.stack(torch.broadcast_tensors(*columns), dim=-1)

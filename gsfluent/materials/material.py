@@ -76,7 +76,8 @@ class Material:
         density: Mass per volume [kg/m^3].
         law: ``elastic`` (neo-Hookean) and ``corotated`` (fixed corotated) never break, ``nacc``
             and ``phase_field`` break, ``drucker_prager`` is sand, ``von_mises`` is metal or clay,
-            ``fluid`` pours, ``rigid`` does not deform.
+            ``fluid`` pours, ``rigid`` does not deform, ``yeoh`` and ``ogden`` are rubber that
+            stiffens.
         tensile_strength: nacc, phase_field: uniaxial strength of the real thing in tension [Pa].
         compressive_strength: nacc: its uniaxial strength in compression [Pa].
         fracture_energy: nacc: energy that a crack takes per area, G_c [J/m^2]. The three are given
@@ -92,11 +93,21 @@ class Material:
         alpha0: nacc: log plastic volume ratio at the start; negative is intact.
         shear_damage: nacc: how much plastic shear counts as damage, eta; 0 is the plain model.
         yield_stress: von_mises: stress [Pa] in a tension test at which flow begins.
-        hardening_modulus: von_mises: growth of the yield stress per plastic strain [Pa].
+        hardening_modulus: von_mises: growth of the yield stress per plastic strain [Pa]; below 0
+            it falls, to zero at most.
+        plastic_viscosity: von_mises: stress beyond yield per rate of flow [Pa s]; 0 flows at once.
         cohesion_pressure: drucker_prager: tensile pressure [Pa] that the grains hold; 0 is dry.
         bulk_modulus: fluid: density times the square of its speed of sound [Pa].
         viscosity: fluid: dynamic viscosity [Pa s].
         tait_exponent: fluid: gamma of p = K/gamma (J^-gamma - 1).
+        yeoh_c20: yeoh: second coefficient of W [Pa]; the first is half of the shear modulus.
+        yeoh_c30: yeoh: third coefficient of W [Pa].
+        ogden_alpha1: ogden: exponent of the first term, whose modulus is what the others leave of
+            the shear modulus (2 mu is the sum of mu_p alpha_p).
+        ogden_mu2: ogden: modulus of the second term [Pa], of W = sum mu_p / alpha_p (...).
+        ogden_alpha2: ogden: its exponent.
+        ogden_mu3: ogden: modulus of the third term [Pa].
+        ogden_alpha3: ogden: its exponent.
         variation: nacc, phase_field: relative scatter of strength in space (standard deviation of
             a smooth random factor on it); natural solids have weak and strong places, and that
             decides where cracks run and how many pieces survive a harder landing.
@@ -152,6 +163,14 @@ class Material:
     bulk_modulus: Field | None = None
     viscosity: Field | None = None
     tait_exponent: Field | None = None
+    plastic_viscosity: Field | None = None
+    yeoh_c20: Field | None = None
+    yeoh_c30: Field | None = None
+    ogden_alpha1: Field | None = None
+    ogden_mu2: Field | None = None
+    ogden_alpha2: Field | None = None
+    ogden_mu3: Field | None = None
+    ogden_alpha3: Field | None = None
     variation: float = 0.0
     grain: float = 0.025
     weibull_modulus: float = 0.0
@@ -225,6 +244,10 @@ class Material:
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
                     hint=f"remove it, or use law {' or '.join(readers)}",
                 )
+        if self.law in ("von_mises", "yeoh", "ogden"):
+            wrong = laws.unstable(self.law, self.parameters())
+            if wrong:
+                raise InputError(f"material {self.name!r}: {wrong}", hint="mend the number")
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     @property

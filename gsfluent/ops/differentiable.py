@@ -125,7 +125,8 @@ def mpm_state(
     n = position.shape[0]
     check_tensor(op, "velocity", velocity, shape=(n, 3), like=position)
     if alpha is None:
-        stateless = (law == LAWS["elastic"]) | (law == LAWS["corotated"])
+        kept = [LAWS[name] for name in ("elastic", "corotated", "yeoh", "ogden")]
+        stateless = torch.isin(law, torch.tensor(kept, device=law.device, dtype=law.dtype))
         if not bool(stateless.all()):
             raise ValueError(f"{op}: alpha must be given for material that is not elastic")
         alpha = position.new_zeros(n)

@@ -1,4 +1,4 @@
-"""Constitutive update of material points, eight laws, on strain e = b - I."""
+"""Constitutive update of material points, by their laws, on strain e = b - I."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsfluent._check import check_tensor
-from gsfluent.materials.laws import LAWS
+from gsfluent.errors import InputError
+from gsfluent.materials.laws import LAWS, unstable
 from gsfluent.materials.phase_field import MODELS, SPLITS
 from gsfluent.ops import _plasticity_grad  # noqa: F401  (registers the gradient)
 from gsfluent.ops._register import fakes
@@ -59,7 +60,12 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
             raise ValueError(f"{op}: law must be one of {names}, got {int(law[~known][0])}")
     if params.numel() and _is_new(params, rows):
         given, params = params, params.detach()  # checking is not part of any graph
-        wrong = ~torch.isfinite(params) | (params < 0)
+        negative = params < 0
+        negative[:, 4] &= law != LAWS["von_mises"]
+        negative[:, 2] &= law != LAWS["yeoh"]
+        negative[:, 2:] &= (law != LAWS["ogden"])[:, None]
+        negative[:, 6] = params[:, 6] < 0
+        wrong = ~torch.isfinite(params) | negative
         # Without bulk stiffness there is no pressure; a rigid body needs none.
         wrong[:, 1] |= (params[:, 1] == 0) & (law != LAWS["rigid"])
         fluid, nacc = law == LAWS["fluid"], law == LAWS["nacc"]
@@ -88,6 +94,13 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
                 f"{op}: params[{row}] {PARAM_COLUMNS[column]} must be "
                 f"{need.get(column, 'finite and not negative')}, got {float(params[row, column]):g}"
             )
+        apart = compiled_apart(law, params)
+        if bool(apart.any()):
+            try:
+                _check_apart(op, law[apart], params[apart])
+            except ValueError:
+                _checked.pop(given, None)
+                raise
     if material is not None and material.numel() and _is_new(material, rows):
         low, high = (int(v) for v in torch.aminmax(material))
         if low < 0 or high >= rows:
@@ -97,15 +110,42 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
             )
 
 
+def compiled_apart(law: Tensor, params: Tensor) -> Tensor:
+    """Rows whose law is in csrc/core/material/more_laws.h, bool [M]: on the CPU only.
+
+    Args:
+        law: int32 [M].
+        params: [M, 8].
+    """
+    flows = (law == LAWS["von_mises"]) & ((params[:, 4] < 0) | (params[:, 5] > 0))
+    return flows | (law == LAWS["yeoh"]) | (law == LAWS["ogden"])
+
+
+def _check_apart(op: str, law: Tensor, params: Tensor) -> None:
+    for name in ("von_mises", "yeoh", "ogden"):
+        rows = law == LAWS[name]
+        if not bool(rows.any()):
+            continue
+        if law.is_cuda:
+            what = "von_mises with plastic_viscosity or softening" if name == "von_mises" else name
+            raise InputError(
+                f"{op}: law {what} has no CUDA kernel yet", hint="run on the CPU (device: cpu)"
+            )
+        wrong = unstable(name, params[rows])
+        if wrong:
+            raise ValueError(f"{op}: {wrong}")
+
+
 def _viscous(law: Tensor, params: Tensor) -> bool:
-    """Tell whether a row is a fluid with viscosity; reads the tables when they are new."""
+    """Tell whether a row has a viscosity; reads the tables when they are new."""
     versions = None
     if not (law.is_inference() or params.is_inference()):
         versions = (params._version, law.data_ptr(), law._version)
         known = _viscous_tables.get(params)
         if known is not None and known[0] == versions:
             return bool(known[1])
-    found = bool(((law == LAWS["fluid"]) & (params[:, 2] > 0)).any())
+    flows = (law == LAWS["fluid"]) & (params[:, 2] > 0)
+    found = bool((flows | ((law == LAWS["von_mises"]) & (params[:, 5] > 0))).any())
     if versions is not None:
         _viscous_tables[params] = (versions, found)
     return found
@@ -217,13 +257,15 @@ def return_mapping(
       ``p0 = kappa (1e-5 + sinh(xi max(-alpha, 0)))``, along the line to the dynamic centre.
     * 2 ``drucker_prager``: Hencky elasticity, ``|dev tau| <= 3 alpha_DP (p + c)``, no tension
       beyond ``p = -c``, with volume correction.
-    * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``.
+    * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``; with a
+      plastic viscosity what is beyond flows back at a rate.
     * 4 ``fluid``: ``p = max(K/gamma (J^-gamma - 1), 0)`` and Newtonian viscosity; the strain is
       ``(J^(2/3) - 1) I`` and J follows ``det(I + A)``.
     * 9 ``phase_field``: neo-Hookean with psi+ degraded by the damage d of column 3,
       ``g = (1 - k)(1 - d)^2 + k``; alpha is the history, max psi+ / psi_t - 1
       (docs/theory/phase-field.md). The damage is a field: :func:`gsfluent.ops.damage_solve`.
     * 5 ``rigid``: no strain, no stress; how the body moves is the solver's matter.
+    * 7 ``yeoh``, 8 ``ogden``: rubber that stiffens. Never yield; on the CPU only.
 
     The stored energy never increases. See docs/theory/return-mapping.md and docs/theory/laws.md.
 
@@ -238,8 +280,10 @@ def return_mapping(
         params: [M, 8]: shear modulus mu [Pa]; bulk modulus kappa [Pa]; strength (nacc: friction M,
             drucker_prager: alpha_DP, von_mises: yield stress sigma_y [Pa], fluid: viscosity
             [Pa s]); cohesion (nacc: beta, drucker_prager: tensile pressure c [Pa]); hardening
-            (nacc: xi, von_mises: modulus H [Pa]); shear damage (nacc: eta); density [kg/m^3], not
-            used here; exponent (fluid: gamma, 0 means 7). phase_field: columns 2 to 5 are the
+            (nacc: xi, von_mises: modulus H [Pa]); shear damage (nacc: eta, von_mises: plastic
+            viscosity [Pa s]); density [kg/m^3], not used here; exponent (fluid: gamma, 0 means 7).
+            yeoh: C20 and C30 [Pa] in columns 2 and 3; ogden: alpha_1, mu_2 [Pa], alpha_2, mu_3
+            [Pa] in columns 2 to 5, alpha_3 in column 7. phase_field: columns 2 to 5 are the
             threshold psi_t [J/m^3], the damage d, the length l [m], and split (0 volumetric, 1
             none, 2 spectral) plus 4 for AT2.
         material: int32 [N], row of ``law`` and ``params`` per particle. None: row 0 for all if
@@ -267,8 +311,9 @@ def return_mapping(
     elastic, by the differentiable reference elsewhere. Not differentiable at the kinks of the map.
     Source: Wolper et al. 2019 (NACC); GaussianFluent, Eq. 6 (dynamic centre, epsilon = 0); Klar et
     al. 2016 and Tampubolon et al. 2017 (sand); Simo and Hughes 1998, box 3.1 (metal); Tait's
-    equation after Monaghan 1994 (fluid); Stomakhin et al. 2012 (fixed corotated);
-    Amor et al. 2009 and Miehe et al. 2010 (phase field).
+    equation after Monaghan 1994 (fluid); Stomakhin et al. 2012 (fixed corotated); Yeoh 1993, Ogden
+    1972 (rubber); Li et al. 2023, PAC-NeRF (plastic viscosity); Amor et al. 2009 and Miehe et al.
+    2010 (phase field).
     """
     op = "return_mapping"
     check_tensor(op, "strain", strain, shape=("N", 6))
@@ -283,7 +328,7 @@ def return_mapping(
     if not (0.0 <= dt < math.inf):
         raise ValueError(f"{op}: dt must be finite and not negative, got {dt}")
     if dt == 0.0 and not torch.compiler.is_compiling() and _viscous(law, params):
-        raise ValueError(f"{op}: a fluid with viscosity needs dt, the time step in seconds")
+        raise ValueError(f"{op}: matter with viscosity needs dt, the time step in seconds")
     wants_gradient = any(t.requires_grad for t in (strain, alpha, increment, params))
     if math.isinf(k) and wants_gradient and torch.is_grad_enabled():
         raise NotImplementedError(f"{op}: no gradient for the fixed centre (k = infinity)")
@@ -320,7 +365,9 @@ def elastic_energy(
     Evaluated in float64. With b = I + e = V V: elastic and nacc
     ``mu/2 (J^(-2/3) tr b - 3) + kappa/2 ((J^2 - 1)/2 - ln J)``; drucker_prager and von_mises
     ``mu |dev ln V|^2 + kappa/2 (ln J)^2``; corotated ``mu |V - I|^2 + lambda/2 (J - 1)^2``; fluid
-    ``K/gamma (J^(1-gamma)/(gamma-1) + J - gamma/(gamma-1))`` below J = 1 and 0 above; rigid 0.
+    ``K/gamma (J^(1-gamma)/(gamma-1) + J - gamma/(gamma-1))`` below J = 1 and 0 above; rigid 0;
+    yeoh ``mu/2 x + C20 x^2 + C30 x^3``, ``x = J^(-2/3) tr b - 3``, and ogden ``sum of mu_p/alpha_p
+    tr(V^alpha_p - I)`` of the isochoric V, both with the volumetric part of elastic.
 
     Args:
         strain: Elastic strain e = b - I, [N, 6].

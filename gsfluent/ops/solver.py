@@ -20,14 +20,18 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
-from gsfluent.errors import GsfluentError
+from gsfluent.errors import GsfluentError, InputError
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
-from gsfluent.ops.plasticity import LAWS, check_params
+from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
 from gsfluent.ops.solver_state import UNBROKEN, SolverState
 
 ELASTIC, NACC, PHASE = LAWS["elastic"], LAWS["nacc"], LAWS["phase_field"]
+CFL_MOST = 0.5
+"""Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
+RADIUS_MOST = 0.5
+"""Largest contact radius [dx]: ``kSpringReach`` of ``csrc/core/collider/spring.h``."""
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -99,6 +103,10 @@ class Solver(SolverState):
         parent: Body of each field, int32 [K], where blades cut; with ``cut``. Fields of one body
             move as one, except on opposite sides of a blade. Default: each field is its own body.
         cut: Sides of each field, int32 [K]; see :func:`gsfluent.ops.blade_sides`.
+        radius: Contact radius of each point [m], [N]: colliders push points that are nearer than it
+            (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
+            cube root of the volume makes a body rest where its points end; a negative one lets a
+            point in as deep. Default: colliders hold nodes. CPU only.
         gravity: Acceleration [m/s^2].
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
@@ -142,6 +150,7 @@ class Solver(SolverState):
         body: Tensor | None = None,
         parent: Tensor | None = None,
         cut: Tensor | None = None,
+        radius: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         colliders: Tensor | None = None,
         sdf: Tensor | None = None,
@@ -178,6 +187,7 @@ class Solver(SolverState):
         check_tensor(op, "law", law, shape=(None,), dtype=torch.int32)
         check_tensor(op, "params", params, shape=(law.shape[0], 8))
         self.dx = check_dx(op, dx)
+        self._surface(radius, like, self.dx, cfl)
         self.device, self.dtype, self.count = velocity.device, velocity.dtype, n
         self.gravity = tuple(float(g) for g in gravity)
         if len(self.gravity) != 3 or not all(math.isfinite(g) for g in self.gravity):
@@ -197,8 +207,10 @@ class Solver(SolverState):
         check_params(op, self._law, self._params)
         laws = set(law.tolist())
         self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
-        if PHASE in laws:
+        if bool(compiled_apart(self._law, self._params).any()):
             self._law_set = 3
+        if PHASE in laws:
+            self._law_set = 4
             if self.device.type != "cpu" or not laws <= {ELASTIC, NACC, PHASE}:
                 raise ValueError(
                     f"{op}: law phase_field (9) works on the CPU beside laws 0 and 1 only, got "
@@ -228,6 +240,8 @@ class Solver(SolverState):
             if sdf is not None:
                 check_tensor(op, "sdf", sdf, shape=(None,), dtype=torch.float32)
                 b.sdf = sdf.to(self.device).contiguous()
+        if radius is not None:
+            b.radius = radius.contiguous()
         self._buffers = b
         self.frame = self._frame(velocity, mass, body, frame, b.colliders.numel() > 0)
         if bool(self.frame.any()):
@@ -262,6 +276,31 @@ class Solver(SolverState):
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
+
+    @staticmethod
+    def _surface(radius: Tensor | None, like: Tensor, dx: float, cfl: float) -> None:
+        """Refuse contact radii that this device does not know or that are no numbers."""
+        if radius is None:
+            return
+        if like.device.type != "cpu":
+            raise InputError(
+                f"Solver: radius: {like.device.type} does not push points yet",
+                hint="leave it out there: colliders then hold nodes",
+            )
+        check_tensor("Solver", "radius", radius, shape=(like.shape[0],), like=like)
+        if not bool(torch.isfinite(radius).all()):
+            raise ValueError("Solver: radius must be finite")
+        if cfl > CFL_MOST:
+            raise InputError(
+                f"Solver: cfl must be at most {CFL_MOST:g} where points are pushed, got {cfl:g}",
+                hint="longer steps make energy there (docs/theory/colliders.md)",
+            )
+        if not bool((radius <= RADIUS_MOST * dx).all()):
+            raise InputError(
+                f"Solver: radius must be at most {RADIUS_MOST:g} dx, got "
+                f"{float(radius.max()):.6g} m at dx = {dx:g} m",
+                hint="half the cube root of a point's volume is usual; sample more points per cell",
+            )
 
     def _settings(self) -> tuple[list[int], list[float]]:
         ints = [self.fields, int(self.implicit), int(self.irreversible), self._law_set]

@@ -87,6 +87,7 @@ class Buffers:
     impulse: Tensor
     parent: Tensor
     cut: Tensor
+    radius: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""

@@ -364,12 +364,12 @@ class SolverState:
         strain, broken = self._rowwise("strain").contiguous(), self._law_set > 0
         alpha = b.alpha if broken else strain.new_zeros(self.count)
         law, params = b.law, b.rows[:, :8].contiguous()
-        if broken and (self.irreversible or self._law_set == 3):
+        if broken and (self.irreversible or self._law_set == 4):
             (law, params), material = weakened(law, params, row, b.peak), None
         _, _, stress, _ = return_mapping(
             strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,
             material=material, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
-            dt=self.dt or 1.0,
+            dt=1e-9,  # of a step without motion: what flows with a viscosity stays
         )  # fmt: skip
         return self._restored(stress)
 

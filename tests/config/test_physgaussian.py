@@ -102,6 +102,7 @@ def test_materials_yield_where_theirs_do(model: Path, tmp_path: Path, kind: str)
         assert math.sqrt(2.0 / 3.0) * float(row[2]) == pytest.approx(theirs)
         # theirs: y grows by 2 mu xi per norm of plastic strain, which is sqrt(3/2) here's measure
         hard = 0.0 if kind == "foam" else 2.0 * mu * 0.5
+        hard -= 0.1 * (kind == "plasticine")  # it softens so unless told otherwise
         grown = math.sqrt(2.0 / 3.0) * float(row[4]) * math.sqrt(2.0 / 3.0)
         assert grown == pytest.approx(hard, rel=1e-6)
 
@@ -281,8 +282,22 @@ def test_every_key_is_named(model: Path, tmp_path: Path) -> None:
     assert {f"particle_filling.{key}" for key in FILLING} <= named
     report = conversion.report()
     assert report["unsupported"]["grid_v_damping_scale"].endswith("exp(-5 t), t in seconds")
-    assert "plastic_viscosity" in report["unsupported"] and "softening" in report["inert"]
+    assert "plastic_viscosity" in report["mapped"] and "softening" in report["inert"]
+    assert conversion.shot["objects"]["object"]["plastic_viscosity"] == 3.0
     assert json.loads((tmp_path / "made" / "keys.json").read_text()) == report
+
+
+def test_plasticine_softens_as_it_flows(model: Path, tmp_path: Path) -> None:
+    """|dev tau| <= y falls by softening times the norm of the flow: -3/2 in a tension test."""
+    keys = {"yield_stress": 100.0, "hardening": 1, "xi": 0.01, "E": 1e4, "nu": 0.25}
+    made_of = made(model, tmp_path, material="plasticine", softening=20.0, **keys)
+    hard = 3.0 * 4e3 * 0.01
+    made_object = made_of.shot["objects"]["object"]
+    assert made_object["hardening_modulus"] == pytest.approx(hard - 30.0)
+    assert status(made_of, "softening") == "near"
+    usual = made(model, tmp_path, material="plasticine", **keys)
+    assert usual.shot["objects"]["object"]["hardening_modulus"] == pytest.approx(hard - 0.15)
+    assert "0.1 Pa unless set" in usual.report()["near"]["softening"]
 
 
 def test_unknown_keys_are_named_with_the_nearest(model: Path, tmp_path: Path) -> None:

@@ -101,9 +101,9 @@ def test_errors_name_the_argument() -> None:
         core.float64.return_mapping(
             np.zeros(5), 0.0, np.zeros((3, 3)), 0, core.float64.Material(1.0, 1.0)
         )
-    with pytest.raises(ValueError, match="law must be 0 to 6"):
+    with pytest.raises(ValueError, match="law must be 0 to 9"):
         core.float64.return_mapping(
-            np.zeros(6), 0.0, np.zeros((3, 3)), 7, core.float64.Material(1.0, 1.0)
+            np.zeros(6), 0.0, np.zeros((3, 3)), 10, core.float64.Material(1.0, 1.0)
         )
     with pytest.raises(ValueError, match="at least one point"):
         core.float64.mvee(np.zeros((0, 3)))

@@ -31,7 +31,8 @@ BASE: dict[str, Material] = {
         "test", law="drucker_prager", friction_angle=30.0, cohesion_pressure=200.0, **SOLID
     ),
     "von_mises": Material(
-        "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3, **SOLID
+        "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3,
+        plastic_viscosity=200.0, **SOLID,
     ),
     "fluid": Material(
         "test", law="fluid", density=1000.0, bulk_modulus=1e5, viscosity=2.0, tait_exponent=7.0
@@ -42,6 +43,11 @@ BASE: dict[str, Material] = {
     ),
     "phase_field by strength": Material(
         "test", law="phase_field", toughness=60.0, tensile_strength=3e3, **SOLID
+    ),
+    "yeoh": Material("test", law="yeoh", yeoh_c20=2e4, yeoh_c30=2e5, **SOLID),
+    "ogden": Material(
+        "test", law="ogden", ogden_alpha1=1.3, ogden_mu2=4e3, ogden_alpha2=8.0, ogden_mu3=-4e3,
+        ogden_alpha3=-3.0, **SOLID,
     ),
     "nacc by handbook": Material(
         "test", law="nacc", tensile_strength=4e3, compressive_strength=2e4, fracture_energy=60.0,

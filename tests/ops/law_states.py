@@ -21,6 +21,8 @@ COLUMNS: dict[str, tuple[float, float, float, float, float]] = {
     "fluid": (3.0, 0.0, 0.0, 0.0, 7.0),
     "rigid": (0.0, 0.0, 0.0, 0.0, 0.0),
     "corotated": (0.0, 0.0, 0.0, 0.0, 0.0),
+    "yeoh": (-3e3, 4e3, 0.0, 0.0, 0.0),
+    "ogden": (1.3, 2e2, 5.0, -1e3, -2.0),
     "phase_field": (500.0, 0.4, 0.04, 0.0, 0.0),
 }
 DT = 1e-3

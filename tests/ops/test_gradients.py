@@ -108,6 +108,8 @@ ROWS = {  # mu, kappa, strength, cohesion, hardening, eta, density, exponent
     "von_mises": [4e4, 8e4, 2e3, 0.0, 1e4, 0.0, 1000.0, 0.0],
     "fluid": [0.0, 8e4, 20.0, 0.0, 0.0, 0.0, 1000.0, 7.0],
     "corotated": [4e4, 8e4, 0.0, 0.0, 0.0, 0.0, 1000.0, 0.0],
+    "yeoh": [4e4, 8e4, -3e3, 4e3, 0.0, 0.0, 1000.0, 0.0],
+    "ogden": [4e4, 8e4, 1.3, 2e2, 5.0, -1e3, 1000.0, -2.0],
 }
 
 

@@ -3,7 +3,7 @@
 #pragma once
 
 #include "core/material/loss.h"
-#include "core/material/return_mapping.h"
+#include "core/material/more_laws.h"
 #include "core/mpm/grid.h"
 #include "core/solver/clock.h"
 #include "core/solver/layout.h"
@@ -14,8 +14,9 @@ namespace gsf {
 inline constexpr double kWeakening = 0.02;
 
 // Laws a kernel is compiled for: fewer laws, fewer registers.
-// kDamageField: elastic, NACC and phase_field (on the CPU).
-enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2, kDamageField = 3 };
+// Compiled on the CPU only, in files of their own: kMoreLaws, those of more_laws.h too
+// (cpu/solver/solver_more.cpp); kDamageField, elastic, NACC and phase_field (fields.cpp).
+enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2, kMoreLaws = 3, kDamageField = 4 };
 
 // Weights at offset o in [0, 1): the stencil of grid.h with f = o + 1/2. `base` stays unset.
 template <typename T>
@@ -170,6 +171,24 @@ GSF_HOST_DEVICE bool move_axis(T step, T slack, int& l, T& o, bool& leaves) {
   return known && cell >= 0 && cell <= kLastCell;
 }
 
+// The maps of the laws that a kernel is compiled for.
+template <typename T, int kLaws>
+GSF_HOST_DEVICE ReturnMapped<T> law_step(const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
+                                         int law, const MaterialRow<T>& m, const NaccOptions<T>& o,
+                                         T dt) {
+  if constexpr (kLaws == kMoreLaws)
+    return return_mapping_more(strain, alpha, increment, law, m, o, dt);
+  else
+    return return_mapping<kLaws == kDamageField>(strain, alpha, increment, law, m, o, dt);
+}
+template <typename T, int kLaws>
+GSF_HOST_DEVICE T law_wave_squared(int law, const MaterialRow<T>& m, const Sym3<T>& strain) {
+  if constexpr (kLaws == kMoreLaws)
+    return wave_speed_squared_more(law, m, strain);
+  else
+    return wave_speed_squared(law, m, strain);
+}
+
 // What a particle brings into its update; read before the gather, so that memory works meanwhile.
 template <typename T>
 struct ParticleBefore {
@@ -195,7 +214,7 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
 // Whether a step looks at wave speeds and gradients: every step for liquids and other laws whose
 // wave speed may rise by half in one step, else every kWaveSteps (CFL 0.5 leaves room).
 GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
-  return laws == kAnyLaw || c.step % kWaveSteps == 0;
+  return laws >= kAnyLaw || c.step % kWaveSteps == 0;
 }
 
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
@@ -247,8 +266,8 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     const T alpha = before.alpha, peak = before.peak;
     const MaterialRow<T> material = material_now<kLaws == kDamageField>(s, row, peak);
     const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
-    const ReturnMapped<T> out = return_mapping<kLaws == kDamageField>(
-        before.strain, alpha, increment, law, material, s.options, dt);
+    const ReturnMapped<T> out =
+        law_step<T, kLaws>(before.strain, alpha, increment, law, material, s.options, dt);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -267,7 +286,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     stress = out.stress;
     if (loses && material.exponent > T(0))
       stress = unloading_share(material.exponent, r[kPaceColumn], stress, c) * stress;
-    if (waves) wave2 = wave_speed_squared(law, material, out.strain);
+    if (waves) wave2 = law_wave_squared<T, kLaws>(law, material, out.strain);
   }
   T slope[9];
   store_slope(slope, c, stress, r, dt_next);
@@ -297,7 +316,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uin
 
 // Start of a call: the slope holds m C (the last step of the call before wrote it with dt_next =
 // 0). `measure` only reads speeds; otherwise the stress of the coming step is taken into the slope.
-template <bool kWithField = false, typename T>
+template <typename T, int kLaws = kAnyLaw>
 GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool measure, T dt,
                                     Largest& largest) {
   const uint32_t meta = load_meta(s, p);
@@ -315,7 +334,7 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     T speed2 = T(0), gradient2 = T(0);
     for (int i = 0; i < 3; ++i) speed2 += v[i] * v[i];
     for (int i = 0; i < 9; ++i) gradient2 += c.m[i] * c.m[i];
-    const T wave2 = wave_speed_squared(s.law[row], load_material(r), load_strain(s, p));
+    const T wave2 = law_wave_squared<T, kLaws>(s.law[row], load_material(r), load_strain(s, p));
     largest.speed2 = larger(float(speed2), largest.speed2);
     largest.wave2 = larger(float(wave2), largest.wave2);
     if (peak < T(0) || s.law[row] != kNacc)
@@ -323,10 +342,12 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     return;
   }
   const Mat3<T> none{};
-  const MaterialRow<T> material = material_now<kWithField>(s, row, peak);
-  ReturnMapped<T> state = return_mapping<kWithField>(load_strain(s, p), alpha, none, s.law[row],
-                                                     material, s.options, dt);
-  const bool loses = s.law[row] == kNacc || (kWithField && s.law[row] == kPhaseField);
+  const MaterialRow<T> material = material_now<kLaws == kDamageField>(s, row, peak);
+  // What flows with a viscosity does so in steps: between them its stress is that of its strain.
+  const T span = kLaws == kMoreLaws ? T(0) : dt;
+  ReturnMapped<T> state =
+      law_step<T, kLaws>(load_strain(s, p), alpha, none, s.law[row], material, s.options, span);
+  const bool loses = s.law[row] == kNacc || (kLaws == kDamageField && s.law[row] == kPhaseField);
   if (loses && material.exponent > T(0))
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;

@@ -195,6 +195,9 @@ struct SolverView {
   // blades: fields of one body move as one, except on opposite sides of a blade; or null: no blade
   const int32_t* parent;  // [fields] body of each field
   const int32_t* cut;     // [fields] its sides (core/collider/blade.h)
+  // [N] contact radius of each point by its row when it was loaded (core/collider/spring.h) [m], or
+  // null: colliders hold nodes; CPU only
+  const T* radius;
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {

@@ -3,6 +3,8 @@
 
 #include <atomic>
 
+#include "cpu/material/plasticity_more.h"
+
 namespace gsf {
 
 // phase_field.cpp: a file of its own, so that what gcc inlines here stays as it is.
@@ -21,6 +23,7 @@ struct PlasticityCpu {
   using Scope = CpuScope;
   template <typename T>
   static void return_mapping(const ReturnMappingArgs<T>& a, const Scope&) {
+    if (any_compiled_apart(a)) return return_mapping_more(a);
     parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
       int32_t counts[4] = {0, 0, 0, 0};
       for (int64_t i = begin; i < end; ++i) {

@@ -21,12 +21,9 @@ Counts FieldPass<T>::from_nodes(const HomePass<T>& homes) {
 }
 
 template <typename T>
-Counts FieldPass<T>::prime(const SolverView<T>& s, bool measure) {
-  const T dt = static_cast<T>(s.clock->dt);
-  constexpr int64_t kGrain = 2048;
-  return parallel_counts(s.count, kGrain, [&](int64_t begin, int64_t end, Counts& counts) {
-    for (int64_t p = begin; p < end; ++p) prime_particle<true>(s, p, measure, dt, counts.largest);
-  });
+void FieldPass<T>::prime(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
+                         Largest& largest) {
+  for (int64_t p = begin; p < end; ++p) prime_particle<T, kDamageField>(s, p, measure, dt, largest);
 }
 
 template class FieldPass<float>;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "cpu/solver/contact.h"
+#include "cpu/solver/surface.h"
 #include "cpu/solver/update.h"
 
 namespace gsf::cpu {
@@ -34,7 +35,8 @@ struct Box {
 template <typename T>
 class HomePass {
  public:
-  HomePass(const SolverView<T>& s, const ContactPlan<T>& contact) : s_(s), contact_(contact) {}
+  HomePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface)
+      : s_(s), contact_(contact), surface_(surface) {}
 
   void plan() {
     const HomeList<T>& list = s_.homes();
@@ -62,6 +64,7 @@ class HomePass {
   // Updates every particle from the velocities of its nodes.
   Counts from_nodes(int laws) const {
     if (laws == kElasticOnly) return from_nodes<kElasticOnly>();
+    if (laws == kMoreLaws) return from_nodes_more();
     return laws == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>();
   }
 
@@ -136,33 +139,45 @@ class HomePass {
     if (r.begin == r.end) return true;
     sort_home(h, r);
     const uint32_t contact = contact_.around_home(h);
+    std::vector<T> pushes;
+    const bool pushed =
+        surface_.near(h) && surface_.pushes(h, s_.entry + r.begin, r.end - r.begin, pushes);
     Lanes<double> tile[kWindowNodes];
-    Lanes<T> moment[kWindowNodes];
+    Lanes<T> moment[kWindowNodes], push[kWindowNodes];
     for_each_run(h, [&](int t, int64_t, int run) {
       std::fill(tile + t, tile + t + run, Lanes<double>{});
       if (contact != 0) std::fill(moment + t, moment + t + run, Lanes<T>{});
+      if (pushed) std::fill(push + t, push + t + run, Lanes<T>{});
     });
     for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
       const Packet<T> packet(s_, s_.entry + at, r.end - at);
-      const PacketMomentum<T> given(s_, packet);
+      PacketMomentum<T> given(s_, packet);
       const int used = static_cast<int>(std::min<int64_t>(r.end - at, Pack<T>::kLanes));
+      const T* impulse = pushed ? pushes.data() + 4 * (at - r.begin) : nullptr;
+      for (int lane = 0; pushed && lane < used; ++lane) given.push(lane, impulse + 4 * lane);
       for (int lane = 0; lane < used;) {
         const int end = std::min(packet.run(lane), used);
         const int base = window_node(packet.meta[lane]);
         given.scatter(lane, end, tile + base);
         if (contact != 0 && ContactPlan<T>::reads(contact, packet.meta[lane]))
           given.scatter_moment(lane, end, moment + base);
+        if (pushed &&
+            std::any_of(impulse + 4 * lane, impulse + 4 * end, [](T v) { return v != T(0); }))
+          given.scatter_four(lane, end, impulse, push + base);
         lane = end;
       }
     }
     double* sums = static_cast<double*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
-    const uint8_t mark = contact != 0 ? kTouchedSums | kTouchedMoments : kTouchedSums;
+    const uint8_t mark = static_cast<uint8_t>(kTouchedSums | (contact != 0 ? kTouchedMoments : 0) |
+                                              (pushed ? kTouchedPush : 0));
     return for_each_run(h, [&](int t, int64_t node, int run) {
       std::atomic_ref<uint8_t>(touched[node / kBlockNodes])
           .fetch_or(mark, std::memory_order_relaxed);
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < 4; ++c) sums[4 * (node + n) + c] += tile[t + n][c];
+      for (int n = 0; pushed && n < run; ++n)
+        for (int c = 0; c < 4; ++c) surface_.sums()[4 * (node + n) + c] += push[t + n][c];
       if (contact == 0) return;
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < kContactMoments; ++c)
@@ -241,8 +256,12 @@ class HomePass {
     });
   }
 
+  // In solver_more.cpp, so that the loops here stay as they are compiled.
+  Counts from_nodes_more() const;
+
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
+  SurfacePlan<T>& surface_;
   std::vector<int32_t> colors_[kColors];  // homes, those of one colour at once
   std::vector<Box> box_;                  // [homes]
 };

@@ -3,6 +3,7 @@
 
 #include "core/solver/node.h"
 #include "cpu/solver/contact.h"
+#include "cpu/solver/surface.h"
 
 namespace gsf::cpu {
 
@@ -13,7 +14,8 @@ constexpr int64_t kNearColliders = 64;  // with more, every site looks at all of
 template <typename T>
 class NodePass {
  public:
-  NodePass(const SolverView<T>& s, const ContactPlan<T>& contact) : s_(s), contact_(contact) {}
+  NodePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface)
+      : s_(s), contact_(contact), surface_(surface) {}
 
   void plan() {
     const int64_t chunks = (s_.clock->sites + kSiteChunk - 1) / kSiteChunk;
@@ -35,8 +37,11 @@ class NodePass {
         for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
           const Site here = site(index, touched);
           if (here.fields == 0) continue;
+          bool pushed = false;
+          for (int i = 0; i < here.fields; ++i)
+            pushed = pushed || (touched[here.slots[i]] & kTouchedPush) != 0;
           for (int local = 0; local < kBlockNodes; ++local)
-            contacts_[chunk] += node(here, local, dt, impulse);
+            contacts_[chunk] += node(here, local, pushed, dt, impulse);
         }
       }
     });
@@ -47,6 +52,8 @@ class NodePass {
         constexpr int64_t kMoments = kBlockNodes * kContactMoments;
         if (touched[b] & kTouchedMoments)
           std::fill_n(static_cast<T*>(s_.moments) + kMoments * b, kMoments, T(0));
+        if (touched[b] & kTouchedPush)
+          std::fill_n(surface_.sums() + 4 * kBlockNodes * b, 4 * kBlockNodes, T(0));
         touched[b] = 0;
       }
     });
@@ -90,7 +97,8 @@ class NodePass {
       const T* row = s_.colliders + k * kColliderColumns;
       if (!collider_valid(row, s_.sdf_count)) continue;
       // Nodes lie within sqrt(27) / 2 of the centre; what sweeps may come from anywhere.
-      const bool far = collider_clearance(row, s_.sdf, center) > T(2.8) * s_.dx;
+      const T reach = surface_.any() && collider_springs(row) ? T(2.8 - kSpringNode) : T(2.8);
+      const bool far = collider_clearance(row, s_.sdf, center) > reach * s_.dx;
       if (!far || row[kSweep] != T(0)) site.near[site.colliders++] = static_cast<int32_t>(k);
     }
     return site;
@@ -102,7 +110,7 @@ class NodePass {
   }
 
   // One node of a site: velocities, contact, colliders. Returns whether fields touched.
-  int64_t node(const Site& site, int local, T dt, double* impulse) {
+  int64_t node(const Site& site, int local, bool pushed, T dt, double* impulse) {
     const double* sums = static_cast<const double*>(s_.sums);
     const int fields = site.fields;
     double mass[kSiteFields];
@@ -130,11 +138,12 @@ class NodePass {
       for (int64_t i = 0; i < site.colliders; ++i) {
         const int32_t k = site.collider(i);
         for (int a = 0; a < fields; ++a)
-          if (heavy[a])
+          if (heavy[a] && holds(k, x))
             node_collide(s_, k, x, mass[a], node_cut(s_, fields, heavy, number, a), dt, velocity[a],
                          impulse + kImpulseSums * k);
       }
     }
+    if (pushed) rub(site, local, heavy, number, mass, velocity, impulse);
     for (int a = 0; a < fields; ++a) {
       T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
       for (int i = 0; i < 3; ++i) out[i] = velocity[a][i];
@@ -143,8 +152,60 @@ class NodePass {
     return contacts;
   }
 
+  // Whether collider k acts on nodes at x: one that pushes points does so far behind its surface.
+  bool holds(int64_t k, const Vec3<T>& x) const {
+    const T* row = s_.colliders + k * kColliderColumns;
+    if (!surface_.any() || !collider_springs(row)) return true;
+    Vec3<T> normal;
+    return collider_signed_distance(row, s_.sdf, x, normal) <= T(-kSpringNode) * s_.dx;
+  }
+
+  // Friction of the points about a node that colliders pushed, and what those gave: on the account
+  // of the nearest of them. Fields that move as one rub as one.
+  template <typename Number>
+  void rub(const Site& site, int local, const bool* heavy, const Number& number, const double* mass,
+           Vec3<T>* velocity, double* impulse) const {
+    const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
+    int32_t k = -1;
+    uint32_t done = 0;
+    for (int a = 0; a < site.fields; ++a) {
+      if (!heavy[a] || (done >> a & 1u) != 0) continue;
+      const uint32_t group = node_group(s_, site.fields, heavy, number, a);
+      done |= group;
+      double total = 0.0;
+      T push[4] = {};
+      for (int f = 0; f < site.fields; ++f) {
+        if ((group >> f & 1u) == 0) continue;
+        const T* given = surface_.sums() + 4 * (int64_t(site.slots[f]) * kBlockNodes + local);
+        for (int c = 0; c < 4; ++c) push[c] += given[c];
+        total += mass[f];
+      }
+      const Vec3<T> j{push[0], push[1], push[2]};
+      if (!(dot(j, j) > T(0))) continue;
+      if (k < 0) k = surface_.nearest(x);
+      const T* row = s_.colliders + int64_t(k) * kColliderColumns;
+      const Vec3<T> v = velocity[a];
+      const Vec3<T> after = spring_friction(v, collider_velocity(row, x), j, push[3], T(total));
+      double given[3], arm[3];
+      for (int i = 0; i < 3; ++i) {
+        given[i] = double(j[i]) + total * (double(after[i]) - double(v[i]));
+        arm[i] = double(x[i]) - double(row[kPoint + i]);
+      }
+      double* sums = impulse + kImpulseSums * k;
+      for (int i = 0; i < 3; ++i) {
+        sums[i] += given[i];
+        sums[3 + i] +=
+            arm[(i + 1) % 3] * given[(i + 2) % 3] - arm[(i + 2) % 3] * given[(i + 1) % 3];
+      }
+      sums[6] += total;
+      for (int f = 0; f < site.fields; ++f)
+        if (group >> f & 1u) velocity[f] = velocity[f] + (after - v);
+    }
+  }
+
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
+  SurfacePlan<T>& surface_;
   std::vector<double> impulse_;    // [chunks, colliders, kImpulseSums]
   std::vector<int64_t> contacts_;  // [chunks] nodes at which fields touched
 };

@@ -223,6 +223,23 @@ struct PacketMomentum {
     }
   }
 
+  // Adds an impulse to what lane `lane` gives.
+  void push(int lane, const T* impulse) {
+    const Quad<T> given{impulse[0], impulse[1], impulse[2], T(0)};
+    for (auto& at : start) at[lane] += given;
+  }
+
+  // Adds four numbers of each of the lanes [first, end) by weight alone.
+  void scatter_four(int first, int end, const T* values, Lanes<T>* node) const {
+    for (int n = 0; n < 27; ++n) {
+      Lanes<T> sum{};
+      for (int lane = first; lane < end; ++lane)
+        sum += weight[n][lane] * Lanes<T>{values[4 * lane], values[4 * lane + 1],
+                                          values[4 * lane + 2], values[4 * lane + 3]};
+      node[(n / 9 * kWindowEdge + n / 3 % 3) * kWindowEdge + n % 3] += sum;
+    }
+  }
+
  private:
   using Raw = typename Pack<T>::Raw;
 

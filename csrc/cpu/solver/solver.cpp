@@ -21,7 +21,12 @@ template <typename T>
 class Stepper {
  public:
   Stepper(const SolverView<T>& s, int laws)
-      : s_(s), laws_(laws), contact_(s), homes_(s, contact_), nodes_(s, contact_) {
+      : s_(s),
+        laws_(laws),
+        contact_(s),
+        surface_(s),
+        homes_(s, contact_, surface_),
+        nodes_(s, contact_, surface_) {
     if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
   }
 
@@ -33,6 +38,7 @@ class Stepper {
                     "solver: the clock counts more blocks than there is room for");
     touched_.assign(c.slots, 0);
     contact_.make();
+    surface_.make();
     homes_.plan();
     nodes_.plan();
     if (fields_) fields_->plan();
@@ -57,6 +63,7 @@ class Stepper {
   const SolverView<T>& s_;
   const int laws_;
   ContactPlan<T> contact_;
+  SurfacePlan<T> surface_;
   HomePass<T> homes_;
   NodePass<T> nodes_;
   std::unique_ptr<FieldPass<T>> fields_;
@@ -64,16 +71,16 @@ class Stepper {
 };
 
 template <typename T>
-void prime_particles(const SolverView<T>& s, bool measure, int laws) {
+void prime_particles(const SolverView<T>& s, int laws, bool measure) {
   SolverClock& c = *s.clock;
   const T dt = static_cast<T>(c.dt);
-  const Counts all = laws == kDamageField
-                         ? FieldPass<T>::prime(s, measure)
-                         : parallel_counts(s.count, kParticleGrain,
-                                           [&](int64_t begin, int64_t end, Counts& counts) {
-                                             for (int64_t p = begin; p < end; ++p)
-                                               prime_particle(s, p, measure, dt, counts.largest);
-                                           });
+  const Counts all =
+      parallel_counts(s.count, kParticleGrain, [&](int64_t begin, int64_t end, Counts& counts) {
+        if (laws == kMoreLaws) return prime_more(s, begin, end, measure, dt, counts.largest);
+        if (laws == kDamageField)
+          return FieldPass<T>::prime(s, begin, end, measure, dt, counts.largest);
+        for (int64_t p = begin; p < end; ++p) prime_particle(s, p, measure, dt, counts.largest);
+      });
   if (measure)
     give_largest(all.largest, c);
   else
@@ -87,10 +94,10 @@ struct Cpu {
   static void prime(const SolverView<T>& s, int laws, const Scope&) {
     SolverClock& c = *s.clock;
     if (s.row_count == 0) return;
-    prime_particles(s, true, laws);
+    prime_particles(s, laws, true);
     start_clock(c, double(s.dx));
     if (c.done != 0 || c.reason != kFine) return;
-    prime_particles(s, false, laws);
+    prime_particles(s, laws, false);
     choose_unit(c);
   }
 

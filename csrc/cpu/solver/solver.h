@@ -1,7 +1,7 @@
 // The CPU half of the resident solver: blocks (build.cpp), particles of a home to its window
-// and back (homes.h, packet.h, update.h), nodes (nodes.h, contact.h), the loop
-// over steps (solver.cpp). Every sum is taken in an order that depends on neither the number of
-// threads nor the order in which the particles were loaded.
+// and back (homes.h, packet.h, update.h), nodes (nodes.h, contact.h), points that colliders push
+// (surface.h), the loop over steps (solver.cpp). Every sum is taken in an order that depends on
+// neither the number of threads nor the order in which the particles were loaded.
 #pragma once
 
 #include <algorithm>
@@ -34,14 +34,19 @@ class FieldPass {
   void plan();  // again after each build
   // The damage field, then HomePass::from_nodes.
   Counts from_nodes(const HomePass<T>& homes);
-  static Counts prime(const SolverView<T>& s, bool measure);
+  static void prime(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
+                    Largest& largest);
 
  private:
   std::unique_ptr<DamagePass<T>> damage_;
 };
+// prime_particle of particles [begin, end) of a scene with laws of more_laws.h.
+template <typename T>
+void prime_more(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
+                Largest& largest);
 
 // What a slot holds in this step.
-enum Touched : uint8_t { kTouchedSums = 1, kTouchedMoments = 2 };
+enum Touched : uint8_t { kTouchedSums = 1, kTouchedMoments = 2, kTouchedPush = 4 };
 
 // Counts and largest values of some particles. They do not depend on the order in which they meet.
 struct Counts {

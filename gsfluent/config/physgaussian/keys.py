@@ -29,8 +29,12 @@ KEYS: dict[str, tuple[str, str]] = {
     "hardening": (MAPPED, "objects.object.hardening_modulus (with xi)"),
     "xi": (MAPPED, "objects.object.hardening_modulus, 3 mu xi"),
     "friction_angle": (MAPPED, "objects.object.friction_angle"),
-    "plastic_viscosity": (UNSUPPORTED, "foam flows here at its yield stress whatever its rate"),
-    "softening": (UNSUPPORTED, "plasticine does not soften here as it flows"),
+    "plastic_viscosity": (MAPPED, "objects.object.plastic_viscosity"),
+    "softening": (
+        NEAR,
+        "in objects.object.hardening_modulus, -3/2 of it; what has softened to nothing keeps its "
+        "volume here",
+    ),
     "additional_material_params": (MAPPED, "objects.object.parts with where: box"),
     "grid_lim": (MAPPED, "with n_grid: the size of a cell, and the walls of bounding_box"),
     "n_grid": (NEAR, "solve.quality whose cells are nearest in size"),

@@ -46,6 +46,7 @@ _LAW = {
     "foam": "von_mises",
     "plasticine": "von_mises",
 }
+_UNSET = {"softening": 0.1}  # Pa, where a config for plasticine names none
 _FRICTION_ANGLE = 25.0  # degrees, where a config for sand names none
 
 
@@ -271,12 +272,16 @@ def _plastic(
                     text = "hardening is not 1"
                 notes.append(Note(key, MAPPED if read else INERT, text))
     for key, reader in (("plastic_viscosity", "foam"), ("softening", "plasticine")):
-        if key in values:
-            gives = kind == reader and number(values, key, 0.0) != 0.0
+        given = number(values, key, _UNSET.get(key, 0.0))
+        gives = kind == reader and given != 0.0
+        if gives and key == "plastic_viscosity":
+            made["plastic_viscosity"] = given
+        elif gives:  # per norm of the strain that flows; ours is per sqrt(2/3) of it, and uniaxial
+            made["hardening_modulus"] = made.get("hardening_modulus", 0.0) - 1.5 * given
+        if key in values or gives:
             text = KEYS[key][1] if gives else (unread if kind != reader else "it is 0")
-            notes.append(Note(key, UNSUPPORTED if gives else INERT, text))
-    if kind == "plasticine" and "softening" not in values:
-        notes.append(Note("softening", UNSUPPORTED, KEYS["softening"][1] + " (0.1 Pa unless set)"))
+            text += "" if key in values else f" ({given:g} Pa unless set)"
+            notes.append(Note(key, KEYS[key][0] if gives else INERT, text))
 
 
 def _damping(values: Mapping[str, Any], notes: list[Note]) -> None:

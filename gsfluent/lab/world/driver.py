@@ -78,6 +78,8 @@ class World:
             where it can do the job, which is without ``force`` and ``period``.
         irreversible: Broken NACC material does not regain its cohesion.
         frame: Velocity of the solver's grid [m/s]; None: the solver's choice. ``"ops"`` has none.
+        surface: Contact radius of the points in cube roots of their volume: colliders push points
+            that are nearer (docs/theory/colliders.md). None: they hold nodes.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
     Raises:
@@ -125,6 +127,7 @@ class World:
         engine: Literal["solver", "ops"] | None = None,
         irreversible: bool = True,
         frame: Sequence[float] | None = None,
+        surface: float | None = None,
         **return_map: Any,
     ):
         if dt is not None and not 0.0 < dt < math.inf:
@@ -174,6 +177,7 @@ class World:
             irreversible=irreversible,
             return_map=return_map,
             frame=None if frame is None else (frame[0], frame[1], frame[2]),
+            radius=None if surface is None else surface * number(volume, count) ** (1.0 / 3.0),
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()
         obstacle = why_not(self.scene, force is not None)

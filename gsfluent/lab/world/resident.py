@@ -52,7 +52,8 @@ class Resident:
             affine=affine, deformation=deformation, body=scene.body, gravity=scene.gravity,
             colliders=scene.colliders, friction=scene.friction, restitution=scene.restitution,
             contact_gap=scene.contact_gap, cfl=scene.cfl, dt=scene.fixed_dt,
-            irreversible=scene.irreversible, frame=scene.frame, **scene.return_map,
+            irreversible=scene.irreversible, frame=scene.frame, radius=scene.radius,
+            **scene.return_map,
         )  # fmt: skip
         rows = 0 if scene.colliders is None else scene.colliders.shape[0]
         self._none = torch.zeros(rows, 3, dtype=torch.float64, device=velocity.device)
@@ -93,7 +94,7 @@ class Resident:
         scene, strain = self.scene, self.solver.strain
         result = ops.return_mapping(
             strain, self.solver.alpha, strain.new_zeros(strain.shape[0], 3, 3), law=scene.law,
-            params=scene.params, material=scene.material, dt=1.0, **scene.return_map,
+            params=scene.params, material=scene.material, dt=1e-9, **scene.return_map,
         )  # fmt: skip
         return result[2]
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.ops.damage import DamageField
 from gsfluent.ops.plasticity import weakened
+from gsfluent.ops.reference import spring
 
 REACH = 3.0
 """Width of the layer that is repeated behind a periodic face [dx]: a point reads nodes up to 1.5
@@ -51,6 +52,7 @@ class Scene:
     irreversible: bool
     return_map: dict[str, Any]
     frame: tuple[float, float, float] | None = None
+    radius: Tensor | None = None
 
 
 def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
@@ -95,6 +97,60 @@ def automatic_dt(scene: Scene, strain: Tensor, velocity: Tensor, affine: Tensor)
     return dt
 
 
+class Pushed:
+    """What colliders give to the points of a scene in a step, summed about the nodes.
+
+    One collider rubs at a node, as in the solver: all here have the same velocity and friction, or
+    are far from each other.
+    """
+
+    def __init__(
+        self, scene: Scene, position: Tensor, blocks: ops.Blocks, dt: float, body: Tensor | None
+    ) -> None:
+        assert scene.colliders is not None and scene.radius is not None
+        where = scene.material.long()
+        params = scene.params[where]
+        wave = ((params[:, 1] + 4.0 / 3.0 * params[:, 0]) / params[:, 6]).sqrt()
+        length = scene.volume ** (1.0 / 3.0)
+        x = blocks.node_positions(scene.dx, position.dtype)
+        none = torch.zeros(len(position), 3, 3, dtype=position.dtype, device=position.device)
+        self.parts: list[tuple[Tensor, Tensor]] = []
+        held = []
+        for row in scene.colliders:
+            pushes = spring.springs(row)
+            impulse = torch.zeros_like(position)
+            if pushes:
+                impulse = spring.point_push(
+                    row, None, position, scene.radius, scene.mass, wave, length, scene.dx, dt
+                )
+            summed, _ = ops.p2g(
+                position, impulse / scene.mass[:, None], none, scene.mass, dx=scene.dx,
+                blocks=blocks, body=body, fields=scene.fields,
+            )  # fmt: skip
+            self.parts.append((row, summed[..., :3]))
+            deep = row.clone()
+            if pushes and int(row[0]) == 0:
+                deep[3:6] -= spring.NODE * scene.dx * row[6:9] / row[6:9].norm()
+            elif pushes:
+                raise ValueError("World: by 'ops' only planes push points")
+            held.append(deep)
+        self.holding = torch.stack(held)
+        total = torch.stack([j for _, j in self.parts]).sum(0)
+        self.momentum = torch.nn.functional.pad(total, (0, 1))
+        self._x = x
+
+    def rub(self, velocity: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocities after friction, and the impulse of every collider [K, 3]."""
+        given = []
+        for row, push in self.parts:
+            own = row[10:13] + torch.linalg.cross(row[20:23].expand_as(self._x), self._x - row[3:6])
+            after = spring.node_friction(velocity, own, push, row[2] * push.norm(dim=-1), mass)
+            rubbed = mass[..., None] * (after - velocity)
+            given.append((push + rubbed).double().sum(dim=(0, 1, 2)))
+            velocity = after
+        return velocity, torch.stack(given)
+
+
 class Stepper:
     """State of the points and the step that advances it; precision is that of the tensors."""
 
@@ -123,7 +179,7 @@ class Stepper:
         self._travelled = 0.0
         # the stress of the first step belongs to the strain given: a step without motion, of a
         # length that only viscosity reads
-        self.stress = self._map(torch.zeros_like(affine), 1.0)[2]
+        self.stress = self._map(torch.zeros_like(affine), 1e-9)[2]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
@@ -159,11 +215,16 @@ class Stepper:
             dx=scene.dx, blocks=blocks, dt=dt, stress=take(self.stress),
             volume=take(scene.volume), body=body, fields=scene.fields, contact=contact,
         )  # fmt: skip
+        push = None if rows is not None else self._pushed(grid, blocks, dt, body)
         grid_velocity, impulse, _ = ops.grid_update(
-            grid, dx=scene.dx, dt=dt, blocks=blocks, gravity=scene.gravity,
-            colliders=scene.colliders, moments=moments, friction=scene.friction,
-            restitution=scene.restitution, contact_gap=scene.contact_gap,
+            grid if push is None else grid + push.momentum, dx=scene.dx, dt=dt, blocks=blocks,
+            gravity=scene.gravity, colliders=scene.colliders if push is None else push.holding,
+            moments=moments, friction=scene.friction, restitution=scene.restitution,
+            contact_gap=scene.contact_gap,
         )  # fmt: skip
+        if push is not None:
+            grid_velocity, given = push.rub(grid_velocity, grid[..., 3])
+            impulse = impulse + given
         deformation = None if self.deformation is None else take(self.deformation)
         x, v, c, f, skipped = ops.g2p(
             grid_velocity, place, dx=scene.dx, dt=dt, blocks=blocks, body=body,
@@ -181,6 +242,14 @@ class Stepper:
         self.impulse += impulse
         self.time += dt
         self.steps += 1
+
+    def _pushed(
+        self, grid: Tensor, blocks: ops.Blocks, dt: float, body: Tensor | None
+    ) -> Pushed | None:
+        scene = self.scene
+        if scene.radius is None or scene.colliders is None:
+            return None
+        return Pushed(scene, self.position, blocks, dt, body)
 
     def _find_blocks(self, place: Tensor, dt: float, *, fresh: bool) -> ops.Blocks:
         speed = float(self.velocity.abs().max())

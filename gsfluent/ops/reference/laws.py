@@ -61,15 +61,30 @@ def _mix(
     return torch.where(plastic[:, None], _strain(dev, log_j), e), dev, log_j
 
 
-def von_mises(e: Tensor, log_j: Tensor, guarded: Tensor, alpha: Tensor, m: Material) -> Returned:
-    """Radial return on ln V; alpha is the accumulated plastic strain."""
+def von_mises(
+    e: Tensor, log_j: Tensor, guarded: Tensor, alpha: Tensor, m: Material, dt: float = 0.0
+) -> Returned:
+    """Radial return on ln V; alpha is the accumulated plastic strain.
+
+    With a plastic viscosity eta (``shear_damage``) what is beyond the surface drives the flow: it
+    is eta times the strain rate, over mu tr(b) / (3 mu) as PAC-NeRF has it. Softening (a negative
+    modulus) ends with the yield stress at zero.
+    """
     dev = deviator(spectral(e, "log"))
     n = safe_norm(dev)
     before = alpha.clamp(min=0.0)
-    limit = _ROOT * (m.friction + m.hardening * before)
+    limit = _ROOT * (m.friction + m.hardening * before).clamp(min=0.0)
     trial = 2.0 * m.mu * n
     plastic = trial > limit + _slack(e) * (limit + 0.25 * m.mu * log_j.abs())
-    slip = (trial - limit) / (2.0 * m.mu + 2.0 / 3.0 * m.hardening)
+    drag = torch.zeros_like(n)
+    viscous = m.shear_damage > 0
+    if dt > 0.0:
+        drag = torch.where(viscous, m.shear_damage / ((1.0 + e[:, :3].mean(1)) * dt), 0.0)
+    else:
+        plastic = plastic & ~viscous
+    slip = (trial - limit) / (2.0 * m.mu + 2.0 / 3.0 * m.hardening + drag)
+    spent = (m.hardening < 0) & (m.friction + m.hardening * (before + _ROOT * slip) < 0)
+    slip = torch.where(spent, trial / (2.0 * m.mu + drag), slip)
     slip = torch.where(plastic, slip, 0.0)
     factor = (1.0 - slip / torch.where(plastic, n, 1.0)).clamp(min=0.0)
     strain, dev, log_j = _mix(e, dev, log_j, factor[:, None] * dev, log_j, plastic)

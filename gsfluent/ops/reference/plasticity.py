@@ -1,7 +1,7 @@
 """The constitutive step in plain PyTorch: the definition of ``return_mapping``, and its gradient.
 
 Differentiable with respect to strain, alpha, increment and params. The laws beside neo-Hookean and
-NACC are in :mod:`gsfluent.ops.reference.laws`.
+NACC are in :mod:`gsfluent.ops.reference.laws` and :mod:`gsfluent.ops.reference.rubber`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsfluent.ops.reference import laws as other
 from gsfluent.ops.reference import phase_field as phase
+from gsfluent.ops.reference import rubber
 from gsfluent.ops.reference.nacc import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -184,10 +185,13 @@ def return_mapping(
             t = _trial(e[rows], inverted[rows])
             pulled = strain_from_isochoric(t.d, t.log_j)
             kept = torch.where(t.guarded[:, None], pulled, t.e)
+            state = kept, t.log_j, t.guarded, alpha[rows], own
             if number == phase.PHASE:
                 r = phase.phase_field(t.e, t.d, t.n, t.j2m1, t.guarded, alpha[rows], own)
+            elif number == other.METAL:
+                r = other.von_mises(*state, dt)
             else:
-                r = other.LAWS[number](kept, t.log_j, t.guarded, alpha[rows], own)
+                r = (other.LAWS | rubber.LAWS)[number](*state)
         new_strain = new_strain.index_copy(0, rows, r.strain)
         stress = stress.index_copy(0, rows, r.stress)
         alpha = alpha.index_copy(0, rows, r.alpha)
@@ -214,11 +218,11 @@ def elastic_energy(strain: Tensor, m: Material, laws: Tensor | None = None) -> T
         if number > 1:
             rows = (laws == number).nonzero()[:, 0]
             own = Material(*(column[rows] for column in m))
-            found = (
-                phase.energy(strain[rows], own)
-                if number == phase.PHASE
-                else other.energy(number, strain[rows], own)
-            )
+            if number == phase.PHASE:
+                found = phase.energy(strain[rows], own)
+            else:
+                of = rubber.energy if number in rubber.LAWS else other.energy
+                found = of(number, strain[rows], own)
             energy = energy.index_copy(0, rows, found)
     return energy
 
@@ -245,4 +249,9 @@ def wave_speed_squared(strain: Tensor, m: Material, laws: Tensor) -> Tensor:
     largest = (1.0 + third + root * size).clamp(min=0.0)
     corotated = 2.0 * m.mu * largest + (m.kappa - 2.0 / 3.0 * m.mu) * (1.0 + j2m1)
     modulus = torch.where(laws == other.COROTATED, corotated, modulus)
+    for number in set(laws.unique().tolist()) & set(rubber.LAWS):
+        rows = (laws == number).nonzero()[:, 0]
+        own = Material(*(column[rows] for column in m))
+        found = rubber.wave_modulus(number, strain[rows], j2m1[rows], log_j[rows], own)
+        modulus = modulus.index_copy(0, rows, found)
     return torch.where((laws == other.RIGID) | ~finite, 0.0, modulus / m.density)

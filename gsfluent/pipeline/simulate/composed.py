@@ -28,6 +28,8 @@ FIELDS = 8
 """Fields this engine can afford: each one has every node."""
 GRADIENT_LIMIT = 0.3
 """Largest ``dt |grad v|`` of intact matter in one step."""
+INSTANT = 1e-9
+"""Step [s] of the stress that points begin with: what flows with a viscosity has not flown yet."""
 REFRESH = 5
 """Steps between two looks at speeds and stiffness (each one waits for the device)."""
 
@@ -79,7 +81,7 @@ class Composed:
             row = None
         _, _, self.stress, _ = ops.return_mapping(
             p.strain, p.alpha, torch.zeros_like(p.affine), law=law, params=params,
-            material=row, dt=1.0, **self._map,
+            material=row, dt=INSTANT, **self._map,
         )  # fmt: skip
 
     def advance(self, until: float, steps: int) -> int:

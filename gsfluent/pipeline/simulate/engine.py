@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from gsfluent.errors import InputError
+from gsfluent.ops.solver import CFL_MOST
 
 CFL = 0.5
 
@@ -98,6 +99,9 @@ class SolverOptions:
             device: the composed operators on a GPU, whose sums have no order.
         standing: Let what stands still on the floor at time 0 sleep, without a strain, until
             something comes near; else its weight begins to act then.
+        surface: Let plain separating colliders push the points, so that bodies lie on floors and
+            not up to 1.5 cells above them (docs/theory/colliders.md, "At a point"). The resident
+            solver on a CPU only; the composed operators hold nodes.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
         max_rollbacks: Roll-backs in a row before the run is given up.
@@ -117,12 +121,18 @@ class SolverOptions:
     contact_proximity: bool = True
     deterministic: bool = False
     standing: bool = False
+    surface: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
     max_rollbacks: int = 6
 
     def __post_init__(self) -> None:
         if not 0.0 < self.cfl <= 1.0:
             raise InputError(f"simulate: cfl must lie in (0, 1], got {self.cfl}", hint="use 0.5")
+        if self.surface and self.cfl > CFL_MOST:
+            raise InputError(
+                f"simulate: cfl must be at most {CFL_MOST:g} with surface=True, got {self.cfl:g}",
+                hint="longer steps make energy where points are pushed",
+            )
 
 
 class Points(NamedTuple):

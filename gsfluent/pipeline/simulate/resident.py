@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.errors import InputError
 from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
@@ -29,6 +30,8 @@ from gsfluent.scene.scene import Scene
 
 FLOOR_DEPTH = 0.05
 """How far [cells] a free body may sink into the floor before it is put back."""
+ROUGH = 0.3
+"""Contact radius of a point in lattice spacings."""
 CROWDED = 3
 """Reason of a SolverError: more fields share a block than it has room for."""
 
@@ -71,6 +74,28 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
     mass = rows[:, columns.MASS]
     touched = float(matter.params[:, 6].max()) * rigid.touchable(rows)
     return bool(((mass >= OUTWEIGHS * touched) | (mass == 0.0)).all())  # 0: standing, or waiting
+
+
+def contact_radius(matter: Matter, rigid: RigidSet) -> Tensor:
+    """Nearest that points come to colliders before these push them [m], float64 [N].
+
+    The outermost points of a jittered lattice lie a quarter of its spacing inside of the face. Of a
+    point that starts nearer the radius is that distance: nothing is thrown out of what it overlaps.
+
+    Raises:
+        InputError: Points on a device whose solver cannot push them.
+    """
+    particles = matter.particles
+    if particles.device.type != "cpu":
+        raise InputError(
+            f"simulate: surface=True is not there on {particles.device.type} yet",
+            hint="leave it out, or simulate on the CPU",
+        )
+    usual = (ROUGH * particles.volume.double() ** (1.0 / 3.0)).clamp(max=0.5 * matter.dx)
+    if not rigid.start.shape[0]:
+        return usual
+    distance, _ = ops.collider_distance(particles.position.double(), rigid.start, rigid.sdf)
+    return torch.minimum(usual, distance.amin(dim=1))
 
 
 class Resident:
@@ -121,6 +146,8 @@ class Resident:
             material=p.material, gravity=scene.gravity, sdf=rigid.sdf, friction=scene.friction,
             cfl=options.cfl, irreversible=options.irreversible, **options.return_map,
         )  # fmt: skip
+        if options.surface:
+            constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
         self._constants: dict[str, Any] = constants
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = dt_scale

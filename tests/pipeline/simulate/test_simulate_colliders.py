@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.data import Frame
+from gsfluent.errors import InputError
 from gsfluent.pipeline.matter.points import build_matter
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
@@ -130,3 +132,40 @@ def test_a_free_ball_rests_on_the_floor_beside_matter() -> None:
     assert run.stepper.counters.composed_steps == 0
     assert float(run.state.colliders[1, 5]) == pytest.approx(0.1, abs=0.06 * DX)
     assert abs(float(run.state.colliders[1, 12])) < 0.1
+
+
+def _dropped(surface: bool) -> float:
+    """Lowest that the bottom of a cube comes in a second after a small drop [dx above a floor]."""
+    ball = ellipsoid((0.2, 0.2, 0.2))
+    cube = dataclasses.replace(ball, occupancy=torch.ones_like(ball.occupancy))
+    scene = Scene()
+    half = 0.5 * cube.occupancy.shape[2] * float(cube.voxel)
+    stiff = materials.elastic.override(young_modulus=4e5)
+    scene.add(cube, stiff, frame=Frame(torch.eye(3), torch.tensor([0.0, 0.0, half + 0.005]), 1.0))
+    run = Run(scene, build_matter(scene, DX), 100.0, SolverOptions(surface=surface, sleep=False))
+    low = torch.argsort(run.matter.rest[:, 2])[: len(run.matter.rest) // 8]
+    inside = float(run.matter.rest[low, 2].mean()) - 0.005  # of its points above its bottom
+    gaps = []
+    for frame in range(1, 41):
+        assert run.advance_to(frame, None), run.failure
+        run.record(frame)
+        gaps.append(float(run.state.position[low, 2].mean()) - inside)
+    assert run.report()["verdict"] == "clean", run.report()["reason"]
+    return min(gaps) / DX
+
+
+def test_bodies_lie_on_a_floor_that_pushes_points() -> None:
+    assert abs(_dropped(surface=True)) < 0.1
+
+
+def test_what_overlaps_at_the_start_is_not_thrown_out() -> None:
+    scene = Scene(gravity=(0.0, 0.0, 0.0))
+    placed = Frame(torch.eye(3), torch.tensor([0.0, 0.0, 0.18]), 1.0)  # 0.4 cells into the floor
+    scene.add(ellipsoid((0.2, 0.2, 0.2)), SOFT, frame=placed)
+    run = run_of(scene, frames=4, surface=True)
+    assert float(run.state.particles.velocity.abs().max()) < 1e-5  # of rounding
+
+
+def test_surface_refuses_long_steps() -> None:
+    with pytest.raises(InputError, match="cfl must be at most"):
+        SolverOptions(surface=True, cfl=0.8)
