@@ -6,18 +6,7 @@
 #include "cpu/material/plasticity_more.h"
 
 namespace gsf {
-
-// phase_field.cpp: a file of its own, so that what gcc inlines here stays as it is.
-template <typename T>
-ReturnFlags phase_particle(const ReturnMappingArgs<T>& a, int64_t i);
-
 namespace {
-
-template <typename T>
-bool is_phase(const ReturnMappingArgs<T>& a, int64_t i) {
-  const int64_t row = a.material != nullptr ? a.material[i] : (a.rows == 1 ? 0 : i);
-  return row >= 0 && row < a.rows && a.law[row] == kPhaseField;
-}
 
 struct PlasticityCpu {
   using Scope = CpuScope;
@@ -27,8 +16,7 @@ struct PlasticityCpu {
     parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
       int32_t counts[4] = {0, 0, 0, 0};
       for (int64_t i = begin; i < end; ++i) {
-        const ReturnFlags f =
-            is_phase(a, i) ? phase_particle(a, i) : return_mapping_particle<false>(a, i);
+        const ReturnFlags f = return_mapping_particle(a, i);
         counts[0] += f.plastic;
         counts[1] += f.guarded;
         counts[2] += f.inverted;
