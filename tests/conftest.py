@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,11 @@ from gsfluent.demo import capture
 from gsfluent.pipeline.simulate.stage import QUALITY
 
 REPO = Path(__file__).resolve().parent.parent
+
+# a shell starts what it puts in the background with Ctrl-C ignored, and every process that a test
+# starts and interrupts would inherit that
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
