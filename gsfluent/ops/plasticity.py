@@ -20,6 +20,9 @@ from gsfluent.ops.reference import plasticity as reference
 WEAKENING = 0.02
 """Range of alpha past zero over which a broken point (NACC) loses its cohesion (``kWeakening``)."""
 
+INSTANT = 1e-9
+"""Step [s] of the stress that points begin with: what flows with a viscosity has not flown yet."""
+
 PHASE_CODES = [float(split + model) for split in SPLITS.values() for model in MODELS.values()]
 """What column 5 of a phase_field row may hold."""
 

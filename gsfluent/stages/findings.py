@@ -66,7 +66,6 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
 FINER = 8
 """How many times finer than a quality says cells are made for walls, at most."""
 
-
 MOSTLY = 0.25
 """Share of its surface on thin walls from which a body is refined for them: a bowl, and no apple
 with a ragged rim, which would take twelve times the points."""

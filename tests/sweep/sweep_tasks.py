@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from gsfluent.sweep.engine import map
+from gsfluent.sweep.folder import SweepFolder
 
 
 def square(item: int, folder: Path) -> int:
@@ -58,6 +59,16 @@ def drive(folder: str, count: int, on: str = "local") -> None:
     from sweep_tasks import slow_square
 
     map(slow_square, range(count), folder, ids=names(count), jobs=2, tries=99, on=on)
+
+
+def all_squares(folder: Path, count: int) -> None:
+    """Every task is there once, whole, and nothing of an unfinished one with it."""
+    place = SweepFolder(folder)
+    assert place.done() == set(names(count))
+    for i, name in enumerate(names(count)):
+        row = place.row(name)
+        assert row is not None and (row["id"], row["value"]) == (name, i * i)
+        assert (place.shots / name / "number.txt").read_text() == str(i * i)
 
 
 if __name__ == "__main__":

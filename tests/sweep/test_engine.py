@@ -15,7 +15,15 @@ from typing import Any
 
 import pytest
 import sweep_tasks
-from sweep_tasks import dies_once, names, never_ends, odd_ones_fail, slow_square, square
+from sweep_tasks import (
+    all_squares,
+    dies_once,
+    names,
+    never_ends,
+    odd_ones_fail,
+    slow_square,
+    square,
+)
 
 from gsfluent.errors import InputError
 from gsfluent.sweep import claims
@@ -48,16 +56,6 @@ def command(pid: int) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return ""
-
-
-def all_squares(folder: Path, count: int) -> None:
-    """Every task is there once, whole, and nothing of an unfinished one with it."""
-    place = SweepFolder(folder)
-    assert place.done() == set(names(count))
-    for i, name in enumerate(names(count)):
-        row = place.row(name)
-        assert row is not None and (row["id"], row["value"]) == (name, i * i)
-        assert (place.shots / name / "number.txt").read_text() == str(i * i)
 
 
 def kill_and_restart(folder: Path, count: int, kills: int, seed: int = 0) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import sweep_tasks
-from sweep_tasks import dies_once, names, never_ends, odd_ones_fail, square
+from sweep_tasks import all_squares, dies_once, names, never_ends, odd_ones_fail, square
 
 from gsfluent.errors import InputError
 from gsfluent.sweep.engine import map
@@ -54,15 +54,6 @@ def path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def driver(on: str, folder: Path, count: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, sweep_tasks.__file__, str(folder), str(count), on])
-
-
-def all_squares(folder: Path, count: int) -> None:
-    place = SweepFolder(folder)
-    assert place.done() == set(names(count))
-    for i, name in enumerate(names(count)):
-        row = place.row(name)
-        assert row is not None and (row["id"], row["value"]) == (name, i * i)
-        assert (place.shots / name / "number.txt").read_text() == str(i * i)
 
 
 def done_at_least(folder: Path, count: int, process: subprocess.Popen[bytes]) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.lab.world.stepper import Scene
-from gsfluent.ops.plasticity import LAWS
+from gsfluent.ops.plasticity import INSTANT, LAWS
 
 
 def why_not(scene: Scene, forced: bool) -> str:
@@ -21,7 +21,8 @@ def why_not(scene: Scene, forced: bool) -> str:
     if any(scene.period):
         return "it has no periodic axes"
     laws = {int(law) for law in scene.law.tolist()}
-    if LAWS["phase_field"] in laws and (scene.law.is_cuda or max(laws - {9}, default=0) > 1):
+    beside = {LAWS[name] for name in ("elastic", "nacc", "phase_field")}
+    if LAWS["phase_field"] in laws and (scene.law.is_cuda or not laws <= beside):
         return "phase_field works on the CPU beside elastic and nacc only"
     if scene.cfl > 1.0:
         return "its cfl is at most 1"
@@ -94,7 +95,7 @@ class Resident:
         scene, strain = self.scene, self.solver.strain
         result = ops.return_mapping(
             strain, self.solver.alpha, strain.new_zeros(strain.shape[0], 3, 3), law=scene.law,
-            params=scene.params, material=scene.material, dt=1e-9, **scene.return_map,
+            params=scene.params, material=scene.material, dt=INSTANT, **scene.return_map,
         )  # fmt: skip
         return result[2]
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.ops.damage import DamageField
-from gsfluent.ops.plasticity import weakened
+from gsfluent.ops.plasticity import INSTANT, weakened
 from gsfluent.ops.reference import spring
 
 REACH = 3.0
@@ -179,7 +179,7 @@ class Stepper:
         self._travelled = 0.0
         # the stress of the first step belongs to the strain given: a step without motion, of a
         # length that only viscosity reads
-        self.stress = self._map(torch.zeros_like(affine), 1e-9)[2]
+        self.stress = self._map(torch.zeros_like(affine), INSTANT)[2]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene

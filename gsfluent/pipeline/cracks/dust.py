@@ -110,18 +110,16 @@ class Dust:
             mine = rows[body == number]
             wet = materials.wet(self._scene.bodies[number].material.name)
             made = grains(mine, self.edge[mine], self._finest[number], wet)
-            made = made.at(self._matter.rest[made.row], color)
-            if wet and made.color is not None:
-                made.color = torch.lerp(made.color, self._juice(number, color), JUICE)
-            self._grains.append(made)
+            shade = functools.partial(self._juice, number, color) if wet else color
+            self._grains.append(made.at(self._matter.rest[made.row], shade))
 
-    def _juice(self, number: int, color: Callable[[Tensor], Tensor]) -> Tensor:
-        """Mean colour of a body, [3]."""
+    def _juice(self, number: int, color: Callable[[Tensor], Tensor], places: Tensor) -> Tensor:
+        """Colours [G, 3] of drops of a body that come from places at rest [m], [G, 3]."""
         if number not in self._mean:
             a, b = self._matter.ranges[number]
             step = max(1, (b - a) // _ASKED)
             self._mean[number] = color(self._matter.rest[a:b:step]).mean(dim=0)
-        return self._mean[number]
+        return torch.lerp(color(places), self._mean[number], JUICE)
 
     @functools.cached_property
     def _finest(self) -> list[float]:
@@ -244,7 +242,8 @@ class Grains:
             off[:, 2] *= torch.minimum(height / torch.maximum(most, reach), torch.ones_like(most))
             lies = (FALLING - height / edge[row].clamp(min=1e-12)) / (FALLING - LANDED)
             lies = lies.clamp(0.0, 1.0)
-            quats, scales = _spread(quats, scales, torch.where(self.wet[some], lies, 0.0))
+            wet = (self.wet[some] & (lies > 0.0)).nonzero()[:, 0]
+            quats[wet], scales[wet] = _spread(quats[wet], scales[wet], lies[wet])
             down = floor + _half_height(quats, scales) - (here + off)[:, 2]
             off[:, 2] += lies * down
         gaussians = Gaussians(
@@ -278,9 +277,7 @@ def _spread(quats: Tensor, scales: Tensor, lies: Tensor) -> tuple[Tensor, Tensor
     level = torch.stack([turn.cos(), none, none, turn.sin()], dim=1)
     level = level * torch.where((level * quats).sum(dim=1) < 0.0, -1.0, 1.0)[:, None]
     turned = torch.nn.functional.normalize(torch.lerp(quats, level, lies[:, None]), dim=1)
-    shape = torch.exp(torch.lerp(scales.log(), flat.log(), lies[:, None]))
-    some = lies[:, None] > 0.0  # the others keep their bits
-    return torch.where(some, turned, quats), torch.where(some, shape, scales)
+    return turned, torch.exp(torch.lerp(scales.log(), flat.log(), lies[:, None]))
 
 
 def _half_height(quats: Tensor, scales: Tensor) -> Tensor:

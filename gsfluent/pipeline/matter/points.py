@@ -192,7 +192,7 @@ def build_matter(
         noise = jitter * (2.0 * torch.rand(count, generator=generator) - 1.0)
         params, law, alpha = _parameters(body, points, seed, noise, dx)
         mass = params[:, 6] * (volume / count)
-        position, velocity, affine = _start(body, scene, _placed(body, points), mass)
+        position, velocity, affine = start_of(body, scene, points, mass)
         tables.append(params)
         laws.append(law)
         groups.append(

@@ -15,7 +15,7 @@ from gsfluent import ops
 from gsfluent.data import Particles
 from gsfluent.materials import BREAKS, LAWS
 from gsfluent.ops.damage import DamageField
-from gsfluent.ops.plasticity import unloading_share, weakened
+from gsfluent.ops.plasticity import INSTANT, unloading_share, weakened
 from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.proximity import proximity_pairs
 from gsfluent.pipeline.colliders.rigid import RigidSet
@@ -28,8 +28,6 @@ FIELDS = 8
 """Fields this engine can afford: each one has every node."""
 GRADIENT_LIMIT = 0.3
 """Largest ``dt |grad v|`` of intact matter in one step."""
-INSTANT = 1e-9
-"""Step [s] of the stress that points begin with: what flows with a viscosity has not flown yet."""
 REFRESH = 5
 """Steps between two looks at speeds and stiffness (each one waits for the device)."""
 
