@@ -70,7 +70,7 @@ def test_the_fall_breaks_what_can_break(tmp_path: Path, material: str) -> None:
     assert shot.output.seconds > fall + 1.0 / slow
     # what is fast for its size is shown slower, in as many frames a second of film
     assert shot.output.fps == pytest.approx(30.0 * slow)
-    assert (slow > 1.0) == (0.03 * speed / 0.2 > 1.5)
+    assert (slow > 1.0) == (0.06 * speed / 0.2 > 1.5)
 
 
 def test_an_edited_shot_is_not_written_over(tmp_path: Path) -> None:
