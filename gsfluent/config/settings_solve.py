@@ -56,8 +56,8 @@ _ERROR = share(1e-4, 0.5)
 
 
 WALL_POINTS = {"preview": 10_000}
-"""Most material points for walls by quality: finer cells cost steps, too, so that a preview of a bowl
-with so many takes about what one of a ball with three times as many does."""
+"""Most material points for walls by quality. Finer cells cost steps, too: a preview of a bowl with
+so many takes about as long as one of a ball with three times as many."""
 _WALL_POINTS = 300_000
 
 
