@@ -169,6 +169,12 @@ def find_input(source: Path) -> tuple[str, Path]:
     Raises:
         InputError: Nothing that a run can start from, or more than one thing.
     """
+    inside = source if source.is_dir() else source.parent
+    if source in (inside, inside / "meta.json") and (inside / "means_l.webp").is_file():
+        raise InputError(
+            f"{source}: a .sog that has been unpacked",
+            f"pack it: cd {inside} && zip -0 ../{inside.name}.sog *, and run that",
+        )
     kind = kind_of(source)
     if kind in ("mesh", "splats", "capture"):
         return kind, source

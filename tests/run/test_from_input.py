@@ -100,6 +100,15 @@ def test_folders(tmp_path: Path) -> None:
         find_input(tmp_path / "photographs" / "1.jpg")
 
 
+@pytest.mark.parametrize("name", ["", "meta.json"])
+def test_an_unpacked_sog_is_told_to_be_packed(tmp_path: Path, name: str) -> None:
+    for file in ("meta.json", "means_l.webp"):
+        (tmp_path / file).write_bytes(b"{}")
+    with pytest.raises(InputError, match=r"unpacked.*\n.*zip -0") as caught:
+        find_input(tmp_path / name)
+    assert f"{tmp_path.name}.sog" in str(caught.value)
+
+
 def front_of(path: Path) -> list[float] | None:
     """The front that the shot for a mesh names."""
     made = load_shot(made_shot(path, path.parent / path.stem)).front
