@@ -48,6 +48,8 @@ Work = dict[str, dict[str, float]]
 
 _SLOWEST = 4.0
 """Times as slow, or as fast, as planned that a run is taken to be, at most."""
+_TRUST = 0.1
+"""Share of a whole plan that is taken to have been kept before a run has begun."""
 
 
 def seconds_left(
@@ -79,8 +81,12 @@ def seconds_left(
     if any(planned[name] is None for name in [current, *later] if name in planned):
         return None
 
+    # a short stage that was slow says little of a long one
+    sure = _TRUST * sum(seconds or 0.0 for seconds in planned.values())
+
     def pace() -> float:
-        return min(max(took / guess, 1.0 / _SLOWEST), _SLOWEST) if guess > 0.0 else 1.0
+        ratio = (took + sure) / (guess + sure) if guess + sure > 0.0 else 1.0
+        return min(max(ratio, 1.0 / _SLOWEST), _SLOWEST)
 
     whole = float(planned.get(current) or 0.0)
     wanted = pace() * whole

@@ -122,13 +122,14 @@ def run_in(
             foreseen = foresee_run(context, plan=plan)
 
     done: dict[str, float] = {}  # shares of the stages
+    begun = start
 
     def left() -> str:
         if foreseen is None or not store.results:
             return ""
         at = store.results[-1].name
         ended = {one.name: one.seconds for one in store.results[:-1] if not one.resumed}
-        elapsed = max(time.perf_counter() - start - sum(ended.values()), 0.0)
+        elapsed = max(time.perf_counter() - begun - sum(ended.values()), 0.0)
         planned = {name: row["seconds"] for name, row in foreseen.plan["stages"].items()}
         seconds = seconds_left(planned, ended, at, elapsed, done.get(at, 0.0))
         return "" if seconds is None else f"about {seconds:.0f} s left"
@@ -152,6 +153,7 @@ def run_in(
         ):
             context.reporter = watched(context.reporter)
             foreseen = foresee_run(context, plan=plan)
+            begun = time.perf_counter()
             run_stages(context, settle)
         if after is not None:
             record.values.update(after(context))

@@ -210,8 +210,11 @@ PLANNED = {"fill": 10.0, "simulate": 100.0, "render": 20.0}
 
 def test_time_left_is_the_plan_at_the_pace_of_the_run() -> None:
     assert seconds_left(PLANNED, {}, "fill", 0.0, 0.0) == pytest.approx(130.0)
-    # what took twice its time makes all that follows be expected to
-    assert seconds_left(PLANNED, {"fill": 20.0}, "simulate", 0.0, 0.0) == pytest.approx(240.0)
+    # what took twice its time makes more be expected of all that follows, a short stage by less
+    slow = seconds_left(PLANNED, {"fill": 20.0}, "simulate", 0.0, 0.0)
+    assert slow is not None and 150.0 < slow < 240.0
+    late = seconds_left(PLANNED, {"fill": 20.0, "simulate": 200.0}, "render", 0.0, 0.0)
+    assert late is not None and 35.0 < late < 40.0
     # on plan, half of the work is half of the time
     assert seconds_left(PLANNED, {"fill": 10.0}, "simulate", 50.0, 0.5) == pytest.approx(70.0)
     # a stage that is late is never said to be over
