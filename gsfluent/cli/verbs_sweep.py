@@ -31,7 +31,7 @@ class Sweep(Verb):
     sweep: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SWEEP.yaml")]
     """The sweep file; or a shot file, with --vary or --seeds."""
     out: Out
-    """Folder for the results; made when missing."""
+    """Folder for the results, made when missing; or s3://BUCKET/PLACE (extra `s3`)."""
     vary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=A,B,C")] = ()
     """Of a shot: keys by their path and the values they take; all combinations are run."""
     seeds: int | None = None
@@ -87,7 +87,7 @@ class Dataset(Verb):
     """
 
     sweep: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SWEEP")]
-    """Folder that `gsfluent sweep` wrote."""
+    """Folder that `gsfluent sweep` wrote; from s3://BUCKET/PLACE shots are brought to OUT/sweep."""
     out: Out
     """Folder of the data set; made when missing."""
     format: tuple[Literal["webdataset", "huggingface"], ...] = ("webdataset",)
@@ -100,11 +100,16 @@ class Dataset(Verb):
     def execute(self) -> dict[str, Any]:
         """Make the samples and pack them."""
         from gsfluent.dataset.write import write_dataset
+        from gsfluent.sweep.bucket import fetch, is_store
 
-        existing(self.sweep, "SWEEP", folder=True)
+        sweep = self.sweep
+        if is_store(sweep):
+            with self.progress("brought here") as progress:
+                sweep = fetch(sweep, self.out / "sweep", progress=progress).root
+        existing(sweep, "SWEEP", folder=True)
         with self.progress("samples") as progress:
             return write_dataset(
-                self.sweep, self.out, self.format, device=self.torch_device(), shares=self.shares,
+                sweep, self.out, self.format, device=self.torch_device(), shares=self.shares,
                 jobs=self.jobs, progress=progress,
             )  # fmt: skip
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent.errors import GsfluentError
-from gsfluent.sweep.claims import claimed
-from gsfluent.sweep.folder import LOG, SweepFolder, last_lines
+from gsfluent.sweep.bucket import opened
+from gsfluent.sweep.folder import LOG, last_lines
 
 DONE, HELD, FAILED = "done", "held", "failed"
 """How a try ends: the task is done, another is at work on it, or it went wrong and is noted."""
@@ -27,11 +27,11 @@ Function = Callable[[Any, Path], Any]
 _PASSING = (errno.EAGAIN, errno.EIO, errno.ENOMEM, errno.ESTALE, errno.ETIMEDOUT)
 
 
-def attempt(root: Path, name: str, function: Function, item: Any) -> str:
+def attempt(root: str | Path, name: str, function: Function, item: Any) -> str:
     """Try a task, unless it is done or somebody else's.
 
     Args:
-        root: Folder of the sweep.
+        root: Folder of the sweep, or its store.
         name: Of the task.
         function: What it does.
         item: Given to it.
@@ -42,8 +42,8 @@ def attempt(root: Path, name: str, function: Function, item: Any) -> str:
     Raises:
         OSError: Not even the failure could be written down.
     """
-    place = SweepFolder(root)
-    with claimed(place.claim(name)) as ours:
+    place = opened(root)
+    with place.held(name) as ours:
         # after the claim: whoever held it before may have finished
         if place.is_done(name):
             return DONE

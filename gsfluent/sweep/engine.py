@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from gsfluent.errors import InputError, RunError
 from gsfluent.progress import Progress, report_progress
 from gsfluent.sweep.attempt import DONE, FAILED, Function
-from gsfluent.sweep.claims import is_stale
+from gsfluent.sweep.bucket import opened
 from gsfluent.sweep.folder import SweepFolder
 from gsfluent.sweep.pool import LocalPool
 
@@ -49,7 +49,7 @@ class Outcome:
     """What became of a task."""
 
     id: str  # Its name
-    folder: Path | None  # Its files; None for one that failed
+    folder: Path | None  # Its files; None for one that failed, or whose files a store has
     value: Any = None  # What the function returned
     tries: int = 0  # How many it took
     failure: dict[str, Any] | None = None  # Of the last try of one that failed
@@ -79,7 +79,8 @@ def map(
         function: ``function(item, folder)``, at the top of a module. It writes its files into the
             folder and returns what JSON can hold.
         items: What it is called with; whatever can be pickled.
-        folder: Where the results go: ``shots/ID``.
+        folder: Where the results go: ``shots/ID``. Or ``s3://BUCKET/PLACE`` (extra ``s3``), whose
+            files :func:`gsfluent.sweep.fetch` brings here.
         ids: Names of the items, letters, digits, ``_`` and ``-``; digests of function and item
             when absent.
         jobs: Calls at a time; one per core when absent, of a Ray cluster for all of its cores.
@@ -100,7 +101,7 @@ def map(
         RunError: Nothing can be started or written.
         KeyboardInterrupt: With what is kept.
     """
-    items, place = list(items), SweepFolder(Path(folder).absolute())
+    items, place = list(items), opened(folder)
     names = _names(function, items, ids)
     for key, value in (("jobs", jobs), ("tries", tries), ("threads", threads)):
         if value is not None and value < 1:
@@ -111,13 +112,13 @@ def map(
     work = _Work(place, dict(zip(names, items, strict=True)), tries, progress)
     work.sort(retry=retry)
     if work.waiting:
-        engine = _engine(on, place.root, function, jobs=jobs, minutes=minutes, threads=threads)
+        engine = _engine(on, place.address, function, jobs=jobs, minutes=minutes, threads=threads)
         try:
             work.through(engine)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(
                 f"{str(stop) or 'interrupted by Ctrl-C'}\n  kept: {work.done} of {len(names)} in "
-                f"{place.shots}\n  resume: run the same command again"
+                f"{place.address}\n  resume: run the same command again"
             ) from stop
         finally:
             engine.close()
@@ -193,14 +194,13 @@ class _Work:
 
     def outcomes(self) -> list[Outcome]:
         """One per task, in their order."""
-        return [self._outcome(name) for name in self.items]
+        rows = self.place.rows([name for name in self.items if name not in self.failed])
+        return [self._outcome(name, rows.get(name, {})) for name in self.items]
 
-    def _outcome(self, name: str) -> Outcome:
+    def _outcome(self, name: str, row: dict[str, Any]) -> Outcome:
         if records := self.failed.get(name):
             return Outcome(name, None, tries=len(records), failure=records[-1])
-        row = self.place.row(name) or {}
-        folder = self.place.shots / name
-        return Outcome(name, folder, row.get("value"), int(row.get("tries", 1)))
+        return Outcome(name, self.place.files(name), row.get("value"), int(row.get("tries", 1)))
 
     def _final(self, records: list[dict[str, Any]]) -> bool:
         return len(records) >= self.tries or any(not record["again"] for record in records)
@@ -229,16 +229,12 @@ class _Work:
 
     def _look_at_held(self) -> None:
         """See what the others have made of what they hold."""
-        clock = self.place.root / "claims" / f".clock.{os.getpid()}"
-        clock.touch()
-        now = clock.stat().st_mtime
-        clock.unlink()
         for name in sorted(self.held):
             if self._found(name):
                 self.held.discard(name)
-            elif is_stale(self.place.claim(name), now):
-                self.held.discard(name)
-                self.waiting.append(name)
+        for name in self.place.abandoned(sorted(self.held)):
+            self.held.discard(name)
+            self.waiting.append(name)
 
     def _tell(self) -> None:
         left = len(self.items) - self.done - len(self.failed)
@@ -286,7 +282,7 @@ def _names(function: Function, items: Sequence[Any], ids: Sequence[str] | None) 
 
 def _engine(
     on: str,
-    root: Path,
+    root: str | Path,
     function: Function,
     *,
     jobs: int | None,

@@ -21,7 +21,8 @@ from typing import Any
 
 from gsfluent.errors import InputError, RunError
 from gsfluent.sweep.attempt import FAILED, Function, attempt
-from gsfluent.sweep.folder import SweepFolder, last_lines
+from gsfluent.sweep.bucket import opened
+from gsfluent.sweep.folder import last_lines
 
 _PATIENCE = 20.0  # seconds in which a stopped task may put down what it has
 _BROKEN = "broken"  # a try that could not even note its failure
@@ -41,7 +42,7 @@ class LocalPool:
     """Tries tasks in processes of this machine, each with threads of its own.
 
     Args:
-        root: Folder of the sweep.
+        root: Folder of the sweep, or its store.
         function: What a task does; importable by name, since processes are spawned.
         jobs: Tasks at a time.
         minutes: Longest time of a try; None for any.
@@ -52,8 +53,9 @@ class LocalPool:
     """
 
     def __init__(
-        self, root: Path, function: Function, *, jobs: int, minutes: float | None, threads: int = 1
-    ) -> None:
+        self, root: str | Path, function: Function, *, jobs: int, minutes: float | None,
+        threads: int = 1,
+    ) -> None:  # fmt: skip
         try:
             pickle.dumps(function)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -61,7 +63,7 @@ class LocalPool:
                 f"sweep: {function!r} cannot be sent to another process ({error})",
                 "give a function that stands at the top of a module",
             ) from error
-        self._place, self._function, self._jobs = SweepFolder(root), function, jobs
+        self._place, self._function, self._jobs = opened(root), function, jobs
         self._seconds = None if minutes is None else 60.0 * minutes
         self._threads = threads
         self._workers: list[_Worker] = []
@@ -116,7 +118,7 @@ class LocalPool:
                 state, words = worker.pipe.recv()
                 if state == _BROKEN:
                     raise RunError(
-                        f"{worker.task}: {words}", f"what is in {self._place.root}",
+                        f"{worker.task}: {words}", f"what is in {self._place.address}",
                         "free space, then run the same command again",
                     )  # fmt: skip
                 if state:
@@ -139,7 +141,8 @@ class LocalPool:
             self._stillborn += 1
             if self._stillborn > 3 + self._jobs:
                 raise RunError(
-                    "sweep: processes end as soon as they start", f"what is in {self._place.root}",
+                    "sweep: processes end as soon as they start",
+                    f"what is in {self._place.address}",
                     "a script that calls gsfluent.sweep.map needs `if __name__ == '__main__':`",
                 )  # fmt: skip
             return ""
@@ -153,7 +156,7 @@ class LocalPool:
         left = self._place.tries(worker.task, worker.process.pid)
         log = last_lines(left[0]) if left else []
         self._place.fail(worker.task, {"kind": kind, "message": said, "again": again, "log": log})
-        self._place.claim(worker.task).unlink(missing_ok=True)
+        self._place.free(worker.task)
         if not again:
             for folder in left:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -162,7 +165,7 @@ class LocalPool:
     def _spawn(self) -> _Worker:
         ours, theirs = _SPAWN.Pipe()
         process = _SPAWN.Process(
-            target=_serve, args=(theirs, self._place.root, self._function), daemon=True
+            target=_serve, args=(theirs, self._place.address, self._function), daemon=True
         )
         with _threads(self._threads):
             process.start()
@@ -193,7 +196,7 @@ def _signal(number: int) -> str:
         return f"signal {number}"
 
 
-def _serve(pipe: Connection, root: Path, function: Function) -> None:
+def _serve(pipe: Connection, root: str | Path, function: Function) -> None:
     """Try the tasks that come, until one fails or nobody is there any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the driver says what to do
     signal.signal(signal.SIGTERM, _stop)

@@ -20,7 +20,9 @@ from gsfluent.plan.plan import plan_shot
 from gsfluent.progress import Reporter
 from gsfluent.run.shot import run_shot
 from gsfluent.stages.solids import context_of, make_solids
+from gsfluent.sweep.bucket import SweepBucket, opened
 from gsfluent.sweep.engine import Outcome, map
+from gsfluent.sweep.folder import SweepFolder
 from gsfluent.sweep.table import write_sheet, write_table
 from gsfluent.sweep.tasks import Sweep, Task, tasks_of
 
@@ -32,7 +34,7 @@ REFUSED = "refused"
 
 def run_sweep(
     sweep: Sweep,
-    out: Path,
+    out: str | Path,
     *,
     device: torch.device,
     seed: int = 0,
@@ -45,7 +47,8 @@ def run_sweep(
 
     Args:
         sweep: What differs.
-        out: Folder of the results; made when missing.
+        out: Folder of the results, made when missing. Or ``s3://BUCKET/PLACE`` for shots, table
+            and failures; solids are then made once on every machine, and stay there.
         device: Where the work is done.
         seed: Of the draws, of the solids, and of shots that have none of their own.
         jobs: Shots at a time; as many as there are cores for when absent.
@@ -60,23 +63,27 @@ def run_sweep(
         InputError: A shot cannot be; nothing has begun.
         KeyboardInterrupt: With what is kept.
     """
-    tasks = tasks_of(sweep, out, device=str(device), seed=seed, progress=reporter.task("look"))
+    place = opened(out)
+    tasks = tasks_of(
+        sweep, place.root, device=str(device), seed=seed, progress=reporter.task("look")
+    )
+    place.make()
     each = sweep.each
     if jobs is None and not on.startswith("ray"):  # which knows the processors of its machines
         jobs = max((os.cpu_count() or 1) // each.cpus, 1)
     settings: dict[str, Any] = {"jobs": jobs, "threads": each.cpus, "on": on, "retry": retry}
-    open_ = [task for task in tasks if not (out / "shots" / task.id).exists()]
-    first = {task.solids: task for task in open_}
+    done = place.done()
+    first = {task.solids: task for task in tasks if task.id not in done}
     # before all others, so that none of them waits for what another makes
     map(
-        make_shared_solids, first.values(), out / "solids", ids=list(first),
+        make_shared_solids, first.values(), f"{place.address}/solids", ids=list(first),
         tries=each.tries, progress=reporter.task("solids"), **settings,
     )  # fmt: skip
     outcomes = map(
-        run_task, tasks, out, ids=[task.id for task in tasks], tries=each.tries,
+        run_task, tasks, place.address, ids=[task.id for task in tasks], tries=each.tries,
         minutes=each.minutes, progress=reporter.task("shots"), **settings,
     )  # fmt: skip
-    return _summary(out, tasks, outcomes)
+    return _summary(place, tasks, outcomes)
 
 
 def make_shared_solids(task: Task, folder: Path) -> dict[str, Any]:
@@ -153,14 +160,19 @@ def figures_of(record: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _summary(out: Path, tasks: list[Task], outcomes: list[Outcome]) -> dict[str, Any]:
+def _summary(place: SweepFolder, tasks: list[Task], outcomes: list[Outcome]) -> dict[str, Any]:
     """Write table, sheet and failures; say what came out."""
+    out = place.root
     failures = [outcome.failure for outcome in outcomes if outcome.failure is not None]
     with atomic_path(out / "failures.jsonl") as part:
         part.write_text("".join(json.dumps(failure) + "\n" for failure in failures))
     done = [outcome for outcome in outcomes if outcome.failure is None]
     tables = write_table(out, done)
-    sheet = write_sheet(out, done, failures)
+    sheet = {}
+    if isinstance(place, SweepBucket):
+        place.leave([*tables, out / "failures.jsonl"])
+    else:  # a page needs its pictures beside it
+        sheet = {"sheet": str(write_sheet(out, done, failures))}
     verdicts = Counter(str(outcome.value["verdict"]) for outcome in done)
     for failure in failures[:5]:
         _log.warning("%s failed: %s", failure["id"], str(failure["message"]).splitlines()[0])
@@ -170,15 +182,15 @@ def _summary(out: Path, tasks: list[Task], outcomes: list[Outcome]) -> dict[str,
         "solids": len({task.solids for task in tasks}),
         "verdicts": dict(verdicts),
         "failed": len(failures),
-        "out": str(out),
-        "tables": [str(path) for path in tables],
-        "sheet": str(sheet),
-        "failures": str(out / "failures.jsonl"),
+        "out": str(place.address),
+        "tables": [f"{place.address}/{path.name}" for path in tables],
+        **sheet,
+        "failures": f"{place.address}/failures.jsonl",
     }
 
 
 def plan_sweep(
-    sweep: Sweep, out: Path, *, device: torch.device, seed: int = 0, jobs: int | None = None
+    sweep: Sweep, out: str | Path, *, device: torch.device, seed: int = 0, jobs: int | None = None
 ) -> dict[str, Any]:
     """What a sweep will cost, by the plans of a few of its shots.
 
@@ -189,9 +201,11 @@ def plan_sweep(
     Raises:
         InputError: A shot cannot be.
     """
-    tasks = tasks_of(sweep, out, device=str(device), seed=seed)
+    place = opened(out)
+    tasks = tasks_of(sweep, place.root, device=str(device), seed=seed)
     jobs = jobs or max((os.cpu_count() or 1) // sweep.each.cpus, 1)
-    left = [task for task in tasks if not (out / "shots" / task.id).exists()]
+    done = place.done()
+    left = [task for task in tasks if task.id not in done]
     some = left[:: max(len(left) // _PLANNED, 1)][:_PLANNED]
     model = CostModel.load(device)
     plans = [plan_shot(task.shot(), device=device, seed=task.seed, model=model) for task in some]
