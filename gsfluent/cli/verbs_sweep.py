@@ -41,6 +41,8 @@ class Sweep(Verb):
     on: On = "local"
     """Where shots run: processes of this machine, jobs of a SLURM cluster (extra `slurm`), or a Ray
     cluster that runs already (extra `ray`)."""
+    pack: int | None = None
+    """Shots that share a GPU; by the memory that one takes when absent."""
     keep: Literal["all", "film"] | None = None
     """What stays of a shot: all, or film and figures without the frames."""
     minutes: float | None = None
@@ -63,6 +65,10 @@ class Sweep(Verb):
             sweep = replace(sweep, keep=self.keep)
         if self.minutes is not None:
             sweep = replace(sweep, each=replace(sweep.each, minutes=self.minutes))
+        if self.pack is not None:
+            if self.pack < 1:
+                raise InputError(f"--pack {self.pack}", "give at least 1")
+            sweep = replace(sweep, each=replace(sweep.each, gpu=1.0 / self.pack))
         device = self.torch_device()
         if self.plan:
             return plan_sweep(sweep, self.out, device=device, seed=self.seed, jobs=self.jobs)

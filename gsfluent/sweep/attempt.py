@@ -69,8 +69,15 @@ def is_passing(error: BaseException) -> bool:
         return True
     if error.__cause__ is not None and is_passing(error.__cause__):
         return True
-    memory = type(error).__name__ == "OutOfMemoryError"  # torch's, which costs its import to name
-    return memory or isinstance(error, MemoryError | ConnectionError | TimeoutError)
+    return wants_memory(error) or isinstance(error, ConnectionError | TimeoutError)
+
+
+def wants_memory(error: BaseException) -> bool:
+    """Whether an error, or what it comes from, is of memory: of the machine or of its GPU."""
+    name = type(error).__name__  # torch's class costs its import to name
+    if name == "OutOfMemoryError" or isinstance(error, MemoryError):
+        return True
+    return error.__cause__ is not None and wants_memory(error.__cause__)
 
 
 def _record(error: Exception, folder: Path) -> dict[str, Any]:
@@ -81,6 +88,7 @@ def _record(error: Exception, folder: Path) -> dict[str, Any]:
         "kind": type(error).__name__,
         "message": str(error),
         "again": is_passing(error),
+        "memory": wants_memory(error),
         "log": [line.rstrip() for line in said],
     }
 

@@ -67,6 +67,7 @@ def map(
     minutes: float | None = None,
     retry: bool = False,
     on: str = "local",
+    gpu: float = 0.0,
     progress: Progress | None = None,
 ) -> list[Outcome]:
     """Call a function for every item, in many processes, so that each call counts once.
@@ -91,6 +92,9 @@ def map(
         retry: Try again what has failed finally.
         on: ``local``; ``slurm``: a job of the cluster for every call (extra ``slurm``); ``ray`` or
             ``ray=HOST:PORT``: a Ray cluster that runs (extra ``ray``).
+        gpu: Part of a GPU that a call takes, at most 1; 0 for none. Calls share a GPU, each within
+            its part of the memory; one that wants more is tried again on a whole one. A SLURM job
+            has a whole one.
         progress: Called with (done, total, note), about once a second.
 
     Returns:
@@ -108,11 +112,18 @@ def map(
             raise InputError(f"sweep: {key} is {value}", "give at least 1")
     if minutes is not None and not minutes > 0:
         raise InputError(f"sweep: minutes is {minutes}", "give a time above 0, or none")
+    if not 0.0 <= gpu <= 1.0:
+        raise InputError(f"sweep: gpu is {gpu}", "give the part of one that a call takes, 0 to 1")
     place.make()
     work = _Work(place, dict(zip(names, items, strict=True)), tries, progress)
     work.sort(retry=retry)
-    if work.waiting:
-        engine = _engine(on, place.address, function, jobs=jobs, minutes=minutes, threads=threads)
+    for part in (gpu, 1.0):  # on a whole GPU what found too little memory on a part of one
+        if not work.waiting:
+            break
+        engine = _engine(
+            on, place.address, function, jobs=jobs, minutes=minutes, threads=threads, gpu=part
+        )
+        work.packed = 0.0 < part < 1.0
         try:
             work.through(engine)
         except KeyboardInterrupt as stop:
@@ -123,6 +134,7 @@ def map(
         finally:
             engine.close()
             place.tidy()
+        work.waiting.extend(work.crowded)
     return work.outcomes()
 
 
@@ -156,6 +168,8 @@ class _Work:
         self.place, self.items, self.tries, self.progress = place, items, tries, progress
         self.waiting: collections.deque[str] = collections.deque()
         self.held: set[str] = set()  # somebody else is at work on them
+        self.packed = False  # whether several share a GPU
+        self.crowded: list[str] = []  # they wait for a GPU of their own
         self.failed: dict[str, list[dict[str, Any]]] = {}
         self.done = 0
         self._began, self._before = time.monotonic(), 0
@@ -221,7 +235,9 @@ class _Work:
             self.done += 1
         elif state == FAILED:
             if not self._found(name):
-                self.waiting.append(name)
+                last = self.place.failures(name)[name][-1]
+                crowded = self.packed and last.get("memory")
+                (self.crowded if crowded else self.waiting).append(name)
         elif state:
             self.held.add(name)
         else:
@@ -288,6 +304,7 @@ def _engine(
     jobs: int | None,
     minutes: float | None,
     threads: int,
+    gpu: float,
 ) -> Engine:
     """What places the tasks.
 
@@ -299,13 +316,14 @@ def _engine(
         from gsfluent.sweep.ray_pool import RayPool
 
         return RayPool(
-            root, function, jobs=jobs, minutes=minutes, threads=threads, address=address or "auto"
-        )
+            root, function, jobs=jobs, minutes=minutes, threads=threads, gpu=gpu,
+            address=address or "auto",
+        )  # fmt: skip
     jobs = jobs or os.cpu_count() or 1
     if on == "local":
-        return LocalPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
+        return LocalPool(root, function, jobs=jobs, minutes=minutes, threads=threads, gpu=gpu)
     if on == "slurm":
         from gsfluent.sweep.slurm import SlurmPool
 
-        return SlurmPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
+        return SlurmPool(root, function, jobs=jobs, minutes=minutes, threads=threads, gpu=gpu)
     raise InputError(f"--on {on}: no such engine", "give local, slurm, ray or ray=HOST:PORT")

@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Any
 
 from gsfluent.errors import InputError, RunError
+from gsfluent.hardware import bound_memory, graphics_cards
 from gsfluent.sweep.attempt import FAILED, Function, attempt
 from gsfluent.sweep.bucket import opened
 from gsfluent.sweep.folder import last_lines
@@ -33,6 +34,7 @@ _SPAWN = multiprocessing.get_context("spawn")  # torch's threads do not survive 
 class _Worker:
     process: Any
     pipe: Connection
+    card: str = ""  # Its GPU; empty where none is asked for
     task: str = ""  # Its task; empty while it has none
     since: float = 0.0  # When it got it
     ready: bool = False  # Whether it has said that it has begun with it
@@ -47,14 +49,16 @@ class LocalPool:
         jobs: Tasks at a time.
         minutes: Longest time of a try; None for any.
         threads: Threads of a process.
+        gpu: Part of a GPU that a process takes; 0 for none. As many as fit share one, each with a
+            bound on its memory.
 
     Raises:
-        InputError: The function cannot be sent to another process.
+        InputError: The function cannot be sent to another process, or there is no GPU.
     """
 
     def __init__(
         self, root: str | Path, function: Function, *, jobs: int, minutes: float | None,
-        threads: int = 1,
+        threads: int = 1, gpu: float = 0.0,
     ) -> None:  # fmt: skip
         try:
             pickle.dumps(function)
@@ -65,7 +69,12 @@ class LocalPool:
             ) from error
         self._place, self._function, self._jobs = opened(root), function, jobs
         self._seconds = None if minutes is None else 60.0 * minutes
-        self._threads = threads
+        self._threads, self._gpu = threads, gpu
+        self._cards = graphics_cards() if gpu else []
+        if gpu:
+            if not self._cards:
+                raise InputError("sweep: no GPU is visible here", "use a CPU, or another machine")
+            self._jobs = min(jobs, len(self._cards) * int(1.0 / gpu + 1e-6))
         self._workers: list[_Worker] = []
         self._stillborn = 0
 
@@ -165,28 +174,33 @@ class LocalPool:
     def _spawn(self) -> _Worker:
         ours, theirs = _SPAWN.Pipe()
         process = _SPAWN.Process(
-            target=_serve, args=(theirs, self._place.address, self._function), daemon=True
-        )
-        with _threads(self._threads):
+            target=_serve, args=(theirs, self._place.address, self._function, self._gpu),
+            daemon=True,
+        )  # fmt: skip
+        taken = [worker.card for worker in self._workers]
+        card = min(self._cards, key=taken.count, default="")
+        variables = {"OMP_NUM_THREADS": str(self._threads)}
+        with environment(variables | ({"CUDA_VISIBLE_DEVICES": card} if card else {})):
             process.start()
         theirs.close()
-        worker = _Worker(process, ours)
+        worker = _Worker(process, ours, card)
         self._workers.append(worker)
         return worker
 
 
 @contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """The number of threads of processes that start meanwhile: read when they import torch."""
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = str(count)
+def environment(variables: dict[str, str]) -> Iterator[None]:
+    """Variables of processes that start meanwhile, which read them when they import torch."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _signal(number: int) -> str:
@@ -196,13 +210,15 @@ def _signal(number: int) -> str:
         return f"signal {number}"
 
 
-def _serve(pipe: Connection, root: str | Path, function: Function) -> None:
+def _serve(pipe: Connection, root: str | Path, function: Function, gpu: float) -> None:
     """Try the tasks that come, until one fails or nobody is there any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the driver says what to do
     signal.signal(signal.SIGTERM, _stop)
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+        if 0.0 < gpu < 1.0:
+            bound_memory(gpu)
         while True:
             name, item = pipe.recv()
             pipe.send(("", ""))

@@ -70,7 +70,7 @@ class RayPool:
                 "lower `each:` of the sweep, or add machines",
             )
         self._place, self._function, self._most = opened(root), function, jobs or sum(fits)
-        self._minutes, self._threads = minutes, threads
+        self._minutes, self._threads, self._gpu = minutes, threads, gpu
         self._refs: dict[Any, str] = {}
         # what dies is tried again by the rules of the sweep, not by Ray's
         self._try = ray.remote(
@@ -83,7 +83,7 @@ class RayPool:
 
     def start(self, name: str, item: Any) -> None:
         """Hand out a task."""
-        settings = {"minutes": self._minutes, "threads": self._threads}
+        settings = {"minutes": self._minutes, "threads": self._threads, "gpu": self._gpu}
         ref = self._try.remote(self._place.address, name, self._function, item, settings)
         self._refs[ref] = name
 

@@ -26,6 +26,7 @@ class SlurmPool:
         jobs: Jobs queued or running at a time.
         minutes: Longest time of a task; a day when None.
         threads: Processors of a job.
+        gpu: Above 0 for jobs that need a GPU: each has one of its own.
         cluster: ``slurm``, or ``local`` for submitit's stand-in on this machine.
 
     Raises:
@@ -35,7 +36,7 @@ class SlurmPool:
 
     def __init__(
         self, root: str | Path, function: Function, *, jobs: int, minutes: float | None,
-        threads: int, cluster: str = "slurm",
+        threads: int, gpu: float = 0.0, cluster: str = "slurm",
     ) -> None:  # fmt: skip
         submitit = need("submitit", "slurm", "--on slurm")
         if cluster == "slurm" and shutil.which("sbatch") is None:
@@ -49,8 +50,9 @@ class SlurmPool:
         self._executor = submitit.AutoExecutor(folder=place / "slurm" / "%j", cluster=cluster)
         limit = math.ceil(minutes or _LONGEST)
         self._executor.update_parameters(
-            name="gsfluent", timeout_min=limit, cpus_per_task=threads, tasks_per_node=1
-        )
+            name="gsfluent", timeout_min=limit, cpus_per_task=threads, tasks_per_node=1,
+            **({"gpus_per_node": 1} if gpu else {}),
+        )  # fmt: skip
 
     def room(self) -> int:
         """How many tasks may be started now."""
