@@ -15,11 +15,12 @@ from torch import Tensor
 from gsfluent._check import check_tensor
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.plasticity import SLOW_UNLOADING, return_mapping, weakened
+from gsfluent.ops.relaxation import maxwell_step
 from gsfluent.ops.solver_buffers import INDEX
 
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
-MORE_LAWS, DAMAGE_FIELD = 3, 4
+MORE_LAWS, DAMAGE_FIELD, RELAXING = 3, 4, 5
 """Sets of laws that have kernels on the CPU only: ``LawSet`` of ``csrc/core/solver/particle.h``."""
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
@@ -355,6 +356,13 @@ class SolverState:
         return self._restored(self._rowwise("deformation")).view(-1, 3, 3)
 
     @property
+    def maxwell(self) -> Tensor | None:
+        """Maxwell branches, [N, 8], or None where nothing relaxes."""
+        if self._buffers.maxwell.numel() == 0:
+            return None
+        return self._restored(self._buffers.maxwell)
+
+    @property
     def stress(self) -> Tensor:
         """Kirchhoff stress of the present state [Pa], [N, 6]; of a liquid without its viscous part.
 
@@ -373,6 +381,12 @@ class SolverState:
             material=material, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
             dt=1e-9,  # of a step without motion: what flows with a viscosity stays
         )  # fmt: skip
+        if b.maxwell.numel():
+            none = strain.new_zeros(self.count, 3, 3)
+            _, stress = maxwell_step(
+                b.maxwell, strain, none, stress, law=b.law, params=b.rows[:, :8].contiguous(),
+                material=row, dt=0.0,
+            )  # fmt: skip
         return self._restored(stress)
 
     @property
