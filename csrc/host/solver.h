@@ -6,7 +6,7 @@
 #include <cstring>
 
 #include "core/collider/collider.h"
-#include "core/material/relaxation.h"
+#include "core/material/viscous.h"
 #include "core/solver/state.h"
 #include "torch_api.h"
 
@@ -58,7 +58,7 @@ enum SolverBuffer : int {
   kParent,
   kCut,
   kContactRadius,
-  kMaxwell,
+  kViscous,
   kSolverBuffers
 };
 
@@ -157,7 +157,7 @@ struct SolverOps {
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
         {"radius", n, 1, real, true},
-        {"maxwell", device ? 0 : n, kMaxwellColumns, real, true},
+        {"viscous", device ? 0 : n, kViscousColumns, real, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -236,7 +236,7 @@ struct SolverOps {
     s.parent = int_at(kParent);
     s.cut = int_at(kCut);
     s.radius = real_at(kContactRadius);
-    s.maxwell = real_at(kMaxwell);
+    s.viscous = real_at(kViscous);
     return s;
   }
 

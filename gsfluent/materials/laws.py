@@ -52,13 +52,14 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "length": (0.0, math.inf, "m"),
     "relaxation_share": (0.0, 0.99, "no unit"),
     "relaxation_time": (0.0, math.inf, "s"),
+    "yield_time": (0.0, math.inf, "s"),
 }
 """Parameter -> lowest value, highest value, unit."""
 
 POSITIVE = (
     "young_modulus", "density", "grain", "bulk_modulus", "reference_volume", "softening",
     "tensile_strength", "compressive_strength", "fracture_energy", "toughness", "length",
-    "relaxation_time",
+    "relaxation_time", "yield_time",
 )  # fmt: skip
 """Parameters that must be above their lowest value."""
 
@@ -98,6 +99,7 @@ READS: dict[str, tuple[str, ...]] = {
         "shear_damage",
         *HANDBOOK,
         *RELAXATION,
+        "yield_time",
     ),
     "drucker_prager": (*_SOLID, "friction_angle", "cohesion_pressure"),
     "von_mises": (*_SOLID, "yield_stress", "hardening_modulus", "plastic_viscosity"),
@@ -118,10 +120,10 @@ READS: dict[str, tuple[str, ...]] = {
 
 OPTIONAL = {
     "elastic": RELAXATION,
-    "nacc": RELAXATION,
+    "nacc": (*RELAXATION, "yield_time"),
     "phase_field": ("length", "tensile_strength"),
 }
-"""Law -> parameters that may be left out: the grid finds them, or there is no relaxation."""
+"""Law -> parameters that may be left out: the grid finds them, or it is not viscous."""
 
 DEFAULTS: dict[str, dict[str, float]] = {
     "nacc": {

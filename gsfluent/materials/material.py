@@ -112,6 +112,8 @@ class Material:
             g of a Prony series; what young_modulus says is the stiffness at once.
         relaxation_time: elastic, nacc: time in which that share falls to 1/e [s], of the real
             thing: a softened one takes longer, as its landing does.
+        yield_time: nacc: time that a yield takes [s], likewise (Duvaut and Lions): what is strained
+            fast holds more, by the stiffness times rate times this.
         variation: nacc, phase_field: relative scatter of strength in space (standard deviation of
             a smooth random factor on it); natural solids have weak and strong places, and that
             decides where cracks run and how many pieces survive a harder landing.
@@ -177,6 +179,7 @@ class Material:
     ogden_alpha3: Field | None = None
     relaxation_share: Field | None = None
     relaxation_time: Field | None = None
+    yield_time: Field | None = None
     variation: float = 0.0
     grain: float = 0.025
     weibull_modulus: float = 0.0
@@ -411,19 +414,27 @@ class Material:
             row[..., 7] += row[..., 7] > 0.0
         return row
 
-    def relaxation(self, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
-        """Share of the stiffness that relaxes and the rate 1 / tau [1/s], [..., 2], float64.
+    @property
+    def viscous(self) -> bool:
+        """Whether it relaxes, or yields in its own time."""
+        return self.relaxation_share is not None or self.yield_time is not None
 
-        A softened material relaxes slower by the root of its softening, as waves in it are.
+    def viscosities(self, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
+        """Share of the stiffness that relaxes, rate 1 / tau [1/s], time of a yield [s], [..., 3].
+
+        A softened material takes longer by the root of its softening, as its waves do. Float64.
 
         Args:
             sample: As in :meth:`parameters`.
         """
-        at = sample or _tensor
-        if self.relaxation_share is None or self.relaxation_time is None:
-            return torch.stack([at(0.0), at(0.0)], dim=-1)
-        rate = 1.0 / (self.softening**0.5 * at(self.relaxation_time))
-        return torch.stack(torch.broadcast_tensors(at(self.relaxation_share), rate), dim=-1)
+        at, slower = sample or _tensor, self.softening**0.5
+        share, tau, time = self.relaxation_share, self.relaxation_time, self.yield_time
+        columns = (
+            at(0.0) if share is None else at(share),
+            at(0.0) if tau is None else 1.0 / (slower * at(tau)),
+            at(0.0) if time is None else slower * at(time),
+        )
+        return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 
     def strengths(self, sample: Callable[[Field], Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Uniaxial strengths of the softened material in tension and compression [Pa], float64.

@@ -56,6 +56,7 @@ BASE: dict[str, Material] = {
 }  # fmt: skip
 RELAXES = {"relaxation_share": 0.5, "relaxation_time": 5e-3}
 BASE |= {f"{law} that relaxes": BASE[law].override(**RELAXES) for law in ("elastic", "nacc")}
+BASE["nacc that yields late"] = BASE["nacc"].override(yield_time=2e-3)
 CASES = [(law, field) for law, reads in READS.items() for field in reads]
 
 
@@ -100,11 +101,11 @@ def fall(material: Material) -> Tensor:
         colliders=torch.tensor([[0, 2, 0.4, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]]).double(),
         dt=4e-4,
     )
-    if material.relaxation_share is not None:  # a matter of the points
-        branch = torch.zeros(2 * count, 8, dtype=torch.float64)
-        branch[:count, 6:] = material.relaxation()
+    if material.viscous:  # a matter of the points
+        branch = torch.zeros(2 * count, 9, dtype=torch.float64)
+        branch[:count, 6:] = material.viscosities()
         kinds = {"law": scene["law"].int(), "volume": volume.double(), "alpha": alpha.double()}
-        solver = ops.Solver(torch.cat([cube, slab]), velocity, maxwell=branch, **scene | kinds)
+        solver = ops.Solver(torch.cat([cube, slab]), velocity, viscous=branch, **scene | kinds)
         solver.advance(110 * 4e-4)
         return solver.position[:count] / DX
     world = World(torch.cat([cube, slab]), velocity, **scene)
@@ -118,6 +119,8 @@ def base_of(law: str, field: str) -> str:
         return "phase_field by strength" if field == "tensile_strength" else law
     if field in RELAXES:
         return f"{law} that relaxes"
+    if field == "yield_time":
+        return "nacc that yields late"
     return "nacc by handbook" if field in materials.HANDBOOK else law
 
 

@@ -150,10 +150,10 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   }
   [[maybe_unused]] Sym3<P> spring;
   [[maybe_unused]] Int relaxes{};
-  if constexpr (kLaws == kRelaxing) {
+  if constexpr (kLaws == kViscousBrittle) {
     P four[8];
-    packet.load4(s.maxwell, kMaxwellColumns, 0, four);
-    packet.load4(s.maxwell, kMaxwellColumns, 4, four + 4);
+    packet.load4(s.viscous, kViscousColumns, 0, four);
+    packet.load4(s.viscous, kViscousColumns, 4, four + 4);
     relaxes = four[6] > P(0);
     spring = relaxed_strain(Sym3<P>{four[0], four[1], four[2], four[3], four[4], four[5]},
                             increment, half_decay(four[7], P(dt)));
@@ -206,12 +206,12 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         const int lane = __builtin_ctz(left);
         s.alpha[packet.index[lane]] = history[lane];
       }
-    if constexpr (kLaws == kRelaxing) {
+    if constexpr (kLaws == kViscousBrittle) {
       const uint32_t kept = done & mask_bits(relaxes);
       const P first[4] = {spring.xx, spring.yy, spring.zz, spring.xy};
       const P last[4] = {spring.zz, spring.xy, spring.xz, spring.yz};
-      packet.store4(first, s.maxwell, kMaxwellColumns, 0, kept);
-      packet.store4(last, s.maxwell, kMaxwellColumns, 2, kept);
+      packet.store4(first, s.viscous, kViscousColumns, 0, kept);
+      packet.store4(last, s.viscous, kViscousColumns, 2, kept);
     }
     if constexpr (kTrack) {
       Mat3<P> f;

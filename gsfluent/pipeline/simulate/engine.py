@@ -145,7 +145,7 @@ class Points(NamedTuple):
     alpha: Tensor
     peak: Tensor
     deformation: Tensor | None
-    maxwell: Tensor | None = None
+    viscous: Tensor | None = None
 
 
 class Engine(Protocol):

@@ -152,10 +152,10 @@ class Flight:
         if deformation is not None:
             deformation = (turn @ deformation).contiguous()
         strain = turn @ geometry.unpack_symmetric(like.strain) @ turn.T
-        branches = like.maxwell
-        if branches is not None:
-            spring = turn @ geometry.unpack_symmetric(branches[:, :6]) @ turn.T
-            branches = torch.cat([geometry.pack_symmetric(spring), branches[:, 6:]], dim=1)
+        viscous = like.viscous
+        if viscous is not None:
+            spring = turn @ geometry.unpack_symmetric(viscous[:, :6]) @ turn.T
+            viscous = torch.cat([geometry.pack_symmetric(spring), viscous[:, 6:]], dim=1)
         place = (center + arm).to(device)
         moved = like.replace(
             position=place.to(like.dtype),
@@ -163,7 +163,7 @@ class Flight:
             affine=gradient.to(like.affine).expand_as(like.affine).contiguous(),
             strain=geometry.pack_symmetric(strain),
             deformation=deformation,
-            maxwell=branches,
+            viscous=viscous,
         )
         return moved, place
 

@@ -69,7 +69,7 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
     known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
     if matter.has_field and (matter.law.is_cuda or not bool(torch.isin(matter.law, known).all())):
         return False  # not there yet
-    if matter.relaxes:
+    if matter.viscous:
         known = matter.law.new_tensor([LAWS["elastic"], LAWS["nacc"]])
         if matter.law.is_cuda or not bool(torch.isin(matter.law, known).all()):
             return False  # not there yet
@@ -134,7 +134,7 @@ class Resident:
         field = torch.unique(field, return_inverse=True)[1]
         law, params = matter.law, matter.params
         if not (
-            options.law_kernels or matter.has_field or matter.relaxes
+            options.law_kernels or matter.has_field or matter.viscous
         ):  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
             spare = params[:1].clone()
@@ -166,7 +166,7 @@ class Resident:
         """Rows of the faces of blades at work, after those of the colliders."""
         self._look(position.to(p.dtype))
         self._begin(Points(
-            position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation, p.maxwell
+            position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation, p.viscous
         ))  # fmt: skip
 
     def _begin(self, points: Points) -> None:
@@ -336,7 +336,7 @@ class Resident:
             s.alpha,
             s.peak,
             s.deformation,
-            s.maxwell,
+            s.viscous,
         )
 
 
