@@ -57,6 +57,7 @@ enum SolverBuffer : int {
   kParent,
   kCut,
   kContactRadius,
+  kObject,
   kSolverBuffers
 };
 
@@ -155,6 +156,7 @@ struct SolverOps {
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
         {"radius", n, 1, real, true},
+        {"object", ints[kFields], 1, i32, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -233,6 +235,7 @@ struct SolverOps {
     s.parent = int_at(kParent);
     s.cut = int_at(kCut);
     s.radius = real_at(kContactRadius);
+    s.object = int_at(kObject);
     return s;
   }
 

@@ -107,6 +107,9 @@ class Solver(SolverState):
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes. CPU only.
+        objects: Object of each field, int32 [K], with ``radius``: points of different objects push
+            each other (docs/theory/contact.md, "At a point"); fields of one object touch at nodes.
+            Default: all fields do.
         gravity: Acceleration [m/s^2].
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
@@ -151,6 +154,7 @@ class Solver(SolverState):
         parent: Tensor | None = None,
         cut: Tensor | None = None,
         radius: Tensor | None = None,
+        objects: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         colliders: Tensor | None = None,
         sdf: Tensor | None = None,
@@ -265,6 +269,14 @@ class Solver(SolverState):
         if deformation is not None:
             values["deformation"] = deformation.reshape(n, 9)
         self._load(position, values, row, body)
+        if objects is not None:
+            if radius is None:
+                raise InputError(
+                    f"{op}: objects push each other's points by their radius, which is missing",
+                    hint="give radius too, or leave out objects: fields then touch at nodes",
+                )
+            rows = check_tensor(op, "objects", objects, shape=(self.fields,), dtype=torch.int32)
+            b.object = rows.to(self.device).contiguous()
         if parent is not None or cut is not None:
             for name, given in (("parent", parent), ("cut", cut)):
                 rows = check_tensor(op, name, given, shape=(self.fields,), dtype=torch.int32)
