@@ -181,7 +181,10 @@ def test_walls_get_the_cells_that_they_want_within_bounds() -> None:
     held, same = cells_for_walls(scene, "preview", most)
     assert 20 <= held < cells and same == wanted
     assert 8 * volume / grid_spacing(scene, held) ** 3 <= most or held == 20
-    assert f"{wanted} would hold them" in walls_note("preview", held, wanted, most)
+    note = walls_note("preview", held, wanted, most)
+    assert f"{wanted} would hold them" in note
+    # and what is given up: the cells that a wall has then
+    assert f"{WALL_CELLS * held / wanted:.2g} cells, too few" in note
     assert cells_for_walls(scene, "preview", 0) == (20, 20)
     thick = Scene()
     ball(thick, "ball", 0.0, 0.1)
