@@ -117,11 +117,10 @@ class TouchPlan {
         if (slot < 0 || slot >= s_.clock->slots) continue;
         const T* r = s_.rows + int64_t(s_.row_of(meta)) * kRowColumns;
         const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
-        const double radius = std::clamp(double(s_.radius[s_.id[p]]) / dx, -0.9, 0.9);
-        const double slope = touch_slope(radius), wave = row_wave(s_, s_.row_of(meta));
+        const double radius = double(s_.radius[s_.id[p]]) / dx;
+        const double wave = row_wave(s_, s_.row_of(meta));
         item.volume = mass * thin / (dx * dx * dx);
-        item.stiffness =
-            touch_stiffness(1.0 / thin, wave, std::cbrt(mass * thin), slope, dx, step_);
+        item.stiffness = touch_stiffness(1.0 / thin, wave, std::cbrt(mass * thin), dx, step_);
         item.lag = spring_lag(wave, dx);
         item.share = touch_share(radius);
         int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
