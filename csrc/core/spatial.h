@@ -214,55 +214,79 @@ struct NearestInCellsArgs {
   int64_t* index;  // [M, wanted]
 };
 
-// The nearest of the points in the 27 cells around query i; of those as near the lower row first.
-GSF_INLINE void nearest_in_cells(const NearestInCellsArgs& a, int64_t i) {
-  const double* q = a.query + 3 * i;
-  double* square = a.square + a.wanted * i;
-  int64_t* index = a.index + a.wanted * i;
-  for (int64_t k = 0; k < a.wanted; ++k) {
-    square[k] = HUGE_VAL;
-    index[k] = 0;
-  }
-  int64_t cell[3];
+// Cell of query i, each index one up as in keys; false where it is nowhere.
+GSF_INLINE bool cell_of(const NearestInCellsArgs& a, int64_t i, int64_t* cell) {
   for (int axis = 0; axis < 3; ++axis) {
-    const double place = (q[axis] - a.low[axis]) / a.cell;
-    if (!(place > -1.0 && place < double(kCellSide))) return;
+    const double place = (a.query[3 * i + axis] - a.low[axis]) / a.cell;
+    if (!(place > -1.0 && place < double(kCellSide))) return false;
     cell[axis] = int64_t(place) + 1;
   }
-  const int64_t last = a.wanted - 1;
-  double worst = square[last];
-  for (int64_t x = cell[0] - 1; x <= cell[0] + 1; ++x)
-    for (int64_t y = cell[1] - 1; y <= cell[1] + 1; ++y) {
-      // cells that follow each other along z have keys that do
-      const int64_t from = (x * kCellSide + y) * kCellSide + cell[2] - 1;
-      int64_t lo = 0, hi = a.cells;
-      while (lo < hi) {
-        const int64_t middle = (lo + hi) / 2;
-        if (a.key[middle] < from)
-          lo = middle + 1;
-        else
-          hi = middle;
-      }
-      for (; lo < a.cells && a.key[lo] <= from + 2; ++lo)
-        for (int64_t k = max(a.start[lo], int64_t(0)); k < min(a.start[lo + 1], a.points); ++k) {
-          const int64_t row = a.order[k];
-          if (row < 0 || row >= a.points) continue;
-          const double* p = a.point + 3 * row;
-          const double dx = p[0] - q[0], dy = p[1] - q[1], dz = p[2] - q[2];
-          const double away = (product(dx, dx) + product(dy, dy)) + product(dz, dz);
-          if (!(away < worst || (away == worst && row < index[last]))) continue;
-          int64_t at = last;
-          for (; at > 0; --at) {
-            const double before = square[at - 1];
-            if (before < away || (before == away && index[at - 1] < row)) break;
-            square[at] = before;
-            index[at] = index[at - 1];
-          }
-          square[at] = away;
-          index[at] = row;
-          worst = square[last];
-        }
+  return true;
+}
+
+// First and last of the places in `order` that hold the points of line `line` (0 to 8) of the 27
+// cells: cells that follow each other along z have keys that do.
+GSF_INLINE void line_of(const NearestInCellsArgs& a, const int64_t* cell, int line, int64_t* begin,
+                        int64_t* end) {
+  const int64_t x = cell[0] - 1 + line / 3, y = cell[1] - 1 + line % 3;
+  const int64_t key[2] = {(x * kCellSide + y) * kCellSide + cell[2] - 1,
+                          (x * kCellSide + y) * kCellSide + cell[2] + 2};
+  int64_t at[2];
+  for (int side = 0; side < 2; ++side) {
+    int64_t lo = 0, hi = a.cells;
+    while (lo < hi) {
+      const int64_t middle = (lo + hi) / 2;
+      if (a.key[middle] < key[side])
+        lo = middle + 1;
+      else
+        hi = middle;
     }
+    at[side] = a.start[lo];
+  }
+  *begin = max(at[0], int64_t(0));
+  *end = min(at[1], a.points);
+}
+
+// Row at a place of `order` and its squared distance from query i; false where there is none.
+GSF_INLINE bool candidate(const NearestInCellsArgs& a, int64_t i, int64_t place, int64_t* row,
+                          double* away) {
+  *row = a.order[place];
+  if (*row < 0 || *row >= a.points) return false;
+  const double *p = a.point + 3 * *row, *q = a.query + 3 * i;
+  const double dx = p[0] - q[0], dy = p[1] - q[1], dz = p[2] - q[2];
+  *away = (product(dx, dx) + product(dy, dy)) + product(dz, dz);
+  return true;
+}
+
+// The list of a query: ascending; of those as near the lower row first.
+struct NearestList {
+  int64_t wanted;
+  double* square;
+  int64_t* index;
+
+  GSF_HOST_DEVICE NearestList(const NearestInCellsArgs& a, int64_t i)
+      : wanted(a.wanted), square(a.square + a.wanted * i), index(a.index + a.wanted * i) {}
+  GSF_HOST_DEVICE void clear() const {
+    for (int64_t k = 0; k < wanted; ++k) {
+      square[k] = HUGE_VAL;
+      index[k] = 0;
+    }
+  }
+  GSF_HOST_DEVICE void take(int64_t row, double away) const {
+    int64_t at = wanted - 1;
+    for (; at > 0; --at) {
+      const double before = square[at - 1];
+      if (before < away || (before == away && index[at - 1] < row)) break;
+      square[at] = before;
+      index[at] = index[at - 1];
+    }
+    square[at] = away;
+    index[at] = row;
+  }
+};
+
+GSF_INLINE bool nearer(double away, int64_t row, double worst, int64_t last) {
+  return away < worst || (away == worst && row < last);
 }
 
 }  // namespace gsf

@@ -57,8 +57,21 @@ struct SpatialCpu {
   }
 
   static void nearest_in_cells(const NearestInCellsArgs& a, const Scope&) {
-    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) gsf::nearest_in_cells(a, i);
+    parallel_for(a.count, 256, [&](int64_t first, int64_t last) {
+      for (int64_t i = first; i < last; ++i) {
+        const NearestList list(a, i);
+        list.clear();
+        int64_t cell[3], begin, end, row;
+        if (!cell_of(a, i, cell)) continue;
+        double away;
+        for (int line = 0; line < 9; ++line) {
+          line_of(a, cell, line, &begin, &end);
+          for (int64_t k = begin; k < end; ++k)
+            if (candidate(a, i, k, &row, &away) &&
+                nearer(away, row, list.square[a.wanted - 1], list.index[a.wanted - 1]))
+              list.take(row, away);
+        }
+      }
     });
   }
 };
