@@ -28,6 +28,8 @@ from gsfluent.fracturebench.scene import SceneError
 from gsfluent.lab.charts.record import commit, machine
 from gsfluent.lab.frozen.answer import clock, run_case
 
+METHODS = {"nacc": "gsfluent", "phase_field": "gsfluent phase field"}
+"""Names of gsfluent's laws of breaking in the table."""
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")
 
 
@@ -39,7 +41,7 @@ def answer(name: str, args: argparse.Namespace, path: Path) -> Run:
         raise SceneError(f"{name}: not what was frozen: {drift[0]}")
     options: dict[str, Any] = {
         "device": args.device, "dtype": getattr(torch, args.dtype), "cfl": args.cfl,
-        "fields": not args.one_field, "place": args.place,
+        "fields": not args.one_field, "place": args.place, "law": args.law,
     }  # fmt: skip
     run = run_case(scene, method=args.method, **options)
     wall = run.wall_seconds
@@ -68,15 +70,20 @@ def main() -> int:
         help="move the points on the grid by this, along the axes without a collider",
     )  # fmt: skip
     parser.add_argument("--one-field", action="store_true", help="all bodies in one velocity field")
-    parser.add_argument("--method", default="gsfluent", help="name in the table")
+    parser.add_argument(
+        "--law", choices=("nacc", "phase_field"), default="nacc", help="of what breaks"
+    )
+    parser.add_argument("--method", default="", help="name in the table")
     parser.add_argument("--repeat", type=int, default=3, help="timed runs")
     parser.add_argument("--quick", action="store_true", help="a few small cases, once each")
     args = parser.parse_args()
     if args.quick:
         args.repeat = 1
+    args.method = args.method or METHODS[args.law]
     bad = 0
     try:
-        names = args.names or ([*QUICK] if args.quick else [c.name for c in cases()])
+        kind = None if args.law == "nacc" else "fracture"
+        names = args.names or ([*QUICK] if args.quick else [c.name for c in cases(kind)])
         for name in names:
             find(name)
         folder = args.out / args.method.replace(" ", "_").replace(",", "")
@@ -85,8 +92,8 @@ def main() -> int:
             path = folder / f"{name}.npz"
             if path.is_file():
                 was = Run.load(path)
-                now = {"dtype": args.dtype, "cfl": args.cfl, "place": args.place}
-                had = {"place": 0.0, **was.settings}
+                now = {"dtype": args.dtype, "cfl": args.cfl, "place": args.place, "law": args.law}
+                had = {"place": 0.0, "law": "nacc", **was.settings}
                 if was.device != args.device or any(had.get(k) != now[k] for k in now):
                     raise SceneError(
                         f"{path} was computed on {was.device} with {dict(was.settings)}: give "
