@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from .run import Measure, Run
 from .scene import Scene, SceneError
 
-MODULES = ("contact", "elastic", "flow", "bars", "cantilever", "plane", "rock", "shatter")
+MODULES = ("contact", "elastic", "flow", "bars", "cantilever", "cracks", "plane", "rock", "shatter")
 """Modules of ``scenes`` that register cases."""
 
 Build = Callable[[float, int], Scene]

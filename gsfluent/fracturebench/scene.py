@@ -70,7 +70,8 @@ class Scene:
             ``alpha`` (at the start).
         gravity: [m/s^2].
         colliders: Planes: ``{"point", "normal", "kind": "sticky" | "slip" | "separate",
-            "friction"}``. A grid node that lies on a plane belongs to the wall.
+            "friction"}``, moving where there is a ``velocity`` [m/s]. A grid node that lies on a
+            plane belongs to the wall.
         drives: What acts on groups of points. ``points`` is a list of indices or ``"all"``, and
             one of: ``velocity`` [vx, vy, vz], prescribed in place of what the method would give
             them (null: this component is free); ``force``, [[fx, fy, fz], ...] in N on each of the
@@ -81,6 +82,7 @@ class Scene:
         facts: Numbers that the judge needs and a simulator does not.
         asks: Further fields of :class:`~gsfluent.fracturebench.run.Run` that the case is judged
             by, such as ``deformation``.
+        strain: Elastic strain b - I at the start as xx, yy, zz, xy, xz, yz, [N, 6]; None: none.
     """
 
     name: str
@@ -99,6 +101,7 @@ class Scene:
     friction: float = 0.0
     facts: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     asks: tuple[str, ...] = ()
+    strain: Floats | None = None
 
     def __post_init__(self) -> None:
         n, t = self.x.shape[0], self.times.shape[0]
@@ -106,6 +109,8 @@ class Scene:
             "x": (n, 3), "v": (n, 3), "volume": (n,), "material": (n,), "body": (n,),
             "affine": (n, 3, 3), "times": (t,),
         }  # fmt: skip
+        if self.strain is not None:
+            shapes["strain"] = (n, 6)
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value.shape != shape:
@@ -140,14 +145,19 @@ class Scene:
 
     def header(self) -> dict[str, Any]:
         """Everything but the arrays, as plain values: what the YAML file beside them says."""
-        arrays = set(_ARRAYS)
+        arrays = {*_ARRAYS, "strain"}
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return {"format": FORMAT} | {k: v for k, v in plain.items() if k not in arrays}
+
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        """Names of the arrays that it has."""
+        return _ARRAYS if self.strain is None else (*_ARRAYS, "strain")
 
     def digest(self) -> str:
         """SHA-256 of all arrays, each :func:`quantised`: the same on every machine."""
         found = hashlib.sha256()
-        for name in _ARRAYS:
+        for name in self.arrays:
             value = quantised(np.asarray(getattr(self, name)))
             found.update(f"{name} {value.shape}".encode())
             found.update(np.ascontiguousarray(value, dtype="<i8").tobytes())
@@ -158,7 +168,7 @@ class Scene:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(path.name + ".tmp")
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays = {name: getattr(self, name) for name in self.arrays}
         with temporary.open("wb") as file:
             np.savez(file, header=np.array(json.dumps(self.header())), **arrays)
         return temporary.replace(path)
@@ -174,6 +184,7 @@ class Scene:
             with np.load(path, allow_pickle=False) as data:
                 header = dict(json.loads(str(data["header"])))
                 arrays = {name: data[name] for name in _ARRAYS}
+                arrays |= {name: data[name] for name in ("strain",) if name in data}
         except BROKEN as error:
             raise SceneError(f"{path}: not a scene of FractureBench ({_said(error)})") from error
         if header.pop("format", None) != FORMAT:

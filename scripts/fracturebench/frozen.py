@@ -22,6 +22,7 @@ ARRAYS = {
     "body": "body; points of different bodies are not glued together",
     "affine": "velocity gradients at the start [1/s]",
     "times": "when positions and velocities are asked for [s]",
+    "strain": "elastic strain b - I at the start",
 }
 UNITS = (
     "metre, second, kilogram; gravity m/s^2, young_modulus and other stresses Pa, density kg/m^3"
@@ -58,6 +59,7 @@ def describe(case: Case, scene: Scene) -> dict[str, Any]:
         "arrays": {
             name: f"{getattr(scene, name).dtype} {list(getattr(scene, name).shape)}: {what}"
             for name, what in ARRAYS.items()
+            if name in scene.arrays
         },
         "sha256": scene.digest(),
     }  # fmt: skip

@@ -29,6 +29,8 @@ from gsfluent.fracturebench.scene import SceneError
 from gsfluent.lab.charts.run_case import ANSWER, Question, answer_task
 from gsfluent.sweep.engine import map as sweep_map
 
+METHODS = {"nacc": "gsfluent", "phase_field": "gsfluent phase field"}
+"""Names of gsfluent's laws of breaking in the table."""
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")
 
 
@@ -44,7 +46,7 @@ def question(name: str, args: argparse.Namespace) -> Question:
         raise SceneError(f"{name}: not what was frozen: {drift[0]}")
     return Question(
         name, frozen.PER_CELL, scene.digest(), args.device, args.dtype, args.cfl, args.place,
-        not args.one_field, args.method, args.repeat,
+        not args.one_field, args.method, args.repeat, args.law,
     )  # fmt: skip
 
 
@@ -86,7 +88,10 @@ def main() -> int:
         help="move the points on the grid by this, along the axes without a collider",
     )  # fmt: skip
     parser.add_argument("--one-field", action="store_true", help="all bodies in one velocity field")
-    parser.add_argument("--method", default="gsfluent", help="name in the table")
+    parser.add_argument(
+        "--law", choices=("nacc", "phase_field"), default="nacc", help="of what breaks"
+    )
+    parser.add_argument("--method", default="", help="name in the table")
     parser.add_argument("--repeat", type=int, default=3, help="timed runs")
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
     parser.add_argument("--on", default="local", help="local, slurm, ray or ray=HOST:PORT")
@@ -94,9 +99,11 @@ def main() -> int:
     args = parser.parse_args()
     if args.quick:
         args.repeat = 1
+    args.method = args.method or METHODS[args.law]
     bad = 0
     try:
-        names = args.names or ([*QUICK] if args.quick else [c.name for c in cases()])
+        kind = None if args.law == "nacc" else "fracture"
+        names = args.names or ([*QUICK] if args.quick else [c.name for c in cases(kind)])
         for name in names:
             find(name)
         folder = args.out / args.method.replace(" ", "_").replace(",", "")
@@ -107,8 +114,8 @@ def main() -> int:
             path = folder / f"{name}.npz"
             if path.is_file():
                 was = Run.load(path)
-                now = {"dtype": args.dtype, "cfl": args.cfl, "place": args.place}
-                had = {"place": 0.0, **was.settings}
+                now = {"dtype": args.dtype, "cfl": args.cfl, "place": args.place, "law": args.law}
+                had = {"place": 0.0, "law": "nacc", **was.settings}
                 if was.device != args.device or any(had.get(k) != now[k] for k in now):
                     raise SceneError(
                         f"{path} was computed on {was.device} with {dict(was.settings)}: give "

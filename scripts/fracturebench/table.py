@@ -156,7 +156,7 @@ def tables(records: Sequence[Record]) -> str:
         + "; ".join(f"{device}: {', '.join(m)}" for device, m in where.items()) + ".",
         "\n".join([f"| case | points | {head} |", rule, *times]),
         "Every measure of gsfluent:",
-        _measures([r for r in records if r.method == "gsfluent"]),
+        _measures([r for r in records if r.method.startswith("gsfluent")]),
     ]  # fmt: skip
     return "\n\n".join(said)
 
@@ -185,8 +185,8 @@ def fracture_cases(records: Sequence[Record]) -> str:
 
 def _measures(records: Sequence[Record]) -> str:
     lines = [
-        "| case | device | quantity | value | reference | error | tolerance | within |",
-        "|---|---|---|---|---|---|---|---|",
+        "| case | method | device | quantity | value | reference | error | tolerance | within |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in records:
         for m in r.measures:
@@ -196,7 +196,7 @@ def _measures(records: Sequence[Record]) -> str:
             unit = f" {m['unit']}" if m["unit"] else ""
             within = "yes" if _within(m) else "no"
             lines.append(
-                f"| {r.case} | {r.device} | {m['quantity']} | {value:.4g}{unit} | "
+                f"| {r.case} | {r.method} | {r.device} | {m['quantity']} | {value:.4g}{unit} | "
                 f"{known:.4g}{unit} | {error:.2g} | {m['tolerance']:.3g} | {within} |"
             )
     return "\n".join(lines)

@@ -65,6 +65,15 @@ def test_scene_and_run_come_back_as_they_went(scene: Scene, run: Run, tmp_path: 
     assert [m.error for m in judge(again, back)] == [m.error for m in judge(scene, run)]
 
 
+def test_strain_at_the_start_is_part_of_a_scene(scene: Scene, tmp_path: Path) -> None:
+    strained = dataclasses.replace(scene, strain=np.full((scene.count, 6), 1e-3))
+    again = Scene.load(strained.save(tmp_path / "bar.npz"))
+    assert again.strain is not None and np.array_equal(again.strain, strained.strain)
+    assert again.digest() == strained.digest() != scene.digest()
+    with pytest.raises(SceneError, match="strain has shape"):
+        dataclasses.replace(scene, strain=np.zeros((scene.count, 3)))
+
+
 def test_digest_sees_a_change_but_no_rounding(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     rounded = dataclasses.replace(

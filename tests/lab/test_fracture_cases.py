@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -30,8 +31,9 @@ from gsfluent.pipeline.matter.crack_band import fracture_energy
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {
-    "brazilian_disc": fracture_plane._RADIUS / 8, "double_cantilever": 1 / 32, "kalthoff": 0.1 / 32,
-    "notch_tension": 1 / 24, "rock_press": 0.035 / 6, "shatter": 0.05 / 3, "spall": 0.04,
+    "branching": 2e-3, "brazilian_disc": fracture_plane._RADIUS / 8, "double_cantilever": 1 / 32,
+    "kalthoff": 0.1 / 32, "notch_peak": 6e-5, "notch_tension": 1 / 24, "pmma_strip": 4e-4,
+    "rock_press": 0.035 / 6, "shatter": 0.05 / 3, "spall": 0.04,
     "stretched_bar": 1 / 120, "struck_rock": 0.035 / 6,
 }  # fmt: skip
 
@@ -128,6 +130,75 @@ def test_a_crack_of_known_direction_is_judged_at_it(angle: float, good: bool) ->
     direction, length = judge(scene, submit(scene, damage=damage_at(scene, when)))
     assert direction.value == pytest.approx(angle, abs=2.0) and direction.passed == good
     assert length.value == pytest.approx(35.0, abs=1.0) and length.passed
+
+
+def painted(scene: Scene, up: float, down: float, speed: float) -> np.ndarray:
+    """Damage of a crack that runs to x = 0.07 and forks into arms of two slopes."""
+    x, y = scene.x[:, 0], scene.x[:, 1]
+    past = np.clip(x - 0.07, 0.0, None)
+    near = np.minimum(np.abs(y - up * past), np.abs(y + down * past)) < scene.dx
+    when = (x - 0.05) / speed
+    return damage_at(scene, np.where(near & (x > 0.05), when, np.inf))
+
+
+def test_a_known_fork_is_judged_as_two_mirror_images() -> None:
+    scene = find("branching").build(5e-4, 8)
+    limit = fracture_plane.rayleigh_speed(32e9, 0.2, 2450.0)
+    most, speed, off = judge(scene, submit(scene, damage=painted(scene, 0.5, 0.5, 0.5 * limit)))
+    assert most.value == 2.0 and most.passed and off.passed and off.value < 1.0
+    assert speed.value == pytest.approx(0.55, abs=0.1) and speed.passed
+    _, fast, crooked = judge(scene, submit(scene, damage=painted(scene, 0.5, 0.2, limit)))
+    assert not fast.passed and crooked.value > 4.0
+    straight = judge(scene, submit(scene, damage=painted(scene, 0.0, 0.0, 0.5 * limit)))
+    assert straight[0].value == 1.0 and not straight[0].passed and not straight[2].passed
+    still = judge(scene, submit(scene, damage=np.zeros((scene.times.shape[0], scene.count))))
+    assert not any(m.passed for m in still)
+
+
+def test_the_layers_of_the_forking_plate_pull_by_a_megapascal() -> None:
+    scene = find("branching").build(2e-3, 8)
+    run = run_case(dataclasses.replace(scene, times=scene.times[:1] * 1e-3, asks=("stress",)))
+    assert run.stress is not None and scene.strain is not None
+    soft = scene.material == 0
+    stretch = np.sqrt(1.0 + scene.strain[soft, 1])
+    assert run.stress[0, soft, 1] / stretch == pytest.approx(1e6, rel=1e-3)
+    assert np.abs(run.stress[0, ~soft]).max() < 1e5
+
+
+def test_a_known_force_has_its_peak() -> None:
+    scene = find("notch_peak").build(3e-5, 8)
+    middle = 0.5 * (scene.times + np.concatenate([[0.0], scene.times[:-1]]))
+    way = 2e6 * scene.facts["speed"] * middle  # um
+    force = 0.701e6 * scene.dx * np.where(way < 5.55, way / 5.55, 0.0)
+    impulse = np.zeros((len(scene.times), len(scene.colliders), 3))
+    impulse[:, -2, 1] = np.cumsum(force * np.diff(scene.times, prepend=0.0))
+    damage = np.broadcast_to(np.abs(scene.x[:, 1]) < scene.dx, (len(scene.times), scene.count))
+    judged = judge(scene, submit(scene, impulse=impulse, damage=damage.astype(np.float64)))
+    assert all(m.passed for m in judged)
+    assert judged[0].value == pytest.approx(0.701, rel=0.03)
+    low = judge(scene, submit(scene, impulse=0.8 * impulse, damage=damage.astype(np.float64)))
+    assert not low[0].passed
+    with pytest.raises(SceneError, match="impulse"):
+        judge(scene, submit(scene))
+
+
+def test_a_strip_that_is_held_stretched_stays_so() -> None:
+    scene = find("pmma_strip").build(4e-4, 8)
+    whole = (elastic(3.09e9, 0.35, 1180.0),) * 2
+    ahead = scene.x[:, 0] > 0.02
+    run = run_case(dataclasses.replace(scene, materials=whole, times=scene.times[:1], asks=()))
+    assert np.abs(run.v[0][ahead]).max() < 0.05 * np.abs(run.v[0]).max()
+    share, speed = judge(scene, submit(scene, damage=np.zeros((20, scene.count))))
+    assert not share.passed and not speed.passed
+
+
+def test_both_laws_crack_the_forking_plate() -> None:
+    scene = find("branching").build(1e-3, 8)
+    for law in ("nacc", "phase_field"):
+        run = run_case(scene, law=law)
+        most, speed, _ = judge(scene, run)
+        assert not run.failed and most.value >= 1.0 and speed.passed
+        assert ("law" in run.settings) == (law == "phase_field")
 
 
 def test_a_known_pull_back_gives_the_strength_and_a_known_plane_its_depth() -> None:

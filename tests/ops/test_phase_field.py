@@ -101,6 +101,17 @@ def test_what_is_intact_is_elastic_and_a_pressed_crack_carries_all(split: str) -
         assert torch.allclose(got[1], want * got[0], rtol=1e-9)
 
 
+@pytest.mark.parametrize("size", [1e-12, 1e-25, 1e-38, 1e-43])
+def test_spectral_stresses_of_no_strain_to_speak_of_are_finite(size: float) -> None:
+    strain = (strained(200, 1.0) * size).float()
+    alpha = torch.full((200,), -1.0)
+    got = ops.return_mapping(
+        strain, alpha, still(200, torch.float32), law=LAW, params=row(0.0, "spectral").float()
+    )
+    assert all(torch.isfinite(g).all() for g in got[:3])
+    assert got[2].abs().max() < 10.0 * KAPPA * float(strain.abs().max()) + 1e-30
+
+
 def test_the_history_only_grows_and_is_in_units_of_the_threshold() -> None:
     strain = strained(300, 0.05)
     given = {"law": LAW, "params": row(0.2)}

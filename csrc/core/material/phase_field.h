@@ -87,8 +87,10 @@ GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m,
     tension[i] = h[i + 1] >= T(0) ? all[i] : (apart > T(0) ? up[i] / apart : T(0));
   }
   const T span = x[0] - x[2];
-  const T all2 = span > T(0) ? (all[0] - all[1]) / span : T(0);
-  const T tension2 = span > T(0) ? (tension[0] - tension[1]) / span : T(0);
+  // Below it the second differences overflow, and what they multiply is nothing.
+  const bool apart = span > T(1e-30);
+  const T all2 = apart ? (all[0] - all[1]) / span : T(0);
+  const T tension2 = apart ? (tension[0] - tension[1]) / span : T(0);
   // Newton's polynomial f1 + f12 (e - x1) + f123 (e - x1)(e - x2).
   const Sym3<T> first = add_diagonal(e, -x[0]);
   const Sym3<T> second = square(first) + (x[0] - x[1]) * first;

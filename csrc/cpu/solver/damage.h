@@ -69,7 +69,12 @@ class DamagePass {
     number_.assign(c.slots, -1);
     std::atomic<bool> any{false};
     parallel_for(c.homes, kHomeGrain, [&](int64_t begin, int64_t end) {
-      for (int64_t h = begin; h < end; ++h)
+      for (int64_t h = begin; h < end; ++h) {
+        int hot = 0;  // most homes have no such point: no branch per point there
+        for_particles(h, [&](int64_t p) {
+          hot |= int(s_.alpha[p] > active_) | int(s_.peak[p] > T(-kBrokenDamage));
+        });
+        if (hot == 0) continue;
         for_particles(h, [&](int64_t p) {
           if (!(s_.alpha[p] > active_ || s_.peak[p] > T(-kBrokenDamage)) || !is_phase(p)) return;
           int n = 0;
@@ -79,6 +84,7 @@ class DamagePass {
           std::atomic_ref<int32_t>(number_[slot]).store(0, std::memory_order_relaxed);
           any.store(true, std::memory_order_relaxed);
         });
+      }
     });
     if (!any) return false;
     slots_.clear();
@@ -127,31 +133,29 @@ class DamagePass {
         }
     return w;
   }
-  // f(node row, weight) for those of the 27 nodes of particle p that take part.
+  // f(node of the window, weight of x and y, weights of z) for the nine rows of nodes of particle
+  // p.
   template <typename F>
-  void for_nodes(const Window& window, int64_t p, const F& f) const {
+  void for_rows(int64_t p, const F& f) const {
     const Stencil<T> stencil = stencil_at(s_.offset + 3 * p);
-    const int32_t* row = window.row + window_node(s_.meta[p]);
+    const int first = window_node(s_.meta[p]);
     for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j) {
-        const T w = stencil.w[0][i] * stencil.w[1][j];
-        for (int k = 0; k < 3; ++k) {
-          const int32_t n = row[(i * kWindowEdge + j) * kWindowEdge + k];
-          if (n >= 0) f(n, w * stencil.w[2][k]);
-        }
-      }
+      for (int j = 0; j < 3; ++j)
+        f(first + (i * kWindowEdge + j) * kWindowEdge, stencil.w[0][i] * stencil.w[1][j],
+          stencil.w[2]);
   }
 
-  struct Node {
-    double damage, drive, stiff, volume;  // sums; volumes in units of dx^2 / 4
-  };
+  // Sums of damage, history and stiffness times volume, and of volume; volumes in units of dx^2
+  // / 4.
+  using Sums = double __attribute__((vector_size(32)));
+  static constexpr int kDamage = 0, kDrive = 1, kStiff = 2, kVolume = 3;
 
   void scatter() {
-    nodes_.assign(slots_.size() * kBlockNodes, Node{});
+    nodes_.assign(slots_.size() * kBlockNodes, Sums{});
     for (const std::vector<int32_t>& homes : homes_)
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
-          const Window nodes = window(homes[i]);
+          Sums sums[kWindowNodes] = {};
           for_particles(homes[i], [&](int64_t p) {
             const uint32_t row = s_.row_of(s_.meta[p]);
             if (s_.law[row] != kPhaseField) return;
@@ -159,16 +163,15 @@ class DamagePass {
             const double v = r[kStressColumn], length = double(r[4]) * double(s_.inv_dx);
             const double drive = std::min(double(s_.alpha[p]) + 1.0, kDriveMax),
                          d = damage_of(s_.peak[p]);
-            const Node given{v * d, v * drive, v * 2.0 * length * length, v};
-            for_nodes(nodes, p, [&](int64_t n, T weight) {
-              Node& node = nodes_[n];
-              const double w = weight;
-              node.damage += w * given.damage;
-              node.drive += w * given.drive;
-              node.stiff += w * given.stiff;
-              node.volume += w * given.volume;
+            const Sums given{v * d, v * drive, v * 2.0 * length * length, v};
+            for_rows(p, [&](int at, T across, const T* along) {
+              const Sums part = double(across) * given;
+              for (int k = 0; k < 3; ++k) sums[at + k] += double(along[k]) * part;
             });
           });
+          const Window nodes = window(homes[i]);
+          for (int n = 0; n < kWindowNodes; ++n)
+            if (nodes.row[n] >= 0) nodes_[nodes.row[n]] += sums[n];
         }
       });
   }
@@ -189,12 +192,13 @@ class DamagePass {
         }
         for (int local = 0; local < kBlockNodes; ++local) {
           const int64_t n = b * kBlockNodes + local;
-          const Node& node = nodes_[n];
-          if (!(node.volume > 0.0)) continue;
+          const Sums& node = nodes_[n];
+          const double volume = node[kVolume], drive = node[kDrive];
+          if (!(volume > 0.0)) continue;
           Edge& e = edge_[n];
-          field_[n] = node.damage / node.volume;
-          e.right = at2_ ? node.drive : node.drive - node.volume;
-          double whole = at2_ ? node.drive + 2.0 * node.volume : node.drive;
+          field_[n] = node[kDamage] / volume;
+          e.right = at2_ ? drive : drive - volume;
+          double whole = at2_ ? drive + 2.0 * volume : drive;
           for (int f = 0; f < 6; ++f) {
             const int shift = 4 - f / 2 * 2;  // of the axis in the local index
             const int at = local >> shift & 3, to = f % 2 == 0 ? at + 1 : at - 1;
@@ -202,13 +206,13 @@ class DamagePass {
             const int32_t slot = to >= 0 && to < 4 ? slots_[b] : face[f];
             if (slot < 0) continue;
             if (number_[slot] < 0) {  // undamaged beyond
-              whole += node.stiff;
+              whole += node[kStiff];
               continue;
             }
             const int64_t m = int64_t(number_[slot]) * kBlockNodes + there;
-            if (!(nodes_[m].volume > 0.0)) continue;
+            if (!(nodes_[m][kVolume] > 0.0)) continue;
             e.near[f] = static_cast<int32_t>(m);
-            e.weight[f] = 0.5 * (node.stiff + nodes_[m].stiff);
+            e.weight[f] = 0.5 * (node[kStiff] + nodes_[m][kStiff]);
             whole += e.weight[f];
           }
           e.inverse = whole > 0.0 ? 1.0 / whole : 0.0;
@@ -240,10 +244,19 @@ class DamagePass {
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
           const Window nodes = window(homes[i]);
+          T field[kWindowNodes], most(0);
+          for (int n = 0; n < kWindowNodes; ++n) {
+            field[n] = nodes.row[n] >= 0 ? T(field_[nodes.row[n]]) : T(0);
+            most = std::max(most, field[n]);
+          }
+          if (most == T(0)) continue;  // no point gets more than it has
           for_particles(homes[i], [&](int64_t p) {
             if (!is_phase(p)) return;
             T found(0);
-            for_nodes(nodes, p, [&](int64_t n, T w) { found += w * T(field_[n]); });
+            for_rows(p, [&](int at, T across, const T* along) {
+              const T* f = field + at;
+              found += across * (along[0] * f[0] + along[1] * f[1] + along[2] * f[2]);
+            });
             const T d = std::max(damage_of(s_.peak[p]), std::min(found, T(1)));
             if (d > T(0)) s_.peak[p] = std::max(s_.peak[p], d - T(kBrokenDamage));
           });
@@ -263,7 +276,7 @@ class DamagePass {
   std::vector<int32_t> colors_[kColors], homes_[kColors];  // homes by colour; those that take part
   std::vector<int32_t> number_;                            // [slots] row of an active slot, or -1
   std::vector<int32_t> slots_;                             // active slots
-  std::vector<Node> nodes_;
+  std::vector<Sums> nodes_;
   std::vector<Edge> edge_;
   std::vector<double> field_;
 };

@@ -231,6 +231,7 @@ class Question:
     fields: bool  # a velocity field per body
     method: str  # name in the table
     repeat: int  # timed runs
+    law: str = "nacc"  # of what breaks
 
 
 def answer_task(question: Question, folder: Path) -> None:
@@ -245,7 +246,7 @@ def answer_task(question: Question, folder: Path) -> None:
         raise SceneError(f"{question.case}: not what was frozen, by its sha256")
     options: dict[str, Any] = {
         "device": question.device, "dtype": getattr(torch, question.dtype), "cfl": question.cfl,
-        "fields": question.fields, "place": question.place,
+        "fields": question.fields, "place": question.place, "law": question.law,
     }  # fmt: skip
     run = run_case(scene, method=question.method, **options)
     wall = run.wall_seconds

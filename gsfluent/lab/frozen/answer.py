@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -16,14 +16,47 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.drives import Drives, damage
 from gsfluent.lab.world.shapes import parameters
+from gsfluent.materials import Material, phase_field
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
 
 
-def rows(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Laws int32 [M], parameters float64 [M, 8] and alpha at the start [N] of a scene."""
+def _phase_field(m: Mapping[str, Any], dx: float) -> torch.Tensor:
+    """Parameters of a brittle row under law ``phase_field``, float64 [8]."""
+    given = {key: m[key] for key in ("split", "model", "prefer") if key in m}
+    young, toughness = float(m["young_modulus"]), float(m["fracture_energy"])
+    strength = float(m["tensile_strength"])
+    if "length" in m:
+        length = float(m["length"])
+        given["length"] = max(length, phase_field.CELLS * dx)
+        size = phase_field.SIZE[str(m.get("model", "at1"))]
+        strength = math.sqrt(size * young * toughness / length)
+    material = Material(
+        "bench", law="phase_field", young_modulus=young, density=float(m["density"]),
+        poisson_ratio=float(m["poisson_ratio"]), toughness=toughness, tensile_strength=strength,
+        **given,
+    )  # fmt: skip
+
+    def at(value: Any) -> torch.Tensor:
+        return torch.as_tensor(value, dtype=torch.float64).reshape(1)
+
+    return phase_field.rows(material, at, torch.ones(1, dtype=torch.float64), dx)[0]
+
+
+def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Laws int32 [M], parameters float64 [M, 8] and alpha at the start [N] of a scene.
+
+    Args:
+        scene: The scene.
+        law: Of what breaks: ``nacc`` or ``phase_field``.
+    """
     laws, params, alpha = [], [], []
     for m in scene.materials:
+        if m["law"] == "nacc" and law == "phase_field":
+            laws.append(LAWS[law])
+            params.append(_phase_field(m, scene.dx))
+            alpha.append(-1.0)
+            continue
         nacc = m["law"] == "nacc"
         laws.append(LAWS[str(m["law"])])
         columns = (
@@ -48,7 +81,7 @@ def _colliders(scene: Scene) -> torch.Tensor | None:
     made = [
         collider_row(
             "plane", point=item["point"], normal=item["normal"], mode=str(item["kind"]),
-            friction=float(item.get("friction", 0.0)),
+            friction=float(item.get("friction", 0.0)), velocity=item.get("velocity", (0.0,) * 3),
         )
         for item in scene.colliders
     ]  # fmt: skip
@@ -92,6 +125,7 @@ def run_case(
     fields: bool = True,
     place: float = 0.0,
     method: str = "gsfluent",
+    law: str = "nacc",
     watch: Callable[[World, int], None] | None = None,
     setup: Callable[[World], None] | None = None,
     **options: Any,
@@ -109,6 +143,7 @@ def run_case(
         place: How far the points lie off their place on the grid [dx], along the axes that no
             collider looks along: a wall has to stay on its nodes. What is handed in does not move.
         method: Name in the record.
+        law: Of what breaks, ``nacc`` or ``phase_field``.
         watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
         setup: ``setup(world)`` is called once before the first step; it may wrap ``world.force``.
         **options: Further arguments of World (``k``, ``epsilon``, ``implicit``, ...).
@@ -119,15 +154,16 @@ def run_case(
     Raises:
         ValueError: An argument of World is wrong.
     """
-    law, params, alpha = rows(scene)
+    laws, params, alpha = rows(scene, law)
     several = fields and int(scene.body.max()) > 0
     drives = Drives(scene, dtype, device) if scene.drives else None
     shift = _shift(scene, place)
     world = World(
         torch.from_numpy(scene.x + shift), torch.from_numpy(scene.v),
-        volume=torch.from_numpy(scene.volume), dx=scene.dx, law=law, params=params,
+        volume=torch.from_numpy(scene.volume), dx=scene.dx, law=laws, params=params,
         material=torch.from_numpy(scene.material), alpha=alpha,
         body=torch.from_numpy(scene.body) if several else None,
+        strain=None if scene.strain is None else torch.from_numpy(scene.strain),
         affine=torch.from_numpy(scene.affine), gravity=scene.gravity, colliders=_colliders(scene),
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
         force=drives,
@@ -160,7 +196,8 @@ def run_case(
             watch(world, i)
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
-        "engine": world.engine, "fields": several, **({"place": place} if place else {}), **options,
+        "engine": world.engine, "fields": several, **({"place": place} if place else {}),
+        **({} if law == "nacc" else {"law": law}), **options,
     }  # fmt: skip
     return Run(
         scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed,

@@ -1,0 +1,274 @@
+"""The long tests of the phase-field law: each job runs one scene and says figures about it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsfluent import ops
+from gsfluent.fracturebench.registry import find, judge
+from gsfluent.fracturebench.run import Run
+from gsfluent.fracturebench.scene import Scene
+from gsfluent.fracturebench.scenes import cracks
+from gsfluent.fracturebench.scenes.plane import rayleigh_speed
+from gsfluent.fracturebench.scenes.rows import BROKEN
+from gsfluent.fracturebench.scenes.slabs import slab_volume, walls
+from gsfluent.fracturebench.shapes import elastic, free
+from gsfluent.lab.frozen.answer import rows, run_case
+from gsfluent.lab.world.driver import World
+from gsfluent.ops.collider import collider_row
+from gsfluent.ops.damage import DamageField
+from gsfluent.ops.plasticity import weakened
+
+GLASS = (1e9, 0.2, 1000.0)
+STRIP_TOUGHNESS = 10.0
+BEAM = (20.8e9, 0.3, 2400.0)
+BEAM_TOUGHNESS = 500.0
+Done = tuple[dict[str, Any], Scene, Run]
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One run of one test.
+
+    Attributes:
+        test: Which test.
+        name: Of the run, also of its files.
+        setting: What is chosen, for the table.
+        seconds: CPU seconds that it takes, about.
+        work: Runs it.
+    """
+
+    test: str
+    name: str
+    setting: str
+    seconds: float
+    work: Callable[[], Done]
+
+
+class Energies:
+    """Kinetic, elastic and surface energy of a world at each sample [J]; a ``watch``."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[float, float, float]] = []
+
+    def __call__(self, world: World, index: int) -> None:
+        """Read the world."""
+        scene, peak, place = world.scene, world.peak.double(), world.position
+        law, params = weakened(scene.law, scene.params.double(), scene.material, peak)
+        volume = scene.volume.double()
+        stored = ops.elastic_energy(world.strain.double(), law=law, params=params)
+        field = DamageField(scene.law, scene.params.double(), scene.material)
+        surface = field.energy(
+            world.alpha.double(), peak, place, volume, dx=scene.dx,
+            blocks=ops.build_blocks(place, scene.dx),
+        )  # fmt: skip
+        self.rows.append((world.kinetic(), float((stored * volume).sum()), float(surface)))
+
+
+def _run(scene: Scene, watch: Energies | None = None, law: str = "phase_field") -> Run:
+    run = run_case(scene, law=law, watch=watch)
+    if run.failed:
+        raise FloatingPointError(run.failed)
+    return run
+
+
+def _damage(run: Run) -> np.ndarray:
+    assert run.damage is not None
+    return run.damage
+
+
+# --- the strip: what a running crack costs, and when it runs ---
+
+
+def strip(cells: float, release: float, place: float) -> Done:
+    """A strip 24 l high that is held stretched, the crack ``place`` cells off the grid."""
+    dx = 1.0 / 24.0 / cells  # the strip is 1 m high
+    length, speed = cells * dx, rayleigh_speed(*GLASS)
+    scene = cracks.stretched_strip(
+        "strip", GLASS, STRIP_TOUGHNESS, (2.5, 1.0), 0.6, release, dx, 8, length, 4.0 / speed,
+        samples=40, shift=place, seed=round(100 * place),
+    )  # fmt: skip
+    energies = Energies()
+    run = _run(scene, energies)
+    reach = cracks.reach_of(scene, _damage(run), 0.6)
+    found: dict[str, Any] = {"release": release, "reach": float(reach[-1]), "cells": cells}
+    # between a quarter and nine tenths of the free way, where the crack runs evenly
+    steady = np.flatnonzero((reach > 0.4) & (reach < 1.5))
+    if steady.size >= 4:
+        a, b = steady[0], steady[-1]
+        way = float(reach[b] - reach[a]) * dx * STRIP_TOUGHNESS
+        rows = np.array(energies.rows)
+        found["surface"] = float(rows[b, 2] - rows[a, 2]) / way
+        found["speed"] = float((reach[b] - reach[a]) / (run.times[b] - run.times[a])) / speed
+    return found, scene, run
+
+
+# --- plates of FractureBench ---
+
+
+def branching(cells: float, length: float = 5e-4) -> Done:
+    """The forking crack of Borden et al. at their own length."""
+    scene = cracks.branching_plate(length / cells, 8, length)
+    energies = Energies()
+    run = _run(scene, energies)
+    most, speed, off = judge(scene, run)
+    rows = np.array(energies.rows)
+    done = rows[0].sum() - rows.sum(axis=1)  # 0 if energy is kept: the layers are part of it
+    reach = cracks.reach_of(scene, _damage(run), 0.05)
+    counts = cracks.branches(scene.x, _damage(run)[-1] >= BROKEN, scene.dx, 0.05)
+    forked = np.flatnonzero(counts >= 2)
+    fork = 2.0 * scene.dx * float(forked[0]) if forked.size else math.nan
+    when = float(np.interp(fork, reach, run.times)) if forked.size else math.nan
+    found = {
+        "cracks": most.value, "speed": speed.value, "off": off.value, "fork": fork,
+        "when": when, "lost": float(done[-1] / rows[-1, :].sum()), "surface": float(rows[-1, 2]),
+        "kinetic": float(rows[-1, 0]), "gone": float(done[-1]),
+    }  # fmt: skip
+    return found, scene, run
+
+
+def notch(cells: float, prefer: str, length: float = 1.5e-5) -> Done:
+    """The notched square of Miehe et al."""
+    scene = cracks.notched_square(length / cells, 8, length, 30.0, prefer)
+    run = _run(scene)
+    force, moved, off = judge(scene, run)
+    found = {"force": force.value, "moved": moved.value, "off": off.value}
+    forces, way = cracks.pulled(scene, run)
+    found["curve"] = [way.tolist(), forces.tolist()]
+    return found, scene, run
+
+
+def pmma(release: float, dx: float) -> Done:
+    """The strip of Bleyer et al. at a release of energy over the toughness."""
+    scene = cracks.stretched_strip(
+        "pmma_strip", cracks.PMMA, cracks.PMMA_TOUGHNESS, (0.032, 0.016), 0.004, release, dx, 8,
+        2.0 * dx, 60e-6,
+    )  # fmt: skip
+    run = _run(scene)
+    share, speed = judge(scene, run)
+    return {"release": release, "share": share.value, "speed": speed.value}, scene, run
+
+
+def kalthoff(cells: int, split: str) -> Done:
+    """Kalthoff and Winkler's plate with the toughness of its phase-field papers, 22 130 J/m^2."""
+    plain = find("kalthoff").build(0.1 / cells, 8)
+    steel = plain.materials[1] | {
+        "fracture_energy": 22130.0, "split": split, "length": 2.0 * plain.dx,
+    }  # fmt: skip
+    scene = dataclasses.replace(plain, materials=(plain.materials[0], steel))
+    run = _run(scene)
+    angle, length = judge(scene, run)
+    return {"angle": angle.value, "length": length.value}, scene, run
+
+
+# --- three-point bending ---
+
+
+def bending(cells: float, prefer: str, length: float = 6e-5) -> Done:
+    """The notched beam of Miehe et al.: 8 x 2 mm on two supports, pressed down in the middle."""
+    dx = length / cells
+    wide, high, deep = 8e-3, 2e-3, 4e-4
+    row = cracks.griffith(
+        *BEAM, toughness=BEAM_TOUGHNESS, length=length, dx=dx, split="none", model="at2",
+        prefer=prefer,
+    )  # fmt: skip
+    points = cracks.plate(np.array([0.0, 0.0]), np.array([wide, high]), dx, 8)
+    across = np.abs(points[:, 0] - 0.5 * wide)
+    points = points[(across > 1.51 * dx) | (points[:, 1] > deep - 0.5 * high)]
+    seconds = 5.0 * 0.07 / math.sqrt(BEAM[0] / BEAM[2])  # five periods of its first bending
+    speed = 6.5e-5 / seconds
+    times = np.linspace(0.0, seconds, 61)[1:]
+    breakable = np.abs(points[:, 0] - 0.5 * wide) < 1.2e-3
+    breakable &= points[:, 1] < 0.5 * high - 6.0 * dx
+    scene = free(
+        "bending", points, [0.0] * 3, dx, 8, times, (elastic(*BEAM), row), material=breakable,
+        volume=np.full(points.shape[0], slab_volume(dx, 8)), colliders=walls(dx),
+    )  # fmt: skip
+    law, params, alpha = rows(scene, "phase_field")
+    half = [2.5 * dx, 2.5 * dx, 4.0 * dx]
+    low, top = -0.5 * high + 0.25 * dx - half[1], 0.5 * high - 0.25 * dx + half[1]
+    bars = [
+        collider_row("box", point=(x, low, 0.0), extent=half, mode="separate")
+        for x in (2e-4, wide - 2e-4)
+    ]
+    bars.append(
+        collider_row(
+            "box", point=(0.5 * wide, top, 0.0), extent=half, mode="separate",
+            velocity=(0.0, -speed, 0.0),
+        )
+    )  # fmt: skip
+    planes = [
+        collider_row("plane", point=p["point"], normal=p["normal"], mode="slip")
+        for p in scene.colliders
+    ]
+    world = World(
+        torch.from_numpy(scene.x), (0.0, 0.0, 0.0), volume=torch.from_numpy(scene.volume), dx=dx,
+        law=law, params=params, material=torch.from_numpy(scene.material), alpha=alpha,
+        colliders=torch.stack([*planes, *bars]), dtype=torch.float32,
+    )  # fmt: skip
+    given, seen, x = [0.0], [], []
+    for end in times:
+        world.run(seconds=float(end) - world.time)
+        given.append(float(world.impulse[-1, 1]))
+        seen.append((world.peak.double() + 1.0).clamp(0.0, 1.0).numpy())
+        x.append(world.position.double().numpy())
+    force = -np.diff(given) / np.diff([0.0, *times]) / dx
+    way = speed * (times - 0.5 * times[0])
+    at = int(np.argmax(force))
+    run = Run(
+        scene.name, "gsfluent", times, np.stack(x), np.zeros((len(times), *scene.x.shape)), 0.0,
+        world.steps, damage=np.stack(seen) * (scene.material > 0),
+    )  # fmt: skip
+    broken = scene.x[_damage(run)[-1] >= BROKEN, 0]
+    off = float(np.abs(broken - 0.5 * wide).max(initial=0.0)) / dx if broken.size else math.nan
+    found = {"force": float(force[at]) / 1e6, "moved": float(way[at]) * 1e6, "off": off}
+    return found | {"curve": [way.tolist(), force.tolist()]}, scene, run
+
+
+def jobs(quick: bool) -> list[Job]:
+    """All jobs; ``quick``: one small one of each test."""
+    made: list[Job] = []
+    wide = 4.0 if quick else 1.0
+
+    def add(test: str, name: str, setting: str, seconds: float, work: Callable[[], Done]) -> None:
+        made.append(Job(test, f"{test}_{name}", setting, seconds, work))
+
+    for cells in (2,) if quick else (2, 3, 4):
+        for release in (1.5,) if quick else (0.9, 1.1, 1.5):
+            for place in (0.25,) if quick else (0.0, 0.25, 0.5, 0.75):
+                add(
+                    "strip", f"{cells}_{release:g}_{place:g}", f"{cells} dx", 1.5 * cells**3,
+                    lambda c=cells, r=release, p=place: strip(c, r, p),
+                )  # fmt: skip
+    for cells in (2, 3)[: 1 if quick else 2]:
+        add(
+            "branching", f"{cells}", f"{cells} dx", 13.0 * cells**3,
+            lambda c=cells: branching(c, wide * 5e-4),
+        )  # fmt: skip
+        for prefer in ("toughness", "strength"):
+            add(
+                "notch", f"{cells}_{prefer}", f"{cells} dx, {prefer}", 18.0 * cells**3,
+                lambda c=cells, p=prefer: notch(c, p, wide * 1.5e-5),
+            )  # fmt: skip
+            if cells > 2:
+                continue
+            add(
+                "bending", f"{cells}_{prefer}", f"{cells} dx, {prefer}", 40.0 * cells**3,
+                lambda c=cells, p=prefer: bending(c, p, wide * 6e-5),
+            )  # fmt: skip
+    for release in (2.6,) if quick else (1.2, 1.6, 2.0, 2.6, 3.2):
+        dx = 4e-4 if quick else 1e-4
+        add("pmma", f"{release:g}", "2 dx", 130.0, lambda r=release, d=dx: pmma(r, d))
+    for split in ("spectral", "volumetric"):
+        for count in (48,) if quick else (64, 128, 192):
+            add(
+                "kalthoff", f"{count}_{split}", f"{count} cells, {split}", (count / 32.0) ** 3,
+                lambda c=count, s=split: kalthoff(c, s),
+            )  # fmt: skip
+    return made

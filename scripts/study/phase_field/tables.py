@@ -1,0 +1,161 @@
+"""Tables and the picture of docs/measured/phase_field.md."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsfluent.figure.markdown import enter
+from gsfluent.io.atomic import atomic_path
+
+ROOT = Path(__file__).resolve().parents[3]
+PAGE = ROOT / "docs" / "measured" / "phase_field.md"
+PICTURE = ROOT / "docs" / "images" / "phase_field_cracks.jpg"
+Found = Mapping[str, Any]
+GONE = 1.5
+"""Reach of a crack that has crossed the strip [heights]."""
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def _mean(values: Sequence[float]) -> str:
+    kept = [v for v in values if math.isfinite(v)]
+    if not kept:
+        return ""
+    spread = f" ({min(kept):.2f} to {max(kept):.2f})" if len(kept) > 1 else ""
+    return f"{sum(kept) / len(kept):.2f}{spread}"
+
+
+def strip(found: Sequence[Found]) -> str:
+    """Of each resolution and release: how far the crack ran, what it cost, how fast."""
+    rows = []
+    for cells, release in sorted({(f["cells"], f["release"]) for f in found}):
+        mine = [f for f in found if (f["cells"], f["release"]) == (cells, release)]
+        ran = sum(f["reach"] > GONE for f in mine)
+        rows.append(
+            (
+                f"{cells:g} dx", f"{release:g}", f"{ran} of {len(mine)}",
+                _mean([f["reach"] for f in mine]),
+                _mean([f.get("surface", math.nan) for f in mine]),
+                _mean([f.get("speed", math.nan) for f in mine]),
+            )
+        )  # fmt: skip
+    head = (
+        "l", "release over Gc", "crossed the strip", "reach [heights]",
+        "surface energy per area over Gc", "speed over c_R",
+    )  # fmt: skip
+    return _table(head, rows)
+
+
+def branching(found: Sequence[Found]) -> str:
+    """The forking crack."""
+    head = (
+        "l", "points", "cracks behind the fork", "fork at [mm]", "at [us]", "fastest tip over c_R",
+        "mirror [dx]", "surface energy [J/m]", "kinetic [J/m]", "gone [J/m]", "CPU s",
+    )  # fmt: skip
+    return _table(
+        head,
+        (
+            (
+                f["setting"], str(f["points"]), f"{f['cracks']:g}", f"{f['fork'] * 1e3:.1f}",
+                f"{f['when'] * 1e6:.0f}", f"{f['speed']:.2f}", f"{f['off']:.1f}",
+                f"{f['surface'] / f['dx']:.3f}", f"{f['kinetic'] / f['dx']:.3f}",
+                f"{f['gone'] / f['dx']:.3f}", f"{f['cpu']:.0f}",
+            )
+            for f in found
+        ),
+    )  # fmt: skip
+
+
+def peak(found: Sequence[Found], force: float | None, way: float | None) -> str:
+    """A largest force and where it is, beside a reference [kN/mm], [um]."""
+    rows = []
+    for f in found:
+        off = f"{f['off']:.1f}"
+        each = [f["setting"], f"{f['force']:.4f}", f"{f['moved']:.2f}"]
+        for value, known in ((f["force"], force), (f["moved"], way)):
+            each.append("" if known is None else f"{100.0 * (value / known - 1.0):+.1f} %")
+        rows.append((*each, off, f"{f['cpu']:.0f}"))
+    head = (
+        "l, kept", "largest force [kN/mm]", "at [um]", "force over reference",
+        "way over reference", "off the line [dx]", "CPU s",
+    )  # fmt: skip
+    return _table(head, rows)
+
+
+def pmma(found: Sequence[Found]) -> str:
+    """Where the strip of PMMA branches."""
+    rows = (
+        (f"{f['release']:g}", f"{f['share']:.2f}", f"{f['speed']:.2f}", f"{f['cpu']:.0f}")
+        for f in sorted(found, key=lambda f: float(f["release"]))
+    )
+    return _table(
+        ("release over Gc", "share of the way with branches", "fastest tip over c_R", "CPU s"), rows
+    )
+
+
+def kalthoff(found: Sequence[Found]) -> str:
+    """Direction of Kalthoff's crack."""
+    rows = (
+        (f["setting"], f"{f['angle']:.1f}", f"{f['length']:.1f}", f"{f['cpu']:.0f}") for f in found
+    )
+    return _table(("side, split", "direction [degrees]", "length [mm]", "CPU s"), rows)
+
+
+def picture(out: Path, names: Sequence[tuple[str, str]]) -> None:
+    """Damage at the end of the named jobs, side by side."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    there = [(name, said) for name, said in names if (out / f"{name}.npz").is_file()]
+    figure, axes = pyplot.subplots(2, 3, figsize=(12, 6.4))
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, (name, said) in zip(axes.flat, there, strict=False):
+        with np.load(out / f"{name}.npz") as data:
+            x, damage = 1e3 * data["x"], data["damage"]
+        order = np.argsort(damage, kind="stable")
+        axis.scatter(*x[order].T, c=damage[order], s=0.15, cmap="inferno", vmin=0, vmax=255)
+        axis.set_aspect("equal")
+        axis.set_title(said, fontsize=9)
+    figure.tight_layout()
+    with atomic_path(PICTURE) as path:
+        figure.savefig(path, dpi=80, format="jpg", pil_kwargs={"quality": 80})
+    pyplot.close(figure)
+
+
+def enter_page(found: Mapping[str, Found], out: Path) -> None:
+    """Write every table for which there are figures, and the picture."""
+    text = PAGE.read_text(encoding="utf-8")
+
+    def of(test: str) -> list[Found]:
+        return [f for f in found.values() if f["test"] == test]
+
+    parts = {
+        "strip": strip, "branching": branching, "pmma": pmma, "kalthoff": kalthoff,
+        "notch": lambda rows: peak(rows, 0.701, 5.55),
+        "bending": lambda rows: peak(rows, None, None),
+    }  # fmt: skip
+    for test, table in parts.items():
+        if rows := of(test):
+            text = enter(text, f"phase_field_{test}", table(rows))
+    picture(
+        out,
+        [
+            ("branching_3", "branching, l = 3 dx"), ("pmma_2.6", "PMMA strip, 2.6 Gc"),
+            ("kalthoff_192_spectral", "Kalthoff, spectral"),
+            ("notch_3_strength", "notched square"), ("bending_2_strength", "three-point bending"),
+            ("kalthoff_192_volumetric", "Kalthoff, volumetric"),
+        ],
+    )  # fmt: skip
+    with atomic_path(PAGE) as path:
+        path.write_text(text, encoding="utf-8")
