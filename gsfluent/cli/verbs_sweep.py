@@ -155,7 +155,7 @@ class Fit(Verb):
     cells: int = 8
     """Cells along the longest side of the largest object; give thin things more."""
     grids: Literal[1, 2] = 2
-    """2: fit on a grid finer by 1.5, too; their difference joins the bands."""
+    """2: a grid twice as fine sets the motion of the coarser one right."""
     jobs: int | None = None
     """Searches at a time; as many as there are cores when absent."""
     on: On = "local"
