@@ -86,6 +86,26 @@ def test_of_two_tries_one_is_the_tasks_and_the_other_leaves_nothing(url: str) ->
     assert attempt(url, "one", odd_ones_fail, 5) == DONE  # found, not done
 
 
+def test_a_try_that_dies_before_it_is_named_is_as_if_it_had_not_been(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = placed(url)
+    dead = place.begin("one")
+    (dead / "number.txt").write_text("of one that was killed")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+
+        def killed(self: SweepBucket, key: str, words: dict[str, Any]) -> bool:
+            raise KeyboardInterrupt
+
+        patch.setattr(SweepBucket, "_create", killed)
+        place.finish("one", dead, {"id": "one", "value": -1})
+    assert place._find("shots") and not place.done()
+    assert attempt(url, "one", square, 5) == DONE
+    row = place.row("one")
+    assert row is not None and row["value"] == 25
+    assert all(row["try"] in key for key in place._find("shots"))
+
+
 def test_an_answer_that_was_lost_is_no_defeat(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     place = placed(url)
     create = SweepBucket._create
