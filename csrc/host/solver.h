@@ -59,6 +59,7 @@ enum SolverBuffer : int {
   kCut,
   kContactRadius,
   kViscous,
+  kObject,
   kSolverBuffers
 };
 
@@ -158,6 +159,7 @@ struct SolverOps {
         {"cut", ints[kFields], 1, i32, true},
         {"radius", n, 1, real, true},
         {"viscous", device ? 0 : n, kViscousColumns, real, true},
+        {"object", ints[kFields], 1, i32, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -237,6 +239,7 @@ struct SolverOps {
     s.cut = int_at(kCut);
     s.radius = real_at(kContactRadius);
     s.viscous = real_at(kViscous);
+    s.object = int_at(kObject);
     return s;
   }
 

@@ -110,6 +110,9 @@ class Solver(SolverState):
             point in as deep. Default: colliders hold nodes. CPU only.
         viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`); laws 0 and 1
             only, on the CPU. Default: nothing relaxes and all yields at once, at no cost.
+        objects: Object of each field, int32 [K], with ``radius``: points of different objects push
+            each other (docs/theory/contact.md, "At a point"); fields of one object touch at nodes.
+            Default: all fields do.
         gravity: Acceleration [m/s^2].
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
@@ -155,6 +158,7 @@ class Solver(SolverState):
         cut: Tensor | None = None,
         radius: Tensor | None = None,
         viscous: Tensor | None = None,
+        objects: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         colliders: Tensor | None = None,
         sdf: Tensor | None = None,
@@ -272,6 +276,14 @@ class Solver(SolverState):
         if viscous is not None:
             values["viscous"] = viscous
         self._load(position, values, row, body)
+        if objects is not None:
+            if radius is None:
+                raise InputError(
+                    f"{op}: objects push each other's points by their radius, which is missing",
+                    hint="give radius too, or leave out objects: fields then touch at nodes",
+                )
+            rows = check_tensor(op, "objects", objects, shape=(self.fields,), dtype=torch.int32)
+            b.object = rows.to(self.device).contiguous()
         if parent is not None or cut is not None:
             for name, given in (("parent", parent), ("cut", cut)):
                 rows = check_tensor(op, name, given, shape=(self.fields,), dtype=torch.int32)

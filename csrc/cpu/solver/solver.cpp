@@ -25,8 +25,9 @@ class Stepper {
         laws_(laws),
         contact_(s),
         surface_(s),
-        homes_(s, contact_, surface_),
-        nodes_(s, contact_, surface_) {
+        touch_(s, contact_),
+        homes_(s, contact_, surface_, touch_),
+        nodes_(s, contact_, surface_, touch_) {
     if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
   }
 
@@ -39,6 +40,7 @@ class Stepper {
     touched_.assign(c.slots, 0);
     contact_.make();
     surface_.make();
+    touch_.make();
     homes_.plan();
     nodes_.plan();
     if (fields_) fields_->plan();
@@ -64,6 +66,7 @@ class Stepper {
   const int laws_;
   ContactPlan<T> contact_;
   SurfacePlan<T> surface_;
+  TouchPlan<T> touch_;
   HomePass<T> homes_;
   NodePass<T> nodes_;
   std::unique_ptr<FieldPass<T>> fields_;

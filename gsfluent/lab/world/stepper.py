@@ -54,6 +54,7 @@ class Scene:
     frame: tuple[float, float, float] | None = None
     radius: Tensor | None = None
     viscous: Tensor | None = None  # viscosity of each point, [N, 9]; ops.viscous_step
+    objects: Tensor | None = None
 
 
 def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
@@ -106,13 +107,15 @@ class Pushed:
     """
 
     def __init__(
-        self, scene: Scene, position: Tensor, blocks: ops.Blocks, dt: float, body: Tensor | None
-    ) -> None:
+        self, scene: Scene, position: Tensor, velocity: Tensor, blocks: ops.Blocks, dt: float,
+        body: Tensor | None,
+    ) -> None:  # fmt: skip
         assert scene.colliders is not None and scene.radius is not None
         where = scene.material.long()
         params = scene.params[where]
         wave = ((params[:, 1] + 4.0 / 3.0 * params[:, 0]) / params[:, 6]).sqrt()
         length = scene.volume ** (1.0 / 3.0)
+        longest = scene.fixed_dt or scene.cfl * scene.dx / float(wave.max())
         x = blocks.node_positions(scene.dx, position.dtype)
         none = torch.zeros(len(position), 3, 3, dtype=position.dtype, device=position.device)
         self.parts: list[tuple[Tensor, Tensor]] = []
@@ -121,9 +124,13 @@ class Pushed:
             pushes = spring.springs(row)
             impulse = torch.zeros_like(position)
             if pushes:
-                impulse = spring.point_push(
-                    row, None, position, scene.radius, scene.mass, wave, length, scene.dx, dt
+                own = row[10:13] + torch.linalg.cross(
+                    row[20:23].expand_as(position), position - row[3:6]
                 )
+                impulse = spring.point_push(
+                    row, None, position, scene.radius, scene.mass, wave, length, scene.dx, dt,
+                    velocity - own, longest,
+                )  # fmt: skip
             summed, _ = ops.p2g(
                 position, impulse / scene.mass[:, None], none, scene.mass, dx=scene.dx,
                 blocks=blocks, body=body, fields=scene.fields,
@@ -265,7 +272,7 @@ class Stepper:
         scene = self.scene
         if scene.radius is None or scene.colliders is None:
             return None
-        return Pushed(scene, self.position, blocks, dt, body)
+        return Pushed(scene, self.position, self.velocity, blocks, dt, body)
 
     def _find_blocks(self, place: Tensor, dt: float, *, fresh: bool) -> ops.Blocks:
         speed = float(self.velocity.abs().max())
