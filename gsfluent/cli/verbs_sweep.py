@@ -128,6 +128,7 @@ class Fit(Verb):
       gsfluent fit shot.yaml --points track.npz --learn melon.young_modulus melon.velocity -o out
       gsfluent fit shot.yaml --clouds frames/ --learn melon.young_modulus melon.poisson_ratio -o out
       gsfluent fit shot.yaml --force press.csv --learn block.young_modulus -o out
+      gsfluent fit shot.yaml --masks films/ --cameras capture/ --learn melon.young_modulus -o out
 
     The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
     What the motion does not show is called unidentified and given as a bound. A fit that was
@@ -146,8 +147,12 @@ class Fit(Verb):
     """Clouds or splats without names: a folder with a file per frame."""
     force: Path | None = None
     """A table with columns displacement [m] and force [N] of the one collider that moves."""
+    masks: Path | None = None
+    """Films of masks: a folder for each camera, named as its image, with a picture per frame."""
+    cameras: Path | None = None
+    """Of --masks: COLMAP model or transforms.json in the frame of the splats; they stand still."""
     sigma: float | None = None
-    """Standard deviation of what was seen [m, N]."""
+    """Standard deviation of what was seen [m, N; of a pixel none]."""
     fps: float | None = None
     """Frames per second of files without times; 24 when absent."""
     starts: int = 4
@@ -166,15 +171,15 @@ class Fit(Verb):
         from gsfluent.config import load_shot
         from gsfluent.fit.job import fit_to
 
-        for name in ("points", "clouds", "force"):
+        for name in ("points", "clouds", "force", "masks", "cameras"):
             if getattr(self, name) is not None:
                 existing(getattr(self, name), f"--{name}")
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
         with self.reporter() as report:
             return fit_to(
                 shot, self.out, self.learn, device=self.torch_device(), reporter=report,
-                **self.given("points", "clouds", "force", "sigma", "fps", "starts", "cells"),
-                **self.given("grids", "jobs", "on", "seed"),
+                **self.given("points", "clouds", "force", "masks", "cameras", "sigma", "fps"),
+                **self.given("starts", "cells", "grids", "jobs", "on", "seed"),
             )  # fmt: skip
 
     def text(self, result: dict[str, Any]) -> str | None:

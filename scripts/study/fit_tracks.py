@@ -4,8 +4,8 @@ python scripts/study/fit_tracks.py --scenes 10 --jobs 16 --minutes 8  # a proces
 
 Ellipsoids fall on a floor. The truth is simulated as `gsfluent run` does it (float32, shaken
 points, its own time steps) at half the spacing of the finer grid of the fit; 150 of its points are
-the tracks. Ranges lie about the objects of PAC-NeRF, starts are those of its files. One JSON line
-per scene.
+the tracks. Ranges lie about the objects of PAC-NeRF; elastic and Newtonian matter starts as in its
+files. One JSON line per scene.
 """
 
 from __future__ import annotations
