@@ -6,6 +6,7 @@
 #include <cstring>
 
 #include "core/collider/collider.h"
+#include "core/material/viscous.h"
 #include "core/solver/state.h"
 #include "torch_api.h"
 
@@ -58,6 +59,7 @@ enum SolverBuffer : int {
   kCut,
   kContactRadius,
   kObject,
+  kViscous,
   kSolverBuffers
 };
 
@@ -157,6 +159,7 @@ struct SolverOps {
         {"cut", ints[kFields], 1, i32, true},
         {"radius", n, 1, real, true},
         {"object", ints[kFields], 1, i32, true},
+        {"viscous", device ? 0 : n, kViscousColumns, real, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -236,6 +239,7 @@ struct SolverOps {
     s.cut = int_at(kCut);
     s.radius = real_at(kContactRadius);
     s.object = int_at(kObject);
+    s.viscous = real_at(kViscous);
     return s;
   }
 

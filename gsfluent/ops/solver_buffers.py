@@ -89,6 +89,7 @@ class Buffers:
     cut: Tensor
     radius: Tensor
     object: Tensor
+    viscous: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""

@@ -201,6 +201,8 @@ struct SolverView {
   // [fields] object of each field: points of different ones push each other
   // (core/collider/touch.h); or null: fields meet at nodes; CPU only
   const int32_t* object;
+  // [N, 9] viscosity of each point (core/material/viscous.h), or null; CPU only
+  T* viscous;
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {

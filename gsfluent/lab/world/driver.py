@@ -82,6 +82,7 @@ class World:
             that are nearer (docs/theory/colliders.md). None: they hold nodes.
         touch: With ``surface``, points of different bodies push each other
             (docs/theory/contact.md); else bodies touch at nodes. The solver only.
+        viscous: Viscosity of each point, [N, 9], or [9] for all: :func:`gsfluent.ops.viscous_step`.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
     Raises:
@@ -131,6 +132,7 @@ class World:
         frame: Sequence[float] | None = None,
         surface: float | None = None,
         touch: bool = False,
+        viscous: Tensor | None = None,
         **return_map: Any,
     ):
         if dt is not None and not 0.0 < dt < math.inf:
@@ -183,6 +185,7 @@ class World:
             return_map=return_map,
             frame=None if frame is None else (frame[0], frame[1], frame[2]),
             objects=None if body is None or not touch else each_its_own(body),
+            viscous=None if viscous is None else number(viscous, count, 9),
             radius=None if surface is None else surface * number(volume, count) ** (1.0 / 3.0),
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()

@@ -146,6 +146,7 @@ class Points(NamedTuple):
     alpha: Tensor
     peak: Tensor
     deformation: Tensor | None
+    viscous: Tensor | None = None
 
 
 class Engine(Protocol):
