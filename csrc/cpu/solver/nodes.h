@@ -214,9 +214,15 @@ class NodePass {
   template <typename Number>
   void rub(const Site& site, int local, const bool* heavy, const Number& number, const double* mass,
            Vec3<T>* velocity, double* impulse) const {
-    const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
+    Vec3<T> x;
     int32_t k = -1;
     uint32_t done = 0;
+    for (int a = 0; a < site.fields; ++a) {
+      const T* given = surface_.sums() + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
+      if (given[0] == T(0) && given[1] == T(0) && given[2] == T(0)) done |= 1u << a;
+    }
+    if (done == (1u << site.fields) - 1u) return;
+    done = 0;
     for (int a = 0; a < site.fields; ++a) {
       if (!heavy[a] || (done >> a & 1u) != 0) continue;
       const uint32_t group = node_group(s_, site.fields, heavy, number, a);
@@ -231,7 +237,10 @@ class NodePass {
       }
       const Vec3<T> j{push[0], push[1], push[2]};
       if (!(dot(j, j) > T(0))) continue;
-      if (k < 0) k = surface_.nearest(x);
+      if (k < 0) {
+        x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
+        k = surface_.nearest(x);
+      }
       const T* row = s_.colliders + int64_t(k) * kColliderColumns;
       const Vec3<T> v = velocity[a];
       const Vec3<T> after = spring_friction(v, collider_velocity(row, x), j, push[3], T(total));

@@ -104,6 +104,7 @@ class SurfacePlan {
   // The collider nearest to x.
   int32_t nearest(const Vec3<T>& x) const {
     int32_t found = springs_[0];
+    if (springs_.size() == 1) return found;
     T least = T(INFINITY);
     for (const int32_t k : springs_) {
       Vec3<T> normal;
