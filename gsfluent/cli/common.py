@@ -17,6 +17,7 @@ from gsfluent.progress import Progress, Reporter, reporter
 _log = logging.getLogger(__name__)
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+On = Annotated[str, tyro.conf.arg(metavar="local|slurm|ray[=HOST:PORT]")]
 
 
 @dataclass(kw_only=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gsfluent.cli.common import Out, Verb, existing
+from gsfluent.cli.common import On, Out, Verb, existing
 from gsfluent.errors import InputError, need
 
 Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")]
@@ -52,7 +52,11 @@ class Chart(Verb):
     """Timed runs of each setting; their median counts."""
     budget: float | None = None
     """Seconds in all; runs expected to pass them are left out. Default: 660 on a CPU, 110 on a
-    GPU; 0 for none."""
+    GPU; 0 for none, as with --jobs or --on."""
+    jobs: int = 1
+    """Runs at a time; the times of more on one machine are not those of one alone."""
+    on: On = "local"
+    """Where runs are done, as of `gsfluent sweep`."""
     draw: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.jsonl ...")] = ()
     """Draw these records, ours and peers', and run nothing."""
 
@@ -65,6 +69,8 @@ class Chart(Verb):
         need("matplotlib", "figures", "chart")  # missing is better said before the runs
         if self.repeat < 1:
             raise InputError(f"--repeat {self.repeat}", "give at least 1")
+        if self.jobs < 1:
+            raise InputError(f"--jobs {self.jobs}", "give at least 1")
         if self.budget is not None and self.budget < 0:
             raise InputError(f"--budget {self.budget}", "give seconds, or 0 for no limit")
         if self.of != "simulation":
@@ -124,7 +130,8 @@ class Chart(Verb):
         with self.progress("chart") as progress:
             return chart_quality(
                 self.of, self.out, device=self.torch_device(), quick=self.quick,
-                repeat=1 if self.quick else self.repeat, progress=progress,
+                repeat=1 if self.quick else self.repeat, jobs=self.jobs, on=self.on,
+                progress=progress,
             )  # fmt: skip
 
     def _run(self, result: dict[str, Any]) -> Any:
@@ -134,12 +141,14 @@ class Chart(Verb):
         device = self.torch_device()
         place = str(device)
         settings = ladder(self.cases, device=place, only=self.only, quick=self.quick)
-        budget = {"cpu": 660.0, "cuda": 110.0}[device.type] if self.budget is None else self.budget
+        budget = self.budget
+        if budget is None and self.jobs == 1 and self.on == "local":
+            budget = {"cpu": 660.0, "cuda": 110.0}[device.type]
         lines = self.out / "chart.jsonl"
         with self.progress("chart") as progress:
             done = run(
                 settings, lines, device=place, repeat=1 if self.quick else self.repeat,
-                budget=budget or None, progress=progress,
+                budget=budget or None, jobs=self.jobs, on=self.on, progress=progress,
             )  # fmt: skip
         result |= {"lines": lines, "seconds": done.seconds, "run now": done.fresh}
         if done.left_out:
@@ -172,6 +181,8 @@ class Stability(Verb):
     """Three by three points of each map, for a look or for CI."""
     jobs: int = 1
     """Processes that share the work."""
+    on: On = "local"
+    """Where points are run, as of `gsfluent sweep`."""
     draw: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.jsonl ...")] = ()
     """Draw these lines and run nothing."""
     peers: Path | None = None
@@ -205,7 +216,7 @@ class Stability(Verb):
             with self.progress("stability") as progress:
                 points = run_maps(
                     wanted, self.out / "stability.jsonl", device=device.type, quick=self.quick,
-                    jobs=self.jobs, progress=progress,
+                    jobs=self.jobs, on=self.on, progress=progress,
                 )  # fmt: skip
         page = write_all(wanted, points, self.out, marks(wanted, programs))
         drawn = [m for m in wanted if any(p.map == m.name for p in points)]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gsfluent.cli.common import Out, Verb, existing
+from gsfluent.cli.common import On, Out, Verb, existing
 from gsfluent.errors import InputError
 
 
@@ -38,7 +38,7 @@ class Sweep(Verb):
     """Of a shot: how many seeds, from 0 on."""
     jobs: int | None = None
     """Shots at a time; as many as there are cores for when absent."""
-    on: Annotated[str, tyro.conf.arg(metavar="local|slurm|ray[=HOST:PORT]")] = "local"
+    on: On = "local"
     """Where shots run: processes of this machine, jobs of a SLURM cluster (extra `slurm`), or a Ray
     cluster that runs already (extra `ray`)."""
     keep: Literal["all", "film"] | None = None
@@ -147,8 +147,8 @@ class Fit(Verb):
     """2: fit on a grid finer by 1.5, too; their difference joins the bands."""
     jobs: int | None = None
     """Searches at a time; as many as there are cores when absent."""
-    on: Literal["local", "slurm"] = "local"
-    """Where searches run."""
+    on: On = "local"
+    """Where searches run, as of `gsfluent sweep`."""
 
     def execute(self) -> dict[str, Any]:
         """Learn."""

@@ -55,6 +55,11 @@ def read_error(text: str, argument: str) -> float:
 _ERROR = share(1e-4, 0.5)
 
 
+WALL_POINTS = {"preview": 40_000}
+"""Most material points for walls by quality: a preview of a bowl costs what one of a ball does."""
+_WALL_POINTS = 300_000
+
+
 @dataclasses.dataclass(frozen=True)
 class SolveSettings:
     """``solve:`` - how accurately."""
@@ -70,13 +75,13 @@ class SolveSettings:
         "Cells along the longest side of the largest solid, instead of those of `quality`.",
         "32",
     )
-    max_points: int = key(
+    max_points: int | None = optional(
         whole(0, 8_000_000),
         "Where a quarter of a body stands on walls thinner than three cells of `quality`, the "
         "cells are made as fine as that takes, up to so many material points and eight times the "
-        "cells of `quality`; 0 leaves them. `cells` is never changed.",
+        "cells of `quality`; 0 leaves them. Without it 40000 for `preview`, else 300000. `cells` "
+        "is never changed.",
         "1000000",
-        default=300_000,
     )
     cfl: float = key(
         number(0.05, 0.9), "Courant number of the automatic time step.", "0.7", default=0.5
@@ -121,6 +126,13 @@ class SolveSettings:
         "true",
         default=False,
     )
+
+    @property
+    def points_for_walls(self) -> int:
+        """Most material points to which cells are refined for walls."""
+        if self.max_points is None:
+            return WALL_POINTS.get(self.quality, _WALL_POINTS)
+        return self.max_points
 
 
 def read_solve(value: Any, place: Place) -> SolveSettings:

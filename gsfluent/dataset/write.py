@@ -14,12 +14,12 @@ from typing import Any
 import torch
 
 from gsfluent.dataset.sample import PARTS, Source, make_sample
-from gsfluent.errors import InputError, RunError, check_choice
+from gsfluent.errors import InputError, check_choice
 from gsfluent.io import atomic_path
 from gsfluent.io.atomic import link_or_copy
 from gsfluent.io.checked.files import read_json
 from gsfluent.progress import Progress
-from gsfluent.sweep.engine import Outcome, map
+from gsfluent.sweep.engine import Outcome, map, required
 from gsfluent.sweep.folder import SweepFolder
 
 _log = logging.getLogger(__name__)
@@ -73,14 +73,7 @@ def write_dataset(
         make_sample, sources, out / "samples", ids=[source.id for source in sources], jobs=jobs,
         retry=True, progress=progress,
     )  # fmt: skip
-    failed = [outcome for outcome in outcomes if outcome.failure is not None]
-    if failed:
-        assert failed[0].failure is not None
-        raise RunError(
-            f"{len(failed)} samples could not be made; {failed[0].id}: "
-            f"{failed[0].failure['message']}",
-            f"the others, in {out / 'samples'}", "run the same command again",
-        )  # fmt: skip
+    required(outcomes, "samples could not be made", out / "samples")
     by_split = {
         split: [o for o in outcomes if split_of(o.value["object"], shares) == split]
         for split in SPLITS

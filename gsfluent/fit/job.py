@@ -17,7 +17,7 @@ import yaml
 
 from gsfluent.choose.shot import shot_scene
 from gsfluent.config import Shot
-from gsfluent.errors import InputError, MissingPackage, RunError
+from gsfluent.errors import InputError, MissingPackage
 from gsfluent.figure.page import Page
 from gsfluent.figure.series import Panel, curves
 from gsfluent.fit.read import read_target
@@ -26,6 +26,7 @@ from gsfluent.pipeline.fit import Fit, Found, Task, run_task
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import content_digest, fingerprint
 from gsfluent.sweep.engine import map as sweep_map
+from gsfluent.sweep.engine import required
 
 FILES = {"fit": "fit.json", "shot": "fitted.yaml", "report": "fit.html"}
 
@@ -65,7 +66,7 @@ def fit_to(
         grids: 1 or 2.
         seed: Of the starts, and of solids.
         jobs: Searches at a time.
-        on: ``local`` or ``slurm``.
+        on: Where searches run, see :func:`gsfluent.sweep.map`.
         device: Where solids are made; the searches are done on the CPU, in float64.
         reporter: Told of the progress.
 
@@ -117,11 +118,10 @@ def _through_sweep(
     tasks = list(items)
     ids = [fingerprint(base, t.start, t.dx, list(t.shares), t.grid) for t in tasks]
     unlike = dict(zip(ids, tasks, strict=True))
-    outcomes = sweep_map(search_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on)
-    failed = next((o for o in outcomes if o.failure is not None), None)
-    if failed is not None:
-        raise RunError(f"fit: a search failed: {failed.failure}", str(folder), "run it again")
-    done = {o.id: o.value for o in outcomes}
+    outcomes = sweep_map(
+        search_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True
+    )
+    done = {o.id: o.value for o in required(outcomes, "searches failed", folder)}
     return [done[name] for name in ids]
 
 

@@ -30,6 +30,7 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.ops.mvee": ("mvee", "mvee_lens"),
         "gsfluent.ops.raster": ("Rendered", "rasterize"),
         "gsfluent.ops.density": ("Bulk", "splat_bulk", "occupancy", "density_normals"),
+        "gsfluent.ops.spatial": ("largest_shares", "nearest_in_cells", "nearest_labels"),
         "gsfluent.ops.shade": ("shade",),
         "gsfluent.ops.losses": ("Photometric", "photometric_loss", "ssim"),
         "gsfluent.ops.adam": ("adam_step",),

@@ -102,7 +102,9 @@ class Prospect:
     @functools.cached_property
     def wall_cells(self) -> tuple[int, int]:
         """Cells along the largest body that walls get, and that they want."""
-        return cells_for_walls(self.scene, self.shot.solve.quality, self.shot.solve.max_points)
+        return cells_for_walls(
+            self.scene, self.shot.solve.quality, self.shot.solve.points_for_walls
+        )
 
     def outlook(self, dx: float) -> Outlook:
         """What happens on a grid of spacing ``dx``."""
@@ -379,7 +381,7 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
             )
     solve = shot.solve
     if solve.cells is None and solve.seconds_per_frame is None and solve.error is None:
-        if note := walls_note(solve.quality, *prospect.wall_cells, solve.max_points):
+        if note := walls_note(solve.quality, *prospect.wall_cells, solve.points_for_walls):
             found.append(note)
     found.extend(lowered(scene, dx))
     if outlook.grid_seconds <= 0.0:

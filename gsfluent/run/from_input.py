@@ -42,6 +42,8 @@ SETTINGS: dict[str, dict[str, Any]] = {"solve": {"quality": "preview"}, "output"
 _GRAVITY = 9.81
 _LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down as well
 _AFTER = 1.2  # seconds of film after the landing
+_QUICK = 0.03  # s: what lands with its length in less is shown slower, by as much
+_SLOWEST = 8  # times slower than it happens, at most
 _SAMPLE = 2000  # points of a surface that are asked for their colour
 _VIEWED, _FEW = 20_000, 200  # points that are looked at for the front, and fewest that tell
 _SOLID = 0.3  # opacity from which a splat counts
@@ -49,9 +51,9 @@ _AROUND = 0.3  # mean of the directions to the photographers below which they st
 
 _WORDS = {
     "fruit.watermelon": "watermelon melon",
-    "fruit.apple": "apple pear mango pepper paprika peach tomato plum fruit",
-    "fruit.orange": "orange lemon citrus grapefruit lime",
-    "fruit.pumpkin": "pumpkin squash gourd",
+    "fruit.apple": "apple",
+    "fruit.orange": "orange",
+    "fruit.pumpkin": "pumpkin",
     "ceramic": "ceramic porcelain china bowl plate cup mug pot vase jug tea teapot dish urn",
     "glass": "glass bottle wineglass goblet jar",
     "bone": "bone skull skeleton tooth",
@@ -71,6 +73,13 @@ _WORDS = {
     "snow": "snow snowman",
 }
 """Words in the names of files, by the preset that they suggest."""
+
+_LIKE = {
+    "fruit.apple": "fruit pear mango pepper paprika peach tomato plum potato carrot vegetable",
+    "fruit.orange": "citrus lemon grapefruit lime",
+    "fruit.pumpkin": "squash gourd",
+}
+"""Words for what has no preset of its own, by the nearest one."""
 
 _INSIDE = {
     "fruit.watermelon": "watermelon",
@@ -106,11 +115,11 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     key, path = find_input(source)
     if material is None:
         material, why = guess_material(key, path, source)
-        _log.info("material: %s, guessed from %s; --material NAME says better", material, why)
+        _log.info("material: %s, a guess from %s; --material NAME says better", material, why)
     splats = _sampled(key, path)
     front, side = guess_front(key, path, splats)
     _log.info("front: %s; front: in the shot says better", side)
-    events, seconds, fall = _fall(materials.get(material), _size(key, path, splats))
+    events, shown, fall = _fall(materials.get(material), _size(key, path, splats))
     _log.info("event: %s", fall)
     values: dict[str, Any] = {key: str(path.resolve())}
     if front is not None:
@@ -118,7 +127,7 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     values["objects"] = {"object": {"material": material}}
     if material in _INSIDE:
         values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
-    output = {"seconds": seconds, **SETTINGS["output"]}
+    output = {**shown, **SETTINGS["output"]}
     values |= SETTINGS | {"events": events, "output": output}
     text = yaml.safe_dump(values, sort_keys=False)
     target = out / FILE
@@ -199,10 +208,13 @@ def guess_material(key: str, path: Path, source: Path) -> tuple[str, str]:
     names = dict.fromkeys((path.stem, source.stem, path.resolve().parent.name))
     for name in names:
         parts = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
-        for preset, words in _WORDS.items():
-            hit = set(words.split()) & {*parts, *(part.removesuffix("s") for part in parts)}
-            if hit:
+        words = {*parts, *(part.removesuffix("s") for part in parts)}
+        for preset, known in _WORDS.items():
+            if words & set(known.split()):
                 return preset, f"the name {name!r}"
+        for preset, known in _LIKE.items():
+            if hit := sorted(words & set(known.split())):
+                return preset, f"the name {name!r}: {_nearest_to(preset, hit[0])}"
     if key == "capture":
         return "plaster", "nothing (it is brittle and breaks from any height)"
     if key == "mesh":
@@ -214,6 +226,14 @@ def guess_material(key: str, path: Path, source: Path) -> tuple[str, str]:
         splats = load_splats(path)
         colors = splats.colors().clamp(0.0, 1.0).double().numpy()[splats.opacities.numpy() > _SOLID]
     return _by_color(np.median(colors, axis=0))
+
+
+def _nearest_to(preset: str, word: str) -> str:
+    """That a word has no preset, and which are near."""
+    family = preset.split(".")[0] + "."
+    others = [name for name in materials.names() if name.startswith(family) and name != preset]
+    near = f", before {', '.join(others)}" if others else ""
+    return f"{word} has no preset, and this is the nearest{near}"
 
 
 def _sampled(key: str, path: Path) -> Gaussians | None:
@@ -301,27 +321,33 @@ def _by_color(color: np.ndarray) -> tuple[str, str]:
     return ("fruit.apple", "its bright colour") if saturation > 0.5 else ("plaster", "its colour")
 
 
-def _fall(material: materials.Material, size: float) -> tuple[list[dict[str, Any]], float, str]:
-    """Events that break a material, how long the film is [s], and why in words."""
+def _fall(
+    material: materials.Material, size: float
+) -> tuple[list[dict[str, Any]], dict[str, float], str]:
+    """Events that break a material, the time of the film, and why in words."""
     limit = breaks_from(material, size, size / QUALITY["preview"])
     if not math.isfinite(limit):
         height, why = 1.0, f"a drop from 1 m ({material.name} does not break)"
-        return [{"type": "drop", "height": height}], _seconds(height, 0.0), why
+        return [{"type": "drop", "height": height}], _time(height, 0.0, 1.0), why
     needed = (SURE * limit) ** 2 / (2.0 * _GRAVITY)
     height = round(min(max(needed, _LOW), _HIGH), 2)
     events: list[dict[str, Any]] = [{"type": "drop", "height": height}]
     about = f"{material.name} is estimated to break from {limit:.2g} m/s"
-    if needed <= _HIGH:
-        return events, _seconds(height, 0.0), f"a drop from {height:g} m ({about})"
-    speed = round(math.sqrt((SURE * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
-    events.append({"type": "throw", "velocity": [0.0, 0.0, -speed]})
-    return (
-        events,
-        _seconds(height, speed),
-        f"thrown down from {height:g} m at {speed:g} m/s ({about})",
-    )
+    speed, said = 0.0, f"a drop from {height:g} m ({about})"
+    if needed > _HIGH:
+        speed = round(math.sqrt((SURE * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
+        events.append({"type": "throw", "velocity": [0.0, 0.0, -speed]})
+        said = f"thrown down from {height:g} m at {speed:g} m/s ({about})"
+    # what is small and fast has left the picture before anybody has seen it break
+    lands = math.hypot(speed, math.sqrt(2.0 * _GRAVITY * height))
+    slow = float(min(max(1, round(_QUICK * lands / size)), _SLOWEST))
+    if slow > 1.0:
+        said += f", shown {slow:g} times slower than it happens"
+    return events, _time(height, speed, slow), said
 
 
-def _seconds(height: float, speed: float) -> float:
+def _time(height: float, speed: float, slow: float) -> dict[str, float]:
+    """``fps``, ``seconds`` and ``slow`` of a film of a fall."""
     fall = (math.sqrt(speed**2 + 2.0 * _GRAVITY * height) - speed) / _GRAVITY
-    return round(fall + _AFTER, 1)
+    seconds = {"seconds": round(fall + _AFTER / slow, 2 if slow > 1.0 else 1)}
+    return seconds if slow == 1.0 else {"fps": 30.0 * slow, **seconds, "slow": slow}

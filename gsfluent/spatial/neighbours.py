@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_CHUNK = 1 << 25  # candidate pairs at a time
+from gsfluent import ops
+
 _SIDE = 1 << 20  # cells along an axis that a key can tell apart
 
 
@@ -161,7 +162,8 @@ def grid_search(
     """
     low = torch.minimum(points.amin(0), queries.amin(0)) if len(queries) else points.amin(0)
     high = torch.maximum(points.amax(0), queries.amax(0)) if len(queries) else points.amax(0)
-    extent = max(float((high - low).amax()), 1e-300)
+    ends = torch.stack([low, high]).tolist()
+    extent = max(*(b - a for a, b in zip(*ends, strict=True)), 1e-300)
     cell = max(cell, extent / (_SIDE - 4))
     reach = min(extent, reach)
     distance = torch.full((len(queries), count), math.inf, dtype=points.dtype, device=points.device)
@@ -170,14 +172,11 @@ def grid_search(
     while len(left):
         last = cell >= reach
         order, starts, keys = _sorted_cells(points, low, cell)
-        pairs = _candidates(queries[left], low, cell, starts, keys)
-        for part in _parts(pairs[1].sum(1)):
-            rows = left[part]
-            square, place = _closest(
-                points, order, queries[rows], pairs[0][part], pairs[1][part], count
-            )
-            distance[rows], index[rows] = square.sqrt(), place
-        left = left[left.new_zeros(0)] if last else left[distance[left, -1] > cell]
+        square, rows = ops.nearest_in_cells(
+            points, queries[left], order, starts, keys, ends[0], cell, count
+        )
+        distance[left], index[left] = square.sqrt(), rows
+        left = left[:0] if last else left[distance[left, -1] > cell]
         cell = min(2.0 * cell, reach) if reach > cell else 2.0 * cell
     return distance, index
 
@@ -193,49 +192,3 @@ def _sorted_cells(points: Tensor, low: Tensor, cell: float) -> tuple[Tensor, Ten
     key, order = _key(((points - low) / cell).long()).sort()
     keys, counts = torch.unique_consecutive(key, return_counts=True)
     return order, torch.cat([counts.new_zeros(1), counts.cumsum(0)]), keys
-
-
-def _candidates(
-    queries: Tensor, low: Tensor, cell: float, starts: Tensor, keys: Tensor
-) -> tuple[Tensor, Tensor]:
-    """First row (in cell order) and number of points of the 27 cells around queries, [M, 27]."""
-    steps = torch.cartesian_prod(*[torch.arange(-1, 2, device=queries.device)] * 3)
-    around = _key(((queries - low) / cell).long()[:, None] + steps)
-    slot = torch.searchsorted(keys, around).clamp(max=len(keys) - 1)
-    there = keys[slot] == around
-    return starts[slot], torch.where(there, starts[slot + 1] - starts[slot], 0)
-
-
-def _parts(totals: Tensor) -> list[Tensor]:
-    """Queries in groups of like numbers of candidates, whose padded tables stay below the chunk."""
-    sizes, order = totals.sort()
-    sizes = sizes.clamp(min=1).cpu()
-    parts, start = [], 0
-    while start < len(sizes):
-        most = min(len(sizes) - start, max(_CHUNK // int(sizes[start]), 1))
-        n = torch.arange(1, most + 1)
-        fits = int((sizes[start : start + most] * n <= _CHUNK).sum())
-        parts.append(order[start : start + max(fits, 1)])
-        start += max(fits, 1)
-    return parts
-
-
-def _closest(
-    points: Tensor, order: Tensor, queries: Tensor, first: Tensor, number: Tensor, count: int
-) -> tuple[Tensor, Tensor]:
-    """Squared distances and rows of the ``count`` nearest candidates; infinite where too few."""
-    totals = number.sum(1)
-    cells = number.flatten()
-    owner = torch.repeat_interleave(torch.arange(len(cells), device=cells.device), cells)
-    begin = cells.cumsum(0) - cells
-    within = torch.arange(len(owner), device=cells.device) - begin[owner]
-    rows = order[first.flatten()[owner] + within]
-    query = owner // 27
-    column = torch.arange(len(owner), device=cells.device) - (totals.cumsum(0) - totals)[query]
-    square = (points[rows] - queries[query]).square().sum(1)
-    width = max(count, int(totals.max()))
-    table = torch.full((len(queries), width), math.inf, dtype=points.dtype, device=points.device)
-    place = torch.zeros((len(queries), width), dtype=torch.long, device=points.device)
-    table[query, column], place[query, column] = square, rows
-    best, chosen = table.topk(count, dim=1, largest=False, sorted=True)
-    return best, place.gather(1, chosen)

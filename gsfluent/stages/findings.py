@@ -58,6 +58,11 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
                 f"{body.name}: {report['warning']}, too few to break as walls do; hint: {asked} "
                 f"gives them {WALL_CELLS:g} cells"
             )
+            if any(material.law == "phase_field" for material in body.materials):
+                report["note"] += (
+                    "; cracks of law phase_field are wider than such walls, and what strikes "
+                    "punches through: law: nacc cracks them"
+                )
             _log.warning("%s", report["note"])
         found[body.name] = report
     return found
@@ -108,8 +113,10 @@ def walls_note(quality: str, cells: int, wanted: int, most: int) -> str:
         said = f"walls thinner than {WALL_CELLS:g} cells, and no finer cells are allowed"
     if cells < wanted:
         said += (
-            f"; {wanted} would hold them, more than solve.max_points: {most} and {FINER} times "
-            f"the cells of the quality allow; hint: solve.cells: {wanted}, or a thicker object"
+            f"; the thinnest then have {WALL_CELLS * cells / wanted:.2g} cells, too few to bend "
+            f"and break as walls do; {wanted} would hold them for {(wanted / cells) ** 4:.2g} "
+            f"times the work, more than solve.max_points: {most} and {FINER} times the cells of "
+            f"the quality allow; hint: solve.cells: {wanted}, or a thicker object"
         )
     else:
         said += f"; hint: solve.cells: {least} if they may bend as one"

@@ -126,7 +126,8 @@ def solver_options(shot: Shot) -> SolverOptions:
 def simulate_stage(context: RunContext) -> None:
     """Move the matter: ``stages/simulate/frame_0001.npz`` and so on."""
     shot = context.shot
-    solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl, shot.solve.max_points]
+    most = shot.solve.points_for_walls
+    solve = [shot.solve.quality, shot.solve.cells, shot.solve.cfl, most]
     settings = [moving_settings(shot), solve, shot.output.cracks]
 
     def work(folder: Path) -> dict[str, Any]:
@@ -134,8 +135,8 @@ def simulate_stage(context: RunContext) -> None:
         cells, quality = shot.solve.cells, shot.solve.quality
         finer = ""
         if cells is None:
-            cells, wanted = cells_for_walls(scene, quality, shot.solve.max_points)
-            finer = walls_note(quality, cells, wanted, shot.solve.max_points)
+            cells, wanted = cells_for_walls(scene, quality, most)
+            finer = walls_note(quality, cells, wanted, most)
             if finer:
                 _log.warning("%s", finer)
         stage = Simulate(

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, RunError
 from gsfluent.progress import Progress, report_progress
 from gsfluent.sweep.attempt import DONE, FAILED, Function
 from gsfluent.sweep.claims import is_stale
@@ -123,6 +123,27 @@ def map(
             engine.close()
             place.tidy()
     return work.outcomes()
+
+
+def required(outcomes: list[Outcome], what: str, folder: Path) -> list[Outcome]:
+    """What :func:`map` gives back, where every item is needed.
+
+    Args:
+        outcomes: What it gave back.
+        what: That some could not be done, such as "searches failed".
+        folder: Where the others are.
+
+    Raises:
+        RunError: Some failed.
+    """
+    failed = {o.id: o.failure["message"] for o in outcomes if o.failure is not None}
+    if failed:
+        name, message = next(iter(failed.items()))
+        raise RunError(
+            f"{len(failed)} {what}; {name}: {message}",
+            f"the others, in {folder}", "run the same command again",
+        )  # fmt: skip
+    return outcomes
 
 
 class _Work:

@@ -4,56 +4,74 @@
 
 One run with stops at the times asked for gives positions and velocities; the time is the median of
 --repeat runs straight to the end. What is there is not run again. On two cores all cases take
-about three minutes.
+about three minutes. --jobs and --on run several at a time, here or on a cluster; the times of
+several on one machine are not those of one alone.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import statistics
+import os
+import shutil
 import sys
+import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import frozen
-import torch
 
 from gsfluent.errors import InputError
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import SceneError
-from gsfluent.lab.charts.record import commit, machine
-from gsfluent.lab.frozen.answer import clock, run_case
+from gsfluent.lab.charts.run_case import ANSWER, Question, answer_task
+from gsfluent.sweep.engine import map as sweep_map
 
 METHODS = {"nacc": "gsfluent", "phase_field": "gsfluent phase field"}
 """Names of gsfluent's laws of breaking in the table."""
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")
 
 
-def answer(name: str, args: argparse.Namespace, path: Path) -> Run:
-    """Run a case and write its file."""
+def question(name: str, args: argparse.Namespace) -> Question:
+    """A case as it is to be answered.
+
+    Raises:
+        SceneError: Its scene is not what was frozen.
+    """
     case = find(name)
     scene = frozen.build(case)
     if drift := frozen.drift(case, scene):
         raise SceneError(f"{name}: not what was frozen: {drift[0]}")
-    options: dict[str, Any] = {
-        "device": args.device, "dtype": getattr(torch, args.dtype), "cfl": args.cfl,
-        "fields": not args.one_field, "place": args.place, "law": args.law,
-    }  # fmt: skip
-    run = run_case(scene, method=args.method, **options)
-    wall = run.wall_seconds
-    if not run.failed:
-        wall = statistics.median(clock(scene, args.repeat, **options))
-    settings = {
-        **run.settings, "timing": "uninterrupted", "repeat": args.repeat,
-        "machine": machine(args.device), "commit": commit(), "sha256": scene.digest(),
-    }  # fmt: skip
-    run = dataclasses.replace(run, wall_seconds=wall, settings=settings)
-    run.save(path)
-    return run
+    return Question(
+        name, frozen.PER_CELL, scene.digest(), args.device, args.dtype, args.cfl, args.place,
+        not args.one_field, args.method, args.repeat, args.law,
+    )  # fmt: skip
+
+
+def answers(questions: Sequence[Question], args: argparse.Namespace, folder: Path) -> Iterator[str]:
+    """Answer questions one after the other, or as tasks of a sweep; says why one was not."""
+    if args.jobs == 1 and args.on == "local":
+        for asked in questions:
+            try:
+                with tempfile.TemporaryDirectory(dir=folder, prefix=".") as place:
+                    answer_task(asked, Path(place))
+                    Path(place, ANSWER).replace(folder / f"{asked.case}.npz")
+                yield ""
+            except (SceneError, NotImplementedError, RuntimeError) as error:
+                yield str(error)
+        return
+    tasks = folder / "tasks"
+    threads = max((os.cpu_count() or 1) // max(args.jobs, 1), 1) if args.on == "local" else 1
+    outcomes = sweep_map(
+        answer_task, questions, tasks, jobs=args.jobs, threads=threads, on=args.on, retry=True
+    )
+    for asked, outcome in zip(questions, outcomes, strict=True):
+        if outcome.folder is not None:
+            (outcome.folder / ANSWER).replace(folder / f"{asked.case}.npz")
+        yield str((outcome.failure or {}).get("message", ""))
+    shutil.rmtree(tasks)
 
 
 def main() -> int:
@@ -75,6 +93,8 @@ def main() -> int:
     )
     parser.add_argument("--method", default="", help="name in the table")
     parser.add_argument("--repeat", type=int, default=3, help="timed runs")
+    parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
+    parser.add_argument("--on", default="local", help="local, slurm, ray or ray=HOST:PORT")
     parser.add_argument("--quick", action="store_true", help="a few small cases, once each")
     args = parser.parse_args()
     if args.quick:
@@ -87,8 +107,10 @@ def main() -> int:
         for name in names:
             find(name)
         folder = args.out / args.method.replace(" ", "_").replace(",", "")
+        folder.mkdir(parents=True, exist_ok=True)
         begin = time.perf_counter()
-        for i, name in enumerate(names, 1):
+        asked: list[Question] = []
+        for name in names:
             path = folder / f"{name}.npz"
             if path.is_file():
                 was = Run.load(path)
@@ -100,18 +122,24 @@ def main() -> int:
                         "another -o or --method, or remove it"
                     )
                 if was.settings.get("sha256") == frozen.build(find(name)).digest():
-                    sys.stderr.write(f"{i}/{len(names)} {name}: {path} is there\n")
+                    sys.stderr.write(f"{name}: {path} is there\n")
                     continue
             try:
-                run = answer(name, args, path)
-            except (SceneError, NotImplementedError, RuntimeError) as error:
+                asked.append(question(name, args))
+            except SceneError as error:
                 bad += 1
-                sys.stderr.write(f"{i}/{len(names)} {name}: not run: {error}\n")
+                sys.stderr.write(f"{name}: not run: {error}\n")
+        for i, wrong in enumerate(answers(asked, args, folder)):
+            name = asked[i].case
+            if wrong:
+                bad += 1
+                sys.stderr.write(f"{i + 1}/{len(asked)} {name}: not run: {wrong}\n")
                 continue
+            run = Run.load(folder / f"{name}.npz")
             first = judge(frozen.build(find(name)), run)[0]
             sys.stderr.write(
-                f"{i}/{len(names)} {name}: error {first.error:.3g} of {first.tolerance:g} allowed, "
-                f"{run.wall_seconds:.3g} s, {run.steps} steps {run.failed} "
+                f"{i + 1}/{len(asked)} {name}: error {first.error:.3g} of {first.tolerance:g} "
+                f"allowed, {run.wall_seconds:.3g} s, {run.steps} steps {run.failed} "
                 f"[{time.perf_counter() - begin:.0f} s]\n"
             )
     except (SceneError, InputError, ValueError, OSError) as error:

@@ -53,6 +53,16 @@ def read(folder: Path, **keys: Any) -> Shot:
     return Shot.from_dict({**base, **keys}, folder)
 
 
+@pytest.mark.parametrize(("solve", "most"), [
+    ({"quality": "preview"}, 40_000), ({"quality": "shot"}, 300_000),
+    ({"quality": "preview", "max_points": 0}, 0), ({"max_points": 7}, 7),
+])  # fmt: skip
+def test_a_preview_spends_fewer_points_on_walls(
+    folder: Path, solve: dict[str, Any], most: int
+) -> None:
+    assert read(folder, solve=solve).solve.points_for_walls == most
+
+
 def test_a_key_is_read_under_its_old_name_with_a_warning(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -15,9 +15,11 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+from in_process import swept
 
 from gsfluent.fracturebench.__main__ import main
 from gsfluent.fracturebench.registry import cases, find, judge
@@ -312,6 +314,14 @@ def test_one_table_of_several_methods(
     assert call(run_gsfluent, *given) == 0
     assert call(run_gsfluent, *given) == 0
     assert "is there" in capsys.readouterr().err
+    alone = Run.load(runs / "gsfluent" / "pull_apart.npz")
+    (runs / "gsfluent" / "pull_apart.npz").unlink()
+    calls: list[dict[str, Any]] = []
+    monkeypatch.setattr(run_gsfluent, "sweep_map", swept(calls))
+    assert call(run_gsfluent, *given, "--on", "slurm") == 0  # by a sweep: the same answer
+    placed = Run.load(runs / "gsfluent" / "pull_apart.npz")
+    assert calls[0]["on"] == "slurm" and np.array_equal(placed.x, alone.x)
+    capsys.readouterr()
     assert call(run_gsfluent, *given, "--cfl", "0.25") == 2  # another setting under the same name
     assert "--method" in capsys.readouterr().err
     glued = Run.load(runs / "gsfluent" / "pull_apart.npz")

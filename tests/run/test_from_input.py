@@ -47,6 +47,15 @@ def test_material_from_name_or_colour(
     assert shot.mesh == source and shot.objects["object"].material == material
 
 
+def test_a_guess_says_that_it_is_one_and_what_is_near(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        made_shot(mesh(tmp_path / "in" / "mango-v1.stl"), tmp_path / "out")
+    assert "fruit.apple, a guess from the name 'mango-v1': mango has no preset" in caplog.text
+    assert "fruit.orange" in caplog.text and "--material" in caplog.text
+
+
 @pytest.mark.parametrize("material", ["plaster", "ceramic", "bone", "rubber"])
 def test_the_fall_breaks_what_can_break(tmp_path: Path, material: str) -> None:
     shot = load_shot(made_shot(mesh(tmp_path / "x.stl"), tmp_path / "out", material))
@@ -57,7 +66,11 @@ def test_the_fall_breaks_what_can_break(tmp_path: Path, material: str) -> None:
     assert drop.height <= 3.0  # type: ignore[union-attr]
     assert speed >= 1.2 * limit or not math.isfinite(limit)
     fall = (math.sqrt(thrown**2 + 19.62 * drop.height) - thrown) / 9.81  # type: ignore[union-attr]
-    assert shot.output.seconds > fall + 1.0
+    slow = shot.output.slow
+    assert shot.output.seconds > fall + 1.0 / slow
+    # what is fast for its size is shown slower, in as many frames a second of film
+    assert shot.output.fps == pytest.approx(30.0 * slow)
+    assert (slow > 1.0) == (0.03 * speed / 0.2 > 1.5)
 
 
 def test_an_edited_shot_is_not_written_over(tmp_path: Path) -> None:

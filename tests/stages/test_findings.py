@@ -167,6 +167,15 @@ def test_thin_walls_are_told_with_the_cells_that_would_do(caplog: pytest.LogCapt
     assert setting(1000) == "solve.cells: 1000"
 
 
+def test_a_phase_field_in_thin_walls_is_told_that_it_is_punched_through() -> None:
+    scene, other = slab(), Scene()
+    material = HARD.override(law="phase_field", toughness=10.0)
+    other.add(scene.bodies[0].solid, material, frame=at(0, 0, 0.015), name="plate")
+    coarse = grid_spacing(scene, 16)
+    plain, said = (thin_walls(s, coarse)["plate"]["note"] for s in (scene, other))
+    assert said.startswith(plain) and "law: nacc" in said and "phase_field" not in plain
+
+
 def test_walls_get_the_cells_that_they_want_within_bounds() -> None:
     scene = slab()
     cells, wanted = cells_for_walls(scene, "preview", 10**7)
@@ -181,7 +190,10 @@ def test_walls_get_the_cells_that_they_want_within_bounds() -> None:
     held, same = cells_for_walls(scene, "preview", most)
     assert 20 <= held < cells and same == wanted
     assert 8 * volume / grid_spacing(scene, held) ** 3 <= most or held == 20
-    assert f"{wanted} would hold them" in walls_note("preview", held, wanted, most)
+    note = walls_note("preview", held, wanted, most)
+    assert f"{wanted} would hold them" in note
+    # and what is given up: the cells that a wall has then
+    assert f"{WALL_CELLS * held / wanted:.2g} cells, too few" in note
     assert cells_for_walls(scene, "preview", 0) == (20, 20)
     thick = Scene()
     ball(thick, "ball", 0.0, 0.1)

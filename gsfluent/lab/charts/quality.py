@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
+import shutil
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -25,8 +26,10 @@ from gsfluent.figure.pareto import Dot, Panel, draw
 from gsfluent.figure.style import save_png, to_svg
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.front import cases, counted, front
-from gsfluent.lab.charts.record import Record, append, commit, machine, now, read
+from gsfluent.lab.charts.record import Record, append, commit, machine, now, read, record_of
 from gsfluent.progress import Progress, report_progress
+from gsfluent.results.store import fingerprint
+from gsfluent.sweep.engine import map, required
 
 KINDS = ("rendering", "reconstruction", "texturing")
 _METHOD = "gsfluent"
@@ -134,18 +137,48 @@ def chart_quality(
     device: torch.device,
     quick: bool = False,
     repeat: int = 3,
+    jobs: int = 1,
+    on: str = "local",
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Chart rendering, reconstruction or texturing.
 
+    Args:
+        of: Which.
+        out: Folder of the results.
+        device: Where.
+        quick: A small ladder.
+        repeat: Timed runs of each setting.
+        jobs: Settings at a time. More share memory and caches: their times are not those of one.
+        on: See :func:`gsfluent.sweep.map`.
+        progress: Called per setting.
+
     Raises:
         InputError: An unknown kind.
     """
-    jobs = _module(of).jobs(device=device, quick=quick)
+    ladder = _module(of).jobs(device=device, quick=quick)
     name = f"{of}_quick" if quick else of  # other sizes: their lines do not mix
     lines = out / f"{name}.jsonl"
-    records = run_jobs(of, jobs, lines, device=device, repeat=repeat, progress=progress)
+    if jobs > 1 or on != "local":
+        have = {r.key for r in read(lines)} if lines.is_file() else set()
+        left = [n for n, job in enumerate(ladder) if job.key(str(device)) not in have]
+        outcomes = map(
+            run_task, [(of, str(device), quick, n, repeat) for n in left], folder := out / "tasks",
+            ids=[fingerprint(of, ladder[n].key(str(device)), quick, repeat) for n in left],
+            jobs=jobs, on=on, retry=True, progress=progress,
+        )  # fmt: skip
+        for outcome in required(outcomes, "settings failed", folder):
+            append(lines, record_of(outcome.value, f"{folder}, {outcome.id}"))
+        shutil.rmtree(folder, ignore_errors=True)  # all of it is in the file
+    records = run_jobs(of, ladder, lines, device=device, repeat=repeat, progress=progress)
     return {"lines": lines, **_written(of, records, out, name)}
+
+
+def run_task(item: tuple[str, str, bool, int, int], folder: Path) -> str:
+    """The line of a job of a ladder, by its number, as a task of a sweep."""
+    of, device, quick, number, repeat = item
+    job = _module(of).jobs(device=torch.device(device), quick=quick)[number]
+    return _record(of, job, repeat, device, machine(device), commit()).line()
 
 
 def gathered(of: str, files: Iterable[Path], out: Path) -> dict[str, Any]:

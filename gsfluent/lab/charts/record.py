@@ -101,13 +101,18 @@ def read(path: str | Path) -> list[Record]:
     for number, line in enumerate(text.splitlines(keepends=True), 1):
         if not line.endswith("\n") or not line.strip():
             continue
-        record = _record(line, f"{path}, line {number}")
+        record = record_of(line, f"{path}, line {number}")
         found.pop(record.key, None)
         found[record.key] = record
     return list(found.values())
 
 
-def _record(line: str, where: str) -> Record:
+def record_of(line: str, where: str) -> Record:
+    """The record that a line holds; ``where`` names it in the error.
+
+    Raises:
+        InputError: It holds none.
+    """
     try:
         data = json.loads(line)
         given = {name: data[name] for name in _NAMES if name in data}

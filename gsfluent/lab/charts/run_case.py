@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import statistics
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +15,13 @@ import torch
 
 from gsfluent.fracturebench.registry import find
 from gsfluent.fracturebench.run import Run
-from gsfluent.fracturebench.scene import Scene
+from gsfluent.fracturebench.scene import Scene, SceneError
 from gsfluent.fracturebench.scenes.shatter import reference
 from gsfluent.fracturebench.statistics import distance, jitter
 from gsfluent.lab.charts.carried_splats import CarriedSplats
 from gsfluent.lab.charts.ladder import TEXTBOOK, Setting
 from gsfluent.lab.charts.record import Record, commit, machine, now, of_run
-from gsfluent.lab.frozen.answer import run_case
+from gsfluent.lab.frozen.answer import clock, run_case
 from gsfluent.lab.world.driver import World
 
 MASS = "mass over pieces, KS"
@@ -209,3 +211,49 @@ def broken(
         wall_per_simulated=math.inf, ns_per_point_step=math.inf, error=math.inf,
         failed=words.rstrip(": "), commit=commit(), date=now(),
     )  # fmt: skip
+
+
+ANSWER = "run.npz"
+"""What :func:`answer_task` writes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Question:
+    """A frozen scene of FractureBench, and how it is answered."""
+
+    case: str  # name of the case
+    ppc: int  # points per cell
+    sha256: str  # of the scene
+    device: str  # where
+    dtype: str  # float32 or float64
+    cfl: float  # Courant number
+    place: float  # how far points lie off their place on the grid [dx]
+    fields: bool  # a velocity field per body
+    method: str  # name in the table
+    repeat: int  # timed runs
+    law: str = "nacc"  # of what breaks
+
+
+def answer_task(question: Question, folder: Path) -> None:
+    """Answer a scene by a file, as a task of a sweep; its time is that of runs without a stop.
+
+    Raises:
+        SceneError: Another scene is built here than was frozen.
+    """
+    case = find(question.case)
+    scene = case.build(case.dx, question.ppc)
+    if scene.digest() != question.sha256:
+        raise SceneError(f"{question.case}: not what was frozen, by its sha256")
+    options: dict[str, Any] = {
+        "device": question.device, "dtype": getattr(torch, question.dtype), "cfl": question.cfl,
+        "fields": question.fields, "place": question.place, "law": question.law,
+    }  # fmt: skip
+    run = run_case(scene, method=question.method, **options)
+    wall = run.wall_seconds
+    if not run.failed:
+        wall = statistics.median(clock(scene, question.repeat, **options))
+    settings = {
+        **run.settings, "timing": "uninterrupted", "repeat": question.repeat,
+        "machine": machine(question.device), "commit": commit(), "sha256": question.sha256,
+    }  # fmt: skip
+    dataclasses.replace(run, wall_seconds=wall, settings=settings).save(folder / ANSWER)

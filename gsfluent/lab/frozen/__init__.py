@@ -4,5 +4,5 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    answer="run_case",
+    answer="clock run_case",
 )

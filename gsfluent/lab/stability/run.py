@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-import os
+import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from gsfluent.errors import InputError
 from gsfluent.lab.charts.record import commit, machine, now
 from gsfluent.lab.stability import contact, matter, rounding, steps, transfer
 from gsfluent.lab.stability.maps import Map, Place, Point, Value, key_of, read
+from gsfluent.progress import Progress
+from gsfluent.sweep.engine import map as sweep_map
+from gsfluent.sweep.engine import required
+
+Task = tuple[str, str, Value, Value, str]
+"""Map, variant, x, y and device of a point."""
 
 
 def all_maps() -> dict[str, Map]:
@@ -46,8 +54,8 @@ def points(wanted: Sequence[Map], *, quick: bool = False) -> list[tuple[str, str
     return todo
 
 
-def run_point(task: tuple[str, str, Value, Value, str]) -> Point:
-    """Run one point of a map (also in a worker process)."""
+def run_point(task: Task) -> Point:
+    """Run one point of a map."""
     name, variant, x, y, device = task
     m = all_maps()[name]
     begin = time.perf_counter()
@@ -59,7 +67,7 @@ def run_point(task: tuple[str, str, Value, Value, str]) -> Point:
         map=name, variant=variant, x=x, y=y, limit=outcome.steps,
         step=None if bad is None else bad.step, kind="" if bad is None else bad.kind, value=value,
         note="" if bad is None else bad.note, points=outcome.points, seconds=round(seconds, 4),
-        device=device, machine=machine(device), commit="", date=now(),
+        device=device, machine=machine(device), commit=commit(), date=now(),
     )  # fmt: skip
 
 
@@ -70,9 +78,22 @@ def run_maps(
     device: str = "cpu",
     quick: bool = False,
     jobs: int = 1,
-    progress: Callable[[int, int, str], None] | None = None,
+    on: str = "local",
+    progress: Progress | None = None,
 ) -> list[Point]:
     """Run what is missing of these maps; every point is written as soon as it is done.
+
+    With several jobs, or elsewhere than in this process, the rows of the maps are tasks of a sweep
+    beside the file: they are kept there until all are done, and then written.
+
+    Args:
+        wanted: The maps.
+        path: File of the points.
+        device: Where.
+        quick: Three by three points of each map.
+        jobs: Rows at a time.
+        on: See :func:`gsfluent.sweep.map`.
+        progress: Called per point, or per row.
 
     Returns:
         The points of these maps, those of the file included.
@@ -88,42 +109,33 @@ def run_maps(
     keys = [key_of(*task) for task in tasks]
     todo = [task for task, key in zip(tasks, keys, strict=True) if key not in have]
     path.parent.mkdir(parents=True, exist_ok=True)
-    version, done = commit(), len(tasks) - len(todo)
+    placed = jobs > 1 or on != "local"
+    done = len(tasks) - len(todo)
+    fresh = _by_sweep(todo, path.with_suffix(".tasks"), jobs, on, progress) if placed else None
     with path.open("a", encoding="utf-8") as file:
         if path.stat().st_size and not path.read_bytes().endswith(b"\n"):
             file.write("\n")  # what a stopped run left: the half line is skipped when read
-        for point in _each(todo, jobs):
-            point = dataclasses.replace(point, commit=version)
+        for point in fresh if fresh is not None else map(run_point, todo):
             file.write(point.line())
             file.flush()
             have[point.key] = point
             done += 1
             if progress is not None:
                 progress(done, len(tasks), point.map)
+    shutil.rmtree(path.with_suffix(".tasks"), ignore_errors=True)  # all of it is in the file
     return [have[key] for key in keys]
 
 
-def _each(todo: Sequence[tuple[str, str, Value, Value, str]], jobs: int) -> Iterator[Point]:
-    if jobs == 1 or len(todo) < 2:
-        yield from map(run_point, todo)
-        return
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-
-    context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the workers: read when they start
-    with ProcessPoolExecutor(jobs, context, _alone) as pool:
-        futures = [pool.submit(run_point, task) for task in todo]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            for future in futures:
-                future.cancel()
+def run_row(tasks: Sequence[Task], folder: Path) -> list[dict[str, Any]]:
+    """A row of points, as a task of a sweep."""
+    return [dataclasses.asdict(run_point(task)) for task in tasks]
 
 
-def _alone() -> None:
-    """One thread per worker."""
-    import torch
-
-    torch.set_num_threads(1)
+def _by_sweep(
+    todo: Sequence[Task], folder: Path, jobs: int, on: str, progress: Progress | None
+) -> list[Point]:
+    """Run points in other processes, a row of a map each: a point alone is too small a task."""
+    rows = [list(row) for _, row in itertools.groupby(todo, lambda t: (t[0], t[1], t[3]))]
+    outcomes = sweep_map(run_row, rows, folder, jobs=jobs, on=on, retry=True, progress=progress)
+    found = required(outcomes, "rows of points failed", folder)
+    return [Point(**values) for outcome in found for values in outcome.value]

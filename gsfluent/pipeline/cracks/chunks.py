@@ -538,27 +538,28 @@ class Chunks:
         """Splats at rest, cut at faces as far as these have opened."""
         means, quats, scales = rest.means, rest.quats, rest.scales
         whole = self.base.gaussians.means
+        if len(self._cuts) > 1:
+            self._cuts = [ChunkCuts(*(torch.cat(part) for part in zip(*self._cuts, strict=True)))]
         for cuts in self._cuts:
             rows = cuts.splat
             _, _, share = self._gap(carry, points, whole[rows], carry.owner[rows], cuts.rival)
             share = self._opened(share, cuts.rival)
-            open_ = share > 0.0
-            rows, share = rows[open_], share[open_, None]
-            if rows.numel() == 0:
-                continue
-            normal = cuts.normal[open_]
-            root = geometry.quaternion_to_matrix(quats[rows]) * scales[rows, None]
-            before, mean = root @ root.mT, means[rows]
-            moved = ((mean - whole[rows]) * normal).sum(dim=1)
-            cut, covariance = cut_at(mean, before, normal, cuts.distance[open_] - moved)
-            mean = mean + share * (cut - mean)
-            covariance = before + share[..., None] * (covariance - before)
-            turned = ops.covariance_axes(geometry.pack_symmetric(covariance))
-            means = means.index_copy(0, rows, mean)
-            quats, scales = (
-                old.index_copy(0, rows, new)
-                for old, new in zip((quats, scales), turned, strict=True)
-            )
+            open_ = (share > 0.0).nonzero()[:, 0]
+            for turn in in_turns(rows[open_]):
+                which = open_[turn]
+                rows, part, normal = cuts.splat[which], share[which, None], cuts.normal[which]
+                root = geometry.quaternion_to_matrix(quats[rows]) * scales[rows, None]
+                before, mean = root @ root.mT, means[rows]
+                moved = ((mean - whole[rows]) * normal).sum(dim=1)
+                cut, covariance = cut_at(mean, before, normal, cuts.distance[which] - moved)
+                mean = mean + part * (cut - mean)
+                covariance = before + part[..., None] * (covariance - before)
+                turned = ops.covariance_axes(geometry.pack_symmetric(covariance))
+                means = means.index_copy(0, rows, mean)
+                quats, scales = (
+                    old.index_copy(0, rows, new)
+                    for old, new in zip((quats, scales), turned, strict=True)
+                )
         rest = rest.replace(means=means, quats=quats, scales=scales)
         if self._dust.rows.numel() == 0:
             return rest
@@ -597,3 +598,14 @@ class Chunks:
             normals=(turn * faces.normals[rows, None]).sum(dim=2),
         )
         return Births(gaussians, _NUMBERS + faces.key[rows], faces.owner[rows])
+
+
+def in_turns(rows: Tensor) -> list[Tensor]:
+    """Places in a list of rows, int64 [M]: where each row comes first, where it comes next, ..."""
+    ordered, order = rows.sort(stable=True)
+    steps = torch.arange(len(rows), device=rows.device)
+    new = torch.ones_like(rows, dtype=torch.bool)
+    new[1:] = ordered[1:] != ordered[:-1]
+    turn = torch.empty_like(rows)
+    turn[order] = steps - torch.where(new, steps, 0).cummax(dim=0).values
+    return [(turn == n).nonzero()[:, 0] for n in range(int(turn.max()) + 1 if len(rows) else 0)]

@@ -9,10 +9,13 @@ volume of its points. All chips are different, and the same on every device.
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import torch
 from torch import Tensor
 
-from gsfluent.pipeline.partition.field import Box, Field, grown
+from gsfluent.pipeline.partition.field import Box, Field, Span, grown
 
 UNEVEN = 0.45
 """By how much of its distance from the middle a plane is moved in or out, at most."""
@@ -31,6 +34,7 @@ _PLANES = (
 )  # fmt: skip
 _SIDES, _AWAY = 6, 3.0
 _MASK = 0xFFFFFFFF
+_AT_ONCE = (1 << 18, 1 << 22)  # voxels, on the CPU and elsewhere
 
 
 def chip_fields(
@@ -47,33 +51,70 @@ def chip_fields(
     there = [label for label in chips if box_of[label] is not None]
     if not there:
         return {}
-    middle, normal, reach = _planes(nearest, there)
+    planes = _planes(nearest, there)
     margin = max(1, round(2.0 * per_spacing))
-    found: dict[int, Field] = {}
-    for slot, label in enumerate(there):
+    spans: dict[int, Span] = {}
+    for label in there:
         box = box_of[label]
         assert box is not None  # there has no other
-        low, span = grown(box, margin)
-        mine = nearest[span] == label
-        inside = nearest[span] >= 0
-        axes = [
-            torch.arange(n, device=mine.device, dtype=torch.float64) + a - middle[slot, axis]
-            for axis, (a, n) in enumerate(zip(low, mine.shape, strict=True))
-        ]
-        out = []
-        for plane in range(len(_PLANES)):
-            x, y, z = (a * normal[slot, plane, axis] for axis, a in enumerate(axes))
-            out.append((x[:, None] + y)[..., None] + z)
-        gauge = out[0] / reach[slot, 0]
-        for plane in range(1, len(_PLANES)):
-            gauge = torch.maximum(gauge, out[plane] / reach[slot, plane])
-        size = gauge[inside].kthvalue(int(mine.sum())).values
-        sheet = size * reach[slot, 0] - out[0]
-        for plane in range(1, len(_PLANES)):
-            sheet = torch.minimum(sheet, size * reach[slot, plane] - out[plane])
-        share = (0.5 + sheet / (2.0 * per_spacing)).clamp(min=0.0).to(torch.float32)
-        found[label] = Field(low, torch.where(mine, share.clamp(min=LEAST), share))
+        spans[label] = grown(box, margin)
+    found: dict[int, Field] = {}
+    slots, voxels = [], 0
+    for slot, label in enumerate(there):
+        slots.append(slot)
+        voxels += math.prod(nearest[spans[label][1]].shape)
+        if voxels >= _AT_ONCE[nearest.device.type != "cpu"] or slot + 1 == len(there):
+            some = [there[n] for n in slots]
+            parts = _between(nearest, some, [spans[n] for n in some], planes, slots, per_spacing)
+            found.update(zip(some, parts, strict=True))
+            slots, voxels = [], 0
     return found
+
+
+def _between(
+    nearest: Tensor,
+    labels: list[int],
+    spans: list[Span],
+    planes: tuple[Tensor, Tensor, Tensor],
+    slots: list[int],
+    per_spacing: float,
+) -> list[Field]:
+    """What lies between the planes of some chips, the voxels of all in one row."""
+    device = nearest.device
+    boxes = [nearest[span] for _, span in spans]
+    count = [box.numel() for box in boxes]
+    owner = torch.repeat_interleave(torch.tensor(count, device=device))
+    row = torch.tensor(slots, device=device)[owner]
+    middle, normal, reach = (part[row] for part in planes)
+    first = torch.tensor([0, *itertools.accumulate(count)][:-1], device=device)
+    within = torch.arange(sum(count), device=device) - first[owner]
+    low = torch.tensor([low for low, _ in spans], device=device)[owner]
+    _, m, n = torch.tensor([box.shape for box in boxes], device=device)[owner].unbind(dim=1)
+    place = torch.stack([within // (m * n), within // n % m, within % n], dim=1) + low
+    axes = (place.double() - middle).unbind(dim=1)
+    out = []
+    for plane in range(len(_PLANES)):
+        x, y, z = (a * normal[:, plane, axis] for axis, a in enumerate(axes))
+        out.append((x + y) + z)
+    gauge = out[0] / reach[:, 0]
+    for plane in range(1, len(_PLANES)):
+        gauge = torch.maximum(gauge, out[plane] / reach[:, plane])
+    label = torch.cat([box.reshape(-1) for box in boxes])
+    mine = label == torch.tensor(labels, device=device)[owner]
+    many = torch.bincount(owner[mine], minlength=len(labels)).tolist()
+    gauge = torch.where(label >= 0, gauge, torch.inf)
+    size = torch.stack(
+        [part.kthvalue(k).values for part, k in zip(gauge.split(count), many, strict=True)]
+    )[owner]
+    sheet = size * reach[:, 0] - out[0]
+    for plane in range(1, len(_PLANES)):
+        sheet = torch.minimum(sheet, size * reach[:, plane] - out[plane])
+    share = (0.5 + sheet / (2.0 * per_spacing)).clamp(min=0.0).to(torch.float32)
+    share = torch.where(mine, share.clamp(min=LEAST), share)
+    return [
+        Field(low, part.view(box.shape))
+        for (low, _), part, box in zip(spans, share.split(count), boxes, strict=True)
+    ]
 
 
 def _planes(nearest: Tensor, chips: list[int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -18,15 +18,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent.geometry import trilinear
+from gsfluent import ops
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.partition.blur import blur, box_width, reach
 from gsfluent.pipeline.partition.chips import chip_fields
-from gsfluent.pipeline.partition.field import Field, boxes, grown
+from gsfluent.pipeline.partition.field import Field, Shares, boxes, grown
 from gsfluent.pipeline.partition.roughness import displacements
 
 STAMP = 1.45
-"""Point spacings from a point to the voxels that it can name."""
+"""Point spacings from a point to the voxels that it can name (:func:`gsfluent.ops.nearest_labels`).
+"""
 FIRST, SECOND = 1.2, 0.8
 """Standard deviations of the blurs of pieces, in point spacings."""
 DUST_BLUR = 0.4
@@ -41,9 +42,6 @@ VOLUME = 0.01
 """Error of a volume that is good enough."""
 _CLEAR = 0.95  # difference of two shares from which on no displacement changes the label
 _PASSES = 60
-_FINE = 1024.0  # squared distances are whole numbers of this share of a voxel squared
-_RANKS = 16  # bits of a key that hold a rank
-_AT_ONCE = 1 << 20  # points
 FAR = 3.5
 """Standard deviations of the second blur at which the distance from a face is capped."""
 
@@ -62,48 +60,7 @@ class Labels(NamedTuple):
     lead: Tensor
 
 
-def nearest_labels(place: Tensor, rank: Tensor, shape: tuple[int, ...], radius: float) -> Tensor:
-    """Label of the nearest point of every voxel, int16 [X, Y, Z]; -1 where none is near.
-
-    Args:
-        place: Points in voxels, centres at whole numbers, float64 [P, 3]; none further outside of
-            the grid than ``radius``.
-        rank: Labels of the points, int64 [P], below 2^16; what is as near goes to the lower.
-        shape: Voxels along each axis.
-        radius: How far a point sees [voxels].
-    """
-    device, r = place.device, math.ceil(radius)
-    steps = torch.arange(-r, r + 1, device=device)
-    padded = tuple(n + 4 * r + 2 for n in shape)  # for points outside of the grid
-    far = (1 << 62) - 1
-    best = torch.full((math.prod(padded),), far, dtype=torch.int64, device=device)
-    limit = round(radius * radius * _FINE)
-    for rows in torch.arange(place.shape[0], device=device).split(_AT_ONCE):
-        voxel = place[rows].round().long()
-        apart = voxel[:, None] + steps[:, None] - place[rows, None]  # [n, 2 r + 1, 3]
-        voxel = voxel + r + 1
-        # squares along each axis as whole numbers: their sums are exact
-        square = (apart * apart * _FINE).round().long()
-        x, y, z = square.unbind(dim=2)
-        label = rank[rows, None]
-        corner = (voxel[:, 0] * padded[1] + voxel[:, 1]) * padded[2] + voxel[:, 2]
-        line = corner[:, None] + torch.arange(2 * r + 1, device=device)
-        for i in range(2 * r + 1):
-            for j in range(2 * r + 1):
-                away = x[:, i : i + 1] + y[:, j : j + 1]
-                close = (away[:, 0] <= limit).nonzero()[:, 0]
-                total = away[close] + z[close]
-                key = torch.where(total <= limit, (total << _RANKS) + label[close], far)
-                flat = line[close] + (i * padded[1] + j) * padded[2]
-                best.scatter_reduce_(0, flat.view(-1), key.view(-1), "amin")
-    found = torch.where(best < far, best & ((1 << _RANKS) - 1), -1).to(torch.int16)
-    inner = tuple(slice(2 * r + 1, 2 * r + 1 + n) for n in shape)
-    return found.view(padded)[inner].contiguous()
-
-
-def fields(
-    nearest: Tensor, small: list[bool], per_spacing: float, dust: int = -1
-) -> list[Field | None]:
+def fields(nearest: Tensor, small: list[bool], per_spacing: float, dust: int = -1) -> Shares:
     """Shares of every label: pieces by threshold dynamics, chips between planes.
 
     Pieces are smoothed as if there were no chips and no dust, which are then cut out of them.
@@ -115,7 +72,7 @@ def fields(
         dust: The label that is dust: the cells of single points; -1 for none.
 
     Returns:
-        One for each label; None where it has no voxel.
+        One field for each label; of no size where it has no voxel.
     """
     inside, count = nearest >= 0, len(small)
     chips = [label for label, chip in enumerate(small) if chip and label != dust]
@@ -155,32 +112,17 @@ def fields(
     found: list[Field | None] = [made.get(label) for label in range(count)]
     for label, field in shares(won, inside, SECOND):
         found[label] = Field(field.low, field.share * left[field.span])
-    return found
+    return Shares.of(found, nearest.device)
 
 
-def top_two(shape: tuple[int, ...], found: list[Field | None], inside: Tensor) -> Labels:
+def top_two(shape: tuple[int, ...], found: Shares, inside: Tensor) -> Labels:
     """The two largest of the fields at every voxel."""
-    device = inside.device
-    first = torch.full(shape, -1, dtype=torch.int16, device=device)
-    second = first.clone()
-    one, two = torch.zeros(shape, device=device), torch.zeros(shape, device=device)
-    for label, field in enumerate(found):
-        if field is None:
-            continue
-        s, value = field.span, field.share
-        ahead, next_ = value > one[s], value > two[s]
-        second[s] = torch.where(ahead, first[s], torch.where(next_, label, second[s].long())).to(
-            torch.int16
-        )
-        two[s] = torch.where(ahead, one[s], torch.where(next_, value, two[s]))
-        first[s] = torch.where(ahead, label, first[s].long()).to(torch.int16)
-        one[s] = torch.where(ahead, value, one[s])
-    first = torch.where(inside, first, -1)
-    return Labels(first, torch.where(inside, second, -1), one - two)
+    first, second, lead = ops.largest_shares(None, shape, found.shares, found.box)
+    return Labels(torch.where(inside, first, -1), torch.where(inside, second, -1), lead)
 
 
 def displaced(
-    smooth: Labels, found: list[Field | None], low: tuple[int, int, int], amplitude: float
+    smooth: Labels, found: Shares, low: tuple[int, int, int], amplitude: float
 ) -> tuple[Tensor, Labels]:
     """The two largest fields at displaced places, for voxels near a face.
 
@@ -196,43 +138,12 @@ def displaced(
     near = ((smooth.second >= 0) & (smooth.lead < _CLEAR)).nonzero()
     shift = displacements(near, low, smooth.first.shape)
     place = near.to(torch.float32) + shift * amplitude
-    count = near.shape[0]
-    first = torch.full((count,), -1, dtype=torch.int16, device=near.device)
-    second = first.clone()
-    one, two = torch.zeros(count, device=near.device), torch.zeros(count, device=near.device)
-    row = torch.full(smooth.first.shape, -1, dtype=torch.int32, device=near.device)
-    row[near.unbind(dim=1)] = torch.arange(count, dtype=torch.int32, device=near.device)
-    far = math.ceil(float((place - near).abs().amax())) + 1 if count else 0
-    for label, field in enumerate(found):
-        if field is None:
-            continue
-        start = torch.tensor(field.low, device=near.device)
-        end = start + torch.tensor(field.share.shape, device=near.device)
-        # only what may have come from around the box is asked: there may be thousands of chips
-        span = tuple(
-            slice(max(a - far, 0), a + n + far)
-            for a, n in zip(field.low, field.share.shape, strict=True)
-        )
-        rows = row[span].reshape(-1)
-        rows = rows[rows >= 0].long()
-        rows = rows[((place[rows] > start - 1) & (place[rows] < end)).all(dim=1)]
-        # far from the label its share is nothing
-        around = (place[rows] - start).round().long().clamp(min=0)
-        x, y, z = torch.minimum(around, end - start - 1).unbind(dim=1)
-        rows = rows[field.share[x, y, z] > 0.0]
-        value = trilinear(field.share, place[rows] - start)
-        ahead, next_ = value > one[rows], value > two[rows]
-        second[rows] = torch.where(
-            ahead, first[rows], torch.where(next_, label, second[rows].long()).to(torch.int16)
-        )
-        two[rows] = torch.where(ahead, one[rows], torch.where(next_, value, two[rows]))
-        first[rows] = torch.where(ahead, label, first[rows].long()).to(torch.int16)
-        one[rows] = torch.where(ahead, value, one[rows])
+    first, second, lead = ops.largest_shares(place, smooth.first.shape, found.shares, found.box)
     # displaced out of every field: what it was
     old = [part[near[:, 0], near[:, 1], near[:, 2]] for part in smooth]
     lost = first < 0
     first, second = torch.where(lost, old[0], first), torch.where(lost, old[1], second)
-    return near, Labels(first, second, torch.where(lost, old[2], one - two))
+    return near, Labels(first, second, torch.where(lost, old[2], lead))
 
 
 def keep_volumes(

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.data import Frame, Solid
 from gsfluent.geometry import trilinear
 from gsfluent.pipeline.partition.blur import box_width, reach
@@ -29,7 +30,6 @@ from gsfluent.pipeline.partition.threshold import (
     fields,
     join_islands,
     keep_volumes,
-    nearest_labels,
     top_two,
 )
 from gsfluent.spatial.neighbours import nearest_rows
@@ -133,7 +133,7 @@ class Partition:
         self.shape = tuple(int(n) for n in (extent / self.voxel).ceil().long() + 1)
         self.splits: list[Split] = []
         self._rest, self._solid, self._frame = rest, solid, frame
-        self.region = nearest_labels(
+        self.region = ops.nearest_labels(
             self.place(rest), torch.zeros(len(rest), dtype=torch.int64, device=device),
             self.shape, self.per_spacing * STAMP,
         ).to(torch.int32)  # fmt: skip
@@ -232,7 +232,7 @@ class Partition:
         high = torch.tensor(shape, device=place.device) - 1 + radius
         near = ((local > -radius) & (local < high)).all(dim=1)
         domain = self.region[span] == region
-        nearest = nearest_labels(local[near], piece[near], shape, radius)
+        nearest = ops.nearest_labels(local[near], piece[near], shape, radius)
         lost = (domain & (nearest < 0)).nonzero()
         if len(lost):
             centers = self.center(lost + torch.tensor(low, device=lost.device))

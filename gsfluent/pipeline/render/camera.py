@@ -25,9 +25,15 @@ _FRONT = -90.0  # azimuth from which the front is seen
 # degrees of azimuth in one video: enough parallax to read the shape, slow enough to watch
 _SWEEP = 70.0
 _SMOOTH_FRAMES = 5.0
-_ROOM = 1.3  # free space around the matter, as a factor on its radius
+_AHEAD = 6  # frames that the camera steps back before the matter does
+_HELD = 30  # frames that it stays back before it comes nearer again
+_SHARE = 0.95  # of the matter that is in the picture
+_ROOM = 1.15  # free space around the matter, as a factor on the distance
+_LEAST = 1.2  # distance, as a factor on that at which the object at first fits
+FARTHEST = 4.5
+"""The same at most."""
 _LAG = 0.6  # share of the free space that a fall may run ahead of the camera
-_WHOLE = 1.12  # the same around the whole object while it is whole
+_WHOLE = 1.12  # free space around the whole object, however tall, as a factor on the distance
 
 
 @dataclass(frozen=True)
@@ -38,11 +44,14 @@ class Action:
         center: Robust centre of the matter per frame [m], shape [F, 3].
         radius: Distance from the centre that holds nine tenths of it, per frame [m], shape [F].
         reach: Distance from the first centre that holds all of the objects [m].
+        extent: Horizontal distance from the centre, and height above or below it, that hold 95 %
+            of it each, per frame [m], shape [F, 2]; ``radius`` twice when absent.
     """
 
     center: Tensor
     radius: Tensor
     reach: float = 0.0
+    extent: Tensor | None = None
 
     @classmethod
     def of(cls, positions: Sequence[Tensor], objects: Tensor | None = None) -> Action:
@@ -55,17 +64,20 @@ class Action:
         """
         # the middle of what lies between the outer tenths: a median follows the largest heap only
         tenths = torch.tensor([0.1, 0.9], dtype=torch.float64)
-        center = torch.stack(
-            [torch.quantile(_thin(p.double().cpu()), tenths, dim=0).mean(dim=0) for p in positions]
-        )
-        radius = [
-            torch.quantile(_thin((p.double().cpu() - c).norm(dim=-1)), 0.9)
-            for p, c in zip(positions, center, strict=True)
-        ]
+        centers, radius, extent = [], [], []
+        for matter in positions:
+            points = _thin(matter.double().cpu())
+            center = torch.quantile(points, tenths, dim=0).mean(dim=0)
+            away = points - center
+            centers.append(center)
+            radius.append(torch.quantile(away.norm(dim=-1), 0.9))
+            apart = torch.stack([away[:, :2].norm(dim=-1), away[:, 2].abs()], dim=-1)
+            extent.append(torch.quantile(apart, _SHARE, dim=0))
+        center = torch.stack(centers)
         first = positions[0].double().cpu()
         first = first if objects is None else first[objects.cpu()]
         reach = float((first - center[0]).norm(dim=-1).amax()) if len(first) else 0.0
-        return cls(center, torch.stack(radius), reach)
+        return cls(center, torch.stack(radius), reach, torch.stack(extent))
 
 
 def _thin(values: Tensor) -> Tensor:
@@ -95,9 +107,9 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    It passes the front in the middle of the film. The distance shows nine tenths of the matter, but
-    the whole object at least, however tall, and 3.6 times the
-    object at most: a spray of debris must not shrink the subject to a dot.
+    It passes the front in the middle of the film. The distance shows 95 % of the matter, but the
+    whole object at least, however tall, and from 4.5 times as far at most: a spray of debris must
+    not shrink the subject to a dot.
 
     Args:
         action: Where the matter is.
@@ -105,9 +117,8 @@ def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> li
         sweep: Degrees of azimuth from the first frame to the last.
     """
     count = action.center.shape[0]
-    shown = _shown(action)
-    distance = shown / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
-    centers = _follow(action, shown)
+    distance = _distance(action, size)
+    centers = _follow(action, distance)
     steps = [i / max(1, count - 1) for i in range(count)]
     return [
         look_at(centers[i], float(distance[i]), _FRONT + sweep * (step - 0.5), _ELEVATION, size)
@@ -115,19 +126,41 @@ def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> li
     ]
 
 
-def _shown(action: Action) -> Tensor:
-    """Radius that is in the picture, per frame [m], shape [F]: it grows ahead of the burst."""
-    first = float(action.radius[0])
-    wanted = action.radius.clamp(min=1.35 * first, max=3.6 * first)
-    ahead = round(2.0 * _SMOOTH_FRAMES)
-    padded = torch.cat([wanted, wanted[-1:].expand(ahead)])
-    widest = torch.cummax(padded.unfold(0, ahead + 1, 1).amax(dim=1), dim=0).values
-    shown = _ROOM * _smooth(widest[:, None], 1.5 * _SMOOTH_FRAMES)[:, 0]
-    return shown.clamp(min=_WHOLE * action.reach)
+def _fits(wide: Tensor, tall: Tensor, size: tuple[int, int]) -> Tensor:
+    """Distance from which an upright cylinder is just in the picture [m], shape [F].
+
+    Args:
+        wide: Its radius [m], shape [F].
+        tall: Half its height [m], shape [F].
+        size: (width, height) of the picture [px].
+    """
+    up = math.tan(math.radians(_vertical_fov(size)) / 2.0)
+    side = up * size[0] / size[1]
+    sin, cos = math.sin(math.radians(_ELEVATION)), math.cos(math.radians(_ELEVATION))
+    # the rims at the sides, at the bottom in front, at the top behind and in front
+    sides = wide * math.sqrt(1.0 / side**2 + cos**2) + tall * sin
+    low = (tall * cos + wide * sin) / up + wide * cos - tall * sin
+    far = (tall * cos + wide * sin) / up - wide * cos + tall * sin
+    near = (tall * cos - wide * sin) / up + wide * cos + tall * sin
+    return torch.stack([sides, low, far, near]).amax(dim=0)
 
 
-def _follow(action: Action, shown: Tensor) -> Tensor:
+def _distance(action: Action, size: tuple[int, int]) -> Tensor:
+    """Of the camera per frame [m], shape [F]: it steps back ahead of the burst."""
+    extent = action.radius[:, None].expand(-1, 2) if action.extent is None else action.extent
+    fits = _fits(extent[:, 0], extent[:, 1], size)
+    whole = action.reach / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
+    wanted = fits.clamp(min=_LEAST * float(fits[0]), max=FARTHEST * float(fits[0]))
+    # the widest of the frames around: it steps back ahead of a burst, and stays back for a while
+    early, late = wanted[:1].expand(_HELD), wanted[-1:].expand(_AHEAD)
+    windows = torch.cat([early, wanted, late]).unfold(0, _HELD + _AHEAD + 1, 1)
+    smooth = _smooth(windows.amax(dim=1)[:, None], 0.8 * _SMOOTH_FRAMES)[:, 0]
+    return (_ROOM * smooth).clamp(min=_WHOLE * whole)
+
+
+def _follow(action: Action, distance: Tensor) -> Tensor:
     """Where to look, shape [F, 3]: smooth, but never so late that the object leaves the picture."""
+    shown = distance * math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
     # what is still whole has its farthest point beyond the nine tenths
     least = torch.where(action.radius <= 1.02 * action.radius[0], action.reach, 0.0)
     room = _LAG * torch.maximum(shown - torch.maximum(1.5 * action.radius, least), 0.05 * shown)
@@ -208,7 +241,7 @@ def _named_path(name: str, action: Action, size: tuple[int, int]) -> list[Camera
     if name == "orbit":
         return orbit(action, size)
     still = orbit(action, size, sweep=0.0)
-    centers = _follow(action, _shown(action))
+    centers = _follow(action, _distance(action, size))
     return turntable(still, centers) if name == "turntable" else dolly(still, centers)
 
 

@@ -17,7 +17,7 @@ from gsfluent.pipeline.light.from_shot import gloss_of, light_of, transmission_o
 from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.render.backdrop import Backdrop
-from gsfluent.pipeline.render.camera import Action, orbit
+from gsfluent.pipeline.render.camera import FARTHEST, Action, orbit
 from gsfluent.pipeline.render.film import captured_backdrop, studio_is_dark
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
@@ -65,10 +65,16 @@ class PictureMaker:
             RunError: That frame cannot be read.
         """
         survey = self.timeline.survey(index)
-        radius = min(max(survey.radius, 1.35 * self.timeline.radius), 3.6 * self.timeline.radius)
+        first = self.timeline.survey(self.timeline.first.index)
+        limit = FARTHEST * max(first.extent)
+        extent = [
+            min(max(now, before), limit)
+            for now, before in zip(survey.extent, first.extent, strict=True)
+        ]
         action = Action(
             torch.tensor([survey.center], dtype=torch.float64),
-            torch.tensor([radius], dtype=torch.float64),
+            torch.tensor([survey.radius], dtype=torch.float64),
+            extent=torch.tensor([extent], dtype=torch.float64),
         )
         return orbit(action, (width, height))[0]
 

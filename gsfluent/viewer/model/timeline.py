@@ -30,6 +30,7 @@ class Survey:
 
     center: tuple[float, float, float]  # Robust centre of the matter [m]
     radius: float  # Distance from it that holds nine tenths of the matter [m]
+    extent: tuple[float, float]  # Beside it and above or below, 95 % of the matter each [m]
     speed: float  # Speed that one point in a hundred exceeds [m/s]
 
     @classmethod
@@ -40,7 +41,9 @@ class Survey:
         speed = frame.velocity.norm(dim=1)
         speed = speed[:: max(1, speed.shape[0] // 20_000)]
         top = float(torch.quantile(speed.float(), 0.99)) if speed.numel() else 0.0
-        return cls((x, y, z), float(action.radius[0]), top)
+        assert action.extent is not None  # of what was measured
+        wide, tall = action.extent[0].tolist()
+        return cls((x, y, z), float(action.radius[0]), (wide, tall), top)
 
 
 class Timeline:

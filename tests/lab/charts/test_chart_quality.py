@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from in_process import swept
 
 from gsfluent import geometry
 from gsfluent.errors import InputError, RunError
-from gsfluent.lab.charts import quality, reconstruction, rendering
+from gsfluent.lab.charts import quality, reconstruction, rendering, texturing
 from gsfluent.lab.charts.quality import Job, Outcome, chart_quality, gathered, run_jobs
 from gsfluent.lab.charts.record import read
 
@@ -102,6 +105,26 @@ def test_what_has_a_line_is_not_done_again(tmp_path: Path) -> None:
     assert both[0].settings["band"] == 0.02
     assert "it diverged" in both[1].failed and not both[1].ok
     assert "it diverged" in quality.markdown(both)
+
+
+def test_settings_that_are_placed_are_those_of_the_ladder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    calls: list[dict[str, Any]] = []
+    monkeypatch.setattr(quality, "map", swept(calls))
+    monkeypatch.setattr(texturing, "jobs", _three)
+    said = chart_quality("texturing", tmp_path, device=CPU, repeat=2, on="slurm")
+    assert (said["settings"], said["failed"], calls[0]["on"]) == (3, 0, "slurm")
+    assert [r.error for r in read(said["lines"])] == [0.0, 0.1, 0.2]
+    assert not (tmp_path / "tasks").exists()
+
+
+def _three(*, device: torch.device, quick: bool) -> list[Job]:
+    def outcome(repeat: int, error: float) -> Outcome:
+        return Outcome(error, [0.1] * repeat, 5, {})
+
+    return [Job("c", f"{n}", {}, functools.partial(outcome, error=0.1 * n)) for n in range(3)]
 
 
 def test_unknown_kinds_and_empty_files_are_refused(tmp_path: Path) -> None:

@@ -6,10 +6,12 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from in_process import swept
 
 from gsfluent.cli import main
 from gsfluent.errors import InputError
@@ -197,6 +199,25 @@ def test_a_ladder_is_resumed_and_keeps_to_its_budget(
     assert {r.key for r in read(path) if r.kind != "machine"} == {s.key("cpu") for s in settings}
     none = run([dataclasses.replace(settings[0], variant="new")], path, device="cpu", budget=1e-9)
     assert none.fresh == 0 and len(none.left_out) == 1
+
+
+def test_runs_that_are_placed_are_those_of_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = [Setting("pull_apart", COARSE), Setting("rest", -1.0)]
+    here = run(settings, tmp_path / "here.jsonl", device="cpu", repeat=1).records
+    calls: list[dict[str, Any]] = []
+    monkeypatch.setattr("gsfluent.lab.charts.chart.map", swept(calls))
+    path = tmp_path / "there.jsonl"
+    there = run(settings, path, device="cpu", repeat=1, on="ray", jobs=3)
+    assert there.fresh == 2 and (calls[0]["on"], calls[0]["jobs"]) == ("ray", 3)
+    assert [(r.key, r.error, r.failed, r.steps) for r in there.records] == [
+        (r.key, r.error, r.failed, r.steps) for r in here
+    ]
+    assert len(read(path)) == 3 and not path.with_suffix(".tasks").exists()
+    assert run(settings, path, device="cpu", on="ray").fresh == 0
+    with pytest.raises(InputError, match="one after the other"):
+        run(settings, path, device="cpu", jobs=2, budget=9.0)
 
 
 def test_the_machine_moves_bytes_and_a_floor_follows(tmp_path: Path) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+from in_process import swept
 
 from gsfluent.cli import main
 from gsfluent.errors import InputError
@@ -201,6 +203,22 @@ def test_the_verb_runs_a_map_and_draws_recorded_lines(
     assert json.loads(capsys.readouterr().out)["points"] == 9
     assert main([*words, "--maps", "nonsense"]) == 2
     assert main([*words, "--draw", str(out / "stability.jsonl"), "--maps", "kernel"]) == 2
+
+
+def test_rows_that_are_placed_leave_the_same_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = running.chosen(["zero_weight"])
+    here = running.run_maps(wanted, tmp_path / "here.jsonl", quick=True)
+    calls: list[dict[str, Any]] = []
+    monkeypatch.setattr(running, "sweep_map", swept(calls))
+    path = tmp_path / "there.jsonl"
+    path.write_text(here[0].line())
+    there = running.run_maps(wanted, path, quick=True, on="slurm")
+    assert calls[0]["on"] == "slurm" and not path.with_suffix(".tasks").exists()
+    same = [(p.key, p.step, p.kind, p.value, p.points) for p in here]
+    assert [(p.key, p.step, p.kind, p.value, p.points) for p in there] == same
+    assert [p.key for p in stability.read(path)] == [key for key, *_ in same]
 
 
 @pytest.mark.slow

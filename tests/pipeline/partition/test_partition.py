@@ -8,9 +8,10 @@ from partition_shapes import cube, points_of, slabs
 
 from gsfluent.data import Frame
 from gsfluent.geometry import trilinear
+from gsfluent.ops import nearest_labels
 from gsfluent.pipeline.partition.blur import blur, box_width
 from gsfluent.pipeline.partition.roughness import amplitude, displacement, displacements
-from gsfluent.pipeline.partition.threshold import ISLAND, Labels, join_islands, nearest_labels
+from gsfluent.pipeline.partition.threshold import ISLAND, Labels, join_islands
 from gsfluent.pipeline.partition.tree import Partition, ranked
 
 

@@ -1,0 +1,292 @@
+// Questions about points and labels in space: the label of the nearest point of every voxel, the
+// two largest of many fields at a place, the nearest points among cells. Their use and every
+// formula: gsfluent/pipeline/partition and gsfluent/spatial/neighbours.py.
+//
+// Each number is rounded where torch, asked one operation at a time, rounds it, so that both back
+// ends give the same labels. Floats go through `product` and `sum`: compilers fuse them otherwise.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/vec.h"
+
+namespace gsf {
+
+#ifdef __CUDA_ARCH__
+GSF_INLINE float product(float a, float b) { return __fmul_rn(a, b); }
+GSF_INLINE double product(double a, double b) { return __dmul_rn(a, b); }
+#else
+// What goes through memory, or seems to, is rounded there.
+template <typename T>
+GSF_INLINE T product(T a, T b) {
+  T value = a * b;
+#if defined(__x86_64__)
+  asm("" : "+x"(value));
+#else
+  volatile T held = value;
+  value = held;
+#endif
+  return value;
+}
+#endif
+
+// --- labels of voxels ---
+
+constexpr int kRankBits = 16;  // of a key that hold a label
+constexpr int64_t kNoKey = (int64_t(1) << 62) - 1;
+constexpr double kFineSquares = 1024.0;  // squared distances are whole numbers of this share
+
+struct NearestLabelsArgs {
+  int64_t count;        // P
+  const double* place;  // [P, 3] in voxels, centres at whole numbers
+  const int64_t* rank;  // [P]
+  int64_t shape[3];
+  int64_t limit;    // of a squared distance, in shares
+  int reach;        // voxels that a point sees along an axis
+  int64_t* best;    // [X, Y, Z] keys
+  int16_t* labels;  // [X, Y, Z]
+
+  GSF_HOST_DEVICE int64_t voxels() const { return shape[0] * shape[1] * shape[2]; }
+  GSF_HOST_DEVICE int64_t square(double apart) const {
+    return int64_t(rint(product(product(apart, apart), kFineSquares)));
+  }
+  GSF_HOST_DEVICE int16_t label(int64_t voxel) const {
+    const int64_t key = best[voxel];
+    return key < kNoKey ? int16_t(key & ((int64_t(1) << kRankBits) - 1)) : int16_t(-1);
+  }
+};
+
+// Calls see(voxel, key) for every voxel with first index in [begin, end) that point i can name.
+template <typename See>
+GSF_INLINE void named_voxels(const NearestLabelsArgs& a, int64_t i, int64_t begin, int64_t end,
+                             const See& see) {
+  const double* place = a.place + 3 * i;
+  int64_t middle[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    // also false for NaN
+    if (!(place[axis] > -1e9 && place[axis] < 1e9)) return;
+    middle[axis] = int64_t(rint(place[axis]));
+  }
+  const int r = a.reach;
+  for (int64_t x = middle[0] - r; x <= middle[0] + r; ++x) {
+    if (x < begin || x >= end) continue;
+    const int64_t along_x = a.square(double(x) - place[0]);
+    if (along_x > a.limit) continue;
+    for (int64_t y = middle[1] - r; y <= middle[1] + r; ++y) {
+      if (y < 0 || y >= a.shape[1]) continue;
+      const int64_t line = along_x + a.square(double(y) - place[1]);
+      if (line > a.limit) continue;
+      for (int64_t z = middle[2] - r; z <= middle[2] + r; ++z) {
+        if (z < 0 || z >= a.shape[2]) continue;
+        const int64_t total = line + a.square(double(z) - place[2]);
+        if (total <= a.limit)
+          see((x * a.shape[1] + y) * a.shape[2] + z, (total << kRankBits) + a.rank[i]);
+      }
+    }
+  }
+}
+
+// --- the two largest of many fields ---
+
+struct LargestSharesArgs {
+  int64_t count;        // M
+  const float* place;   // [M, 3] in voxels; null: every voxel of `shape`
+  int64_t shape[3];     // of the grid, where there are no places
+  int64_t fields;       // F
+  const float* shares;  // of all fields, one after the other
+  const int64_t* box;   // [F, 7]: first voxel, size, where its shares begin; size 0 for none
+  int64_t total;        // shares in all
+  int16_t *first, *second;
+  float* lead;
+
+  // Whether the shares of a box are there.
+  GSF_HOST_DEVICE bool holds(const int64_t* box) const {
+    constexpr int64_t kMost = int64_t(1) << 20;
+    for (int axis = 3; axis < 6; ++axis)
+      if (box[axis] < 1 || box[axis] > kMost) return false;
+    return box[6] >= 0 && box[6] <= total && box[3] * box[4] * box[5] <= total - box[6];
+  }
+};
+
+struct TwoLargest {
+  int16_t first = -1, second = -1;
+  float one = 0.0f, two = 0.0f;
+  GSF_HOST_DEVICE void take(int16_t label, float value) {
+    if (value > one) {
+      second = first;
+      two = one;
+      first = label;
+      one = value;
+    } else if (value > two) {
+      second = label;
+      two = value;
+    }
+  }
+};
+
+// A field between its voxels, trilinear, 0 outside of its box.
+GSF_INLINE float share_between(const float* share, const int64_t* size, const float* local) {
+  int64_t low[3];
+  float ends[3][2];
+  for (int axis = 0; axis < 3; ++axis) {
+    const float base = floorf(local[axis]), fraction = local[axis] - base;
+    low[axis] = int64_t(base);
+    ends[axis][0] = low[axis] >= 0 && low[axis] < size[axis] ? 1.0f - fraction : 0.0f;
+    ends[axis][1] = low[axis] + 1 >= 0 && low[axis] + 1 < size[axis] ? fraction : 0.0f;
+  }
+  float total = 0.0f;
+  for (int corner = 0; corner < 8; ++corner) {
+    const int side[3] = {corner >> 2, corner >> 1 & 1, corner & 1};
+    int64_t at = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+      const int64_t index = low[axis] + side[axis], most = size[axis] - 1;
+      at = at * size[axis] + (index < 0 ? 0 : index > most ? most : index);
+    }
+    const float weight = product(product(ends[0][side[0]], ends[1][side[1]]), ends[2][side[2]]);
+    total = total + product(weight, share[at]);
+  }
+  return total;
+}
+
+// Where place i is: of the list, or of the grid.
+GSF_INLINE void place_of(const LargestSharesArgs& a, int64_t i, float* place) {
+  if (a.place) {
+    for (int axis = 0; axis < 3; ++axis) place[axis] = a.place[3 * i + axis];
+    return;
+  }
+  const int64_t plane = a.shape[1] * a.shape[2];
+  place[0] = float(i / plane);
+  place[1] = float(i % plane / a.shape[2]);
+  place[2] = float(i % a.shape[2]);
+}
+
+// Whether a field may be there somewhere between two corners. No for NaN.
+GSF_INLINE bool meets(const LargestSharesArgs& a, int64_t label, const float* low,
+                      const float* high) {
+  const int64_t *first = a.box + 7 * label, *size = first + 3;
+  for (int axis = 0; axis < 3; ++axis)
+    if (!(high[axis] > float(first[axis] - 1) && low[axis] < float(first[axis] + size[axis])))
+      return false;
+  return a.holds(first);
+}
+
+// Shows a field to a place that it meets.
+GSF_INLINE void show(const LargestSharesArgs& a, int64_t label, const float* place,
+                     TwoLargest* found) {
+  const int64_t *low = a.box + 7 * label, *size = low + 3;
+  const float* share = a.shares + low[6];
+  float local[3];
+  int64_t at = 0;
+  bool inside = true;
+  for (int axis = 0; axis < 3; ++axis) {
+    local[axis] = place[axis] - float(low[axis]);
+    const int64_t near = int64_t(rintf(local[axis])), most = size[axis] - 1;
+    inside = inside && near >= 0 && near <= most;
+    at = at * size[axis] + (near < 0 ? 0 : near > most ? most : near);
+  }
+  if (!a.place) {
+    if (inside) found->take(int16_t(label), share[at]);
+  } else if (share[at] > 0.0f) {  // far from the label its share is nothing
+    found->take(int16_t(label), share_between(share, size, local));
+  }
+}
+
+GSF_INLINE void settle(const LargestSharesArgs& a, int64_t i, const TwoLargest& found) {
+  a.first[i] = found.first;
+  a.second[i] = found.second;
+  a.lead[i] = found.one - found.two;
+}
+
+// --- the nearest points ---
+
+constexpr int64_t kCellSide = int64_t(1) << 20;  // cells along an axis that a key can tell apart
+
+struct NearestInCellsArgs {
+  int64_t count, cells, points;  // queries, occupied cells, points
+  const double *point, *query;   // [N, 3], [M, 3]
+  const int64_t* order;          // [N] rows by cell
+  const int64_t* start;          // [cells + 1]
+  const int64_t* key;            // [cells], ascending
+  double low[3], cell;
+  int64_t wanted;  // neighbours of each query
+  double* square;  // [M, wanted], infinite where there are too few
+  int64_t* index;  // [M, wanted]
+};
+
+// Cell of query i, each index one up as in keys; false where it is nowhere.
+GSF_INLINE bool cell_of(const NearestInCellsArgs& a, int64_t i, int64_t* cell) {
+  for (int axis = 0; axis < 3; ++axis) {
+    const double place = (a.query[3 * i + axis] - a.low[axis]) / a.cell;
+    if (!(place > -1.0 && place < double(kCellSide))) return false;
+    cell[axis] = int64_t(place) + 1;
+  }
+  return true;
+}
+
+// First and last of the places in `order` that hold the points of line `line` (0 to 8) of the 27
+// cells: cells that follow each other along z have keys that do.
+GSF_INLINE void line_of(const NearestInCellsArgs& a, const int64_t* cell, int line, int64_t* begin,
+                        int64_t* end) {
+  const int64_t x = cell[0] - 1 + line / 3, y = cell[1] - 1 + line % 3;
+  const int64_t key[2] = {(x * kCellSide + y) * kCellSide + cell[2] - 1,
+                          (x * kCellSide + y) * kCellSide + cell[2] + 2};
+  int64_t at[2];
+  for (int side = 0; side < 2; ++side) {
+    int64_t lo = 0, hi = a.cells;
+    while (lo < hi) {
+      const int64_t middle = (lo + hi) / 2;
+      if (a.key[middle] < key[side])
+        lo = middle + 1;
+      else
+        hi = middle;
+    }
+    at[side] = a.start[lo];
+  }
+  *begin = max(at[0], int64_t(0));
+  *end = min(at[1], a.points);
+}
+
+// Row at a place of `order` and its squared distance from query i; false where there is none.
+GSF_INLINE bool candidate(const NearestInCellsArgs& a, int64_t i, int64_t place, int64_t* row,
+                          double* away) {
+  *row = a.order[place];
+  if (*row < 0 || *row >= a.points) return false;
+  const double *p = a.point + 3 * *row, *q = a.query + 3 * i;
+  const double dx = p[0] - q[0], dy = p[1] - q[1], dz = p[2] - q[2];
+  *away = (product(dx, dx) + product(dy, dy)) + product(dz, dz);
+  return true;
+}
+
+// The list of a query: ascending; of those as near the lower row first.
+struct NearestList {
+  int64_t wanted;
+  double* square;
+  int64_t* index;
+
+  GSF_HOST_DEVICE NearestList(const NearestInCellsArgs& a, int64_t i)
+      : wanted(a.wanted), square(a.square + a.wanted * i), index(a.index + a.wanted * i) {}
+  GSF_HOST_DEVICE void clear() const {
+    for (int64_t k = 0; k < wanted; ++k) {
+      square[k] = HUGE_VAL;
+      index[k] = 0;
+    }
+  }
+  GSF_HOST_DEVICE void take(int64_t row, double away) const {
+    int64_t at = wanted - 1;
+    for (; at > 0; --at) {
+      const double before = square[at - 1];
+      if (before < away || (before == away && index[at - 1] < row)) break;
+      square[at] = before;
+      index[at] = index[at - 1];
+    }
+    square[at] = away;
+    index[at] = row;
+  }
+};
+
+GSF_INLINE bool nearer(double away, int64_t row, double worst, int64_t last) {
+  return away < worst || (away == worst && row < last);
+}
+
+}  // namespace gsf

@@ -1,0 +1,82 @@
+// CPU kernels of the spatial ops.
+#include "host/spatial.h"
+
+#include <algorithm>
+#include <vector>
+
+namespace gsf {
+namespace {
+
+struct SpatialCpu {
+  using Scope = CpuScope;
+
+  static void nearest_labels(const NearestLabelsArgs& a, const Scope&) {
+    // each thread has layers of its own and asks all points
+    const int64_t plane = a.shape[1] * a.shape[2];
+    parallel_for(a.shape[0], 8, [&](int64_t begin, int64_t end) {
+      std::fill(a.best + begin * plane, a.best + end * plane, kNoKey);
+      for (int64_t i = 0; i < a.count; ++i)
+        named_voxels(a, i, begin, end,
+                     [&](int64_t voxel, int64_t key) { a.best[voxel] = min(a.best[voxel], key); });
+      for (int64_t k = begin * plane; k < end * plane; ++k) a.labels[k] = a.label(k);
+    });
+  }
+
+  static void largest_shares(const LargestSharesArgs& a, const Scope&) {
+    // places that follow each other are close: few of the fields meet a run of them
+    constexpr int64_t kRun = 256;
+    parallel_for((a.count + kRun - 1) / kRun, 16, [&](int64_t begin, int64_t end) {
+      std::vector<int64_t> met;
+      for (int64_t run = begin; run < end; ++run) {
+        const int64_t from = run * kRun, to = std::min(a.count, from + kRun);
+        float places[3 * kRun], low[3], high[3];
+        for (int axis = 0; axis < 3; ++axis) {
+          low[axis] = HUGE_VALF;
+          high[axis] = -HUGE_VALF;
+        }
+        for (int64_t i = from; i < to; ++i) {
+          float* place = places + 3 * (i - from);
+          place_of(a, i, place);
+          for (int axis = 0; axis < 3; ++axis) {
+            low[axis] = std::fmin(low[axis], place[axis]);
+            high[axis] = std::fmax(high[axis], place[axis]);
+          }
+        }
+        met.clear();
+        for (int64_t label = 0; label < a.fields; ++label)
+          if (meets(a, label, low, high)) met.push_back(label);
+        for (int64_t i = from; i < to; ++i) {
+          const float* place = places + 3 * (i - from);
+          TwoLargest found;
+          for (const int64_t label : met)
+            if (meets(a, label, place, place)) show(a, label, place, &found);
+          settle(a, i, found);
+        }
+      }
+    });
+  }
+
+  static void nearest_in_cells(const NearestInCellsArgs& a, const Scope&) {
+    parallel_for(a.count, 256, [&](int64_t first, int64_t last) {
+      for (int64_t i = first; i < last; ++i) {
+        const NearestList list(a, i);
+        list.clear();
+        int64_t cell[3], begin, end, row;
+        if (!cell_of(a, i, cell)) continue;
+        double away;
+        for (int line = 0; line < 9; ++line) {
+          line_of(a, cell, line, &begin, &end);
+          for (int64_t k = begin; k < end; ++k)
+            if (candidate(a, i, k, &row, &away) &&
+                nearer(away, row, list.square[a.wanted - 1], list.index[a.wanted - 1]))
+              list.take(row, away);
+        }
+      }
+    });
+  }
+};
+
+}  // namespace
+}  // namespace gsf
+
+GSF_REGISTER(CPU, gsf::SpatialOps<gsf::SpatialCpu>)

@@ -1,0 +1,14 @@
+// Launchers of the spatial kernels: torch-free.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "core/spatial.h"
+
+namespace gsf::cuda {
+
+cudaError_t nearest_labels(const NearestLabelsArgs& a, cudaStream_t stream);
+cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream);
+cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream);
+
+}  // namespace gsf::cuda

@@ -1,0 +1,19 @@
+// CUDA registration of the spatial ops.
+#include "cuda/spatial/launch.h"
+#include "cuda/stream.h"
+#include "host/spatial.h"
+
+namespace gsf {
+namespace {
+
+struct SpatialCuda {
+  using Scope = CudaScope;
+  GSF_LAUNCH(nearest_labels)
+  GSF_LAUNCH(largest_shares)
+  GSF_LAUNCH(nearest_in_cells)
+};
+
+}  // namespace
+}  // namespace gsf
+
+GSF_REGISTER(CUDA, gsf::SpatialOps<gsf::SpatialCuda>)

@@ -1,0 +1,142 @@
+// CUDA kernels of the spatial ops: one thread for a point or a voxel, a warp for a query.
+#include "cuda/spatial/launch.h"
+
+namespace gsf::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+inline unsigned blocks_for(int64_t n) {
+  return static_cast<unsigned>((n + kThreads - 1) / kThreads);
+}
+
+__device__ int64_t thread_number() { return int64_t(blockIdx.x) * kThreads + threadIdx.x; }
+
+__global__ void clear_kernel(NearestLabelsArgs a) {
+  const int64_t k = thread_number();
+  if (k < a.voxels()) a.best[k] = kNoKey;
+}
+
+__global__ void stamp_kernel(NearestLabelsArgs a) {
+  const int64_t i = thread_number();
+  if (i >= a.count) return;
+  // the least key of a voxel does not depend on who comes first
+  named_voxels(a, i, 0, a.shape[0], [&](int64_t voxel, int64_t key) {
+    if (key < a.best[voxel])
+      atomicMin(reinterpret_cast<long long*>(a.best + voxel), static_cast<long long>(key));
+  });
+}
+
+__global__ void name_kernel(NearestLabelsArgs a) {
+  const int64_t k = thread_number();
+  if (k < a.voxels()) a.labels[k] = a.label(k);
+}
+
+// The block's least and largest of three values each.
+__device__ void block_bounds(const float* place, bool counts, float* low, float* high) {
+  __shared__ float ends[kThreads / 32][6];
+  const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+  for (int axis = 0; axis < 3; ++axis) {
+    float least = counts ? place[axis] : HUGE_VALF, most = counts ? place[axis] : -HUGE_VALF;
+    for (int step = 16; step; step /= 2) {
+      least = fminf(least, __shfl_xor_sync(~0u, least, step));
+      most = fmaxf(most, __shfl_xor_sync(~0u, most, step));
+    }
+    if (lane == 0) {
+      ends[warp][axis] = least;
+      ends[warp][axis + 3] = most;
+    }
+  }
+  __syncthreads();
+  for (int axis = 0; axis < 3; ++axis) {
+    low[axis] = HUGE_VALF;
+    high[axis] = -HUGE_VALF;
+    for (int w = 0; w < kThreads / 32; ++w) {
+      low[axis] = fminf(low[axis], ends[w][axis]);
+      high[axis] = fmaxf(high[axis], ends[w][axis + 3]);
+    }
+  }
+}
+
+// Places that follow each other are close: a block looks first which fields meet any of its own,
+// 256 at a time, and then asks those in order.
+__global__ void largest_shares_kernel(LargestSharesArgs a) {
+  __shared__ unsigned met[kThreads / 32];
+  const int64_t i = thread_number();
+  const bool counts = i < a.count;
+  float place[3] = {0.0f, 0.0f, 0.0f}, low[3], high[3];
+  if (counts) place_of(a, i, place);
+  block_bounds(place, counts, low, high);
+  TwoLargest found;
+  for (int64_t base = 0; base < a.fields; base += kThreads) {
+    const int64_t mine = base + threadIdx.x;
+    const unsigned bits = __ballot_sync(~0u, mine < a.fields && meets(a, mine, low, high));
+    __syncthreads();  // the last words have been read
+    if (threadIdx.x % 32 == 0) met[threadIdx.x / 32] = bits;
+    __syncthreads();
+    for (int word = 0; word < kThreads / 32; ++word)
+      for (unsigned left = met[word]; left; left &= left - 1) {
+        const int64_t label = base + 32 * word + __ffs(left) - 1;
+        if (counts && meets(a, label, place, place)) show(a, label, place, &found);
+      }
+  }
+  if (counts) settle(a, i, found);
+}
+
+// A warp for a query: its lanes ask 32 points at a time, and the first lane keeps the list.
+__global__ void nearest_in_cells_kernel(NearestInCellsArgs a) {
+  const int64_t i = thread_number() / 32;
+  const int lane = threadIdx.x % 32;
+  if (i >= a.count) return;  // whole warps
+  const NearestList list(a, i);
+  if (lane == 0) list.clear();
+  int64_t cell[3], begin, end;
+  if (!cell_of(a, i, cell)) return;
+  double worst = HUGE_VAL;
+  int64_t last = 0;
+  for (int line = 0; line < 9; ++line) {
+    line_of(a, cell, line, &begin, &end);
+    for (int64_t base = begin; base < end; base += 32) {
+      int64_t row = 0;
+      double away = HUGE_VAL;
+      const bool there = base + lane < end && candidate(a, i, base + lane, &row, &away);
+      unsigned left = __ballot_sync(~0u, there && nearer(away, row, worst, last));
+      while (left) {
+        const int source = __ffs(left) - 1;
+        const int64_t its = __shfl_sync(~0u, row, source);
+        const double far = __shfl_sync(~0u, away, source);
+        if (lane == 0) {
+          list.take(its, far);
+          worst = list.square[a.wanted - 1];
+          last = list.index[a.wanted - 1];
+        }
+        worst = __shfl_sync(~0u, worst, 0);
+        last = __shfl_sync(~0u, last, 0);
+        left &= left - 1;
+        left &= __ballot_sync(~0u, there && nearer(away, row, worst, last));
+      }
+    }
+  }
+}
+
+}  // namespace
+
+cudaError_t nearest_labels(const NearestLabelsArgs& a, cudaStream_t stream) {
+  if (a.voxels() == 0) return cudaSuccess;
+  clear_kernel<<<blocks_for(a.voxels()), kThreads, 0, stream>>>(a);
+  if (a.count) stamp_kernel<<<blocks_for(a.count), kThreads, 0, stream>>>(a);
+  name_kernel<<<blocks_for(a.voxels()), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+
+cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream) {
+  if (a.count) largest_shares_kernel<<<blocks_for(a.count), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+
+cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream) {
+  if (a.count) nearest_in_cells_kernel<<<blocks_for(32 * a.count), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+
+}  // namespace gsf::cuda

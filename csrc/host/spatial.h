@@ -1,0 +1,118 @@
+// Checks and allocation of the spatial ops, once for both back ends.
+#pragma once
+
+#include <limits>
+
+#include "core/spatial.h"
+#include "torch_api.h"
+
+namespace gsf {
+
+template <class Backend>
+struct SpatialOps {
+  static Tensor nearest_labels(Tensor place, Tensor rank, std::vector<int64_t> shape,
+                               double radius) {
+    const char* op = "nearest_labels";
+    place = ready(op, "place", place, place, {-1, 3}, ScalarType::Double);
+    rank = ready(op, "rank", rank, place, {place.size(0)}, ScalarType::Long);
+    check_grid(op, shape);
+    STD_TORCH_CHECK(radius >= 0 && radius <= 1000, op, ": radius must be 0 to 1000, got ", radius);
+    Tensor labels = gsf::new_empty(place, shape, ScalarType::Short);
+    Tensor best = gsf::new_empty(place, shape, ScalarType::Long);
+    const NearestLabelsArgs args{place.size(0),
+                                 cptr<double>(place),
+                                 cptr<int64_t>(rank),
+                                 {shape[0], shape[1], shape[2]},
+                                 static_cast<int64_t>(std::rint(radius * radius * kFineSquares)),
+                                 static_cast<int>(std::ceil(radius)),
+                                 mptr<int64_t>(best),
+                                 mptr<int16_t>(labels)};
+    const typename Backend::Scope scope(place);
+    Backend::nearest_labels(args, scope);
+    return labels;
+  }
+
+  static std::tuple<Tensor, Tensor, Tensor> largest_shares(OptTensor place,
+                                                           std::vector<int64_t> shape,
+                                                           Tensor shares, Tensor box) {
+    const char* op = "largest_shares";
+    shares = ready(op, "shares", shares, shares, {-1}, ScalarType::Float);
+    box = ready(op, "box", box, shares, {-1, 7}, ScalarType::Long);
+    place = ready(op, "place", place, shares, {-1, 3}, ScalarType::Float);
+    STD_TORCH_CHECK(box.size(0) <= 32767, op, ": at most 32767 fields, got ", box.size(0));
+    check_grid(op, shape);
+    const std::vector<int64_t> sizes = place ? std::vector<int64_t>{place->size(0)} : shape;
+    Tensor first = gsf::new_empty(shares, sizes, ScalarType::Short);
+    Tensor second = gsf::new_empty(shares, sizes, ScalarType::Short);
+    Tensor lead = gsf::new_empty(shares, sizes, ScalarType::Float);
+    int64_t count = 1;
+    for (const int64_t n : sizes) count *= n;
+    const LargestSharesArgs args{count,
+                                 cptr<float>(place),
+                                 {shape[0], shape[1], shape[2]},
+                                 box.size(0),
+                                 cptr<float>(shares),
+                                 cptr<int64_t>(box),
+                                 shares.size(0),
+                                 mptr<int16_t>(first),
+                                 mptr<int16_t>(second),
+                                 mptr<float>(lead)};
+    const typename Backend::Scope scope(shares);
+    Backend::largest_shares(args, scope);
+    return {first, second, lead};
+  }
+
+  static std::tuple<Tensor, Tensor> nearest_in_cells(Tensor points, Tensor queries, Tensor order,
+                                                     Tensor start, Tensor keys,
+                                                     std::vector<double> low, double cell,
+                                                     int64_t count) {
+    const char* op = "nearest_in_cells";
+    points = ready(op, "points", points, points, {-1, 3}, ScalarType::Double);
+    queries = ready(op, "queries", queries, points, {-1, 3}, ScalarType::Double);
+    order = ready(op, "order", order, points, {points.size(0)}, ScalarType::Long);
+    keys = ready(op, "keys", keys, points, {-1}, ScalarType::Long);
+    start = ready(op, "start", start, points, {keys.size(0) + 1}, ScalarType::Long);
+    STD_TORCH_CHECK(low.size() == 3, op, ": low must have 3 values, got ", low.size());
+    STD_TORCH_CHECK(cell > 0, op, ": cell must be positive, got ", cell);
+    STD_TORCH_CHECK(count >= 1, op, ": count must be at least 1, got ", count);
+    const std::vector<int64_t> sizes{queries.size(0), count};
+    Tensor square = gsf::new_empty(points, sizes, ScalarType::Double);
+    Tensor index = gsf::new_empty(points, sizes, ScalarType::Long);
+    const NearestInCellsArgs args{queries.size(0),
+                                  keys.size(0),
+                                  points.size(0),
+                                  cptr<double>(points),
+                                  cptr<double>(queries),
+                                  cptr<int64_t>(order),
+                                  cptr<int64_t>(start),
+                                  cptr<int64_t>(keys),
+                                  {low[0], low[1], low[2]},
+                                  cell,
+                                  count,
+                                  mptr<double>(square),
+                                  mptr<int64_t>(index)};
+    const typename Backend::Scope scope(points);
+    Backend::nearest_in_cells(args, scope);
+    return {square, index};
+  }
+
+  template <typename Library>
+  static void register_all(Library& m) {
+    GSF_IMPL(SpatialOps, nearest_labels);
+    GSF_IMPL(SpatialOps, largest_shares);
+    GSF_IMPL(SpatialOps, nearest_in_cells);
+  }
+
+ private:
+  static void check_grid(const char* op, const std::vector<int64_t>& shape) {
+    STD_TORCH_CHECK(shape.size() == 3, op, ": shape must have 3 sizes, got ", shape.size());
+    double voxels = 1.0;
+    for (const int64_t n : shape) {
+      STD_TORCH_CHECK(n >= 0, op, ": sizes must not be negative, got ", n);
+      voxels *= double(n);
+    }
+    STD_TORCH_CHECK(voxels < 1e12, op, ": the grid is too large");
+  }
+};
+
+}  // namespace gsf

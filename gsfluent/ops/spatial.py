@@ -1,0 +1,157 @@
+"""Labels of voxels, the largest of many fields, the nearest of points among cells.
+
+What they are for: :mod:`gsfluent.pipeline.partition` and :mod:`gsfluent.spatial.neighbours`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsfluent import _load  # noqa: F401  (loads the compiled operators)
+from gsfluent._check import check_tensor
+from gsfluent.ops._register import fakes, no_gradient
+
+MOST_FIELDS = 32767
+
+
+def nearest_labels(place: Tensor, rank: Tensor, shape: Sequence[int], radius: float) -> Tensor:
+    """Label of the nearest point of every voxel, int16 [X, Y, Z]; -1 where none is near.
+
+    Squared distances are counted in shares of 1/1024, so the order of the points changes nothing.
+
+    Args:
+        place: Points in voxels, centres at whole numbers, float64 [P, 3]; NaN names nothing.
+        rank: Labels of the points, int64 [P], below 2^15; of two as near the lower one wins.
+        shape: Voxels along each axis.
+        radius: How far a point sees [voxels], 0 to 1000.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong, or the radius is out of range.
+
+    Gradient: none.
+    """
+    op = "nearest_labels"
+    check_tensor(op, "place", place, shape=("P", 3), dtype=torch.float64)
+    check_tensor(op, "rank", rank, shape=(place.shape[0],), dtype=torch.int64, like=place)
+    _check_shape(op, shape)
+    if not 0.0 <= radius <= 1000.0:
+        raise ValueError(f"{op}: radius must be 0 to 1000, got {radius}")
+    return torch.ops.gsfluent.nearest_labels.default(place, rank, list(shape), float(radius))
+
+
+def largest_shares(
+    place: Tensor | None, shape: Sequence[int], shares: Tensor, box: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The two largest of many fields, each of which is kept in a box of a grid.
+
+    Fields are asked in order, and a later one must be larger to come first. Between voxels they
+    are trilinear. A field that is 0 in the voxel around a place is not asked there.
+
+    Args:
+        place: Where [voxels], centres at whole numbers, float32 [M, 3]; None for every voxel.
+        shape: Voxels of the grid along each axis; asked only without places.
+        shares: The fields one after the other, float32 [S].
+        box: For each field its first voxel, its size, and where its shares begin, int64 [F, 7];
+            what reaches beyond ``shares``, or has no size, is no field.
+
+    Returns:
+        Number of the largest, -1 for none, int16; of the next one, int16; by how much the first
+        leads, float32. Each [M], or [X, Y, Z] without places.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong, or there are more than 32767 fields.
+
+    Gradient: none.
+    """
+    op = "largest_shares"
+    check_tensor(op, "shares", shares, shape=("S",), dtype=torch.float32)
+    check_tensor(op, "box", box, shape=("F", 7), dtype=torch.int64, like=shares)
+    if place is not None:
+        check_tensor(op, "place", place, shape=("M", 3), dtype=torch.float32, like=shares)
+    _check_shape(op, shape)
+    if box.shape[0] > MOST_FIELDS:
+        raise ValueError(f"{op}: at most {MOST_FIELDS} fields, got {box.shape[0]}")
+    return torch.ops.gsfluent.largest_shares.default(place, list(shape), shares, box)
+
+
+def nearest_in_cells(
+    points: Tensor,
+    queries: Tensor,
+    order: Tensor,
+    start: Tensor,
+    keys: Tensor,
+    low: Sequence[float],
+    cell: float,
+    count: int,
+) -> tuple[Tensor, Tensor]:
+    """Nearest of the points in the 27 cells around each query.
+
+    Args:
+        points: Where to look, float64 [N, 3], world units.
+        queries: float64 [M, 3], world units.
+        order: Rows of the points by cell, int64 [N].
+        start: Where each occupied cell begins in ``order``, and the end, int64 [K + 1].
+        keys: Of the cells, ascending, int64 [K]: ``((x + 1) 2^20 + y + 1) 2^20 + z + 1``.
+        low: Corner of cell (0, 0, 0), world units.
+        cell: Edge of the cells, world units.
+        count: Neighbours of each query.
+
+    Returns:
+        Squared distances float64 [M, count], ascending, infinite where there are too few, and rows
+        int64 [M, count], 0 there. Of points as near the lower row comes first.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong, ``cell`` or ``count`` is not positive.
+
+    Gradient: none.
+    """
+    op = "nearest_in_cells"
+    check_tensor(op, "points", points, shape=("N", 3), dtype=torch.float64)
+    check_tensor(op, "queries", queries, shape=("M", 3), dtype=torch.float64, like=points)
+    for name, value, size in (
+        ("order", order, points.shape[0]), ("keys", keys, None), ("start", start, len(keys) + 1),
+    ):  # fmt: skip
+        check_tensor(op, name, value, shape=(size,), dtype=torch.int64, like=points)
+    if not (math.isfinite(cell) and cell > 0.0):
+        raise ValueError(f"{op}: cell must be positive, got {cell}")
+    if count < 1:
+        raise ValueError(f"{op}: count must be at least 1, got {count}")
+    return torch.ops.gsfluent.nearest_in_cells.default(
+        points, queries, order, start, keys, [float(v) for v in low], float(cell), count
+    )
+
+
+def _check_shape(op: str, shape: Sequence[int]) -> None:
+    if len(shape) != 3 or any(n < 0 for n in shape):
+        raise ValueError(f"{op}: shape must be three sizes, got {tuple(shape)}")
+
+
+def _three(
+    place: Tensor | None, shape: Sequence[int], shares: Tensor, box: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    size = tuple(shape) if place is None else (place.shape[0],)
+    return (
+        shares.new_empty(size, dtype=torch.int16),
+        shares.new_empty(size, dtype=torch.int16),
+        shares.new_empty(size),
+    )
+
+
+fakes(
+    nearest_labels=lambda place, rank, shape, radius: place.new_empty(
+        tuple(shape), dtype=torch.int16
+    ),
+    largest_shares=_three,
+    nearest_in_cells=lambda points, queries, order, start, keys, low, cell, count: (
+        queries.new_empty((queries.shape[0], count)),
+        queries.new_empty((queries.shape[0], count), dtype=torch.int64),
+    ),
+)
+no_gradient("spatial: no gradient", "nearest_labels", "largest_shares", "nearest_in_cells")
