@@ -20,13 +20,15 @@ from gsfluent.config import Shot
 from gsfluent.errors import InputError, MissingPackage
 from gsfluent.figure.page import Page
 from gsfluent.figure.series import Panel, curves
-from gsfluent.fit.read import read_target
+from gsfluent.fit.read import read_masks, read_target
 from gsfluent.io import atomic_path, write_json
 from gsfluent.pipeline.fit import Fit, Found, Task, run_task
+from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import content_digest, fingerprint
 from gsfluent.sweep.engine import map as sweep_map
 from gsfluent.sweep.engine import required
+from gsfluent.targets.target import Target
 
 FILES = {"fit": "fit.json", "shot": "fitted.yaml", "report": "fit.html"}
 
@@ -39,6 +41,8 @@ def fit_to(
     points: Path | None = None,
     clouds: Path | None = None,
     force: Path | None = None,
+    masks: Path | None = None,
+    cameras: Path | None = None,
     sigma: float | None = None,
     fps: float | None = None,
     starts: int = 4,
@@ -58,8 +62,11 @@ def fit_to(
         learn: ``OBJECT.NUMBER`` each.
         points: Tracks (see :func:`gsfluent.fit.read.read_target`); or
         clouds: a cloud per frame; or
-        force: a table of displacement and force.
-        sigma: Standard deviation of what was seen [m, N].
+        force: a table of displacement and force; or
+        masks: films of masks, with
+        cameras: their cameras (see :func:`gsfluent.fit.read.read_masks`), in the frame of the
+            splats of the first object, where it is in frame 0.
+        sigma: Standard deviation of what was seen [m, N, none].
         fps: Frames per second of files without times.
         starts: How many, see :class:`gsfluent.pipeline.Fit`.
         cells: Along the longest side of the largest body.
@@ -79,17 +86,27 @@ def fit_to(
         KeyboardInterrupt: The same command goes on.
     """
     reporter = reporter or LineReporter()
-    given = {"points": points, "clouds": clouds, "force": force}
+    given = {"points": points, "clouds": clouds, "force": force, "masks": masks}
     named = {kind: path for kind, path in given.items() if path is not None}
     if len(named) != 1:
         got = " and ".join(f"--{kind}" for kind in named) or "none"
-        raise InputError(f"fit: needs one of --points, --clouds and --force, got {got}", "give one")
+        kinds = "--points, --clouds, --force and --masks"
+        raise InputError(f"fit: needs one of {kinds}, got {got}", "give one")
     ((kind, path),) = named.items()
-    target = read_target(kind, path, sigma=sigma, fps=fps, shot=shot)
+    if (kind == "masks") != (cameras is not None):
+        raise InputError("fit: --masks and --cameras go together", "give both, or neither")
+    target: Target
+    if kind != "masks":
+        target = read_target(kind, path, sigma=sigma, fps=fps, shot=shot)
     scene, _ = shot_scene(
         shot, out, device=torch.device(device), seed=seed, reporter=reporter, make=True
     )
-    base = fingerprint(shot.resolved(), list(learn), kind, content_digest(path), sigma, fps, seed)
+    digests = [content_digest(path)]
+    if cameras is not None:
+        frame = body_frame(scene.bodies[0], scene)
+        target = read_masks(path, cameras, frame, sigma=sigma, fps=fps)
+        digests.append(content_digest(cameras))
+    base = fingerprint(shot.resolved(), list(learn), kind, *digests, sigma, fps, seed)
     runner = functools.partial(_through_sweep, out / "search", base, jobs, on)
     stage = Fit(list(learn), starts=starts, cells=cells, grids=grids, seed=seed, runner=runner)
     found = stage(scene, target, progress=reporter.task("fit"))
@@ -116,7 +133,7 @@ def _through_sweep(
 ) -> list[dict[str, Any]]:
     """Do searches, each once; those of another shot or target have other names."""
     tasks = list(items)
-    ids = [fingerprint(base, t.start, t.dx, list(t.shares), t.grid) for t in tasks]
+    ids = [fingerprint(base, t.start, t.dx, list(t.shares), t.grids) for t in tasks]
     unlike = dict(zip(ids, tasks, strict=True))
     outcomes = sweep_map(
         search_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True

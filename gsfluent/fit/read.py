@@ -8,10 +8,14 @@ from typing import Any
 import numpy as np
 
 from gsfluent.config import Shot
+from gsfluent.data import Frame
 from gsfluent.errors import InputError
+from gsfluent.io.capture import load_poses
 from gsfluent.io.checked.files import read_text
+from gsfluent.io.images import IMAGE_SUFFIXES, read_mask
 from gsfluent.io.sequences import read_clouds, read_sequence
 from gsfluent.targets.force import Force
+from gsfluent.targets.masks import Masks
 from gsfluent.targets.points import Clouds, Points
 from gsfluent.targets.target import Target
 
@@ -48,6 +52,49 @@ def read_target(
     table = _table(path)
     speed = float(np.linalg.norm(getattr(moving[0], "velocity", (0.0,))))
     return Force(table[:, 0].tolist(), table[:, 1].tolist(), speed=speed, **more)
+
+
+def read_masks(
+    path: Path, cameras: Path, frame: Frame, *, sigma: float | None, fps: float | None
+) -> Masks:
+    """Read films of masks from posed cameras that stand still.
+
+    Args:
+        path: A folder with a folder of pictures for each camera, named as its image without the
+            suffix; pictures in the order of their names, white or opaque where the object is.
+        cameras: A COLMAP model or ``transforms.json``, as of the capture of the splats; more
+            cameras than films are no harm.
+        frame: From the world of the cameras to the scene.
+        sigma: Standard deviation of a pixel.
+        fps: Frames per second; 24 when None.
+
+    Raises:
+        InputError: A film without a camera, films of unlike length or size, or a lens that bends.
+    """
+    posed = {Path(camera.name).stem: camera for camera in load_poses(cameras)}
+    films = sorted(p for p in path.iterdir() if p.is_dir()) if path.is_dir() else []
+    if not films:
+        raise InputError(f"{path}: no films", "a folder for each camera, with a picture per frame")
+    stray = [film.name for film in films if film.name not in posed]
+    if stray:
+        few = ", ".join(sorted(posed)[:4])
+        raise InputError(f"{path}: no camera {stray[0]!r} in {cameras}", f"there are {few}, ...")
+    used = [posed[film.name] for film in films]
+    if any(any(camera.distortion) for camera in used):
+        raise InputError(f"{cameras}: the lenses bend", "undistort the films and their cameras")
+    seen = []
+    for film in films:
+        files = sorted(p for p in film.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        pictures = [read_mask(file) for file in files]
+        if len({picture.shape for picture in pictures}) != 1:
+            raise InputError(f"{film}: no pictures, or of several sizes", "one size for a film")
+        seen.append(np.stack(pictures))
+    if len({film.shape for film in seen}) != 1:
+        shapes = ", ".join(f"{f.name} {list(s.shape)}" for f, s in zip(films, seen, strict=True))
+        raise InputError(f"{path}: films are unlike: {shapes}", "as many frames of one size each")
+    more: dict[str, Any] = {} if sigma is None else {"sigma": sigma}
+    moved = [camera.transformed(frame) for camera in used]
+    return Masks(moved, np.stack(seen), fps=fps or FPS, **more)
 
 
 def _table(path: Path) -> np.ndarray:

@@ -132,7 +132,7 @@ def load_view(camera: Camera, max_size: int | None = None) -> View:
     mask = pixels[..., 3] if pixels.shape[2] == 4 else None
     image = np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
     if camera.mask_path is not None:
-        mask = _read_mask(camera.mask_path)
+        mask = read_mask(camera.mask_path)
     camera = _fitted(camera, image.shape[1], image.shape[0])
     factor = 1.0 if max_size is None else min(1.0, max_size / max(image.shape[:2]))
     camera = camera.scaled(factor)
@@ -239,8 +239,8 @@ def _fitted(camera: Camera, width: int, height: int) -> Camera:
     return camera.resized(width, height)
 
 
-def _read_mask(path: Path) -> NDArray[np.float32]:
-    """Read a mask: its alpha channel if that says anything, else its first; white is object."""
+def read_mask(path: Path) -> NDArray[np.float32]:
+    """Read a mask, [H, W]: its alpha channel if that says anything, else its first; 1 is object."""
     values = read_array(path)
     if values.shape[2] == 4 and values[..., 3].min() < 1:
         return values[..., 3]

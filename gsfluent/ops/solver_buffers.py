@@ -88,6 +88,8 @@ class Buffers:
     parent: Tensor
     cut: Tensor
     radius: Tensor
+    viscous: Tensor
+    object: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""
@@ -177,7 +179,8 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
     for name in ("id", "entry", "place"):
         values[name] = zeros(count, dtype=torch.int32)
     values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
-    whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut")
+    whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut",
+             "object")  # fmt: skip
     for name in whole:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):

@@ -45,6 +45,9 @@ class Each:
     """``each:`` - what one shot may take."""
 
     cpus: int = key(whole(1, 4096), "Threads of a shot.", "2", default=1)
+    gpu: float | None = optional(
+        number(0.0, 1.0, above=0.0), "Part of a GPU; by its memory when absent.", "0.25"
+    )
     minutes: float | None = optional(number(above=0.0), "Longest time of a shot [min].", "30")
     tries: int = key(
         whole(1, 100), "Tries of a shot that was killed or ran out of memory.", "3", default=TRIES
@@ -145,10 +148,11 @@ def tasks_of(
         raise InputError(f"{sweep.shot}: must be a YAML mapping", "see docs/guide/shot-keys.md")
     folder = sweep.shot.resolve().parent
     common = Common(dict(values), folder, device, seed, out / "stages", sweep.keep)
-    draws = draw(sweep.vary, sweep.sample, sweep.count, seed)
-    wanted = fingerprint("tasks", values, str(folder), draws, device, seed, sweep.keep)
+    how = [sweep.vary, sweep.sample, sweep.count]
+    wanted = fingerprint("tasks", values, str(folder), how, device, seed, sweep.keep)
     found = _known(out / FILE, wanted)
     if found is None:
+        draws = draw(sweep.vary, sweep.sample, sweep.count, seed)
         digests: dict[str, str] = {}
         found = []
         for index, (changes, own) in enumerate(draws):
@@ -159,12 +163,12 @@ def tasks_of(
                 raise InputError(f"shot {index} ({what}): {error.what}", error.hint) from error
             own_seed = seed if own is None else own
             where = [seed, device.partition(":")[0], sweep.keep]
-            found.append([index, own_seed, *_digests(shot, own_seed, where, digests)])
+            found.append([index, changes, own_seed, *_digests(shot, own_seed, where, digests)])
             report_progress(progress, index + 1, len(draws), "looked through")
         write_json(out / FILE, {"key": wanted, "inputs": digests, "tasks": found})
     tasks: dict[str, Task] = {}
-    for index, own_seed, name, thing, solids in found:
-        task = Task(name, index, draws[index][0], own_seed, thing, solids, common)
+    for index, changes, own_seed, name, thing, solids in found:
+        task = Task(name, index, changes, own_seed, thing, solids, common)
         tasks.setdefault(name, task)
     if len(tasks) < len(found):
         _log.info("%d draws are the same as others and are done once", len(found) - len(tasks))

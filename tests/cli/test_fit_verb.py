@@ -14,9 +14,18 @@ import yaml
 from gsfluent.choose.shot import shot_scene
 from gsfluent.cli import main
 from gsfluent.config import load_shot
+from gsfluent.data import Camera, Frame
+from gsfluent.draw import draw
+from gsfluent.errors import InputError
+from gsfluent.fit.read import read_masks
+from gsfluent.geometry import look_at
+from gsfluent.io.images import save_image
 from gsfluent.pipeline.fit.forward import Forward
+from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.progress import LineReporter
+from gsfluent.targets.target import Followers
 
+THROWN = [0.4, -0.2, -1.2]
 TIMES = [k / 24 for k in range(7)]
 
 
@@ -71,9 +80,89 @@ def test_tracks_become_a_shot_that_runs_on(
     assert sorted(done) == sorted((out / "search").rglob("*"))
 
 
+@pytest.fixture(scope="module")
+def films(thrown: Path) -> tuple[Path, Path]:
+    """Masks of the thing, thrown faster, from two cameras in the frame of the splats."""
+    shot = load_shot(thrown / "shot.yaml")
+    scene, _ = shot_scene(
+        shot, thrown / "out", device=torch.device("cpu"), reporter=LineReporter(), make=True
+    )
+    truth = Forward(scene, TIMES, 0.3 / 5)
+    values = {"it.velocity": THROWN, "floor.offset": 0.4}
+    motion = truth.run(values, len(TIMES), truth.step(values))
+    splats = truth.setting().splats
+    assert splats is not None
+    follow = Followers("test", splats.means.double(), truth.setting())
+    world = body_frame(scene.bodies[0], scene)
+    middle = truth.rest.mean(dim=0)
+    frames, masks = [], thrown / "films"
+    for name, side in (("a", (1.0, 0.2, 0.3)), ("b", (-0.3, 1.0, 0.3))):
+        eye = middle + torch.tensor(side, dtype=torch.float64)
+        pose = look_at(eye, middle, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        K = torch.tensor([[200.0, 0, 64], [0, 200.0, 64], [0, 0, 1]], dtype=torch.float64)
+        here = Camera(pose, K, 128, 128)
+        (masks / name).mkdir(parents=True)
+        for k in range(len(TIMES)):
+            alpha = draw(splats.replace(means=follow.places(motion, k)[0].float()), here).alpha
+            save_image(alpha[..., None].expand(-1, -1, 3), masks / name / f"{k:04}.png")
+        seen = here.transformed(world.inverse())
+        placed = torch.linalg.inv(seen.viewmat) @ torch.diag(
+            torch.tensor([1.0, -1, -1, 1]).double()
+        )
+        frames.append({"file_path": f"images/{name}.png", "transform_matrix": placed.tolist()})
+    poses = {"fl_x": 200, "fl_y": 200, "cx": 64, "cy": 64, "w": 128, "h": 128, "frames": frames}
+    (thrown / "transforms.json").write_text(json.dumps(poses))
+    return masks, thrown / "transforms.json"
+
+
+def test_films_of_masks_lead_to_the_velocity(
+    thrown: Path, films: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["fit", str(thrown / "shot.yaml"), "--masks", str(films[0]), "--cameras", str(films[1])]
+    words += ["--learn", "it.velocity", "--starts", "1", "--grids", "1", "--cells", "5"]
+    assert main([*words, "--jobs", "1", "-o", str(thrown / "out"), "--json"]) == 0
+    number = json.loads(capsys.readouterr().out)["parameters"]["it.velocity"]
+    start = np.linalg.norm(np.subtract([0.1, 0.0, -1.5], THROWN))
+    # five cells and eighty points: most of the way
+    assert np.linalg.norm(np.subtract(number["value"], THROWN)) < 0.6 * start
+
+
+def test_cameras_stand_where_the_splats_are_seen_from(
+    thrown: Path, films: tuple[Path, Path]
+) -> None:
+    """On the grid of the truth nothing but the drawing of 32 pixels is left of the differences."""
+    scene, _ = shot_scene(
+        load_shot(thrown / "shot.yaml"), thrown / "out", device=torch.device("cpu"),
+        reporter=LineReporter(), make=True,
+    )  # fmt: skip
+    target = read_masks(*films, body_frame(scene.bodies[0], scene), sigma=None, fps=None)
+    truth = Forward(scene, target.times, 0.3 / 5)
+    observer = target.observe(truth.setting())
+    sizes = []
+    for velocity in (THROWN, [0.1, 0.0, -1.5]):
+        values = {"it.velocity": velocity, "floor.offset": 0.4}
+        motion = truth.run(values, len(TIMES), truth.step(values))
+        sizes.append(float(observer.residuals(motion, len(TIMES), None)[0].square().mean().sqrt()))
+    assert sizes[0] < 2.0 and sizes[0] < 0.5 * sizes[1]
+
+
+def test_films_without_a_camera_are_named(films: tuple[Path, Path], tmp_path: Path) -> None:
+    world = Frame(torch.eye(3).double(), torch.zeros(3).double(), 1.0)
+    (tmp_path / "c").mkdir()
+    with pytest.raises(InputError, match="no camera 'c'"):
+        read_masks(tmp_path, films[1], world, sigma=None, fps=None)
+    (tmp_path / "c").rename(tmp_path / "a")
+    with pytest.raises(InputError, match="no pictures"):
+        read_masks(tmp_path, films[1], world, sigma=None, fps=None)
+
+
 @pytest.mark.parametrize(
     ("more", "what"),
-    [([], "needs one of"), (["--points", "track.npz", "--force", "track.npz"], "needs one of")],
+    [
+        ([], "needs one of"),
+        (["--points", "track.npz", "--force", "track.npz"], "needs one of"),
+        (["--points", "track.npz", "--cameras", "track.npz"], "go together"),
+    ],
 )
 def test_one_target_it_is(
     more: list[str], what: str, thrown: Path, capsys: pytest.CaptureFixture[str],

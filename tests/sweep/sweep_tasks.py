@@ -44,9 +44,21 @@ def touches_and_waits(item: Path, folder: Path) -> None:
     time.sleep(600)
 
 
+def waits_to_go(item: Path, folder: Path) -> int:
+    (item / "begun").touch()
+    while not (item / "go").exists():
+        time.sleep(0.01)
+    return os.getpid()
+
+
 def never_ends(item: int, folder: Path) -> None:
     print("waiting", flush=True)
     time.sleep(600)
+
+
+def its_card(item: int, folder: Path) -> str:
+    time.sleep(0.3)
+    return os.environ["CUDA_VISIBLE_DEVICES"]
 
 
 def names(count: int) -> list[str]:

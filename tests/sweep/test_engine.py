@@ -193,6 +193,27 @@ def test_a_late_try_loses_against_the_one_that_was_quicker(tmp_path: Path) -> No
     assert row is not None and row["value"] == 25 and not late.exists()
 
 
+def test_a_process_that_was_stopped_until_another_had_won_changes_nothing(tmp_path: Path) -> None:
+    place = SweepFolder(tmp_path / "out")
+    place.make()
+    pool = LocalPool(place.root, sweep_tasks.waits_to_go, jobs=1, minutes=None)
+    pool.start("one", tmp_path)
+    while not (tmp_path / "begun").exists():
+        assert pool.ended(0.02) == []
+    (worker,) = pool._workers
+    os.kill(worker.process.pid, signal.SIGSTOP)
+    os.utime(place.claim("one"), (time.time() - SILENCE - 1,) * 2)
+    assert attempt(place.root, "one", square, 5) == DONE
+    (tmp_path / "go").touch()
+    os.kill(worker.process.pid, signal.SIGCONT)
+    while not (ended := pool.ended(0.1)):
+        pass
+    pool.close()
+    row = place.row("one")
+    assert ended == [("one", DONE)] and row is not None and row["value"] == 25
+    assert not list((place.root / "work").iterdir()) + list((place.root / "claims").iterdir())
+
+
 def test_a_claim_is_held_freed_and_retaken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     place = SweepFolder(tmp_path)
     place.make()

@@ -13,6 +13,9 @@ namespace gsf {
 
 // Largest (frequency of the spring times dt)^2; 4 would be unstable, and 1 already shows.
 constexpr double kSpringStep = 0.25;
+// Damping of the springs in periods of a cell's wave, so that what stands on them comes to rest: a
+// body that chatters is not held by friction.
+constexpr double kSpringDamping = 0.1;
 // Depth [cells] from which on the force does not grow.
 constexpr double kSpringDepth = 0.5;
 // Nodes so deep [cells] inside are held as without springs: what came through them is stopped.
@@ -29,11 +32,17 @@ GSF_HOST_DEVICE bool collider_springs(const T* row) {
 }
 
 // Speed [m/s] that a point gets along the normal in a step: `depth` [m] is how far it is nearer
-// than its radius, `wave` the speed of its P-wave, `length` the cube root of its volume.
+// than its radius, `wave` the speed of its P-wave, `length` the cube root of its volume, `longest`
+// a step [s] that no step exceeds.
 template <typename T>
-GSF_HOST_DEVICE T spring_speed(T depth, T wave, T length, T dx, T dt) {
-  const T rate = min(wave * wave / (dx * length), T(kSpringStep) / (dt * dt));
+GSF_HOST_DEVICE T spring_speed(T depth, T wave, T length, T dx, T dt, T longest) {
+  const T rate = min(wave * wave / (dx * length), T(kSpringStep) / (longest * longest));
   return dt * rate * min(depth, T(kSpringDepth) * dx);
+}
+
+// Time [s] by which a spring's force is ahead of its depth: what it gives back less than it took.
+GSF_HOST_DEVICE double spring_lag(double wave, double dx) {
+  return kSpringDamping * dx / max(wave, 1e-30);
 }
 
 // Coulomb friction at a node that got the impulse `push` [N s] of springs: v loses up to

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "core/collider/collider.h"
+#include "core/collider/touch.h"
 #include "core/solver/state.h"
 
 namespace gsf {
@@ -84,7 +85,9 @@ GSF_HOST_DEVICE int node_contact(const SolverView<T>& s, int fields, const bool*
     for (int b = a + 1; b < fields; ++b) {
       if (!heavy[b] || (with_a >> b & 1u) != 0) continue;
       const auto pair = [&](int side, int o) { return near(side == 0 ? a : b, o); };
-      touched += contact_pair<T>(pair, s.contact, velocity[a], velocity[b]) ? 1 : 0;
+      ContactLaw law = s.contact;
+      if (s.touches_by_points(number(a), number(b))) law.gap = kTouchGap;
+      touched += contact_pair<T>(pair, law, velocity[a], velocity[b]) ? 1 : 0;
     }
   }
   if (s.parent == nullptr) return touched;

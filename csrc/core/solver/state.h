@@ -198,6 +198,11 @@ struct SolverView {
   // [N] contact radius of each point by its row when it was loaded (core/collider/spring.h) [m], or
   // null: colliders hold nodes; CPU only
   const T* radius;
+  // [N, 9] viscosity of each point (core/material/viscous.h), or null; CPU only
+  T* viscous;
+  // [fields] object of each field: points of different ones push each other
+  // (core/collider/touch.h); or null: fields meet at nodes; CPU only
+  const int32_t* object;
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {
@@ -206,6 +211,13 @@ struct SolverView {
   GSF_HOST_DEVICE int32_t cut_of(int32_t field) const { return cut != nullptr ? cut[field] : 0; }
   GSF_HOST_DEVICE bool moves_with(int32_t a, int32_t b) const {
     return parent != nullptr && parent[a] == parent[b] && !cut_apart(cut[a], cut[b]);
+  }
+  GSF_HOST_DEVICE bool touches_by_points(int32_t a, int32_t b) const {
+#ifdef __CUDA_ARCH__
+    return false;
+#else
+    return object != nullptr && object[a] != object[b];
+#endif
   }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }

@@ -1,7 +1,7 @@
 // Particles of the resident solver on the CPU, home by home: to the nodes of its window and back.
 #pragma once
 
-#include "cpu/solver/contact.h"
+#include "cpu/contact/points.h"
 #include "cpu/solver/surface.h"
 #include "cpu/solver/update.h"
 
@@ -35,8 +35,9 @@ struct Box {
 template <typename T>
 class HomePass {
  public:
-  HomePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface)
-      : s_(s), contact_(contact), surface_(surface) {}
+  HomePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface,
+           TouchPlan<T>& touch)
+      : s_(s), contact_(contact), surface_(surface), touch_(touch) {}
 
   void plan() {
     const HomeList<T>& list = s_.homes();
@@ -52,6 +53,7 @@ class HomePass {
   // that have no slot count as lost.
   Counts to_nodes(std::vector<uint8_t>& touched) {
     Counts all;
+    touch_.run();
     for (const std::vector<int32_t>& homes : colors_)
       all.add(parallel_counts(static_cast<int64_t>(homes.size()), kHomeGrain,
                               [&](int64_t begin, int64_t end, Counts& counts) {
@@ -65,6 +67,7 @@ class HomePass {
   Counts from_nodes(int laws) const {
     if (laws == kElasticOnly) return from_nodes<kElasticOnly>();
     if (laws == kMoreLaws) return from_nodes_more();
+    if (laws == kViscousBrittle) return from_nodes_viscous();
     return laws == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>();
   }
 
@@ -142,12 +145,14 @@ class HomePass {
     std::vector<T> pushes;
     const bool pushed =
         surface_.near(h) && surface_.pushes(h, s_.entry + r.begin, r.end - r.begin, pushes);
+    const bool met = touch_.pushes(h);
     Lanes<double> tile[kWindowNodes];
-    Lanes<T> moment[kWindowNodes], push[kWindowNodes];
+    Lanes<T> moment[kWindowNodes], push[kWindowNodes], press[kWindowNodes];
     for_each_run(h, [&](int t, int64_t, int run) {
       std::fill(tile + t, tile + t + run, Lanes<double>{});
       if (contact != 0) std::fill(moment + t, moment + t + run, Lanes<T>{});
       if (pushed) std::fill(push + t, push + t + run, Lanes<T>{});
+      if (met) std::fill(press + t, press + t + run, Lanes<T>{});
     });
     for (int64_t at = r.begin; at < r.end; at += Pack<T>::kLanes) {
       const Packet<T> packet(s_, s_.entry + at, r.end - at);
@@ -155,6 +160,11 @@ class HomePass {
       const int used = static_cast<int>(std::min<int64_t>(r.end - at, Pack<T>::kLanes));
       const T* impulse = pushed ? pushes.data() + 4 * (at - r.begin) : nullptr;
       for (int lane = 0; pushed && lane < used; ++lane) given.push(lane, impulse + 4 * lane);
+      T pressed[4 * Pack<T>::kLanes];
+      for (int lane = 0; met && lane < used; ++lane) {
+        std::copy_n(touch_.given(packet.index[lane]), 4, pressed + 4 * lane);
+        given.push(lane, pressed + 4 * lane);
+      }
       for (int lane = 0; lane < used;) {
         const int end = std::min(packet.run(lane), used);
         const int base = window_node(packet.meta[lane]);
@@ -164,13 +174,17 @@ class HomePass {
         if (pushed &&
             std::any_of(impulse + 4 * lane, impulse + 4 * end, [](T v) { return v != T(0); }))
           given.scatter_four(lane, end, impulse, push + base);
+        if (met &&
+            std::any_of(pressed + 4 * lane, pressed + 4 * end, [](T v) { return v != T(0); }))
+          given.scatter_four(lane, end, pressed, press + base);
         lane = end;
       }
     }
     double* sums = static_cast<double*>(s_.sums);
     T* moments = static_cast<T*>(s_.moments);
-    const uint8_t mark = static_cast<uint8_t>(kTouchedSums | (contact != 0 ? kTouchedMoments : 0) |
-                                              (pushed ? kTouchedPush : 0));
+    const uint8_t mark =
+        static_cast<uint8_t>(kTouchedSums | (contact != 0 ? kTouchedMoments : 0) |
+                             (pushed ? kTouchedPush : 0) | (met ? kTouchedPoints : 0));
     return for_each_run(h, [&](int t, int64_t node, int run) {
       std::atomic_ref<uint8_t>(touched[node / kBlockNodes])
           .fetch_or(mark, std::memory_order_relaxed);
@@ -178,6 +192,8 @@ class HomePass {
         for (int c = 0; c < 4; ++c) sums[4 * (node + n) + c] += tile[t + n][c];
       for (int n = 0; pushed && n < run; ++n)
         for (int c = 0; c < 4; ++c) surface_.sums()[4 * (node + n) + c] += push[t + n][c];
+      for (int n = 0; met && n < run; ++n)
+        for (int c = 0; c < 4; ++c) touch_.sums()[4 * (node + n) + c] += press[t + n][c];
       if (contact == 0) return;
       for (int n = 0; n < run; ++n)
         for (int c = 0; c < kContactMoments; ++c)
@@ -258,10 +274,12 @@ class HomePass {
 
   // In solver_more.cpp, so that the loops here stay as they are compiled.
   Counts from_nodes_more() const;
+  Counts from_nodes_viscous() const;  // in solver_viscous.cpp
 
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
   SurfacePlan<T>& surface_;
+  TouchPlan<T>& touch_;
   std::vector<int32_t> colors_[kColors];  // homes, those of one colour at once
   std::vector<Box> box_;                  // [homes]
 };

@@ -2,7 +2,7 @@
 #pragma once
 
 #include "core/solver/node.h"
-#include "cpu/solver/contact.h"
+#include "cpu/contact/points.h"
 #include "cpu/solver/surface.h"
 
 namespace gsf::cpu {
@@ -14,8 +14,9 @@ constexpr int64_t kNearColliders = 64;  // with more, every site looks at all of
 template <typename T>
 class NodePass {
  public:
-  NodePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface)
-      : s_(s), contact_(contact), surface_(surface) {}
+  NodePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface,
+           TouchPlan<T>& touch)
+      : s_(s), contact_(contact), surface_(surface), touch_(touch) {}
 
   void plan() {
     const int64_t chunks = (s_.clock->sites + kSiteChunk - 1) / kSiteChunk;
@@ -37,11 +38,10 @@ class NodePass {
         for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
           const Site here = site(index, touched);
           if (here.fields == 0) continue;
-          bool pushed = false;
-          for (int i = 0; i < here.fields; ++i)
-            pushed = pushed || (touched[here.slots[i]] & kTouchedPush) != 0;
+          int marks = 0;
+          for (int i = 0; i < here.fields; ++i) marks |= touched[here.slots[i]];
           for (int local = 0; local < kBlockNodes; ++local)
-            contacts_[chunk] += node(here, local, pushed, dt, impulse);
+            contacts_[chunk] += node(here, local, marks, dt, impulse);
         }
       }
     });
@@ -54,6 +54,8 @@ class NodePass {
           std::fill_n(static_cast<T*>(s_.moments) + kMoments * b, kMoments, T(0));
         if (touched[b] & kTouchedPush)
           std::fill_n(surface_.sums() + 4 * kBlockNodes * b, 4 * kBlockNodes, T(0));
+        if (touched[b] & kTouchedPoints)
+          std::fill_n(touch_.sums() + 4 * kBlockNodes * b, 4 * kBlockNodes, T(0));
         touched[b] = 0;
       }
     });
@@ -110,7 +112,7 @@ class NodePass {
   }
 
   // One node of a site: velocities, contact, colliders. Returns whether fields touched.
-  int64_t node(const Site& site, int local, bool pushed, T dt, double* impulse) {
+  int64_t node(const Site& site, int local, int marks, T dt, double* impulse) {
     const double* sums = static_cast<const double*>(s_.sums);
     const int fields = site.fields;
     double mass[kSiteFields];
@@ -133,6 +135,8 @@ class NodePass {
       const auto weight = [&](int field) { return mass[field]; };
       contacts = node_contact(s_, fields, heavy, number, weight, near, velocity) > 0 ? 1 : 0;
     }
+    if (present > 1 && (marks & kTouchedPoints) != 0)
+      hold(site, local, heavy, number, mass, velocity);
     if (site.colliders > 0 && present > 0) {
       const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
       for (int64_t i = 0; i < site.colliders; ++i) {
@@ -143,7 +147,7 @@ class NodePass {
                          impulse + kImpulseSums * k);
       }
     }
-    if (pushed) rub(site, local, heavy, number, mass, velocity, impulse);
+    if ((marks & kTouchedPush) != 0) rub(site, local, heavy, number, mass, velocity, impulse);
     for (int a = 0; a < fields; ++a) {
       T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
       for (int i = 0; i < 3; ++i) out[i] = velocity[a][i];
@@ -158,6 +162,51 @@ class NodePass {
     if (!surface_.any() || !collider_springs(row)) return true;
     Vec3<T> normal;
     return collider_signed_distance(row, s_.sdf, x, normal) <= T(-kSpringNode) * s_.dx;
+  }
+
+  // Friction between the objects whose points about a node push each other. Fields that move as one
+  // rub as one.
+  template <typename Number>
+  void hold(const Site& site, int local, const bool* heavy, const Number& number,
+            const double* mass, Vec3<T>* velocity) const {
+    struct Group {
+      uint32_t fields = 0;
+      int first = 0;
+      double mass = 0.0, push[4] = {};
+    } groups[kSiteFields];
+    int count = 0;
+    uint32_t done = 0;
+    for (int a = 0; a < site.fields; ++a) {
+      if (!heavy[a] || (done >> a & 1u) != 0) continue;
+      Group& group = groups[count++];
+      group.first = a;
+      group.fields = node_group(s_, site.fields, heavy, number, a);
+      done |= group.fields;
+      for (int f = 0; f < site.fields; ++f) {
+        if ((group.fields >> f & 1u) == 0) continue;
+        const T* given = touch_.sums() + 4 * (int64_t(site.slots[f]) * kBlockNodes + local);
+        for (int c = 0; c < 4; ++c) group.push[c] += double(given[c]);
+        group.mass += mass[f];
+      }
+    }
+    for (int i = 0; i < count; ++i)
+      for (int j = i + 1; j < count; ++j) {
+        const Group &a = groups[i], &b = groups[j];
+        if (!s_.touches_by_points(number(a.first), number(b.first))) continue;
+        Vec3<double> push, relative;
+        for (int c = 0; c < 3; ++c) {
+          push[c] = a.push[c] - b.push[c];
+          relative[c] = double(velocity[a.first][c]) - double(velocity[b.first][c]);
+        }
+        const Vec3<double> along =
+            touch_friction(push, relative, s_.contact.friction * 0.5 * (a.push[3] + b.push[3]),
+                           a.mass / (a.mass + b.mass) * b.mass);
+        for (int f = 0; f < site.fields; ++f)
+          for (int c = 0; c < 3; ++c) {
+            if (a.fields >> f & 1u) velocity[f][c] -= T(along[c] / a.mass);
+            if (b.fields >> f & 1u) velocity[f][c] += T(along[c] / b.mass);
+          }
+      }
   }
 
   // Friction of the points about a node that colliders pushed, and what those gave: on the account
@@ -206,6 +255,7 @@ class NodePass {
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
   SurfacePlan<T>& surface_;
+  TouchPlan<T>& touch_;
   std::vector<double> impulse_;    // [chunks, colliders, kImpulseSums]
   std::vector<int64_t> contacts_;  // [chunks] nodes at which fields touched
 };

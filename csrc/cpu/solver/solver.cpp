@@ -25,8 +25,9 @@ class Stepper {
         laws_(laws),
         contact_(s),
         surface_(s),
-        homes_(s, contact_, surface_),
-        nodes_(s, contact_, surface_) {
+        touch_(s, contact_),
+        homes_(s, contact_, surface_, touch_),
+        nodes_(s, contact_, surface_, touch_) {
     if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
   }
 
@@ -39,6 +40,7 @@ class Stepper {
     touched_.assign(c.slots, 0);
     contact_.make();
     surface_.make();
+    touch_.make();
     homes_.plan();
     nodes_.plan();
     if (fields_) fields_->plan();
@@ -64,6 +66,7 @@ class Stepper {
   const int laws_;
   ContactPlan<T> contact_;
   SurfacePlan<T> surface_;
+  TouchPlan<T> touch_;
   HomePass<T> homes_;
   NodePass<T> nodes_;
   std::unique_ptr<FieldPass<T>> fields_;
@@ -81,6 +84,8 @@ void prime_particles(const SolverView<T>& s, int laws, bool measure) {
                             [&](int64_t begin, int64_t end, Counts& counts) {
                               if (laws == kMoreLaws)
                                 return prime_more(s, begin, end, measure, dt, counts.largest);
+                              if (laws == kViscousBrittle)
+                                return prime_viscous(s, begin, end, measure, dt, counts.largest);
                               for (int64_t p = begin; p < end; ++p)
                                 prime_particle(s, p, measure, dt, counts.largest);
                             });

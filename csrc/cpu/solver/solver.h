@@ -1,7 +1,8 @@
 // The CPU half of the resident solver: blocks (build.cpp), particles of a home to its window
 // and back (homes.h, packet.h, update.h), nodes (nodes.h, contact.h), points that colliders push
-// (surface.h), the loop over steps (solver.cpp). Every sum is taken in an order that depends on
-// neither the number of threads nor the order in which the particles were loaded.
+// (surface.h) and that push each other (cpu/contact/points.h), the loop over steps (solver.cpp).
+// Every sum is taken in an order that depends on neither the number of threads nor the order in
+// which the particles were loaded.
 #pragma once
 
 #include <algorithm>
@@ -23,6 +24,10 @@ void solver_build(const SolverView<T>& s);
 template <typename T>
 void prime_more(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
                 Largest& largest);
+// The same of a scene with viscous matter.
+template <typename T>
+void prime_viscous(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
+                   Largest& largest);
 template <typename T>
 class HomePass;
 template <typename T>
@@ -46,7 +51,12 @@ class FieldPass {
 };
 
 // What a slot holds in this step.
-enum Touched : uint8_t { kTouchedSums = 1, kTouchedMoments = 2, kTouchedPush = 4 };
+enum Touched : uint8_t {
+  kTouchedSums = 1,
+  kTouchedMoments = 2,
+  kTouchedPush = 4,
+  kTouchedPoints = 8
+};
 
 // Counts and largest values of some particles. They do not depend on the order in which they meet.
 struct Counts {

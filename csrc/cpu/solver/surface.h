@@ -7,6 +7,24 @@
 
 namespace gsf::cpu {
 
+// P-wave speed of a row at rest [m/s].
+template <typename T>
+double row_wave(const SolverView<T>& s, int64_t row) {
+  const T* r = s.rows + row * kRowColumns;
+  return double(r[kPaceColumn]) * double(r[kInverseDensityColumn]) /
+         (kSlowUnloading * double(s.dx));
+}
+
+// Step [s] that springs of points must bear: the longest at rest. Not the present one: a spring
+// that is stiffer in a short step gives back more than it took.
+template <typename T>
+double spring_step(const SolverView<T>& s) {
+  const SolverClock& c = *s.clock;
+  double wave = 0.0;
+  for (int64_t row = 0; row < s.row_count; ++row) wave = std::max(wave, row_wave(s, row));
+  return c.dt_fixed > 0.0 ? c.dt_fixed : c.cfl * double(s.dx) / std::max(wave, 1e-30);
+}
+
 template <typename T>
 class SurfacePlan {
  public:
@@ -21,6 +39,7 @@ class SurfacePlan {
       if (collider_valid(row, s_.sdf_count) && collider_springs(row))
         springs_.push_back(static_cast<int32_t>(k));
     }
+    step_ = spring_step(s_);
     near_.assign(springs_.empty() ? 0 : c.homes, 0);
     push_.assign(springs_.empty() ? 0 : c.slots * kBlockNodes * 4, T(0));
     for (int64_t h = 0; h < static_cast<int64_t>(near_.size()); ++h)
@@ -59,12 +78,17 @@ class SurfacePlan {
       for (const int32_t k : springs_) {
         const double* row = s_.collider_state + int64_t(k) * kColliderColumns;
         Vec3<double> normal;
-        const double depth = radius - collider_signed_distance(row, s_.sdf, x, normal);
+        double depth = radius - collider_signed_distance(row, s_.sdf, x, normal);
         if (!(depth > 0.0)) continue;
         const T* r = s_.rows + int64_t(s_.row_of(meta)) * kRowColumns;
         const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
-        const double wave = double(r[kPaceColumn]) * thin / (kSlowUnloading * dx);
-        const double gained = spring_speed(depth, wave, std::cbrt(mass * thin), dx, dt);
+        const double wave = row_wave(s_, s_.row_of(meta));
+        const Vec3<double> own = collider_velocity(row, x);
+        double away = 0.0;
+        for (int axis = 0; axis < 3; ++axis)
+          away += normal[axis] * (double(s_.velocity[3 * p + axis]) - own[axis]);
+        depth = std::max(0.0, depth - spring_lag(wave, dx) * away);
+        const double gained = spring_speed(depth, wave, std::cbrt(mass * thin), dx, dt, step_);
         for (int axis = 0; axis < 3; ++axis) out[4 * i + axis] += T(mass * gained * normal[axis]);
         out[4 * i + 3] += T(row[kFriction] * mass * gained);
         any = true;
@@ -112,6 +136,7 @@ class SurfacePlan {
   }
 
   const SolverView<T>& s_;
+  double step_ = 0.0;             // [s] for which springs are stable
   std::vector<int32_t> springs_;  // colliders
   std::vector<uint8_t> near_;     // [homes]
   std::vector<T> push_;           // [slots, 64, 4]

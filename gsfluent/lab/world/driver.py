@@ -80,6 +80,9 @@ class World:
         frame: Velocity of the solver's grid [m/s]; None: the solver's choice. ``"ops"`` has none.
         surface: Contact radius of the points in cube roots of their volume: colliders push points
             that are nearer (docs/theory/colliders.md). None: they hold nodes.
+        viscous: Viscosity of each point, [N, 9], or [9] for all: :func:`gsfluent.ops.viscous_step`.
+        touch: With ``surface``, points of different bodies push each other
+            (docs/theory/contact.md); else bodies touch at nodes. The solver only.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
     Raises:
@@ -128,6 +131,8 @@ class World:
         irreversible: bool = True,
         frame: Sequence[float] | None = None,
         surface: float | None = None,
+        viscous: Tensor | None = None,
+        touch: bool = False,
         **return_map: Any,
     ):
         if dt is not None and not 0.0 < dt < math.inf:
@@ -157,6 +162,8 @@ class World:
             density = params.reshape(-1, 8)[which, 6].double().cpu()
             mass = density * torch.as_tensor(volume, dtype=torch.float64).cpu()
         walls = None if colliders is None else torch.stack([*colliders]).to(device, dtype)
+        if touch and (surface is None or engine == "ops"):
+            raise ValueError("World: touch needs surface, and the solver")
         self.scene = Scene(
             mass=number(mass, count),
             volume=number(volume, count),
@@ -177,6 +184,8 @@ class World:
             irreversible=irreversible,
             return_map=return_map,
             frame=None if frame is None else (frame[0], frame[1], frame[2]),
+            viscous=None if viscous is None else number(viscous, count, 9),
+            objects=None if body is None or not touch else each_its_own(body),
             radius=None if surface is None else surface * number(volume, count) ** (1.0 / 3.0),
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()
@@ -333,6 +342,11 @@ class World:
         )
         each = scene.mass.double()[:, None] * (orbit + 0.25 * scene.dx**2 * curl)
         return _of(each, of).sum(0)
+
+
+def each_its_own(body: Tensor) -> Tensor:
+    """Objects [K] of fields that are bodies of their own."""
+    return torch.arange(int(body.max()) + 1, dtype=torch.int32, device=body.device)
 
 
 def _of(values: Tensor, mask: Tensor | None) -> Tensor:

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from gsfluent.ops.reference.collider import signed_distance
 
-STEP = 0.25  # largest (frequency times dt)^2
+STEP = 0.25  # largest (frequency times longest step)^2
 DEPTH = 0.5  # cells from which on the force does not grow
+DAMPING = 0.1  # of a spring, in dx / wave speed
 NODE = 1.25  # cells inside from which on nodes are held
 
 
@@ -31,6 +32,8 @@ def point_push(
     length: Tensor,
     dx: float,
     dt: float,
+    velocity: Tensor,
+    longest: float,
 ) -> Tensor:
     """Impulse that a collider gives to points in a step [N s], [N, 3].
 
@@ -44,10 +47,14 @@ def point_push(
         length: Cube root of the volume [m], [N].
         dx: Node spacing [m].
         dt: Time step [s].
+        velocity: Of the points less that of the collider there [m/s], [N, 3].
+        longest: Longest time step [s].
     """
     distance, normal = signed_distance(row, sdf, position)
-    depth = (radius - distance).clamp(0.0, DEPTH * dx)
-    rate = (wave**2 / (dx * length)).clamp(max=STEP / dt**2)
+    deep = radius - distance
+    ahead = deep - DAMPING * dx / wave * (velocity * normal).sum(-1)
+    depth = torch.where(deep > 0, ahead, 0.0).clamp(0.0, DEPTH * dx)
+    rate = (wave**2 / (dx * length)).clamp(max=STEP / longest**2)
     return (mass * dt * rate * depth)[:, None] * normal
 
 

@@ -29,7 +29,7 @@ from gsfluent.pipeline.cracks.chunk_faces import (
     find_faces,
     wide_cuts,
 )
-from gsfluent.pipeline.cracks.cuts import cut_at
+from gsfluent.pipeline.cracks.cuts import cut_at, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
 from gsfluent.pipeline.cracks.followers import WIDE, Followers, neighbours, turns
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
@@ -598,14 +598,3 @@ class Chunks:
             normals=(turn * faces.normals[rows, None]).sum(dim=2),
         )
         return Births(gaussians, _NUMBERS + faces.key[rows], faces.owner[rows])
-
-
-def in_turns(rows: Tensor) -> list[Tensor]:
-    """Places in a list of rows, int64 [M]: where each row comes first, where it comes next, ..."""
-    ordered, order = rows.sort(stable=True)
-    steps = torch.arange(len(rows), device=rows.device)
-    new = torch.ones_like(rows, dtype=torch.bool)
-    new[1:] = ordered[1:] != ordered[:-1]
-    turn = torch.empty_like(rows)
-    turn[order] = steps - torch.where(new, steps, 0).cummax(dim=0).values
-    return [(turn == n).nonzero()[:, 0] for n in range(int(turn.max()) + 1 if len(rows) else 0)]

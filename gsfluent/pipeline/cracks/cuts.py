@@ -104,3 +104,14 @@ def cut_splats(
         mean, covariance = cut_at(mean, covariance, n, torch.where(here, distance, torch.inf))
     new_quats, new_scales = ops.covariance_axes(geometry.pack_symmetric(covariance))
     return rows, mean, new_quats, new_scales
+
+
+def in_turns(rows: Tensor) -> list[Tensor]:
+    """Places in a list of rows, int64 [M]: where each row comes first, where it comes next, ..."""
+    ordered, order = rows.sort(stable=True)
+    steps = torch.arange(len(rows), device=rows.device)
+    new = torch.ones_like(rows, dtype=torch.bool)
+    new[1:] = ordered[1:] != ordered[:-1]
+    turn = torch.empty_like(rows)
+    turn[order] = steps - torch.where(new, steps, 0).cummax(dim=0).values
+    return [(turn == n).nonzero()[:, 0] for n in range(int(turn.max()) + 1 if len(rows) else 0)]

@@ -99,9 +99,10 @@ class SolverOptions:
             device: the composed operators on a GPU, whose sums have no order.
         standing: Let what stands still on the floor at time 0 sleep, without a strain, until
             something comes near; else its weight begins to act then.
-        surface: Let plain separating colliders push the points, so that bodies lie on floors and
-            not up to 1.5 cells above them (docs/theory/colliders.md, "At a point"). The resident
-            solver on a CPU only; the composed operators hold nodes.
+        surface: Let plain separating colliders and other bodies push the points, so that bodies lie
+            on floors and on each other and not up to 1.5 cells above them (docs/theory/colliders.md
+            and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver on
+            a CPU only; the composed operators hold nodes.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
         max_rollbacks: Roll-backs in a row before the run is given up.
@@ -145,6 +146,7 @@ class Points(NamedTuple):
     alpha: Tensor
     peak: Tensor
     deformation: Tensor | None
+    viscous: Tensor | None = None
 
 
 class Engine(Protocol):

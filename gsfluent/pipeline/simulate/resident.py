@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from gsfluent.errors import InputError
 from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
+from gsfluent.ops.reference import touch
 from gsfluent.ops.solver_buffers import MAX_FIELDS
 from gsfluent.pipeline.colliders.blades import BladeSet
 from gsfluent.pipeline.colliders.rigid import RigidSet
@@ -69,6 +71,10 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
     known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
     if matter.has_field and (matter.law.is_cuda or not bool(torch.isin(matter.law, known).all())):
         return False  # not there yet
+    if matter.viscous:
+        known = matter.law.new_tensor([LAWS["elastic"], LAWS["nacc"]])
+        if matter.law.is_cuda or not bool(torch.isin(matter.law, known).all()):
+            return False  # not there yet
     if not rigid.frees:
         return True
     mass = rows[:, columns.MASS]
@@ -77,7 +83,9 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
 
 
 def contact_radius(matter: Matter, rigid: RigidSet) -> Tensor:
-    """Nearest that points come to colliders before these push them [m], float64 [N].
+    """Nearest that points come to colliders and other bodies before these push them [m], [N].
+
+    Float64.
 
     The outermost points of a jittered lattice lie a quarter of its spacing inside of the face. Of a
     point that starts nearer the radius is that distance: nothing is thrown out of what it overlaps.
@@ -92,10 +100,46 @@ def contact_radius(matter: Matter, rigid: RigidSet) -> Tensor:
             hint="leave it out, or simulate on the CPU",
         )
     usual = (ROUGH * particles.volume.double() ** (1.0 / 3.0)).clamp(max=0.5 * matter.dx)
+    usual = torch.minimum(usual, apart(matter))
     if not rigid.start.shape[0]:
         return usual
     distance, _ = ops.collider_distance(particles.position.double(), rigid.start, rigid.sdf)
     return torch.minimum(usual, distance.amin(dim=1))
+
+
+def apart(matter: Matter) -> Tensor:
+    """Distance at which each point starts from the faces of other bodies [m], float64 [N].
+
+    As the solver finds faces (docs/theory/contact.md, "At a point"), up to a cell.
+    """
+    from scipy.spatial import cKDTree
+
+    place = matter.rest.double().numpy() / matter.dx
+    volume = matter.particles.volume.double().numpy() / matter.dx**3
+    found = np.zeros(len(place))
+
+    def near(own: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
+        there = place[slice(*other)]
+        low, high = there.min(0) - 1.0, there.max(0) + 1.0
+        here = place[slice(*own)]
+        return np.flatnonzero(((here >= low) & (here <= high)).all(1)) + own[0]
+
+    for a, second in enumerate(matter.ranges):
+        for first in matter.ranges[:a]:
+            one, two = near(first, second), near(second, first)
+            if not len(one) or not len(two):
+                continue
+            pairs = cKDTree(place[one]).sparse_distance_matrix(
+                cKDTree(place[two]), 1.0, output_type="ndarray"
+            )
+            weight = touch.kernel(torch.from_numpy(pairs["v"])).numpy()
+            one, two = one[pairs["i"]], two[pairs["j"]]
+            np.add.at(found, one, weight * volume[two])
+            np.add.at(found, two, weight * volume[one])
+    distance = np.linspace(0.9, -1.9, 28001)  # the share grows along these
+    share = touch.share(torch.from_numpy(distance)).numpy()
+    # a little less: rounding pushes nobody
+    return torch.from_numpy(matter.dx * (np.interp(found, share, distance) - 1e-5))
 
 
 class Resident:
@@ -129,8 +173,8 @@ class Resident:
         )
         field = torch.unique(field, return_inverse=True)[1]
         law, params = matter.law, matter.params
-        if (
-            not options.law_kernels and not matter.has_field
+        if not (
+            options.law_kernels or matter.has_field or matter.viscous
         ):  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
             spare = params[:1].clone()
@@ -148,6 +192,10 @@ class Resident:
         )  # fmt: skip
         if options.surface:
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
+            which = torch.arange(len(matter.ranges)).repeat_interleave(
+                torch.tensor([end - start for start, end in matter.ranges])
+            )
+            self._object = at_rows(which, rows)
         self._constants: dict[str, Any] = constants
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = dt_scale
@@ -161,7 +209,9 @@ class Resident:
         self._faces = self.colliders[:0]
         """Rows of the faces of blades at work, after those of the colliders."""
         self._look(position.to(p.dtype))
-        self._begin(Points(position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation))
+        self._begin(Points(
+            position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation, p.viscous
+        ))  # fmt: skip
 
     def _begin(self, points: Points) -> None:
         """Load points into a solver, with the fields and the faces of now."""
@@ -172,10 +222,14 @@ class Resident:
             if bool((fields.cut != 0).any()):
                 body, parent, cut = fields.field, fields.parent, fields.cut
         rows = torch.cat([self.colliders, self._faces])
+        objects = None
+        if "radius" in self._constants:
+            none = self._object.new_full((int(body.max()) + 1,), len(self._matter.ranges))
+            objects = none.scatter_reduce(0, body.long(), self._object, "amin").to(torch.int32)
         self._solver = _guarded(
             points.velocity,
             lambda: ops.Solver(
-                **points._asdict(), body=body, parent=parent, cut=cut,
+                **points._asdict(), body=body, parent=parent, cut=cut, objects=objects,
                 colliders=rows if rows.shape[0] else None, **self._constants,
             ),
         )  # fmt: skip
@@ -323,7 +377,14 @@ class Resident:
         """See :class:`Engine`."""
         s = self._solver
         return Points(
-            self._position(), s.velocity, s.affine, s.strain, s.alpha, s.peak, s.deformation
+            self._position(),
+            s.velocity,
+            s.affine,
+            s.strain,
+            s.alpha,
+            s.peak,
+            s.deformation,
+            s.viscous,
         )
 
 

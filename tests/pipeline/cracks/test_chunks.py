@@ -11,7 +11,8 @@ from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
 from gsfluent.pipeline.cracks.chunk_faces import ChunkCuts, ChunkFaces, wide_cuts
-from gsfluent.pipeline.cracks.chunks import OPACITY, in_turns
+from gsfluent.pipeline.cracks.chunks import OPACITY
+from gsfluent.pipeline.cracks.cuts import in_turns
 from gsfluent.pipeline.cracks.stage import Repair, Repaired
 from gsfluent.pipeline.matter.carry import Carry, Points
 from gsfluent.pipeline.matter.points import build_matter

@@ -169,3 +169,42 @@ def test_what_overlaps_at_the_start_is_not_thrown_out() -> None:
 def test_surface_refuses_long_steps() -> None:
     with pytest.raises(InputError, match="cfl must be at most"):
         SolverOptions(surface=True, cfl=0.8)
+
+
+def _stacked(gap: float, surface: bool, gravity: float = -9.81) -> Run:
+    """A cube `gap` metres above another that stands on a floor."""
+    ball = ellipsoid((0.2, 0.2, 0.2))
+    cube = dataclasses.replace(ball, occupancy=torch.ones_like(ball.occupancy))
+    scene = Scene(gravity=(0.0, 0.0, gravity))
+    edge = cube.occupancy.shape[2] * float(cube.voxel)
+    stiff = materials.elastic.override(young_modulus=4e5)
+    for height in (0.5 * edge, 1.5 * edge + gap):
+        scene.add(cube, stiff, frame=Frame(torch.eye(3), torch.tensor([0.0, 0.0, height]), 1.0))
+    return Run(scene, build_matter(scene, DX), 100.0, SolverOptions(surface=surface, sleep=False))
+
+
+def _fallen(surface: bool) -> float:
+    """Smallest gap that a cube leaves above another within half a second [dx]."""
+    run = _stacked(0.005, surface)
+    count = run.matter.ranges[0][1]
+    rest = run.matter.rest
+    top = torch.argsort(-rest[:count, 2])[: count // 8]
+    low = count + torch.argsort(rest[count:, 2])[: (len(rest) - count) // 8]
+    start = float(rest[low, 2].mean() - rest[top, 2].mean()) - 0.005
+    gaps = []
+    for frame in range(1, 21):
+        assert run.advance_to(frame, None), run.failure
+        place = run.state.position
+        gaps.append(float(place[low, 2].mean() - place[top, 2].mean()) - start)
+    return min(gaps) / DX
+
+
+def test_bodies_lie_on_each_other_where_their_points_end() -> None:
+    assert abs(_fallen(surface=True)) < 0.1
+
+
+def test_bodies_that_overlap_at_the_start_are_not_thrown_apart() -> None:
+    run = _stacked(-0.3 * DX, True, gravity=0.0)
+    for frame in (1, 2):
+        assert run.advance_to(frame, None), run.failure
+    assert float(run.state.particles.velocity.abs().max()) < 1e-5  # of rounding

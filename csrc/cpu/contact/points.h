@@ -1,0 +1,243 @@
+// Points of the resident solver that points of other bodies push: core/collider/touch.h.
+#pragma once
+
+#include "core/collider/touch.h"
+#include "core/solver/node.h"
+#include "cpu/solver/contact.h"
+#include "cpu/solver/surface.h"
+
+namespace gsf::cpu {
+
+template <typename T>
+class TouchPlan {
+ public:
+  TouchPlan(const SolverView<T>& s, const ContactPlan<T>& contact) : s_(s), contact_(contact) {}
+
+  // Tables of the blocks; again after each build.
+  void make() {
+    const SolverClock& c = *s_.clock;
+    on_ = s_.object != nullptr && s_.radius != nullptr && contact_.any();
+    if (!on_) return;
+    step_ = spring_step(s_);
+    first_.assign(c.slots * kBlockNodes, -1);
+    push_.assign(c.slots * kBlockNodes * 4, T(0));
+    given_.assign(4 * s_.count, T(0));
+    homes_.assign(c.homes, 0);
+    site_.assign(c.slots, -1);
+    key_.resize(c.sites);
+    around_.assign(c.sites * kNeighbours, -2);
+    for (int64_t i = 0; i < c.sites; ++i) {
+      const int32_t* slots = s_.site_slots + kSiteFields * i;
+      const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
+      key_[i] = block_key(b[0], b[1], b[2], 0);
+      for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
+        site_[slots[f]] = static_cast<int32_t>(i);
+    }
+  }
+
+  bool any() const { return on_; }
+  // Whether a point of home h is pushed in this step.
+  bool pushes(int64_t h) const { return on_ && homes_[h] != 0; }
+  // What point p gets, [4]: impulse and its length [N s].
+  const T* given(int64_t p) const { return given_.data() + 4 * p; }
+  // Sums of these over the points about each node: [slots, 64, 4].
+  T* sums() { return push_.data(); }
+  const T* sums() const { return push_.data(); }
+
+  // What every point gets in the coming step.
+  void run() {
+    if (!on_) return;
+    collect();
+    const auto each = [&](const auto& f) {
+      parallel_for(static_cast<int64_t>(cells_.size()), kCellGrain,
+                   [&](int64_t begin, int64_t end) {
+                     std::vector<int32_t> others;
+                     for (int64_t i = begin; i < end; ++i) f(cells_[i], others);
+                   });
+    };
+    each([&](Cell& cell, std::vector<int32_t>& others) { find(cell, others); });
+    each([&](const Cell& cell, std::vector<int32_t>& others) { push(cell, others); });
+    for (const Item& item : items_)
+      if (item.pushed) homes_[item.home] = 1;
+  }
+
+ private:
+  static constexpr int64_t kCellGrain = 32;
+
+  // A point that could touch another body.
+  struct Item {
+    int32_t point, home, next;  // next: of its cell
+    bool pushed;
+    double x[3], v[3];  // place in cells and velocity in cells per second
+    double volume;      // in cells
+    double stiffness;   // K [Pa]
+    double share;       // of other bodies at which it touches
+    double lag;         // time of the damping [s]
+    double energy;      // V dE/df [Pa cells]
+  };
+  // Cell of a slot with such points.
+  struct Cell {
+    int32_t slot, local;
+    bool meets;
+  };
+
+  // The points near blocks that fields share, cell by cell. Every list is in the order in which
+  // points are stored, which is one of their places and state.
+  void collect() {
+    for (const Cell& cell : cells_) first_[int64_t(cell.slot) * kBlockNodes + cell.local] = -1;
+    for (const Item& item : items_) {
+      std::fill_n(given_.data() + 4 * int64_t(item.point), 4, T(0));
+      homes_[item.home] = 0;
+    }
+    cells_.clear();
+    items_.clear();
+    const double dx = double(s_.dx);
+    const HomeList<T>& list = s_.homes();
+    for (int64_t h = 0; h < s_.clock->homes; ++h) {
+      const uint32_t shared = contact_.around_home(h);
+      if (shared == 0) continue;
+      const int64_t begin = std::clamp<int64_t>(list.start[h], 0, s_.count);
+      const int64_t end = begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin);
+      const int32_t* b = list.coord + 4 * h;
+      for (int64_t p = begin; p < end; ++p) {
+        const uint32_t meta = s_.meta[p];
+        if (!ContactPlan<T>::reads(shared, meta)) continue;
+        int block = 0, local = 0;
+        Item item{};
+        item.point = static_cast<int32_t>(p);
+        item.home = static_cast<int32_t>(h);
+        for (int axis = 0; axis < 3; ++axis) {
+          const int cell = std::min(meta_cell(meta, axis), kLastCell) - 1;
+          block = 3 * block + (cell >> 2) + 1;
+          local = 4 * local + (cell & 3);
+          item.x[axis] = 4.0 * b[axis] + cell + 0.5 + double(s_.offset[3 * p + axis]);
+          item.v[axis] = double(s_.velocity[3 * p + axis]) / dx;
+        }
+        const int32_t slot = s_.neighbour[kNeighbours * h + block];
+        if (slot < 0 || slot >= s_.clock->slots) continue;
+        const T* r = s_.rows + int64_t(s_.row_of(meta)) * kRowColumns;
+        const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
+        const double radius = double(s_.radius[s_.id[p]]) / dx;
+        const double wave = row_wave(s_, s_.row_of(meta));
+        item.volume = mass * thin / (dx * dx * dx);
+        item.stiffness = touch_stiffness(1.0 / thin, wave, std::cbrt(mass * thin), dx, step_);
+        item.lag = spring_lag(wave, dx);
+        item.share = touch_share(radius);
+        int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
+        if (first < 0) {
+          cells_.push_back({slot, local, false});
+          place(site_[slot]);
+        }
+        item.next = first;
+        first = static_cast<int32_t>(items_.size());
+        items_.push_back(item);
+      }
+    }
+  }
+
+  // The sites around one, once.
+  void place(int32_t site) {
+    int32_t* around = around_.data() + kNeighbours * int64_t(site);
+    if (around[0] != -2) return;
+    const uint64_t key = key_[site];
+    for (int n = 0; n < kNeighbours; ++n) {
+      const uint64_t wanted =
+          block_key(key_block(key, 0) + n / 9 - 1, key_block(key, 1) + n / 3 % 3 - 1,
+                    key_block(key, 2) + n % 3 - 1, 0);
+      const auto at = std::lower_bound(key_.begin(), key_.end(), wanted);
+      around[n] = at != key_.end() && *at == wanted ? static_cast<int32_t>(at - key_.begin()) : -1;
+    }
+  }
+
+  // Points of other objects in the 27 cells about one.
+  void gather(const Cell& cell, std::vector<int32_t>& others) const {
+    others.clear();
+    const int32_t own = s_.object[s_.slot_coord[4 * int64_t(cell.slot) + 3]];
+    const int32_t* around = around_.data() + kNeighbours * int64_t(site_[cell.slot]);
+    for (int o = 0; o < kNeighbours; ++o) {
+      int there;
+      const int32_t site = around[near_block(cell.local, o, there)];
+      if (site < 0) continue;
+      const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
+      for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f) {
+        int32_t i = first_[int64_t(slots[f]) * kBlockNodes + there];
+        if (i < 0 || s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] == own) continue;
+        for (; i >= 0; i = items_[i].next) others.push_back(i);
+      }
+    }
+  }
+
+  template <typename F>
+  void each_near(const Item& p, const std::vector<int32_t>& others, const F& f) const {
+    for (const int32_t i : others) {
+      const Item& q = items_[i];
+      const double d[3] = {p.x[0] - q.x[0], p.x[1] - q.x[1], p.x[2] - q.x[2]};
+      const double r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+      if (r2 < kTouchReach * kTouchReach) f(q, d, r2);
+    }
+  }
+
+  // How much of other bodies the points of a cell find.
+  void find(Cell& cell, std::vector<int32_t>& others) {
+    gather(cell, others);
+    cell.meets = !others.empty();
+    for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
+         i = items_[i].next) {
+      Item& p = items_[i];
+      double share = 0.0, stiffness = 0.0, rate = 0.0;
+      if (cell.meets)
+        each_near(p, others, [&](const Item& q, const double* d, double r2) {
+          const double found = q.volume * touch_kernel(r2);
+          share += found;
+          stiffness += found * q.stiffness;
+          for (int axis = 0; axis < 3; ++axis)
+            rate += q.volume * touch_gradient(r2) * d[axis] * (p.v[axis] - q.v[axis]);
+        });
+      const double over = share - p.share;
+      p.pushed = false;
+      p.energy = over > 0.0 ? p.volume * std::max(0.0, over + p.lag * rate) *
+                                  std::min(p.stiffness, stiffness / share)
+                            : 0.0;
+    }
+  }
+
+  // What the points of a cell get.
+  void push(const Cell& cell, std::vector<int32_t>& others) {
+    if (!cell.meets) return;
+    gather(cell, others);
+    const double dx = double(s_.dx), scale = -s_.clock->dt * dx * dx;
+    for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
+         i = items_[i].next) {
+      Item& p = items_[i];
+      double sum[3] = {};
+      each_near(p, others, [&](const Item& q, const double* d, double r2) {
+        const double f = (p.energy * q.volume + q.energy * p.volume) * touch_gradient(r2);
+        for (int axis = 0; axis < 3; ++axis) sum[axis] += f * d[axis];
+      });
+      T* out = given_.data() + 4 * int64_t(p.point);
+      double length = 0.0;
+      for (int axis = 0; axis < 3; ++axis) {
+        out[axis] = T(scale * sum[axis]);
+        length += sum[axis] * sum[axis];
+      }
+      out[3] = T(std::abs(scale) * std::sqrt(length));
+      p.pushed = length > 0.0;
+    }
+  }
+
+  const SolverView<T>& s_;
+  const ContactPlan<T>& contact_;
+  bool on_ = false;
+  double step_ = 0.0;            // [s] for which springs are stable
+  std::vector<int32_t> first_;   // [slots, 64] first item of each cell, or -1
+  std::vector<int32_t> site_;    // [slots]
+  std::vector<uint64_t> key_;    // [sites] ascending
+  std::vector<int32_t> around_;  // [sites, 27] sites around one; -2: not looked for yet
+  std::vector<Item> items_;
+  std::vector<Cell> cells_;
+  std::vector<T> given_;        // [N, 4]
+  std::vector<uint8_t> homes_;  // [homes]
+  std::vector<T> push_;         // [slots, 64, 4]
+};
+
+}  // namespace gsf::cpu

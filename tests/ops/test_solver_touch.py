@@ -1,0 +1,145 @@
+"""Bodies whose points push each other: where they touch, what they keep, how they rub."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsfluent import ops
+from gsfluent.errors import InputError
+from gsfluent.lab.problems.contact import touching
+from gsfluent.lab.problems.contact.contact import SPACING, bodies
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.registry import Result
+from gsfluent.lab.world.shapes import box
+from gsfluent.ops.reference import touch
+
+
+def holds(result: Result) -> None:
+    assert result.passed, f"{result.name}, {result.quantity}: {result.value}"
+
+
+def test_cube_rests_where_the_points_end() -> None:
+    for result in touching.rest(4):
+        holds(result)
+
+
+@pytest.mark.parametrize(("cfl", "least"), [(0.25, 0.9), (0.5, 0.94)])
+def test_balls_bounce_and_make_neither_energy_nor_momentum(cfl: float, least: float) -> None:
+    kept, most, drift = touching.head_on(5.0, cfl=cfl)
+    assert least < kept < 1.0  # the transfer's loss is one of each step
+    assert most <= 1.0 + 1e-6
+    assert drift < 1e-6
+
+
+def test_nodes_that_exchange_impulses_keep_less() -> None:
+    assert touching.head_on(4.0)[0] > touching.head_on(4.0, touch=False)[0] + 0.1
+
+
+@pytest.mark.parametrize("friction", [0.25, 0.5])
+def test_sliding_is_coulombs(friction: float) -> None:
+    holds(touching.slide(friction))
+
+
+def _pressed(dtype: torch.dtype = torch.float64, turn: torch.Tensor | None = None) -> World:
+    """Two rough cubes that overlap by a fifth of a cell and move into each other."""
+    generator = torch.Generator().manual_seed(2)
+    parts = [box((0.1, 0.2, z), (2.0, 2.0, 2.0), SPACING) for z in (0.3, 2.1)]
+    parts = [p + 0.1 * torch.rand(p.shape, generator=generator, dtype=p.dtype) for p in parts]
+    if turn is not None:
+        parts = [p[turn] for p in parts]
+    speed = torch.tensor([0.01, 0.02, 0.04], dtype=torch.float64)
+    return bodies(parts, [speed, -speed], dtype=dtype, surface=0.5, touch=True, friction=0.3)
+
+
+def test_solver_agrees_with_the_reference() -> None:
+    world = bodies(*_two(), dtype=torch.float64, surface=0.5, touch=True, dt=0.3, friction=0.0)
+    scene = world.scene
+    assert scene.radius is not None and scene.body is not None
+    density = scene.params[0, 6].expand(len(scene.mass))
+    wave = ((scene.params[0, 1] + 4.0 / 3.0 * scene.params[0, 0]) / density).sqrt()
+    position, velocity = world.position, world.velocity
+    push = touch.touch_push(
+        position, velocity, scene.body, scene.radius, scene.volume, density, wave, 1.0, 0.3, 0.3
+    )
+    assert float(push.norm(dim=1).max()) > 1e-5
+    blocks = ops.build_blocks(position, 1.0)
+    grid, _ = ops.p2g(
+        position, velocity + push / scene.mass[:, None], world.affine, scene.mass, dx=1.0,
+        blocks=blocks, body=scene.body, fields=2,
+    )  # fmt: skip
+    speed = grid[..., :3] / grid[..., 3:].clamp(min=1e-300)
+    moved = ops.g2p(
+        speed.contiguous(), position, dx=1.0, dt=0.3, blocks=blocks,
+        body=scene.body, velocity=velocity,
+    )  # fmt: skip
+    world.run(steps=1)
+    assert float((world.velocity - moved[1]).abs().max()) < 1e-12
+    assert float((world.position - moved[0]).abs().max()) < 1e-12
+
+
+def _two() -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Two cubes that hardly overlap: nodes have nothing to do."""
+    parts = [box((0.1, 0.2, z), (2.0, 2.0, 2.0), SPACING) for z in (0.3, 2.27)]
+    speed = torch.tensor([0.0, 0.0, 0.01], dtype=torch.float64)
+    return parts, [speed, -speed]
+
+
+def test_momentum_and_angular_momentum_are_exchanged_only() -> None:
+    world = _pressed()
+    first = torch.arange(len(world.position)) < len(world.position) // 2
+    scale = float(world.scene.mass.sum()) * 0.04
+    before = world.momentum(), world.angular_momentum(), world.momentum(first)
+    world.run(steps=60)
+    assert float((world.momentum(first) - before[2]).norm()) > 0.1 * scale
+    assert float((world.momentum() - before[0]).norm()) < 1e-13 * scale
+    turned = world.angular_momentum() - before[1]
+    assert float(turned.norm()) < 1e-13 * scale
+
+
+def test_order_and_threads_change_no_bit() -> None:
+    count = len(box((0.0, 0.0, 0.0), (2.0, 2.0, 2.0), SPACING))
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
+    found = []
+    for turn, threads in ((None, 1), (order, 2)):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            world = _pressed(torch.float32, turn).run(steps=40)
+        finally:
+            torch.set_num_threads(before)
+        place = world.position.view(2, count, 3)
+        found.append(place if turn is None else place[:, torch.argsort(turn)])
+    assert torch.equal(*found)
+
+
+def _solver(**given: torch.Tensor) -> ops.Solver:
+    parts, speed = _two()
+    position = torch.cat(parts)
+    count = len(position)
+    body = (torch.arange(count) >= count // 2).to(torch.int32)
+    velocity = torch.where(body[:, None] == 0, speed[0], speed[1]).float()
+    ones = torch.ones(count)
+    solver = ops.Solver(
+        position, velocity, 0.125 * ones, 0.125 * ones, dx=1.0, body=body,
+        gravity=(0.0, 0.0, 0.0), law=torch.zeros(1, dtype=torch.int32),
+        params=torch.tensor([[0.4, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]]), **given,
+    )  # fmt: skip
+    solver.advance(steps=30)
+    return solver
+
+
+def test_fields_of_one_object_touch_at_nodes() -> None:
+    radius = torch.full((128,), 0.25)
+    plain = _solver()
+    alike = _solver(radius=radius, objects=torch.zeros(2, dtype=torch.int32))
+    apart = _solver(radius=radius, objects=torch.arange(2, dtype=torch.int32))
+    assert torch.equal(plain.velocity, alike.velocity)
+    assert not torch.equal(plain.velocity, apart.velocity)
+
+
+def test_bad_objects_are_refused() -> None:
+    with pytest.raises(InputError, match="by their radius, which is missing"):
+        _solver(objects=torch.arange(2, dtype=torch.int32))
+    with pytest.raises(ValueError, match="objects"):
+        _solver(radius=torch.full((128,), 0.25), objects=torch.arange(3, dtype=torch.int32))
