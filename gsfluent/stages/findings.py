@@ -58,6 +58,11 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
                 f"{body.name}: {report['warning']}, too few to break as walls do; hint: {asked} "
                 f"gives them {WALL_CELLS:g} cells"
             )
+            if any(material.law == "phase_field" for material in body.materials):
+                report["note"] += (
+                    "; cracks of law phase_field are wider than such walls, and what strikes "
+                    "punches through: law: nacc cracks them"
+                )
             _log.warning("%s", report["note"])
         found[body.name] = report
     return found

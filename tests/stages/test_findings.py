@@ -167,6 +167,15 @@ def test_thin_walls_are_told_with_the_cells_that_would_do(caplog: pytest.LogCapt
     assert setting(1000) == "solve.cells: 1000"
 
 
+def test_a_phase_field_in_thin_walls_is_told_that_it_is_punched_through() -> None:
+    scene, other = slab(), Scene()
+    material = HARD.override(law="phase_field", toughness=10.0)
+    other.add(scene.bodies[0].solid, material, frame=at(0, 0, 0.015), name="plate")
+    coarse = grid_spacing(scene, 16)
+    plain, said = (thin_walls(s, coarse)["plate"]["note"] for s in (scene, other))
+    assert said.startswith(plain) and "law: nacc" in said and "phase_field" not in plain
+
+
 def test_walls_get_the_cells_that_they_want_within_bounds() -> None:
     scene = slab()
     cells, wanted = cells_for_walls(scene, "preview", 10**7)

@@ -28,6 +28,8 @@ from cases import Job, jobs
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import machine
 
+PAGE = tables.ROOT / "docs" / "measured" / "phase_field.md"
+
 
 def work(job: Job, out: Path) -> None:
     """Run a job and write its files."""
@@ -86,7 +88,7 @@ def main() -> int:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.enter:
-        tables.enter_page(records(args.out), args.out)
+        tables.enter_page(records(args.out), args.out, PAGE)
         return 0
     known = jobs(args.quick)
     if args.job:

@@ -13,9 +13,28 @@ from gsfluent.figure.markdown import enter
 from gsfluent.io.atomic import atomic_path
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = ROOT / "docs" / "measured" / "phase_field.md"
 PICTURE = ROOT / "docs" / "images" / "phase_field_cracks.jpg"
 Found = Mapping[str, Any]
+HEADINGS = {
+    "pmma": (
+        "## PMMA\n\n"
+        "Bleyer et al. 2017: a strip of 32 x 16 mm, notch of 4 mm, held stretched; branches "
+        "from a release of about 2 $G_c$. Here l is 0.2 mm, theirs is 0.1 mm."
+    ),
+    "notch": (
+        "## A notched square\n\n"
+        "Miehe et al. 2010: 1 mm, E 210 GPa, $G_c$ 2700 J/m², l 0.015 mm, AT2. Reference: "
+        "0.701 kN/mm at 5.55 um. The last word says what the grid keeps: with `toughness` the "
+        "solver works with a reduced $G_c$, so that a long crack costs $G_c$; with `strength` "
+        "it works with $G_c$."
+    ),
+    "bending": (
+        "## Three-point bending\n\n"
+        "Miehe et al. 2010: 8 x 2 mm, notch of 0.4 mm, E 20.8 GPa, $G_c$ 500 J/m², l 0.06 mm, "
+        "AT2."
+    ),
+}
+"""What stands above the tables that the page has not yet."""
 GONE = 1.5
 """Reach of a crack that has crossed the strip [heights]."""
 
@@ -117,7 +136,8 @@ def picture(out: Path, names: Sequence[tuple[str, str]]) -> None:
     from matplotlib import pyplot
 
     there = [(name, said) for name, said in names if (out / f"{name}.npz").is_file()]
-    figure, axes = pyplot.subplots(2, 3, figsize=(12, 6.4))
+    lines = math.ceil(len(there) / 3)
+    figure, axes = pyplot.subplots(lines, 3, figsize=(12, 3.2 * lines), squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, (name, said) in zip(axes.flat, there, strict=False):
@@ -133,9 +153,9 @@ def picture(out: Path, names: Sequence[tuple[str, str]]) -> None:
     pyplot.close(figure)
 
 
-def enter_page(found: Mapping[str, Found], out: Path) -> None:
+def enter_page(found: Mapping[str, Found], out: Path, page: Path) -> None:
     """Write every table for which there are figures, and the picture."""
-    text = PAGE.read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
 
     def of(test: str) -> list[Found]:
         return [f for f in found.values() if f["test"] == test]
@@ -147,15 +167,17 @@ def enter_page(found: Mapping[str, Found], out: Path) -> None:
     }  # fmt: skip
     for test, table in parts.items():
         if rows := of(test):
-            text = enter(text, f"phase_field_{test}", table(rows))
-    picture(
-        out,
-        [
-            ("branching_3", "branching, l = 3 dx"), ("pmma_2.6", "PMMA strip, 2.6 Gc"),
-            ("kalthoff_192_spectral", "Kalthoff, spectral"),
-            ("notch_3_strength", "notched square"), ("bending_2_strength", "three-point bending"),
-            ("kalthoff_192_volumetric", "Kalthoff, volumetric"),
-        ],
+            text = enter(text, f"phase_field_{test}", table(rows), HEADINGS.get(test, ""))
+    shown = (
+        ("branching", ""), ("pmma", "2.6"), ("kalthoff", "spectral"), ("notch", "strength"),
+        ("bending", "strength"), ("kalthoff", "volumetric"),
     )  # fmt: skip
-    with atomic_path(PAGE) as path:
+    names = []
+    for test, word in shown:
+        mine = [n for n, f in found.items() if f["test"] == test and word in n]
+        if mine:  # the finest
+            best = max(mine, key=lambda n: int(found[n]["points"]))
+            names.append((best, f"{test}, {found[best]['setting']}"))
+    picture(out, names)
+    with atomic_path(page) as path:
         path.write_text(text, encoding="utf-8")
