@@ -104,3 +104,43 @@ def cut_splats(
         mean, covariance = cut_at(mean, covariance, n, torch.where(here, distance, torch.inf))
     new_quats, new_scales = ops.covariance_axes(geometry.pack_symmetric(covariance))
     return rows, mean, new_quats, new_scales
+
+
+def cut_in_part(
+    splats: tuple[Tensor, Tensor, Tensor], whole: Tensor, rows: Tensor, normal: Tensor,
+    distance: Tensor, share: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Means, quaternions and scales of splats of which some are cut, each once, by a share.
+
+    Args:
+        splats: All, as earlier cuts left them.
+        whole: Means of the uncut ones [m], [N, 3].
+        rows: Splats that are cut, int64 [M]; none twice.
+        normal: Unit normals of the faces, outward, [M, 3].
+        distance: Of the uncut means from the faces [m], [M].
+        share: How far they are cut, 0 to 1, [M, 1].
+    """
+    means, quats, scales = splats
+    root = geometry.quaternion_to_matrix(quats[rows]) * scales[rows, None]
+    before, mean = root @ root.mT, means[rows]
+    moved = ((mean - whole[rows]) * normal).sum(dim=1)
+    cut, covariance = cut_at(mean, before, normal, distance - moved)
+    mean = mean + share * (cut - mean)
+    covariance = before + share[..., None] * (covariance - before)
+    turned = ops.covariance_axes(geometry.pack_symmetric(covariance))
+    means = means.index_copy(0, rows, mean)
+    quats, scales = (
+        old.index_copy(0, rows, new) for old, new in zip((quats, scales), turned, strict=True)
+    )
+    return means, quats, scales
+
+
+def in_turns(rows: Tensor) -> list[Tensor]:
+    """Places in a list of rows, int64 [M]: where each row comes first, where it comes next, ..."""
+    ordered, order = rows.sort(stable=True)
+    steps = torch.arange(len(rows), device=rows.device)
+    new = torch.ones_like(rows, dtype=torch.bool)
+    new[1:] = ordered[1:] != ordered[:-1]
+    turn = torch.empty_like(rows)
+    turn[order] = steps - torch.where(new, steps, 0).cummax(dim=0).values
+    return [(turn == n).nonzero()[:, 0] for n in range(int(turn.max()) + 1 if len(rows) else 0)]
