@@ -16,6 +16,7 @@ EXTRAS = {
     "figures": ("matplotlib",),
     "slurm": ("submitit",),
     "ray": ("ray",),
+    "s3": ("s3fs",),
 }
 """Packages that gsfluent does without until they are asked for: extra -> names on the index."""
 

@@ -160,17 +160,19 @@ class _Pulse(logging.Handler):
 
 @dataclasses.dataclass(frozen=True)
 class _Watched:
-    """A reporter of which it is known when it last drew."""
+    """A reporter of which it is known when it last drew, and that says more than it is told."""
 
     inner: Reporter
     pulse: _Pulse
+    adds: Callable[[str, int, int], str] | None
 
     def task(self, name: str) -> Progress:
         """The callback of the reporter, watched."""
         report = self.inner.task(name)
 
         def watched(done: int, total: int, text: str) -> None:
-            report(done, total, text)
+            more = "" if self.adds is None else self.adds(name, done, total)
+            report(done, total, f"{text}, {more}" if text and more else text or more)
             # a log says itself when it has said something; a bar draws at once
             if not isinstance(self.inner, LineReporter):
                 self.pulse.last = time.monotonic()
@@ -180,7 +182,10 @@ class _Watched:
 
 @contextmanager
 def heartbeat(
-    name: str, says: Callable[[], str], seconds: float = _SECONDS_BETWEEN_LINES
+    name: str,
+    says: Callable[[], str],
+    seconds: float = _SECONDS_BETWEEN_LINES,
+    adds: Callable[[str, int, int], str] | None = None,
 ) -> Iterator[Callable[[Reporter], Reporter]]:
     """Say something whenever nothing has been said for a while.
 
@@ -188,6 +193,7 @@ def heartbeat(
         name: Of the logger that counts, and that is spoken to.
         says: Makes the line.
         seconds: Longest silence.
+        adds: Makes what is added to the progress of a task, from its name, done and total.
 
     Returns:
         Takes a reporter and gives one whose drawing counts as saying something.
@@ -206,7 +212,7 @@ def heartbeat(
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()
     try:
-        yield lambda reporter: _Watched(reporter, pulse)
+        yield lambda reporter: _Watched(reporter, pulse, adds)
     finally:
         over.set()
         thread.join()

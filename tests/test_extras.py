@@ -33,7 +33,7 @@ CPU = torch.device("cpu")
 PROJECT = tomllib.loads(
     (Path(__file__).resolve().parents[1] / "pyproject.toml").read_text(encoding="utf-8")
 )["project"]
-NOT_OF_DEVELOPERS = ("ray",)
+NOT_OF_DEVELOPERS = ("ray", "s3")
 """Extras whose tests are skipped where nobody has installed them."""
 Blocker = Callable[[str], None]
 
@@ -164,7 +164,7 @@ def test_every_module_loads_without_the_extras() -> None:
 import importlib, pkgutil, sys
 sys.modules |= dict.fromkeys(
     ["pycolmap", "skimage", "viser", "pxr", "transformers", "accelerate", "matplotlib",
-     "submitit", "ray"])
+     "submitit", "ray", "s3fs"])
 import gsfluent
 names = [m.name for m in pkgutil.walk_packages(gsfluent.__path__, "gsfluent.")]
 for name in names:

@@ -6,6 +6,7 @@
 #include <cstring>
 
 #include "core/collider/collider.h"
+#include "core/material/viscous.h"
 #include "core/solver/state.h"
 #include "torch_api.h"
 
@@ -57,6 +58,7 @@ enum SolverBuffer : int {
   kParent,
   kCut,
   kContactRadius,
+  kViscous,
   kSolverBuffers
 };
 
@@ -155,6 +157,7 @@ struct SolverOps {
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
         {"radius", n, 1, real, true},
+        {"viscous", device ? 0 : n, kViscousColumns, real, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -233,6 +236,7 @@ struct SolverOps {
     s.parent = int_at(kParent);
     s.cut = int_at(kCut);
     s.radius = real_at(kContactRadius);
+    s.viscous = real_at(kViscous);
     return s;
   }
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from gsfluent.cli.common import Out, Verb, existing
 from gsfluent.errors import InputError
+
+if TYPE_CHECKING:
+    from gsfluent.config import Shot
 
 
 @dataclass(kw_only=True)
@@ -107,6 +111,7 @@ class Plan(Verb):
 
     Examples:
       gsfluent plan shot.yaml               # before an hour is spent
+      gsfluent plan vase.glb                # of what gsfluent run would make of it
       gsfluent plan shot.yaml --json
       gsfluent plan shot.yaml --recalibrate # measure this machine anew (ten seconds)
       gsfluent plan shot.yaml --no-probe    # do not measure; no times where nothing was measured
@@ -115,8 +120,10 @@ class Plan(Verb):
     in the user's cache; every run then corrects it. See docs/theory/plan.md.
     """
 
-    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SHOT.yaml")]
-    """The shot file."""
+    shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
+    """The shot file; or a mesh, a splat or a folder, as for `gsfluent run`."""
+    material: str | None = None
+    """Without a shot: what the object is made of, a preset; guessed and said when absent."""
     recalibrate: bool = False
     """Measure this machine anew, and forget what runs have taught."""
     probe: bool = True
@@ -124,13 +131,12 @@ class Plan(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Plan the shot."""
-        from gsfluent.config import load_shot
         from gsfluent.plan.cost import CostModel
         from gsfluent.plan.plan import cost_model, plan_shot
 
         if self.recalibrate and not self.probe:
             raise InputError("--recalibrate measures, --no-probe forbids it", "drop one of them")
-        shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        shot = self._read()
         device = self.torch_device()
         # what is wrong with the shot is said before anything is measured
         plan = plan_shot(shot, device=device, seed=self.seed, model=CostModel.load(device))
@@ -139,6 +145,22 @@ class Plan(Verb):
                 model = cost_model(device, recalibrate=self.recalibrate, progress=progress)
             plan = plan_shot(shot, device=device, seed=self.seed, model=model)
         return plan
+
+    def _read(self) -> Shot:
+        """The shot, or that which a run would make; only a run keeps it."""
+        from gsfluent.config import load_shot
+
+        path = existing(self.shot, "INPUT")
+        if path.suffix.lower() in (".yaml", ".yml"):
+            if self.material is not None:
+                raise InputError(
+                    "--material does nothing with a shot", "write it there: objects: NAME: material"
+                )
+            return load_shot(path)
+        from gsfluent.run.from_input import made_shot
+
+        with tempfile.TemporaryDirectory(prefix="gsfluent-plan-") as folder:
+            return load_shot(made_shot(path, Path(folder), self.material))
 
     def text(self, result: dict[str, Any]) -> str:
         """The plan as tables."""

@@ -31,7 +31,7 @@ class Sweep(Verb):
     sweep: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SWEEP.yaml")]
     """The sweep file; or a shot file, with --vary or --seeds."""
     out: Out
-    """Folder for the results; made when missing."""
+    """Folder for the results, made when missing; or s3://BUCKET/PLACE (extra `s3`)."""
     vary: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=A,B,C")] = ()
     """Of a shot: keys by their path and the values they take; all combinations are run."""
     seeds: int | None = None
@@ -41,6 +41,8 @@ class Sweep(Verb):
     on: On = "local"
     """Where shots run: processes of this machine, jobs of a SLURM cluster (extra `slurm`), or a Ray
     cluster that runs already (extra `ray`)."""
+    pack: int | None = None
+    """Shots that share a GPU; by the memory that one takes when absent."""
     keep: Literal["all", "film"] | None = None
     """What stays of a shot: all, or film and figures without the frames."""
     minutes: float | None = None
@@ -63,6 +65,10 @@ class Sweep(Verb):
             sweep = replace(sweep, keep=self.keep)
         if self.minutes is not None:
             sweep = replace(sweep, each=replace(sweep.each, minutes=self.minutes))
+        if self.pack is not None:
+            if self.pack < 1:
+                raise InputError(f"--pack {self.pack}", "give at least 1")
+            sweep = replace(sweep, each=replace(sweep.each, gpu=1.0 / self.pack))
         device = self.torch_device()
         if self.plan:
             return plan_sweep(sweep, self.out, device=device, seed=self.seed, jobs=self.jobs)
@@ -87,7 +93,7 @@ class Dataset(Verb):
     """
 
     sweep: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SWEEP")]
-    """Folder that `gsfluent sweep` wrote."""
+    """Folder that `gsfluent sweep` wrote; from s3://BUCKET/PLACE shots are brought to OUT/sweep."""
     out: Out
     """Folder of the data set; made when missing."""
     format: tuple[Literal["webdataset", "huggingface"], ...] = ("webdataset",)
@@ -100,11 +106,16 @@ class Dataset(Verb):
     def execute(self) -> dict[str, Any]:
         """Make the samples and pack them."""
         from gsfluent.dataset.write import write_dataset
+        from gsfluent.sweep.bucket import fetch, is_store
 
-        existing(self.sweep, "SWEEP", folder=True)
+        sweep = self.sweep
+        if is_store(sweep):
+            with self.progress("brought here") as progress:
+                sweep = fetch(sweep, self.out / "sweep", progress=progress).root
+        existing(sweep, "SWEEP", folder=True)
         with self.progress("samples") as progress:
             return write_dataset(
-                self.sweep, self.out, self.format, device=self.torch_device(), shares=self.shares,
+                sweep, self.out, self.format, device=self.torch_device(), shares=self.shares,
                 jobs=self.jobs, progress=progress,
             )  # fmt: skip
 
@@ -144,7 +155,7 @@ class Fit(Verb):
     cells: int = 8
     """Cells along the longest side of the largest object; give thin things more."""
     grids: Literal[1, 2] = 2
-    """2: fit on a grid finer by 1.5, too; their difference joins the bands."""
+    """2: a grid twice as fine sets the motion of the coarser one right."""
     jobs: int | None = None
     """Searches at a time; as many as there are cores when absent."""
     on: On = "local"

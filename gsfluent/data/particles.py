@@ -30,6 +30,8 @@ class Particles(TensorContainer):
         material: Row of the material table of each point, int32 [N].
         deformation: Total deformation gradient F since the start, [N, 3, 3]; None when nobody draws
             it.
+        viscous: Viscosity of each solid point, [N, 9] (:func:`gsfluent.ops.viscous_step`); None
+            where nothing is viscous.
     """
 
     position: Annotated[Tensor, shape("N", 3, unit="m")]
@@ -42,6 +44,7 @@ class Particles(TensorContainer):
     body: Annotated[Tensor, shape("N", kind="int")]
     material: Annotated[Tensor, shape("N", kind="int")]
     deformation: Annotated[Tensor, shape("N", 3, 3)] | None = None
+    viscous: Annotated[Tensor, shape("N", 9)] | None = None
 
     @staticmethod
     def at_rest(
@@ -111,9 +114,20 @@ class Particles(TensorContainer):
         """Return the rows picked by a bool mask [N] or an integer index [M]."""
         return self.map(lambda value: value[index])
 
+    def unstrained(self, rows: Tensor) -> Particles:
+        """The points, of which those of ``rows`` (bool [N] or int [M]) have no elastic strain."""
+        index = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        viscous = self.viscous
+        if viscous is not None:
+            springs = viscous[:, :6].index_fill(0, index, 0.0)
+            viscous = torch.cat([springs, viscous[:, 6:]], dim=1)
+        return self.replace(strain=self.strain.index_fill(0, index, 0.0), viscous=viscous)
+
     @staticmethod
     def cat(parts: Sequence[Particles]) -> Particles:
         """Join rows; ``deformation`` must be present in all parts or in none.
+
+        Where one part has a ``viscous``, the points of the others get one of zeros.
 
         Raises:
             ValueError: ``parts`` is empty or only some carry a deformation.
@@ -123,11 +137,18 @@ class Particles(TensorContainer):
         carried = [part.deformation for part in parts if part.deformation is not None]
         if carried and len(carried) != len(parts):
             raise ValueError("Particles.cat: deformation must be present in all parts or none")
-        names = [
-            field.name for field in dataclasses.fields(Particles) if field.name != "deformation"
-        ]
+        optional = ("deformation", "viscous")
+        names = [f.name for f in dataclasses.fields(Particles) if f.name not in optional]
         joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        return Particles(**joined, deformation=torch.cat(carried) if carried else None)
+        viscous = None
+        if any(part.viscous is not None for part in parts):
+            viscous = torch.cat([
+                part.strain.new_zeros(part.count, 9) if part.viscous is None else part.viscous
+                for part in parts
+            ])  # fmt: skip
+        return Particles(
+            **joined, deformation=torch.cat(carried) if carried else None, viscous=viscous
+        )
 
     def validated(self, source: str = "Particles") -> Particles:
         """Return self after checking for rows that are finite and have positive mass and volume.

@@ -116,7 +116,7 @@ def _through_sweep(
 ) -> list[dict[str, Any]]:
     """Do searches, each once; those of another shot or target have other names."""
     tasks = list(items)
-    ids = [fingerprint(base, t.start, t.dx, list(t.shares), t.grid) for t in tasks]
+    ids = [fingerprint(base, t.start, t.dx, list(t.shares), t.grids) for t in tasks]
     unlike = dict(zip(ids, tasks, strict=True))
     outcomes = sweep_map(
         search_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True

@@ -19,6 +19,8 @@ from gsfluent.io.atomic import atomic_path
 from gsfluent.io.checked.arrays import read_npz
 from gsfluent.io.splats.load import load_splats, save_splats
 
+_VOLUME = ".volume.npz"
+
 
 def load(path: str | Path) -> Gaussians | Solid:
     """Read what :func:`save` wrote: a solid where its volume lies beside the ``.ply``, else splats.
@@ -26,8 +28,16 @@ def load(path: str | Path) -> Gaussians | Solid:
     Splats of other programs are read, too: see :func:`gsfluent.io.load_splats`.
 
     Raises:
-        InputError: As :func:`gsfluent.io.load_splats` and :func:`load_solid`.
+        InputError: As :func:`gsfluent.io.load_splats` and :func:`load_solid`; or the path is that
+            of a volume, which is read with its splats.
     """
+    if (name := Path(path).name).lower().endswith(_VOLUME):
+        splats = Path(path).with_name(f"{name[: -len(_VOLUME)]}.ply")
+        missing = "" if splats.is_file() else ", which is not there: fill it anew"
+        raise InputError(
+            f"{path}: the volume of a solid, which is read with its splats",
+            f"load {splats}{missing}",
+        )
     solid = Path(path).suffix.lower() == ".ply" and volume_path(path).is_file()
     return load_solid(path) if solid else load_splats(path)
 
@@ -132,4 +142,4 @@ def load_solid(path: str | Path) -> Solid:
 
 def volume_path(path: str | Path) -> Path:
     """Name of the volume file that belongs to a solid ``.ply``."""
-    return Path(path).with_suffix(".volume.npz")
+    return Path(path).with_suffix(_VOLUME)

@@ -50,12 +50,16 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "ogden_alpha3": (-20.0, 20.0, "no unit"),
     "toughness": (0.0, math.inf, "J/m^2"),
     "length": (0.0, math.inf, "m"),
+    "relaxation_share": (0.0, 0.99, "no unit"),
+    "relaxation_time": (0.0, math.inf, "s"),
+    "yield_time": (0.0, math.inf, "s"),
 }
 """Parameter -> lowest value, highest value, unit."""
 
 POSITIVE = (
     "young_modulus", "density", "grain", "bulk_modulus", "reference_volume", "softening",
     "tensile_strength", "compressive_strength", "fracture_energy", "toughness", "length",
+    "relaxation_time", "yield_time",
 )  # fmt: skip
 """Parameters that must be above their lowest value."""
 
@@ -79,9 +83,12 @@ BREAKS = ("nacc", "phase_field")
 PARAMETERS = tuple(RANGES)
 """The fields of a material that may vary in space."""
 
+RELAXATION = ("relaxation_share", "relaxation_time")
+"""What makes matter relax, both together or not at all."""
+
 _SOLID = ("young_modulus", "poisson_ratio", "density")
 READS: dict[str, tuple[str, ...]] = {
-    "elastic": _SOLID,
+    "elastic": (*_SOLID, *RELAXATION),
     "corotated": _SOLID,
     "nacc": (
         *_SOLID,
@@ -91,6 +98,8 @@ READS: dict[str, tuple[str, ...]] = {
         "alpha0",
         "shear_damage",
         *HANDBOOK,
+        *RELAXATION,
+        "yield_time",
     ),
     "drucker_prager": (*_SOLID, "friction_angle", "cohesion_pressure"),
     "von_mises": (*_SOLID, "yield_stress", "hardening_modulus", "plastic_viscosity"),
@@ -109,8 +118,12 @@ READS: dict[str, tuple[str, ...]] = {
 }
 """Law -> the parameters it reads; any other is refused, because it would do nothing."""
 
-OPTIONAL = {"phase_field": ("length", "tensile_strength")}
-"""Law -> parameters that the grid finds where they are left out."""
+OPTIONAL = {
+    "elastic": RELAXATION,
+    "nacc": (*RELAXATION, "yield_time"),
+    "phase_field": ("length", "tensile_strength"),
+}
+"""Law -> parameters that may be left out: the grid finds them, or it is not viscous."""
 
 DEFAULTS: dict[str, dict[str, float]] = {
     "nacc": {

@@ -108,6 +108,12 @@ class Material:
         ogden_alpha2: ogden: its exponent.
         ogden_mu3: ogden: modulus of the third term [Pa].
         ogden_alpha3: ogden: its exponent.
+        relaxation_share: elastic, nacc: share of the stiffness that relaxes when a strain is held,
+            g of a Prony series; what young_modulus says is the stiffness at once.
+        relaxation_time: elastic, nacc: time in which that share falls to 1/e [s], of the real
+            thing: a softened one takes longer, as its landing does.
+        yield_time: nacc: time that a yield takes [s], likewise (Duvaut and Lions): what is strained
+            fast holds more, by the stiffness times rate times this.
         variation: nacc, phase_field: relative scatter of strength in space (standard deviation of
             a smooth random factor on it); natural solids have weak and strong places, and that
             decides where cracks run and how many pieces survive a harder landing.
@@ -171,6 +177,9 @@ class Material:
     ogden_alpha2: Field | None = None
     ogden_mu3: Field | None = None
     ogden_alpha3: Field | None = None
+    relaxation_share: Field | None = None
+    relaxation_time: Field | None = None
+    yield_time: Field | None = None
     variation: float = 0.0
     grain: float = 0.025
     weibull_modulus: float = 0.0
@@ -213,6 +222,11 @@ class Material:
                 f"material {self.name!r}: {', '.join(HANDBOOK)} go together, but "
                 f"{', '.join(missing)} is missing",
                 hint="give all three, or none of them and alpha0, hardening and cohesion",
+            )
+        if (self.relaxation_share is None) != (self.relaxation_time is None):
+            raise InputError(
+                f"material {self.name!r}: {' and '.join(laws.RELAXATION)} go together",
+                hint="give both, or none: then nothing relaxes",
             )
         by_handbook = not missing
         for field, (low, high, unit) in RANGES.items():
@@ -399,6 +413,28 @@ class Material:
         if self.hysteresis == "both":
             row[..., 7] += row[..., 7] > 0.0
         return row
+
+    @property
+    def viscous(self) -> bool:
+        """Whether it relaxes, or yields in its own time."""
+        return self.relaxation_share is not None or self.yield_time is not None
+
+    def viscosities(self, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
+        """Share of the stiffness that relaxes, rate 1 / tau [1/s], time of a yield [s], [..., 3].
+
+        A softened material takes longer by the root of its softening, as its waves do. Float64.
+
+        Args:
+            sample: As in :meth:`parameters`.
+        """
+        at, slower = sample or _tensor, self.softening**0.5
+        share, tau, time = self.relaxation_share, self.relaxation_time, self.yield_time
+        columns = (
+            at(0.0) if share is None else at(share),
+            at(0.0) if tau is None else 1.0 / (slower * at(tau)),
+            at(0.0) if time is None else slower * at(time),
+        )
+        return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 
     def strengths(self, sample: Callable[[Field], Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Uniaxial strengths of the softened material in tension and compression [Pa], float64.

@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.ops.grip": ("grip_rows",),
         "gsfluent.ops.blade": ("blade_rows", "blade_sides", "merged_fields"),
         "gsfluent.ops.plasticity": ("return_mapping", "elastic_energy", "wave_speed"),
+        "gsfluent.ops.viscous": ("viscous_step", "viscous_energy"),
         "gsfluent.ops.damage": ("damage_solve",),
         "gsfluent.ops.differentiable": (
             "MpmState",

@@ -25,7 +25,8 @@ from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
 from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
-from gsfluent.ops.solver_state import DAMAGE_FIELD, MORE_LAWS, UNBROKEN, SolverState
+from gsfluent.ops.solver_state import DAMAGE_FIELD, MORE_LAWS, UNBROKEN, VISCOUS, SolverState
+from gsfluent.ops.viscous import check_viscous
 
 ELASTIC, NACC, PHASE = LAWS["elastic"], LAWS["nacc"], LAWS["phase_field"]
 CFL_MOST = 0.5
@@ -107,6 +108,8 @@ class Solver(SolverState):
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes. CPU only.
+        viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`); laws 0 and 1
+            only, on the CPU. Default: nothing relaxes and all yields at once, at no cost.
         gravity: Acceleration [m/s^2].
         colliders: Rows of :func:`gsfluent.ops.grid_update`, [K, columns].
         sdf: Values of all distance grids that ``colliders`` name, float32 [M].
@@ -151,6 +154,7 @@ class Solver(SolverState):
         parent: Tensor | None = None,
         cut: Tensor | None = None,
         radius: Tensor | None = None,
+        viscous: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         colliders: Tensor | None = None,
         sdf: Tensor | None = None,
@@ -220,6 +224,7 @@ class Solver(SolverState):
             codes = {int(c) >> 2 for c in self._params[self._law == PHASE, 5].tolist()}
             if len(codes) > 1:
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
+        self._thickens(viscous, like, laws)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -264,6 +269,8 @@ class Solver(SolverState):
             values.update(scalars)
         if deformation is not None:
             values["deformation"] = deformation.reshape(n, 9)
+        if viscous is not None:
+            values["viscous"] = viscous
         self._load(position, values, row, body)
         if parent is not None or cut is not None:
             for name, given in (("parent", parent), ("cut", cut)):
@@ -276,6 +283,24 @@ class Solver(SolverState):
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
+
+    def _thickens(self, viscous: Tensor | None, like: Tensor, laws: set[int]) -> None:
+        """Choose the kernel of viscous solids; refuse what it does not know."""
+        if viscous is None:
+            return
+        if like.device.type != "cpu":
+            raise InputError(
+                f"Solver: viscous: {like.device.type} knows no viscous solids yet",
+                hint="step them by p2g, grid_update, g2p, return_mapping and viscous_step",
+            )
+        if not laws <= {ELASTIC, NACC}:
+            raise InputError(
+                f"Solver: viscous works beside laws 0 and 1 (elastic, nacc) only, got "
+                f"{sorted(laws)}",
+                hint="step them by p2g, grid_update, g2p, return_mapping and viscous_step",
+            )
+        check_viscous("Solver", viscous, like)
+        self._law_set = VISCOUS
 
     @staticmethod
     def _surface(radius: Tensor | None, like: Tensor, dx: float, cfl: float) -> None:
@@ -404,7 +429,8 @@ class Solver(SolverState):
     # --- going back ---
 
     _MOVING = ("clock", "offset", "meta", "velocity", "slope", "strain", "alpha", "peak",
-               "deformation", "id", "impulse", "colliders", "collider_state", "home_coord0",
+               "deformation", "viscous", "id", "impulse", "colliders", "collider_state",
+               "home_coord0",
                "home_start0", "home_count0", "home_coord1", "home_start1",
                "home_count1")  # fmt: skip
 

@@ -88,6 +88,7 @@ class Buffers:
     parent: Tensor
     cut: Tensor
     radius: Tensor
+    viscous: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""

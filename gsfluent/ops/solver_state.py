@@ -16,10 +16,11 @@ from gsfluent._check import check_tensor
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.plasticity import SLOW_UNLOADING, return_mapping, weakened
 from gsfluent.ops.solver_buffers import INDEX
+from gsfluent.ops.viscous import viscous_step
 
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
-MORE_LAWS, DAMAGE_FIELD = 3, 4
+MORE_LAWS, DAMAGE_FIELD, VISCOUS = 3, 4, 5
 """Sets of laws that have kernels on the CPU only: ``LawSet`` of ``csrc/core/solver/particle.h``."""
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
@@ -355,6 +356,13 @@ class SolverState:
         return self._restored(self._rowwise("deformation")).view(-1, 3, 3)
 
     @property
+    def viscous(self) -> Tensor | None:
+        """Viscosity of each point with its spring, [N, 9], or None without."""
+        if self._buffers.viscous.numel() == 0:
+            return None
+        return self._restored(self._buffers.viscous)
+
+    @property
     def stress(self) -> Tensor:
         """Kirchhoff stress of the present state [Pa], [N, 6]; of a liquid without its viscous part.
 
@@ -368,11 +376,17 @@ class SolverState:
         law, params = b.law, b.rows[:, :8].contiguous()
         if broken and (self.irreversible or self._law_set == DAMAGE_FIELD):
             (law, params), material = weakened(law, params, row, b.peak), None
-        _, _, stress, _ = return_mapping(
+        after, new_alpha, stress, _ = return_mapping(
             strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,
             material=material, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
             dt=1e-9,  # of a step without motion: what flows with a viscosity stays
         )  # fmt: skip
+        if b.viscous.numel():
+            none = strain.new_zeros(self.count, 3, 3)
+            stress = viscous_step(
+                b.viscous, strain, alpha, none, (after, new_alpha, stress), law=b.law,
+                params=b.rows[:, :8].contiguous(), material=row, dt=0.0,
+            )[3]  # fmt: skip
         return self._restored(stress)
 
     @property

@@ -46,6 +46,57 @@ _ALIKE = {
 Work = dict[str, dict[str, float]]
 
 
+_SLOWEST = 4.0
+"""Times as slow, or as fast, as planned that a run is taken to be, at most."""
+_TRUST = 0.1
+"""Share of a whole plan that is taken to have been kept before a run has begun."""
+
+
+def seconds_left(
+    planned: Mapping[str, float | None],
+    finished: Mapping[str, float],
+    current: str,
+    elapsed: float,
+    share: float,
+) -> float | None:
+    """What a run will still take [s]: the plan, at the pace that the run has shown.
+
+    What is left of the stage at work is told by its plan at first, and the more by its own pace the
+    more of it is done.
+
+    Args:
+        planned: Seconds of every stage by the plan.
+        finished: Seconds that finished stages took; what was found done is left out.
+        current: Stage at work.
+        elapsed: Since it began [s].
+        share: How much of it is done, 0..1.
+
+    Returns:
+        None where the plan has no time for a stage that is still to be done.
+    """
+    told = {name: took for name, took in finished.items() if planned.get(name)}
+    took, guess = sum(told.values()), sum(float(planned[name] or 0.0) for name in told)
+    order = list(planned)
+    later = order[order.index(current) + 1 :] if current in order else order
+    if any(planned[name] is None for name in [current, *later] if name in planned):
+        return None
+
+    # a short stage that was slow says little of a long one
+    sure = _TRUST * sum(seconds or 0.0 for seconds in planned.values())
+
+    def pace() -> float:
+        ratio = (took + sure) / (guess + sure) if guess + sure > 0.0 else 1.0
+        return min(max(ratio, 1.0 / _SLOWEST), _SLOWEST)
+
+    whole = float(planned.get(current) or 0.0)
+    wanted = pace() * whole
+    rest = max(wanted - elapsed, 0.1 * elapsed)
+    if share > 0.0:
+        rest = (1.0 - share) * (elapsed + (1.0 - share) * max(wanted, elapsed))
+        took, guess = took + elapsed + rest, guess + whole
+    return rest + pace() * sum(float(planned[name] or 0.0) for name in later)
+
+
 def actual_work(planned: Mapping[str, Mapping[str, float]], values: Mapping[str, Any]) -> Work:
     """The features of the work that a run has done.
 

@@ -61,12 +61,24 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
         raise InputError(made["refused"], made["hint"])
     if model is None:
         _log.info("plan: no times yet: this run will teach them (gsfluent plan measures them)")
+    elif made["seconds"] is not None:
+        _log.info("plan: %s", _in_words(made))
     for warning in made["warnings"]:
         _log.warning("%s", warning)
     section = {"calibrated": made["calibrated"], "predicted": predicted_of(made)}
     section |= {"binding": made["binding"], "warnings": made["warnings"]}
     context.record.values["plan"] = section | ({} if chosen is None else {"chosen": chosen})
     return Foresight(made, model)
+
+
+def _in_words(plan: dict[str, Any]) -> str:
+    """What a run will take, and what of it takes longest."""
+    seconds = {name: row["seconds"] for name, row in plan["stages"].items()}
+    longest = max(seconds, key=seconds.__getitem__)
+    return (
+        f"about {plan['seconds']:.3g} s in all, {seconds[longest]:.3g} s of it to {longest}; "
+        f"{plan['particles']} points on {plan['cells']} cells, {plan['substeps']} steps"
+    )
 
 
 def predicted_of(plan: dict[str, Any]) -> dict[str, Any]:

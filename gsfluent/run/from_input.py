@@ -42,7 +42,7 @@ SETTINGS: dict[str, dict[str, Any]] = {"solve": {"quality": "preview"}, "output"
 _GRAVITY = 9.81
 _LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down as well
 _AFTER = 1.2  # seconds of film after the landing
-_QUICK = 0.03  # s: what lands with its length in less is shown slower, by as much
+_QUICK = 0.06  # s: what lands with its length in less is shown slower, by as much
 _SLOWEST = 8  # times slower than it happens, at most
 _SAMPLE = 2000  # points of a surface that are asked for their colour
 _VIEWED, _FEW = 20_000, 200  # points that are looked at for the front, and fewest that tell
@@ -169,6 +169,12 @@ def find_input(source: Path) -> tuple[str, Path]:
     Raises:
         InputError: Nothing that a run can start from, or more than one thing.
     """
+    inside = source if source.is_dir() else source.parent
+    if source in (inside, inside / "meta.json") and (inside / "means_l.webp").is_file():
+        raise InputError(
+            f"{source}: a .sog that has been unpacked",
+            f"pack it: cd {inside} && zip -0 ../{inside.name}.sog *, and run that",
+        )
     kind = kind_of(source)
     if kind in ("mesh", "splats", "capture"):
         return kind, source

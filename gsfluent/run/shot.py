@@ -19,6 +19,7 @@ import torch
 from gsfluent.choose.shot import choose_stage
 from gsfluent.config import Shot
 from gsfluent.errors import GsfluentError, RunError
+from gsfluent.plan.fact import seconds_left
 from gsfluent.plan.in_run import foresee_run, judge_plan
 from gsfluent.progress import LineReporter, Reporter, heard_warnings, heartbeat
 from gsfluent.results.lock import locked
@@ -28,6 +29,7 @@ from gsfluent.run.report import REPORT, write_report
 from gsfluent.stages.chain import run_stages
 from gsfluent.stages.check import check_shot
 from gsfluent.stages.context import RunContext
+from gsfluent.stages.findings import THIN
 
 _log = logging.getLogger(__name__)
 
@@ -119,18 +121,39 @@ def run_in(
         if choose_stage(context):  # the plan was made with other cells
             foreseen = foresee_run(context, plan=plan)
 
+    done: dict[str, float] = {}  # shares of the stages
+    begun = start
+
+    def left() -> str:
+        if foreseen is None or not store.results:
+            return ""
+        at = store.results[-1].name
+        ended = {one.name: one.seconds for one in store.results[:-1] if not one.resumed}
+        elapsed = max(time.perf_counter() - begun - sum(ended.values()), 0.0)
+        planned = {name: row["seconds"] for name, row in foreseen.plan["stages"].items()}
+        seconds = seconds_left(planned, ended, at, elapsed, done.get(at, 0.0))
+        return "" if seconds is None else f"about {seconds:.0f} s left"
+
     def at_work() -> str:
         took = time.perf_counter() - start
         stage = store.results[-1].name if store.results else "plan"
-        planned = None if foreseen is None else foreseen.plan["seconds"]
-        left = "" if planned is None else f", about {max(planned - took, 0.0):.0f} s left"
-        return f"{stage}: at work, {took:.0f} s since the start{left}"
+        return ", ".join(said for said in (
+            f"{stage}: at work", f"{took:.0f} s since the start", left()
+        ) if said)  # fmt: skip
+
+    def progressed(name: str, part: int, total: int) -> str:
+        done[name] = part / total if total > 0 else 0.0
+        return left()
 
     try:
         check_shot(shot)
-        with heard_warnings("gsfluent") as heard, heartbeat("gsfluent", at_work) as watched:
+        with (
+            heard_warnings("gsfluent") as heard,
+            heartbeat("gsfluent", at_work, adds=progressed) as watched,
+        ):
             context.reporter = watched(context.reporter)
             foreseen = foresee_run(context, plan=plan)
+            begun = time.perf_counter()
             run_stages(context, settle)
         if after is not None:
             record.values.update(after(context))
@@ -168,7 +191,7 @@ def _warnings(shot: Shot, values: Mapping[str, Any], heard: list[str]) -> list[s
     notes = list((values["simulation"] or {}).get("notes") or [])
     foreseen = set((values.get("plan") or {}).get("warnings") or [])
     # of the objects the simulation has told what became of them
-    bodies = tuple(f"{name}: " for name in shot.objects)
+    bodies = (*(f"{name}: " for name in shot.objects), THIN)
     kept = [said for said in heard if not (said in foreseen and said.startswith(bodies))]
     return [*(said for said in kept if said not in notes), *notes]
 

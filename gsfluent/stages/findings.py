@@ -66,6 +66,9 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
 FINER = 8
 """How many times finer than a quality says cells are made for walls, at most."""
 
+THIN = f"walls thinner than {WALL_CELLS:g} cells"
+"""Begins what is said of cells that walls get."""
+
 MOSTLY = 0.25
 """Share of its surface on thin walls from which a body is refined for them: a bowl, and no apple
 with a ragged rim, which would take twelve times the points."""
@@ -101,11 +104,11 @@ def walls_note(quality: str, cells: int, wanted: int, most: int) -> str:
         return ""
     times = cells / least
     said = (
-        f"walls thinner than {WALL_CELLS:g} cells: {cells} cells instead of the {least} of "
+        f"{THIN}: {cells} cells instead of the {least} of "
         f"quality: {quality}, {times**3:.2g} times the points and {times:.2g} times the steps"
     )
     if cells == least:
-        said = f"walls thinner than {WALL_CELLS:g} cells, and no finer cells are allowed"
+        said = f"{THIN}, and no finer cells are allowed"
     if cells < wanted:
         said += (
             f"; the thinnest then have {WALL_CELLS * cells / wanted:.2g} cells, too few to bend "

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent.errors import GsfluentError
-from gsfluent.sweep.claims import claimed
-from gsfluent.sweep.folder import LOG, SweepFolder, last_lines
+from gsfluent.sweep.bucket import opened
+from gsfluent.sweep.folder import LOG, last_lines
 
 DONE, HELD, FAILED = "done", "held", "failed"
 """How a try ends: the task is done, another is at work on it, or it went wrong and is noted."""
@@ -27,11 +27,11 @@ Function = Callable[[Any, Path], Any]
 _PASSING = (errno.EAGAIN, errno.EIO, errno.ENOMEM, errno.ESTALE, errno.ETIMEDOUT)
 
 
-def attempt(root: Path, name: str, function: Function, item: Any) -> str:
+def attempt(root: str | Path, name: str, function: Function, item: Any) -> str:
     """Try a task, unless it is done or somebody else's.
 
     Args:
-        root: Folder of the sweep.
+        root: Folder of the sweep, or its store.
         name: Of the task.
         function: What it does.
         item: Given to it.
@@ -42,8 +42,8 @@ def attempt(root: Path, name: str, function: Function, item: Any) -> str:
     Raises:
         OSError: Not even the failure could be written down.
     """
-    place = SweepFolder(root)
-    with claimed(place.claim(name)) as ours:
+    place = opened(root)
+    with place.held(name) as ours:
         # after the claim: whoever held it before may have finished
         if place.is_done(name):
             return DONE
@@ -69,8 +69,15 @@ def is_passing(error: BaseException) -> bool:
         return True
     if error.__cause__ is not None and is_passing(error.__cause__):
         return True
-    memory = type(error).__name__ == "OutOfMemoryError"  # torch's, which costs its import to name
-    return memory or isinstance(error, MemoryError | ConnectionError | TimeoutError)
+    return wants_memory(error) or isinstance(error, ConnectionError | TimeoutError)
+
+
+def wants_memory(error: BaseException) -> bool:
+    """Whether an error, or what it comes from, is of memory: of the machine or of its GPU."""
+    name = type(error).__name__  # torch's class costs its import to name
+    if name == "OutOfMemoryError" or isinstance(error, MemoryError):
+        return True
+    return error.__cause__ is not None and wants_memory(error.__cause__)
 
 
 def _record(error: Exception, folder: Path) -> dict[str, Any]:
@@ -81,6 +88,7 @@ def _record(error: Exception, folder: Path) -> dict[str, Any]:
         "kind": type(error).__name__,
         "message": str(error),
         "again": is_passing(error),
+        "memory": wants_memory(error),
         "log": [line.rstrip() for line in said],
     }
 

@@ -7,20 +7,62 @@ of :meth:`gsfluent.sweep.folder.SweepFolder.finish` still lets only one of them 
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import secrets
+import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from gsfluent.sweep.folder import has_ended, myself, read_words, write_words
+from gsfluent.process import boot, is_alive
 
 BEAT = 10.0
 """Seconds from one sign of life to the next."""
 SILENCE = 120.0
 """Seconds without one after which a claim is nobody's."""
+
+
+def myself() -> dict[str, Any]:
+    """This process, in words that others can judge."""
+    return {
+        "process": os.getpid(),
+        "host": socket.gethostname(),
+        "boot": boot(),
+        "seconds": time.time(),
+    }
+
+
+def has_ended(words: dict[str, Any]) -> bool:
+    """Whether a process has surely ended; of other machines nobody knows."""
+    if words.get("host") != socket.gethostname() or not words.get("boot"):
+        return False
+    if words["boot"] != boot():
+        return True  # this machine has started again since
+    try:
+        return not is_alive(int(words["process"]), float(words["seconds"]))
+    except (KeyError, TypeError, ValueError):
+        return False
+
+
+def read_words(path: Path) -> dict[str, Any] | None:
+    """A small JSON object; None where there is no whole one."""
+    try:
+        words = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return words if isinstance(words, dict) else None
+
+
+def write_words(path: Path, words: dict[str, Any]) -> None:
+    """Write a JSON object and make sure that it is on the disk."""
+    with path.open("w", encoding="utf-8") as stream:
+        json.dump(words, stream)
+        stream.flush()
+        os.fsync(stream.fileno())
 
 
 @contextmanager
@@ -37,16 +79,31 @@ def claimed(path: Path) -> Iterator[bool]:
     if not _take(path, mine):
         yield False
         return
+    try:
+        with beating(lambda: os.utime(path)):
+            yield True
+    finally:
+        if read_words(path) == mine:  # who was silent for too long has lost it
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def beating(beat: Callable[[], None]) -> Iterator[None]:
+    """Give signs of life while the block runs."""
     over = threading.Event()
-    thread = threading.Thread(target=_beat, args=(path, over), daemon=True)
+
+    def live() -> None:
+        while not over.wait(BEAT):
+            with suppress(OSError):
+                beat()
+
+    thread = threading.Thread(target=live, daemon=True)
     thread.start()
     try:
-        yield True
+        yield
     finally:
         over.set()
         thread.join()
-        if read_words(path) == mine:  # who was silent for too long has lost it
-            path.unlink(missing_ok=True)
 
 
 def is_stale(path: Path, now: float) -> bool:
@@ -97,9 +154,3 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
-
-
-def _beat(path: Path, over: threading.Event) -> None:
-    while not over.wait(BEAT):
-        with suppress(OSError):
-            os.utime(path)

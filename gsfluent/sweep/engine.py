@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from gsfluent.errors import InputError, RunError
 from gsfluent.progress import Progress, report_progress
 from gsfluent.sweep.attempt import DONE, FAILED, Function
-from gsfluent.sweep.claims import is_stale
+from gsfluent.sweep.bucket import opened
 from gsfluent.sweep.folder import SweepFolder
 from gsfluent.sweep.pool import LocalPool
 
@@ -49,7 +49,7 @@ class Outcome:
     """What became of a task."""
 
     id: str  # Its name
-    folder: Path | None  # Its files; None for one that failed
+    folder: Path | None  # Its files; None for one that failed, or whose files a store has
     value: Any = None  # What the function returned
     tries: int = 0  # How many it took
     failure: dict[str, Any] | None = None  # Of the last try of one that failed
@@ -67,6 +67,7 @@ def map(
     minutes: float | None = None,
     retry: bool = False,
     on: str = "local",
+    gpu: float = 0.0,
     progress: Progress | None = None,
 ) -> list[Outcome]:
     """Call a function for every item, in many processes, so that each call counts once.
@@ -79,7 +80,8 @@ def map(
         function: ``function(item, folder)``, at the top of a module. It writes its files into the
             folder and returns what JSON can hold.
         items: What it is called with; whatever can be pickled.
-        folder: Where the results go: ``shots/ID``.
+        folder: Where the results go: ``shots/ID``. Or ``s3://BUCKET/PLACE`` (extra ``s3``), whose
+            files :func:`gsfluent.sweep.fetch` brings here.
         ids: Names of the items, letters, digits, ``_`` and ``-``; digests of function and item
             when absent.
         jobs: Calls at a time; one per core when absent, of a Ray cluster for all of its cores.
@@ -90,6 +92,9 @@ def map(
         retry: Try again what has failed finally.
         on: ``local``; ``slurm``: a job of the cluster for every call (extra ``slurm``); ``ray`` or
             ``ray=HOST:PORT``: a Ray cluster that runs (extra ``ray``).
+        gpu: Part of a GPU that a call takes, at most 1; 0 for none. Calls share a GPU, each within
+            its part of the memory; one that wants more is tried again on a whole one. A SLURM job
+            has a whole one.
         progress: Called with (done, total, note), about once a second.
 
     Returns:
@@ -100,28 +105,36 @@ def map(
         RunError: Nothing can be started or written.
         KeyboardInterrupt: With what is kept.
     """
-    items, place = list(items), SweepFolder(Path(folder).absolute())
+    items, place = list(items), opened(folder)
     names = _names(function, items, ids)
     for key, value in (("jobs", jobs), ("tries", tries), ("threads", threads)):
         if value is not None and value < 1:
             raise InputError(f"sweep: {key} is {value}", "give at least 1")
     if minutes is not None and not minutes > 0:
         raise InputError(f"sweep: minutes is {minutes}", "give a time above 0, or none")
+    if not 0.0 <= gpu <= 1.0:
+        raise InputError(f"sweep: gpu is {gpu}", "give the part of one that a call takes, 0 to 1")
     place.make()
     work = _Work(place, dict(zip(names, items, strict=True)), tries, progress)
     work.sort(retry=retry)
-    if work.waiting:
-        engine = _engine(on, place.root, function, jobs=jobs, minutes=minutes, threads=threads)
+    for part in (gpu, 1.0):  # on a whole GPU what found too little memory on a part of one
+        if not work.waiting:
+            break
+        engine = _engine(
+            on, place.address, function, jobs=jobs, minutes=minutes, threads=threads, gpu=part
+        )
+        work.packed = 0.0 < part < 1.0
         try:
             work.through(engine)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(
                 f"{str(stop) or 'interrupted by Ctrl-C'}\n  kept: {work.done} of {len(names)} in "
-                f"{place.shots}\n  resume: run the same command again"
+                f"{place.address}\n  resume: run the same command again"
             ) from stop
         finally:
             engine.close()
             place.tidy()
+        work.waiting.extend(work.crowded)
     return work.outcomes()
 
 
@@ -155,6 +168,8 @@ class _Work:
         self.place, self.items, self.tries, self.progress = place, items, tries, progress
         self.waiting: collections.deque[str] = collections.deque()
         self.held: set[str] = set()  # somebody else is at work on them
+        self.packed = False  # whether several share a GPU
+        self.crowded: list[str] = []  # they wait for a GPU of their own
         self.failed: dict[str, list[dict[str, Any]]] = {}
         self.done = 0
         self._began, self._before = time.monotonic(), 0
@@ -193,14 +208,13 @@ class _Work:
 
     def outcomes(self) -> list[Outcome]:
         """One per task, in their order."""
-        return [self._outcome(name) for name in self.items]
+        rows = self.place.rows([name for name in self.items if name not in self.failed])
+        return [self._outcome(name, rows.get(name, {})) for name in self.items]
 
-    def _outcome(self, name: str) -> Outcome:
+    def _outcome(self, name: str, row: dict[str, Any]) -> Outcome:
         if records := self.failed.get(name):
             return Outcome(name, None, tries=len(records), failure=records[-1])
-        row = self.place.row(name) or {}
-        folder = self.place.shots / name
-        return Outcome(name, folder, row.get("value"), int(row.get("tries", 1)))
+        return Outcome(name, self.place.files(name), row.get("value"), int(row.get("tries", 1)))
 
     def _final(self, records: list[dict[str, Any]]) -> bool:
         return len(records) >= self.tries or any(not record["again"] for record in records)
@@ -221,7 +235,9 @@ class _Work:
             self.done += 1
         elif state == FAILED:
             if not self._found(name):
-                self.waiting.append(name)
+                last = self.place.failures(name)[name][-1]
+                crowded = self.packed and last.get("memory")
+                (self.crowded if crowded else self.waiting).append(name)
         elif state:
             self.held.add(name)
         else:
@@ -229,16 +245,12 @@ class _Work:
 
     def _look_at_held(self) -> None:
         """See what the others have made of what they hold."""
-        clock = self.place.root / "claims" / f".clock.{os.getpid()}"
-        clock.touch()
-        now = clock.stat().st_mtime
-        clock.unlink()
         for name in sorted(self.held):
             if self._found(name):
                 self.held.discard(name)
-            elif is_stale(self.place.claim(name), now):
-                self.held.discard(name)
-                self.waiting.append(name)
+        for name in self.place.abandoned(sorted(self.held)):
+            self.held.discard(name)
+            self.waiting.append(name)
 
     def _tell(self) -> None:
         left = len(self.items) - self.done - len(self.failed)
@@ -286,12 +298,13 @@ def _names(function: Function, items: Sequence[Any], ids: Sequence[str] | None) 
 
 def _engine(
     on: str,
-    root: Path,
+    root: str | Path,
     function: Function,
     *,
     jobs: int | None,
     minutes: float | None,
     threads: int,
+    gpu: float,
 ) -> Engine:
     """What places the tasks.
 
@@ -303,13 +316,14 @@ def _engine(
         from gsfluent.sweep.ray_pool import RayPool
 
         return RayPool(
-            root, function, jobs=jobs, minutes=minutes, threads=threads, address=address or "auto"
-        )
+            root, function, jobs=jobs, minutes=minutes, threads=threads, gpu=gpu,
+            address=address or "auto",
+        )  # fmt: skip
     jobs = jobs or os.cpu_count() or 1
     if on == "local":
-        return LocalPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
+        return LocalPool(root, function, jobs=jobs, minutes=minutes, threads=threads, gpu=gpu)
     if on == "slurm":
         from gsfluent.sweep.slurm import SlurmPool
 
-        return SlurmPool(root, function, jobs=jobs, minutes=minutes, threads=threads)
+        return SlurmPool(root, function, jobs=jobs, minutes=minutes, threads=threads, gpu=gpu)
     raise InputError(f"--on {on}: no such engine", "give local, slurm, ray or ray=HOST:PORT")

@@ -8,64 +8,32 @@ remembered, so any driver can go on from it, also several at a time.
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import secrets
 import shutil
 import socket
 import time
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
-from gsfluent.process import boot, is_alive
+from gsfluent.sweep.claims import (
+    claimed,
+    has_ended,
+    is_stale,
+    myself,
+    read_words,
+    write_words,
+)
 
 ROW = "row.json"
 """What a task returned, in its folder."""
 LOG = "log.txt"
 """What a try has said."""
-_OWNER = "try.json"
+OWNER = "try.json"
+"""Who makes a try, in its folder."""
 _LAST_LINES = 50
-
-
-def myself() -> dict[str, Any]:
-    """This process, in words that others can judge."""
-    return {
-        "process": os.getpid(),
-        "host": socket.gethostname(),
-        "boot": boot(),
-        "seconds": time.time(),
-    }
-
-
-def has_ended(words: dict[str, Any]) -> bool:
-    """Whether a process has surely ended; of other machines nobody knows."""
-    if words.get("host") != socket.gethostname() or not words.get("boot"):
-        return False
-    if words["boot"] != boot():
-        return True  # this machine has started again since
-    try:
-        return not is_alive(int(words["process"]), float(words["seconds"]))
-    except (KeyError, TypeError, ValueError):
-        return False
-
-
-def read_words(path: Path) -> dict[str, Any] | None:
-    """A small JSON object; None where there is no whole one."""
-    try:
-        words = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return words if isinstance(words, dict) else None
-
-
-def write_words(path: Path, words: dict[str, Any]) -> None:
-    """Write a JSON object and make sure that it is on the disk."""
-    with path.open("w", encoding="utf-8") as stream:
-        json.dump(words, stream)
-        stream.flush()
-        os.fsync(stream.fileno())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +41,11 @@ class SweepFolder:
     """The folder of a sweep."""
 
     root: Path
+
+    @property
+    def address(self) -> str | Path:
+        """What other processes open it by."""
+        return self.root
 
     @property
     def shots(self) -> Path:
@@ -88,10 +61,29 @@ class SweepFolder:
         """The claim of a task."""
         return self.root / "claims" / name
 
+    def held(self, name: str) -> AbstractContextManager[bool]:
+        """Hold the claim of a task; whether it is ours, as of :func:`claims.claimed`."""
+        return claimed(self.claim(name))
+
+    def free(self, name: str) -> None:
+        """Drop the claim of a process that is known to have ended."""
+        self.claim(name).unlink(missing_ok=True)
+
+    def abandoned(self, names: Iterable[str]) -> list[str]:
+        """Those of some tasks that nobody is at work on."""
+        clock = self.claim(f".clock.{os.getpid()}")
+        clock.touch()
+        now = clock.stat().st_mtime
+        clock.unlink()
+        return [name for name in names if is_stale(self.claim(name), now)]
+
     def done(self) -> set[str]:
         """Names of the finished tasks."""
-        with os.scandir(self.shots) as found:
-            return {entry.name for entry in found}
+        try:
+            with os.scandir(self.shots) as found:
+                return {entry.name for entry in found}
+        except FileNotFoundError:
+            return set()
 
     def is_done(self, name: str) -> bool:
         """Whether a task is finished."""
@@ -101,6 +93,14 @@ class SweepFolder:
         """The row of a finished task: ``id``, ``value``, ``tries``, ``host``, ``seconds``."""
         return read_words(self.shots / name / ROW)
 
+    def rows(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:
+        """The rows of those of some tasks that are finished."""
+        return {name: row for name in names if (row := self.row(name)) is not None}
+
+    def files(self, name: str) -> Path | None:
+        """Where the files of a finished task lie; None where that is not on this machine."""
+        return self.shots / name
+
     def begin(self, name: str) -> Path:
         """A folder for a try, with what a try of a process that has ended left in it.
 
@@ -108,7 +108,7 @@ class SweepFolder:
         """
         mine = self.root / "work" / f"{name}.{secrets.token_hex(4)}"
         for left in self.tries(name):
-            if not has_ended(read_words(left / _OWNER) or {}):
+            if not has_ended(read_words(left / OWNER) or {}):
                 continue
             if mine.exists():
                 shutil.rmtree(left, ignore_errors=True)
@@ -116,7 +116,7 @@ class SweepFolder:
             with suppress(OSError):  # another driver was quicker
                 left.rename(mine)
         mine.mkdir(exist_ok=True)
-        write_words(mine / _OWNER, myself())
+        write_words(mine / OWNER, myself())
         return mine
 
     def tries(self, name: str, process: int | None = None) -> list[Path]:
@@ -125,7 +125,7 @@ class SweepFolder:
         if process is None:
             return found
         here = socket.gethostname()
-        owners = [read_words(path / _OWNER) or {} for path in found]
+        owners = [read_words(path / OWNER) or {} for path in found]
         return [
             path
             for path, owner in zip(found, owners, strict=True)
@@ -139,7 +139,7 @@ class SweepFolder:
             OSError: The disk is full.
         """
         write_words(folder / ROW, row)
-        (folder / _OWNER).unlink(missing_ok=True)
+        (folder / OWNER).unlink(missing_ok=True)
         _sync(folder)
         try:
             folder.rename(self.shots / name)
@@ -158,7 +158,7 @@ class SweepFolder:
             if has_ended(read_words(claim) or {}):
                 claim.unlink(missing_ok=True)
         for left in (self.root / "work").iterdir():
-            ended = has_ended(read_words(left / _OWNER) or {})
+            ended = has_ended(read_words(left / OWNER) or {})
             if ended and self.is_done(left.name.partition(".")[0]):
                 shutil.rmtree(left, ignore_errors=True)
 

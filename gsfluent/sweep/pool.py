@@ -20,8 +20,10 @@ from types import FrameType
 from typing import Any
 
 from gsfluent.errors import InputError, RunError
+from gsfluent.hardware import bound_memory, graphics_cards
 from gsfluent.sweep.attempt import FAILED, Function, attempt
-from gsfluent.sweep.folder import SweepFolder, last_lines
+from gsfluent.sweep.bucket import opened
+from gsfluent.sweep.folder import last_lines
 
 _PATIENCE = 20.0  # seconds in which a stopped task may put down what it has
 _BROKEN = "broken"  # a try that could not even note its failure
@@ -32,6 +34,7 @@ _SPAWN = multiprocessing.get_context("spawn")  # torch's threads do not survive 
 class _Worker:
     process: Any
     pipe: Connection
+    card: str = ""  # Its GPU; empty where none is asked for
     task: str = ""  # Its task; empty while it has none
     since: float = 0.0  # When it got it
     ready: bool = False  # Whether it has said that it has begun with it
@@ -41,19 +44,22 @@ class LocalPool:
     """Tries tasks in processes of this machine, each with threads of its own.
 
     Args:
-        root: Folder of the sweep.
+        root: Folder of the sweep, or its store.
         function: What a task does; importable by name, since processes are spawned.
         jobs: Tasks at a time.
         minutes: Longest time of a try; None for any.
         threads: Threads of a process.
+        gpu: Part of a GPU that a process takes; 0 for none. As many as fit share one, each with a
+            bound on its memory.
 
     Raises:
-        InputError: The function cannot be sent to another process.
+        InputError: The function cannot be sent to another process, or there is no GPU.
     """
 
     def __init__(
-        self, root: Path, function: Function, *, jobs: int, minutes: float | None, threads: int = 1
-    ) -> None:
+        self, root: str | Path, function: Function, *, jobs: int, minutes: float | None,
+        threads: int = 1, gpu: float = 0.0,
+    ) -> None:  # fmt: skip
         try:
             pickle.dumps(function)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -61,9 +67,14 @@ class LocalPool:
                 f"sweep: {function!r} cannot be sent to another process ({error})",
                 "give a function that stands at the top of a module",
             ) from error
-        self._place, self._function, self._jobs = SweepFolder(root), function, jobs
+        self._place, self._function, self._jobs = opened(root), function, jobs
         self._seconds = None if minutes is None else 60.0 * minutes
-        self._threads = threads
+        self._threads, self._gpu = threads, gpu
+        self._cards = graphics_cards() if gpu else []
+        if gpu:
+            if not self._cards:
+                raise InputError("sweep: no GPU is visible here", "use a CPU, or another machine")
+            self._jobs = min(jobs, len(self._cards) * int(1.0 / gpu + 1e-6))
         self._workers: list[_Worker] = []
         self._stillborn = 0
 
@@ -116,7 +127,7 @@ class LocalPool:
                 state, words = worker.pipe.recv()
                 if state == _BROKEN:
                     raise RunError(
-                        f"{worker.task}: {words}", f"what is in {self._place.root}",
+                        f"{worker.task}: {words}", f"what is in {self._place.address}",
                         "free space, then run the same command again",
                     )  # fmt: skip
                 if state:
@@ -139,7 +150,8 @@ class LocalPool:
             self._stillborn += 1
             if self._stillborn > 3 + self._jobs:
                 raise RunError(
-                    "sweep: processes end as soon as they start", f"what is in {self._place.root}",
+                    "sweep: processes end as soon as they start",
+                    f"what is in {self._place.address}",
                     "a script that calls gsfluent.sweep.map needs `if __name__ == '__main__':`",
                 )  # fmt: skip
             return ""
@@ -153,7 +165,7 @@ class LocalPool:
         left = self._place.tries(worker.task, worker.process.pid)
         log = last_lines(left[0]) if left else []
         self._place.fail(worker.task, {"kind": kind, "message": said, "again": again, "log": log})
-        self._place.claim(worker.task).unlink(missing_ok=True)
+        self._place.free(worker.task)
         if not again:
             for folder in left:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -162,28 +174,33 @@ class LocalPool:
     def _spawn(self) -> _Worker:
         ours, theirs = _SPAWN.Pipe()
         process = _SPAWN.Process(
-            target=_serve, args=(theirs, self._place.root, self._function), daemon=True
-        )
-        with _threads(self._threads):
+            target=_serve, args=(theirs, self._place.address, self._function, self._gpu),
+            daemon=True,
+        )  # fmt: skip
+        taken = [worker.card for worker in self._workers]
+        card = min(self._cards, key=taken.count, default="")
+        variables = {"OMP_NUM_THREADS": str(self._threads)}
+        with environment(variables | ({"CUDA_VISIBLE_DEVICES": card} if card else {})):
             process.start()
         theirs.close()
-        worker = _Worker(process, ours)
+        worker = _Worker(process, ours, card)
         self._workers.append(worker)
         return worker
 
 
 @contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """The number of threads of processes that start meanwhile: read when they import torch."""
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = str(count)
+def environment(variables: dict[str, str]) -> Iterator[None]:
+    """Variables of processes that start meanwhile, which read them when they import torch."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _signal(number: int) -> str:
@@ -193,13 +210,15 @@ def _signal(number: int) -> str:
         return f"signal {number}"
 
 
-def _serve(pipe: Connection, root: Path, function: Function) -> None:
+def _serve(pipe: Connection, root: str | Path, function: Function, gpu: float) -> None:
     """Try the tasks that come, until one fails or nobody is there any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the driver says what to do
     signal.signal(signal.SIGTERM, _stop)
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+        if 0.0 < gpu < 1.0:
+            bound_memory(gpu)
         while True:
             name, item = pipe.recv()
             pipe.send(("", ""))

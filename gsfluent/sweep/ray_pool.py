@@ -14,7 +14,8 @@ from typing import Any
 
 from gsfluent.errors import InputError, RunError, need
 from gsfluent.sweep.attempt import FAILED, Function
-from gsfluent.sweep.folder import SweepFolder, last_lines
+from gsfluent.sweep.bucket import opened
+from gsfluent.sweep.folder import last_lines
 from gsfluent.sweep.pool import LocalPool
 
 _LOOK = 0.5  # seconds
@@ -25,7 +26,7 @@ class RayPool:
     """Hands every task to a Ray cluster that runs already.
 
     Args:
-        root: Folder of the sweep, under the same path on every machine.
+        root: Folder of the sweep, under the same path on every machine; or its store.
         function: What a task does; its module has to be importable there.
         jobs: Tasks at a time; None for as many as the cluster has processors for.
         minutes: Longest time of a task; None for any.
@@ -39,7 +40,7 @@ class RayPool:
     """
 
     def __init__(
-        self, root: Path, function: Function, *, jobs: int | None, minutes: float | None,
+        self, root: str | Path, function: Function, *, jobs: int | None, minutes: float | None,
         threads: int, gpu: float = 0.0, address: str = "auto",
     ) -> None:  # fmt: skip
         self._ray = ray = need("ray", "ray", "--on ray")
@@ -68,8 +69,8 @@ class RayPool:
                 f"--on ray={address}: none of {len(machines)} machines has {words}",
                 "lower `each:` of the sweep, or add machines",
             )
-        self._place, self._function, self._most = SweepFolder(root), function, jobs or sum(fits)
-        self._minutes, self._threads = minutes, threads
+        self._place, self._function, self._most = opened(root), function, jobs or sum(fits)
+        self._minutes, self._threads, self._gpu = minutes, threads, gpu
         self._refs: dict[Any, str] = {}
         # what dies is tried again by the rules of the sweep, not by Ray's
         self._try = ray.remote(
@@ -82,8 +83,8 @@ class RayPool:
 
     def start(self, name: str, item: Any) -> None:
         """Hand out a task."""
-        settings = {"minutes": self._minutes, "threads": self._threads}
-        ref = self._try.remote(self._place.root, name, self._function, item, settings)
+        settings = {"minutes": self._minutes, "threads": self._threads, "gpu": self._gpu}
+        ref = self._try.remote(self._place.address, name, self._function, item, settings)
         self._refs[ref] = name
 
     def ended(self, seconds: float) -> list[tuple[str, str]]:
@@ -111,7 +112,7 @@ class RayPool:
             return str(self._ray.get(ref))
         except errors.RayTaskError as error:
             raise RunError(
-                f"{name}: {error.cause}", f"what is in {self._place.root}",
+                f"{name}: {error.cause}", f"what is in {self._place.address}",
                 "mend that machine or its folder, then run the same command again",
             ) from error  # fmt: skip
         except errors.RayError as error:
@@ -126,7 +127,7 @@ class RayPool:
                 },
             )
             # if it lives on out of sight it loses the race for the name, as any second try does
-            self._place.claim(name).unlink(missing_ok=True)
+            self._place.free(name)
             return FAILED
 
 
@@ -134,7 +135,9 @@ _POOLS: dict[tuple[Any, ...], LocalPool] = {}
 """The pool of a worker of Ray, kept from task to task, for torch is slow to import."""
 
 
-def _try(root: Path, name: str, function: Function, item: Any, settings: dict[str, Any]) -> str:
+def _try(
+    root: str | Path, name: str, function: Function, item: Any, settings: dict[str, Any]
+) -> str:
     """Try a task in a process of its own; runs in a worker of Ray."""
     # Ray may give the next task another GPU
     key = (root, function, os.environ.get("CUDA_VISIBLE_DEVICES"), *settings.items())
@@ -142,8 +145,7 @@ def _try(root: Path, name: str, function: Function, item: Any, settings: dict[st
         for pool in _POOLS.values():
             pool.close()
         _POOLS.clear()
-        place = SweepFolder(root)
-        place.make()
+        opened(root).make()
         _POOLS[key] = LocalPool(root, function, jobs=1, **settings)
     pool = _POOLS[key]
     while True:

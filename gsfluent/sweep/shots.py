@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from gsfluent.errors import InputError, RunError
+from gsfluent.hardware import graphics_cards, part_of_gpu
 from gsfluent.io import atomic_path
 from gsfluent.io.checked.files import read_json
 from gsfluent.plan.cost import CostModel
@@ -20,19 +21,23 @@ from gsfluent.plan.plan import plan_shot
 from gsfluent.progress import Reporter
 from gsfluent.run.shot import run_shot
 from gsfluent.stages.solids import context_of, make_solids
+from gsfluent.sweep.bucket import SweepBucket, opened
 from gsfluent.sweep.engine import Outcome, map
+from gsfluent.sweep.folder import SweepFolder
+from gsfluent.sweep.pool import environment
 from gsfluent.sweep.table import write_sheet, write_table
 from gsfluent.sweep.tasks import Sweep, Task, tasks_of
 
 _log = logging.getLogger(__name__)
 _PLANNED = 5
+_LOOKED_AT = 100
 REFUSED = "refused"
 """Verdict of a shot whose input cannot be."""
 
 
 def run_sweep(
     sweep: Sweep,
-    out: Path,
+    out: str | Path,
     *,
     device: torch.device,
     seed: int = 0,
@@ -45,7 +50,8 @@ def run_sweep(
 
     Args:
         sweep: What differs.
-        out: Folder of the results; made when missing.
+        out: Folder of the results, made when missing. Or ``s3://BUCKET/PLACE`` for shots, table
+            and failures; solids are then made once on every machine, and stay there.
         device: Where the work is done.
         seed: Of the draws, of the solids, and of shots that have none of their own.
         jobs: Shots at a time; as many as there are cores for when absent.
@@ -60,23 +66,52 @@ def run_sweep(
         InputError: A shot cannot be; nothing has begun.
         KeyboardInterrupt: With what is kept.
     """
-    tasks = tasks_of(sweep, out, device=str(device), seed=seed, progress=reporter.task("look"))
+    place = opened(out)
+    tasks = tasks_of(
+        sweep, place.root, device=device.type, seed=seed, progress=reporter.task("look")
+    )
+    place.make()
     each = sweep.each
     if jobs is None and not on.startswith("ray"):  # which knows the processors of its machines
         jobs = max((os.cpu_count() or 1) // each.cpus, 1)
+    done = place.done()
+    gpu = 0.0
+    if device.type == "cuda":
+        gpu = each.gpu or _part(device, place, [task for task in tasks if task.id not in done])
     settings: dict[str, Any] = {"jobs": jobs, "threads": each.cpus, "on": on, "retry": retry}
-    open_ = [task for task in tasks if not (out / "shots" / task.id).exists()]
-    first = {task.solids: task for task in open_}
-    # before all others, so that none of them waits for what another makes
-    map(
-        make_shared_solids, first.values(), out / "solids", ids=list(first),
-        tries=each.tries, progress=reporter.task("solids"), **settings,
-    )  # fmt: skip
-    outcomes = map(
-        run_task, tasks, out, ids=[task.id for task in tasks], tries=each.tries,
-        minutes=each.minutes, progress=reporter.task("shots"), **settings,
-    )  # fmt: skip
-    return _summary(out, tasks, outcomes)
+    settings["gpu"] = gpu
+    first = {task.solids: task for task in tasks if task.id not in done}
+    alone = None if device.index is None else graphics_cards()[device.index]
+    with environment({} if alone is None else {"CUDA_VISIBLE_DEVICES": alone}):
+        # before all others, so that none of them waits for what another makes
+        map(
+            make_shared_solids, first.values(), f"{place.address}/solids", ids=list(first),
+            tries=each.tries, progress=reporter.task("solids"), **settings,
+        )  # fmt: skip
+        outcomes = map(
+            run_task, tasks, place.address, ids=[task.id for task in tasks], tries=each.tries,
+            minutes=each.minutes, progress=reporter.task("shots"), **settings,
+        )  # fmt: skip
+    return _summary(place, tasks, outcomes)
+
+
+def _part(device: torch.device, place: SweepFolder, left: list[Task]) -> float:
+    """Part of a GPU that a shot takes: by the peaks of shots that are done, else by a few plans."""
+    rows = place.rows(sorted(place.done())[:_LOOKED_AT]).values()
+    peaks = [row["value"]["figures"].get("peak_device_memory_bytes") or 0 for row in rows]
+    if not any(peaks):
+        model = CostModel.load(device)
+        plans = [plan_shot(t.shot(), device=device, seed=t.seed, model=model) for t in _some(left)]
+        peaks = [plan["memory_bytes"] for plan in plans]
+    total = torch.cuda.get_device_properties(device).total_memory
+    part = part_of_gpu(max(peaks, default=0), total)
+    _log.info("%d shots share a GPU: one takes %.2g GB", int(1 / part), max(peaks, default=0) / 1e9)
+    return part
+
+
+def _some(tasks: list[Task]) -> list[Task]:
+    """A few of many, from the first to the last."""
+    return tasks[:: max(len(tasks) // _PLANNED, 1)][:_PLANNED]
 
 
 def make_shared_solids(task: Task, folder: Path) -> dict[str, Any]:
@@ -149,18 +184,24 @@ def figures_of(record: dict[str, Any]) -> dict[str, Any]:
     found |= {name: frames[name][-1] for name in _AT_THE_END if frames.get(name)}
     stages = [stage for stage in record["stages"] if not stage["resumed"]]
     found["stage_seconds"] = sum(stage["seconds"] for stage in stages)
-    found["peak_memory_bytes"] = max((s["peak_memory_bytes"] for s in stages), default=0)
+    for name in ("peak_memory_bytes", "peak_device_memory_bytes"):
+        found[name] = max((s.get(name) or 0 for s in stages), default=0)
     return found
 
 
-def _summary(out: Path, tasks: list[Task], outcomes: list[Outcome]) -> dict[str, Any]:
+def _summary(place: SweepFolder, tasks: list[Task], outcomes: list[Outcome]) -> dict[str, Any]:
     """Write table, sheet and failures; say what came out."""
+    out = place.root
     failures = [outcome.failure for outcome in outcomes if outcome.failure is not None]
     with atomic_path(out / "failures.jsonl") as part:
         part.write_text("".join(json.dumps(failure) + "\n" for failure in failures))
     done = [outcome for outcome in outcomes if outcome.failure is None]
     tables = write_table(out, done)
-    sheet = write_sheet(out, done, failures)
+    sheet = {}
+    if isinstance(place, SweepBucket):
+        place.leave([*tables, out / "failures.jsonl"])
+    else:  # a page needs its pictures beside it
+        sheet = {"sheet": str(write_sheet(out, done, failures))}
     verdicts = Counter(str(outcome.value["verdict"]) for outcome in done)
     for failure in failures[:5]:
         _log.warning("%s failed: %s", failure["id"], str(failure["message"]).splitlines()[0])
@@ -170,15 +211,15 @@ def _summary(out: Path, tasks: list[Task], outcomes: list[Outcome]) -> dict[str,
         "solids": len({task.solids for task in tasks}),
         "verdicts": dict(verdicts),
         "failed": len(failures),
-        "out": str(out),
-        "tables": [str(path) for path in tables],
-        "sheet": str(sheet),
-        "failures": str(out / "failures.jsonl"),
+        "out": str(place.address),
+        "tables": [f"{place.address}/{path.name}" for path in tables],
+        **sheet,
+        "failures": f"{place.address}/failures.jsonl",
     }
 
 
 def plan_sweep(
-    sweep: Sweep, out: Path, *, device: torch.device, seed: int = 0, jobs: int | None = None
+    sweep: Sweep, out: str | Path, *, device: torch.device, seed: int = 0, jobs: int | None = None
 ) -> dict[str, Any]:
     """What a sweep will cost, by the plans of a few of its shots.
 
@@ -189,10 +230,12 @@ def plan_sweep(
     Raises:
         InputError: A shot cannot be.
     """
-    tasks = tasks_of(sweep, out, device=str(device), seed=seed)
+    place = opened(out)
+    tasks = tasks_of(sweep, place.root, device=device.type, seed=seed)
     jobs = jobs or max((os.cpu_count() or 1) // sweep.each.cpus, 1)
-    left = [task for task in tasks if not (out / "shots" / task.id).exists()]
-    some = left[:: max(len(left) // _PLANNED, 1)][:_PLANNED]
+    done = place.done()
+    left = [task for task in tasks if task.id not in done]
+    some = _some(left)
     model = CostModel.load(device)
     plans = [plan_shot(task.shot(), device=device, seed=task.seed, model=model) for task in some]
     solids = len({task.solids for task in left})

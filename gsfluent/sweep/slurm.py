@@ -10,7 +10,8 @@ from typing import Any
 
 from gsfluent.errors import InputError, need
 from gsfluent.sweep.attempt import FAILED, Function, attempt
-from gsfluent.sweep.folder import SweepFolder, last_lines
+from gsfluent.sweep.bucket import SweepBucket, opened
+from gsfluent.sweep.folder import last_lines
 
 _LONGEST = 24 * 60.0  # minutes of a job that has no limit of its own
 _POLL = 2.0  # seconds
@@ -20,11 +21,12 @@ class SlurmPool:
     """Hands every task to the cluster as a job of its own.
 
     Args:
-        root: Folder of the sweep, under the same path on every machine.
+        root: Folder of the sweep, under the same path on every machine; or its store.
         function: What a task does.
         jobs: Jobs queued or running at a time.
         minutes: Longest time of a task; a day when None.
         threads: Processors of a job.
+        gpu: Above 0 for jobs that need a GPU: each has one of its own.
         cluster: ``slurm``, or ``local`` for submitit's stand-in on this machine.
 
     Raises:
@@ -33,21 +35,24 @@ class SlurmPool:
     """
 
     def __init__(
-        self, root: Path, function: Function, *, jobs: int, minutes: float | None, threads: int,
-        cluster: str = "slurm",
+        self, root: str | Path, function: Function, *, jobs: int, minutes: float | None,
+        threads: int, gpu: float = 0.0, cluster: str = "slurm",
     ) -> None:  # fmt: skip
         submitit = need("submitit", "slurm", "--on slurm")
         if cluster == "slurm" and shutil.which("sbatch") is None:
             raise InputError(
                 "--on slurm: there is no sbatch on this machine", "run it where jobs are submitted"
             )
-        self._place, self._function, self._most = SweepFolder(root), function, jobs
+        self._place, self._function, self._most = opened(root), function, jobs
         self._jobs: dict[str, Any] = {}
-        self._executor = submitit.AutoExecutor(folder=root / "slurm" / "%j", cluster=cluster)
+        # what submitit leaves its machines have to share
+        place = Path.cwd() if isinstance(self._place, SweepBucket) else self._place.root
+        self._executor = submitit.AutoExecutor(folder=place / "slurm" / "%j", cluster=cluster)
         limit = math.ceil(minutes or _LONGEST)
         self._executor.update_parameters(
-            name="gsfluent", timeout_min=limit, cpus_per_task=threads, tasks_per_node=1
-        )
+            name="gsfluent", timeout_min=limit, cpus_per_task=threads, tasks_per_node=1,
+            **({"gpus_per_node": 1} if gpu else {}),
+        )  # fmt: skip
 
     def room(self) -> int:
         """How many tasks may be started now."""
@@ -56,7 +61,7 @@ class SlurmPool:
     def start(self, name: str, item: Any) -> None:
         """Submit a task."""
         self._jobs[name] = self._executor.submit(
-            attempt, self._place.root, name, self._function, item
+            attempt, self._place.address, name, self._function, item
         )
 
     def ended(self, seconds: float) -> list[tuple[str, str]]:

@@ -45,6 +45,9 @@ class Each:
     """``each:`` - what one shot may take."""
 
     cpus: int = key(whole(1, 4096), "Threads of a shot.", "2", default=1)
+    gpu: float | None = optional(
+        number(0.0, 1.0, above=0.0), "Part of a GPU; by its memory when absent.", "0.25"
+    )
     minutes: float | None = optional(number(above=0.0), "Longest time of a shot [min].", "30")
     tries: int = key(
         whole(1, 100), "Tries of a shot that was killed or ran out of memory.", "3", default=TRIES

@@ -64,8 +64,19 @@ def test_the_right_key_is_named(vase: Path, key: str, capsys: pytest.CaptureFixt
     assert "is a mesh" in said and "write mesh: vase.glb" in said
 
 
+def test_a_mesh_is_planned_as_it_would_run(vase: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted(vase.parent.iterdir())
+    assert main(["plan", str(vase), "--no-probe", "--json", "--material", "glass"]) == 0
+    said = capsys.readouterr()
+    plan = json.loads(said.out)
+    assert plan["particles"] > 0 and plan["breaking"][0]["material"] == "glass"
+    assert "event: " in said.err and sorted(vase.parent.iterdir()) == before
+    assert main(["plan", str(vase.with_suffix(".txt"))]) == 2
+    assert "does not exist" in capsys.readouterr().err
+
+
 def test_a_mesh_where_a_shot_is_wanted(vase: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", str(vase)]) == 2
+    assert main(["chart", str(vase), "--error", "5%"]) == 2
     assert "write mesh: vase.glb" in capsys.readouterr().err
 
 

@@ -54,7 +54,7 @@ def read(folder: Path, **keys: Any) -> Shot:
 
 
 @pytest.mark.parametrize(("solve", "most"), [
-    ({"quality": "preview"}, 40_000), ({"quality": "shot"}, 300_000),
+    ({"quality": "preview"}, 10_000), ({"quality": "shot"}, 300_000),
     ({"quality": "preview", "max_points": 0}, 0), ({"max_points": 7}, 7),
 ])  # fmt: skip
 def test_a_preview_spends_fewer_points_on_walls(

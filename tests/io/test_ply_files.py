@@ -379,3 +379,13 @@ def test_compressed_splat_that_is_incomplete_is_said(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", {"chunk": chunk, "vertex": vertex})
     with pytest.raises(InputError, match="compressed splat is incomplete"):
         load_splats(tmp_path / "a.ply")
+
+
+def test_a_volume_names_the_splats_that_it_belongs_to(tmp_path: Path) -> None:
+    volume = tmp_path / "melon.volume.npz"
+    with pytest.raises(InputError, match=r"melon\.ply, which is not there"):
+        gsfluent.load(volume)
+    (tmp_path / "melon.ply").touch()
+    with pytest.raises(InputError) as caught:
+        gsfluent.load(volume)
+    assert str(caught.value).endswith(f"load {tmp_path / 'melon.ply'}")

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from simulation_shapes import ellipsoid
 
 from gsfluent.config import Shot
@@ -15,7 +17,7 @@ from gsfluent.errors import InputError
 from gsfluent.io.splats.load import save_splats
 from gsfluent.plan import probe as plan_probe
 from gsfluent.plan.cost import CostModel, machine_key
-from gsfluent.plan.fact import actual_work, compare, learn
+from gsfluent.plan.fact import actual_work, compare, learn, seconds_left
 from gsfluent.plan.plan import cost_model, plan_shot
 from gsfluent.run.shot import run_shot
 
@@ -201,3 +203,36 @@ def test_work_that_was_foreseen_wrongly_is_not_the_models_fault(shot: Shot, stor
     assert section["ratio"]["stages"]["simulate"]["seconds"] == pytest.approx(
         stages["simulate"]["seconds"] / planned
     )
+
+
+PLANNED = {"fill": 10.0, "simulate": 100.0, "render": 20.0}
+
+
+def test_time_left_is_the_plan_at_the_pace_of_the_run() -> None:
+    assert seconds_left(PLANNED, {}, "fill", 0.0, 0.0) == pytest.approx(130.0)
+    # what took twice its time makes more be expected of all that follows, a short stage by less
+    slow = seconds_left(PLANNED, {"fill": 20.0}, "simulate", 0.0, 0.0)
+    assert slow is not None and 150.0 < slow < 240.0
+    late = seconds_left(PLANNED, {"fill": 20.0, "simulate": 200.0}, "render", 0.0, 0.0)
+    assert late is not None and 35.0 < late < 40.0
+    # on plan, half of the work is half of the time
+    assert seconds_left(PLANNED, {"fill": 10.0}, "simulate", 50.0, 0.5) == pytest.approx(70.0)
+    # a stage that is late is never said to be over
+    late = seconds_left(PLANNED, {"fill": 10.0}, "simulate", 400.0, 0.8)
+    assert late is not None and 60.0 < late < 300.0
+    over = seconds_left(PLANNED, {"fill": 10.0}, "render", 300.0, 0.0)
+    assert over is not None and over > 0.0
+    # at its end its own pace counts alone
+    end = seconds_left(PLANNED, {"fill": 10.0, "simulate": 100.0}, "render", 99.0, 0.99)
+    assert end == pytest.approx(1.0, rel=0.1)
+    # nothing is said where the plan knows nothing, and found stages teach nothing
+    assert seconds_left({**PLANNED, "render": None}, {}, "fill", 1.0, 0.0) is None
+    assert seconds_left(PLANNED, {}, "simulate", 0.0, 0.0) == pytest.approx(120.0)
+
+
+@given(
+    st.floats(0.1, 1e4), st.floats(0.0, 1e4), st.floats(0.0, 1.0), st.sampled_from(list(PLANNED))
+)
+def test_time_left_is_a_time(took: float, elapsed: float, share: float, current: str) -> None:
+    left = seconds_left(PLANNED, {"fill": took}, current, elapsed, share)
+    assert left is not None and math.isfinite(left) and left >= 0.0

@@ -70,7 +70,7 @@ def test_the_fall_breaks_what_can_break(tmp_path: Path, material: str) -> None:
     assert shot.output.seconds > fall + 1.0 / slow
     # what is fast for its size is shown slower, in as many frames a second of film
     assert shot.output.fps == pytest.approx(30.0 * slow)
-    assert (slow > 1.0) == (0.03 * speed / 0.2 > 1.5)
+    assert (slow > 1.0) == (0.06 * speed / 0.2 > 1.5)
 
 
 def test_an_edited_shot_is_not_written_over(tmp_path: Path) -> None:
@@ -98,6 +98,15 @@ def test_folders(tmp_path: Path) -> None:
         find_input(tmp_path / "photographs")
     with pytest.raises(InputError, match="neither a shot"):
         find_input(tmp_path / "photographs" / "1.jpg")
+
+
+@pytest.mark.parametrize("name", ["", "meta.json"])
+def test_an_unpacked_sog_is_told_to_be_packed(tmp_path: Path, name: str) -> None:
+    for file in ("meta.json", "means_l.webp"):
+        (tmp_path / file).write_bytes(b"{}")
+    with pytest.raises(InputError, match=r"unpacked.*\n.*zip -0") as caught:
+        find_input(tmp_path / name)
+    assert f"{tmp_path.name}.sog" in str(caught.value)
 
 
 def front_of(path: Path) -> list[float] | None:

@@ -47,6 +47,21 @@ def test_a_silence_is_broken() -> None:
     assert not spoken.wait(0.2)  # over is over
 
 
+def test_progress_says_what_is_left(caplog: pytest.LogCaptureFixture) -> None:
+    def adds(name: str, done: int, total: int) -> str:
+        return f"{total - done} to go with {name}"
+
+    with (
+        caplog.at_level(logging.INFO),
+        heartbeat("gsfluent", lambda: "", adds=adds) as watched,
+    ):
+        task = watched(LineReporter(seconds=0.0)).task("fill")
+        task(1, 3, "voxels")
+        task(2, 3, "")
+    assert "fill: 1/3 voxels, 2 to go with fill" in caplog.messages
+    assert "fill: 2/3 1 to go with fill" in caplog.messages
+
+
 def test_warnings_are_heard_once() -> None:
     log = logging.getLogger("gsfluent.somewhere")
     with heard_warnings("gsfluent") as heard:

@@ -49,6 +49,11 @@ def never_ends(item: int, folder: Path) -> None:
     time.sleep(600)
 
 
+def its_card(item: int, folder: Path) -> str:
+    time.sleep(0.3)
+    return os.environ["CUDA_VISIBLE_DEVICES"]
+
+
 def names(count: int) -> list[str]:
     return [f"n{i}" for i in range(count)]
 

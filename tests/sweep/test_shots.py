@@ -19,6 +19,7 @@ from gsfluent.figure.page import Page
 from gsfluent.io import save_splats
 from gsfluent.results.store import StageStore
 from gsfluent.sweep import shots
+from gsfluent.sweep.bucket import SweepBucket
 from gsfluent.sweep.engine import Outcome
 from gsfluent.sweep.shots import REFUSED, make_shared_solids, run_sweep, run_task
 from gsfluent.sweep.tasks import FILE, Sweep, Task, read_sweep, tasks_of
@@ -265,6 +266,31 @@ def test_a_sweep_leaves_table_sheet_and_failures(
     assert "height 0.5, seed 0, 5 pieces, clean" in page and "killed by SIGKILL" in page
     (failure,) = (out / "failures.jsonl").read_text().splitlines()
     assert json.loads(failure)["kind"] == "process"
+
+
+def test_a_sweep_in_a_store_leaves_its_table_there(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left: list[str] = []
+
+    def mapped(function: Any, items: Any, folder: Any, *, ids: Any, **options: Any) -> Any:
+        left.append(str(folder))
+        value = {"index": 0, "seed": 0, "object": "o", "changes": {}, "verdict": "clean"}
+        value |= {"reason": "", "figures": {}}
+        return [Outcome(name, None, value, 1) for name in ids]
+
+    monkeypatch.setattr("tempfile.tempdir", str(place))
+    monkeypatch.setattr(shots, "map", mapped)
+    monkeypatch.setattr(SweepBucket, "done", lambda self: set())
+    monkeypatch.setattr(SweepBucket, "make", lambda self: None)
+    monkeypatch.setattr(
+        SweepBucket, "leave", lambda self, paths: left.extend(path.name for path in paths)
+    )
+    sweep = sweep_of(place, vary={"seed": [3]})
+    said = run_sweep(sweep, Path("s3://bucket/drops"), device=CPU, reporter=Silent())
+    assert left[:2] == ["s3://bucket/drops/solids", "s3://bucket/drops"]
+    assert {"table.csv", "failures.jsonl"} <= set(left) and "sheet" not in said
+    assert said["tables"][0] == "s3://bucket/drops/table.csv" and said["ok"]
 
 
 def test_names_of_pictures_are_no_part_of_a_page() -> None:

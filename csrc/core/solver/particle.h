@@ -4,6 +4,7 @@
 
 #include "core/material/loss.h"
 #include "core/material/more_laws.h"
+#include "core/material/viscous.h"
 #include "core/mpm/grid.h"
 #include "core/solver/clock.h"
 #include "core/solver/layout.h"
@@ -16,7 +17,16 @@ inline constexpr double kWeakening = 0.02;
 // Laws a kernel is compiled for: fewer laws, fewer registers.
 // kMoreLaws: those of more_laws.h too; on the CPU only (cpu/solver/solver_more.cpp).
 // kDamageField: elastic, NACC and phase_field; on the CPU only (cpu/solver/solver_fields.cpp).
-enum LawSet : int { kElasticOnly = 0, kBrittle = 1, kAnyLaw = 2, kMoreLaws = 3, kDamageField = 4 };
+// kViscousBrittle: elastic and NACC with Maxwell branches; CPU only
+// (cpu/solver/solver_viscous.cpp).
+enum LawSet : int {
+  kElasticOnly = 0,
+  kBrittle = 1,
+  kAnyLaw = 2,
+  kMoreLaws = 3,
+  kDamageField = 4,
+  kViscousBrittle = 5
+};
 
 // Weights at offset o in [0, 1): the stencil of grid.h with f = o + 1/2. `base` stays unset.
 template <typename T>
@@ -171,6 +181,49 @@ GSF_HOST_DEVICE bool move_axis(T step, T slack, int& l, T& o, bool& leaves) {
   return known && cell >= 0 && cell <= kLastCell;
 }
 
+// What is kept of a strain: itself, or where it was pulled back to.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> kept_strain(const ElasticState<T>& state) {
+  return state.guarded ? strain_from_isochoric(state.d, log_volume(state)) : state.e;
+}
+
+// What viscosity makes of the step of a law (core/material/viscous.h): the yield takes its time,
+// the Maxwell branch goes along and its spring shares in the stress. A spring that is not finite is
+// let go, and the point counts as invalid.
+template <typename T>
+GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T* row,
+                                      const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
+                                      T dt, ReturnMapped<T>& out) {
+  T* own = s.viscous + kViscousColumns * p;
+  const T share = own[6];
+  T left = T(1);  // of the spring's strain
+  if (out.plastic) {
+    const ElasticState<T> trial = elastic_state(update_strain(strain, increment), out.inverted);
+    if (own[8] > T(0)) {
+      const T way = yielding_share(own[8], dt);
+      out.strain = (T(1) - way) * kept_strain(trial) + way * out.strain;
+      out.alpha = alpha + way * (out.alpha - alpha);
+      const ElasticState<T> now = elastic_state(out.strain, false);
+      out.strain = kept_strain(now);
+      out.stress = kirchhoff_stress(row[0], row[1], now.d, now.j2m1);
+    }
+    left = kept_by_yield(kirchhoff_stress(row[0], row[1], trial.d, trial.j2m1), out.stress);
+  }
+  if (!(share > T(0))) return;
+  Sym3<T> e{own[0], own[1], own[2], own[3], own[4], own[5]};
+  e = left * relaxed_strain(e, increment, half_decay(own[7], dt));
+  if (!finite(e)) {
+    e = Sym3<T>{};
+    out.invalid = true;
+  }
+  const ElasticState<T> spring = elastic_state(e, out.inverted);
+  e = kept_strain(spring);
+  const T values[6] = {e.xx, e.yy, e.zz, e.xy, e.xz, e.yz};
+  for (int c = 0; c < 6; ++c) own[c] = values[c];
+  out.stress =
+      shared_stress(out.stress, kirchhoff_stress(row[0], row[1], spring.d, spring.j2m1), share);
+}
+
 // The maps of the laws that a kernel is compiled for.
 template <typename T, int kLaws>
 GSF_HOST_DEVICE ReturnMapped<T> law_step(const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
@@ -265,9 +318,13 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   } else {
     const T alpha = before.alpha, peak = before.peak;
     const MaterialRow<T> material = material_now<kLaws == kDamageField>(s, row, peak);
-    const int law = kLaws == kBrittle ? (s.law[row] == kNacc ? kNacc : kElastic) : s.law[row];
-    const ReturnMapped<T> out =
+    const int law = kLaws == kBrittle || kLaws == kViscousBrittle
+                        ? (s.law[row] == kNacc ? kNacc : kElastic)
+                        : s.law[row];
+    ReturnMapped<T> out =
         law_step<T, kLaws>(before.strain, alpha, increment, law, material, s.options, dt);
+    if constexpr (kLaws == kViscousBrittle)
+      viscous_particle(s, p, r, before.strain, alpha, increment, dt, out);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -348,6 +405,8 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   ReturnMapped<T> state =
       law_step<T, kLaws>(load_strain(s, p), alpha, none, s.law[row], material, s.options, span);
   const bool loses = s.law[row] == kNacc || (kLaws == kDamageField && s.law[row] == kPhaseField);
+  if constexpr (kLaws == kViscousBrittle)
+    viscous_particle(s, p, r, load_strain(s, p), alpha, none, T(0), state);
   if (loses && material.exponent > T(0))
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;

@@ -198,6 +198,8 @@ struct SolverView {
   // [N] contact radius of each point by its row when it was loaded (core/collider/spring.h) [m], or
   // null: colliders hold nodes; CPU only
   const T* radius;
+  // [N, 9] viscosity of each point (core/material/viscous.h), or null; CPU only
+  T* viscous;
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {

@@ -193,7 +193,8 @@ class Builder {
     if (meta_row(s_.meta[a]) != meta_row(s_.meta[b]))
       return meta_row(s_.meta[a]) < meta_row(s_.meta[b]);
     if (differ(s_.velocity, 3, less) || differ(s_.slope, 9, less) || differ(s_.strain, 6, less) ||
-        differ(s_.alpha, 1, less) || differ(s_.peak, 1, less) || differ(s_.deformation, 9, less))
+        differ(s_.alpha, 1, less) || differ(s_.peak, 1, less) || differ(s_.deformation, 9, less) ||
+        differ(s_.viscous, kViscousColumns, less))
       return less;
     return false;
   }
@@ -238,6 +239,7 @@ class Builder {
     move(s_.alpha, 1);
     move(s_.peak, 1);
     move(s_.deformation, 9);
+    move(s_.viscous, kViscousColumns);
     move(s_.id, 1);
   }
 

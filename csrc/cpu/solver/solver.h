@@ -23,6 +23,10 @@ void solver_build(const SolverView<T>& s);
 template <typename T>
 void prime_more(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
                 Largest& largest);
+// The same of a scene with viscous matter.
+template <typename T>
+void prime_viscous(const SolverView<T>& s, int64_t begin, int64_t end, bool measure, T dt,
+                   Largest& largest);
 template <typename T>
 class HomePass;
 template <typename T>

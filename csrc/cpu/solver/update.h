@@ -148,6 +148,23 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       history = max(history, min(now.active / row[2], P(kDriveMax)) - P(1));
     }
   }
+  [[maybe_unused]] Sym3<P> spring;
+  [[maybe_unused]] Int relaxes{};
+  if constexpr (kLaws == kViscousBrittle) {
+    P four[8];
+    packet.load4(s.viscous, kViscousColumns, 0, four);
+    packet.load4(s.viscous, kViscousColumns, 4, four + 4);
+    relaxes = four[6] > P(0);
+    spring = relaxed_strain(Sym3<P>{four[0], four[1], four[2], four[3], four[4], four[5]},
+                            increment, half_decay(four[7], P(dt)));
+    const P change = det_minus_one(spring);
+    const Sym3<P> away = reciprocal_cube_root(P(1) + change) * deviator(spring);
+    plain &= ~relaxes |
+             ((max_abs(spring) <= P(kStrainMax)) & (change >= P(kJMin * kJMin - 1.0)) &
+              (change <= P(kJMax * kJMax - 1.0)) & (norm2(away) <= P(kDeviatorMax * kDeviatorMax)));
+    stress = shared_stress(stress, add_diagonal(row[0] * away, P(0.5) * row[1] * change),
+                           select<T>(relaxes, four[6], P(0)));
+  }
   if (kLaws != kElasticOnly && mask_bits(loss > P(0)) != 0)
     stress = unloading_share(loss, row[kPaceColumn], stress, c) * stress;
   P slope[9];
@@ -189,6 +206,13 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         const int lane = __builtin_ctz(left);
         s.alpha[packet.index[lane]] = history[lane];
       }
+    if constexpr (kLaws == kViscousBrittle) {
+      const uint32_t kept = done & mask_bits(relaxes);
+      const P first[4] = {spring.xx, spring.yy, spring.zz, spring.xy};
+      const P last[4] = {spring.zz, spring.xy, spring.xz, spring.yz};
+      packet.store4(first, s.viscous, kViscousColumns, 0, kept);
+      packet.store4(last, s.viscous, kViscousColumns, 2, kept);
+    }
     if constexpr (kTrack) {
       Mat3<P> f;
       packet.load9(s.deformation, f.m);

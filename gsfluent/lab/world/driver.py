@@ -80,6 +80,7 @@ class World:
         frame: Velocity of the solver's grid [m/s]; None: the solver's choice. ``"ops"`` has none.
         surface: Contact radius of the points in cube roots of their volume: colliders push points
             that are nearer (docs/theory/colliders.md). None: they hold nodes.
+        viscous: Viscosity of each point, [N, 9], or [9] for all: :func:`gsfluent.ops.viscous_step`.
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
     Raises:
@@ -128,6 +129,7 @@ class World:
         irreversible: bool = True,
         frame: Sequence[float] | None = None,
         surface: float | None = None,
+        viscous: Tensor | None = None,
         **return_map: Any,
     ):
         if dt is not None and not 0.0 < dt < math.inf:
@@ -177,6 +179,7 @@ class World:
             irreversible=irreversible,
             return_map=return_map,
             frame=None if frame is None else (frame[0], frame[1], frame[2]),
+            viscous=None if viscous is None else number(viscous, count, 9),
             radius=None if surface is None else surface * number(volume, count) ** (1.0 / 3.0),
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()

@@ -53,6 +53,7 @@ class Scene:
     return_map: dict[str, Any]
     frame: tuple[float, float, float] | None = None
     radius: Tensor | None = None
+    viscous: Tensor | None = None  # viscosity of each point, [N, 9]; ops.viscous_step
 
 
 def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
@@ -167,7 +168,7 @@ class Stepper:
         self.scene = scene
         self.position, self.velocity, self.affine = position, velocity, affine
         self.strain, self.alpha, self.deformation = strain, alpha, deformation
-        self.peak = alpha
+        self.peak, self.viscous = alpha, scene.viscous
         self.cracks = DamageField(scene.law, scene.params, scene.material)
         if self.cracks.exists and any(scene.period):
             raise ValueError("World: phase_field knows no periodic axes")
@@ -179,7 +180,8 @@ class Stepper:
         self._travelled = 0.0
         # the stress of the first step belongs to the strain given: a step without motion, of a
         # length that only viscosity reads
-        self.stress = self._map(torch.zeros_like(affine), INSTANT)[2]
+        still = torch.zeros_like(affine)
+        self.stress = self._thickened(self._map(still, INSTANT)[:3], still, 0.0)[3]
 
     def _rows(self) -> tuple[Tensor, Tensor, Tensor | None]:
         scene = self.scene
@@ -192,6 +194,18 @@ class Stepper:
         return ops.return_mapping(
             self.strain, self.alpha, increment,
             law=law, params=params, material=material, dt=dt, **self.scene.return_map,
+        )  # fmt: skip
+
+    def _thickened(
+        self, returned: tuple[Tensor, Tensor, Tensor], increment: Tensor, dt: float
+    ) -> tuple[Tensor | None, Tensor, Tensor, Tensor]:
+        """What viscosity makes of a step of the law."""
+        scene, viscous = self.scene, self.viscous
+        if viscous is None:
+            return None, *returned
+        return ops.viscous_step(
+            viscous, self.strain, self.alpha, increment, returned, law=scene.law,
+            params=scene.params, material=scene.material, dt=dt,
         )  # fmt: skip
 
     def limit(self) -> float:
@@ -236,7 +250,9 @@ class Stepper:
             )
         self.position, self.velocity, self.affine = x[:count], v[:count], c[:count]
         self.deformation = None if f is None else f[:count]
-        self.strain, self.alpha, self.stress, info = self._map(dt * self.affine, dt)
+        *returned, info = self._map(dt * self.affine, dt)
+        after = self._thickened((returned[0], returned[1], returned[2]), dt * self.affine, dt)
+        self.viscous, self.strain, self.alpha, self.stress = after
         self.info += info
         self.peak = self.cracks.grown(self.peak, self.alpha)
         self.impulse += impulse

@@ -20,6 +20,8 @@ VECTORS = ("velocity", "angular_velocity")
 """What of a body is three numbers."""
 OFFSET = "floor.offset"
 """How much lower than the floor matter is held up, in cells: the grid feels a floor early."""
+FINER = "grid.extrapolation"
+"""How far a motion goes on from the coarser grid through the finer one."""
 _NU, _ANGLE = 0.49, 60.0
 _FIXED = ("density", "cohesion", "hardening", "alpha0", "shear_damage", "poisson_ratio")
 _SPREAD = {"velocity": 5.0, "angular_velocity": 10.0}
@@ -67,7 +69,7 @@ class Parameter:
         """``log``, ``poisson_ratio``, ``friction_angle``, ``plain`` or the name of a vector."""
         if self.name in ("poisson_ratio", "friction_angle", *VECTORS):
             return self.name
-        return "plain" if self.key == OFFSET else "log"
+        return "plain" if self.key in (OFFSET, FINER) else "log"
 
     def free(self, value: Sequence[float]) -> Array:
         """The free coordinates of a value."""
@@ -158,7 +160,7 @@ class Unknowns:
         for row in share:
             at = self.start.copy()
             for p, part in zip(self.parameters, self.slices().values(), strict=True):
-                if p.name in VECTORS or p.key == OFFSET:
+                if p.name in VECTORS or p.key in (OFFSET, FINER):
                     continue  # seen before contact, and small
                 low, high = self.start[part] - 1.0, self.start[part] + 1.0
                 if p.low is not None and p.high is not None:

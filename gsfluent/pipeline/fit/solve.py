@@ -13,11 +13,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsfluent.pipeline.fit.forward import Forward, TooFast
-from gsfluent.pipeline.fit.parameters import Unknowns
-from gsfluent.targets.target import Motion, Observer
+from gsfluent.pipeline.fit.parameters import FINER, Unknowns
+from gsfluent.targets.target import Followers, Motion, Observer
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -28,6 +29,12 @@ DAMPING = (1e-2, 5.0)
 """First damping, and the factor by which it changes."""
 CLOSE = 2e-4
 """A step this short, in free coordinates, ends a stage."""
+SETTLED = 1e-3
+"""A step that lowers the cost by less than this part of it ends a stage."""
+UNSURE = 0.25
+"""Of what a finer grid changes in a frame, the part that is not believed."""
+CORRECTIONS = 4
+"""How often at most the change by a finer grid is seen anew, on all frames."""
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Of the frames, stage by stage."""
 
@@ -78,10 +85,55 @@ class Problem:
     ) -> None:
         self.forward, self.observer, self.unknowns = forward, observer, unknowns
         self.step, self.fixed = step, fixed or {}
+        self.change: Motion | None = None
+        self.trust = np.ones(len(forward.times))
+        self._last: tuple[Any, Motion] | None = None
 
-    def motion(self, free: Array, frames: int, dt: float) -> Motion:
-        """Run these coordinates."""
-        return self.forward.run(self.fixed | self.unknowns.values(free), frames, dt)
+    def motion(self, free: Array, frames: int, dt: float, *, keep: bool = False) -> Motion:
+        """Run these coordinates; of a run that is kept only what the grid changes is done anew."""
+        values = self.fixed | self.unknowns.values(free)
+        more = values.pop(FINER, 0.0)
+        key = (values, frames, dt)
+        if self._last is not None and self._last[0] == key:
+            moved = self._last[1]
+        else:
+            moved = self.forward.run(values, frames, dt)
+        if keep:
+            self._last = (key, moved)
+        if self.change is None:
+            return moved
+        return moved._replace(
+            **{k: v + more * getattr(self.change, k)[:frames] for k, v in moved._asdict().items()
+               if k != "strain"}
+        )  # fmt: skip
+
+    def refine(self, finer: Forward, free: Array, frames: int) -> None:
+        """See at these coordinates what a finer grid changes, and how far it is to be trusted."""
+        values = self.fixed | self.unknowns.values(free)
+        self.change = None
+        coarse = _run(self, free, frames)[1]
+        values.pop(FINER, None)
+        fine = _steady(lambda dt: finer.run(values, frames, dt), finer.step(values))[1]
+        follow = Followers("fit", self.forward.rest, finer.setting())
+        there = [follow.places(fine, k) for k in range(frames)]
+        self.change = Motion(
+            torch.stack([place for place, _ in there]) - coarse.position,
+            torch.stack([map for _, map in there]) - coarse.deformation,
+            fine.impulse - coarse.impulse,
+            fine.strain,
+        )
+        pairs = self.observer.pair(coarse)
+        self.trust[:] = 1.0
+        gap, frame = self.seen(coarse, frames, pairs)
+        with_it = coarse._replace(
+            position=coarse.position + self.change.position,
+            deformation=coarse.deformation + self.change.deformation, impulse=fine.impulse,
+        )  # fmt: skip
+        shift = self.seen(with_it, frames, pairs)[0] - gap
+        for k in range(frames):
+            if (frame == k).any():
+                size = float(np.mean(shift[frame == k] ** 2))
+                self.trust[k] = (1.0 + UNSURE**2 * size) ** -0.5
 
     def dt(self, free: Array) -> float:
         """A time step for a linearisation about them."""
@@ -90,7 +142,7 @@ class Problem:
     def seen(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
         """Residuals and their frames."""
         gap, frame = self.observer.residuals(motion, frames, pairs)
-        return gap.double().numpy(), frame.numpy()
+        return gap.double().numpy() * self.trust[frame.numpy()], frame.numpy()
 
 
 def weights(residual: Array) -> Array:
@@ -133,7 +185,7 @@ def search(
     free, damping, runs = start.copy(), DAMPING[0], problem.forward.runs
     scale = 1.0
     for round_ in range(rounds + 1):
-        free, dt, motion = _run(problem, free, frames)
+        dt, motion = _run(problem, free, frames)
         pairs = problem.observer.pair(motion)
         residual, frame = problem.seen(motion, frames, pairs)
         if len(residual) == 0:
@@ -149,7 +201,7 @@ def search(
         whole = normal + np.diag(prior[rows])
         if round_ == rounds:
             break
-        moved, better = 0.0, False
+        moved, better, little = 0.0, False, False
         while damping < 1e8:
             step = -np.linalg.solve(whole + damping * np.diag(np.diag(whole)), slope)
             step *= min(1.0, MOST / max(float(np.abs(step).max()), 1e-300))
@@ -162,6 +214,7 @@ def search(
             except TooFast:
                 there = np.inf
             if there < here:
+                little = here - there < SETTLED * here
                 free, moved, better = trial, float(np.abs(step).max()), True
                 damping = max(damping / DAMPING[1], 1e-8)
                 break
@@ -170,7 +223,7 @@ def search(
             damping *= DAMPING[1]
         if tell is not None:
             tell(f"{frames} frames, cost {min(here, there if better else here):.4g}")
-        if not better or moved < CLOSE:
+        if not better or little or moved < CLOSE:
             break
     if len(residual) == 0:
         size = len(unknowns)
@@ -193,12 +246,16 @@ def search(
     )
 
 
-def _run(problem: Problem, free: Array, frames: int) -> tuple[Array, float, Motion]:
+def _run(problem: Problem, free: Array, frames: int) -> tuple[float, Motion]:
     """Run the middle of a linearisation, at a step that all runs about it can take."""
-    dt = problem.dt(free)
+    return _steady(lambda dt: problem.motion(free, frames, dt, keep=True), problem.dt(free))
+
+
+def _steady(run: Callable[[float], Motion], dt: float) -> tuple[float, Motion]:
+    """Run at this step, or at the longest of its halves that holds."""
     for _ in range(5):
         try:
-            return free, dt, problem.motion(free, frames, dt)
+            return dt, run(dt)
         except TooFast:
             dt *= 0.5
     raise TooFast
@@ -264,11 +321,25 @@ def contact_frame(problem: Problem, free: Array) -> int:
 
 
 def in_stages(
-    problem: Problem, start: Array, *, shares: tuple[float, ...] = SHARES, tell: Tell | None = None
+    problem: Problem,
+    start: Array,
+    *,
+    finer: Forward | None = None,
+    shares: tuple[float, ...] = SHARES,
+    tell: Tell | None = None,
 ) -> Fitted:
     """Velocities on the frames before contact, then all numbers on more and more frames.
 
-    All frames at once get stuck where the first rebound is wrong.
+    All frames at once get stuck where the first rebound is wrong. With a finer grid each stage is a
+    defect correction: what that grid changes is seen at the last values, and the search goes on
+    with it on the coarse grid. How far the change goes on, beyond the finer grid, is learnt.
+
+    Args:
+        problem: What is searched; with a finer grid its numbers have :data:`FINER`.
+        start: Free coordinates.
+        finer: The same scene on a finer grid.
+        shares: Of the frames, by stage.
+        tell: Told of each linearisation.
     """
     frames, free = len(problem.forward.times), start
     moving = problem.unknowns.motion_only()
@@ -277,10 +348,14 @@ def in_stages(
         free = search(problem, free, before, active=moving, rounds=6, tell=tell).free
     runs = problem.forward.runs
     found = None
-    counts = sorted({max(2, round(share * frames)) for share in shares})
-    for count in counts:
-        last = count == counts[-1] and shares[-1] == 1.0
-        found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
-        free = found.free
+    for count in sorted({max(2, round(share * frames)) for share in shares}):
+        last = count == frames
+        for _ in range(CORRECTIONS if last and finer else 1):
+            if finer is not None:
+                problem.refine(finer, free, count)
+            found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
+            moved, free = float(np.abs(found.free - free).max()), found.free
+            if moved < 10.0 * CLOSE:
+                break
     assert found is not None
     return dataclasses.replace(found, runs=problem.forward.runs - runs)

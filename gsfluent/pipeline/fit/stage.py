@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.fit.forward import Forward, TooFast
-from gsfluent.pipeline.fit.parameters import LIMITS, OFFSET, Parameter, Unknowns, read_learn
-from gsfluent.pipeline.fit.solve import SHARES, Problem, in_stages, search
+from gsfluent.pipeline.fit.parameters import FINER, LIMITS, OFFSET, Parameter, Unknowns, read_learn
+from gsfluent.pipeline.fit.solve import SHARES, Problem, in_stages
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
@@ -24,12 +24,17 @@ Array = NDArray[np.float64]
 Runner = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
 """Calls a function for every item; :func:`gsfluent.sweep.map` does it in many processes."""
 
-FINER = 1.5
+RATIO = 2.0
 """Ratio of the two grids' spacings."""
-ORDER = 1.0
-"""Order of the error of the grid: contact and impact are met to first order of dx."""
+EXTRAPOLATION = (1.5, 0.3)
+"""Believed share of the change to the finer grid that is to come in all, and its deviation: 2 where
+the error falls as dx, 4 / 3 where it falls as its square."""
 OFFSET_PRIOR = (0.4, 0.3)
 """Believed floor offset in cells, and its deviation: measured on rebounds, docs/theory/fit.md."""
+LEFT = 0.1
+"""Of what the finer grid moves a number by, the part that may be left: a standard deviation."""
+NUISANCE = (OFFSET, FINER)
+"""What is learnt of the grid, not of the scene."""
 CORRELATED = 0.9
 PRIOR_SHARE = 0.5
 STILL = 0.01
@@ -66,26 +71,24 @@ class Task:
     start: list[float]
     dx: float
     shares: tuple[float, ...]
-    grid: bool = False
+    grids: int = 1
 
 
 def run_task(task: Task) -> dict[str, Any]:
     """Do one search; plain values come back."""
-    forward = Forward(task.scene, list(task.target.times), task.dx)
+    times = list(task.target.times)
+    forward = Forward(task.scene, times, task.dx)
+    finer = Forward(task.scene, times, task.dx / RATIO) if task.grids == 2 else None
     observer = task.target.observe(forward.setting())
     problem = Problem(forward, observer, task.unknowns, task.target.step)
-    start = np.asarray(task.start)
     try:
-        if task.grid:
-            found = search(problem, start, len(task.target.times), rounds=4)
-        else:
-            found = in_stages(problem, start, shares=task.shares)
+        found = in_stages(problem, np.asarray(task.start), finer=finer, shares=task.shares)
     except TooFast:
         return {"cost": float("inf"), "free": list(task.start), "runs": forward.runs}
+    used = [g for g in (forward, finer) if g is not None]
     return {
         **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(found).items()},
-        "points": forward.count,
-        "dx": task.dx,
+        "grids": [{"dx": g.dx, "points": g.count, "runs": g.runs} for g in used],
     }
 
 
@@ -105,7 +108,7 @@ class Fit(Stage):
             ``melon.young_modulus``.
         starts: How many; the first is the scene as it is.
         cells: Cells along the longest side of the largest body.
-        grids: 2 to fit on a grid finer by 1.5, too, and take out the error of the grid; or 1.
+        grids: 2 to see on a grid twice as fine what the first does wrong, and take it out; or 1.
         offset: Learn how much higher than the floor the grid holds matter up, too.
         seed: Of the starts.
         runner: Does the searches; one after the other when absent.
@@ -149,62 +152,65 @@ class Fit(Stage):
             RunError: No start can be run.
         """
         unknowns = read_learn(scene, self.learn)
+        more = []
         if self.offset and scene.floor is not None and not scene.colliders:
-            believed = Parameter(OFFSET, (OFFSET_PRIOR[0],), spread=OFFSET_PRIOR[1])
-            unknowns = Unknowns([*unknowns.parameters, believed])
+            more.append(Parameter(OFFSET, (OFFSET_PRIOR[0],), spread=OFFSET_PRIOR[1]))
+        if self.grids == 2:
+            more.append(Parameter(FINER, (EXTRAPOLATION[0],), spread=EXTRAPOLATION[1]))
+        unknowns = Unknowns([*unknowns.parameters, *more])
         dx = grid_spacing(scene, self.cells)
         make = functools.partial(Task, scene, target, unknowns)
-        total = self.starts + self.grids
-        first = self.starts if self.starts > 1 else 0
-        starts = unknowns.starts(self.starts, self.seed)
-        tries: list[dict[str, Any]] = []
-        if first:
+        total = 1 + (self.starts if self.starts > 1 else 0)
+        begin, tries = unknowns.start.tolist(), list[dict[str, Any]]()
+        if self.starts > 1:
             # of all starts two stages; the best goes on
-            tries = self.runner(run_task, [make(s.tolist(), dx, SHARES[:2]) for s in starts])
-            report_progress(progress, first, total, "starts")
+            starts = unknowns.starts(self.starts, self.seed)
+            tries = self.runner(
+                run_task, [make(s.tolist(), dx, SHARES[:2], self.grids) for s in starts]
+            )
+            report_progress(progress, self.starts, total, "starts")
             good = [t for t in tries if np.isfinite(t["cost"])]
             if not good:
                 raise RunError("fit: no start can be run", "nothing", "start from other numbers")
             begin = min(good, key=lambda t: t["cost"])["free"]
-        else:
-            begin = starts[0].tolist()
-        coarse = self.runner(run_task, [make(begin, dx, SHARES)])[0]
-        report_progress(progress, first + 1, total, f"{self.cells} cells")
-        if not np.isfinite(coarse["cost"]):
+        found = self.runner(run_task, [make(begin, dx, SHARES, self.grids)])[0]
+        report_progress(progress, total, total, f"{self.cells} cells")
+        if not np.isfinite(found["cost"]):
             raise RunError("fit: the best start cannot be run", "nothing", "use fewer cells")
-        found, grid = coarse, np.zeros(len(unknowns))
-        if self.grids == 2:
-            fine = self.runner(run_task, [make(coarse["free"], dx / FINER, SHARES, True)])[0]
-            report_progress(progress, total, total, f"{self.cells * FINER:g} cells")
-            if np.isfinite(fine["cost"]):
-                grid = np.asarray(fine["free"]) - np.asarray(coarse["free"])
-                found = fine
-        return conclude(scene, unknowns, found, coarse, grid, tries)
+        return conclude(scene, unknowns, found, tries)
+
+
+def of_the_grid(unknowns: Unknowns, free: Array, information: Any) -> Array:
+    """By how much the change to the finer grid has moved each number: linearised, free [P]."""
+    part = unknowns.slices().get(FINER)
+    if part is None:
+        return np.zeros(len(unknowns))
+    rows = np.arange(len(unknowns)) != part.start
+    normal = np.asarray(information)
+    whole = normal + np.diag(1.0 / unknowns.spread**2)
+    moved = np.zeros(len(unknowns))
+    pull = normal[rows, part.start] * free[part.start]
+    moved[rows] = -np.linalg.solve(whole[np.ix_(rows, rows)], pull)
+    return moved
 
 
 def conclude(
-    scene: Scene,
-    unknowns: Unknowns,
-    found: Mapping[str, Any],
-    coarse: Mapping[str, Any],
-    grid: Array,
-    tries: Sequence[Mapping[str, Any]],
+    scene: Scene, unknowns: Unknowns, found: Mapping[str, Any], tries: Sequence[Mapping[str, Any]]
 ) -> Found:
     """Values, bands and words of a search.
 
     Args:
         scene: As it was.
         unknowns: What was learnt.
-        found: The search on the finer grid, or the only one.
-        coarse: That on the coarser.
-        grid: How much further the finer one went, in free coordinates; 0 for one grid.
+        found: The search.
         tries: The starts.
     """
     free = np.asarray(found["free"])
     covariance = np.asarray(found["covariance"])
-    sd = np.sqrt(np.diag(covariance) + grid**2)
+    grid = of_the_grid(unknowns, free, found["information"])
+    sd = np.sqrt(np.diag(covariance) + (LEFT * grid) ** 2)
     slope = np.abs(unknowns.slope(free))
-    share = np.clip(np.diag(np.asarray(found["covariance"])) / unknowns.spread**2, 0.0, 1.0)
+    share = np.clip(np.diag(covariance) / unknowns.spread**2, 0.0, 1.0)
     deviation = np.sqrt(np.diag(covariance))
     related = covariance / np.outer(deviation, deviation)
     labels, values = unknowns.labels(), unknowns.values(free)
@@ -221,7 +227,7 @@ def conclude(
         here = sd[part] * slope[part]
         spread[p.key] = float(here[0]) if p.size == 1 else [float(v) for v in here]
         limit = LIMITS.get(p.kind, np.inf)
-        if p.key != OFFSET and (here.max() > limit or share[part].max() > PRIOR_SHARE):
+        if p.key not in NUISANCE and (here.max() > limit or share[part].max() > PRIOR_SHARE):
             unidentified[p.key] = _bound(p, free[part], sd[part])
         numbers[p.key] = {
             "value": values[p.key],
@@ -234,7 +240,7 @@ def conclude(
     warnings = []
     if strain < STILL:
         warnings.append(f"no strain exceeds 1 % ({strain:.2%}): stiffness hardly shows")
-    learnt = {k: v for k, v in values.items() if k not in unidentified and k != OFFSET}
+    learnt = {k: v for k, v in values.items() if k not in unidentified and k not in NUISANCE}
     report = {
         "parameters": numbers,
         "unidentified": unidentified,
@@ -244,7 +250,7 @@ def conclude(
         "rms": found["rms"],
         "per_frame": found["per_frame"],
         "strain": strain,
-        "grids": [{k: g[k] for k in ("dx", "points", "runs", "rms")} for g in (coarse, found)],
+        "grids": found["grids"],
         "starts": [
             {"cost": t["cost"], "values": unknowns.values(np.asarray(t["free"]))} for t in tries
         ],

@@ -74,13 +74,22 @@ class Matter:
         """Whether any row is of phase-field matter."""
         return bool((self.law == materials.LAWS["phase_field"]).any())
 
-    def stored(self, strain: Tensor, material: Tensor, peak: Tensor) -> Tensor:
-        """Elastic energy per volume of points with these strains, rows and peaks [J/m^3], [N]."""
-        law, params, row = self.law, self.params, material
-        if not self.has_field:
-            return ops.elastic_energy(strain, law=law, params=params, material=row)
-        law, params = weakened(law, params, row, peak)
-        return ops.elastic_energy(strain, law=law, params=params)
+    @property
+    def viscous(self) -> bool:
+        """Whether any point is of viscous solid matter."""
+        return self.particles.viscous is not None
+
+    def stored(self, points: Particles, peak: Tensor) -> Tensor:
+        """Elastic energy per volume of some points, with their peaks [J/m^3], [N]."""
+        law, params, row = self.law, self.params, points.material
+        if self.has_field:
+            wholes = weakened(law, params, row, peak)
+            energy = ops.elastic_energy(points.strain, law=wholes[0], params=wholes[1])
+        else:
+            energy = ops.elastic_energy(points.strain, law=law, params=params, material=row)
+        if points.viscous is None:
+            return energy
+        return ops.viscous_energy(points.viscous, energy, law=law, params=params, material=row)
 
     @functools.cached_property
     def brittle(self) -> Tensor:
@@ -190,7 +199,7 @@ def build_matter(
         count = points.shape[0]
         generator = torch.Generator().manual_seed(seed + 7919 * (number + 1))
         noise = jitter * (2.0 * torch.rand(count, generator=generator) - 1.0)
-        params, law, alpha = _parameters(body, points, seed, noise, dx)
+        params, law, alpha, viscous = _parameters(body, points, seed, noise, dx)
         mass = params[:, 6] * (volume / count)
         position, velocity, affine = start_of(body, scene, points, mass)
         tables.append(params)
@@ -203,7 +212,10 @@ def build_matter(
                 velocity=velocity.to(torch.float32),
                 alpha=alpha.to(torch.float32),
                 body=number,
-            ).replace(affine=affine.to(torch.float32).expand(count, 3, 3).contiguous())
+            ).replace(
+                affine=affine.to(torch.float32).expand(count, 3, 3).contiguous(),
+                viscous=viscous,
+            )
         )
         ranges.append((done, done + count))
         spacings.append((volume / count) ** (1 / 3))
@@ -282,8 +294,10 @@ def _placed(body: Body, points: Tensor) -> Tensor:
 
 def _parameters(
     body: Body, points: Tensor, seed: int, noise: Tensor, dx: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return per-point parameters [N, 8], law [N] (int32) and alpha0 [N] (float64).
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Return per-point parameters [N, 8], law [N] (int32), alpha0 [N] and viscosity [N, 9].
+
+    The first and the third are float64; the viscosity is None where there is none.
 
     What has a scatter of its own that does not hang on the grid (a Weibull modulus) is spared the
     ``noise`` [N] from point to point.
@@ -311,6 +325,7 @@ def _parameters(
     params = torch.zeros(count, 8, dtype=torch.float64)
     law = torch.zeros(count, dtype=torch.int32)
     alpha = torch.zeros(count, dtype=torch.float64)
+    viscous: Tensor | None = None
     everywhere = torch.ones(count, dtype=torch.bool)
     layers = [
         (body.material, everywhere),
@@ -331,7 +346,10 @@ def _parameters(
             alpha[index] = at(material.start_alpha)
         else:
             params[index], alpha[index] = material.parameters(at), at(material.start_alpha)
-    return params, law, alpha
+        if material.viscous or viscous is not None:
+            viscous = torch.zeros(count, 9) if viscous is None else viscous
+            viscous[index, 6:] = material.viscosities(at).to(viscous)
+    return params, law, alpha, viscous
 
 
 def _weakness(material: Material, points: Tensor, seed: int, dx: float) -> Tensor:

@@ -17,7 +17,7 @@ from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
 VERSION = 8
-_MOVING = ("velocity", "affine", "strain", "alpha", "deformation")
+_MOVING = ("velocity", "affine", "strain", "alpha", "deformation", "viscous")
 _POINTS = (
     "position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit", "ever",
     "lowest", "alpha_seen", "time_seen",
@@ -158,6 +158,8 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         extra: Counters and records, of plain types.
     """
     moving = {name: getattr(state.particles, name) for name in _MOVING}
+    if moving["viscous"] is None:  # a state in which nothing relaxes is that of versions before
+        del moving["viscous"]
     values: dict[str, Any] = {
         "version": VERSION,
         "fingerprint": _fingerprint(matter),
@@ -219,5 +221,6 @@ def _fingerprint(matter: Matter) -> list[float]:
     """Numbers that differ between scenes, qualities and seeds."""
     p = matter.particles
     parts = [p.position, p.velocity, p.alpha, p.mass, p.volume, matter.params]
+    parts += [] if p.viscous is None else [p.viscous]
     sums = [float(v.cpu().double().sum()) for v in parts]
     return [float(p.count), matter.dx, *sums]

@@ -77,10 +77,16 @@ class Composed:
         if self._cracks.exists:
             law, params = weakened(law, params, p.material, self.peak)
             row = None
-        _, _, self.stress, _ = ops.return_mapping(
+        after, alpha, self.stress, _ = ops.return_mapping(
             p.strain, p.alpha, torch.zeros_like(p.affine), law=law, params=params,
             material=row, dt=INSTANT, **self._map,
         )  # fmt: skip
+        if p.viscous is not None:
+            self.stress = ops.viscous_step(
+                p.viscous, p.strain, p.alpha, torch.zeros_like(p.affine),
+                (after, alpha, self.stress), law=matter.law, params=matter.params,
+                material=p.material, dt=0.0,
+            )[3]  # fmt: skip
 
     def advance(self, until: float, steps: int) -> int:
         """See :class:`gsfluent.pipeline.simulate.engine.Engine`."""
@@ -122,7 +128,7 @@ class Composed:
         p = self.points
         return Points(
             p.position.to(torch.float64), p.velocity, p.affine, p.strain, p.alpha, self.peak,
-            p.deformation,
+            p.deformation, p.viscous,
         )  # fmt: skip
 
     def _look(self) -> None:
@@ -193,6 +199,12 @@ class Composed:
             p.strain, p.alpha, dt * affine,
             law=self._law, params=self._params, material=self._row, dt=dt, **self._map,
         )  # fmt: skip
+        viscous = p.viscous
+        if viscous is not None:
+            viscous, strain, alpha, self.stress = ops.viscous_step(
+                viscous, p.strain, p.alpha, dt * affine, (strain, alpha, self.stress),
+                law=self.matter.law, params=self.matter.params, material=p.material, dt=dt,
+            )  # fmt: skip
         if self._loses:
             share = unloading_share(
                 self.stress, affine, law=self.matter.law, params=self.matter.params,
@@ -201,7 +213,7 @@ class Composed:
             self.stress = self.stress * share[:, None]
         self.points = p.replace(
             position=position, velocity=velocity, affine=affine, deformation=deformation,
-            strain=strain, alpha=alpha,
+            strain=strain, alpha=alpha, viscous=viscous,
         )  # fmt: skip
         grown = self._cracks.grown(self.peak, alpha)
         self.peak = torch.where(self._brittle, grown, self.peak)

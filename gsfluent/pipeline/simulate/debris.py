@@ -63,7 +63,7 @@ def let_go(state: State, gone: Tensor) -> State:
     """The state in which these points [N] are dust, without a strain; no momentum is lost."""
     p = state.particles
     return state._replace(
-        particles=p.replace(strain=p.strain.masked_fill(gone[:, None], 0.0)),
+        particles=p.unstrained(gone),
         loose=state.loose | gone,
         unit=torch.where(gone, -1, state.unit),
     )
@@ -146,7 +146,7 @@ def _stiffened(state: State, matter: Matter, rows: Tensor) -> State:
     p = state.particles
     mass, velocity, affine = p.mass[rows], p.velocity[rows], p.affine[rows]
     before = kinetic_energy(mass, velocity, affine, matter.dx)
-    density = matter.stored(p.strain[rows], p.material[rows], state.peak[rows])
+    density = matter.stored(p.select(rows), state.peak[rows])
     stored = (density.double() * p.volume[rows].double()).sum()
     index = torch.unique(state.unit[rows], return_inverse=True)[1]
     body = RigidChips(mass, state.position[rows], velocity, affine, index, matter.dx)
@@ -155,10 +155,9 @@ def _stiffened(state: State, matter: Matter, rows: Tensor) -> State:
     affine = _cross(spin)[index].to(affine)
     lost = before - kinetic_energy(mass, velocity, affine, matter.dx) + stored
     return state._replace(
-        particles=p.replace(
+        particles=p.unstrained(rows).replace(
             velocity=p.velocity.index_copy(0, rows, velocity),
             affine=p.affine.index_copy(0, rows, affine),
-            strain=p.strain.index_fill(0, rows, 0.0),
         ),
         dissipated=state.dissipated + lost,
     )

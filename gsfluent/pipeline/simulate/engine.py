@@ -145,6 +145,7 @@ class Points(NamedTuple):
     alpha: Tensor
     peak: Tensor
     deformation: Tensor | None
+    viscous: Tensor | None = None
 
 
 class Engine(Protocol):

@@ -152,6 +152,10 @@ class Flight:
         if deformation is not None:
             deformation = (turn @ deformation).contiguous()
         strain = turn @ geometry.unpack_symmetric(like.strain) @ turn.T
+        viscous = like.viscous
+        if viscous is not None:
+            spring = turn @ geometry.unpack_symmetric(viscous[:, :6]) @ turn.T
+            viscous = torch.cat([geometry.pack_symmetric(spring), viscous[:, 6:]], dim=1)
         place = (center + arm).to(device)
         moved = like.replace(
             position=place.to(like.dtype),
@@ -159,6 +163,7 @@ class Flight:
             affine=gradient.to(like.affine).expand_as(like.affine).contiguous(),
             strain=geometry.pack_symmetric(strain),
             deformation=deformation,
+            viscous=viscous,
         )
         return moved, place
 

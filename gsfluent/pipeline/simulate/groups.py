@@ -196,7 +196,7 @@ class Leaving:
         room = gap - LANDING * matter.dx
         if time_to_meet(room, flight.speed_at(state.time), float(self.gravity.norm())) < frame / 2:
             return state
-        density = matter.stored(points.strain, points.material, state.peak[rows])
+        density = matter.stored(points, state.peak[rows])
         lost = (
             kinetic_energy(points.mass, points.velocity, points.affine, matter.dx) - flight.kinetic
         )

@@ -432,7 +432,7 @@ def figures_of(matter: Matter, state: State, gravity: tuple[float, float, float]
     surface = torch.zeros((), dtype=wide, device=x.device)
     if matter.has_field:
         surface = _crack_energy(matter, state)
-    density = matter.stored(strain, particles.material, peak)
+    density = matter.stored(p, peak)
     elastic = (density.to(wide) * volume).sum()
     pull = torch.tensor(gravity, dtype=wide, device=x.device)
     potential = -(mass * (x @ pull)).sum()

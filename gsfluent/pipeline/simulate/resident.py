@@ -69,6 +69,10 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
     known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
     if matter.has_field and (matter.law.is_cuda or not bool(torch.isin(matter.law, known).all())):
         return False  # not there yet
+    if matter.viscous:
+        known = matter.law.new_tensor([LAWS["elastic"], LAWS["nacc"]])
+        if matter.law.is_cuda or not bool(torch.isin(matter.law, known).all()):
+            return False  # not there yet
     if not rigid.frees:
         return True
     mass = rows[:, columns.MASS]
@@ -129,8 +133,8 @@ class Resident:
         )
         field = torch.unique(field, return_inverse=True)[1]
         law, params = matter.law, matter.params
-        if (
-            not options.law_kernels and not matter.has_field
+        if not (
+            options.law_kernels or matter.has_field or matter.viscous
         ):  # a row that no point has asks for the kernel of all laws
             law = torch.cat([law, law.new_tensor([LAWS["fluid"]])])
             spare = params[:1].clone()
@@ -161,7 +165,9 @@ class Resident:
         self._faces = self.colliders[:0]
         """Rows of the faces of blades at work, after those of the colliders."""
         self._look(position.to(p.dtype))
-        self._begin(Points(position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation))
+        self._begin(Points(
+            position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation, p.viscous
+        ))  # fmt: skip
 
     def _begin(self, points: Points) -> None:
         """Load points into a solver, with the fields and the faces of now."""
@@ -323,7 +329,14 @@ class Resident:
         """See :class:`Engine`."""
         s = self._solver
         return Points(
-            self._position(), s.velocity, s.affine, s.strain, s.alpha, s.peak, s.deformation
+            self._position(),
+            s.velocity,
+            s.affine,
+            s.strain,
+            s.alpha,
+            s.peak,
+            s.deformation,
+            s.viscous,
         )
 
 

@@ -374,7 +374,7 @@ class Stepper:
         """The state at a later time: points of the grid, groups and loose debris."""
         span = time - state.time
         p = state.particles
-        names = ("velocity", "affine", "strain", "alpha", "deformation")
+        names = ("velocity", "affine", "strain", "alpha", "deformation", "viscous")
         if points is not None and self._rows is None:
             position, peak = points.position, points.peak
             values = {name: getattr(points, name) for name in names}

@@ -19,7 +19,7 @@ from gsfluent.pipeline import Fit
 from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, in_stages, search
-from gsfluent.pipeline.fit.stage import conclude, least_informed
+from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
 from gsfluent.targets import Clouds, Force, Masks, Points
 from gsfluent.targets.target import Followers
 
@@ -176,11 +176,28 @@ def test_two_grids_and_several_starts_widen_the_band(tracks: Any) -> None:
 
     fit = Fit({"thing": {"young_modulus": (1e4, 1e6)}}, starts=2, cells=4, runner=runner)
     found = fit(scene(elastic(3e5), velocity=(0.2, 0.0, -2.0)), Points(tracks[:6]))
-    assert calls == [2, 1, 1]
+    assert calls == [2, 1]
     number = found.report["parameters"]["thing.young_modulus"]
-    assert number["sd"] >= abs(number["grid"][0]) > 0.0
+    assert number["sd"] >= LEFT * abs(number["grid"][0]) > 0.0
     assert abs(math.log10(number["value"]) - 5.0) < 0.3
-    assert [g["points"] for g in found.report["grids"]] == [512, 1728]
+    assert [g["points"] for g in found.report["grids"]] == [512, 4096]
+
+
+def test_a_finer_grid_sets_right_what_a_coarse_one_does_wrong() -> None:
+    """The truth on three times as many cells, shaken by nothing: one grid alone is far off."""
+    truth = scene(elastic(1e5), velocity=(0.0, 0.0, -2.0))
+    tracks, _ = seen(truth, SIDE / 12, frames=8)
+    guess = scene(elastic(8e4), velocity=(0.0, 0.0, -2.0))
+    one, two = (
+        Fit(NAMES[:1], starts=1, cells=4, grids=grids, offset=False)(guess, Points(tracks))
+        for grids in (1, 2)
+    )
+    error = [abs(math.log10(f.values[NAMES[0]]) - 5.0) for f in (one, two)]
+    assert error[1] < 0.25 * error[0]
+    assert two.report["rms"] < 0.5 * one.report["rms"]
+    assert 1.0 < two.values["grid.extrapolation"] < 2.0
+    moved = two.report["parameters"][NAMES[0]]["grid"][0]
+    assert two.sd[NAMES[0]] >= LEFT * abs(moved) > 0.0
 
 
 def test_coordinates_and_values_are_inverse() -> None:
@@ -208,9 +225,8 @@ def test_what_goes_together_is_said_in_words() -> None:
     words = least_informed(weak, unknowns.labels(), unknowns)
     assert len(words) == 1 and "young_modulus up with thing.poisson_ratio up" in words[0]
     state = {"free": unknowns.start, "covariance": np.linalg.inv(weak), "information": weak,
-             "strain": 0.2, "rms": 1.0, "per_frame": [], "dx": 0.1, "points": 1,
-             "runs": 1}  # fmt: skip
-    found = conclude(scene(elastic()), unknowns, state, state, np.zeros(2), [])
+             "strain": 0.2, "rms": 1.0, "per_frame": [], "grids": []}  # fmt: skip
+    found = conclude(scene(elastic()), unknowns, state, [])
     assert list(found.correlation) == [("thing.poisson_ratio", "thing.young_modulus")]
 
 

@@ -1,0 +1,49 @@
+// A Maxwell branch beside a neo-Hookean law (elastic, NACC): a spring and a dashpot that carry a
+// share g of the stiffness. The law keeps the rest, so that what is loaded at once is as stiff as
+// without, and what is held for long has (1 - g) of it: the standard linear solid, or one term of a
+// Prony series (Simo and Hughes 1998, ch. 10; Reese and Govindjee 1998 for finite strain).
+// Definition: ops/viscous.py; equations: docs/theory/viscous.md.
+#pragma once
+
+#include "core/material/elastic.h"
+
+namespace gsf {
+
+// Of a point: strain of the spring (0 to 5), g, 1 / tau [1/s], and the time T [s] of a yield.
+inline constexpr int kViscousColumns = 9;
+
+// exp(-dt / (2 tau)) to (dt / tau)^3 / 48, between 0 and 1 whatever the step.
+template <typename T>
+GSF_HOST_DEVICE T half_decay(T rate, T dt) {
+  const T y = T(0.5) * rate * dt;
+  return T(1) / (T(1) + y * (T(1) + T(0.5) * y));
+}
+
+// Strain of the spring after a step: it relaxes for half of it, goes along, relaxes for the rest.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> relaxed_strain(const Sym3<T>& spring, const Mat3<T>& increment, T half) {
+  return half * update_strain(half * spring, increment);
+}
+
+// (1 - g) tau of the law + g tau of the spring.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> shared_stress(const Sym3<T>& law, const Sym3<T>& spring, T share) {
+  return (T(1) - share) * law + share * spring;
+}
+
+// A yield that takes time (Duvaut and Lions 1976; Simo and Hughes 1998, ch. 2.7): what the law says
+// is where a state would be in the end, and a step goes dt / (T + dt) of the way there. Backward
+// Euler, stable for any step; without a time all of the way.
+template <typename T>
+GSF_HOST_DEVICE T yielding_share(T time, T dt) {
+  return time > T(0) ? dt / (time + dt) : T(1);
+}
+
+// What is left of the spring where the law yields: as much as of the law's own stress.
+template <typename T>
+GSF_HOST_DEVICE T kept_by_yield(const Sym3<T>& trial, const Sym3<T>& returned) {
+  using std::sqrt;
+  return min(sqrt(norm2(returned) / max(norm2(trial), T(1e-30))), T(1));
+}
+
+}  // namespace gsf

@@ -1,0 +1,139 @@
+"""Viscosity of solids: a share of the stiffness that relaxes, and a yield that takes time.
+
+Composed of :func:`gsfluent.ops.return_mapping`; the resident solver has it in one kernel
+(``csrc/core/material/viscous.h``). Equations: docs/theory/viscous.md.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsfluent._check import check_tensor
+from gsfluent.ops.plasticity import INSTANT, LAWS, elastic_energy, return_mapping
+
+SHARE, RATE, TIME = 6, 7, 8
+"""Columns of ``viscous`` after the strain of the spring: share g of the stiffness, 1 / tau, T."""
+
+
+def check_viscous(op: str, viscous: Tensor, like: Tensor) -> None:
+    """Refuse viscosity that is none.
+
+    Raises:
+        TypeError: Wrong type or dtype.
+        ValueError: Wrong shape or device; a share outside 0 to 1, a rate or a time below 0, values
+            that are not finite.
+    """
+    check_tensor(op, "viscous", viscous, shape=(like.shape[0], 9), like=like)
+    share = viscous[:, SHARE]
+    good = torch.isfinite(viscous).all(dim=1) & (viscous[:, SHARE:] >= 0).all(dim=1) & (share <= 1)
+    if not bool(good.all()):
+        row = int((~good).nonzero()[0])
+        raise ValueError(
+            f"{op}: viscous must be finite, with a share of 0 to 1, a rate and a time of 0 or "
+            f"more, got {viscous[row, SHARE:].tolist()} in row {row}"
+        )
+
+
+def _elastic(law: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of the neo-Hookean law with the stiffness of these."""
+    plain = torch.zeros_like(params)
+    plain[:, :2], plain[:, 6] = params[:, :2], params[:, 6]
+    return torch.full_like(law, LAWS["elastic"]), plain
+
+
+def viscous_step(
+    viscous: Tensor,
+    strain: Tensor,
+    alpha: Tensor,
+    increment: Tensor,
+    returned: tuple[Tensor, Tensor, Tensor],
+    *,
+    law: Tensor,
+    params: Tensor,
+    material: Tensor | None = None,
+    dt: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What viscosity makes of the step of a law: a yield that takes time, a spring that relaxes.
+
+    A yield goes ``dt / (T + dt)`` of the way that the law says (Duvaut and Lions 1976). The spring
+    of the Maxwell branch relaxes for half of the step, goes along with ``increment``, and relaxes
+    for the rest (second order in dt / tau). Where the law yields it keeps as much of its strain as
+    the law of its stress. Both are stable for any step. Simo and Hughes 1998, ch. 2.7 and 10.
+
+    Args:
+        viscous: Of each point, [N, 9]: strain of its spring (as ``strain``), its share g of the
+            stiffness, 0 to 1, its rate of relaxation 1 / tau [1/s], and the time T of a yield [s],
+            0 for at once.
+        strain: Strain of the law before the step, [N, 6].
+        alpha: Its alpha before the step, [N].
+        increment: ``dt grad v``, [N, 3, 3].
+        returned: Strain, alpha and Kirchhoff stress [Pa] that :func:`return_mapping` made of them.
+        law: Law of each row, int32 [M]; 0 (elastic) and 1 (nacc) are the ones that make sense.
+        params: Parameters of each row, [M, 8].
+        material: Row of each point, int32 [N]; as in :func:`return_mapping`.
+        dt: Step [s]; 0 asks for the stress of a state as it is.
+
+    Returns:
+        After the step: ``viscous`` [N, 9], strain [N, 6], alpha [N], and the stress ``(1 - g)
+        stress + g spring`` [N, 6].
+
+    Raises:
+        TypeError, ValueError: As :func:`check_viscous` and :func:`return_mapping`.
+    """
+    check_viscous("viscous_step", viscous, strain)
+    share, rate, time = (viscous[:, c, None] for c in (SHARE, RATE, TIME))
+    still, none = strain.new_zeros(strain.shape[0]), torch.zeros_like(increment)
+    plain_law, plain = _elastic(law, params)
+
+    def elastic(e: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
+        strain, _, stress, _ = return_mapping(
+            e, still, moved, law=plain_law, params=plain, material=material, dt=INSTANT
+        )
+        return strain, stress
+
+    after, new_alpha, stress = returned
+    left = torch.ones_like(share)
+    if bool((law == LAWS["nacc"]).any()):
+        trial, trial_stress = elastic(strain, increment)
+        late = (stress != trial_stress).any(dim=1, keepdim=True) & (time > 0)
+        way = torch.where(late, dt / (time + dt).clamp(min=1e-30), 1.0)
+        slow, slow_stress = elastic((1.0 - way) * trial + way * after, none)
+        after, stress = torch.where(late, slow, after), torch.where(late, slow_stress, stress)
+        new_alpha = torch.where(late[:, 0], alpha + way[:, 0] * (new_alpha - alpha), new_alpha)
+        yields = (stress != trial_stress).any(dim=1, keepdim=True)
+        ratio = _norm2(stress) / _norm2(trial_stress).clamp(min=1e-30)
+        left = torch.where(yields, ratio.sqrt().clamp(max=1.0), left)
+    y = 0.5 * dt * rate
+    half = 1.0 / (1.0 + y * (1.0 + 0.5 * y))
+    spring = left * half * elastic(half * viscous[:, :6], increment)[0]
+    spring, held = elastic(spring, none)
+    spring = torch.where(share > 0, spring, viscous[:, :6])
+    stress = torch.where(share > 0, (1.0 - share) * stress + share * held, stress)
+    return torch.cat([spring, viscous[:, SHARE:]], dim=1), after, new_alpha, stress
+
+
+def viscous_energy(
+    viscous: Tensor, energy: Tensor, *, law: Tensor, params: Tensor, material: Tensor | None = None
+) -> Tensor:
+    """Energy stored by viscous points per initial volume [J/m^3], [N].
+
+    Args:
+        viscous: Of each point, [N, 9]; see :func:`viscous_step`.
+        energy: What :func:`gsfluent.ops.elastic_energy` says of the law's strain, [N].
+        law: Law of each row, int32 [M].
+        params: Parameters of each row, [M, 8].
+        material: Row of each point, int32 [N].
+    """
+    plain_law, plain = _elastic(law, params)
+    spring = elastic_energy(
+        viscous[:, :6].contiguous(), law=plain_law, params=plain, material=material
+    )
+    share = viscous[:, SHARE]
+    return (1.0 - share) * energy + share * spring
+
+
+def _norm2(stress: Tensor) -> Tensor:
+    """Square of the size of symmetric tensors, [N, 1]."""
+    square = stress.square()
+    return square[:, :3].sum(dim=1, keepdim=True) + 2.0 * square[:, 3:].sum(dim=1, keepdim=True)

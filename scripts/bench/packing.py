@@ -1,0 +1,151 @@
+"""Small shots beside each other on one GPU, against the same shots one after the other.
+
+    python scripts/bench/packing.py [--device cuda] [--shots 8] [--pack 8] [-o OUT] [--json FILE]
+    python scripts/bench/packing.py --page FILE.json     # enters the table into the docs
+
+A melon is filled and textured once; then the shots, which differ in their seed, go through
+gsfluent.sweep twice, one at a time and --pack at a time. Time counts from the first to the last
+shot, start of processes included. Films and figures of both are compared. Two minutes on a GPU
+with sixteen cores; on a CPU --pack is the number of processes. Enters docs/measured/sweeps.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+import gsfluent as gf
+from gsfluent.cli.common import choose_device
+from gsfluent.figure.markdown import enter
+from gsfluent.hardware import processor
+from gsfluent.io import save_splats
+from gsfluent.progress import LineReporter
+from gsfluent.sweep import read_sweep, run_sweep
+from gsfluent.sweep.folder import SweepFolder
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "measured" / "sweeps.md"
+WARM = 1000
+"""Seed of the shot that makes the solids and loads the kernels."""
+
+
+def sweep_file(folder: Path, seeds: list[int], seconds: float, pack: int, device: str) -> Path:
+    """A sweep over seeds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "melon.ply").is_file():
+        save_splats(gf.demo.make_splats("watermelon"), folder / "melon.ply")
+    shot = {
+        "splats": "melon.ply", "size": 0.25, "objects": {"melon": {"material": "fruit.watermelon"}},
+        "texture": {"method": "procedural", "preset": "watermelon"},
+        "events": [{"type": "drop", "height": 1.5}], "solve": {"quality": "preview"},
+        "output": {"seconds": seconds, "size": [320, 320]},
+    }  # fmt: skip
+    (folder / "shot.yaml").write_text(yaml.safe_dump(shot))
+    each = {"gpu": 1.0 / pack} if device == "cuda" else {}
+    sweep = {"shot": "shot.yaml", "vary": {"seed": seeds}, "each": each}
+    (folder / "sweep.yaml").write_text(yaml.safe_dump(sweep))
+    return folder / "sweep.yaml"
+
+
+def timed(file: Path, out: Path, device: torch.device, jobs: int) -> float:
+    """Seconds that a sweep takes whose solids are there."""
+    start = time.perf_counter()
+    said = run_sweep(
+        read_sweep(file, {}, None), out, device=device, jobs=jobs, reporter=LineReporter()
+    )
+    if not said["ok"] or "failed" in said["verdicts"]:
+        raise SystemExit(f"packing.py: {said}")
+    return time.perf_counter() - start
+
+
+def figures(out: Path) -> dict[int, Any]:
+    """What came out, by seed."""
+    place = SweepFolder(out)
+    rows = place.rows(sorted(place.done())).values()
+    names = ("frames", "substeps", "particles", "pieces", "dissipated")
+    return {
+        row["value"]["seed"]: [row["value"]["figures"].get(name) for name in names] for row in rows
+    }
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Both sweeps."""
+    device = choose_device(options.device)
+    seeds = list(range(options.shots))
+    walls, found = {}, {}
+    first = options.out / "warm"
+    timed(sweep_file(options.out, [WARM], options.seconds, 1, device.type), first, device, 1)
+    for pack in (options.pack, 1):
+        out = options.out / f"pack_{pack}"
+        shutil.rmtree(out, ignore_errors=True)
+        for name in ("stages", "solids"):
+            shutil.copytree(first / name, out / name)
+        file = sweep_file(options.out, seeds, options.seconds, pack, device.type)
+        walls[pack] = timed(file, out, device, pack)
+        found[pack] = figures(out)
+    alone = SweepFolder(options.out / "pack_1")
+    peaks = [
+        row["value"]["figures"]["peak_device_memory_bytes"]
+        for row in alone.rows(sorted(alone.done())).values()
+    ]
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else processor()
+    return {
+        "device": name, "cores": os.cpu_count(), "shots": options.shots, "pack": options.pack,
+        "points": found[1][0][2], "seconds_of_film": options.seconds,
+        "one_after_another": walls[1], "packed": walls[options.pack],
+        "peak_device_memory_bytes": max(peaks), "same_figures": found[1] == found[options.pack],
+    }  # fmt: skip
+
+
+def markdown(row: dict[str, Any]) -> str:
+    """The table."""
+    ratio = row["one_after_another"] / row["packed"]
+    return "\n".join([
+        f"{row['shots']} drops of a melon ({row['points']:,} points, {row['seconds_of_film']:g} s) "
+        f"on {row['device']} with {row['cores']} cores:",
+        "",
+        "| | wall [s] | a shot [s] |",
+        "| --- | --- | --- |",
+        f"| one after another | {row['one_after_another']:.1f} | "
+        f"{row['one_after_another'] / row['shots']:.1f} |",
+        f"| {row['pack']} at a time | {row['packed']:.1f} | {row['packed'] / row['shots']:.1f} |",
+        "",
+        f"{ratio:.2f} times as fast; a shot's tensors take "
+        f"{row['peak_device_memory_bytes'] / 1e9:.2g} GB of the GPU; figures of both are "
+        f"{'the same' if row['same_figures'] else 'not the same'}.",
+    ])  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda")
+    parser.add_argument("--shots", type=int, default=8)
+    parser.add_argument("--pack", type=int, default=8, help="shots at a time")
+    parser.add_argument("--seconds", type=float, default=0.6, help="of film")
+    parser.add_argument("-o", "--out", type=Path, default=Path("packing"))
+    parser.add_argument("--json", type=Path, help="where the figures go")
+    parser.add_argument("--page", type=Path, metavar="FILE.json", help="only enter these")
+    options = parser.parse_args()
+    if options.page is not None:
+        row = json.loads(options.page.read_text())
+        PAGE.write_text(enter(PAGE.read_text(), "packing", row["device"], markdown(row)))
+        return
+    row = measure(options)
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(row, indent=1) + "\n")
+    print(markdown(row))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,372 @@
+"""Stiffness that relaxes and yields that take time: one point, the books, both engines."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.errors import InputError
+from gsfluent.ops.plasticity import LAWS
+
+YOUNG, NU, DENSITY = 1e6, 0.3, 1000.0
+MU, KAPPA = YOUNG / (2.0 * (1.0 + NU)), YOUNG / (3.0 * (1.0 - 2.0 * NU))
+ELASTIC, NACC = LAWS["elastic"], LAWS["nacc"]
+
+
+def rows(law: int = ELASTIC, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+    values = [MU, KAPPA, 1.5, 0.6, 3.0, 0.0, DENSITY, 0.0]
+    return {
+        "law": torch.tensor([law], dtype=torch.int32),
+        "params": torch.tensor([values], dtype=dtype),
+    }
+
+
+def branch(share: float, rate: float, count: int = 1) -> Tensor:
+    found = torch.zeros(count, 9, dtype=torch.float64)
+    found[:, 6], found[:, 7] = share, rate
+    return found
+
+
+def step(
+    strain: Tensor, viscous: Tensor, increment: Tensor, dt: float, law: int = ELASTIC,
+    alpha: float = -0.05,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Strain, branch and stress after a step of one point."""
+    table = rows(law)
+    start = torch.full((strain.shape[0],), alpha, dtype=torch.float64)
+    returned = ops.return_mapping(strain, start, increment, dt=dt, **table)[:3]
+    after, e, _, stress = ops.viscous_step(
+        viscous, strain, start, increment, returned, dt=dt, **table
+    )
+    return e, after, stress
+
+
+def test_the_loss_factor_is_that_of_a_standard_linear_solid() -> None:
+    """Cyclic shear of a point: its complex modulus is 1 - g + g i w tau / (1 + i w tau)."""
+    share = torch.tensor([0.2, 0.5, 0.9, 0.9, 0.9], dtype=torch.float64)
+    speed = torch.tensor([3.0, 1.0, 2.0, 1.0, 3.0], dtype=torch.float64)  # w tau
+    steps, amplitude = 3000, 1e-7
+    omega = 2.0 * math.pi
+    dt = 1.0 / steps
+    part = 1j * speed / (1.0 + 1j * speed)
+    wanted = 1.0 - share + share * part
+    viscous = branch(0.0, 0.0, 5)
+    viscous[:, 6], viscous[:, 7] = share, omega / speed
+    viscous[:, 3] = amplitude * part.imag  # where the spring is when the cycle has gone on for long
+    strain, found = torch.zeros(5, 6, dtype=torch.float64), torch.zeros(5, dtype=torch.complex128)
+    for i in range(steps):
+        grown = amplitude * (math.sin(omega * (i + 1) * dt) - math.sin(omega * i * dt))
+        increment = torch.zeros(5, 3, 3, dtype=torch.float64)
+        increment[:, 0, 1] = increment[:, 1, 0] = 0.5 * grown
+        strain, viscous, stress = step(strain, viscous, increment, dt)
+        found += stress[:, 3] * cmath.exp(-1j * omega * (i + 1) * dt)
+    modulus = found * 2j / (steps * amplitude * MU)
+    loss = modulus.imag / modulus.real - wanted.imag / wanted.real
+    assert float(loss.abs().max()) < 1e-6
+    assert float((modulus - wanted).abs().max()) < 1e-6
+
+
+def test_what_is_held_relaxes_to_the_rest_of_its_stiffness() -> None:
+    rate, dt = 10.0, 2e-4
+    viscous = branch(0.6, rate)
+    pull = torch.zeros(1, 3, 3, dtype=torch.float64)
+    pull[0] = 1e-6 * torch.eye(3, dtype=torch.float64)
+    strain, viscous, first = step(torch.zeros(1, 6, dtype=torch.float64), viscous, pull, 1e-12)
+    stress = first
+    for _ in range(1000):
+        strain, viscous, stress = step(strain, viscous, torch.zeros_like(pull), dt)
+    left = 0.4 + 0.6 * math.exp(-1000 * dt * rate)
+    assert float(stress[0, 0] / first[0, 0]) == pytest.approx(left, rel=1e-6)
+    # any step is stable: a very long one leaves the law's share
+    _, viscous, stress = step(strain, viscous, torch.zeros_like(pull), 1e9)
+    assert float(stress[0, 0] / first[0, 0]) == pytest.approx(0.4, rel=1e-6)
+
+
+def some(seed: int, count: int, size: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Strains, springs and increments at random, of what can be: b is positive."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def strains() -> Tensor:
+        f = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+        f = torch.eye(3, dtype=torch.float64) + 0.2 * f
+        b = f @ f.transpose(1, 2) - torch.eye(3, dtype=torch.float64)
+        return torch.stack(
+            [b[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))], 1
+        )
+
+    move = size * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    return strains(), strains(), move
+
+
+@given(st.integers(0, 10**6), st.floats(0.0, 1.0), st.floats(0.0, 1e6))
+def test_relaxing_never_stores_energy(seed: int, share: float, rate: float) -> None:
+    strain, spring, _ = some(seed, 16, 0.0)
+    viscous = branch(share, rate, 16)
+    viscous[:, :6] = spring
+    still = torch.zeros(16, 3, 3, dtype=torch.float64)
+    table = rows()
+
+    def stored(m: Tensor, e: Tensor) -> Tensor:
+        return ops.viscous_energy(m, ops.elastic_energy(e, **table), **table)
+
+    after, relaxed, _ = step(strain, viscous, still, 1e-3)
+    before = stored(viscous, strain)
+    assert bool((stored(relaxed, after) <= before * (1.0 + 1e-12) + 1e-9).all())
+
+
+@given(st.integers(0, 10**6))
+def test_a_turned_point_answers_as_a_turned_one(seed: int) -> None:
+    strain, spring, move = some(seed, 8, 0.02)
+    viscous = branch(0.7, 50.0, 8)
+    viscous[:, :6] = spring
+    turn, _ = torch.linalg.qr(
+        torch.randn(3, 3, generator=torch.Generator().manual_seed(seed + 1), dtype=torch.float64)
+    )
+
+    def turned(e: Tensor) -> Tensor:
+        full = e[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
+        full = turn @ full @ turn.T
+        return full.reshape(-1, 9)[:, [0, 4, 8, 1, 2, 5]]
+
+    other = viscous.clone()
+    other[:, :6] = turned(spring)
+    _, _, stress = step(strain, viscous, move, 1e-3)
+    _, _, again = step(turned(strain), other, turn @ move @ turn.T, 1e-3)
+    assert torch.allclose(turned(stress), again, rtol=1e-10, atol=1e-6)
+
+
+def test_what_breaks_lets_go_of_its_spring() -> None:
+    viscous = branch(0.8, 1.0)
+    strain = torch.zeros(1, 6, dtype=torch.float64)
+    pull = torch.zeros(1, 3, 3, dtype=torch.float64)
+    pull[0, 0, 0] = 2e-3
+    for _ in range(50):
+        strain, viscous, stress = step(strain, viscous, pull, 1e-6, NACC, alpha=0.1)
+    assert float(viscous[0, :6].abs().max()) < 1e-3
+    assert float(stress.abs().max()) < 1e-3 * YOUNG
+    # without a yield the branch of brittle matter is that of elastic matter
+    small = torch.zeros(1, 3, 3, dtype=torch.float64)
+    small[0, 0, 0] = 1e-4
+    none = torch.zeros(1, 6, dtype=torch.float64)
+    one, two = (step(none, branch(0.8, 10.0), small, 1e-3, law) for law in (ELASTIC, NACC))
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+def sheared(rate: float, time: float, dt: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Shear stress over the steps of perfectly plastic matter, then strain and alpha.
+
+    NACC whose surface is symmetric in pressure (beta = 1) without shear damage: in pure shear its
+    pressure is and stays none, and its alpha what it was.
+    """
+    table = rows(NACC)
+    table["params"][0, 3] = 1.0
+    viscous = branch(0.0, 0.0)
+    viscous[0, 8] = time
+    strain, alpha = torch.zeros(1, 6, dtype=torch.float64), torch.full((1,), 0.0).double()
+    increment = torch.zeros(1, 3, 3, dtype=torch.float64)
+    increment[0, 0, 1] = increment[0, 1, 0] = 0.5 * rate * dt
+    stress = []
+    for _ in range(steps):
+        returned = ops.return_mapping(strain, alpha, increment, dt=dt, epsilon=0.0, **table)[:3]
+        viscous, strain, alpha, now = ops.viscous_step(
+            viscous, strain, alpha, increment, returned, dt=dt, **table
+        )
+        stress.append(now[0, 3])
+    return torch.stack(stress), strain, alpha
+
+
+def test_strength_rises_with_the_rate_by_stiffness_times_rate_times_the_time_of_a_yield() -> None:
+    """Steady flow: the law's own strength and mu rate T, closed form of Duvaut and Lions."""
+    time, dt = 1e-3, 1e-4
+    slow = sheared(1e-3, 0.0, dt, 200)[0]
+    own = float(slow[-1])  # yields at once
+    # the surface says it: q = M a / sqrt(1 + 2 beta), q = sqrt(3) tau_xy
+    assert own == pytest.approx(1.5 * 1e-5 * KAPPA / 3.0, rel=1e-4)
+    assert float(sheared(1e-2, 0.0, dt, 200)[0][-1]) == pytest.approx(own, rel=5e-5)
+    for rate in (1e-3, 1e-2, 3e-2):
+        stress, _, alpha = sheared(rate, time, dt, 400)
+        assert float(stress[-1]) == pytest.approx(own + MU * rate * time, rel=2e-5)
+        assert float(alpha) == pytest.approx(0.0, abs=1e-7)
+    # on the way there, and at a tenth of the step: the exponential, to first order in dt / T
+    rate = 3e-2
+    for dt, close in ((1e-4, 0.06), (1e-5, 0.006)):
+        stress = sheared(rate, time, dt, round(3.0 * time / dt))[0]
+        begins = own / (MU * rate)  # when it begins to yield
+        wanted = own + MU * rate * time * (1.0 - math.exp(-(3.0 * time - begins) / time))
+        assert float(stress[-1]) == pytest.approx(wanted, rel=close)
+        assert float(stress.max()) <= own + MU * rate * time
+
+
+def test_what_is_strained_beyond_its_surface_decays_to_it() -> None:
+    time, dt = 1e-3, 1e-5
+    table = rows(NACC)
+    table["params"][0, 3] = 1.0
+    viscous, still = branch(0.0, 0.0), torch.zeros(1, 3, 3, dtype=torch.float64)
+    viscous[0, 8] = time
+    strain = torch.zeros(1, 6, dtype=torch.float64)
+    strain[0, 3] = 3e-5
+    alpha = torch.zeros(1, dtype=torch.float64)
+    own = 1.5 * 1e-5 * KAPPA / 3.0
+    first = ops.viscous_step(
+        viscous, strain, alpha, still,
+        ops.return_mapping(strain, alpha, still, dt=dt, epsilon=0.0, **table)[:3], dt=0.0, **table,
+    )[3]  # fmt: skip
+    assert float(first[0, 3]) == pytest.approx(3e-5 * MU, rel=1e-6)  # nothing has yielded yet
+    for _ in range(100):
+        returned = ops.return_mapping(strain, alpha, still, dt=dt, epsilon=0.0, **table)[:3]
+        viscous, strain, alpha, stress = ops.viscous_step(
+            viscous, strain, alpha, still, returned, dt=dt, **table
+        )
+    left = (1.0 + dt / time) ** -100
+    assert float(stress[0, 3]) == pytest.approx(own + (3e-5 * MU - own) * left, rel=1e-4)
+
+
+# --- the resident solver ---
+
+DX = 0.1
+
+
+def ball(dtype: torch.dtype, law: int, count: int = 8) -> dict[str, Tensor]:
+    """A jittered cube of points that is squeezed along x."""
+    generator = torch.Generator().manual_seed(3)
+    axis = (torch.arange(count, dtype=torch.float64) + 0.5) * 0.5 * DX
+    position = torch.cartesian_prod(axis, axis, axis)
+    position = position + 0.1 * DX * (torch.rand(position.shape, generator=generator) - 0.5)
+    n = position.shape[0]
+    velocity = torch.zeros(n, 3, dtype=dtype)
+    velocity[:, 0] = (-2.0 * (position[:, 0] - position[:, 0].mean()) / (count * DX)).to(dtype)
+    volume = torch.full((n,), (0.5 * DX) ** 3, dtype=dtype)
+    return {
+        "position": position, "velocity": velocity, "volume": volume, "mass": DENSITY * volume,
+        "alpha": torch.full((n,), -0.05, dtype=dtype), **rows(law, dtype),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("law", [ELASTIC, NACC])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_resident_solver_does_what_the_operators_do(law: int, dtype: torch.dtype) -> None:
+    cube, dt, steps = ball(dtype, law), 5e-4, 60
+    n = cube["position"].shape[0]
+    start = branch(0.7, 100.0, n).to(dtype)
+    start[: n // 3, 6:] = 0.0  # a part that does not relax
+    start[::2, 8] = 2e-3  # half yields in its own time
+    if law == NACC:
+        cube["alpha"] = torch.where(torch.arange(n) % 3 == 0, -0.05, -0.002).to(dtype)
+    solver = ops.Solver(
+        **cube,
+        dx=DX,
+        dt=dt,
+        gravity=(0.0, 0.0, 0.0),
+        frame=(0.0, 0.0, 0.0),
+        viscous=start,
+        irreversible=False,
+    )
+    solver.advance(steps * dt)
+    table = {"law": cube["law"], "params": cube["params"]}
+    x, v, alpha = cube["position"].clone(), cube["velocity"], cube["alpha"]
+    affine, strain = torch.zeros(n, 3, 3, dtype=dtype), torch.zeros(n, 6, dtype=dtype)
+    stress, viscous, row = torch.zeros_like(strain), start, torch.zeros(n, dtype=torch.int32)
+    x = x.to(dtype)
+    for _ in range(steps):
+        blocks = ops.build_blocks(x, DX)
+        grid, _ = ops.p2g(
+            x,
+            v,
+            affine,
+            cube["mass"],
+            dx=DX,
+            blocks=blocks,
+            dt=dt,
+            stress=stress,
+            volume=cube["volume"],
+        )
+        nodes = ops.grid_update(grid, dx=DX, dt=dt, blocks=blocks, gravity=(0.0, 0.0, 0.0))[0]
+        x, v, affine, _ = ops.g2p(nodes, x, dx=DX, dt=dt, blocks=blocks, velocity=v)[:4]
+        moved = dt * affine
+        returned = ops.return_mapping(strain, alpha, moved, material=row, dt=dt, **table)[:3]
+        viscous, strain, alpha, stress = ops.viscous_step(
+            viscous, strain, alpha, moved, returned, material=row, dt=dt, **table
+        )
+    assert solver.steps == steps and solver.viscous is not None
+    assert (solver.counters()["plastic"] > 100) == (law == NACC)
+    close = 1e-3 if dtype == torch.float32 else 1e-9
+    scale = float(viscous[:, :6].abs().max())
+    assert scale > 1e-3
+    assert float((solver.viscous - viscous)[:, :6].abs().max()) < close * scale
+    assert torch.equal(solver.viscous[:, 6:], start[:, 6:])
+    assert float((solver.position - x).abs().max()) < close * DX
+    assert float((solver.alpha - alpha).abs().max()) < close * 0.05
+    assert float((solver.stress - stress).abs().max()) < close * float(stress.abs().max())
+    # what relaxes shows: the part without keeps its own strain to itself
+    assert float(viscous[: n // 3, :6].abs().max()) == 0.0
+
+
+def test_the_solver_keeps_order_and_goes_back(dtype: torch.dtype = torch.float32) -> None:
+    cube = ball(dtype, NACC)
+    n = cube["position"].shape[0]
+    start = branch(0.7, 100.0, n).to(dtype)
+    settings = {"dx": DX, "gravity": (0.0, 0.0, 0.0)}
+    solver = ops.Solver(**cube, **settings, viscous=start)
+    saved = solver.snapshot()
+    solver.advance(0.02)
+    found, where = solver.viscous, solver.position
+    solver.restore(saved)
+    solver.advance(0.02)
+    assert found is not None and torch.equal(found, solver.viscous)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(1))
+    mixed = {k: v[order] if k not in ("law", "params") else v for k, v in cube.items()}
+    other = ops.Solver(**mixed, **settings, viscous=start[order])
+    other.advance(0.02)
+    assert torch.equal(other.position, where[order])
+    assert torch.equal(other.viscous, found[order])
+    without = ops.Solver(**cube, **settings)
+    assert without.viscous is None
+    idle = ops.Solver(**cube, **settings, viscous=torch.zeros_like(start))
+    without.advance(0.02), idle.advance(0.02)
+    assert float((without.position - idle.position).abs().max()) < 1e-6 * DX
+
+
+def test_branches_that_are_none_are_refused() -> None:
+    cube = ball(torch.float32, ELASTIC)
+    n = cube["position"].shape[0]
+    good = branch(0.5, 1.0, n).float()
+    for column, value in ((6, -0.1), (6, 1.1), (7, -1.0), (0, math.nan)):
+        bad = good.clone()
+        bad[3, column] = value
+        with pytest.raises(ValueError, match="row 3"):
+            ops.Solver(**cube, dx=DX, viscous=bad)
+    with pytest.raises(ValueError, match="viscous"):
+        ops.Solver(**cube, dx=DX, viscous=good[:5])
+    sand = cube | rows(LAWS["drucker_prager"], torch.float32)
+    with pytest.raises(InputError, match="laws 0 and 1"):
+        ops.Solver(**sand, dx=DX, viscous=good)
+
+
+@pytest.mark.cuda
+def test_a_gpu_steps_by_the_operators() -> None:
+    cube = {k: v.cuda() for k, v in ball(torch.float32, NACC).items()}
+    n = cube["position"].shape[0]
+    with pytest.raises(InputError, match="relax"):
+        ops.Solver(**cube, dx=DX, viscous=branch(0.5, 1.0, n).float().cuda())
+    strain, spring, move = some(5, 64, 0.02)
+    viscous = branch(0.7, 50.0, 64)
+    viscous[:, :6] = spring
+    viscous[::2, 8] = 1e-3
+    alpha = torch.full((64,), -0.002, dtype=torch.float64)
+
+    def on(device: str) -> tuple[Tensor, ...]:
+        e, a, v, m = (t.to(device) for t in (strain, alpha, viscous, move))
+        table = {k: t.to(device) for k, t in rows(NACC).items()}
+        returned = ops.return_mapping(e, a, m, dt=1e-3, **table)[:3]
+        return ops.viscous_step(v, e, a, m, returned, dt=1e-3, **table)
+
+    here, there = on("cpu"), on("cuda")
+    for a, b in zip(here, there, strict=True):
+        assert torch.allclose(a, b.cpu(), rtol=1e-9, atol=1e-9 * float(a.abs().max()))
